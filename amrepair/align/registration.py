@@ -1,0 +1,40 @@
+"""`Registration`: where the scan lies in the template, and how sure that is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.frames import Transform
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """A converged alignment (one that does not converge raises instead).
+
+    Attributes
+    ----------
+    template_from_scan
+        The pose found.
+    rmse_mm
+        Root mean square of |f| over the inliers.
+    inlier_ratio
+        Share of scan points explained by the template.
+    information
+        (6, 6) Gauss–Newton Hessian JᵀWJ / σ², order (rotation x y z about the scan's centroid in
+        rad, translation x y z in mm); its inverse is the covariance.
+    symmetric_alternatives
+        Other poses (template_from_scan) that fit as well, within noise.
+    method, iterations
+        How it was found.
+    """
+
+    template_from_scan: Transform
+    rmse_mm: float
+    inlier_ratio: float
+    information: Float[np.ndarray, "6 6"]
+    symmetric_alternatives: tuple[Transform, ...]
+    method: str
+    iterations: int

@@ -1,0 +1,2 @@
+"""Detect: scores, thresholds, labels and regions. It says what differs, not what to do about it.
+"""

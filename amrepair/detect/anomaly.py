@@ -1,0 +1,86 @@
+"""What detection says: a label for every scan point and every template surface point, regions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+class Label(IntEnum):
+    """Labels as they stand in `anomaly.npz`."""
+
+    OK = 0  # for template points: present
+    MISSING = 1
+    EXCESS = 2
+    UNSEEN = 3
+
+
+class DefectType(StrEnum):
+    """Kinds of defects, in the words of the command line."""
+
+    VOID = "void"
+    UNDER_EXTRUSION = "under_extrusion"
+    CHIP = "chip"
+    BLOB = "blob"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A connected defect in the template frame.
+
+    Attributes
+    ----------
+    label
+        MISSING or EXCESS.
+    box_mm
+        (2, 3) lowest and highest corner.
+    depth_mm
+        The largest |deviation| in it.
+    """
+
+    label: Label
+    type: DefectType
+    volume_mm3: float
+    area_mm2: float
+    depth_mm: float
+    box_mm: Float[np.ndarray, "2 3"]
+
+
+@dataclass(frozen=True, slots=True)
+class AnomalyMap:
+    """Scores and labels, template frame.
+
+    Attributes
+    ----------
+    points_mm
+        (n, 3) scan points in the template frame, in the scan's own order.
+    deviation_mm
+        (n,) f at each point: negative inside the template.
+    score
+        (n,) A(x) = |f(x)| (PASDF, the anomaly score).
+    label
+        (n,) `Label` of each scan point; background (bed, far clutter) is OK.
+    template_points_mm
+        (m, 3) template surface points.
+    template_label
+        (m,) OK (present), MISSING or UNSEEN.
+    threshold_mm, threshold_source
+        The limit and how it was set.
+    object_score
+        Mean of the K highest scores.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    deviation_mm: Float[np.ndarray, " n"]
+    score: Float[np.ndarray, " n"]
+    label: Int[np.ndarray, " n"]
+    template_points_mm: Float[np.ndarray, "m 3"]
+    template_label: Int[np.ndarray, " m"]
+    threshold_mm: float
+    threshold_source: str
+    object_score: float
+    regions: tuple[Region, ...]

@@ -1,0 +1,44 @@
+"""The error tree of `amrepair`; the command line turns a class into an exit code.
+
+A message is one sentence: what happened, the value, the limit and what to try.
+"""
+
+from __future__ import annotations
+
+
+class AmrepairError(Exception):
+    """Root of every error that `amrepair` raises on purpose."""
+
+    exit_code: int = 2
+
+
+class InputError(AmrepairError):
+    """A scan, mesh, template or option that cannot be used."""
+
+
+class TemplateError(InputError):
+    """A template that cannot be fitted, read or extracted."""
+
+
+class AlignmentError(AmrepairError):
+    """An alignment that does not converge, or that leaves the pose ambiguous."""
+
+
+class DeficitError(AmrepairError):
+    """A deficit that cannot be made into a valid solid."""
+
+
+class ScannerError(AmrepairError):
+    """The scanner was silent or its data cannot be trusted."""
+
+    exit_code = 4
+
+
+class LoopError(AmrepairError):
+    """The loop stopped before the job was done."""
+
+    exit_code = 4
+
+
+class MissingDependencyError(AmrepairError):
+    """A library that this command needs cannot be loaded."""

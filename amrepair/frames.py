@@ -1,0 +1,120 @@
+"""Rigid transforms that carry their frames: `target_from_source`.
+
+Frames in use: `build` (bed corner at the origin, Z up), `scanner` (whatever the sensor says),
+`template` (the part's own coordinates, as its mesh file has them). All lengths are mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.errors import InputError
+
+# A product of a few float64 rotations stays orthonormal to about 1e-15; files carry 6 digits.
+ORTHONORMAL_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """A rigid motion that takes coordinates in `source` to coordinates in `target`.
+
+    Attributes
+    ----------
+    matrix
+        (4, 4) float64, row-major, acts on column vectors.
+
+    Raises
+    ------
+    InputError
+        If the matrix is not rigid.
+    """
+
+    target: str
+    source: str
+    matrix: Float[np.ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.matrix, dtype=np.float64)
+        rotation = matrix[:3, :3]
+        defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        bottom_is_affine = bool(np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0)))
+        if not np.isfinite(matrix).all() or not bottom_is_affine:
+            raise InputError(
+                f"the transform {self.target}_from_{self.source} is not a finite rigid motion: "
+                "its last row must be 0 0 0 1 and every entry finite"
+            )
+        if defect > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise InputError(
+                f"the transform {self.target}_from_{self.source} is not rigid: "
+                f"its rotation is off by {defect:.2e}, the limit is {ORTHONORMAL_TOLERANCE:.0e}"
+            )
+        matrix.setflags(write=False)
+        object.__setattr__(self, "matrix", matrix)
+
+    @classmethod
+    def identity(cls, target: str, source: str) -> Transform:
+        """The motion that moves nothing."""
+        return cls(target, source, np.eye(4))
+
+    @classmethod
+    def from_rotation_translation(
+        cls,
+        target: str,
+        source: str,
+        *,
+        rotation: Float[np.ndarray, "3 3"],
+        translation_mm: Float[np.ndarray, " 3"],
+    ) -> Transform:
+        """A motion from its (3, 3) rotation and (3,) translation in mm."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation
+        matrix[:3, 3] = translation_mm
+        return cls(target, source, matrix)
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """(3, 3) rotation."""
+        return self.matrix[:3, :3]
+
+    @property
+    def translation_mm(self) -> Float[np.ndarray, " 3"]:
+        """(3,) translation, mm."""
+        return self.matrix[:3, 3]
+
+    def inverse(self) -> Transform:
+        """`source_from_target`."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation.T
+        matrix[:3, 3] = -self.rotation.T @ self.translation_mm
+        return Transform(self.source, self.target, matrix)
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """Compose: (a_from_b @ b_from_c) is a_from_c; frames that do not meet are refused."""
+        if self.source != other.target:
+            raise InputError(
+                f"cannot compose {self.target}_from_{self.source} with "
+                f"{other.target}_from_{other.source}: {self.source} is not {other.target}"
+            )
+        return Transform(self.target, other.source, self.matrix @ other.matrix)
+
+    def apply(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) points in the target frame, mm."""
+        return points_mm @ self.rotation.T + self.translation_mm
+
+    def rotate(self, vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) directions in the target frame."""
+        return vectors @ self.rotation.T
+
+
+def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation matrix of an axis-angle vector (Rodrigues), exact near zero."""
+    angle_rad = float(np.linalg.norm(vector_rad))
+    x, y, z = vector_rad
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # sinc forms keep the series exact where the angle vanishes
+    first = np.sinc(angle_rad / np.pi)
+    second = 0.5 * np.sinc(angle_rad / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))

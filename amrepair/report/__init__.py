@@ -1,0 +1,2 @@
+"""Report: what people see of a run. It reads results and never changes them.
+"""

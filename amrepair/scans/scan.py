@@ -1,0 +1,89 @@
+"""`Scan`: points, how well they were measured, and from where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from amrepair.errors import InputError
+from amrepair.frames import Transform
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """A point cloud with its provenance.
+
+    Attributes
+    ----------
+    points_mm
+        (n, 3) float64 in `frame`.
+    sigma_mm
+        Standard deviation of one point along its ray.
+    frame
+        Name of the frame: `scanner`, `build`, `template`, …
+    normals
+        (n, 3) unit outward normals, or None.
+    sensors_mm
+        (k, 3) origins that the rays came from, in `frame`, or None where the file did not say.
+    sensor_index
+        (n,) which sensor saw each point, or None.
+    source
+        Where it came from, for messages.
+
+    Raises
+    ------
+    InputError
+        If there is no point, a value is not finite, or the arrays do not match.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    sigma_mm: float
+    frame: str
+    normals: Float[np.ndarray, "n 3"] | None = None
+    sensors_mm: Float[np.ndarray, "k 3"] | None = None
+    sensor_index: Int[np.ndarray, " n"] | None = None
+    source: str = "memory"
+
+    def __post_init__(self) -> None:
+        if len(self.points_mm) == 0:
+            raise InputError(f"the scan {self.source} has no points; scan again or check the export")
+        bad = int((~np.isfinite(self.points_mm)).any(axis=1).sum())
+        if bad:
+            raise InputError(
+                f"the scan {self.source} has {bad} of {len(self.points_mm)} points that are not "
+                "finite numbers (NaN or infinity); remove them before use"
+            )
+        if not self.sigma_mm >= 0:
+            raise InputError(f"the scan {self.source} has a noise of {self.sigma_mm} mm; it must be ≥ 0")
+        if self.normals is not None and self.normals.shape != self.points_mm.shape:
+            raise InputError(
+                f"the scan {self.source} has {len(self.points_mm)} points but "
+                f"{len(self.normals)} normals"
+            )
+        if (self.sensor_index is None) != (self.sensors_mm is None):
+            raise InputError(f"the scan {self.source} needs sensors_mm and sensor_index together")
+        for array in (self.points_mm, self.normals, self.sensors_mm, self.sensor_index):
+            if array is not None:
+                array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.points_mm)
+
+    def moved(self, target_from_source: Transform) -> Scan:
+        """The same scan in another frame; normals and sensors move along."""
+        if target_from_source.source != self.frame:
+            raise InputError(
+                f"the scan {self.source} is in frame {self.frame}, the transform starts from "
+                f"{target_from_source.source}"
+            )
+        return replace(
+            self,
+            points_mm=target_from_source.apply(self.points_mm),
+            normals=None if self.normals is None else target_from_source.rotate(self.normals),
+            sensors_mm=None
+            if self.sensors_mm is None
+            else target_from_source.apply(self.sensors_mm),
+            frame=target_from_source.target,
+        )

@@ -1,0 +1,53 @@
+"""The `Scanner` port: anything that can be asked for a scan of what stands on the bed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from amrepair.frames import Transform
+from amrepair.scans.scan import Scan
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRequest:
+    """Why a scan is taken.
+
+    Attributes
+    ----------
+    label
+        Short name for files and messages: `layer-044`, `final`.
+    layer_index
+        The layer just finished, or None for the finished part.
+    z_mm
+        Height printed so far, build frame.
+    """
+
+    label: str
+    layer_index: int | None
+    z_mm: float
+
+
+class Scanner(Protocol):
+    """A sensor fixed over the bed.
+
+    Attributes
+    ----------
+    build_from_scanner
+        The calibrated pose of the scanner frame, good to about a tenth of a millimetre.
+    """
+
+    @property
+    def build_from_scanner(self) -> Transform:
+        """Calibrated pose."""
+        ...
+
+    def scan(self, request: ScanRequest) -> Scan:
+        """Measure what stands on the bed now.
+
+        Raises
+        ------
+        ScannerError
+            If no usable scan arrives in time.
+        """
+        ...

@@ -1,0 +1,2 @@
+"""Simulate: a world that beads are laid in, that breaks as asked, and that a scanner can look at.
+"""

@@ -1,0 +1,50 @@
+"""The `Template` port: the part as it should be, as a signed distance field.
+
+Negative inside, mm, in the `template` frame. Every implementation answers the same questions;
+those who ask never know whether the field was learned, exact or planned from G-code.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Template(Protocol):
+    """A signed distance field of the expected part."""
+
+    @property
+    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
+        """(2, 3) lowest and highest corner of the part, template frame."""
+        ...
+
+    @property
+    def bias_mm(self) -> float:
+        """How far the field's zero level may lie from the true surface (99th percentile)."""
+        ...
+
+    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) signed distance at (n, 3) points, mm, negative inside."""
+        ...
+
+    def distance_and_gradient(
+        self, points_mm: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """(n,) signed distance, mm, and its (n, 3) gradient (unit outward normal near f = 0)."""
+        ...
+
+    def below_z(self, z_mm: float) -> Template:
+        """The part printed so far: max(f, z − z_k) (idea 1 of the design)."""
+        ...
+
+    def surface_points(
+        self, spacing_mm: float
+    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+        """(m, 3) points on the zero level about `spacing_mm` apart, and (m, 3) unit normals."""
+        ...
+
+    def solid(self) -> object:
+        """The interior as a `manifold3d.Manifold`, template frame, checked watertight."""
+        ...

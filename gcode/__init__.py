@@ -1,0 +1,4 @@
+"""gcode turns a solid into bytes on a wire: slice, check, estimate, send, emulate.
+
+It knows nothing of scans, templates or learning; `amrepair` stands on it, never the reverse.
+"""

@@ -1,0 +1,69 @@
+"""The error tree of `gcode`: every failure a caller may want to tell apart, and nothing else.
+
+A message is one sentence that says what happened, the value, the limit and what to try.
+Data rides as attributes. The command line turns a class into an exit code by `exit_code`.
+"""
+
+from __future__ import annotations
+
+
+class GcodeError(Exception):
+    """Root of every error that `gcode` raises on purpose."""
+
+    exit_code: int = 2
+
+
+class InputError(GcodeError):
+    """A file, mesh or option that cannot be used."""
+
+
+class ProfileError(GcodeError):
+    """A profile that is unknown, malformed or out of range."""
+
+
+class ReadError(GcodeError):
+    """G-code text that cannot be understood."""
+
+
+class SliceError(GcodeError):
+    """A solid that cannot be turned into beads."""
+
+
+class CheckRefusedError(GcodeError):
+    """A program that the checker refuses.
+
+    Attributes
+    ----------
+    refusals
+        The refusals, in program order; each names line, move, value and limit.
+    """
+
+    def __init__(self, message: str, refusals: tuple[object, ...] = ()) -> None:
+        super().__init__(message)
+        self.refusals = refusals
+
+
+class LocalProtocolError(GcodeError):
+    """We asked the protocol machine for something its state does not allow."""
+
+
+class LinkError(GcodeError):
+    """The printer or the link to it failed."""
+
+    exit_code = 4
+
+
+class RemoteProtocolError(LinkError):
+    """The printer sent something that its protocol does not allow here."""
+
+
+class PrinterError(LinkError):
+    """The printer reported a fault of its own (thermal runaway, kill, halt)."""
+
+
+class PortBusyError(LinkError):
+    """Another sender holds this printer."""
+
+
+class JournalError(LinkError):
+    """The journal of a job cannot be read, or contradicts the printer."""

@@ -1,0 +1,5 @@
+"""Hosts: the `Printer` port and the adapters behind it.
+
+A host carries a checked program to a machine and says truthfully what arrived. It does not
+make, judge or alter G-code.
+"""

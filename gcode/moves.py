@@ -1,0 +1,207 @@
+"""The vocabulary of a print: what a nozzle does, before any dialect gives it words.
+
+A `Toolpath` is a sequence of moves in the build frame (bed corner at the origin, Z up, mm).
+It knows nothing of E values, feed words or firmware; `writer` does. A `Program` is final text.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Role(StrEnum):
+    """What a bead is for, in the words that PrusaSlicer's and OrcaSlicer's viewers know."""
+
+    SKIRT = "Skirt/Brim"
+    EXTERNAL_PERIMETER = "External perimeter"
+    PERIMETER = "Perimeter"
+    SOLID_INFILL = "Solid infill"
+    TOP_SOLID_INFILL = "Top solid infill"
+    SPARSE_INFILL = "Internal infill"
+    GAP_FILL = "Gap fill"
+    CUSTOM = "Custom"
+
+
+@dataclass(frozen=True, slots=True)
+class Extrude:
+    """A chain of beads.
+
+    Attributes
+    ----------
+    points_mm
+        (n, 3) nozzle positions, build frame, n ≥ 2; the first is where the bead begins.
+    section_mm2
+        (n-1,) cross-section of the plastic along each segment; volume = section × length.
+    width_mm, height_mm
+        Nominal width and layer height, for viewers and for the reader of the report.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    section_mm2: Float[np.ndarray, " m"]
+    speed_mm_s: float
+    role: Role
+    width_mm: float
+    height_mm: float
+
+    @property
+    def length_mm(self) -> float:
+        """Length of the chain, mm."""
+        return float(np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1).sum())
+
+    @property
+    def volume_mm3(self) -> float:
+        """Plastic in the chain, mm³."""
+        lengths_mm = np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1)
+        return float(lengths_mm @ self.section_mm2)
+
+
+@dataclass(frozen=True, slots=True)
+class Travel:
+    """A move without plastic through `points_mm` (n, 3), build frame, its start left out."""
+
+    points_mm: Float[np.ndarray, "n 3"]
+    speed_mm_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Retract:
+    """Pull `length_mm` of filament back (negative pushes it out again)."""
+
+    length_mm: float
+    speed_mm_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Prime:
+    """Push `length_mm` of filament standing still, beyond what was retracted."""
+
+    length_mm: float
+    speed_mm_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SetHotend:
+    """Set the hotend's target; `wait` until it is reached."""
+
+    temperature_c: float
+    wait: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SetBed:
+    """Set the bed's target; `wait` until it is reached."""
+
+    temperature_c: float
+    wait: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SetFan:
+    """Set the part-cooling fan, 0..1."""
+
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class SetAcceleration:
+    """Set the acceleration of printing moves."""
+
+    acceleration_mm_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class LayerChange:
+    """A new layer begins: its index, the height of its top and its thickness."""
+
+    index: int
+    z_mm: float
+    height_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class FinishMoves:
+    """Wait until every buffered move has been made (M400)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Script:
+    """Lines of a profile's own G-code (start, end), already filled in."""
+
+    lines: tuple[str, ...]
+    label: str = "custom"
+
+
+@dataclass(frozen=True, slots=True)
+class Comment:
+    """A line of text for people and viewers."""
+
+    text: str
+
+
+Move = (
+    Extrude
+    | Travel
+    | Retract
+    | Prime
+    | SetHotend
+    | SetBed
+    | SetFan
+    | SetAcceleration
+    | LayerChange
+    | FinishMoves
+    | Script
+    | Comment
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Toolpath:
+    """Moves in the order they are made, build frame."""
+
+    moves: tuple[Move, ...]
+
+    def __iter__(self) -> Iterator[Move]:
+        return iter(self.moves)
+
+    def __len__(self) -> int:
+        return len(self.moves)
+
+    @property
+    def extrusions(self) -> tuple[Extrude, ...]:
+        """The chains of beads alone."""
+        return tuple(move for move in self.moves if isinstance(move, Extrude))
+
+    @property
+    def volume_mm3(self) -> float:
+        """Plastic laid down as beads, mm³ (priming and retraction left out)."""
+        return sum(chain.volume_mm3 for chain in self.extrusions)
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """Final G-code text in one dialect.
+
+    Attributes
+    ----------
+    text
+        Lines ended by a newline.
+    dialect
+        A name that `dialects` knows: marlin, prusa, klipper, reprap.
+    """
+
+    text: str
+    dialect: str
+    sha256: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sha256", hashlib.sha256(self.text.encode()).hexdigest())
+
+    def lines(self) -> Iterator[str]:
+        """Lines without their newline."""
+        return iter(self.text.splitlines())

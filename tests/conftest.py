@@ -1,0 +1,57 @@
+"""Shared by every test: shapes checked at run time, the data folder, deterministic examples."""
+
+from __future__ import annotations
+
+import importlib.machinery
+import os
+import sys
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+
+import hypothesis
+import pytest
+from jaxtyping import install_import_hook
+
+
+class _KernelFinder:
+    """Keeps the run-time shape checks away from numba kernels, which compile their own."""
+
+    @staticmethod
+    def find_spec(
+        name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if name.endswith("_kernels"):
+            return importlib.machinery.PathFinder.find_spec(name, path, target)
+        return None
+
+
+install_import_hook(["amrepair", "gcode"], "beartype.beartype")
+sys.meta_path.insert(0, _KernelFinder)  # type: ignore[arg-type]
+
+hypothesis.settings.register_profile(
+    "suite",
+    deadline=None,  # two busy cores: time says nothing about correctness
+    derandomize=True,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("suite")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--regenerate-golden", action="store_true", help="write golden files anew")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of fetched test data; skips, visibly, where there is none."""
+    value = os.environ.get("AMREPAIR_DATA", "")
+    if not value:
+        pytest.skip("AMREPAIR_DATA is not set: the fetched parts and G-code are not here")
+    return Path(value)
+
+
+@pytest.fixture(scope="session")
+def regenerate_golden(request: pytest.FixtureRequest) -> bool:
+    return bool(request.config.getoption("--regenerate-golden"))
