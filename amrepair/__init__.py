@@ -1,1 +1,1 @@
-"""amrepair turns scans into a solid that is missing; `gcode` turns that solid into bytes on a wire."""
+"""amrepair turns scans into a solid that is missing; `gcode` turns that solid into G-code."""

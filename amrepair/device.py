@@ -39,12 +39,14 @@ def torch_device(request: str = "auto") -> torch.device:
         raise InputError(f"device '{request}' is unknown; choose auto, cpu or cuda")
     has_cuda = torch.cuda.is_available()
     if request == "cuda" and not has_cuda:
-        raise InputError("device 'cuda' was asked for but torch sees no CUDA device; use --device cpu")
+        raise InputError(
+            "device 'cuda' was asked for but torch sees no CUDA device; use --device cpu"
+        )
     return torch.device("cuda" if has_cuda and request != "cpu" else "cpu")
 
 
 @cache
-def open3d() -> Any:  # noqa: ANN401 - open3d ships no types
+def open3d() -> Any:
     """The open3d module, with the system library that its wheel wants but does not carry.
 
     The wheel links to libusb-1.0.so.0 (for depth cameras). Where the system has none, the copy

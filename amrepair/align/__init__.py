@@ -1,2 +1,1 @@
-"""Align: where a scan lies in the template. Returns a `Registration` or raises, never guesses.
-"""
+"""Align: where a scan lies in the template. Returns a `Registration` or raises, never guesses."""

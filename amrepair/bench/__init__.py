@@ -1,2 +1,1 @@
-"""Bench: data sets, metrics, baselines and the runner that compares methods by name.
-"""
+"""Bench: data sets, metrics, baselines and the runner that compares methods by name."""

@@ -1,2 +1,1 @@
-"""Detect: scores, thresholds, labels and regions. It says what differs, not what to do about it.
-"""
+"""Detect: scores, thresholds, labels and regions. It says what differs, not what to do about it."""

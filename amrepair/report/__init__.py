@@ -1,2 +1,1 @@
-"""Report: what people see of a run. It reads results and never changes them.
-"""
+"""Report: what people see of a run. It reads results and never changes them."""

@@ -48,7 +48,9 @@ class Scan:
 
     def __post_init__(self) -> None:
         if len(self.points_mm) == 0:
-            raise InputError(f"the scan {self.source} has no points; scan again or check the export")
+            raise InputError(
+                f"the scan {self.source} has no points; scan again or check the export"
+            )
         bad = int((~np.isfinite(self.points_mm)).any(axis=1).sum())
         if bad:
             raise InputError(
@@ -56,7 +58,9 @@ class Scan:
                 "finite numbers (NaN or infinity); remove them before use"
             )
         if not self.sigma_mm >= 0:
-            raise InputError(f"the scan {self.source} has a noise of {self.sigma_mm} mm; it must be ≥ 0")
+            raise InputError(
+                f"the scan {self.source} has a noise of {self.sigma_mm} mm; it must be ≥ 0"
+            )
         if self.normals is not None and self.normals.shape != self.points_mm.shape:
             raise InputError(
                 f"the scan {self.source} has {len(self.points_mm)} points but "

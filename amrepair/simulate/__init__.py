@@ -1,2 +1,1 @@
-"""Simulate: a world that beads are laid in, that breaks as asked, and that a scanner can look at.
-"""
+"""Simulate: a world that beads are laid in, that breaks as asked, that a scanner looks at."""
