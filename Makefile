@@ -1,0 +1,36 @@
+# Everything a fresh machine needs is Python 3.11+, make and pip; the rest is installed into .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+OUT ?= out/demo
+
+.PHONY: demo test lint suite bench slow peers clean help
+
+help: ## say what there is
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+demo: $(STAMP) ## print the bracket, break it, find what is missing, print only that
+	$(BIN)/amrepair simulate --out $(OUT)
+
+test: lint suite ## what CI runs
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+suite: $(STAMP)
+	$(BIN)/python -m pytest
+
+slow: $(STAMP) ## the tests that take longer than a minute
+	$(BIN)/python -m pytest -m slow
+
+clean: ## remove the environment and what runs left behind
+	rm -rf $(VENV) out runs build dist
