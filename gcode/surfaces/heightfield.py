@@ -1,0 +1,353 @@
+"""`HeightField`: the top surface over a regular XY grid, and what one may ask of it.
+
+Reads and writes `.npz` (complete), `.tif`/`.tiff` (float heights, NaN = unseen, placement in the
+description) and `.npy` (heights alone). It holds one height per column: undercuts are not here.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from jaxtyping import Bool, Float, Int
+
+from gcode.errors import InputError
+from gcode.surfaces import raster_kernels as kernels
+
+MAX_CELLS = 60_000_000  # half a gigabyte of heights: beyond that a cell size is a mistake
+
+
+@dataclass(frozen=True, slots=True)
+class HeightField:
+    """Top surface over a regular XY grid, build frame.
+
+    Attributes
+    ----------
+    origin_mm
+        (2,) XY of the *corner* of cell [0, 0]; cell [iy, ix] has its centre at
+        origin + (ix + ½, iy + ½) × cell.
+    cell_mm
+        Edge of a square cell.
+    z_mm
+        (ny, nx) height of the top surface; 0 is the bed. Unseen cells carry the height that
+        is safe for collisions (idea 7 of the design: unseen is solid), and are False in `seen`.
+    seen
+        (ny, nx) whether a sensor measured the cell.
+    """
+
+    origin_mm: Float[np.ndarray, " 2"]
+    cell_mm: float
+    z_mm: Float[np.ndarray, "ny nx"]
+    seen: Bool[np.ndarray, "ny nx"]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return (int(self.z_mm.shape[0]), int(self.z_mm.shape[1]))
+
+    @property
+    def top_mm(self) -> float:
+        """Height of the highest cell; 0 for a field without cells."""
+        return float(self.z_mm.max()) if self.z_mm.size else 0.0
+
+    @property
+    def box_mm(self) -> tuple[float, float, float, float]:
+        """(x_min, y_min, x_max, y_max)."""
+        ny, nx = self.shape
+        x, y = float(self.origin_mm[0]), float(self.origin_mm[1])
+        return (x, y, x + nx * self.cell_mm, y + ny * self.cell_mm)
+
+    def centres_mm(self) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " ny"]]:
+        """X of the columns and Y of the rows, at the cells' centres."""
+        ny, nx = self.shape
+        return (
+            self.origin_mm[0] + (np.arange(nx) + 0.5) * self.cell_mm,
+            self.origin_mm[1] + (np.arange(ny) + 0.5) * self.cell_mm,
+        )
+
+    def cells_of(self, xy_mm: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
+        """(n, 2) indices (iy, ix) of the cells that hold the points; may lie outside."""
+        index = np.floor((xy_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
+        return np.ascontiguousarray(index[:, ::-1])
+
+    def sample(
+        self, xy_mm: Float[np.ndarray, "n 2"], *, smooth: bool = False, outside_mm: float = 0.0
+    ) -> Float[np.ndarray, " n"]:
+        """Heights at points: of the cell that holds each, or bilinear between centres.
+
+        Parameters
+        ----------
+        xy_mm
+            Points, build frame.
+        smooth
+            Interpolate; leave it off near steep walls, which interpolation smears.
+        outside_mm
+            Height beyond the field (the bed).
+        """
+        ny, nx = self.shape
+        if ny == 0 or nx == 0:
+            return np.full(len(xy_mm), outside_mm)
+        index = self.cells_of(xy_mm)
+        inside = ((index >= 0) & (index < (ny, nx))).all(axis=1)
+        iy = np.clip(index[:, 0], 0, ny - 1)
+        ix = np.clip(index[:, 1], 0, nx - 1)
+        z_mm = self.z_mm[iy, ix].astype(np.float64)
+        if smooth:
+            place = (xy_mm - self.origin_mm) / self.cell_mm - 0.5
+            low = np.clip(np.floor(place).astype(np.int64), 0, (max(nx - 2, 0), max(ny - 2, 0)))
+            u, v = np.clip(place - low, 0.0, 1.0).T
+            x0, y0 = low.T
+            x1, y1 = np.minimum(x0 + 1, nx - 1), np.minimum(y0 + 1, ny - 1)
+            z = self.z_mm
+            z_mm = (z[y0, x0] * (1 - u) + z[y0, x1] * u) * (1 - v)
+            z_mm += (z[y1, x0] * (1 - u) + z[y1, x1] * u) * v
+        return np.where(inside, z_mm, outside_mm)
+
+    def max_along(self, points_mm: Float[np.ndarray, "n d"], *, radius_mm: float = 0.0) -> float:
+        """Greatest height within `radius_mm` of a polyline's XY; 0 where it leaves the field."""
+        if not self.z_mm.size or len(points_mm) == 0:
+            return 0.0
+        step_mm = max(self.cell_mm, radius_mm) / 2
+        pieces = [np.asarray(points_mm[:1, :2], float)]
+        for start, end in zip(points_mm[:-1, :2], points_mm[1:, :2], strict=True):
+            n = max(1, math.ceil(float(np.linalg.norm(end - start)) / step_mm))
+            pieces.append(start + (end - start) * (np.arange(1, n + 1) / n)[:, None])
+        index = self.cells_of(np.concatenate(pieces))
+        reach = math.ceil(radius_mm / self.cell_mm)
+        dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+        keep = (np.hypot(dy, dx) - 1.0) * self.cell_mm <= radius_mm
+        around = (index[:, None, :] + np.stack([dy[keep], dx[keep]], axis=1)).reshape(-1, 2)
+        ny, nx = self.shape
+        around = around[((around >= 0) & (around < (ny, nx))).all(axis=1)]
+        if len(around) == 0:
+            return 0.0
+        return max(0.0, float(self.z_mm[around[:, 0], around[:, 1]].max()))
+
+    def max_within(self, polygon_mm: Sequence[tuple[float, float]]) -> Float[np.ndarray, "ny nx"]:
+        """Greatest height under a convex polygon placed with its origin on each cell's centre.
+
+        Parameters
+        ----------
+        polygon_mm
+            Convex outline relative to the cell's centre. Every cell that it touches counts, so
+            the answer is never too low.
+        """
+        dy, low, high = footprint_rows(polygon_mm, self.cell_mm)
+        return kernels.dilate_rows(self.z_mm.astype(np.float64), dy, low, high)
+
+    def crop(self, box_mm: tuple[float, float, float, float]) -> HeightField:
+        """Cells that touch (x_min, y_min, x_max, y_max); empty if none does."""
+        ny, nx = self.shape
+        low = np.floor((np.array(box_mm[:2]) - self.origin_mm) / self.cell_mm).astype(int)
+        high = np.ceil((np.array(box_mm[2:]) - self.origin_mm) / self.cell_mm).astype(int)
+        x0, x1 = np.clip((low[0], high[0]), 0, nx)
+        y0, y1 = np.clip((low[1], high[1]), 0, ny)
+        return HeightField(
+            origin_mm=self.origin_mm + np.array([x0, y0]) * self.cell_mm,
+            cell_mm=self.cell_mm,
+            z_mm=self.z_mm[y0:y1, x0:x1].copy(),
+            seen=self.seen[y0:y1, x0:x1].copy(),
+        )
+
+    def raised(self, z_mm: Float[np.ndarray, "ny nx"]) -> HeightField:
+        """The same grid with heights max(z, own)."""
+        return HeightField(self.origin_mm, self.cell_mm, np.maximum(self.z_mm, z_mm), self.seen)
+
+    def write(self, path: Path) -> None:
+        """Write `.npz` (all), `.tif`/`.tiff` (heights and placement) or `.npy` (heights)."""
+        suffix = path.suffix.lower()
+        placement = {"origin_mm": self.origin_mm.tolist(), "cell_mm": self.cell_mm}
+        shown = np.where(self.seen, self.z_mm, np.nan).astype(np.float32)
+        if suffix == ".npz":
+            np.savez_compressed(
+                path, origin_mm=self.origin_mm, cell_mm=self.cell_mm, z_mm=self.z_mm, seen=self.seen
+            )
+        elif suffix in {".tif", ".tiff"}:
+            tifffile.imwrite(path, shown, description=json.dumps(placement))
+        elif suffix == ".npy":
+            np.save(path, shown)
+        else:
+            raise InputError(
+                f"{path}: a height map is written as .npz, .tif or .npy, not '{suffix}'."
+            )
+
+    @classmethod
+    def read(
+        cls,
+        path: Path,
+        *,
+        cell_mm: float | None = None,
+        origin_mm: tuple[float, float] | None = None,
+        unseen_z_mm: float | None = None,
+    ) -> HeightField:
+        """Read what `write` writes.
+
+        Parameters
+        ----------
+        cell_mm, origin_mm
+            Placement for files that carry none (`.npy`, plain TIFF); origin defaults to 0, 0.
+        unseen_z_mm
+            Height for NaN cells; by default the highest seen cell (unseen is solid).
+
+        Raises
+        ------
+        InputError
+            Where the file cannot be read or its placement is unknown.
+        """
+        z_mm, placement, seen = _read_heights(path)
+        cell = cell_mm if cell_mm is not None else placement.get("cell_mm")
+        origin = origin_mm if origin_mm is not None else placement.get("origin_mm", (0.0, 0.0))
+        if cell is None:
+            raise InputError(f"{path}: the height map does not say its cell size; pass one in mm.")
+        if not float(cell) > 0 or z_mm.ndim != 2 or z_mm.size == 0:
+            raise InputError(
+                f"{path}: a height map needs two dimensions and a cell above 0 mm, "
+                f"not shape {z_mm.shape} and cell {cell} mm."
+            )
+        finite = np.isfinite(z_mm)
+        if not finite.any():
+            raise InputError(f"{path}: the height map holds no finite height.")
+        solid_mm = float(z_mm[finite].max()) if unseen_z_mm is None else unseen_z_mm
+        return cls(
+            origin_mm=np.asarray(origin, float).reshape(2),
+            cell_mm=float(cell),
+            z_mm=np.where(finite, z_mm, solid_mm),
+            seen=finite if seen is None else seen & finite,
+        )
+
+    @classmethod
+    def flat(
+        cls, size_mm: tuple[float, float], cell_mm: float, *, z_mm: float = 0.0
+    ) -> HeightField:
+        """A plane of `size_mm` at one height, its corner at the origin."""
+        ny, nx = (math.ceil(size_mm[1] / cell_mm), math.ceil(size_mm[0] / cell_mm))
+        return cls(np.zeros(2), cell_mm, np.full((ny, nx), z_mm), np.ones((ny, nx), bool))
+
+    @classmethod
+    def from_mesh(
+        cls,
+        vertices: Float[np.ndarray, "n 3"],
+        faces: Int[np.ndarray, "m 3"],
+        cell_mm: float,
+        *,
+        box_mm: tuple[float, float, float, float] | None = None,
+        ground_mm: float = 0.0,
+    ) -> HeightField:
+        """Top of a mesh (open ones too) over a grid; `ground_mm` where there is none.
+
+        Parameters
+        ----------
+        vertices, faces
+            Mesh, mm, build frame.
+        box_mm
+            (x_min, y_min, x_max, y_max) to cover; the mesh's own box by default.
+        """
+        if box_mm is None:
+            if len(vertices) == 0:
+                raise InputError("A height field needs a mesh with at least one vertex.")
+            low, high = vertices[:, :2].min(0), vertices[:, :2].max(0)
+            box_mm = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        nx = max(1, math.ceil((box_mm[2] - box_mm[0]) / cell_mm - 1e-9))
+        ny = max(1, math.ceil((box_mm[3] - box_mm[1]) / cell_mm - 1e-9))
+        if nx * ny > MAX_CELLS:
+            raise InputError(
+                f"A height field of {nx}×{ny} cells is over the limit of {MAX_CELLS}; "
+                f"use cells larger than {cell_mm:g} mm."
+            )
+        offset, z, _ = kernels.column_crossings(
+            np.ascontiguousarray(vertices, np.float64),
+            np.ascontiguousarray(faces, np.int64),
+            box_mm[0],
+            box_mm[1],
+            cell_mm,
+            nx,
+            ny,
+        )
+        top = kernels.column_top(offset, z, ground_mm).reshape(ny, nx)
+        return cls(
+            np.array(box_mm[:2]), cell_mm, np.maximum(top, ground_mm), np.ones((ny, nx), bool)
+        )
+
+    @classmethod
+    def from_manifold(
+        cls,
+        solid: Any,
+        cell_mm: float,
+        *,
+        box_mm: tuple[float, float, float, float] | None = None,
+        margin_mm: float = 0.0,
+    ) -> HeightField:
+        """Top of a `manifold3d.Manifold` over its own box, grown by `margin_mm`, or `box_mm`."""
+        mesh = solid.to_mesh()
+        vertices = np.asarray(mesh.vert_properties, np.float64)[:, :3]
+        if box_mm is None:
+            b = solid.bounding_box()
+            box_mm = (b[0] - margin_mm, b[1] - margin_mm, b[3] + margin_mm, b[4] + margin_mm)
+        return cls.from_mesh(vertices, np.asarray(mesh.tri_verts, np.int64), cell_mm, box_mm=box_mm)
+
+
+def flat_bed(size_mm: tuple[float, float], cell_mm: float) -> HeightField:
+    """The empty bed."""
+    return HeightField.flat(size_mm, cell_mm)
+
+
+def footprint_rows(
+    polygon_mm: Sequence[tuple[float, float]], cell_mm: float
+) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
+    """Rows of cell offsets (dy, low, high) that a convex polygon around a cell's centre touches."""
+    outline = np.asarray(polygon_mm, float) / cell_mm
+    closed = np.vstack([outline, outline[:1]])
+    first = math.floor(outline[:, 1].min() + 0.5)
+    last = math.ceil(outline[:, 1].max() - 0.5)
+    rows: list[tuple[int, int, int]] = []
+    for dy in range(first, last + 1):
+        # the polygon's reach in x over the whole band of the row, [dy − ½, dy + ½]
+        xs: list[float] = []
+        for (px, py), (qx, qy) in itertools.pairwise(closed):
+            low, high = max(min(py, qy), dy - 0.5), min(max(py, qy), dy + 0.5)
+            if low > high:
+                continue
+            if qy == py:
+                xs += [px, qx]
+            else:
+                xs += [px + (y - py) * (qx - px) / (qy - py) for y in (low, high)]
+        if xs:
+            rows.append((dy, math.floor(min(xs) + 0.5), math.ceil(max(xs) - 0.5)))
+    table = np.array(rows, np.int64).reshape(-1, 3)
+    return table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy()
+
+
+def _read_heights(
+    path: Path,
+) -> tuple[Float[np.ndarray, ...], dict[str, Any], Bool[np.ndarray, ...] | None]:
+    """Heights, placement and seen mask of a file, as far as it carries them."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".npz":
+            with np.load(path) as archive:
+                placement = {
+                    "cell_mm": float(archive["cell_mm"]),
+                    "origin_mm": archive["origin_mm"].tolist(),
+                }
+                return archive["z_mm"].astype(np.float64), placement, archive["seen"].astype(bool)
+        if suffix in {".tif", ".tiff"}:
+            with tifffile.TiffFile(path) as tiff:
+                page = tiff.pages[0]
+                heights = page.asarray().astype(np.float64)
+                try:
+                    placement = json.loads(getattr(page, "description", "") or "{}")
+                except json.JSONDecodeError:
+                    placement = {}
+            return heights, placement if isinstance(placement, dict) else {}, None
+        if suffix == ".npy":
+            return np.load(path).astype(np.float64), {}, None
+    except (OSError, ValueError, KeyError, tifffile.TiffFileError) as e:
+        raise InputError(f"{path}: the height map cannot be read ({e}).") from e
+    raise InputError(f"{path}: a height map is a .npz, .tif or .npy file, not '{suffix}'.")

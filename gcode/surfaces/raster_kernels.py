@@ -1,0 +1,152 @@
+"""Triangles and footprints on a regular XY grid, cell by cell: the loops under `surfaces`.
+
+Compiled; no allocation policy, no units of its own: everything is in cells' own millimetres.
+"""
+
+# ruff: noqa: PLR0917 - numba knows no keyword-only arguments
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def column_crossings(
+    vertices: Any, faces: Any, x0: float, y0: float, cell: float, nx: int, ny: int
+) -> tuple[Any, Any, Any]:
+    """Heights at which vertical lines through the cells' centres cross a mesh.
+
+    Returns (offset, z, up): crossings of cell i = iy·nx + ix are z[offset[i]:offset[i+1]], not
+    sorted; `up` is +1 where the face looks up and −1 where it looks down. Edges shared by two
+    faces are counted once by the half-open rule on signed areas.
+    """
+    count = np.zeros(nx * ny + 1, np.int64)
+    for phase in range(2):
+        if phase == 1:
+            total = 0
+            for i in range(nx * ny + 1):
+                step = count[i]
+                count[i] = total
+                total += step
+            z_out = np.empty(total, np.float64)
+            up_out = np.empty(total, np.int8)
+            cursor = count.copy()
+        for f in range(faces.shape[0]):
+            a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+            # cell units, centres at integers
+            ax = (vertices[a, 0] - x0) / cell - 0.5
+            ay = (vertices[a, 1] - y0) / cell - 0.5
+            bx = (vertices[b, 0] - x0) / cell - 0.5
+            by = (vertices[b, 1] - y0) / cell - 0.5
+            cx = (vertices[c, 0] - x0) / cell - 0.5
+            cy = (vertices[c, 1] - y0) / cell - 0.5
+            az, bz, cz = vertices[a, 2], vertices[b, 2], vertices[c, 2]
+            area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+            if area == 0.0:
+                continue
+            sign = 1
+            if area < 0.0:
+                sign = -1
+                bx, cx = cx, bx
+                by, cy = cy, by
+                bz, cz = cz, bz
+                area = -area
+            y_low = min(ay, by, cy)
+            y_high = max(ay, by, cy)
+            iy_first = max(0, int(np.ceil(y_low)))
+            iy_last = min(ny - 1, int(np.floor(y_high)))
+            for iy in range(iy_first, iy_last + 1):
+                y = float(iy)
+                # half-open scan line: an edge owns its lower end, not its upper one
+                x_low = np.inf
+                x_high = -np.inf
+                hits = 0
+                for e in range(3):
+                    if e == 0:
+                        px, py, qx, qy = ax, ay, bx, by
+                    elif e == 1:
+                        px, py, qx, qy = bx, by, cx, cy
+                    else:
+                        px, py, qx, qy = cx, cy, ax, ay
+                    if (py <= y) != (qy <= y):
+                        # from the lower end always, so that both faces of an edge agree exactly
+                        if py < qy:
+                            x = px + (y - py) * (qx - px) / (qy - py)
+                        else:
+                            x = qx + (y - qy) * (px - qx) / (py - qy)
+                        x_low = min(x_low, x)
+                        x_high = max(x_high, x)
+                        hits += 1
+                if hits < 2:
+                    continue
+                ix_first = max(0, int(np.ceil(x_low)))
+                ix_last = min(nx - 1, int(np.ceil(x_high)) - 1)
+                for ix in range(ix_first, ix_last + 1):
+                    i = iy * nx + ix
+                    if phase == 0:
+                        count[i] += 1
+                    else:
+                        x = float(ix)
+                        wb = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / area
+                        wc = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / area
+                        z = az + wb * (bz - az) + wc * (cz - az)
+                        z_out[cursor[i]] = min(max(z, min(az, bz, cz)), max(az, bz, cz))
+                        up_out[cursor[i]] = sign
+                        cursor[i] += 1
+    return count, z_out, up_out
+
+
+@njit(cache=True, nogil=True)
+def column_top(offset: Any, z: Any, empty: float) -> Any:
+    """Highest crossing of each column, `empty` where there is none."""
+    n = offset.shape[0] - 1
+    top = np.full(n, empty)
+    for i in range(n):
+        for j in range(offset[i], offset[i + 1]):
+            if z[j] > top[i] or j == offset[i]:
+                top[i] = z[j]
+    return top
+
+
+@njit(cache=True, nogil=True)
+def running_max(row: Any, low: int, high: int, out: Any) -> None:
+    """out[i] = max(row[i+low : i+high+1]) by a monotone queue; cells outside count as −inf."""
+    n = row.shape[0]
+    queue = np.empty(n + 1, np.int64)
+    head = 0
+    tail = 0
+    entered = max(0, low)
+    if low < 0:
+        entered = 0
+    for i in range(n):
+        last = min(n - 1, i + high)
+        while entered <= last:
+            while tail > head and row[queue[tail - 1]] <= row[entered]:
+                tail -= 1
+            queue[tail] = entered
+            tail += 1
+            entered += 1
+        first = i + low
+        while tail > head and queue[head] < first:
+            head += 1
+        out[i] = row[queue[head]] if tail > head else -np.inf
+
+
+@njit(cache=True, nogil=True)
+def dilate_rows(z: Any, row_dy: Any, row_low: Any, row_high: Any) -> Any:
+    """Greatest height under a footprint given by rows of cell offsets [low, high] at dy."""
+    ny, nx = z.shape
+    out = np.full((ny, nx), -np.inf)
+    line = np.empty(nx)
+    for r in range(row_dy.shape[0]):
+        dy = row_dy[r]
+        for iy in range(ny):
+            source = iy + dy
+            if source < 0 or source >= ny:
+                continue
+            running_max(z[source], row_low[r], row_high[r], line)
+            for ix in range(nx):
+                out[iy, ix] = max(out[iy, ix], line[ix])
+    return out
