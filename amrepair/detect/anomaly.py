@@ -8,6 +8,8 @@ from enum import IntEnum, StrEnum
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.detect.evidence import Evidence
+
 
 class Label(IntEnum):
     """Labels as they stand in `anomaly.npz`."""
@@ -40,6 +42,8 @@ class Region:
         (2, 3) lowest and highest corner.
     depth_mm
         The largest |deviation| in it.
+    below_bead
+        Too small for one bead to fix.
     """
 
     label: Label
@@ -48,6 +52,7 @@ class Region:
     area_mm2: float
     depth_mm: float
     box_mm: Float[np.ndarray, "2 3"]
+    below_bead: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +77,8 @@ class AnomalyMap:
         The limit and how it was set.
     object_score
         Mean of the K highest scores.
+    evidence, surfel_label
+        What the labels rest on, for the deficit; None for a map read back from a file.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -84,3 +91,5 @@ class AnomalyMap:
     threshold_source: str
     object_score: float
     regions: tuple[Region, ...]
+    evidence: Evidence | None = None
+    surfel_label: Int[np.ndarray, " s"] | None = None

@@ -1,0 +1,9 @@
+"""Deficit: watertight solids of what is missing and what is too much, in the build frame.
+
+It turns a detected difference into geometry with a tolerance; it does not decide what to print.
+"""
+
+from amrepair.deficit.compute import Deficit, compute_deficit
+from amrepair.deficit.heights import as_built_heights
+
+__all__ = ["Deficit", "as_built_heights", "compute_deficit"]

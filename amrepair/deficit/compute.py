@@ -1,0 +1,279 @@
+"""The deficit: template minus as-built, with a tolerance, as solids in the build frame.
+
+Idea 6 of the design, in the distance field: erode the template by τ, subtract the as-built part,
+grow back, clip to template minus as-built. What is thinner than τ counts only where detection's
+averages say so. Empty space counts only where a ray crossed it or scanned surface bounds it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.deficit.heights import as_built_heights
+from amrepair.deficit.voxels import VoxelBox, solid_from_field
+from amrepair.detect import AnomalyMap, Label, Region, detect
+from amrepair.detect.evidence import Evidence
+from amrepair.detect.regions import classify, group_points
+from amrepair.errors import DeficitError
+from amrepair.frames import Transform
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+from gcode.progress import Progress, silent
+from gcode.surfaces import HeightField
+
+# A corner of a cube of side τ lies √3 τ from the eroded template.
+GROW_FACTOR = 3**0.5
+# One bead of 0.45 × 0.2 mm as long as two nozzle widths: less cannot be placed.
+BEAD_MM3 = 0.08
+# Pieces below this share of a bead are what marching cubes makes of noise at a rim.
+CRUMB_MM3 = 0.02
+BOX_MARGIN_MM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Deficit:
+    """What is missing and what is too much, build frame.
+
+    Attributes
+    ----------
+    missing, excess
+        Watertight `manifold3d.Manifold`s, possibly empty.
+    regions
+        One per defect, boxes in the build frame, missing first, largest first. Those below what
+        one bead can fix are in the list (`below_bead`) and in the solids.
+    tolerance_mm
+        τ: the erosion that was used.
+    unseen_area_mm2
+        Template surface that nothing is known of.
+    as_built
+        What stands on the bed; unseen cells are solid up to the printed height and a margin.
+    """
+
+    missing: manifold3d.Manifold
+    excess: manifold3d.Manifold
+    regions: tuple[Region, ...]
+    tolerance_mm: float
+    unseen_area_mm2: float
+    as_built: HeightField
+
+    @property
+    def missing_mm3(self) -> float:
+        """Volume missing."""
+        return float(self.missing.volume())
+
+    @property
+    def excess_mm3(self) -> float:
+        """Volume in excess."""
+        return float(self.excess.volume())
+
+
+def compute_deficit(
+    scan: Scan,
+    template: Template,
+    anomaly: AnomalyMap | None = None,
+    *,
+    build_from_template: Transform,
+    tolerance_mm: float | None = None,
+    printed_z_mm: float | None = None,
+    cell_mm: float = 0.25,
+    progress: Progress = silent,
+) -> Deficit:
+    """Solids of what is missing and in excess.
+
+    Parameters
+    ----------
+    scan
+        In the template's frame.
+    anomaly
+        What `detect` said about this scan; None runs it with its defaults.
+    build_from_template
+        Where the part stands on the bed.
+    tolerance_mm
+        τ; None takes the detection's threshold.
+    printed_z_mm
+        Height printed so far, build frame; None is the template's own top.
+    cell_mm
+        Cell of the as-built height field.
+
+    Raises
+    ------
+    DeficitError
+        If a defect's surface cannot be made a valid solid.
+    """
+    if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
+        anomaly = detect(scan, template)
+    if tolerance_mm is not None and not tolerance_mm >= 0:
+        raise DeficitError(f"the tolerance is {tolerance_mm} mm; it must be ≥ 0")
+    tau_mm = anomaly.threshold_mm if tolerance_mm is None else tolerance_mm
+    evidence = anomaly.evidence
+    if evidence is None:
+        raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
+    solids: dict[Label, list[manifold3d.Manifold]] = {Label.MISSING: [], Label.EXCESS: []}
+    regions: list[Region] = []
+    for label, found in solids.items():
+        boxes = _boxes(anomaly, evidence, label)
+        for i, (low, high, depth) in enumerate(boxes):
+            progress(f"deficit: {label.name.lower()}", i, len(boxes))
+            solid = _solid_in_box(
+                template, evidence, anomaly, label, low, high, depth_mm=depth, tau_mm=tau_mm
+            )
+            for piece in solid.decompose():
+                if piece.volume() >= CRUMB_MM3:
+                    found.append(piece)
+                    regions.append(_region(piece, label, template, build_from_template))
+    matrix = build_from_template.matrix[:3]
+    missing, excess = (
+        manifold3d.Manifold.batch_boolean(found, manifold3d.OpType.Add).transform(matrix)
+        if found
+        else manifold3d.Manifold()
+        for found in solids.values()
+    )
+    unseen = anomaly.template_label == int(Label.UNSEEN)
+    return Deficit(
+        missing=missing,
+        excess=excess,
+        regions=tuple(sorted(regions, key=lambda r: (int(r.label), -r.volume_mm3))),
+        tolerance_mm=tau_mm,
+        unseen_area_mm2=_unseen_area(anomaly, int(unseen.sum())),
+        as_built=as_built_heights(
+            scan,
+            template,
+            evidence,
+            build_from_template=build_from_template,
+            printed_z_mm=printed_z_mm,
+            cell_mm=cell_mm,
+        ),
+    )
+
+
+def _boxes(
+    anomaly: AnomalyMap, evidence: Evidence, label: Label
+) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
+    """Low corner, high corner and depth of each group of labelled cells and template points."""
+    s = evidence.surfels
+    which = np.flatnonzero(np.asarray(anomaly.surfel_label) == int(label))
+    points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
+    if label is Label.MISSING:
+        gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
+        points = np.concatenate([points, gone])
+        depth = np.concatenate([depth, np.full(len(gone), np.nan)])
+    else:
+        points = np.concatenate([points, _feet(evidence, which)])
+        depth = np.concatenate([depth, np.full(len(which), np.nan)])
+    group = group_points(points)
+    found = []
+    for g in range(int(group.max()) + 1 if len(group) else 0):
+        mine = points[group == g]
+        deep = depth[group == g]
+        known = deep[~np.isnan(deep)]
+        # cells with a handful of template points and nothing else are pixels, not defects
+        if len(known) == 0 and len(mine) < 4:
+            continue
+        thick = float(np.percentile(known, 90)) if len(known) else 2.0
+        found.append((mine.min(axis=0) - BOX_MARGIN_MM, mine.max(axis=0) + BOX_MARGIN_MM, thick))
+    return _merge(found)
+
+
+def _feet(
+    evidence: Evidence, which: np.ndarray
+) -> Float[np.ndarray, "q 3"]:
+    """Where excess surfels stand on the template: along their planes, back by their height."""
+    s = evidence.surfels
+    return np.asarray(s.place_mm[which] - s.deviation_mm[which, None] * evidence.normal[which])
+
+
+def _merge(
+    boxes: list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]],
+) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
+    """Boxes that overlap become one, so that no volume is made twice."""
+    merged = list(boxes)
+    changed = True
+    while changed:
+        changed = False
+        for i in range(len(merged)):
+            for j in range(i + 1, len(merged)):
+                (a_low, a_high, a), (b_low, b_high, b) = merged[i], merged[j]
+                if (a_low <= b_high).all() and (b_low <= a_high).all():
+                    joined = (np.minimum(a_low, b_low), np.maximum(a_high, b_high), min(a, b))
+                    merged = [m for k, m in enumerate(merged) if k not in {i, j}] + [joined]
+                    changed = True
+                    break
+            if changed:
+                break
+    return merged
+
+
+def _solid_in_box(
+    template: Template,
+    evidence: Evidence,
+    anomaly: AnomalyMap,
+    label: Label,
+    low_mm: Float[np.ndarray, " 3"],
+    high_mm: Float[np.ndarray, " 3"],
+    *,
+    depth_mm: float,
+    tau_mm: float,
+) -> manifold3d.Manifold:
+    """Erode, subtract, grow back, clip: all on one grid of signed distances."""
+    s = evidence.surfels
+    labels = np.asarray(anomaly.surfel_label)
+    inside = ((s.place_mm >= low_mm) & (s.place_mm <= high_mm)).all(axis=1) & (labels == int(label))
+    across = int(np.argmax(np.abs(evidence.normal[inside]).sum(axis=0))) if inside.any() else 2
+    box = VoxelBox.around(low_mm, high_mm, thickness_mm=depth_mm, across=across)
+    samples = box.samples_mm()
+    f = template.distance(samples)
+    sign = -1.0 if label is Label.MISSING else 1.0
+    # only where the template says it can be: the rest of the box needs no look at the scan
+    near = np.flatnonzero(sign * f > -2 * float(box.step_mm.max()))
+    best = np.full(len(samples), -10.0 if label is Label.MISSING else 10.0)
+    cautious = best.copy()
+    if label is Label.MISSING:
+        best[near], cautious[near] = evidence.clearance(samples[near], f[near])
+    else:
+        best[near] = evidence.surface_clearance(samples[near], f[near])
+        # SOLID means "nobody knows": for excess the cautious answer is that nothing is there
+        best[near] = np.where(best[near] <= -4.999, 10.0, best[near])
+        cautious = best
+    # solid = both negative: inside the template and outside the as-built part (or the reverse)
+    clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
+    core = (sign * f > tau_mm) & (sign * -cautious < -tau_mm / 2)
+    nearest = evidence.tree.query(samples[near], workers=2)[1]
+    by_label = np.zeros(len(samples), bool)
+    by_label[near] = labels[nearest] == int(label)
+    thin_mm = min(tau_mm, depth_mm / 2)
+    core |= by_label & (sign * f > thin_mm) & (clip < 0)
+    grow_mm = GROW_FACTOR * tau_mm + float(box.step_mm.max())
+    reach = box.distance_to(core.reshape(box.shape)) - grow_mm
+    return solid_from_field(box, np.maximum(clip.reshape(box.shape), np.minimum(reach, 10.0)))
+
+
+def _region(
+    piece: manifold3d.Manifold, label: Label, template: Template, build_from_template: Transform
+) -> Region:
+    """Measures of one piece; its box in the build frame."""
+    bounds = np.asarray(piece.bounding_box()).reshape(2, 3)
+    volume = float(piece.volume())
+    area = float(piece.surface_area()) / 2
+    depth = min(float(np.ptp(bounds, axis=0).min()), 2 * volume / max(area, 1e-9))
+    kind = classify(label, depth_mm=depth, area_mm2=area, box_mm=bounds, template=template)
+    moved = piece.transform(build_from_template.matrix[:3])
+    region = Region(
+        label=label,
+        type=kind,
+        volume_mm3=volume,
+        area_mm2=area,
+        depth_mm=depth,
+        box_mm=np.asarray(moved.bounding_box()).reshape(2, 3),
+    )
+    return replace(region, below_bead=volume < BEAD_MM3)
+
+
+def _unseen_area(anomaly: AnomalyMap, count: int) -> float:
+    """Area of the unseen template points, from their mean spacing."""
+    from amrepair.detect.regions import area_per_point
+
+    return count * area_per_point(anomaly.template_points_mm)

@@ -1,0 +1,113 @@
+"""The as-built height field: what stands on the bed, for the slicer and the checker.
+
+Heights are robust means of what was seen from above. What nobody saw is solid up to the printed
+height and a margin, unless the scan shows no bed at all: then the bed around the part is bare.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from amrepair.detect.evidence import Evidence
+from amrepair.frames import Transform
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+from gcode.surfaces import HeightField
+
+UNSEEN_MARGIN_MM = 1.0
+# Around the part: more than a nozzle's cone, so that what stands beside it is in the field.
+AROUND_MM = 8.0
+# Points within this of a cell's top are one surface with its noise.
+TOP_BAND_MM = 0.3
+
+
+def as_built_heights(
+    scan: Scan,
+    template: Template,
+    evidence: Evidence,
+    *,
+    build_from_template: Transform,
+    printed_z_mm: float | None,
+    cell_mm: float,
+) -> HeightField:
+    """Height field of the scan, build frame."""
+    points = build_from_template.apply(scan.points_mm)
+    corners = _corners(template.bounds_mm)
+    box = build_from_template.apply(corners)
+    low, high = box.min(axis=0) - AROUND_MM, box.max(axis=0) + AROUND_MM
+    cell_mm = max(cell_mm, 1.2 * evidence.surfels.spacing_mm)
+    shape = tuple(np.ceil((high[:2] - low[:2]) / cell_mm).astype(int)[::-1])
+    top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
+    solid_z = top_z + UNSEEN_MARGIN_MM
+    z, seen = _tops(points, low[:2], cell_mm, (int(shape[0]), int(shape[1])))
+    z, seen = _close_gaps(z, seen)
+    if not evidence.has_rays:
+        # without rays nothing tells empty from unseen: beside the part the bed is taken as bare
+        bare = ~seen & ~_footprint(template, build_from_template, low, cell_mm, z.shape)
+        z = np.where(bare, 0.0, z)
+        known = seen | bare
+    else:
+        known = seen
+    return HeightField(
+        origin_mm=low[:2].copy(),
+        cell_mm=cell_mm,
+        z_mm=np.where(known, np.maximum(z, 0.0), solid_z),
+        seen=seen,
+    )
+
+
+def _corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
+    """The eight corners of a box."""
+    grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(bounds_mm[grid, np.arange(3)], dtype=np.float64)
+
+
+def _tops(
+    points_mm: Float[np.ndarray, "n 3"],
+    low_mm: Float[np.ndarray, " 2"],
+    cell_mm: float,
+    shape: tuple[int, int],
+) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+    """Mean height of each cell's topmost surface."""
+    index = np.floor((points_mm[:, :2] - low_mm) / cell_mm).astype(np.int64)
+    ok = ((index >= 0) & (index < shape[::-1])).all(axis=1)
+    flat = index[ok, 1] * shape[1] + index[ok, 0]
+    z = points_mm[ok, 2]
+    top = np.full(shape[0] * shape[1], -np.inf)
+    np.maximum.at(top, flat, z)
+    near = z >= top[flat] - TOP_BAND_MM
+    total = np.bincount(flat[near], weights=z[near], minlength=len(top))
+    count = np.bincount(flat[near], minlength=len(top))
+    seen = count > 0
+    mean = np.where(seen, total / np.maximum(count, 1), 0.0)
+    return mean.reshape(shape), seen.reshape(shape)
+
+
+def _close_gaps(
+    z_mm: Float[np.ndarray, "ny nx"], seen: Bool[np.ndarray, "ny nx"]
+) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+    """A cell that sampling left empty among seen ones takes its highest neighbour."""
+    around = ndimage.uniform_filter(seen.astype(float), 3) * 9
+    gap = ~seen & (around >= 4.5)
+    highest = ndimage.maximum_filter(np.where(seen, z_mm, -np.inf), 3)
+    return np.where(gap, highest, z_mm), seen | gap
+
+
+def _footprint(
+    template: Template,
+    build_from_template: Transform,
+    low_mm: Float[np.ndarray, " 3"],
+    cell_mm: float,
+    shape: tuple[int, ...],
+) -> Bool[np.ndarray, "ny nx"]:
+    """Cells that the template covers, from its surface points, holes filled cell by cell."""
+    surface, _ = template.surface_points(max(0.6, cell_mm))
+    xy = build_from_template.apply(surface)[:, :2]
+    index = np.floor((xy - low_mm[:2]) / cell_mm).astype(np.int64)
+    ok = ((index >= 0) & (index < (shape[1], shape[0]))).all(axis=1)
+    covered = np.zeros(shape, bool)
+    covered[index[ok, 1], index[ok, 0]] = True
+    reach = max(1, round(0.9 / cell_mm))
+    return np.asarray(ndimage.binary_dilation(covered, iterations=reach))

@@ -1,0 +1,114 @@
+"""Voxel boxes around defects, and surfaces out of them: field in, manifold3d solid out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from skimage.measure import marching_cubes
+
+from amrepair.errors import DeficitError
+
+MAX_VOXELS = 400_000
+FINEST_MM, COARSEST_MM = 0.05, 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelBox:
+    """A regular grid of sample points, template frame.
+
+    Attributes
+    ----------
+    low_mm
+        (3,) first sample.
+    step_mm
+        (3,) distance between samples by axis (thin defects are sampled finer across).
+    shape
+        Samples by axis.
+    """
+
+    low_mm: Float[np.ndarray, " 3"]
+    step_mm: Float[np.ndarray, " 3"]
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def around(
+        cls,
+        low_mm: Float[np.ndarray, " 3"],
+        high_mm: Float[np.ndarray, " 3"],
+        *,
+        thickness_mm: float,
+        across: int,
+    ) -> VoxelBox:
+        """A grid over a box, fine enough for a defect `thickness_mm` thick across one axis."""
+        fine = float(np.clip(thickness_mm / 4, FINEST_MM, COARSEST_MM))
+        step = np.full(3, max(fine, min(COARSEST_MM, 2.5 * fine)))
+        step[across] = fine
+        extent = np.maximum(high_mm - low_mm, 1e-6)
+        over = float(np.prod(extent / step + 1)) / MAX_VOXELS
+        if over > 1:
+            along = np.arange(3) != across
+            step[along] *= min(np.sqrt(over), 2.0)
+            over = float(np.prod(extent / step + 1)) / MAX_VOXELS
+            step *= max(over, 1.0) ** (1 / 3)
+        size = np.ceil(extent / step).astype(int) + 1
+        return cls(low_mm, step, (int(size[0]), int(size[1]), int(size[2])))
+
+    def samples_mm(self) -> Float[np.ndarray, "v 3"]:
+        """(v, 3) all sample points, last axis fastest."""
+        axes = [self.low_mm[i] + self.step_mm[i] * np.arange(self.shape[i]) for i in range(3)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+    def distance_to(self, mask: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
+        """Distance of every sample to the nearest one in `mask`, mm; inf where it is empty."""
+        if not mask.any():
+            return np.full(self.shape, np.inf)
+        return np.asarray(ndimage.distance_transform_edt(~mask, sampling=tuple(self.step_mm)))
+
+
+def solid_from_field(box: VoxelBox, field_mm: Float[np.ndarray, "x y z"]) -> manifold3d.Manifold:
+    """The solid where the field is negative, closed at the box's faces.
+
+    Raises
+    ------
+    DeficitError
+        If the surface is not a valid manifold.
+    """
+    if not (field_mm < 0).any():
+        return manifold3d.Manifold()
+    # exact zeros make triangles without area; a nanometre is far below any tolerance here
+    field_mm = np.where(np.abs(field_mm) < 1e-6, 1e-6, field_mm)
+    limit = float(box.step_mm.max()) * 4
+    padded = np.pad(np.clip(field_mm, -limit, limit), 1, constant_values=limit)
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=tuple(box.step_mm))
+    vertices = vertices.astype(np.float64) + (box.low_mm - box.step_mm)
+    solid = _manifold(vertices, faces)
+    if solid.status() != manifold3d.Error.NoError:
+        vertices, faces, _, _ = marching_cubes(
+            padded, 0.0, spacing=tuple(box.step_mm), method="lorensen"
+        )
+        solid = _manifold(vertices.astype(np.float64) + (box.low_mm - box.step_mm), faces)
+    if solid.status() != manifold3d.Error.NoError:
+        raise DeficitError(
+            f"the surface of a defect near {np.round(box.low_mm, 1).tolist()} mm is not a valid "
+            f"solid ({solid.status()}); scan again with finer spacing"
+        )
+    return solid if solid.volume() > 0 else solid.mirror((0, 0, 0))
+
+
+def _manifold(
+    vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
+) -> manifold3d.Manifold:
+    """A solid from marching cubes' output, turned outward."""
+    corners = vertices[faces]
+    signed = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
+    if signed < 0:
+        faces = faces[:, ::-1]
+    return manifold3d.Manifold(
+        manifold3d.Mesh64(
+            np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.uint64)
+        )
+    )

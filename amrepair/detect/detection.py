@@ -1,0 +1,273 @@
+"""Detection: from an aligned scan to labels, thresholds and regions.
+
+The threshold adds what is systematic (process allowance, registration, template bias) to what
+noise can do at a stated false-alarm rate; averages over cells and bead-sized windows find what
+is thinner than one point's noise, and hysteresis follows it to its rim.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.stats import norm
+
+from amrepair.detect.anomaly import AnomalyMap, Label
+from amrepair.detect.evidence import Evidence, gather
+from amrepair.detect.regions import find_regions
+from amrepair.detect.surfels import Surfels, make_surfels
+from amrepair.errors import InputError
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+from gcode.progress import Progress, silent
+
+# Half a 0.2 mm layer: what section-at-mid-layer leaves on slopes and rounds off at tops.
+DEFAULT_ALLOWANCE_MM = 0.1
+DEFAULT_REGISTRATION_SIGMA_MM = 0.03
+FALSE_ALARMS_PER_SCAN = 1e-3
+# Excess farther out than this is not part of the print (clutter, the bed's rim).
+MAX_EXCESS_MM = 12.0
+# Bed, skirt and first-layer ooze: one thick layer above the lowest plane of the part.
+BED_BAND_MM = 0.35
+# Fewer cells than this over the threshold are an outlier, not a surface.
+MIN_CORE_CELLS = 3
+SURFACE_SPACING_MM = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """Limits on a cell's mean deviation.
+
+    Attributes
+    ----------
+    systematic_mm
+        Allowance, registration and bias: what averaging does not remove.
+    sigma_mm
+        Noise of one point.
+    quantile
+        Standard normal quantile of the false-alarm rate.
+    """
+
+    systematic_mm: float
+    sigma_mm: float
+    quantile: float
+
+    def high_mm(self, count: Int[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+        """(s,) limit for a mean of `count` points to start a region."""
+        return self.systematic_mm + self.quantile * self.sigma_mm / np.sqrt(np.maximum(count, 1))
+
+    def low_mm(self, count: Int[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+        """(s,) limit for a mean of `count` points to go on with one."""
+        return self.systematic_mm / 2 + 2 * self.sigma_mm / np.sqrt(np.maximum(count, 1))
+
+
+def detect(
+    scan: Scan,
+    template: Template,
+    *,
+    threshold_mm: float | None = None,
+    allowance_mm: float = DEFAULT_ALLOWANCE_MM,
+    registration_sigma_mm: float = DEFAULT_REGISTRATION_SIGMA_MM,
+    false_alarms: float = FALSE_ALARMS_PER_SCAN,
+    top_k: int = 1000,
+    progress: Progress = silent,
+) -> AnomalyMap:
+    """Score and label a scan against its template.
+
+    Parameters
+    ----------
+    scan
+        In the template's frame.
+    threshold_mm
+        Systematic part of the limit; None adds up allowance, registration and template bias.
+    allowance_mm
+        What the process may leave (staircase, top rounding): half a layer by default.
+    registration_sigma_mm
+        Standard deviation of the alignment at the surface.
+    false_alarms
+        Expected number of regions per scan that noise alone makes.
+    top_k
+        How many of the highest scores make the object score (PASDF: 1000).
+
+    Raises
+    ------
+    InputError
+        If the scan is not in the template's frame, or its size contradicts the template's.
+    """
+    if scan.frame != "template":
+        raise InputError(
+            f"the scan {scan.source} is in frame '{scan.frame}'; align it to the template first"
+        )
+    _refuse_wrong_scale(scan, template)
+    progress("detect", 0, 4)
+    f_mm = template.distance(scan.points_mm)
+    keep = ~_background(scan, template, f_mm)
+    if not keep.any():
+        raise InputError(
+            f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the template; "
+            "check its frame, its unit and that it shows this part"
+        )
+    surfels = make_surfels(scan.points_mm, f_mm, keep)
+    limit, source = _threshold(
+        scan, template, surfels, threshold_mm, allowance_mm, registration_sigma_mm, false_alarms
+    )
+    progress("detect", 1, 4)
+    missing, excess = _label_surfels(surfels, limit)
+    evidence = gather(scan, template, surfels, missing | excess)
+    progress("detect", 2, 4)
+    label = np.zeros(len(scan), np.int64)
+    has_cell = surfels.of_point >= 0
+    cell = surfels.of_point[has_cell]
+    label[has_cell] = np.where(
+        missing[cell], int(Label.MISSING), np.where(excess[cell], int(Label.EXCESS), 0)
+    )
+    surface_mm, normals = template.surface_points(max(SURFACE_SPACING_MM, surfels.spacing_mm))
+    surface_label = _label_surface(surface_mm, normals, template, evidence, missing, limit)
+    progress("detect", 3, 4)
+    score = np.abs(f_mm)
+    kept_scores = score[keep]
+    k = min(top_k, len(kept_scores))
+    object_score = float(np.partition(kept_scores, len(kept_scores) - k)[-k:].mean())
+    regions = find_regions(evidence, missing, excess, surface_mm, surface_label, template)
+    progress("detect", 4, 4)
+    return AnomalyMap(
+        points_mm=scan.points_mm,
+        deviation_mm=f_mm,
+        score=score,
+        label=label,
+        template_points_mm=surface_mm,
+        template_label=surface_label,
+        threshold_mm=float(limit.high_mm(np.array([27]))[0]),
+        threshold_source=source,
+        object_score=object_score,
+        regions=regions,
+        evidence=evidence,
+        surfel_label=np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0)),
+    )
+
+
+def _refuse_wrong_scale(scan: Scan, template: Template) -> None:
+    """Metres or inches read as millimetres: the sizes differ by the factor between the units."""
+    scan_mm = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
+    part_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    if 0 < scan_mm * 200 < part_mm:
+        raise InputError(
+            f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "
+            f"the scan looks like metres; multiply it by 1000"
+        )
+    if scan_mm > 200 * part_mm:
+        raise InputError(
+            f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "
+            f"the scan looks like micrometres, or the template like metres; convert one to mm"
+        )
+
+
+def _background(
+    scan: Scan, template: Template, f_mm: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
+    low_z = float(template.bounds_mm[0, 2])
+    bed = (scan.points_mm[:, 2] < low_z + BED_BAND_MM) & (f_mm > 0.02)
+    inside_band = scan.points_mm[:, 2] > low_z - BED_BAND_MM
+    # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
+    return (bed & (f_mm > BED_BAND_MM / 2)) | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
+
+
+def _threshold(
+    scan: Scan,
+    template: Template,
+    surfels: Surfels,
+    threshold_mm: float | None,
+    allowance_mm: float,
+    registration_sigma_mm: float,
+    false_alarms: float,
+) -> tuple[Threshold, str]:
+    """The limit, and how it was set."""
+    sigma_mm = max(scan.sigma_mm, surfels.spread_mm)
+    rate = false_alarms / max(len(surfels), 1)
+    quantile = float(norm.isf(rate))
+    if threshold_mm is not None:
+        return (
+            Threshold(threshold_mm, sigma_mm, quantile),
+            f"given: {threshold_mm:g} mm plus noise {sigma_mm:.3f} mm per point",
+        )
+    systematic = allowance_mm + float(np.hypot(2 * registration_sigma_mm, template.bias_mm))
+    return (
+        Threshold(systematic, sigma_mm, quantile),
+        f"systematic {systematic:.3f} mm (allowance {allowance_mm:g}, registration "
+        f"{registration_sigma_mm:g}, template bias {template.bias_mm:.3f}) plus {quantile:.1f} "
+        f"sigma of noise {sigma_mm:.3f} mm on averages: at most {false_alarms:g} false regions "
+        "expected per scan",
+    )
+
+
+def _label_surfels(
+    surfels: Surfels, limit: Threshold
+) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
+    """Missing and excess by two scales and hysteresis."""
+    labels = []
+    for sign in (-1.0, 1.0):
+        cell = sign * surfels.deviation_mm
+        wide = sign * surfels.wide_deviation_mm
+        core = (cell > limit.high_mm(surfels.count)) & (surfels.count >= 2)
+        core |= (wide > limit.high_mm(surfels.wide_count)) & (surfels.wide_count >= 6)
+        through = cell > limit.low_mm(surfels.count)
+        core &= through
+        grown = surfels.grow(core, through)
+        labels.append(_drop_specks(surfels, grown, core))
+    missing, excess = labels
+    return missing, excess & ~missing
+
+
+def _drop_specks(
+    surfels: Surfels, grown: Bool[np.ndarray, " s"], core: Bool[np.ndarray, " s"]
+) -> Bool[np.ndarray, " s"]:
+    """Without the connected groups that hold fewer than MIN_CORE_CELLS core cells."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    which = np.flatnonzero(grown)
+    if len(which) == 0:
+        return grown
+    number = np.full(len(surfels) + 1, -1, np.int64)
+    number[which] = np.arange(len(which))
+    near = number[surfels.table[which]]  # −1 looks up the last entry, which is −1
+    row = np.repeat(np.arange(len(which)), 27)
+    ok = near.ravel() >= 0
+    graph = coo_matrix(
+        (np.ones(int(ok.sum()), bool), (row[ok], near.ravel()[ok])), (len(which), len(which))
+    )
+    groups, group = connected_components(graph, directed=False)
+    cores = np.bincount(group, weights=core[which], minlength=groups)
+    kept = np.zeros_like(grown)
+    kept[which] = cores[group] >= MIN_CORE_CELLS
+    return kept
+
+
+def _label_surface(
+    surface_mm: Float[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "m 3"],
+    template: Template,
+    evidence: Evidence,
+    missing: Bool[np.ndarray, " s"],
+    limit: Threshold,
+) -> Int[np.ndarray, " m"]:
+    """Present where scanned surface lies on it, missing where it is seen to be gone, else unseen."""
+    surfels = evidence.surfels
+    reach_mm = 1.8 * surfels.cell_mm + limit.systematic_mm
+    distance, nearest = evidence.tree.query(surface_mm, workers=2)
+    present = (distance < reach_mm) & ~missing[nearest]
+    label = np.where(present, int(Label.OK), int(Label.UNSEEN))
+    open_ = np.flatnonzero(~present)
+    if len(open_):
+        # just inside the surface, as deep as the limit: empty there is more than noise
+        depth_mm = float(limit.high_mm(np.array([27]))[0])
+        inside = surface_mm[open_] - depth_mm * normals[open_]
+        f_mm = template.distance(inside)
+        cautious = evidence.clearance(inside, f_mm)[1]
+        gone = (cautious > depth_mm / 2) & (f_mm < -depth_mm / 2)
+        if not missing.any() and not evidence.has_rays:
+            gone[:] = False
+        label[open_[gone]] = int(Label.MISSING)
+    return label

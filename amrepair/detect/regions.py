@@ -1,0 +1,116 @@
+"""Regions: labelled cells and template points grouped into defects with size and type.
+
+Figures here come from the surface alone (area × depth); `deficit` measures volume by solids.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from amrepair.detect.anomaly import DefectType, Label, Region
+from amrepair.detect.evidence import Evidence
+from amrepair.template.port import Template
+
+# Pieces nearer than this are one defect.
+GROUP_MM = 1.2
+# Template points alone (seen through by rays) need this much surface to be a region.
+MIN_AREA_MM2 = 2.0
+
+
+def group_points(
+    points_mm: Float[np.ndarray, "n 3"], *, reach_mm: float = GROUP_MM
+) -> Int[np.ndarray, " n"]:
+    """(n,) group number of each point: those in touching cells of `reach_mm` belong together."""
+    if len(points_mm) == 0:
+        return np.zeros(0, np.int64)
+    index = np.floor((points_mm - points_mm.min(axis=0)) / reach_mm).astype(np.int64)
+    occupied = np.zeros(tuple(index.max(axis=0) + 1), bool)
+    occupied[tuple(index.T)] = True
+    numbered, _ = ndimage.label(occupied, structure=np.ones((3, 3, 3), bool))
+    return numbered[tuple(index.T)].astype(np.int64) - 1
+
+
+def find_regions(
+    evidence: Evidence,
+    missing: Bool[np.ndarray, " s"],
+    excess: Bool[np.ndarray, " s"],
+    surface_mm: Float[np.ndarray, "m 3"],
+    surface_label: Int[np.ndarray, " m"],
+    template: Template,
+) -> tuple[Region, ...]:
+    """Regions of both kinds, largest first."""
+    s = evidence.surfels
+    gone = surface_mm[surface_label == int(Label.MISSING)]
+    area_each = area_per_point(surface_mm)
+    found: list[Region] = []
+    for label, cells, extra in (
+        (Label.MISSING, missing, gone),
+        (Label.EXCESS, excess, np.zeros((0, 3))),
+    ):
+        which = np.flatnonzero(cells)
+        points = np.concatenate([s.place_mm[which], extra])
+        group = group_points(points)
+        for g in range(int(group.max()) + 1 if len(group) else 0):
+            mine = group == g
+            own = which[mine[: len(which)]]
+            n_gone = int(mine[len(which) :].sum())
+            if len(own) == 0 and n_gone * area_each < MIN_AREA_MM2:
+                continue
+            found.append(_region(label, s.deviation_mm[own], points[mine], s.cell_mm, template))
+    return tuple(sorted(found, key=lambda r: -r.volume_mm3))
+
+
+def area_per_point(surface_mm: Float[np.ndarray, "m 3"]) -> float:
+    """Rough area per template point, from how many cells of 2 mm they fill."""
+    if len(surface_mm) == 0:
+        return 0.0
+    cells = len(np.unique(np.floor(surface_mm / 2.0).astype(np.int64), axis=0))
+    return 1.5 * 4.0 * cells / len(surface_mm)
+
+
+def _region(
+    label: Label,
+    deviation_mm: Float[np.ndarray, " q"],
+    points_mm: Float[np.ndarray, "p 3"],
+    cell_mm: float,
+    template: Template,
+) -> Region:
+    """Size and type of one group."""
+    box = np.stack([points_mm.min(axis=0), points_mm.max(axis=0)])
+    depth = float(np.abs(deviation_mm).max()) if len(deviation_mm) else float(np.ptp(box, 0).min())
+    area = max(len(deviation_mm), 1) * cell_mm**2
+    volume = float(np.abs(deviation_mm).sum()) * cell_mm**2
+    return Region(
+        label=label,
+        type=classify(label, depth_mm=depth, area_mm2=area, box_mm=box, template=template),
+        volume_mm3=volume,
+        area_mm2=area,
+        depth_mm=depth,
+        box_mm=box,
+    )
+
+
+def classify(
+    label: Label,
+    *,
+    depth_mm: float,
+    area_mm2: float,
+    box_mm: Float[np.ndarray, "2 3"],
+    template: Template,
+) -> DefectType:
+    """Type from geometry: shallow and wide, at the rim, or within."""
+    if label is Label.EXCESS:
+        return DefectType.BLOB
+    if depth_mm < 0.05 * np.sqrt(area_mm2):
+        return DefectType.UNDER_EXTRUSION
+    # a chip reaches the part's outline seen from above, a void lies within it
+    low, high = template.bounds_mm
+    middle = box_mm.mean(axis=0)
+    around = np.array(
+        [[box_mm[i, 0], box_mm[j, 1], middle[2]] for i in (0, 1) for j in (0, 1)]
+    )
+    at_rim = bool((template.distance(around) > -0.5).any())
+    above = high[2] - box_mm[1, 2] < 1.0
+    return DefectType.CHIP if at_rim and not above or at_rim else DefectType.VOID

@@ -1,0 +1,163 @@
+"""Surfels: the scan condensed to occupied cells, so that noise averages out before any decision.
+
+A surfel is the mean of the points in one cell: place, deviation, count. It knows its neighbours,
+and so a bead-sized average and a local plane. It decides nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from amrepair.detect import surfel_kernels as kernels
+
+MIN_CELL_MM, MAX_CELL_MM = 0.3, 2.0
+# Occupied unit cells hold about 1.5 cell² of surface each (a plane at a random slope).
+AREA_PER_CELL = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Surfels:
+    """Occupied cells of a scan, template frame.
+
+    Attributes
+    ----------
+    cell_mm
+        Edge of a cell, about twice the point spacing.
+    spacing_mm
+        Mean distance between neighbouring points, estimated.
+    place_mm
+        (s, 3) mean of the points in each cell.
+    deviation_mm
+        (s,) mean f of the points in each cell.
+    count
+        (s,) points in each cell.
+    wide_deviation_mm, wide_count
+        (s,) the same over the cell and its 26 neighbours: a bead-sized window.
+    spread_mm
+        Robust standard deviation of f within a cell: the noise as the scan shows it.
+    table
+        (s, 27) neighbours, −1 where empty.
+    of_point
+        (n,) the surfel of each point, −1 for points left out.
+    """
+
+    cell_mm: float
+    spacing_mm: float
+    place_mm: Float[np.ndarray, "s 3"]
+    deviation_mm: Float[np.ndarray, " s"]
+    count: Int[np.ndarray, " s"]
+    wide_deviation_mm: Float[np.ndarray, " s"]
+    wide_count: Int[np.ndarray, " s"]
+    spread_mm: float
+    table: Int[np.ndarray, "s 27"]
+    of_point: Int[np.ndarray, " n"]
+    moments: Float[np.ndarray, "s 11"]
+    order: Int[np.ndarray, " kept"]
+    start: Int[np.ndarray, " s1"]
+
+    def __len__(self) -> int:
+        return len(self.place_mm)
+
+    def planes(self, which: Int[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
+        """(q, 3) unit normals (either sign) of the planes through each cell and its neighbours."""
+        sums = kernels.neighbour_sums(self.table[which], self.moments)
+        n = sums[:, 10]
+        mean = sums[:, :3] / n[:, None]
+        xx, yy, zz, xy, xz, yz = (sums[:, 4:10] / n[:, None]).T
+        second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+        covariance = second - mean[:, :, None] * mean[:, None, :]
+        return np.asarray(np.linalg.eigh(covariance)[1][:, :, 0])
+
+    def mean_of(self, vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "s 3"]:
+        """(s, 3) mean over each cell of per-point vectors."""
+        return np.add.reduceat(vectors[self.order], self.start[:-1], axis=0) / self.count[:, None]
+
+    def grow(
+        self, seeds: Bool[np.ndarray, " s"], through: Bool[np.ndarray, " s"]
+    ) -> Bool[np.ndarray, " s"]:
+        """Cells reached from `seeds` by steps between neighbours that are in `through`."""
+        reached = seeds.copy()
+        front = np.flatnonzero(seeds)
+        while len(front):
+            near = np.unique(self.table[front])
+            near = near[near >= 0]
+            front = near[through[near] & ~reached[near]]
+            reached[front] = True
+        return reached
+
+
+def make_surfels(
+    points_mm: Float[np.ndarray, "n 3"],
+    deviation_mm: Float[np.ndarray, " n"],
+    keep: Bool[np.ndarray, " n"],
+) -> Surfels:
+    """Condense the points in `keep`; the cell follows their spacing."""
+    chosen = np.flatnonzero(keep)
+    kept = np.ascontiguousarray(points_mm[chosen])
+    spacing_mm = estimate_spacing(kept)
+    cell_mm = float(np.clip(2.0 * spacing_mm, MIN_CELL_MM, MAX_CELL_MM))
+    keys, strides = _cell_keys(kept, cell_mm)
+    order = np.argsort(keys, kind="stable")
+    ranked = keys[order]
+    first = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]]) if len(ranked) else ranked
+    start = np.append(first, len(ranked))
+    # moments about one origin near the part keep float64 far from cancellation
+    origin = kept.mean(axis=0) if len(kept) else np.zeros(3)
+    f = deviation_mm[chosen]
+    sums = kernels.cell_sums(order, start, kept - origin, f)
+    count = np.diff(start)
+    table = kernels.neighbour_table(ranked[first], *strides)
+    wide = kernels.neighbour_sums(
+        table, np.ascontiguousarray(np.column_stack([sums[:, 3], count.astype(float)]))
+    )
+    of_point = np.full(len(points_mm), -1, np.int64)
+    of_point[chosen[order]] = np.repeat(np.arange(len(count)), count)
+    mean_f = sums[:, 3] / count
+    many = count >= 3
+    variance = np.maximum(sums[:, 10] / count - mean_f**2, 0.0) * count / np.maximum(count - 1, 1)
+    spread_mm = float(np.sqrt(np.median(variance[many]))) if many.any() else 0.0
+    sums[:, 10] = count
+    return Surfels(
+        cell_mm=cell_mm,
+        spacing_mm=spacing_mm,
+        place_mm=sums[:, :3] / count[:, None] + origin,
+        deviation_mm=mean_f,
+        count=count,
+        wide_deviation_mm=wide[:, 0] / wide[:, 1],
+        wide_count=wide[:, 1].astype(np.int64),
+        spread_mm=spread_mm,
+        table=table,
+        of_point=of_point,
+        moments=sums,
+        order=chosen[order],
+        start=start,
+    )
+
+
+def estimate_spacing(points_mm: Float[np.ndarray, "n 3"]) -> float:
+    """Mean spacing of a surface cloud from how many 1 mm (or larger) cells it occupies."""
+    if len(points_mm) < 2:
+        return MAX_CELL_MM / 2
+    cell_mm = 1.0
+    while True:
+        occupied = len(np.unique(_cell_keys(points_mm, cell_mm)[0]))
+        # a cell must hold several points, or the count of cells says nothing about area
+        if len(points_mm) >= 4 * occupied or occupied == 1 or cell_mm > 64.0:
+            return float(np.sqrt(AREA_PER_CELL * occupied * cell_mm**2 / len(points_mm)))
+        cell_mm *= 2.0
+
+
+def _cell_keys(
+    points_mm: Float[np.ndarray, "n 3"], cell_mm: float
+) -> tuple[Int[np.ndarray, " n"], tuple[int, int]]:
+    """Cell number of each point, and the strides of x and y (one empty layer between rows)."""
+    if len(points_mm) == 0:
+        return np.zeros(0, np.int64), (1, 1)
+    index = np.floor((points_mm - points_mm.min(axis=0)) / cell_mm).astype(np.int64) + 1
+    size = index.max(axis=0) + 2
+    stride_y = int(size[2])
+    stride_x = int(size[1]) * stride_y
+    return index @ np.array([stride_x, stride_y, 1]), (stride_x, stride_y)
