@@ -1,0 +1,303 @@
+"""Columns of solid: what the simulated world is made of, and flat pictures of it to compare.
+
+`Columns` grows and is cut; `IntervalMap` is a read-only window of it with set operations. Beads,
+defects and scanners live elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float, Int
+
+from amrepair.errors import InputError
+from amrepair.simulate import columns_kernels as kernels
+
+_FIRST_POOL = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A rectangle of columns, half-open: rows [y0, y1), columns [x0, x1) of a grid.
+
+    Attributes
+    ----------
+    origin_mm
+        XY of the corner of the *grid's* cell [0, 0], build frame.
+    cell_mm
+        Edge of a column.
+    """
+
+    origin_mm: tuple[float, float]
+    cell_mm: float
+    y0: int
+    y1: int
+    x0: int
+    x1: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return max(0, self.y1 - self.y0), max(0, self.x1 - self.x0)
+
+    @property
+    def corner_mm(self) -> tuple[float, float]:
+        """XY of the window's lowest corner, build frame."""
+        return (
+            self.origin_mm[0] + self.x0 * self.cell_mm,
+            self.origin_mm[1] + self.y0 * self.cell_mm,
+        )
+
+    def union(self, other: Window) -> Window:
+        """The smallest window that holds both; of two grids that are the same."""
+        if (self.origin_mm, self.cell_mm) != (other.origin_mm, other.cell_mm):
+            raise InputError(
+                f"two worlds can be compared only on one grid, these have cells of {self.cell_mm} "
+                f"and {other.cell_mm} mm and corners {self.origin_mm} and {other.origin_mm}"
+            )
+        return Window(
+            self.origin_mm,
+            self.cell_mm,
+            min(self.y0, other.y0),
+            max(self.y1, other.y1),
+            min(self.x0, other.x0),
+            max(self.x1, other.x1),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalMap:
+    """Solid z-intervals by column over a window, read-only.
+
+    Attributes
+    ----------
+    window
+        Which columns, row by row.
+    offsets
+        (n + 1,) where each column's intervals begin in `spans_mm`.
+    spans_mm
+        (m, 2) lower and upper end of each interval, rising within a column, build frame.
+    """
+
+    window: Window
+    offsets: Int[np.ndarray, " k"]
+    spans_mm: Float[np.ndarray, "m 2"]
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume of all intervals."""
+        lengths_mm = self.spans_mm[:, 1] - self.spans_mm[:, 0]
+        return float(lengths_mm.sum()) * self.window.cell_mm**2
+
+    def minus(self, other: IntervalMap) -> IntervalMap:
+        """What is solid here and not there, over the same window."""
+        self._meet(other)
+        offsets, spans = kernels.subtract_flat(
+            self.offsets, self.spans_mm, other.offsets, other.spans_mm
+        )
+        return IntervalMap(self.window, offsets, spans)
+
+    def common(self, other: IntervalMap) -> IntervalMap:
+        """What is solid in both, over the same window."""
+        self._meet(other)
+        offsets, spans = kernels.intersect_flat(
+            self.offsets, self.spans_mm, other.offsets, other.spans_mm
+        )
+        return IntervalMap(self.window, offsets, spans)
+
+    def thicker_than(self, length_mm: float) -> IntervalMap:
+        """Only the intervals longer than `length_mm`."""
+        keep = self.spans_mm[:, 1] - self.spans_mm[:, 0] > length_mm
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return IntervalMap(self.window, before[self.offsets], self.spans_mm[keep])
+
+    def thickness_mm(
+        self, z_low_mm: float = -np.inf, z_high_mm: float = np.inf
+    ) -> Float[np.ndarray, "ny nx"]:
+        """(ny, nx) solid length of each column between two heights."""
+        lengths = kernels.column_lengths(
+            self.offsets, self.spans_mm, float(z_low_mm), float(z_high_mm)
+        )
+        return np.asarray(lengths).reshape(self.window.shape)
+
+    def top_mm(self) -> Float[np.ndarray, "ny nx"]:
+        """(ny, nx) height of the highest solid; 0, the bed, where there is none."""
+        top = np.zeros(len(self.offsets) - 1)
+        filled = np.diff(self.offsets) > 0
+        top[filled] = self.spans_mm[self.offsets[1:][filled] - 1, 1]
+        return top.reshape(self.window.shape)
+
+    def clipped(self, box_mm: Float[np.ndarray, "2 3"]) -> IntervalMap:
+        """What lies within a box, by column centre in XY and exactly in Z; the same window."""
+        lows = np.maximum(self.spans_mm[:, 0], box_mm[0, 2])
+        highs = np.minimum(self.spans_mm[:, 1], box_mm[1, 2])
+        column = np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+        ny, nx = self.window.shape
+        corner = self.window.corner_mm
+        x_mm = corner[0] + (column % max(nx, 1) + 0.5) * self.window.cell_mm
+        y_mm = corner[1] + (column // max(nx, 1) + 0.5) * self.window.cell_mm
+        keep = (
+            (highs > lows)
+            & (x_mm >= box_mm[0, 0])
+            & (x_mm <= box_mm[1, 0])
+            & (y_mm >= box_mm[0, 1])
+            & (y_mm <= box_mm[1, 1])
+        )
+        offsets = np.concatenate([[0], np.cumsum(np.bincount(column[keep], minlength=ny * nx))])
+        return IntervalMap(self.window, offsets, np.stack([lows[keep], highs[keep]], axis=1))
+
+    def bounds_mm(self) -> Float[np.ndarray, "2 3"] | None:
+        """(2, 3) box around all intervals, build frame; None where there are none."""
+        if len(self.spans_mm) == 0:
+            return None
+        nx = self.window.shape[1]
+        filled = np.flatnonzero(np.diff(self.offsets))
+        x0, y0 = self.window.corner_mm
+        cell = self.window.cell_mm
+        iy, ix = filled // nx, filled % nx
+        low = (x0 + ix.min() * cell, y0 + iy.min() * cell, self.spans_mm[:, 0].min())
+        high = (x0 + (ix.max() + 1) * cell, y0 + (iy.max() + 1) * cell, self.spans_mm[:, 1].max())
+        return np.array([low, high])
+
+    def _meet(self, other: IntervalMap) -> None:
+        if self.window != other.window:
+            raise InputError(
+                f"two interval maps can be compared only over one window, these cover "
+                f"{self.window} and {other.window}"
+            )
+
+
+class Columns:
+    """Solid z-intervals over a grid of square columns, in continuous z.
+
+    Parameters
+    ----------
+    origin_mm, size_mm
+        XY corner and extent of the grid, build frame.
+    cell_mm
+        Edge of a column.
+    """
+
+    def __init__(
+        self, *, origin_mm: tuple[float, float], size_mm: tuple[float, float], cell_mm: float
+    ) -> None:
+        self.origin_mm = origin_mm
+        self.cell_mm = cell_mm
+        self.shape = (int(np.ceil(size_mm[1] / cell_mm)), int(np.ceil(size_mm[0] / cell_mm)))
+        self.hi = np.zeros(self.shape)
+        self.lo = np.zeros(self.shape)
+        self.nxt = np.zeros(self.shape, dtype=np.int32)
+        self.pool = np.empty((_FIRST_POOL, 2))
+        self.pool_next = np.zeros(_FIRST_POOL, dtype=np.int32)
+        self.meta = np.array([1, 0], dtype=np.int64)
+        self._touched = np.array([self.shape[0], -1, self.shape[1], -1], dtype=np.int64)
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """The arrays in the order that the kernels take them."""
+        return self.hi, self.lo, self.nxt, self.pool, self.pool_next, self.meta
+
+    @property
+    def touched(self) -> Any:
+        """(4,) rows and columns (y_first, y_last, x_first, x_last) where anything was laid."""
+        return self._touched
+
+    def window(self, margin_mm: float = 0.0) -> Window:
+        """The columns in use, and a margin around them."""
+        pad = int(np.ceil(margin_mm / self.cell_mm))
+        y0, y1, x0, x1 = (int(value) for value in self._touched)
+        if y1 < 0:
+            return Window(self.origin_mm, self.cell_mm, 0, 0, 0, 0)
+        return Window(
+            self.origin_mm,
+            self.cell_mm,
+            max(0, y0 - pad),
+            min(self.shape[0], y1 + 1 + pad),
+            max(0, x0 - pad),
+            min(self.shape[1], x1 + 1 + pad),
+        )
+
+    def box_window(self, low_mm: tuple[float, float], high_mm: tuple[float, float]) -> Window:
+        """The columns that a rectangle of the build frame touches."""
+        x0 = int(np.floor((low_mm[0] - self.origin_mm[0]) / self.cell_mm))
+        y0 = int(np.floor((low_mm[1] - self.origin_mm[1]) / self.cell_mm))
+        x1 = int(np.ceil((high_mm[0] - self.origin_mm[0]) / self.cell_mm))
+        y1 = int(np.ceil((high_mm[1] - self.origin_mm[1]) / self.cell_mm))
+        ny, nx = self.shape
+        x0, x1 = np.clip((x0, x1), 0, nx).tolist()
+        y0, y1 = np.clip((y0, y1), 0, ny).tolist()
+        return Window(self.origin_mm, self.cell_mm, y0, y1, x0, x1)
+
+    def snapshot(self, window: Window | None = None) -> IntervalMap:
+        """The intervals of a window (default: all in use) as they are now."""
+        window = self.window() if window is None else window
+        hi, lo, nxt, pool, pool_next, _ = self.arrays
+        offsets, spans = kernels.flatten(
+            hi, lo, nxt, pool, pool_next, window.y0, window.y1, window.x0, window.x1
+        )
+        return IntervalMap(window, offsets, spans)
+
+    def unite(self, added: IntervalMap) -> float:
+        """Add intervals; returns the volume that was not solid before, mm³."""
+        return self._merge(added, subtract=False)
+
+    def cut(self, removed: IntervalMap) -> float:
+        """Take intervals away; returns the volume removed, mm³."""
+        return self._merge(removed, subtract=True)
+
+    def rasterise(self, solid: manifold3d.Manifold) -> IntervalMap:
+        """A solid of the build frame as intervals along the column centres; cut at the bed."""
+        x0, y0, _, x1, y1, _ = solid.bounding_box()
+        window = self.box_window((x0, y0), (x1, y1))
+        mesh = solid.to_mesh64()
+        corners = np.ascontiguousarray(np.asarray(mesh.vert_properties)[:, :3])
+        triangles = np.ascontiguousarray(corners[np.asarray(mesh.tri_verts)], dtype=np.float64)
+        ny, nx = window.shape
+        corner = window.corner_mm
+        column, height = kernels.crossings(
+            triangles.reshape(-1, 3, 3), corner[0], corner[1], self.cell_mm, ny, nx
+        )
+        order = np.lexsort((height, column))
+        offsets, spans = kernels.pair_crossings(column[order], height[order], ny * nx)
+        return IntervalMap(window, offsets, spans)
+
+    def copy(self) -> Columns:
+        """An independent copy."""
+        twin = Columns.__new__(Columns)
+        twin.origin_mm, twin.cell_mm, twin.shape = self.origin_mm, self.cell_mm, self.shape
+        twin.hi, twin.lo = np.zeros(self.shape), np.zeros(self.shape)
+        twin.nxt = np.zeros(self.shape, dtype=np.int32)
+        used = self.window(margin_mm=10.0)  # plastic spreads a little beyond the nozzle's path
+        rows, cols = slice(used.y0, used.y1), slice(used.x0, used.x1)
+        for target, source in ((twin.hi, self.hi), (twin.lo, self.lo), (twin.nxt, self.nxt)):
+            target[rows, cols] = source[rows, cols]
+        twin.pool, twin.pool_next = self.pool.copy(), self.pool_next.copy()
+        twin.meta, twin._touched = self.meta.copy(), self._touched.copy()
+        return twin
+
+    def touch(self, window: Window) -> None:
+        """Note that a window may have been changed."""
+        if window.shape[0] and window.shape[1]:
+            self._touched[0] = min(self._touched[0], window.y0)
+            self._touched[1] = max(self._touched[1], window.y1 - 1)
+            self._touched[2] = min(self._touched[2], window.x0)
+            self._touched[3] = max(self._touched[3], window.x1 - 1)
+
+    def _merge(self, change: IntervalMap, *, subtract: bool) -> float:
+        window = change.window
+        if (window.origin_mm, window.cell_mm) != (self.origin_mm, self.cell_mm):
+            raise InputError("intervals can be merged only into columns of their own grid")
+        self.pool, self.pool_next, changed = kernels.merge_flat(
+            *self.arrays,
+            window.y0,
+            window.x0,
+            window.shape[1],
+            change.offsets,
+            change.spans_mm,
+            subtract,
+        )
+        self.touch(window)
+        return float(changed) * self.cell_mm**2

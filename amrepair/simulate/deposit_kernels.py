@@ -1,0 +1,284 @@
+"""The bead model: plastic under a moving nozzle finds its place among the columns.
+
+Per short step of the path the volume pushed out (1) levels the columns under the nozzle's bore,
+lowest first, up to the nozzle's height; (2) what is left fills further columns in order of
+distance; (3) what finds no room rides along with the nozzle and, once it is more than
+`carry_limit`, rises as a ridge around the nozzle's flat. Volume is conserved to rounding.
+The step positions are dithered over one column (a low-discrepancy sequence from the segment's own
+coordinates), so that a wall's mean position does not depend on where it falls in the grid.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from amrepair.simulate.columns_kernels import grown, insert, surface_below
+
+# Entries of `state`, floats: what the nozzle carries along, and where it last was.
+CARRY, LAST_X, LAST_Y, LAST_Z, LOST, LAST_T = 0, 1, 2, 3, 4, 5
+# Additive recurrence of the plastic number: the 2-D low-discrepancy sequence R2 (M. Roberts, 2018)
+R2_X, R2_Y = 0.7548776662466927, 0.5698402909980532
+LEAST_MM = 1e-9  # mm of column: less than this waits for the next step
+RIDGE_STEP_MM = 0.05  # a ridge grows evenly, by this much at a time
+MOST_RIDGE_STEPS = 4000
+
+
+@njit(cache=True)
+def floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit):
+    """Where plastic coming from height z begins to stack: on what lies below, or hanging."""
+    surface = surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z)
+    if z - surface > gap_limit:
+        return z - thickness
+    return surface
+
+
+@njit(cache=True)
+def level_of(floors, count, amount, z):
+    """Level to which `amount` (mm of column) fills the first `count` floors, sorted rising."""
+    used = 0.0
+    level = floors[0]
+    for k in range(1, count + 1):
+        following = z if k == count else min(floors[k], z)
+        rise = (following - level) * k
+        if used + rise >= amount:
+            return level + (amount - used) / k
+        used += rise
+        level = following
+    return z
+
+
+@njit(cache=True)
+def lay(
+    hi,
+    lo,
+    nxt,
+    pool,
+    pool_next,
+    meta,
+    window,
+    near,
+    counts,
+    phases,
+    grid,
+    state,
+    floors,
+    chosen,
+    x,
+    y,
+    z,
+    amount,
+    thickness,
+    gap_limit,
+    carry_limit,
+    flush,
+):
+    """One step: place `amount` (mm of column) from the nozzle at (x, y, z)."""
+    ny, nx = hi.shape
+    cell = grid[2]
+    gx = (x - grid[0]) / cell
+    gy = (y - grid[1]) / cell
+    cx, cy = int(np.floor(gx)), int(np.floor(gy))
+    amount += state[CARRY]
+    if cx < 0 or cy < 0 or cx >= nx or cy >= ny:
+        state[LOST] += amount
+        state[CARRY] = 0.0
+        return
+    phase = int((gy - cy) * phases) * phases + int((gx - cx) * phases)
+    bore, reach, flat, spread = counts[phase]
+    found = 0
+    capacity = 0.0
+    for k in range(bore):  # columns under the bore, kept sorted by floor
+        iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
+        if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
+            continue
+        bottom = floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit)
+        if bottom >= z:
+            continue
+        at = found
+        while at > 0 and floors[at - 1] > bottom:
+            floors[at] = floors[at - 1]
+            chosen[at] = chosen[at - 1]
+            at -= 1
+        floors[at] = bottom
+        chosen[at, 0] = iy
+        chosen[at, 1] = ix
+        found += 1
+        capacity += z - bottom
+    if found > 0:
+        level = z if capacity <= amount else level_of(floors, found, amount, z)
+        for k in range(found):
+            if floors[k] < level:
+                insert(
+                    hi,
+                    lo,
+                    nxt,
+                    pool,
+                    pool_next,
+                    meta,
+                    chosen[k, 0],
+                    chosen[k, 1],
+                    floors[k],
+                    level,
+                )
+        amount = amount - capacity if capacity <= amount else 0.0
+    last = spread if (flush or amount > carry_limit) else reach
+    for k in range(bore, last):
+        if amount <= LEAST_MM:
+            break
+        iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
+        if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
+            continue
+        bottom = floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit)
+        if bottom < z:
+            level = min(z, bottom + amount)
+            insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
+            amount -= level - bottom
+    ridge = 0
+    while amount > LEAST_MM and (flush or amount > carry_limit) and ridge < MOST_RIDGE_STEPS:
+        ridge += 1
+        top = z + ridge * RIDGE_STEP_MM
+        for k in range(flat, spread):
+            iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
+            if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
+                continue
+            bottom = surface_below(hi, lo, nxt, pool, pool_next, iy, ix, top)
+            if bottom < top:
+                bottom = max(bottom, z - thickness)
+                level = min(top, bottom + amount)
+                insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
+                amount -= level - bottom
+                if amount <= LEAST_MM:
+                    break
+        flush = True
+    state[CARRY] = max(amount, 0.0)
+    window[0] = min(window[0], cy)
+    window[1] = max(window[1], cy)
+    window[2] = min(window[2], cx)
+    window[3] = max(window[3], cx)
+
+
+@njit(cache=True)
+def flow_factor(regions, x, y, z):
+    """Product of the flow factors of all defect regions that hold (x, y, z)."""
+    factor = 1.0
+    for r in range(len(regions)):
+        if z <= regions[r, 6] or z > regions[r, 7]:
+            continue
+        dx, dy = x - regions[r, 0], y - regions[r, 1]
+        u = (dx * regions[r, 2] + dy * regions[r, 3]) / regions[r, 4]
+        v = (dy * regions[r, 2] - dx * regions[r, 3]) / regions[r, 5]
+        if u * u + v * v <= 1.0:
+            factor *= regions[r, 8]
+    return factor
+
+
+@njit(cache=True)
+def deposit(
+    hi,
+    lo,
+    nxt,
+    pool,
+    pool_next,
+    meta,
+    window,
+    near,
+    counts,
+    phases,
+    grid,
+    state,
+    start,
+    end,
+    volume,
+    thickness,
+    regions,
+    step_mm,
+    gap_layers,
+    carry_limit,
+):
+    """Lay every segment in order; returns the pool and the volume pushed out, mm³."""
+    cell = grid[2]
+    area = cell * cell
+    pushed = 0.0
+    floors = np.empty(near.shape[1])
+    chosen = np.empty((near.shape[1], 2), dtype=np.int64)
+    for s in range(len(volume)):
+        chained = (
+            volume[s] > 0.0
+            and start[s, 0] == state[LAST_X]
+            and start[s, 1] == state[LAST_Y]
+            and start[s, 2] == state[LAST_Z]
+        )
+        if not chained and state[CARRY] > 0.0:
+            pool, pool_next = grown(pool, pool_next, meta, 4 * near.shape[1] + 64)
+            lay(
+                hi,
+                lo,
+                nxt,
+                pool,
+                pool_next,
+                meta,
+                window,
+                near,
+                counts,
+                phases,
+                grid,
+                state,
+                floors,
+                chosen,
+                state[LAST_X],
+                state[LAST_Y],
+                state[LAST_Z],
+                0.0,
+                state[LAST_T],
+                gap_layers * state[LAST_T],
+                carry_limit,
+                True,
+            )
+        if volume[s] > 0.0:
+            dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
+            length = np.sqrt(dx * dx + dy * dy + dz * dz)
+            steps = max(1, int(np.ceil(length / step_mm)))
+            share = volume[s] / steps
+            seed = np.abs(np.sin(12.9898 * start[s, 0] + 78.233 * start[s, 1]) * 43758.5453)
+            jx, jy = seed % 1.0, (seed * 7.0) % 1.0
+            for k in range(steps):
+                t = (k + 0.5) / steps
+                x, y = start[s, 0] + t * dx, start[s, 1] + t * dy
+                z = start[s, 2] + t * dz
+                amount = share
+                if len(regions) > 0:
+                    amount *= flow_factor(regions, x, y, z)
+                jx = (jx + R2_X) % 1.0
+                jy = (jy + R2_Y) % 1.0
+                if amount <= 0.0 and state[CARRY] <= 0.0:
+                    continue
+                pushed += amount
+                pool, pool_next = grown(pool, pool_next, meta, 4 * near.shape[1] + 64)
+                lay(
+                    hi,
+                    lo,
+                    nxt,
+                    pool,
+                    pool_next,
+                    meta,
+                    window,
+                    near,
+                    counts,
+                    phases,
+                    grid,
+                    state,
+                    floors,
+                    chosen,
+                    x + (jx - 0.5) * cell,
+                    y + (jy - 0.5) * cell,
+                    z,
+                    amount / area,
+                    thickness[s],
+                    gap_layers * thickness[s],
+                    carry_limit,
+                    amount <= 0.0,
+                )
+        state[LAST_X], state[LAST_Y], state[LAST_Z] = end[s, 0], end[s, 1], end[s, 2]
+        state[LAST_T] = thickness[s]
+    return pool, pool_next, pushed

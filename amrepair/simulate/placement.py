@@ -1,0 +1,261 @@
+"""Where a defect goes on a part: seeded, and smaller where the part leaves no room.
+
+Works on sections of the solid in the build frame. It neither prints nor repairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import manifold3d as m3
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.errors import InputError
+from amrepair.simulate.defects import Defect, DefectKind, PlacedDefect
+
+_SHRINK = tuple(0.85**k for k in range(9))  # down to a quarter of the size asked for
+_LEAST_ROOM_MM2 = 0.02
+_TRIES = 60
+_EVERYWHERE_MM = 1e9
+
+
+def place(
+    defect: Defect,
+    part: m3.Manifold,
+    tops_mm: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+) -> PlacedDefect:
+    """Find a place for a defect.
+
+    Parameters
+    ----------
+    defect
+        What is asked for.
+    part
+        The solid that is printed, build frame.
+    tops_mm
+        (n,) heights of the layers' tops, rising.
+    rng
+        Chooses among the places.
+
+    Raises
+    ------
+    InputError
+        If the part has no room for it, even at a quarter of its size.
+    """
+    finders: dict[DefectKind, Callable[..., PlacedDefect | None]] = {
+        DefectKind.VOID: _void,
+        DefectKind.UNDER_EXTRUSION: _under_extrusion,
+        DefectKind.CHIP: _chip,
+        DefectKind.BLOB: _blob,
+    }
+    if defect.kind is DefectKind.NONE:
+        return PlacedDefect(defect.kind, (), np.zeros((0, 9)), None, None, np.zeros((2, 3)))
+    for scale in _SHRINK:
+        placed = finders[defect.kind](defect, part, np.asarray(tops_mm), rng, scale)
+        if placed is not None:
+            return placed
+    box = part.bounding_box()
+    raise InputError(
+        f"the part of {box[3] - box[0]:.1f}×{box[4] - box[1]:.1f}×{box[5] - box[2]:.1f} mm has no "
+        f"room for the defect {defect}, even at {_SHRINK[-1]:.0%} of its size; ask for a smaller one"
+    )
+
+
+def _layer_ranges(
+    defect: Defect, tops_mm: Float[np.ndarray, " n"], rng: np.random.Generator
+) -> list[range]:
+    """Candidate layer ranges in random order; the one asked for where there is one."""
+    count = min(int(defect.values["layers"]), max(1, len(tops_mm) - 2))
+    asked = int(defect.values["layer"])
+    if asked >= len(tops_mm):
+        raise InputError(
+            f"the defect {defect} asks for layer {asked}, but the job has {len(tops_mm)} layers"
+        )
+    if asked >= 0:
+        return [range(max(0, asked - count + 1), asked + 1)]
+    first_last = min(count + 1, len(tops_mm) - 1)  # the first two layers hold the part: not there
+    lasts = rng.permutation(np.arange(first_last, max(first_last + 1, len(tops_mm) - 1)))
+    return [range(int(last) - count + 1, int(last) + 1) for last in lasts[:_TRIES]]
+
+
+def _z_range(layers: range, tops_mm: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Nozzle heights (above, up to) that belong to the layers and to no other."""
+    below = tops_mm[layers[0] - 1] if layers[0] > 0 else 0.0
+    low = 0.5 * (below + tops_mm[layers[0]])
+    last = layers[-1]
+    above = tops_mm[last + 1] if last + 1 < len(tops_mm) else tops_mm[last] + 0.2
+    return float(low), float(0.5 * (tops_mm[last] + above))
+
+
+def _solid_through(
+    part: m3.Manifold, layers: range, tops_mm: Float[np.ndarray, " n"]
+) -> m3.CrossSection:
+    """Where the part is solid from the layer under the range to its last layer."""
+    bottoms = np.concatenate([[0.0], tops_mm[:-1]])
+    middles = 0.5 * (bottoms + tops_mm)
+    room = part.slice(float(middles[max(0, layers[0] - 1)]))
+    for layer in layers:
+        room = room ^ part.slice(float(middles[layer]))
+    return room
+
+
+def random_point(area: m3.CrossSection, rng: np.random.Generator) -> Float[np.ndarray, " 2"] | None:
+    """(2,) a point uniform over a cross-section, build frame; None where it is empty."""
+    triangles = _triangles(area)
+    if len(triangles) == 0:
+        return None
+    u, v = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    weight = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    if weight.sum() <= 0:
+        return None
+    pick = int(rng.choice(len(triangles), p=weight / weight.sum()))
+    a, b = rng.random(2)
+    if a + b > 1:
+        a, b = 1 - a, 1 - b
+    return triangles[pick, 0] + a * u[pick] + b * v[pick]
+
+
+def _triangles(area: m3.CrossSection) -> Float[np.ndarray, "n 3 2"]:
+    polygons = [np.asarray(polygon, dtype=np.float64) for polygon in area.to_polygons()]
+    if not polygons:
+        return np.zeros((0, 3, 2))
+    corners = np.concatenate(polygons)
+    return corners[np.asarray(m3.triangulate(polygons))].reshape(-1, 3, 2)
+
+
+def _void(
+    defect: Defect,
+    part: m3.Manifold,
+    tops_mm: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    scale: float,
+) -> PlacedDefect | None:
+    diameter_mm = defect.values["diameter"] * scale
+    long_mm, short_mm = 0.5 * diameter_mm, 0.5 * diameter_mm * rng.uniform(0.7, 1.0)
+    wall_mm = defect.values["wall"] * min(1.0, scale * 1.25)
+    for layers in _layer_ranges(defect, tops_mm, rng):
+        room = _solid_through(part, layers, tops_mm)
+        room = room.offset(-(wall_mm + long_mm), m3.JoinType.Round, circular_segments=32)
+        if room.area() < _LEAST_ROOM_MM2:
+            continue
+        centre = random_point(room, rng)
+        if centre is None:
+            continue
+        angle = rng.uniform(0, np.pi)
+        low, high = _z_range(layers, tops_mm)
+        region = [*centre, np.cos(angle), np.sin(angle), long_mm, short_mm, low, high, 0.0]
+        bottom = tops_mm[layers[0] - 1] if layers[0] > 0 else 0.0
+        box = np.array([[*(centre - long_mm), bottom], [*(centre + long_mm), tops_mm[layers[-1]]]])
+        return PlacedDefect(defect.kind, tuple(layers), np.array([region]), None, None, box)
+    return None
+
+
+def _under_extrusion(
+    defect: Defect,
+    part: m3.Manifold,
+    tops_mm: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    scale: float,
+) -> PlacedDefect | None:
+    flow = defect.values["flow"]
+    diameter_mm = defect.values["diameter"] * scale
+    for layers in _layer_ranges(defect, tops_mm, rng):
+        room = _solid_through(part, layers, tops_mm)
+        if room.area() < 1.0:
+            continue
+        low, high = _z_range(layers, tops_mm)
+        centre, half_mm = np.zeros(2), _EVERYWHERE_MM
+        bounds = np.array(room.bounds()).reshape(2, 2)
+        if diameter_mm > 0:
+            half_mm = 0.5 * diameter_mm
+            found = random_point(room.offset(-half_mm, m3.JoinType.Round), rng)
+            if found is None:
+                continue
+            centre = found
+            bounds = np.stack([centre - half_mm, centre + half_mm])
+        bottom = tops_mm[layers[0] - 1] if layers[0] > 0 else 0.0
+        box = np.array([[*bounds[0], bottom], [*bounds[1], tops_mm[layers[-1]]]])
+        region = [*centre, 1.0, 0.0, half_mm, half_mm, low, high, flow]
+        return PlacedDefect(defect.kind, tuple(layers), np.array([region]), None, None, box)
+    return None
+
+
+def _bite(
+    centre_mm: Float[np.ndarray, " 3"],
+    radius_mm: float,
+    roughness_mm: float,
+    rng: np.random.Generator,
+) -> m3.Manifold:
+    """A ball with a rough surface (the fracture), and open above: a bite from the top."""
+    ball = m3.Manifold.sphere(radius_mm, 48).to_mesh64()
+    corners = np.asarray(ball.vert_properties)[:, :3]
+    waves = rng.normal(size=(24, 3)) * (3.0 / radius_mm)
+    phases = rng.uniform(0, 2 * np.pi, 24)
+    noise = np.sqrt(2 / 24) * np.cos(corners @ waves.T + phases).sum(axis=1)
+    limit_mm = min(roughness_mm, 0.15 * radius_mm)
+    corners = corners * (1 + limit_mm * noise / radius_mm)[:, None]
+    rough = m3.Manifold(m3.Mesh64(corners, np.asarray(ball.tri_verts)))
+    column = m3.Manifold.cylinder(4 * radius_mm, radius_mm, radius_mm, 48)
+    return (rough + column).translate(tuple(centre_mm))
+
+
+def _chip(
+    defect: Defect,
+    part: m3.Manifold,
+    tops_mm: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    scale: float,
+) -> PlacedDefect | None:
+    """A bite off an edge of the top: the ball's centre lies on the outline near the top."""
+    radius_mm = 0.5 * defect.values["size"] * scale
+    height_mm = float(part.bounding_box()[5])
+    depth_mm = min(0.05 + 0.3 * radius_mm, 0.2 * height_mm)
+    section = part.slice(height_mm - depth_mm)
+    outlines = [np.asarray(polygon, dtype=np.float64) for polygon in section.to_polygons()]
+    if not outlines or section.area() < 1.0:
+        return None
+    lengths = [np.linalg.norm(np.roll(o, -1, axis=0) - o, axis=1) for o in outlines]
+    starts = np.concatenate(outlines)
+    ends = np.concatenate([np.roll(o, -1, axis=0) for o in outlines])
+    weight = np.concatenate(lengths)
+    for _ in range(_TRIES):
+        pick = int(rng.choice(len(starts), p=weight / weight.sum()))
+        on_edge = starts[pick] + rng.random() * (ends[pick] - starts[pick])
+        centre = np.array([*on_edge, height_mm])
+        bite = _bite(centre, radius_mm, defect.values["roughness"], rng)
+        broken = part ^ bite
+        volume_mm3 = broken.volume()
+        ball_mm3 = 4 / 3 * np.pi * radius_mm**3
+        if volume_mm3 < 0.05 * ball_mm3 or volume_mm3 < 3.0:
+            continue
+        pieces = (part - bite).decompose()
+        # what falls off with it would lie loose on the bed: not a chip
+        if len(pieces) > 1 and sorted(piece.volume() for piece in pieces)[-2] > 0.05:
+            continue
+        box = np.array(broken.bounding_box()).reshape(2, 3)
+        grow_mm = np.array([0.5, 0.5, 0.5])  # the print stands a little off the CAD
+        box = np.stack([box[0] - grow_mm, box[1] + grow_mm])
+        return PlacedDefect(defect.kind, (), np.zeros((0, 9)), bite, None, box)
+    return None
+
+
+def _blob(
+    defect: Defect,
+    part: m3.Manifold,
+    tops_mm: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    scale: float,
+) -> PlacedDefect | None:
+    radius_mm = 0.5 * defect.values["size"] * scale
+    height_mm = defect.values["height"] * scale
+    top_mm = float(tops_mm[-1])
+    room = part.slice(top_mm - 0.1).offset(-0.3 * radius_mm, m3.JoinType.Round)
+    centre = random_point(room, rng)
+    if centre is None:
+        return None
+    dome = m3.Manifold.sphere(1.0, 48).scale((radius_mm, radius_mm, height_mm))
+    dome = dome.trim_by_plane((0.0, 0.0, 1.0), -0.05).translate((*centre, top_mm))
+    box = np.array(dome.bounding_box()).reshape(2, 3)
+    return PlacedDefect(defect.kind, (), np.zeros((0, 9)), None, dome, box)

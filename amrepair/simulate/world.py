@@ -1,0 +1,271 @@
+"""The simulated world: beads are laid in it, pieces break off it, scanners look at it.
+
+Columns of at most 0.15 mm in XY, each a list of solid z-intervals in continuous z. What the
+nozzle did comes as `MotionBatch`; the world knows neither G-code nor the part that was meant.
+The bead model is told in `deposit_kernels`; its parameters are in `BeadModel`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.errors import InputError
+from amrepair.simulate.columns import Columns, IntervalMap, Window
+from amrepair.simulate.deposit_kernels import deposit
+from amrepair.simulate.truth import Difference
+from gcode.firmware.motion import MotionBatch
+from gcode.surfaces import HeightField
+
+MAX_CELL_MM = 0.15
+_PHASES = 8  # sub-column positions of the nozzle that have a list of neighbours of their own
+_STATE_SIZE = 6
+
+
+@dataclass(frozen=True, slots=True)
+class BeadModel:
+    """How plastic behaves under the nozzle.
+
+    Attributes
+    ----------
+    step_mm
+        Length of path per deposition step.
+    gap_layers
+        A gap below the nozzle of more layers than this is bridged, not filled.
+    reach_ratio
+        How far plastic spreads sideways at once, in nozzle diameters from the nozzle's axis.
+    spread_ratio
+        How far pressure can push it before it rises as a ridge, likewise.
+    flat_ratio
+        Radius of the nozzle's flat, likewise: ridges stand outside it.
+    carry_mm3
+        Plastic that rides along with the nozzle before it must go somewhere.
+    """
+
+    step_mm: float = 0.2
+    gap_layers: float = 2.5
+    reach_ratio: float = 1.75
+    spread_ratio: float = 4.0
+    flat_ratio: float = 1.25
+    carry_mm3: float = 0.02
+
+
+class FlowDefect(Protocol):
+    """Anything that changes the flow somewhere: a placed void or under-extrusion."""
+
+    @property
+    def flow_regions(self) -> Float[np.ndarray, "n 9"]:
+        """(n, 9) ellipses: x, y, cos, sin, half-axes, z above, z up to, flow factor."""
+        ...
+
+
+class World:
+    """What stands on the bed.
+
+    Parameters
+    ----------
+    bed_size_mm
+        Bed in X and Y; its corner is the build frame's origin.
+    cell_mm
+        Edge of a column, at most 0.15 mm.
+    nozzle_diameter_mm, filament_diameter_mm
+        Bore of the nozzle, and the filament that motion is told in.
+    margin_mm
+        How far the world goes beyond the bed (some printers prime there).
+
+    Attributes
+    ----------
+    lost_mm3
+        Plastic pushed out beyond the world.
+    """
+
+    def __init__(
+        self,
+        bed_size_mm: tuple[float, float],
+        *,
+        cell_mm: float = 0.125,
+        nozzle_diameter_mm: float = 0.4,
+        filament_diameter_mm: float = 1.75,
+        margin_mm: float = 10.0,
+        bead: BeadModel | None = None,
+    ) -> None:
+        if not 0.02 <= cell_mm <= MAX_CELL_MM:
+            raise InputError(
+                f"a world's columns must be 0.02 to {MAX_CELL_MM} mm wide, not {cell_mm} mm"
+            )
+        self.bead = bead or BeadModel()
+        self.nozzle_diameter_mm = nozzle_diameter_mm
+        self.filament_mm2 = np.pi / 4 * filament_diameter_mm**2
+        self.columns = Columns(
+            origin_mm=(-margin_mm, -margin_mm),
+            size_mm=(bed_size_mm[0] + 2 * margin_mm, bed_size_mm[1] + 2 * margin_mm),
+            cell_mm=cell_mm,
+        )
+        self._near, self._counts = _neighbours(cell_mm, nozzle_diameter_mm, self.bead)
+        self._state = np.zeros(_STATE_SIZE)
+        self._pulled_mm = 0.0  # filament retracted and not yet pushed back
+        self._layer_tops_mm = np.zeros(0)  # heights extruded at so far, rising
+        self.pushed_mm3 = 0.0
+
+    @property
+    def cell_mm(self) -> float:
+        """Edge of a column."""
+        return self.columns.cell_mm
+
+    @property
+    def lost_mm3(self) -> float:
+        """Plastic pushed out beyond the world."""
+        return float(self._state[4]) * self.cell_mm**2
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume of everything solid."""
+        return self.snapshot().volume_mm3
+
+    def deposit(self, motion: MotionBatch, defects: Sequence[FlowDefect] = ()) -> float:
+        """Lay what the nozzle pushed out.
+
+        Parameters
+        ----------
+        motion
+            Executed moves, in order, build frame.
+        defects
+            Placed defects that change the flow of these moves.
+
+        Returns
+        -------
+        float
+            Volume that left the nozzle, mm³.
+        """
+        if len(motion) == 0:
+            return 0.0
+        volume_mm3 = self._pushed_mm(motion.filament_mm) * self.filament_mm2
+        thickness_mm = self._thickness_mm(motion, volume_mm3)
+        none = np.zeros((0, 9))
+        regions = np.concatenate([none, *(defect.flow_regions for defect in defects)])
+        pool, pool_next, pushed = deposit(
+            *self.columns.arrays,
+            self.columns.touched,
+            self._near,
+            self._counts,
+            _PHASES,
+            np.array([*self.columns.origin_mm, self.cell_mm]),
+            self._state,
+            np.ascontiguousarray(motion.start_mm, dtype=np.float64),
+            np.ascontiguousarray(motion.end_mm, dtype=np.float64),
+            volume_mm3,
+            thickness_mm,
+            np.ascontiguousarray(regions),
+            self.bead.step_mm,
+            self.bead.gap_layers,
+            self.bead.carry_mm3 / self.cell_mm**2,
+        )
+        self.columns.pool, self.columns.pool_next = pool, pool_next
+        self.pushed_mm3 += float(pushed)
+        return float(pushed)
+
+    def add(self, solid: manifold3d.Manifold) -> float:
+        """Unite the world with a solid of the build frame; returns the volume added, mm³."""
+        return self.columns.unite(self.columns.rasterise(solid))
+
+    def remove(self, solid: manifold3d.Manifold) -> float:
+        """Take a solid of the build frame out of the world; returns the volume removed, mm³."""
+        return self.columns.cut(self.columns.rasterise(solid))
+
+    def snapshot(self, window: Window | None = None) -> IntervalMap:
+        """The intervals of a window (default: all in use) as they are now."""
+        return self.columns.snapshot(self.window() if window is None else window)
+
+    def window(self) -> Window:
+        """The columns in use, and as far around them as plastic can have spread."""
+        spread_mm = self.bead.spread_ratio * self.nozzle_diameter_mm
+        return self.columns.window(margin_mm=spread_mm + self.cell_mm)
+
+    def missing_versus(
+        self, reference: World, box_mm: Float[np.ndarray, "2 3"] | None = None
+    ) -> Difference:
+        """What this world lacks, and has too much, against a reference without defects."""
+        window = self.window().union(reference.window())
+        mine, other = self.snapshot(window), reference.snapshot(window)
+        if box_mm is not None:
+            mine, other = mine.clipped(box_mm), other.clipped(box_mm)
+        return Difference(missing=other.minus(mine), excess=mine.minus(other))
+
+    def top(self, margin_mm: float = 2.0) -> HeightField:
+        """The highest solid of every column in use, as a height field; all of it is seen."""
+        window = self.columns.window(margin_mm=margin_mm)
+        z_mm = self.snapshot(window).top_mm()
+        return HeightField(
+            origin_mm=np.array(window.corner_mm),
+            cell_mm=self.cell_mm,
+            z_mm=z_mm,
+            seen=np.ones(z_mm.shape, dtype=bool),
+        )
+
+    def copy(self) -> World:
+        """An independent copy; what is laid in one does not show in the other."""
+        twin = World.__new__(World)
+        twin.__dict__.update(self.__dict__)
+        twin.columns = self.columns.copy()
+        twin._state = self._state.copy()
+        return twin
+
+    def _pushed_mm(self, filament_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Filament that left the nozzle in each move: what was pulled must come back first."""
+        position = np.concatenate([[-self._pulled_mm], filament_mm]).cumsum()
+        front = np.maximum.accumulate(np.maximum(position, 0.0))
+        self._pulled_mm = float(front[-1] - position[-1])
+        return np.diff(front)
+
+    def _thickness_mm(
+        self, motion: MotionBatch, volume_mm3: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Layer thickness of each move: the step to the highest layer laid below its height.
+
+        Bounded by what its own cross-section can fill, for moves that follow no layers.
+        """
+        z_mm = motion.end_mm[:, 2]
+        laid = volume_mm3 > 0
+        tops = np.union1d(self._layer_tops_mm, np.round(z_mm[laid], 3))
+        self._layer_tops_mm = tops
+        floor_mm = np.concatenate([[0.0], tops])
+        below = floor_mm[np.searchsorted(tops, z_mm - 0.02, side="right")]
+        length_mm = np.linalg.norm(motion.end_mm - motion.start_mm, axis=1)
+        nozzle_mm = self.nozzle_diameter_mm
+        flat_mm = volume_mm3 / np.maximum(length_mm, 0.1) / nozzle_mm
+        step_mm = np.clip(z_mm - below, 0.25 * flat_mm, 4.0 * flat_mm)
+        return np.clip(step_mm, 0.05, nozzle_mm)
+
+
+def _neighbours(
+    cell_mm: float, nozzle_mm: float, bead: BeadModel
+) -> tuple[np.ndarray, np.ndarray]:  # integer tables, (phases², L, 2) and (phases², 4)
+    """Column offsets by rising distance from the nozzle's axis, for each sub-column position.
+
+    Counts: columns under the bore, within reach, under the flat, within the spread.
+    """
+    radius_mm = bead.spread_ratio * nozzle_mm
+    half = int(np.ceil(radius_mm / cell_mm)) + 1
+    dy, dx = (grid.ravel() for grid in np.mgrid[-half : half + 1, -half : half + 1])
+    most = int(np.pi * (radius_mm / cell_mm + 1) ** 2) + 8
+    near = np.zeros((_PHASES**2, most, 2), dtype=np.int64)
+    counts = np.zeros((_PHASES**2, 4), dtype=np.int64)
+    ratios = (0.5, bead.reach_ratio, bead.flat_ratio, bead.spread_ratio)
+    for py in range(_PHASES):
+        for px in range(_PHASES):
+            x = (dx + 0.5 - (px + 0.5) / _PHASES) * cell_mm
+            y = (dy + 0.5 - (py + 0.5) / _PHASES) * cell_mm
+            distance_mm = np.hypot(x, y)
+            order = np.lexsort((np.arctan2(y, x), np.round(distance_mm, 9)))
+            order = order[distance_mm[order] <= radius_mm][:most]
+            row = py * _PHASES + px
+            near[row, : len(order), 0] = dy[order]
+            near[row, : len(order), 1] = dx[order]
+            limits = [ratio * nozzle_mm for ratio in ratios]
+            counts[row] = np.searchsorted(distance_mm[order], limits, side="right")
+    return near, counts
