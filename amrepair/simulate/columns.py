@@ -290,7 +290,8 @@ class Columns:
         window = change.window
         if (window.origin_mm, window.cell_mm) != (self.origin_mm, self.cell_mm):
             raise InputError("intervals can be merged only into columns of their own grid")
-        self.pool, self.pool_next, changed = kernels.merge_flat(
+        merge: Any = kernels.merge_flat
+        self.pool, self.pool_next, changed = merge(
             *self.arrays,
             window.y0,
             window.x0,

@@ -59,7 +59,8 @@ def place(
     box = part.bounding_box()
     raise InputError(
         f"the part of {box[3] - box[0]:.1f}×{box[4] - box[1]:.1f}×{box[5] - box[2]:.1f} mm has no "
-        f"room for the defect {defect}, even at {_SHRINK[-1]:.0%} of its size; ask for a smaller one"
+        f"room for the defect {defect}, even at {_SHRINK[-1]:.0%} of its size; "
+        "ask for a smaller one"
     )
 
 
@@ -196,7 +197,9 @@ def _bite(
     noise = np.sqrt(2 / 24) * np.cos(corners @ waves.T + phases).sum(axis=1)
     limit_mm = min(roughness_mm, 0.15 * radius_mm)
     corners = corners * (1 + limit_mm * noise / radius_mm)[:, None]
-    rough = m3.Manifold(m3.Mesh64(corners, np.asarray(ball.tri_verts)))
+    rough = m3.Manifold(
+        m3.Mesh64(np.ascontiguousarray(corners), np.array(ball.tri_verts, dtype=np.uint64))
+    )
     column = m3.Manifold.cylinder(4 * radius_mm, radius_mm, radius_mm, 48)
     return (rough + column).translate(tuple(centre_mm))
 

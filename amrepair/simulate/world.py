@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import manifold3d
 import numpy as np
@@ -148,7 +148,8 @@ class World:
         thickness_mm = self._thickness_mm(motion, volume_mm3)
         none = np.zeros((0, 9))
         regions = np.concatenate([none, *(defect.flow_regions for defect in defects)])
-        pool, pool_next, pushed = deposit(
+        lay_all: Any = deposit
+        pool, pool_next, pushed = lay_all(
             *self.columns.arrays,
             self.columns.touched,
             self._near,
