@@ -22,6 +22,8 @@ from amrepair.template.port import Template
 # sideways by one cell plus this many times the height.
 SIDEWAYS_PER_HEIGHT = 1.0
 NEIGHBOURS = 4
+# Planes more than 40° off the template's own slope are another surface.
+STRIP_COSINE = 0.77
 # "Solid, as far as anybody knows": a clearance well below every threshold.
 SOLID_MM = -5.0
 # A sign vector needs this mean agreement with the template before file normals are believed.
@@ -106,6 +108,7 @@ def gather(
     scan: Scan, template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"]
 ) -> Evidence:
     """Collect the evidence of a scan whose off-template surfels are known."""
+    off = off | _strips(template, surfels, off)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
     if len(which):
@@ -117,6 +120,28 @@ def gather(
         images=range_images(scan, spacing_mm=surfels.spacing_mm),
         tree=cKDTree(surfels.place_mm, compact_nodes=False, balanced_tree=False),
     )
+
+
+def _strips(
+    template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"]
+) -> Bool[np.ndarray, " s"]:
+    """Surfels beside off-template ones whose plane crosses the template's surface.
+
+    The broken end of a thin wall lies at f ≈ 0 along both rims, yet it is no part of the
+    template's surface: its plane says so.
+    """
+    near = off.copy()
+    for _ in range(2):
+        touched = surfels.table[near]
+        near[touched[touched >= 0]] = True
+    which = np.flatnonzero(near & ~off)
+    strips = np.zeros_like(off)
+    if len(which):
+        gradient = template.distance_and_gradient(surfels.place_mm[which])[1]
+        gradient /= np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+        along = np.abs((gradient * surfels.planes(which)).sum(axis=1))
+        strips[which] = (along < STRIP_COSINE) & (surfels.deviation_mm[which] < 0)
+    return strips
 
 
 def _outward(
@@ -131,7 +156,7 @@ def _outward(
     guide: Float[np.ndarray, "q 3"] | None = None
     if scan.sensors_mm is not None and scan.sensor_index is not None:
         to_sensor = scan.sensors_mm[scan.sensor_index] - scan.points_mm
-        guide = surfels.mean_of(to_sensor[surfels.order])[which]
+        guide = surfels.mean_of(to_sensor)[which]
     elif scan.normals is not None:
         guide = _file_normals(scan.normals, template, surfels, off, which)
     if guide is None:
@@ -148,7 +173,7 @@ def _file_normals(
     which: Int[np.ndarray, " q"],
 ) -> Float[np.ndarray, "q 3"] | None:
     """The file's normals, turned outward as a whole; None where they contradict the template."""
-    mean = surfels.mean_of(normals[surfels.order])
+    mean = surfels.mean_of(normals)
     on = np.flatnonzero(~off)[:: max(1, int((~off).sum()) // 5000)]
     if len(on) == 0:
         return mean[which]

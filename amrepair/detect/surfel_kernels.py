@@ -39,7 +39,7 @@ def neighbour_table(keys: Any, stride_x: int, stride_y: int) -> Any:
 @njit(cache=True, nogil=True)
 def neighbour_sums(table: Any, values: Any) -> Any:
     """(s, c) sums of `values` over each cell and its neighbours."""
-    n, channels = values.shape
+    n, channels = table.shape[0], values.shape[1]
     out = np.zeros((n, channels))
     for i in range(n):
         for k in range(table.shape[1]):
