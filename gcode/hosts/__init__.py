@@ -3,3 +3,23 @@
 A host carries a checked program to a machine and says truthfully what arrived. It does not
 make, judge or alter G-code.
 """
+
+from gcode.hosts.connect import connect
+from gcode.hosts.port import (
+    Capabilities,
+    LinkLostError,
+    PrintableProgram,
+    Printer,
+    PrintReport,
+    Temperatures,
+)
+
+__all__ = [
+    "Capabilities",
+    "LinkLostError",
+    "PrintReport",
+    "PrintableProgram",
+    "Printer",
+    "Temperatures",
+    "connect",
+]

@@ -1,0 +1,129 @@
+"""How the emulated firmwares differ: one table.
+
+Facts from the firmwares' sources and documentation; where one is a choice of ours it says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+FirmwareName = Literal["marlin", "prusa", "klipper", "reprap"]
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """What a firmware says and takes.
+
+    Attributes
+    ----------
+    numbers
+        `verify`: number and checksum must be right; `checksum`: only the checksum, a bad line is
+        dropped silently; `ignore`: both are stripped unread.
+    modes_follow_g90
+        G90 and G91 set the extruder's mode too (Marlin); `relative_only`: G91 makes E relative
+        while it lasts and M83 persists (Klipper); `independent`: they leave it alone.
+    """
+
+    name: FirmwareName
+    banner: tuple[str, ...]
+    firmware_line: str
+    capabilities: tuple[tuple[str, bool], ...]
+    numbers: Literal["verify", "checksum", "ignore"]
+    modes_follow_g90: Literal["both", "relative_only", "independent"]
+    error_prefix: str
+    unknown: str
+    echo_prefix: str
+    emergency_parser: bool
+    keepalive: bool
+    temperatures_in_ok: bool
+    advanced_ok: bool
+
+
+_MARLIN_CAPABILITIES = (
+    ("SERIAL_XON_XOFF", False),
+    ("EEPROM", True),
+    ("AUTOREPORT_POS", True),
+    ("AUTOREPORT_TEMP", True),
+    ("PROGRESS", False),
+    ("AUTOLEVEL", True),
+    ("EMERGENCY_PARSER", True),
+    ("HOST_ACTION_COMMANDS", True),
+    ("ARCS", True),
+)
+
+VARIANTS: dict[str, Variant] = {
+    "marlin": Variant(
+        name="marlin",
+        banner=(
+            "start",
+            "echo:Marlin 2.1.2",
+            "echo: Last Updated: 2022-12-17 | Author: (emulated)",
+            "echo: Free Memory: 5000  PlannerBufferBytes: 1200",
+        ),
+        firmware_line="FIRMWARE_NAME:Marlin 2.1.2 (emulated) SOURCE_CODE_URL:none "
+        "PROTOCOL_VERSION:1.0 MACHINE_TYPE:{machine} EXTRUDER_COUNT:1",
+        capabilities=_MARLIN_CAPABILITIES,
+        numbers="verify",
+        modes_follow_g90="both",
+        error_prefix="Error:",
+        unknown='echo:Unknown command: "{command}"',
+        echo_prefix="echo:",
+        emergency_parser=True,
+        keepalive=True,
+        temperatures_in_ok=True,
+        advanced_ok=False,
+    ),
+    # MK3S: Prusa-Firmware, where only M82 and M83 set the extruder's mode.
+    "prusa": Variant(
+        name="prusa",
+        banner=("start", "echo: 3.13.3-7094", "echo: Last Updated: (emulated)"),
+        firmware_line="FIRMWARE_NAME:Prusa-Firmware 3.13.3 (emulated) based on Marlin "
+        "PROTOCOL_VERSION:1.0 MACHINE_TYPE:{machine} EXTRUDER_COUNT:1",
+        capabilities=(
+            ("AUTOREPORT_TEMP", True),
+            ("AUTOREPORT_POSITION", True),
+            ("EXTENDED_M20", True),
+        ),
+        numbers="verify",
+        modes_follow_g90="independent",
+        error_prefix="Error:",
+        unknown='echo:Unknown command: "{command}"',
+        echo_prefix="echo:",
+        emergency_parser=False,
+        keepalive=True,
+        temperatures_in_ok=True,
+        advanced_ok=False,
+    ),
+    "klipper": Variant(
+        name="klipper",
+        banner=(),
+        firmware_line="FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12.0-emulated",
+        capabilities=(),
+        numbers="ignore",
+        modes_follow_g90="relative_only",
+        error_prefix="!! ",
+        unknown='// Unknown command:"{command}"',
+        echo_prefix="// ",
+        emergency_parser=False,
+        keepalive=False,
+        temperatures_in_ok=True,
+        advanced_ok=False,
+    ),
+    "reprap": Variant(
+        name="reprap",
+        banner=("RepRapFirmware for emulated boards is up and running.",),
+        firmware_line="FIRMWARE_NAME: RepRapFirmware for emulated boards FIRMWARE_VERSION: 3.6.0 "
+        "ELECTRONICS: emulated",
+        capabilities=(),
+        numbers="checksum",
+        modes_follow_g90="independent",
+        error_prefix="Error: ",
+        unknown="Error: Bad command: {command}",
+        echo_prefix="",
+        emergency_parser=False,
+        keepalive=False,
+        temperatures_in_ok=True,
+        advanced_ok=False,
+    ),
+}

@@ -1,0 +1,55 @@
+"""From a port's name on the command line to the printer behind it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gcode.errors import InputError
+from gcode.hosts.file import FilePrinter
+from gcode.hosts.journal import Journal
+from gcode.hosts.port import Printer
+from gcode.hosts.serial import SerialPrinter
+
+
+def connect(
+    port: str,
+    *,
+    dialect: str = "marlin",
+    baud: int = 115200,
+    wire_log: Path | None = None,
+    journal: Path | None = None,
+) -> Printer:
+    """Return the printer that `port` names, not connected yet.
+
+    Parameters
+    ----------
+    port
+        A device path, `octoprint+http://…`, `moonraker+http://…` or `file:PATH`.
+
+    Raises
+    ------
+    InputError
+        If the name is none of these.
+    """
+    if port.startswith("file:"):
+        return FilePrinter(Path(port.removeprefix("file:")))
+    if port.startswith(("octoprint+http://", "octoprint+https://")):
+        from gcode.hosts.octoprint import OctoPrintPrinter
+
+        return OctoPrintPrinter(port.removeprefix("octoprint+"))
+    if port.startswith(("moonraker+http://", "moonraker+https://")):
+        from gcode.hosts.moonraker import MoonrakerPrinter
+
+        return MoonrakerPrinter(port.removeprefix("moonraker+"))
+    if "://" in port:
+        raise InputError(
+            f"{port!r} names no kind of printer; write a device path, octoprint+http://…, "
+            f"moonraker+http://… or file:PATH."
+        )
+    return SerialPrinter(
+        port,
+        baud=baud,
+        dialect=dialect,
+        wire_log=wire_log,
+        journal=Journal(journal) if journal is not None else None,
+    )

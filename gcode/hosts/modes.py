@@ -1,0 +1,97 @@
+"""Where a program leaves the machine after some of its lines: modes, feed, position.
+
+Just enough to come back after a pause and to compare with M114; the full reader is `gcode.reader`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+
+from gcode.hosts.port import PrintableProgram
+
+_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
+_NAME = re.compile(r"([GM])\s*0*(\d+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Modes:
+    """Modal state of a machine; positions are logical, as M114 tells them, None if unknown."""
+
+    absolute: bool = True
+    absolute_e: bool = True
+    unit_mm: float = 1.0
+    feed_mm_min: float | None = None
+    position_mm: dict[str, float] = field(default_factory=dict)
+
+    def restore(self, x_mm: float, y_mm: float, z_mm: float, e_mm: float) -> tuple[str, ...]:
+        """Commands that bring the machine to a place and back into these modes."""
+        commands = ["G21", "G90", f"G1 X{x_mm:.3f} Y{y_mm:.3f} F6000", f"G1 Z{z_mm:.3f} F600"]
+        commands.append(f"G92 E{e_mm:.5f}")
+        if self.feed_mm_min is not None:
+            commands.append(f"G1 F{self.feed_mm_min:g}")
+        if not self.absolute:
+            commands.append("G91")
+        commands.append("M82" if self.absolute_e else "M83")  # after G90 and G91, always
+        if self.unit_mm != 1.0:
+            commands.append("G20")
+        return tuple(commands)
+
+
+def modes_after(checked: PrintableProgram, line: int, dialect: str) -> Modes:
+    """Return the modes after the lines [0, line) of a program."""
+    modes = Modes()
+    for start in range(0, line, 4096):
+        for text in checked.lines(start, min(line, start + 4096)):
+            modes = follow(modes, text, dialect)
+    return modes
+
+
+def follow(modes: Modes, text: str, dialect: str) -> Modes:
+    """Return the modes after one more line."""
+    command = text.partition(";")[0].strip().upper()
+    match = _NAME.match(command)
+    if match is None:
+        return modes
+    name = match.group(1) + match.group(2)
+    words = {letter: float(value) for letter, value in _WORD.findall(command[match.end() :])}
+    if name in ("G0", "G1", "G2", "G3"):
+        return _move(modes, words)
+    if name in ("G90", "G91"):
+        absolute = name == "G90"
+        if dialect == "marlin":
+            return replace(modes, absolute=absolute, absolute_e=absolute)
+        return replace(modes, absolute=absolute)
+    if name in ("M82", "M83"):
+        return replace(modes, absolute_e=name == "M82")
+    if name in ("G20", "G21"):
+        return replace(modes, unit_mm=25.4 if name == "G20" else 1.0)
+    if name == "G92":
+        place = {letter: words[letter] * modes.unit_mm for letter in "XYZE" if letter in words}
+        return replace(modes, position_mm={**modes.position_mm, **place})
+    if name == "G28":
+        gone = {letter for letter in "XYZ" if letter in command[3:]} or set("XYZ")
+        return replace(
+            modes,
+            position_mm={k: v for k, v in modes.position_mm.items() if k not in gone},
+        )
+    return modes
+
+
+def _move(modes: Modes, words: dict[str, float]) -> Modes:
+    place = dict(modes.position_mm)
+    for letter in "XYZE":
+        if letter not in words:
+            continue
+        value = words[letter] * modes.unit_mm
+        absolute = modes.absolute_e if letter == "E" else modes.absolute
+        if absolute:
+            place[letter] = value
+        elif letter in place:
+            place[letter] += value
+    feed = words.get("F")
+    return replace(
+        modes,
+        position_mm=place,
+        feed_mm_min=modes.feed_mm_min if feed is None else feed * modes.unit_mm,
+    )

@@ -1,0 +1,173 @@
+"""The `Printer` port: what any machine can be asked for, whatever carries the bytes.
+
+Adapters live beside this file (`serial`, `octoprint`, `moonraker`, `file`). A printer prints
+checked programs only; it does not judge, make or alter them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from gcode.errors import LinkError
+from gcode.moves import Program
+from gcode.progress import Progress, silent
+
+
+@runtime_checkable
+class PrintableProgram(Protocol):
+    """What a host needs of a `CheckedProgram`."""
+
+    @property
+    def program(self) -> Program:
+        """The program's text and dialect."""
+        ...
+
+    def lines(self, first: int, end: int) -> Sequence[str]:
+        """Lines of the half-open range [first, end)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Temperatures:
+    """Current and target temperatures, °C; the bed is None where there is none."""
+
+    hotend_c: float
+    hotend_target_c: float
+    bed_c: float | None
+    bed_target_c: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a firmware says of itself (M115)."""
+
+    firmware: str
+    caps: dict[str, bool] = field(default_factory=dict)
+
+    def has(self, name: str) -> bool:
+        """Whether the firmware says that it can do `name`."""
+        return self.caps.get(name, False)
+
+
+@dataclass(frozen=True, slots=True)
+class PrintReport:
+    """What became of one `print` call.
+
+    Attributes
+    ----------
+    ok
+        Every line is acknowledged and proved to have been received.
+    lines_acked
+        Program lines acknowledged (comments and empty lines are never sent).
+    next_line
+        The first program line not known to be executed.
+    round_trip_s
+        Percentiles 50, 95 and 99 of the time from a line to its `ok`.
+    """
+
+    ok: bool
+    lines_acked: int
+    resends: int
+    stalls: int
+    spare_oks: int
+    bytes_sent: int
+    seconds: float
+    next_line: int
+    round_trip_s: tuple[float, float, float]
+    warnings: tuple[str, ...] = ()
+
+
+class LinkLostError(LinkError):
+    """The link was lost in mid-job; what is uncertain is named.
+
+    Attributes
+    ----------
+    last_executed_line
+        The last program line known to be executed, -1 if none.
+    last_sent_line
+        The last program line sent: those between may or may not have been executed.
+    """
+
+    def __init__(self, message: str, last_executed_line: int, last_sent_line: int) -> None:
+        super().__init__(message)
+        self.last_executed_line = last_executed_line
+        self.last_sent_line = last_sent_line
+
+
+@runtime_checkable
+class Printer(Protocol):
+    """A machine that prints."""
+
+    def connect(self) -> None:
+        """Open the link and agree on line numbers.
+
+        Raises
+        ------
+        LinkError
+            If the printer cannot be reached.
+        PortBusyError
+            If another sender holds it.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the printer; harmless when not connected."""
+        ...
+
+    def capabilities(self) -> Capabilities:
+        """Return what the firmware says it can do."""
+        ...
+
+    def temperatures(self) -> Temperatures:
+        """Ask for temperatures."""
+        ...
+
+    def position_mm(self) -> tuple[float, float, float]:
+        """Ask for the logical position, mm."""
+        ...
+
+    def print(
+        self,
+        checked: PrintableProgram,
+        *,
+        lines: range | None = None,
+        progress: Progress = silent,
+    ) -> PrintReport:
+        """Print a checked program, or the part `lines` of it; return when all is acknowledged.
+
+        Several calls in a row make up one job.
+
+        Raises
+        ------
+        LinkLostError
+            If lines are in doubt, naming the interval.
+        PrinterError
+            If the printer reports a fault of its own.
+        """
+        ...
+
+    def finish_moves(self) -> None:
+        """Return when every buffered move has been made (M400)."""
+        ...
+
+    def pause(self) -> None:
+        """Stop after the line under way, lift the nozzle; from another thread than `print`."""
+        ...
+
+    def resume(self) -> None:
+        """Go back to where the pause began and go on."""
+        ...
+
+    def abort(self) -> None:
+        """End the job: nothing more is sent, heaters off, nozzle lifted."""
+        ...
+
+    def emergency_stop(self) -> None:
+        """Stop everything now; the printer must be reset afterwards."""
+        ...
+
+    def heaters_off(self) -> None:
+        """Switch hotend, bed and fan off."""
+        ...

@@ -1,0 +1,588 @@
+"""A printer on a serial port or pseudo-terminal: `protocol.Link` with a port and a clock.
+
+It owns the port, the lock, the wire log and the safe exit; what may be sent, and what an answer
+means, is `Link`'s business. DTR is left as it is: raising it resets most boards in mid-print.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import NoReturn, TypeVar
+
+import serial
+
+from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.hosts.journal import Journal
+from gcode.hosts.lock import PortLock
+from gcode.hosts.modes import modes_after
+from gcode.hosts.port import (
+    Capabilities,
+    LinkLostError,
+    PrintableProgram,
+    PrintReport,
+    Temperatures,
+)
+from gcode.hosts.proof import require_checked
+from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
+from gcode.hosts.telemetry import RoundTrips
+from gcode.hosts.wirelog import WireLog
+from gcode.progress import Progress, silent
+from gcode.protocol import Link, LinkTiming
+from gcode.protocol import events as ev
+
+Answer = TypeVar("Answer")
+PAUSE_LIFT_MM = 5.0
+PROGRESS_EVERY_LINES = 500
+QUERY_TRIES = 3
+
+
+class SerialPrinter:
+    """A printer behind a serial port.
+
+    Parameters
+    ----------
+    port
+        Device path.
+    baud
+        Speed of the port; a pseudo-terminal does not mind.
+    window
+        Lines under way at once; more than 1 only for firmware that buffers them.
+    wire_log
+        File for every byte either way, with times.
+    journal
+        Where the job's progress is written ahead of the wire.
+    supervise
+        Start the process that switches heaters off should this one be killed.
+    guard
+        Test on connecting that the firmware refuses wrong checksums and numbers, where its
+        dialect says so; a firmware that fails is refused (`LinkError`).
+    """
+
+    def __init__(
+        self,
+        port: str,
+        *,
+        baud: int = 115200,
+        dialect: str = "marlin",
+        window: int = 1,
+        wire_log: Path | None = None,
+        journal: Journal | None = None,
+        timing: LinkTiming | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        supervise: bool = True,
+        guard: bool = True,
+    ) -> None:
+        self.port = port
+        self._baud = baud
+        self._clock = clock
+        self._link = Link(dialect, window=window, timing=timing)
+        self._log = WireLog(wire_log) if wire_log is not None else None
+        self._journal = journal
+        self._supervise = supervise
+        self._guard = guard
+        self._supervisor: Supervisor | None = None
+        self._lock = PortLock(port)
+        self._serial: serial.Serial | None = None
+        self._fd = -1
+        self._poll = select.poll()
+        self._mutex = threading.RLock()
+        self._capabilities = Capabilities("")
+        self._sent_lines: deque[tuple[int, int]] = deque(maxlen=1024)
+        self._position: ev.PositionReport | None = None
+        self._temperatures: ev.TemperatureReport | None = None
+        self._failure: Exception | None = None
+        self._warnings: deque[str] = deque(maxlen=100)
+        self._round_trips = RoundTrips()
+        self._stalls = self._bytes_sent = self._lines_acked = 0
+        self._refused_numbers: list[int] = []
+        self._greeted = False
+        self._executed_line = -1
+        self._pause_asked = threading.Event()
+        self._go_on = threading.Event()
+        self._abort_asked = threading.Event()
+        self._printing = False
+        self.actions: deque[str] = deque(maxlen=100)
+
+    def __enter__(self) -> SerialPrinter:
+        self.connect()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            self.make_safe()
+        self.close()
+
+    # ------------------------------------------------------------------ connection
+
+    def connect(self) -> None:
+        """Open the port, agree on line numbers and ask who is there."""
+        if self._serial is not None:
+            return
+        self._lock.acquire()
+        try:
+            self._open_port()
+            self._greet()
+            if self._guard and self._link.dialect.verifies:
+                self._test_guard()
+            self._learn()
+        except BaseException:
+            self.close()
+            raise
+        if self._supervise:
+            self._supervisor = Supervisor(self._fd, self._lock.fd, self._journal_path())
+
+    def _journal_path(self) -> Path | None:
+        return self._journal.path if self._journal is not None else None
+
+    def _open_port(self) -> None:
+        device = serial.Serial(baudrate=self._baud, timeout=0, exclusive=False)
+        device.port = self.port
+        device.dtr = False  # a rising DTR resets the board (pyserial#124)
+        device.rts = False
+        try:
+            device.open()
+        except (serial.SerialException, OSError) as error:
+            raise LinkError(f"{self.port} cannot be opened ({error}); check the path.") from error
+        self._serial = device
+        self._fd = device.fileno()
+        self._keep_line_up()
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+
+    def _keep_line_up(self) -> None:
+        """Clear HUPCL: closing the port must not drop DTR and so reset the printer."""
+        import termios
+
+        with contextlib.suppress(termios.error):
+            attributes = termios.tcgetattr(self._fd)
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._fd, termios.TCSANOW, attributes)
+
+    def _greet(self, number: int = 0) -> None:
+        self._greeted = False
+        self._failure = None
+        self._write(self._link.hello(self._clock(), number=number))
+        while not self._greeted:
+            self._pump()
+        self._settle()
+
+    def _settle(self, quiet_s: float = 0.05) -> None:
+        """Hear out what a half line or an earlier sender may still cause."""
+        until_s = self._clock() + quiet_s
+        while (now_s := self._clock()) < until_s:
+            if self._pump(limit_s=until_s - now_s):
+                until_s = self._clock() + quiet_s / 2
+
+    def _test_guard(self) -> None:
+        """Send a line with a wrong checksum and one with a wrong number: both must bounce."""
+        number = self._link.last_sent + 1
+        for what, line in (
+            ("checksums", b"N%d M105*0\n" % number),
+            ("line numbers", _wrong_number(number + 7)),
+        ):
+            refused = False
+            for _ in range(QUERY_TRIES):
+                self._refused_numbers.clear()
+                self._write(line)
+                until_s = self._clock() + max(self._link.timing.doubt_s, 0.3)
+                while not self._refused_numbers and (left_s := until_s - self._clock()) > 0:
+                    self._pump(limit_s=left_s)
+                if self._refused_numbers:
+                    refused = True
+                    break
+            self._settle(0.02)
+            if not refused:
+                self._link.give_up(f"the firmware ignores {what}")
+                raise LinkError(
+                    f"The printer on {self.port} takes lines with wrong {what}: corruption could "
+                    f"not be noticed and nothing was printed; use another firmware or cable."
+                )
+        self._failure = None
+        self._greet(self._link.last_sent)
+
+    def _learn(self) -> None:
+        caps: dict[str, bool] = {}
+        firmware = ""
+        for event in self._ask("M115"):
+            if isinstance(event, ev.FirmwareInfo):
+                firmware = event.name
+            elif isinstance(event, ev.Capability):
+                caps[event.name] = event.enabled
+        self._capabilities = Capabilities(firmware, caps)
+
+    def close(self) -> None:
+        """Let go of the printer; heaters stay as they are (`make_safe` switches them off)."""
+        if self._supervisor is not None:
+            self._supervisor.stand_down()
+            self._supervisor = None
+        if self._serial is not None:
+            with contextlib.suppress(OSError, serial.SerialException):
+                self._serial.close()
+            self._serial = None
+        self._lock.release()
+        if self._log is not None:
+            self._log.flush()
+
+    # ------------------------------------------------------------------ questions
+
+    def capabilities(self) -> Capabilities:
+        """Return what the firmware said on connecting."""
+        return self._capabilities
+
+    def temperatures(self) -> Temperatures:
+        """Ask for temperatures (M105)."""
+        report = self._answer("M105", lambda: self._temperatures, "temperatures")
+        heaters = report.heaters
+        hotend = heaters.get("T") or heaters.get("T0")
+        if hotend is None:
+            raise LinkError("The printer reports no hotend temperature; check its firmware.")
+        bed = heaters.get("B")
+        return Temperatures(
+            hotend.current_c,
+            hotend.target_c or 0.0,
+            bed.current_c if bed else None,
+            (bed.target_c or 0.0) if bed else None,
+        )
+
+    def position_mm(self) -> tuple[float, float, float]:
+        """Ask for the logical position (M114)."""
+        report = self._where()
+        return report.x_mm, report.y_mm, report.z_mm
+
+    def _where(self) -> ev.PositionReport:
+        return self._answer("M114", lambda: self._position, "position")
+
+    def _answer(self, command: str, read: Callable[[], Answer | None], what: str) -> Answer:
+        for _ in range(QUERY_TRIES):
+            self._temperatures = self._position = None
+            self._ask(command)
+            value = read()
+            if value is not None:
+                return value
+        raise LinkError(f"The printer does not report its {what} to {command}; is it a printer?")
+
+    def _ask(self, command: str) -> list[ev.Event]:
+        """Send one command outside of any job and return what is said until its `ok`."""
+        with self._mutex:
+            heard: list[ev.Event] = []
+            while not self._link.ready:
+                heard += self._pump()
+            self._write(self._link.send(command, self._clock()))
+            while not self._link.idle:
+                heard += self._pump()
+            return heard
+
+    def _prove(self) -> None:
+        """Make sure that the printer has received every line, whatever its `ok`s say.
+
+        Only the execution of M114, numbered after them, can report a position.
+        """
+        self._where()
+        self._link.confirm()
+
+    # ------------------------------------------------------------------ printing
+
+    def print(
+        self,
+        checked: PrintableProgram,
+        *,
+        lines: range | None = None,
+        progress: Progress = silent,
+    ) -> PrintReport:
+        """Print a checked program, or a part of it; return when all is acknowledged."""
+        require_checked(checked)
+        if self._serial is None:
+            raise LocalProtocolError("The printer is not connected; call connect() first.")
+        total = checked.program.text.count("\n") + 1
+        first, end = (0, total) if lines is None else (lines.start, lines.stop)
+        start_s = self._clock()
+        before = (self._lines_acked, self._link.resends, self._stalls, self._link.spare_oks)
+        before_bytes = self._bytes_sent
+        self._round_trips = RoundTrips()
+        self._warnings.clear()
+        self._abort_asked.clear()
+        self._sent_lines.clear()
+        self._executed_line = first - 1
+        self._printing = True
+        try:
+            with self._mutex:
+                if self._journal is not None:
+                    self._journal.begin(checked.program.sha256, self.port, first, end)
+                whole = self._stream(checked, first, end, progress)
+                self._prove()
+                self._executed_line = self._last_sent_line(first)
+                if self._journal is not None:
+                    self._journal.acknowledged(self._executed_line + 1, self._link.last_acked)
+                    if whole and end >= total:
+                        self._journal.finish()
+        except (LinkError, LocalProtocolError):
+            self.make_safe()
+            raise
+        finally:
+            self._printing = False
+            if self._log is not None:
+                self._log.flush()
+        if not whole:
+            self.make_safe()
+        return PrintReport(
+            ok=whole,
+            lines_acked=self._lines_acked - before[0],
+            resends=self._link.resends - before[1],
+            stalls=self._stalls - before[2],
+            spare_oks=self._link.spare_oks - before[3],
+            bytes_sent=self._bytes_sent - before_bytes,
+            seconds=self._clock() - start_s,
+            next_line=end if whole else self._executed_line + 1,
+            round_trip_s=self._round_trips.summary_s(),
+            warnings=tuple(self._warnings),
+        )
+
+    def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
+        """Send the lines; False if the job was aborted."""
+        link, clock, journal, trips = self._link, self._clock, self._journal, self._round_trips
+        reserved = first
+        for index, command in _commands(checked, first, end):
+            if journal is not None and index >= reserved:
+                step = journal.step_lines if link.dialect.verifies else 1
+                reserved = index + step
+                journal.reserve(reserved, link.last_sent + 1 - index, self._executed_line + 1)
+            if self._pause_asked.is_set() and not self._sit_out_pause(checked, index):
+                return False
+            if self._abort_asked.is_set():
+                return False
+            sent_s = clock()
+            self._sent_lines.append((link.last_sent + 1, index))
+            self._write(link.send(command, sent_s))
+            while not link.ready:
+                self._pump()
+            trips.add(clock() - sent_s)
+            if index % PROGRESS_EVERY_LINES == 0:
+                progress("printing", index - first, end - first)
+        while not link.idle:
+            self._pump()
+        progress("printing", end - first, end - first)
+        return True
+
+    def _last_sent_line(self, first: int) -> int:
+        return self._sent_lines[-1][1] if self._sent_lines else first - 1
+
+    def finish_moves(self) -> None:
+        """Return when every buffered move has been made."""
+        self._ask("M400")
+
+    def command(self, text: str) -> None:
+        """Send one command of the host's own (parking, heating), outside any program."""
+        self._ask(text)
+
+    # ------------------------------------------------------------------ pause, abort, stop
+
+    def pause(self) -> None:
+        """Stop after the line under way and lift the nozzle; harmless when paused already."""
+        self._go_on.clear()
+        self._pause_asked.set()
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        self._pause_asked.clear()
+        self._go_on.set()
+
+    def abort(self) -> None:
+        """End the job: nothing more is sent, heaters off, nozzle lifted."""
+        self._abort_asked.set()
+        self._go_on.set()
+        if not self._printing:
+            self.make_safe()
+
+    def _sit_out_pause(self, checked: PrintableProgram, line: int) -> bool:
+        """Lift, wait, and restore position, modes, feed and extruder exactly; False on abort.
+
+        Whatever is extruded or moved meanwhile is undone by absolute moves and `G92 E`, so that
+        a purge during the pause makes no giant move (Printrun#70).
+        """
+        while not self._link.idle:
+            self._pump()
+        self._ask("M400")
+        place = self._where()
+        modes = modes_after(checked, line, self._link.dialect.name)
+        self._lift()
+        self._note("paused")
+        while not self._go_on.wait(1.0):
+            self._ask("M105")  # keeps firmware time-outs and this end of the link awake
+        if self._abort_asked.is_set():
+            return False
+        for command in modes.restore(place.x_mm, place.y_mm, place.z_mm, place.e_mm):
+            self._ask(command)
+        self._note("resumed")
+        return True
+
+    def _lift(self) -> None:
+        for command in ("G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
+            self._ask(command)
+
+    def emergency_stop(self) -> None:
+        """Send M112, past every queue that the firmware lets it pass."""
+        self._write_raw(b"\nM112\n")
+        self._link.give_up("an emergency stop was asked for")
+
+    def heaters_off(self) -> None:
+        """Switch hotend, bed and fan off, acknowledged."""
+        for command in SAFE_COMMANDS:
+            self._ask(command)
+
+    def make_safe(self) -> None:
+        """Heaters off and nozzle lifted, by any means left; says loudly if it cannot."""
+        if self._serial is None:
+            return
+        try:
+            if self._link.ended or not self._link.idle:
+                data = b"\n" + b"".join(command.encode() + b"\n" for command in SAFE_COMMANDS)
+                self._write_raw(data)
+                self._note("heaters off, unnumbered")
+            else:
+                self.heaters_off()
+                self._lift()
+                self._note("heaters off, nozzle lifted")
+        except (LinkError, LocalProtocolError, OSError) as error:
+            self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+
+    def _note(self, text: str) -> None:
+        self._warnings.append(text)
+        if self._log is not None:
+            self._log.add(self._clock(), b"#", text.encode("ascii", "replace"))
+        if self._journal is not None:
+            self._journal.note(text)
+
+    # ------------------------------------------------------------------ the wire
+
+    def _write(self, data: bytes) -> None:
+        self._write_raw(data)
+        self._bytes_sent += len(data)
+
+    def _write_raw(self, data: bytes) -> None:
+        if self._log is not None:
+            self._log.add(self._clock(), b">", data)
+        try:
+            written = os.write(self._fd, data)
+            while written < len(data):
+                select.select([], [self._fd], [], 1.0)
+                written += os.write(self._fd, data[written:])
+        except OSError as error:
+            self._lost(f"the port failed ({error})")
+
+    def _pump(self, limit_s: float | None = None) -> list[ev.Event]:
+        """Wait for the printer or for a deadline of the link, and act on what comes."""
+        link = self._link
+        now_s = self._clock()
+        wait_s = link.next_deadline_s() - now_s
+        if limit_s is not None:
+            wait_s = min(wait_s, limit_s)
+        wait_s = min(max(wait_s, 0.0), 0.5)
+        if self._poll.poll(wait_s * 1000 + 0.5 if wait_s else 0):
+            try:
+                data = os.read(self._fd, 65536)
+            except BlockingIOError:
+                return []
+            except OSError as error:
+                self._lost(f"the port failed ({error})")
+            if not data:
+                self._lost("the port was closed")
+            now_s = self._clock()
+            if self._log is not None:
+                self._log.add(now_s, b"<", data)
+            events = link.receive(data, now_s)
+        else:
+            events = link.tick(self._clock())
+        if output := link.take_output():
+            self._write(output)
+        for event in events:
+            if type(event) is ev.Acknowledged:
+                self._acked(event.number)
+            else:
+                self._on_event(event)
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+        return events
+
+    def _acked(self, number: int) -> None:
+        lines = self._sent_lines
+        if lines and lines[-1][0] == number:
+            self._executed_line = lines[-1][1]
+            self._lines_acked += 1
+        elif lines and lines[0][0] <= number < lines[-1][0]:
+            index = number - lines[-1][0] - 1
+            if -index <= len(lines):
+                self._executed_line = lines[index][1]
+            self._lines_acked += 1
+
+    def _on_event(self, event: ev.Event) -> None:
+        if isinstance(event, ev.TemperatureReport):
+            self._temperatures = event
+        elif isinstance(event, ev.PositionReport):
+            self._position = event
+        elif isinstance(event, ev.Greeted):
+            self._greeted = True
+        elif isinstance(event, ev.ResendRequested):
+            self._refused_numbers.append(event.number)
+        elif isinstance(event, ev.Probed):
+            self._stalls += 1
+        elif isinstance(event, ev.HostAction):
+            self.actions.append(event.action)
+            if event.action.split()[0] in ("pause", "cancel"):
+                (self.pause if event.action.startswith("pause") else self.abort)()
+        elif isinstance(event, ev.UnknownCommand):
+            self._warnings.append(event.text)
+        elif isinstance(event, ev.CommandFailed):
+            self._failure = PrinterError(
+                f"The printer reports a fault: {event.text}; the last program line known to be "
+                f"executed is {self._executed_line + 1}."
+            )
+        elif isinstance(event, ev.LinkLost):
+            self._failure = self._lost_error(event.why)
+
+    def _lost(self, why: str) -> NoReturn:
+        """Raise for a dead port."""
+        self._link.give_up(why)
+        raise self._lost_error(why)
+
+    def _lost_error(self, why: str) -> LinkLostError:
+        last_sent = max((line for _, line in self._sent_lines), default=self._executed_line)
+        return LinkLostError(
+            f"The link to {self.port} is lost: {why}; program lines up to "
+            f"{self._executed_line + 1} are executed, lines {self._executed_line + 2} to "
+            f"{last_sent + 1} are uncertain; find out where the printer is before going on.",
+            self._executed_line,
+            last_sent,
+        )
+
+
+def _wrong_number(number: int) -> bytes:
+    body = b"N%d M105" % number
+    value = 0
+    for byte in body:
+        value ^= byte
+    return b"%b*%d\n" % (body, value)
+
+
+def _commands(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
+    """Lines to send with their numbers in the program; comments and empty lines left out."""
+    step = 4096
+    for start in range(first, end, step):
+        stop = min(end, start + step)
+        for offset, line in enumerate(checked.lines(start, stop)):
+            command = line.partition(";")[0].strip()
+            if command:
+                yield start + offset, command

@@ -1,0 +1,70 @@
+"""The wire log: every byte either way with its time, in files that rotate.
+
+It is evidence, not logging: a file of its own, never filtered. It never sees a secret, because
+serial lines carry none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+FLUSH_ENTRIES = 2000
+
+
+class WireLog:
+    """Append-only; `>` to the printer, `<` from it, `#` a remark of the host.
+
+    Parameters
+    ----------
+    max_bytes
+        Size at which the file is renamed `.1` (`.1` to `.2`, and so on up to `keep`).
+    """
+
+    def __init__(self, path: Path, *, max_bytes: int = 64_000_000, keep: int = 3) -> None:
+        self.path = path
+        self._max_bytes = max_bytes
+        self._keep = keep
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("ab")
+        self._size = self._file.tell()
+        self._entries: list[tuple[float, bytes, bytes]] = []
+
+    def add(self, now_s: float, direction: bytes, data: bytes) -> None:
+        """Note bytes; they are written in batches."""
+        entries = self._entries
+        entries.append((now_s, direction, data))
+        if len(entries) >= FLUSH_ENTRIES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is noted."""
+        if not self._entries:
+            return
+        rows = [
+            b"%.6f %b %b" % (now_s, direction, data.rstrip(b"\n").replace(b"\n", b"\\n"))
+            for now_s, direction, data in self._entries
+        ]
+        self._entries.clear()
+        blob = b"\n".join(rows) + b"\n"
+        if self._size and self._size + len(blob) > self._max_bytes:
+            self._rotate()
+        self._file.write(blob)
+        self._file.flush()
+        self._size += len(blob)
+
+    def _rotate(self) -> None:
+        self._file.close()
+        for index in range(self._keep, 0, -1):
+            older = self.path.with_name(f"{self.path.name}.{index}")
+            newer = (
+                self.path if index == 1 else self.path.with_name(f"{self.path.name}.{index - 1}")
+            )
+            if newer.exists():
+                newer.replace(older)
+        self._file = self.path.open("ab")
+        self._size = 0
+
+    def close(self) -> None:
+        """Write what is left and close."""
+        self.flush()
+        self._file.close()

@@ -1,0 +1,20 @@
+"""The serial protocol of printers as a state machine: bytes in, events out.
+
+No I/O, no clock, no threads (h11 is the model). `hosts` gives it a port and a clock.
+"""
+
+from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
+from gcode.protocol.link import Link, LinkTiming, checksum, wire_text
+from gcode.protocol.transitions import TRANSITIONS, Signal, State
+
+__all__ = [
+    "LINK_DIALECTS",
+    "TRANSITIONS",
+    "Link",
+    "LinkDialect",
+    "LinkTiming",
+    "Signal",
+    "State",
+    "checksum",
+    "wire_text",
+]
