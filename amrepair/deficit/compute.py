@@ -240,7 +240,8 @@ def _solid_in_box(
         cautious = best
     # solid = both negative: inside the template and outside the as-built part (or the reverse)
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
-    core = (sign * f > tau_mm) & (sign * -cautious < -tau_mm / 2)
+    beyond = -sign * cautious  # missing: how empty; excess: how solid
+    core = (sign * f > tau_mm) & (beyond > tau_mm / 2)
     nearest = evidence.tree.query(samples[near], workers=2)[1]
     by_label = np.zeros(len(samples), bool)
     by_label[near] = labels[nearest] == int(label)
