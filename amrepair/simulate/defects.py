@@ -41,14 +41,14 @@ class Option:
 OPTIONS: dict[DefectKind, dict[str, Option]] = {
     DefectKind.VOID: {
         "diameter": Option(10.0, 2.0, 40.0, "mm across"),
-        "layers": Option(4, 1, 40, "layers not extruded"),
-        "layer": Option(-1, -1, 100000, "last layer, counted from 0; -1: seeded"),
+        "layers": Option(4.0, 1.0, 40.0, "layers not extruded"),
+        "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
         "wall": Option(2.0, 0.0, 20.0, "mm to the part's wall"),
     },
     DefectKind.UNDER_EXTRUSION: {
         "flow": Option(0.5, 0.0, 0.95, "flow left, of 1"),
-        "layers": Option(3, 1, 40, "layers affected"),
-        "layer": Option(-1, -1, 100000, "last layer, counted from 0; -1: seeded"),
+        "layers": Option(3.0, 1.0, 40.0, "layers affected"),
+        "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
         "diameter": Option(0.0, 0.0, 200.0, "mm across; 0: the whole layer"),
     },
     DefectKind.CHIP: {

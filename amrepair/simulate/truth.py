@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.simulate.columns import IntervalMap
+from amrepair.simulate.columns import IntervalMap, Window
 
-if TYPE_CHECKING:
-    from amrepair.simulate.world import World
+
+@runtime_checkable
+class Standing(Protocol):
+    """Anything that stands on the bed and can be looked into: a `World`."""
+
+    def snapshot(self, window: Window | None = None) -> IntervalMap:
+        """The intervals of a window as they are now."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +51,6 @@ class Difference:
         """Only where it is taller than `length_mm`: what a bead could mend."""
         return Difference(self.missing.thicker_than(length_mm), self.excess.thicker_than(length_mm))
 
-    def filled_mm3(self, world: World) -> float:
+    def filled_mm3(self, world: Standing) -> float:
         """Volume that was missing then and is solid in `world` now."""
         return self.missing.common(world.snapshot(self.missing.window)).volume_mm3

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import manifold3d
 import numpy as np
@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.simulate.columns import Columns, IntervalMap, Window
+from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.deposit_kernels import deposit
 from amrepair.simulate.truth import Difference
 from gcode.firmware.motion import MotionBatch
@@ -53,15 +54,6 @@ class BeadModel:
     spread_ratio: float = 4.0
     flat_ratio: float = 1.25
     carry_mm3: float = 0.02
-
-
-class FlowDefect(Protocol):
-    """Anything that changes the flow somewhere: a placed void or under-extrusion."""
-
-    @property
-    def flow_regions(self) -> Float[np.ndarray, "n 9"]:
-        """(n, 9) ellipses: x, y, cos, sin, half-axes, z above, z up to, flow factor."""
-        ...
 
 
 class World:
@@ -127,7 +119,7 @@ class World:
         """Volume of everything solid."""
         return self.snapshot().volume_mm3
 
-    def deposit(self, motion: MotionBatch, defects: Sequence[FlowDefect] = ()) -> float:
+    def deposit(self, motion: MotionBatch, defects: Sequence[PlacedDefect] = ()) -> float:
         """Lay what the nozzle pushed out.
 
         Parameters
