@@ -95,9 +95,7 @@ def sphere(centre: tuple[float, float, float], radius: float) -> AnalyticTemplat
     )
 
 
-def cylinder(
-    base: tuple[float, float, float], radius: float, height: float
-) -> AnalyticTemplate:
+def cylinder(base: tuple[float, float, float], radius: float, height: float) -> AnalyticTemplate:
     """Upright, `base` the middle of its foot."""
 
     def f(p: np.ndarray) -> np.ndarray:

@@ -178,9 +178,7 @@ def _boxes(
     return _merge(found)
 
 
-def _feet(
-    evidence: Evidence, which: np.ndarray
-) -> Float[np.ndarray, "q 3"]:
+def _feet(evidence: Evidence, which: np.ndarray) -> Float[np.ndarray, "q 3"]:
     """Where excess surfels stand on the template: along their planes, back by their height."""
     s = evidence.surfels
     return np.asarray(s.place_mm[which] - s.deviation_mm[which, None] * evidence.normal[which])

@@ -99,9 +99,7 @@ def solid_from_field(box: VoxelBox, field_mm: Float[np.ndarray, "x y z"]) -> man
     return solid if solid.volume() > 0 else solid.mirror((0, 0, 0))
 
 
-def _manifold(
-    vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
-) -> manifold3d.Manifold:
+def _manifold(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray) -> manifold3d.Manifold:
     """A solid from marching cubes' output, turned outward."""
     corners = vertices[faces]
     signed = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))

@@ -108,9 +108,7 @@ def classify(
     # a chip reaches the part's outline seen from above, a void lies within it
     low, high = template.bounds_mm
     middle = box_mm.mean(axis=0)
-    around = np.array(
-        [[box_mm[i, 0], box_mm[j, 1], middle[2]] for i in (0, 1) for j in (0, 1)]
-    )
+    around = np.array([[box_mm[i, 0], box_mm[j, 1], middle[2]] for i in (0, 1) for j in (0, 1)])
     at_rim = bool((template.distance(around) > -0.5).any())
     above = high[2] - box_mm[1, 2] < 1.0
-    return DefectType.CHIP if at_rim and not above or at_rim else DefectType.VOID
+    return DefectType.CHIP if (at_rim and not above) or at_rim else DefectType.VOID

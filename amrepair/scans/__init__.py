@@ -3,7 +3,19 @@
 This room reads files and sensors into `Scan`; it does not align, clean or judge.
 """
 
+from amrepair.scans.files import FileScanner, WatchedFolderScanner
+from amrepair.scans.ply import write_ply
+from amrepair.scans.readers import read_height_map, read_scan
 from amrepair.scans.scan import Scan
-from amrepair.scans.scanner import Scanner
+from amrepair.scans.scanner import Scanner, ScanRequest
 
-__all__ = ["Scan", "Scanner"]
+__all__ = [
+    "FileScanner",
+    "Scan",
+    "ScanRequest",
+    "Scanner",
+    "WatchedFolderScanner",
+    "read_height_map",
+    "read_scan",
+    "write_ply",
+]

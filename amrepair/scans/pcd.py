@@ -28,9 +28,7 @@ class PcdHeader:
     end: int
 
 
-def read_pcd(
-    data: bytes, path: Path
-) -> tuple[dict[str, Float[np.ndarray, " n"]], PcdHeader]:
+def read_pcd(data: bytes, path: Path) -> tuple[dict[str, Float[np.ndarray, " n"]], PcdHeader]:
     """Columns by field name.
 
     Raises
@@ -63,8 +61,10 @@ def _header(data: bytes, path: Path) -> PcdHeader:
     try:
         fields, sizes, kinds = said["FIELDS"], said["SIZE"], said["TYPE"]
         counts = said.get("COUNT", ["1"] * len(fields))
-        points = int(said["POINTS"][0]) if "POINTS" in said else (
-            int(said["WIDTH"][0]) * int(said["HEIGHT"][0])
+        points = (
+            int(said["POINTS"][0])
+            if "POINTS" in said
+            else (int(said["WIDTH"][0]) * int(said["HEIGHT"][0]))
         )
         names, parts = [], []
         for i, (f, s, k, c) in enumerate(zip(fields, sizes, kinds, counts, strict=True)):
@@ -118,8 +118,7 @@ def _compressed(body: bytes, header: PcdHeader, path: Path) -> dict[str, Float[n
     flat = lzf_decompress(np.frombuffer(body, np.uint8, packed, 8), size)
     if len(flat) != want:
         raise InputError(
-            f"{path}: the compressed PCD data unpack to {len(flat)} of {want} bytes; "
-            "it is damaged"
+            f"{path}: the compressed PCD data unpack to {len(flat)} of {want} bytes; it is damaged"
         )
     columns, at = {}, 0
     for name in header.names:

@@ -275,7 +275,7 @@ def _is_map(path: Path) -> bool:
     return table.ndim == 2 and table.shape[1] not in {3, 6}
 
 
-def _load_npy(path: Path) -> Float[np.ndarray, "..."]:
+def _load_npy(path: Path) -> Float[np.ndarray, ...]:
     try:
         return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
     except (OSError, ValueError, EOFError, TypeError) as e:
