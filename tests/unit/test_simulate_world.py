@@ -45,6 +45,7 @@ def block(corner: tuple[float, float], lines: int, layers: int, flow: float = 1.
     """A solid block: one perimeter and crossing lines, a whole number of spacings wide."""
     nozzle, size = Nozzle(), lines * SPACING_MM
     (x0, y0), section, half = corner, SECTION_MM2 * flow, SPACING_MM / 2
+    z = 0.0
     for layer in range(layers):
         z = HEIGHT_MM * (layer + 1)
         low, high = half, size - half
@@ -59,6 +60,7 @@ def block(corner: tuple[float, float], lines: int, layers: int, flow: float = 1.
             points = [(end, across) if layer % 2 == 0 else (across, end) for end in ends]
             nozzle.go(x0 + points[0][0], y0 + points[0][1], z)
             nozzle.go(x0 + points[1][0], y0 + points[1][1], z, section)
+    nozzle.go(0.0, 0.0, z + 5.0)  # what rides along with the nozzle is laid when it leaves
     return nozzle.batch()
 
 
