@@ -28,11 +28,11 @@ def knob() -> m3.Manifold:
     # the top is chamfered by a cone, and dished for a finger
     cone = cylinder(RADIUS_MM + 8.0, 16.0, RADIUS_MM - 8.0).translate((0, 0, HEIGHT_MM - 10.0))
     dish = m3.Manifold.sphere(20.0, 160).translate((0, 0, HEIGHT_MM + 18.5))
-    flat = m3.Manifold.cube((10.0, 10.0, 30.0)).translate((2.4, -5.0, -15.0))
-    bore = cylinder(3.1, 8.0).translate((0, 0, -0.5)) - flat
+    flat = m3.Manifold.cube((10.0, 10.0, 60.0)).translate((2.4, -5.0, -15.0))
+    bore = cylinder(3.1, 30.0).translate((0, 0, -0.5)) - flat
     return (
         (body ^ cone) + (body.trim_by_plane((0, 0, -1), 1.0 - HEIGHT_MM)) - dish - bore
-    ).simplify(1e-3)
+    ).simplify(5e-3)
 
 
 def main() -> None:
