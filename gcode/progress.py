@@ -5,9 +5,10 @@ Progress is not logging: it is said often, kept nowhere, and may be dropped.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Called as work goes on; must be cheap and must not raise."""
 

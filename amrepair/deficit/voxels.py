@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
-from skimage.measure import marching_cubes
+from skimage import measure
 
 from amrepair.errors import DeficitError
 
@@ -83,13 +84,12 @@ def solid_from_field(box: VoxelBox, field_mm: Float[np.ndarray, "x y z"]) -> man
     field_mm = np.where(np.abs(field_mm) < 1e-6, 1e-6, field_mm)
     limit = float(box.step_mm.max()) * 4
     padded = np.pad(np.clip(field_mm, -limit, limit), 1, constant_values=limit)
-    vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=tuple(box.step_mm))
+    extract: Any = measure.marching_cubes
+    vertices, faces, _, _ = extract(padded, 0.0, spacing=tuple(box.step_mm))
     vertices = vertices.astype(np.float64) + (box.low_mm - box.step_mm)
     solid = _manifold(vertices, faces)
     if solid.status() != manifold3d.Error.NoError:
-        vertices, faces, _, _ = marching_cubes(
-            padded, 0.0, spacing=tuple(box.step_mm), method="lorensen"
-        )
+        vertices, faces, _, _ = extract(padded, 0.0, spacing=tuple(box.step_mm), method="lorensen")
         solid = _manifold(vertices.astype(np.float64) + (box.low_mm - box.step_mm), faces)
     if solid.status() != manifold3d.Error.NoError:
         raise DeficitError(

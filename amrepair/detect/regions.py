@@ -106,9 +106,7 @@ def classify(
     if depth_mm < 0.05 * np.sqrt(area_mm2):
         return DefectType.UNDER_EXTRUSION
     # a chip reaches the part's outline seen from above, a void lies within it
-    low, high = template.bounds_mm
-    middle = box_mm.mean(axis=0)
-    around = np.array([[box_mm[i, 0], box_mm[j, 1], middle[2]] for i in (0, 1) for j in (0, 1)])
+    middle_z = float(box_mm[:, 2].mean())
+    around = np.array([[box_mm[i, 0], box_mm[j, 1], middle_z] for i in (0, 1) for j in (0, 1)])
     at_rim = bool((template.distance(around) > -0.5).any())
-    above = high[2] - box_mm[1, 2] < 1.0
-    return DefectType.CHIP if (at_rim and not above) or at_rim else DefectType.VOID
+    return DefectType.CHIP if at_rim else DefectType.VOID

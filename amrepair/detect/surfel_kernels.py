@@ -176,7 +176,7 @@ def look_up_depth(depth: Any, low: Any, extra: Any, u: Any, v: Any, blend: float
             continue
         a, b = depth[r0, c0], depth[r0, c0 + 1]
         p, q = depth[r0 + 1, c0], depth[r0 + 1, c0 + 1]
-        top, bottom = max(max(a, b), max(p, q)), min(min(a, b), min(p, q))
+        top, bottom = max(a, b, p, q), min(a, b, p, q)
         if np.isfinite(top) and top - bottom <= blend:
             fu, fv = u[i] - r0, v[i] - c0
             out[i] = (a * (1 - fv) + b * fv) * (1 - fu) + (p * (1 - fv) + q * fv) * fu

@@ -7,6 +7,7 @@ height maps apart: there NaN is the format's word for "nothing seen").
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -236,8 +237,10 @@ def read_height_map(
 
     try:
         heights = HeightField.read(path, cell_mm=cell_mm, origin_mm=origin_mm)
-    except (GcodeInputError, tifffile.TiffFileError) as e:
+    except GcodeInputError as e:
         raise InputError(str(e)) from e
+    except (tifffile.TiffFileError, struct.error, ValueError, IndexError) as e:
+        raise InputError(f"{path}: the height map cannot be read ({e})") from e
     x, y = heights.centres_mm()
     grid_x, grid_y = np.meshgrid(x, y)
     seen = heights.seen

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from amrepair.frames import Transform
 from amrepair.scans.scan import Scan
@@ -28,6 +28,7 @@ class ScanRequest:
     z_mm: float
 
 
+@runtime_checkable
 class Scanner(Protocol):
     """A sensor fixed over the bed.
 

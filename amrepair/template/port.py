@@ -6,12 +6,13 @@ those who ask never know whether the field was learned, exact or planned from G-
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 
+@runtime_checkable
 class Template(Protocol):
     """A signed distance field of the expected part."""
 

@@ -1,0 +1,103 @@
+"""The watched folder: partial, repeated, late and early files, without any waiting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amrepair.errors import InputError, ScannerError
+from amrepair.scans import FileScanner, Scan, ScanRequest, WatchedFolderScanner, write_ply
+
+
+class Time:
+    """A clock that only sleeping moves; things may happen while one sleeps."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.plan: list[tuple[float, Callable[[], object]]] = []
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+        due = [act for at, act in self.plan if at <= self.now_s]
+        self.plan = [(at, act) for at, act in self.plan if at > self.now_s]
+        for act in due:
+            act()
+
+
+def make(seed: int) -> Scan:
+    return Scan(np.random.default_rng(seed).uniform(0, 9, (40, 3)), 0.04, "scanner")
+
+
+def watcher(folder: Path, time: Time) -> WatchedFolderScanner:
+    return WatchedFolderScanner(folder, timeout_s=5.0, clock=time.clock, sleep=time.sleep)
+
+
+def ask(layer: int) -> ScanRequest:
+    return ScanRequest(f"layer-{layer:03d}", layer, layer * 0.2)
+
+
+def test_takes_the_new_file_not_the_old_one(tmp_path: Path) -> None:
+    time = Time()
+    write_ply(make(0), tmp_path / "old.ply")
+    scanner = watcher(tmp_path, time)
+    time.plan = [(1.0, lambda: write_ply(make(1), tmp_path / "new.ply"))]
+    assert np.array_equal(scanner.scan(ask(3)).points_mm, make(1).points_mm)
+
+
+def test_waits_for_a_file_that_still_grows(tmp_path: Path) -> None:
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    write_ply(make(1), tmp_path / "whole.hidden")
+    whole = (tmp_path / "whole.hidden").read_bytes()
+    path = tmp_path / "a.ply"
+    time.plan = [
+        (0.5, lambda: path.write_bytes(whole[:60])),
+        (1.8, lambda: path.write_bytes(whole[:500])),
+        (3.0, lambda: path.write_bytes(whole)),
+    ]
+    assert len(scanner.scan(ask(1))) == 40
+    assert time.now_s >= 3.0
+
+
+def test_a_repeat_is_not_a_new_scan(tmp_path: Path) -> None:
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    write_ply(make(1), tmp_path / "a.ply")
+    scanner.scan(ask(1))
+    write_ply(make(1), tmp_path / "b.ply")
+    with pytest.raises(ScannerError, match="repeats an earlier scan"):
+        scanner.scan(ask(2))
+
+
+def test_late_files_are_dropped_and_early_ones_kept(tmp_path: Path) -> None:
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    write_ply(make(3), tmp_path / "layer-003.ply")
+    write_ply(make(1), tmp_path / "layer-001.ply")
+    write_ply(make(2), tmp_path / "layer-002.ply")
+    assert np.array_equal(scanner.scan(ask(2)).points_mm, make(2).points_mm)
+    assert np.array_equal(scanner.scan(ask(3)).points_mm, make(3).points_mm)
+
+
+def test_silence_is_an_error_of_the_link(tmp_path: Path) -> None:
+    time = Time()
+    with pytest.raises(ScannerError, match="no new file") as caught:
+        watcher(tmp_path, time).scan(ask(1))
+    assert caught.value.exit_code == 4
+
+
+def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        WatchedFolderScanner(tmp_path / "gone")
+
+
+def test_file_scanner_reads_its_file(tmp_path: Path) -> None:
+    write_ply(make(5), tmp_path / "a.ply")
+    scan = FileScanner(tmp_path / "a.ply").scan(ScanRequest("final", None, 1.0))
+    assert np.array_equal(scan.points_mm, make(5).points_mm)

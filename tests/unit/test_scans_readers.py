@@ -1,0 +1,184 @@
+"""Readers: what a scanner or a peer writes comes back point by point, and damage is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.errors import InputError
+from amrepair.scans import Scan, read_scan, write_ply
+from gcode.surfaces import HeightField
+
+
+@pytest.fixture
+def scan() -> Scan:
+    rng = np.random.default_rng(3)
+    normals = rng.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Scan(
+        rng.uniform(0, 50, (50, 3)),
+        0.03,
+        "scanner",
+        normals,
+        np.array([[0.0, 0, 300], [100, 0, 250]]),
+        rng.integers(0, 2, 50),
+    )
+
+
+def lzf_literals(data: bytes) -> bytes:
+    """A valid LZF stream that only uses literals."""
+    out = bytearray()
+    for i in range(0, len(data), 32):
+        piece = data[i : i + 32]
+        out += bytes([len(piece) - 1]) + piece
+    return bytes(out)
+
+
+def pcd_header(n: int, kind: str) -> str:
+    return (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {kind}\n"
+    )
+
+
+def test_ply_round_trip_keeps_everything(tmp_path: Path, scan: Scan) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(scan, path, colours=np.full((50, 3), 7), scalars={"deviation": np.zeros(50)})
+    back = read_scan(path, frame="scanner")
+    assert np.array_equal(back.points_mm, scan.points_mm)
+    assert back.normals is not None
+    assert scan.normals is not None
+    assert np.allclose(back.normals, scan.normals, atol=1e-6)
+    assert back.sigma_mm == 0.03
+    assert np.array_equal(back.sensors_mm, scan.sensors_mm)  # type: ignore[arg-type]
+    assert np.array_equal(back.sensor_index, scan.sensor_index)  # type: ignore[arg-type]
+
+
+def test_ply_is_read_by_a_peer(tmp_path: Path, scan: Scan) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(scan, path)
+    assert np.allclose(trimesh.load(path).vertices, scan.points_mm)
+
+
+def test_ascii_ply_of_a_peer(tmp_path: Path, scan: Scan) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(trimesh.PointCloud(scan.points_mm).export(file_type="ply", encoding="ascii"))
+    assert np.allclose(read_scan(path, frame="scanner").points_mm, scan.points_mm, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary", "binary_compressed"])
+def test_pcd(tmp_path: Path, scan: Scan, kind: str) -> None:
+    rows = scan.points_mm.astype("<f4")
+    if kind == "ascii":
+        body = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in rows).encode()
+    elif kind == "binary":
+        body = rows.tobytes()
+    else:
+        flat = rows.T.tobytes()
+        packed = lzf_literals(flat)
+        body = np.array([len(packed), len(flat)], "<u4").tobytes() + packed
+    path = tmp_path / "a.pcd"
+    path.write_bytes(pcd_header(50, kind).encode() + body)
+    # nine digits of text hold a float32, read back as float64
+    assert np.allclose(read_scan(path, frame="scanner").points_mm, rows, rtol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["binary", "binary_compressed"])
+def test_pcd_of_open3d(tmp_path: Path, scan: Scan, kind: str) -> None:
+    from amrepair.device import open3d
+
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.repeat(scan.points_mm, 4, 0)))
+    path = tmp_path / "a.pcd"
+    o3d.io.write_point_cloud(str(path), cloud, compressed=kind == "binary_compressed")
+    back = read_scan(path, frame="scanner").points_mm
+    assert np.allclose(back, np.repeat(scan.points_mm, 4, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "separator", "head"), [("a.xyz", " ", ""), ("a.csv", ",", "x,y,z\n"), ("a.txt", ";", "")]
+)
+def test_text(tmp_path: Path, scan: Scan, name: str, separator: str, head: str) -> None:
+    path = tmp_path / name
+    path.write_text(head + "\n".join(separator.join(map(repr, r)) for r in scan.points_mm.tolist()))
+    assert np.array_equal(read_scan(path, frame="scanner").points_mm, scan.points_mm)
+
+
+@pytest.mark.parametrize("name", ["h.npz", "h.tif"])
+def test_height_map_is_seen_from_straight_above(tmp_path: Path, name: str) -> None:
+    field = HeightField(
+        np.array([10.0, 20.0]), 0.5, np.arange(12.0).reshape(3, 4), np.ones((3, 4), bool)
+    )
+    field.seen[1, 1] = False
+    field.write(tmp_path / name)
+    scan = read_scan(tmp_path / name, frame="build")
+    assert len(scan) == 11
+    assert np.allclose(scan.points_mm[0], [10.25, 20.25, 0.0])
+    assert scan.sensors_mm is not None
+    tilt = (scan.points_mm - scan.sensors_mm[0])[:, :2] / scan.sensors_mm[0, 2]
+    assert np.abs(tilt).max() < 1e-3
+
+
+def test_npy_height_map_needs_its_cell(tmp_path: Path) -> None:
+    np.save(tmp_path / "h.npy", np.ones((5, 7)))
+    with pytest.raises(InputError, match="cell"):
+        read_scan(tmp_path / "h.npy", frame="build")
+    assert len(read_scan(tmp_path / "h.npy", frame="build", cell_mm=0.5)) == 35
+
+
+def test_mesh_is_sampled_on_its_surface(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(subdivisions=4, radius=5.0).export(tmp_path / "s.stl")
+    scan = read_scan(tmp_path / "s.stl", frame="scanner")
+    radius = np.linalg.norm(scan.points_mm, axis=1)
+    assert np.abs(radius - 5.0).max() < 0.02  # sagitta of the facets
+    assert scan.normals is not None
+    assert ((scan.normals * scan.points_mm).sum(axis=1) > 4.9).all()
+
+
+def test_the_users_word_on_sensors_goes_first(tmp_path: Path, scan: Scan) -> None:
+    path = tmp_path / "a.xyz"
+    path.write_text("\n".join(" ".join(map(repr, r)) for r in scan.points_mm.tolist()))
+    told = read_scan(path, frame="scanner", sensor_at=(1.0, 2.0, 300.0), sigma_mm=0.1)
+    assert told.sigma_mm == 0.1
+    assert told.sensors_mm is not None
+    assert told.sensors_mm.tolist() == [[1.0, 2.0, 300.0]]
+
+
+BROKEN = {
+    "cut.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty double x\n"
+    b"property double y\nproperty double z\nend_header\nabc",
+    "none.ply": b"solid nothing",
+    "cut.pcd": pcd_header(9, "binary").encode() + b"123",
+    "packed.pcd": pcd_header(2, "binary_compressed").encode()
+    + np.array([4, 24], "<u4").tobytes()
+    + b"\xff\xff\xff\xff",
+    "size.pcd": pcd_header(2, "binary_compressed").encode() + b"\x01",
+    "no.pcd": b"hello",
+    "empty.xyz": b"",
+    "words.xyz": b"a b c\nd e f\n",
+    "two.csv": b"1,2\n3,4\n",
+    "nan.xyz": b"1 2 3\nnan 1 2\n",
+    "bad.npy": b"\x93NUMPY",
+    "bad.npz": b"PK",
+    "bad.stl": b"",
+    "bad.tif": b"II*",
+    "what.doc": b"1 2 3",
+}
+
+
+@pytest.mark.parametrize("name", sorted(BROKEN))
+def test_damage_is_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(BROKEN[name])
+    with pytest.raises(InputError) as caught:
+        read_scan(path, frame="scanner")
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value).strip()
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_scan(tmp_path / "gone.ply", frame="scanner")
