@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from amrepair.simulate.columns_kernels import grown, insert, surface_below
+from amrepair.simulate.columns_kernels import FRESH, grown, insert, surface_below
 
 # Entries of `state`, floats: what the nozzle carries along, and where it last was.
 CARRY, LAST_X, LAST_Y, LAST_Z, LOST, LAST_T = 0, 1, 2, 3, 4, 5
@@ -26,12 +26,33 @@ RIDGE_STEP_MM = 0.05  # a ridge grows evenly, by this much at a time
 MOST_RIDGE_STEPS = 4000
 
 
-@njit(cache=True)
+# The common cases are told twice, inline: a call with arrays costs more than the work itself.
+@njit(cache=True, inline="always")
+def surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z):
+    """As `surface_below`, the topmost interval first."""
+    surface = hi[iy, ix]
+    if surface > z:
+        surface = z
+        if lo[iy, ix] >= z:
+            surface = surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z)
+    return surface
+
+
+@njit(cache=True, inline="always")
+def stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level):
+    """As `insert`, for plastic that begins on the topmost solid."""
+    if bottom == hi[iy, ix] and (bottom > lo[iy, ix] or bottom == 0.0):
+        hi[iy, ix] = level
+    else:
+        insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
+
+
+@njit(cache=True, inline="always")
 def floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit):
     """Where plastic coming from height z begins to stack: on what lies below, or hanging."""
-    surface = surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z)
+    surface = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
     if z - surface > gap_limit:
-        return z - thickness
+        surface = z - thickness
     return surface
 
 
@@ -87,7 +108,8 @@ def lay(
         state[CARRY] = 0.0
         return
     phase = int((gy - cy) * phases) * phases + int((gx - cx) * phases)
-    bore, reach, flat, spread = counts[phase]
+    bore, reach = counts[phase, 0], counts[phase, 1]
+    flat, spread = counts[phase, 2], counts[phase, 3]
     found = 0
     capacity = 0.0
     for k in range(bore):  # columns under the bore, kept sorted by floor
@@ -100,7 +122,8 @@ def lay(
         at = found
         while at > 0 and floors[at - 1] > bottom:
             floors[at] = floors[at - 1]
-            chosen[at] = chosen[at - 1]
+            chosen[at, 0] = chosen[at - 1, 0]
+            chosen[at, 1] = chosen[at - 1, 1]
             at -= 1
         floors[at] = bottom
         chosen[at, 0] = iy
@@ -111,7 +134,7 @@ def lay(
         level = z if capacity <= amount else level_of(floors, found, amount, z)
         for k in range(found):
             if floors[k] < level:
-                insert(
+                stack(
                     hi,
                     lo,
                     nxt,
@@ -134,7 +157,7 @@ def lay(
         bottom = floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit)
         if bottom < z:
             level = min(z, bottom + amount)
-            insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
+            stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
             amount -= level - bottom
     ridge = 0
     while amount > LEAST_MM and (flush or amount > carry_limit) and ridge < MOST_RIDGE_STEPS:
@@ -144,11 +167,11 @@ def lay(
             iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
             if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
                 continue
-            bottom = surface_below(hi, lo, nxt, pool, pool_next, iy, ix, top)
+            bottom = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, top)
             if bottom < top:
                 bottom = max(bottom, z - thickness)
                 level = min(top, bottom + amount)
-                insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
+                stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
                 amount -= level - bottom
                 if amount <= LEAST_MM:
                     break
@@ -202,6 +225,7 @@ def deposit(
     cell = grid[2]
     area = cell * cell
     pushed = 0.0
+    room = 4 * near.shape[1] + 64  # more pool nodes than one step can take
     floors = np.empty(near.shape[1])
     chosen = np.empty((near.shape[1], 2), dtype=np.int64)
     for s in range(len(volume)):
@@ -256,7 +280,8 @@ def deposit(
                 if amount <= 0.0 and state[CARRY] <= 0.0:
                     continue
                 pushed += amount
-                pool, pool_next = grown(pool, pool_next, meta, 4 * near.shape[1] + 64)
+                if meta[FRESH] + room > len(pool_next):
+                    pool, pool_next = grown(pool, pool_next, meta, room)
                 lay(
                     hi,
                     lo,

@@ -49,8 +49,8 @@ class BeadModel:
     """
 
     step_mm: float = 0.2
-    gap_layers: float = 2.5
-    reach_ratio: float = 1.75
+    gap_layers: float = 2.75
+    reach_ratio: float = 1.25
     spread_ratio: float = 4.0
     flat_ratio: float = 1.25
     carry_mm3: float = 0.02
