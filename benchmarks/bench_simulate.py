@@ -119,9 +119,7 @@ def main() -> None:
     aims = np.random.default_rng(0).uniform((20, 30, 0), (100, 90, 0), (points, 3))
     origins = np.repeat(sensors, int(np.ceil(points / len(sensors))), axis=0)[:points]
     median, spread = timed(lambda: shape.ray.intersects_first(origins, aims - origins), repeats)
-    print(
-        f"peer, embree on the mesh: {points / median / 1e3:6.0f} k rays/s  (± {spread / median:.0%})"
-    )
+    print(f"peer, embree: {points / median / 1e3:6.0f} k rays/s  (± {spread / median:.0%})")
 
 
 if __name__ == "__main__":
