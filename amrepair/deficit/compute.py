@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from amrepair.deficit.heights import as_built_heights
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
@@ -32,6 +32,7 @@ BEAD_MM3 = 0.08
 # Pieces below this share of a bead are what marching cubes makes of noise at a rim.
 CRUMB_MM3 = 0.02
 BOX_MARGIN_MM = 1.0
+PATH_STEP_MM = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +116,9 @@ def compute_deficit(
     solids: dict[Label, list[manifold3d.Manifold]] = {Label.MISSING: [], Label.EXCESS: []}
     regions: list[Region] = []
     for label, found in solids.items():
-        boxes = _boxes(anomaly, evidence, label)
+        boxes = _boxes(anomaly, evidence, template, label)
         for i, (low, high, depth) in enumerate(boxes):
-            progress(f"deficit: {label.name.lower()}", i, len(boxes))
+            progress(f"deficit: {label.name.lower()}", float(i), float(len(boxes)))
             solid = _solid_in_box(
                 template, evidence, anomaly, label, low, high, depth_mm=depth, tau_mm=tau_mm
             )
@@ -151,7 +152,7 @@ def compute_deficit(
 
 
 def _boxes(
-    anomaly: AnomalyMap, evidence: Evidence, label: Label
+    anomaly: AnomalyMap, evidence: Evidence, template: Template, label: Label
 ) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
     """Low corner, high corner and depth of each group of labelled cells and template points."""
     s = evidence.surfels
@@ -159,6 +160,7 @@ def _boxes(
     points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
     if label is Label.MISSING:
         gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
+        gone = np.concatenate([gone, _paths_out(template, evidence, which)])
         points = np.concatenate([points, gone])
         depth = np.concatenate([depth, np.full(len(gone), np.nan)])
     else:
@@ -178,7 +180,34 @@ def _boxes(
     return _merge(found)
 
 
-def _feet(evidence: Evidence, which: np.ndarray) -> Float[np.ndarray, "q 3"]:
+def _paths_out(
+    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"]
+) -> Float[np.ndarray, "p 3"]:
+    """Points through the empty space from a void's floor to where it leaves the template.
+
+    They tie the floor to the mouth where nobody sampled the walls between.
+    """
+    s = evidence.surfels
+    if len(which) == 0:
+        return np.zeros((0, 3))
+    _, first = np.unique(
+        np.floor(s.place_mm[which] / PATH_STEP_MM).astype(np.int64), axis=0, return_index=True
+    )
+    front, along = s.place_mm[which[first]], evidence.normal[which[first]]
+    found = []
+    reach_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    for _ in range(int(reach_mm / PATH_STEP_MM) + 1):
+        front = front + PATH_STEP_MM * along
+        f = template.distance(front)
+        go_on = (f < 0) & (evidence.clearance(front, f)[0] > 0)
+        if not go_on.any():
+            break
+        front, along = front[go_on], along[go_on]
+        found.append(front)
+    return np.concatenate(found) if found else np.zeros((0, 3))
+
+
+def _feet(evidence: Evidence, which: Int[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
     """Where excess surfels stand on the template: along their planes, back by their height."""
     s = evidence.surfels
     return np.asarray(s.place_mm[which] - s.deviation_mm[which, None] * evidence.normal[which])

@@ -100,7 +100,7 @@ def detect(
             f"the scan {scan.source} is in frame '{scan.frame}'; align it to the template first"
         )
     _refuse_wrong_scale(scan, template)
-    progress("detect", 0, 4)
+    progress("detect", 0.0, 4.0)
     f_mm = template.distance(scan.points_mm)
     keep = ~_background(scan, template, f_mm)
     if not keep.any():
@@ -112,10 +112,10 @@ def detect(
     limit, source = _threshold(
         scan, template, surfels, threshold_mm, allowance_mm, registration_sigma_mm, false_alarms
     )
-    progress("detect", 1, 4)
+    progress("detect", 1.0, 4.0)
     missing, excess = _label_surfels(surfels, limit)
     evidence = gather(scan, template, surfels, missing | excess)
-    progress("detect", 2, 4)
+    progress("detect", 2.0, 4.0)
     label = np.zeros(len(scan), np.int64)
     has_cell = surfels.of_point >= 0
     cell = surfels.of_point[has_cell]
@@ -124,13 +124,13 @@ def detect(
     )
     surface_mm, normals = template.surface_points(max(SURFACE_SPACING_MM, surfels.spacing_mm))
     surface_label = _label_surface(surface_mm, normals, template, evidence, missing, limit)
-    progress("detect", 3, 4)
+    progress("detect", 3.0, 4.0)
     score = np.abs(f_mm)
     kept_scores = score[keep]
     k = min(top_k, len(kept_scores))
     object_score = float(np.partition(kept_scores, len(kept_scores) - k)[-k:].mean())
     regions = find_regions(evidence, missing, excess, surface_mm, surface_label, template)
-    progress("detect", 4, 4)
+    progress("detect", 4.0, 4.0)
     return AnomalyMap(
         points_mm=scan.points_mm,
         deviation_mm=f_mm,
