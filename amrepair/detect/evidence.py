@@ -192,7 +192,7 @@ def _open_side(
     planes: Float[np.ndarray, "q 3"],
 ) -> Float[np.ndarray, "q 3"]:
     """Vectors toward the open side, by rays from each surfel to what the scan knows around it."""
-    cell_mm = 1.25 * surfels.cell_mm
+    cell_mm = surfels.cell_mm
     low = template.bounds_mm[0] - 3 * cell_mm
     shape = np.ceil((template.bounds_mm[1] - low) / cell_mm).astype(int) + 4
     grid = np.full(tuple(shape), -1, np.int32)

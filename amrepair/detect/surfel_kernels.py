@@ -223,7 +223,7 @@ def open_votes(
             across = normals[i, 0] * ux + normals[i, 1] * uy + normals[i, 2] * uz
             if abs(across) < 0.5:
                 continue
-            t = 3.0 * cell
+            t = 1.5 * cell
             weight = 0.3
             while True:
                 ix = int(np.floor((start[i, 0] + t * ux - origin[0]) / cell))
@@ -232,7 +232,12 @@ def open_votes(
                 if ix < 0 or iy < 0 or iz < 0 or ix >= nx or iy >= ny or iz >= nz:
                     break
                 hit = grid[ix, iy, iz]
+                known = False
                 if hit >= 0:
+                    length = abs(outward[hit, 0]) + abs(outward[hit, 1]) + abs(outward[hit, 2])
+                    known = length > 0.0
+                # the start's own surface lies within a few cells and says nothing
+                if known or (hit >= 0 and t > 3.5 * cell):
                     facing = outward[hit, 0] * ux + outward[hit, 1] * uy + outward[hit, 2] * uz
                     weight = 0.0
                     if facing > 0.3:
