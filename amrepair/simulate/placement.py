@@ -17,6 +17,7 @@ from amrepair.simulate.defects import Defect, DefectKind, PlacedDefect
 _SHRINK = tuple(0.85**k for k in range(9))  # down to a quarter of the size asked for
 _LEAST_ROOM_MM2 = 0.02
 _TRIES = 60
+_CRUMB_MM3 = 0.05  # too small to be found, let alone printed
 _EVERYWHERE_MM = 1e9
 
 
@@ -223,6 +224,7 @@ def _chip(
     starts = np.concatenate(outlines)
     ends = np.concatenate([np.roll(o, -1, axis=0) for o in outlines])
     weight = np.concatenate(lengths)
+    whole = len(part.decompose())  # parts of several bodies, or with closed cavities
     for _ in range(_TRIES):
         pick = int(rng.choice(len(starts), p=weight / weight.sum()))
         on_edge = starts[pick] + rng.random() * (ends[pick] - starts[pick])
@@ -235,7 +237,7 @@ def _chip(
             continue
         pieces = (part - bite).decompose()
         # what falls off with it would lie loose on the bed: not a chip
-        if len(pieces) > 1 and sorted(piece.volume() for piece in pieces)[-2] > 0.05:
+        if sum(abs(piece.volume()) > _CRUMB_MM3 for piece in pieces) > whole:
             continue
         box = np.array(broken.bounding_box()).reshape(2, 3)
         grow_mm = np.array([0.5, 0.5, 0.5])  # the print stands a little off the CAD
