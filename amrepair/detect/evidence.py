@@ -101,7 +101,36 @@ class Evidence:
         beside = self.off[index[:, 0]] & (
             sideways > 1.5 * s.cell_mm + SIDEWAYS_PER_HEIGHT * np.abs(height)
         )
-        return np.where(beside, SOLID_MM, best)
+        best = np.where(beside, SOLID_MM, best)
+        return self._beyond_rims(points_mm, f_mm, distance[:, 0], self.off[index[:, 0]], best)
+
+    def _beyond_rims(
+        self,
+        points_mm: Float[np.ndarray, "n 3"],
+        f_mm: Float[np.ndarray, " n"],
+        distance_mm: Float[np.ndarray, " n"],
+        nearest_off: Bool[np.ndarray, " n"],
+        best_mm: Float[np.ndarray, " n"],
+    ) -> Float[np.ndarray, " n"]:
+        """Mend the answers beyond a convex rim, where a surfel on the template is nearest.
+
+        Material under a scanned face lies |f| below it. What lies farther from the nearest
+        surfel than that is not under it: the broken face that meets it at the rim decides.
+        """
+        s = self.surfels
+        off = np.flatnonzero(self.off)
+        ask = np.flatnonzero(
+            ~nearest_off & (f_mm < 0) & (distance_mm > 1.3 * np.abs(f_mm) + 1.5 * s.cell_mm)
+        )
+        if len(off) == 0 or len(ask) == 0:
+            return best_mm
+        reach, which = cKDTree(s.place_mm[off]).query(points_mm[ask], workers=2)
+        which = off[which]
+        height = ((points_mm[ask] - s.place_mm[which]) * self.normal[which]).sum(axis=1)
+        meets = reach <= distance_mm[ask] + 1.5 * s.cell_mm
+        mended = best_mm.copy()
+        mended[ask] = np.where(meets & (height > 0), height, best_mm[ask])
+        return mended
 
 
 def gather(
