@@ -67,10 +67,14 @@ def main() -> None:
     true_mm3 = (body - built).volume()
     print(f"{platform.processor() or platform.machine()}, {POINTS} points, {runs} runs")
     print(f"missing: true {true_mm3:.1f} mm3, found {deficit.missing_mm3:.1f} mm3")
+
+    def peer() -> float:
+        return float((body - built).volume())
+
     stages: dict[str, Callable[[], object]] = {
         "detect": lambda: detect(scan, template),
         "deficit": lambda: compute_deficit(scan, template, anomaly, build_from_template=pose),
-        "peer: boolean of perfect meshes": lambda: (body - built).volume(),
+        "peer: boolean of perfect meshes": peer,
     }
     for name, work in stages.items():
         median_s, spread_s = timed(work, runs)

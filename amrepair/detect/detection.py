@@ -174,7 +174,7 @@ def _background(
     return (bed & (f_mm > BED_BAND_MM / 2)) | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
 
 
-def _threshold(
+def _threshold(  # noqa: PLR0917
     scan: Scan,
     template: Template,
     surfels: Surfels,
@@ -245,7 +245,7 @@ def _drop_specks(
     return kept
 
 
-def _label_surface(
+def _label_surface(  # noqa: PLR0917
     surface_mm: Float[np.ndarray, "m 3"],
     normals: Float[np.ndarray, "m 3"],
     template: Template,
@@ -253,7 +253,7 @@ def _label_surface(
     missing: Bool[np.ndarray, " s"],
     limit: Threshold,
 ) -> Int[np.ndarray, " m"]:
-    """Present where scanned surface lies on it, missing where it is seen to be gone, else unseen."""
+    """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
     surfels = evidence.surfels
     reach_mm = 1.8 * surfels.cell_mm + limit.systematic_mm
     distance, nearest = evidence.tree.query(surface_mm, workers=2)

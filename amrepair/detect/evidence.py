@@ -180,7 +180,7 @@ def _outward(
     off: Bool[np.ndarray, " s"],
     which: Int[np.ndarray, " q"],
 ) -> Float[np.ndarray, "q 3"]:
-    """Outward normals of the surfels in `which`: from the sensors, the file, or by looking about."""
+    """Outward normals of the surfels in `which`: by sensors, file, or looking about."""
     planes = surfels.planes(which)
     guide: Float[np.ndarray, "q 3"] | None = None
     if scan.sensors_mm is not None and scan.sensor_index is not None:

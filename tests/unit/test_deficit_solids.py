@@ -54,9 +54,7 @@ def cloud(
 
 
 def rays(solid: manifold3d.Manifold, sensors_mm: np.ndarray, *, seed: int = 0) -> Scan:
-    points, who = analytic.ray_scan(
-        solid, sensors_mm, spacing_mm=0.2, sigma_mm=SIGMA_MM, seed=seed
-    )
+    points, who = analytic.ray_scan(solid, sensors_mm, spacing_mm=0.2, sigma_mm=SIGMA_MM, seed=seed)
     return Scan(points, SIGMA_MM, "template", None, sensors_mm.copy(), who)
 
 

@@ -99,7 +99,8 @@ def test_pcd_of_open3d(tmp_path: Path, scan: Scan, kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "separator", "head"), [("a.xyz", " ", ""), ("a.csv", ",", "x,y,z\n"), ("a.txt", ";", "")]
+    ("name", "separator", "head"),
+    [("a.xyz", " ", ""), ("a.csv", ",", "x,y,z\n"), ("a.txt", ";", "")],
 )
 def test_text(tmp_path: Path, scan: Scan, name: str, separator: str, head: str) -> None:
     path = tmp_path / name
