@@ -31,7 +31,8 @@ class FirmwareCore:
     Parameters
     ----------
     record
-        Called with every command carried out, in order, freed of number and checksum.
+        Called with every command carried out (not with those it does not know), in order,
+        freed of number and checksum.
     """
 
     def __init__(
@@ -226,9 +227,8 @@ class FirmwareCore:
             if match := re.search(rb"N(-?\d+)", command):
                 self.last_number = int(match.group(1))
         else:
-            if self.record is not None:
+            if machine.execute(command) and self.record is not None:
                 self.record(command)
-            machine.execute(command)
         if command.startswith((b"M154", b"M155")):
             self._schedule_reports()
         if machine.replies:

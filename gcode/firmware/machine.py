@@ -104,7 +104,7 @@ class Machine:
         name, _, rest = command.partition(b" ")
         handler = self._commands.get(name)
         if handler is None:
-            match = re.match(rb"([GMT])\s*0*(\d+)(?:\.\d+)?", command)
+            match = re.match(rb"([GM])\s*0*(\d+)(?:\.\d+)?", command)
             if match is None:
                 return self._unknown(command)
             name, rest = match.group(1) + match.group(2), command[match.end() :]
@@ -115,7 +115,7 @@ class Machine:
         return True
 
     def _unknown(self, command: bytes) -> bool:
-        if command[:1] == b"T":
+        if re.fullmatch(rb"T\d", command):
             return True
         text = command.decode("latin-1")
         name = text.split(" ")[0] if self.variant.name == "klipper" else text

@@ -98,6 +98,8 @@ class SerialPrinter:
         self._sent_lines: deque[tuple[int, int]] = deque(maxlen=1024)
         self._position: ev.PositionReport | None = None
         self._temperatures: ev.TemperatureReport | None = None
+        self._asked = {"M114": 0, "M115": 0}
+        self._heard = {"M114": 0, "M115": 0}
         self._failure: Exception | None = None
         self._warnings: deque[str] = deque(maxlen=100)
         self._round_trips = RoundTrips()
@@ -138,6 +140,7 @@ class SerialPrinter:
             if self._guard and self._link.dialect.verifies:
                 self._test_guard()
             self._learn()
+            self._prove()  # from here on a silent reset cannot be taken for a resend request
         except BaseException:
             self.close()
             raise
@@ -280,6 +283,8 @@ class SerialPrinter:
             heard: list[ev.Event] = []
             while not self._link.ready:
                 heard += self._pump()
+            if command in self._asked:
+                self._asked[command] += 1
             self._write(self._link.send(command, self._clock()))
             while not self._link.idle:
                 heard += self._pump()
@@ -288,10 +293,15 @@ class SerialPrinter:
     def _prove(self) -> None:
         """Make sure that the printer has received every line, whatever its `ok`s say.
 
-        Only the execution of M114, numbered after them, can report a position.
+        A question is carried out once and answered once: when all questions of a kind are
+        answered, the last of them has been received, and with it every line before.
         """
-        self._where()
-        self._link.confirm()
+        for kind in (*("M114",) * 4, "M115", "M114", "M115"):
+            self._ask(kind)
+            if self._heard[kind] >= self._asked[kind]:
+                self._link.confirm()
+                return
+        self._lost("the printer does not prove that it received the last lines")
 
     # ------------------------------------------------------------------ printing
 
@@ -353,6 +363,7 @@ class SerialPrinter:
     def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
         """Send the lines; False if the job was aborted."""
         link, clock, journal, trips = self._link, self._clock, self._journal, self._round_trips
+        asked = self._asked
         reserved = first
         for index, command in _commands(checked, first, end):
             if journal is not None and index >= reserved:
@@ -365,6 +376,8 @@ class SerialPrinter:
                 return False
             sent_s = clock()
             self._sent_lines.append((link.last_sent + 1, index))
+            if command[:4] in asked:
+                asked[command[:4]] += 1
             self._write(link.send(command, sent_s))
             while not link.ready:
                 self._pump()
@@ -419,8 +432,12 @@ class SerialPrinter:
         modes = modes_after(checked, line, self._link.dialect.name)
         self._lift()
         self._note("paused")
-        while not self._go_on.wait(1.0):
-            self._ask("M105")  # keeps firmware time-outs and this end of the link awake
+        self._mutex.release()  # others may ask while the job rests
+        try:
+            while not self._go_on.wait(1.0):
+                self._ask("M105")  # keeps firmware time-outs and this end of the link awake
+        finally:
+            self._mutex.acquire()
         if self._abort_asked.is_set():
             return False
         for command in modes.restore(place.x_mm, place.y_mm, place.z_mm, place.e_mm):
@@ -457,6 +474,11 @@ class SerialPrinter:
                 self._note("heaters off, nozzle lifted")
         except (LinkError, LocalProtocolError, OSError) as error:
             self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the host did of its own accord since the last `print` began."""
+        return tuple(self._warnings)
 
     def _note(self, text: str) -> None:
         self._warnings.append(text)
@@ -533,6 +555,9 @@ class SerialPrinter:
             self._temperatures = event
         elif isinstance(event, ev.PositionReport):
             self._position = event
+            self._heard["M114"] += 1
+        elif isinstance(event, ev.FirmwareInfo):
+            self._heard["M115"] += 1
         elif isinstance(event, ev.Greeted):
             self._greeted = True
         elif isinstance(event, ev.ResendRequested):

@@ -34,4 +34,4 @@ class RoundTrips:
 
     def summary_s(self) -> tuple[float, float, float]:
         """Return percentiles 50, 95 and 99."""
-        return self.percentile_s(50), self.percentile_s(95), self.percentile_s(99)
+        return self.percentile_s(50.0), self.percentile_s(95.0), self.percentile_s(99.0)

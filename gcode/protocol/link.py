@@ -428,7 +428,10 @@ class Link:
         if (why := self._why_refused(number)) is not None:
             self._refuse(number, why, now_s)
             return
-        self._same_resends = self._same_resends + 1 if number == self._last_resend else 1
+        if number != self._last_resend:
+            self._same_resends = 0
+        if self.state is not State.REWINDING:  # a burst of requests counts once
+            self._same_resends += 1
         self._last_resend = number
         if self._same_resends > self.timing.max_resends:
             self._lose(f"the printer asked for line {number} {self._same_resends} times in a row")

@@ -1,0 +1,300 @@
+"""The fifteen bugs that other senders shipped, one test each, in the order of their list."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from link_harness import Conversation
+from link_helpers import moves, profile, program
+
+import gcode.hosts.serial as serial_host
+from gcode.errors import LocalProtocolError
+from gcode.firmware import EmulatedPrinterProcess
+from gcode.hosts.serial import SerialPrinter
+from gcode.protocol import Link, State, checksum
+from gcode.protocol import events as ev
+from gcode.protocol.link import HISTORY_LINES
+
+LINES = [f"G1 X{i} Y{i * 3 % 170} F6000" for i in range(60)]
+
+
+@pytest.fixture(autouse=True)
+def _no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These tests judge the link, on programs that no checker has seen."""
+    monkeypatch.setattr(serial_host, "require_checked", lambda checked: None)
+
+
+def greeted(window: int = 1) -> Link:
+    link = Link(window=window)
+    link.hello(0.0)
+    link.receive(b"ok\n", 0.0)
+    return link
+
+
+def test_bug_01_no_endless_off_by_one_resend() -> None:
+    """A duplicate earns a stale request; serving it would earn the next, for ever (OctoPrint#470)."""
+    talk = Conversation("line 20 silence s=30")  # long enough for several probes of one line
+    assert talk.job(LINES)
+    assert talk.program == LINES
+    served = [e for e in talk.events if isinstance(e, ev.ResendRequested) and e.served]
+    assert len(served) <= 3
+
+
+def test_bug_02_right_line_after_a_resend_without_ok() -> None:
+    """Without an ok after `Resend:` the next ok belongs to the line itself (OctoPrint#2285)."""
+    talk = Conversation("always resend_without_ok\nevery 7 corrupt_in")
+    assert talk.job(LINES)
+    assert talk.program == LINES
+
+
+def test_bug_03_a_line_that_left_the_history_stops_the_job() -> None:
+    """OctoPrint#4671: stop and name the interval; never send something else in its place."""
+    link = greeted()
+    for i in range(HISTORY_LINES + 50):
+        link.send(f"G1 X{i}", 0.0)
+        if i < HISTORY_LINES + 49:
+            link.receive(b"ok\n", 0.0)
+    events: list[ev.Event] = []
+    for attempt in range(3):
+        events += link.receive(b"Resend: 20\nok\n", float(attempt))
+    lost = [e for e in events if isinstance(e, ev.LinkLost)]
+    assert lost and link.state is State.LOST
+    assert lost[0].last_sent == HISTORY_LINES + 50
+    assert link.take_output() == b""
+
+
+@pytest.mark.parametrize(
+    "text", [b"Resend: hours", b"rs", b"Resend:", b"resend 12x", b"Resend: -4", b"Resend: 1 2"]
+)
+def test_bug_04_loose_text_is_no_resend(text: bytes) -> None:
+    """OctoPrint#205 crashed on "hours"."""
+    link = greeted()
+    link.send("G1 X1", 0.0)
+    (event,) = link.receive(text + b"\n", 0.1)
+    assert isinstance(event, ev.Unrecognised)
+    assert link.take_output() == b""
+
+
+def test_bug_05_checksum_error_without_resend_does_not_wait_for_ever() -> None:
+    """OctoPrint#2226: an error, then nothing; the line is sent again after a while."""
+    link = greeted()
+    line = link.send("G1 X1", 0.0)
+    link.receive(b"Error:checksum mismatch, Last Line: 0\n", 0.1)
+    link.tick(link.next_deadline_s())
+    assert link.take_output() == line
+
+
+@pytest.mark.parametrize("fault", ["lose_ok", "garble_ok"])
+def test_bug_06_a_lost_or_garbled_ok_does_not_stall(fault: str) -> None:
+    """OctoPrint#2454, even while temperatures keep coming; nothing runs twice."""
+    talk = Conversation(f"every 6 {fault}")
+    assert talk.job(LINES)
+    assert talk.program == LINES
+
+
+def test_bug_06_temperature_reports_are_no_sign_of_life_of_a_line() -> None:
+    link = greeted()
+    line = link.send("G1 X1", 0.0)
+    deadline_s = link.next_deadline_s()
+    for second in range(1, 8):
+        link.receive(b" T:200.00 /200.00 B:60.00 /60.00 @:0 B@:0\n", float(second))
+    assert link.next_deadline_s() == deadline_s
+    link.tick(deadline_s)
+    assert link.take_output() == line
+
+
+def test_bug_07_pause_abort_and_resend_cannot_deadlock() -> None:
+    """OctoPrint#2524: pause and resume from another thread while lines are resent."""
+    with EmulatedPrinterProcess(printer=profile(), faults="every 9 corrupt_in") as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        done = threading.Event()
+        half = threading.Event()
+
+        def tell(stage: str, count: float, total: float) -> None:
+            if count >= total / 3:
+                half.set()
+
+        def meddle() -> None:
+            half.wait(20)
+            for _ in range(3):
+                printer.pause()
+                printer.resume()
+            done.set()
+
+        thread = threading.Thread(target=meddle)
+        thread.start()
+        report = printer.print(program(moves(1500)), progress=tell)
+        thread.join(20)
+        printer.close()
+    assert report.ok and done.is_set()
+
+
+def test_bug_08_an_unknown_number_kills_nobody() -> None:
+    """Printrun#594: KeyError in the sender's thread for a line it does not have."""
+    link = greeted()
+    link.send("G1 X1", 0.0)
+    for number in (0, 5, 999999999):
+        assert any(
+            isinstance(e, ev.ResendRefused) for e in link.receive(b"Resend: %d\n" % number, 1.0)
+        )
+    assert link.state is State.LOST  # three contradictions in a row
+
+
+def test_bug_09_comments_stay_here_and_rs_is_heard() -> None:
+    """Printrun#271."""
+    link = greeted()
+    line = link.send("G1 X1 ; to the edge", 0.0)
+    assert line == b"N1 G1 X1*%d\n" % checksum(b"N1 G1 X1")
+    link.receive(b"rs N1\nok\n", 0.1)
+    assert link.take_output() == line
+
+
+def test_bug_10_a_purge_in_a_pause_makes_no_giant_extrusion() -> None:
+    """Printrun#70, Klipper#2624: absolute E, 8 mm purged by hand while paused."""
+    lines = ["M82", "G92 E0", "G28", "M302 S0"]
+    lines += [f"G1 X{20 + i % 50} Y{30 + i % 3} E{0.02 * (i + 1):.4f} F6000" for i in range(2000)]
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        asked = threading.Event()
+
+        def tell(stage: str, count: float, total: float) -> None:
+            if count and not asked.is_set():
+                printer.pause()
+                asked.set()
+
+        def purge() -> None:
+            asked.wait(20)
+            while "paused" not in printer.notes:
+                asked.wait(0.01)
+            printer.command("G1 E8 F300")
+            printer.resume()
+
+        thread = threading.Thread(target=purge)
+        thread.start()
+        report = printer.print(program(lines), progress=tell)
+        thread.join(20)
+        printer.finish_moves()
+        motion = emulator.take_motion()
+        printer.close()
+    assert report.ok
+    # The purge itself is one move in place; no other move pushes more than its own bead.
+    beads = [e for e in motion.filament_mm if abs(e) > 0.021]
+    assert len(beads) <= 1
+    assert sum(e for e in motion.filament_mm if 0 < e <= 0.021) == pytest.approx(40.0, abs=0.05)
+
+
+def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
+    """Marlin#10875, Klipper#2412: two pauses, relative moves, Z as the program wants it."""
+    lines = ["G28", "G90", "G1 Z3 F600", "G91", "M83"] + ["G1 X0.1 F3000"] * 1500
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        asked = threading.Event()
+
+        def tell(stage: str, count: float, total: float) -> None:
+            if count and not asked.is_set():
+                printer.pause()
+                printer.pause()
+                asked.set()
+
+        def go_on() -> None:
+            asked.wait(20)
+            while "paused" not in printer.notes:
+                asked.wait(0.01)
+            printer.resume()
+
+        thread = threading.Thread(target=go_on)
+        thread.start()
+        printer.print(program(lines), progress=tell)
+        thread.join(20)
+        place = printer.position_mm()
+        printer.close()
+    assert place == pytest.approx((150.0, 0.0, 3.0), abs=0.01)
+
+
+def test_bug_12_opening_the_port_raises_no_dtr(monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyserial#124, Printrun#1068: DTR must be down before the port is opened."""
+    seen: list[bool] = []
+    original = serial_host.serial.Serial.open
+
+    def watch(self: object) -> None:
+        seen.extend((self.dtr, self.rts))  # type: ignore[attr-defined]
+        original(self)
+
+    monkeypatch.setattr(serial_host.serial.Serial, "open", watch)
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        printer.close()
+    assert seen == [False, False]
+
+
+def test_bug_13_a_slow_command_never_forces_the_next_line() -> None:
+    """OctoPrint#553, #2026: ten minutes of heating without a word; one line is under way."""
+    link = greeted()
+    line = link.send("M190 S110", 0.0)
+    now_s = 0.0
+    while now_s < 600.0:
+        now_s = link.next_deadline_s()
+        link.tick(now_s)
+        assert link.take_output() in (b"", line)  # the same line at most: it is idempotent
+        assert not link.ready
+    assert link.state is State.PROBING
+
+
+def test_bug_15_advanced_ok_numbers_are_not_believed_blindly() -> None:
+    """Marlin#2952: numbers off by whatever; the job goes on all the same."""
+    link = greeted(window=4)
+    for i in range(4):
+        link.send(f"G1 X{i}", 0.0)
+    for number in (900, 901, 902, 903):
+        link.receive(b"ok N%d P15 B3\n" % number, 0.1)
+    assert link.idle and link.last_acked == 4
+
+
+def test_m110_in_a_message_renumbers_nothing() -> None:
+    link = greeted()
+    assert b"M110" not in link.send("M117 M110 N5", 0.0)
+    link.receive(b"ok\n", 0.0)
+    with pytest.raises(LocalProtocolError, match="M110"):
+        link.send("M110 N7", 0.0)
+
+
+def test_a_line_the_firmware_would_cut_is_refused() -> None:
+    link = greeted()
+    with pytest.raises(LocalProtocolError, match="95"):
+        link.send("G1 " + "X1.000000 " * 12, 0.0)
+
+
+def test_a_second_sender_is_refused() -> None:
+    from gcode.errors import PortBusyError
+
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        first = SerialPrinter(emulator.port, supervise=False)
+        first.connect()
+        with pytest.raises(PortBusyError, match=str(os.getpid())):
+            SerialPrinter(emulator.port, supervise=False).connect()
+        first.close()
+        with SerialPrinter(emulator.port, supervise=False) as second:
+            assert second.temperatures().hotend_c > 0
+
+
+@dataclass
+class Raw:
+    text: str
+
+
+def test_what_nobody_checked_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    from gcode.hosts.proof import require_checked
+
+    with pytest.raises(LocalProtocolError, match="CheckedProgram"):
+        require_checked(Raw("G1 X1"))
