@@ -226,9 +226,8 @@ class FirmwareCore:
         if command.startswith(b"M110"):
             if match := re.search(rb"N(-?\d+)", command):
                 self.last_number = int(match.group(1))
-        else:
-            if machine.execute(command) and self.record is not None:
-                self.record(command)
+        elif machine.execute(command) and self.record is not None:
+            self.record(command)
         if command.startswith((b"M154", b"M155")):
             self._schedule_reports()
         if machine.replies:

@@ -33,14 +33,11 @@ def connect(
     """
     if port.startswith("file:"):
         return FilePrinter(Path(port.removeprefix("file:")))
-    if port.startswith(("octoprint+http://", "octoprint+https://")):
-        from gcode.hosts.octoprint import OctoPrintPrinter
-
-        return OctoPrintPrinter(port.removeprefix("octoprint+"))
-    if port.startswith(("moonraker+http://", "moonraker+https://")):
-        from gcode.hosts.moonraker import MoonrakerPrinter
-
-        return MoonrakerPrinter(port.removeprefix("moonraker+"))
+    if port.startswith(("octoprint+", "moonraker+")):
+        raise InputError(
+            f"{port!r} needs the OctoPrint or Moonraker adapter, which this version does not have "
+            f"yet; use the printer's device path or file:PATH."
+        )
     if "://" in port:
         raise InputError(
             f"{port!r} names no kind of printer; write a device path, octoprint+http://…, "

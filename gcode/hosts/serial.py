@@ -84,7 +84,8 @@ class SerialPrinter:
         self._baud = baud
         self._clock = clock
         self._link = Link(dialect, window=window, timing=timing)
-        self._log = WireLog(wire_log) if wire_log is not None else None
+        self._wire_log = wire_log
+        self._log: WireLog | None = None
         self._journal = journal
         self._supervise = supervise
         self._guard = guard
@@ -135,6 +136,7 @@ class SerialPrinter:
             return
         self._lock.acquire()
         try:
+            self._log = WireLog(self._wire_log) if self._wire_log is not None else None
             self._open_port()
             self._greet()
             if self._guard and self._link.dialect.verifies:
@@ -237,7 +239,8 @@ class SerialPrinter:
             self._serial = None
         self._lock.release()
         if self._log is not None:
-            self._log.flush()
+            self._log.close()
+            self._log = None
 
     # ------------------------------------------------------------------ questions
 
@@ -383,10 +386,10 @@ class SerialPrinter:
                 self._pump()
             trips.add(clock() - sent_s)
             if index % PROGRESS_EVERY_LINES == 0:
-                progress("printing", index - first, end - first)
+                progress("printing", float(index - first), float(end - first))
         while not link.idle:
             self._pump()
-        progress("printing", end - first, end - first)
+        progress("printing", float(end - first), float(end - first))
         return True
 
     def _last_sent_line(self, first: int) -> int:
@@ -570,6 +573,8 @@ class SerialPrinter:
                 (self.pause if event.action.startswith("pause") else self.abort)()
         elif isinstance(event, ev.UnknownCommand):
             self._warnings.append(event.text)
+        elif self._failure is not None:
+            return  # the first fault is the cause, the rest its consequences
         elif isinstance(event, ev.CommandFailed):
             self._failure = PrinterError(
                 f"The printer reports a fault: {event.text}; the last program line known to be "

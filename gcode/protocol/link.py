@@ -40,6 +40,7 @@ from gcode.protocol.events import (
     ResendRequested,
     SpareOk,
     TemperatureReport,
+    UnknownCommand,
     Unrecognised,
     Waiting,
 )
@@ -147,6 +148,7 @@ class Link:
         self._same_resends = 0
         self._last_resend = -1
         self._refused = 0
+        self._refused_at = 0
         self._number_faults = 0
         self._heard_s = 0.0
         self._deadline_s = float("inf")
@@ -343,6 +345,12 @@ class Link:
             self._events.append(reply)
             if reply.fatal and Signal.HALT in TRANSITIONS[self.state]:
                 self._go(Signal.HALT)
+        elif isinstance(reply, UnknownCommand) and "*" in reply.text:
+            # A numbered line whose N was lost: taken for a command without number, checksum
+            # and all, and answered with ok. It must be sent again.
+            self._events.append(reply)
+            if self.state in (State.WAITING, State.PROBING):
+                self._on_resend(self._acked + 1, now_s)
         elif isinstance(reply, Unrecognised):
             self._events.append(reply)
             self._doubt(now_s)
@@ -458,6 +466,9 @@ class Link:
 
     def _refuse(self, number: int, why: str, now_s: float) -> None:
         self._events.append(ResendRefused(number, why))
+        if self._acked - self._refused_at >= 2:
+            self._refused = 0  # it has made progress since: that one was noise
+        self._refused_at = self._acked
         self._refused += 1
         if self._refused >= self.timing.max_refused:
             self._lose(why)

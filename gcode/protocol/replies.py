@@ -58,7 +58,7 @@ _POSITION = re.compile(
 _CAPABILITY = re.compile(r"Cap:([A-Z0-9_]{1,40}):([01])")
 _FIRMWARE_NAME = re.compile(r"FIRMWARE_NAME:\s*(\S[^:]*?)(?:\s+[A-Z_]+:.*)?$")
 _ACTION = re.compile(r"//\s?action:\s*(\S.*)")
-_UNKNOWN = re.compile(r"(?:echo:\s*|//\s*)?unknown command:.*", re.IGNORECASE)
+_UNKNOWN = re.compile(r"(?:echo:\s*|//\s*)?unknown command:.*", re.IGNORECASE | re.DOTALL)
 
 # What firmwares print as they boot: Marlin `start`, reset causes (`setup()` of MarlinCore),
 # Repetier the same; Klipper tells of its restart with `// Klipper state:`.
@@ -96,7 +96,8 @@ def parse_reply(raw: bytes) -> Reply:
     if raw == b"ok":
         return Ok()
     if _PRINTABLE.fullmatch(raw) is None:
-        return Unrecognised(raw)
+        text = raw.decode("latin-1").strip()
+        return UnknownCommand(text) if _UNKNOWN.fullmatch(text) else Unrecognised(raw)
     text = raw.decode("latin-1").strip()
     if not text:
         return Echo("")

@@ -1,0 +1,144 @@
+"""Whatever goes wrong on the wire: executed exactly once and in order, or stopped and said so."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
+from link_harness import Conversation
+
+from gcode.protocol import Link
+from gcode.protocol import events as ev
+
+# Faults after which a firmware that verifies can always be brought on.
+MENDABLE = (
+    "lose_ok",
+    "garble_ok",
+    "double_ok",
+    "corrupt_in",
+    "drop_in",
+    "noise_in",
+    "noise_out",
+    "resend_storm",
+    "resend_gone",
+    "resend_without_ok",
+    "silence s=3",
+    "busy s=30",
+    "runout s=5",
+)
+ENDING = ("reset", "silent_reset", "thermal_runaway", "dead")
+
+
+def program(count: int) -> list[str]:
+    return [f"G1 X{i % 180} Y{i * 7 % 180} F6000" for i in range(count)]
+
+
+def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
+    one = st.tuples(st.integers(5, 45), st.sampled_from(kinds)).map(lambda f: f"line {f[0]} {f[1]}")
+    many = st.tuples(st.integers(3, 20), st.sampled_from(kinds[:8])).map(
+        lambda f: f"every {f[0]} {f[1]}"
+    )
+    always = st.sampled_from(["", "always resend_without_ok"])
+    return st.tuples(st.lists(one, max_size=8), st.lists(many, max_size=2), always).map(
+        lambda parts: "\n".join([*parts[0], *parts[1], parts[2]])
+    )
+
+
+@settings(max_examples=60)
+@given(
+    faults=fault_scripts(MENDABLE),
+    seed=st.integers(0, 99),
+    window=st.sampled_from([1, 1, 4]),
+    advanced=st.booleans(),
+)
+def test_every_command_runs_once_and_in_order(
+    faults: str, seed: int, window: int, advanced: bool
+) -> None:
+    lines = program(40)
+    talk = Conversation(faults, window=window, seed=seed, advanced_ok=advanced)
+    assert talk.job(lines), talk.lost
+    assert talk.program == lines
+
+
+@settings(max_examples=60)
+@given(
+    faults=fault_scripts(MENDABLE),
+    end=st.tuples(st.integers(5, 40), st.sampled_from(ENDING)),
+    seed=st.integers(0, 99),
+    window=st.sampled_from([1, 4]),
+)
+def test_where_it_cannot_go_on_it_stops_and_names_the_true_interval(
+    faults: str, end: tuple[int, str], seed: int, window: int
+) -> None:
+    lines = program(40)
+    talk = Conversation(faults + f"\nline {end[0]} {end[1]}", window=window, seed=seed)
+    done = talk.job(lines)
+    executed = talk.program
+    assert executed == lines[: len(executed)]  # a prefix: in order, none twice
+    if done:
+        assert executed == lines
+    elif talk.lost is not None:
+        assert len(executed) <= talk.lost.last_sent
+    else:
+        assert any(isinstance(e, ev.CommandFailed) and e.fatal for e in talk.events)
+
+
+@settings(max_examples=40)
+@given(
+    faults=fault_scripts(("lose_ok", "garble_ok", "drop_in", "corrupt_in")),
+    firmware=st.sampled_from(["klipper", "reprap"]),
+    seed=st.integers(0, 99),
+)
+def test_without_numbers_nothing_is_ever_sent_twice(faults: str, firmware: str, seed: int) -> None:
+    lines = program(40)
+    talk = Conversation(faults, dialect=firmware, firmware=firmware, seed=seed)
+    done = talk.job(lines)
+    assert len(talk.executed) <= talk.link.last_sent + 1
+    if not done:
+        assert talk.lost is not None
+        # The oldest unanswered line is where the truth begins to be unknown.
+        assert talk.lost.last_sent - talk.lost.last_acked >= 1
+
+
+@settings(max_examples=60)
+@given(
+    chunks=st.lists(
+        st.one_of(
+            st.binary(max_size=40),
+            st.sampled_from(
+                [b"ok\n", b"Resend: 3\n", b"rs 2\n", b"start\n", b"wait\n", b"Error:x\n", b"!! a\n"]
+            ),
+        ),
+        max_size=30,
+    ),
+    window=st.sampled_from([1, 4]),
+)
+def test_any_bytes_to_the_host_make_events(chunks: list[bytes], window: int) -> None:
+    link = Link(window=window)
+    link.hello(0.0)
+    now_s = 0.0
+    for chunk in chunks:
+        now_s += 0.05
+        events = link.receive(chunk, now_s) + link.tick(now_s)
+        assert all(type(event).__module__ == ev.__name__ for event in events)
+        link.take_output()
+        if link.ready:
+            link.send("G1 X1", now_s)
+        assert 0 <= link.last_acked <= link.last_sent
+
+
+@settings(max_examples=60)
+@given(
+    chunks=st.lists(st.binary(max_size=60), max_size=20),
+    firmware=st.sampled_from(["marlin", "prusa", "klipper", "reprap"]),
+)
+def test_any_bytes_to_the_firmware_make_answers(chunks: list[bytes], firmware: str) -> None:
+    talk = Conversation(firmware=firmware)
+    for chunk in chunks:
+        talk.core.feed(chunk + b"\n", 0.0)
+        talk.core.run()
+        talk.core.take_output()
