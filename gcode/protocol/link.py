@@ -533,6 +533,8 @@ class Link:
 
     def _slow_under_way(self) -> bool:
         offset = self._acked - self._last
+        if offset == -1:
+            return self._slow[-1]  # one line under way: the beaten path
         return any(self._slow[index] for index in range(offset, 0))
 
     def _silence_s(self) -> float:

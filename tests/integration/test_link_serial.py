@@ -48,7 +48,8 @@ def test_a_job_is_executed_and_its_plastic_is_reported(tmp_path: Path) -> None:
         assert printer.temperatures().hotend_c == pytest.approx(205, abs=1)
         # Heating is 205 °C in virtual minutes; the wall saw seconds.
         assert emulator.clock_s() > 180
-    assert first.ok and second.ok
+    assert first.ok
+    assert second.ok
     assert first.lines_acked + second.lines_acked == 2006
     assert motion.filament_mm.sum() == pytest.approx(20.0, abs=1e-9)
     beads = motion.filament_mm > 0
@@ -73,7 +74,9 @@ def test_every_second_thing_goes_wrong_and_each_command_runs_once(tmp_path: Path
         if line not in ("M114", "M115", "M105", "M104 S0", "M140 S0", "M107")
     ]
     assert executed == lines
-    assert report.ok and report.resends > 10 and report.stalls > 5
+    assert report.ok
+    assert report.resends > 10
+    assert report.stalls > 5
 
 
 @pytest.mark.parametrize("fault", ["reset", "silent_reset", "dead", "disconnect s=0.1"])
@@ -150,10 +153,12 @@ def test_a_killed_sender_leaves_heaters_off_and_a_whole_journal(tmp_path: Path) 
             while emulator.state()["hotend_target_c"] and time.monotonic() < until_s:
                 time.sleep(0.02)
             state = emulator.state()
-            assert state["hotend_target_c"] == 0 and state["bed_target_c"] == 0
+            assert state["hotend_target_c"] == 0
+            assert state["bed_target_c"] == 0
             journal = Journal(journal_path)
             job = journal.latest()
-            assert journal.check() and job is not None
+            assert journal.check()
+            assert job is not None
             executed = [
                 line
                 for line in record.read_bytes()[before:].decode().splitlines()

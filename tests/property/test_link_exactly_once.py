@@ -48,7 +48,7 @@ def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
     )
 
 
-@settings(max_examples=60)
+@settings(max_examples=200)
 @given(
     faults=fault_scripts(MENDABLE),
     seed=st.integers(0, 99),
@@ -64,7 +64,7 @@ def test_every_command_runs_once_and_in_order(
     assert talk.program == lines
 
 
-@settings(max_examples=60)
+@settings(max_examples=150)
 @given(
     faults=fault_scripts(MENDABLE),
     end=st.tuples(st.integers(5, 40), st.sampled_from(ENDING)),

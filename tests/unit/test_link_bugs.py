@@ -39,7 +39,7 @@ def greeted(window: int = 1) -> Link:
 
 
 def test_bug_01_no_endless_off_by_one_resend() -> None:
-    """A duplicate earns a stale request; serving it would earn the next, for ever (OctoPrint#470)."""
+    """A duplicate earns a stale request, serving it the next, for ever (OctoPrint#470)."""
     talk = Conversation("line 20 silence s=30")  # long enough for several probes of one line
     assert talk.job(LINES)
     assert talk.program == LINES
@@ -65,7 +65,8 @@ def test_bug_03_a_line_that_left_the_history_stops_the_job() -> None:
     for attempt in range(3):
         events += link.receive(b"Resend: 20\nok\n", float(attempt))
     lost = [e for e in events if isinstance(e, ev.LinkLost)]
-    assert lost and link.state is State.LOST
+    assert lost
+    assert link.state is State.LOST
     assert lost[0].last_sent == HISTORY_LINES + 50
     assert link.take_output() == b""
 
@@ -134,7 +135,8 @@ def test_bug_07_pause_abort_and_resend_cannot_deadlock() -> None:
         report = printer.print(program(moves(1500)), progress=tell)
         thread.join(20)
         printer.close()
-    assert report.ok and done.is_set()
+    assert report.ok
+    assert done.is_set()
 
 
 def test_bug_08_an_unknown_number_kills_nobody() -> None:
@@ -258,7 +260,8 @@ def test_bug_15_advanced_ok_numbers_are_not_believed_blindly() -> None:
         link.send(f"G1 X{i}", 0.0)
     for number in (900, 901, 902, 903):
         link.receive(b"ok N%d P15 B3\n" % number, 0.1)
-    assert link.idle and link.last_acked == 4
+    assert link.idle
+    assert link.last_acked == 4
 
 
 def test_m110_in_a_message_renumbers_nothing() -> None:
