@@ -1,0 +1,67 @@
+"""Reader of the Real3D-AD layout.
+
+    <class>/train/*template*.pcd   four full scans (the README says prototype)
+    <class>/test/*.pcd             mostly single views; `good` anywhere in the name is normal
+    <class>/gt/<stem>.txt          rows `x y z label`, white space
+
+Of anomalous samples the txt is the geometry too: five published pcd/txt pairs differ in count.
+Names with `temp` in `test/` are stray templates and are skipped; `cut` and `copy` are ordinary.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from amrepair.bench.dataset import (
+    BenchClass,
+    Cloud,
+    Format,
+    Sample,
+    class_folders,
+    defect_word,
+    read_truth,
+)
+
+DEFECTS = ("bulge", "sink", "concavity", "hole", "break", "bend", "crack")
+TRUTH_FOLDERS = ("gt", "GT")
+
+
+def find_classes(root: Path) -> tuple[BenchClass, ...]:
+    """Classes in `root`, else in its only data folder (`Real3D-AD-PCD/…`)."""
+    folders = class_folders(root)
+    if not folders:
+        for child in sorted(path for path in root.iterdir() if path.is_dir()):
+            folders = class_folders(child)
+            if folders:
+                break
+    return tuple(_read_class(folder) for folder in folders)
+
+
+def _read_class(folder: Path) -> BenchClass:
+    clouds = sorted((folder / "train").glob("*.pcd"))
+    named = [path for path in clouds if "template" in path.name or "prototype" in path.name]
+    truth = next((folder / name for name in TRUTH_FOLDERS if (folder / name).is_dir()), None)
+    samples = [
+        _sample(folder.name, path, truth or folder / TRUTH_FOLDERS[0])
+        for path in sorted((folder / "test").glob("*.pcd"))
+        if "temp" not in path.name
+    ]
+    return BenchClass(folder.name, tuple(named or clouds), None, tuple(samples))
+
+
+def _sample(class_name: str, path: Path, truth: Path) -> Sample:
+    normal = "good" in path.stem
+    return Sample(
+        class_name=class_name,
+        name=path.stem,
+        kind="good" if normal else defect_word(path.stem, DEFECTS),
+        cloud_path=path,
+        truth_path=None if normal else truth / f"{path.stem}.txt",
+        format=Format.REAL3D,
+    )
+
+
+def load_anomalous(truth_path: Path) -> Cloud:
+    """Geometry and labels from the txt alone."""
+    points, labels = read_truth(truth_path)
+    return Cloud(points, labels)
