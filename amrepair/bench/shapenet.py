@@ -56,7 +56,7 @@ def _read_class(folder: Path, meshes: Path) -> BenchClass:
     samples = [
         _sample(folder.name, path, truth or folder / TRUTH_FOLDERS[0])
         for path in _clouds(folder / "test")
-        if "template" not in path.name
+        if "template" not in path.stem.removeprefix(folder.name)
     ]
     train = tuple(_clouds(folder / "train"))
     return BenchClass(folder.name, train, _mesh_of(meshes, folder.name), tuple(samples))
@@ -81,11 +81,12 @@ def _mesh_of(meshes: Path, class_name: str) -> Path | None:
 
 
 def _sample(class_name: str, path: Path, truth: Path) -> Sample:
-    normal = "positive" in path.stem
+    word = path.stem.removeprefix(class_name)  # a class may be called positive_stop or holder
+    normal = "positive" in word
     return Sample(
         class_name=class_name,
         name=path.stem,
-        kind="good" if normal else defect_word(path.stem.removeprefix(class_name), DEFECTS),
+        kind="good" if normal else defect_word(word, DEFECTS),
         cloud_path=path,
         truth_path=None if normal else _truth_path(truth, class_name, path.stem),
         format=Format.SHAPENET,

@@ -1,0 +1,267 @@
+"""The six defects of the data sets, made on a solid: where the surface changed is known exactly.
+
+Bulge, concavity, hole, break and crack are booleans: each triangle knows which solid it came
+from. Bend moves vertices: each knows how far. Sizes follow the part's diagonal, depths the
+material that is there. It makes shapes; `synth_views` looks at them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import manifold3d as m3
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.bench.synth_views import Rays, Shape, Surface, sample_shape, sensors_around
+from amrepair.errors import InputError
+from amrepair.template.mesh_file import as_manifold, is_valid, manifold_arrays
+
+# The face of a tool: a change without measure, above every limit of visibility.
+NEW_SURFACE_MM = 1e9
+SEED_POINTS = 400
+MAX_ATTEMPTS = 30
+# Less material than this part of the diagonal under a seed is too thin to dent or crack.
+MIN_THICKNESS_RATIO = 0.008
+# A defect that moves less than this part of the diagonal, 3σ of the default noise twice over.
+MIN_DEPTH_RATIO = 0.004
+ROUGHNESS_WAVES = 6
+SPLINTER_RATIO = 0.01
+
+
+class Defect(StrEnum):
+    """Words as in Anomaly-ShapeNet."""
+
+    BULGE = "bulge"
+    CONCAVITY = "concavity"
+    HOLE = "hole"
+    BREAK = "break"
+    BEND = "bend"
+    CRACK = "crack"
+
+
+@dataclass(frozen=True, slots=True)
+class Seed:
+    """Where a defect sits: a point that can be seen, its normal, the material below it."""
+
+    point_mm: Float[np.ndarray, " 3"]
+    normal: Float[np.ndarray, " 3"]
+    thickness_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A normal part, ready to be damaged."""
+
+    solid: Any  # manifold3d.Manifold, marked as original
+    shape: Shape
+    seeds: Surface
+    thickness_mm: Float[np.ndarray, " n"]
+
+    @property
+    def diagonal_mm(self) -> float:
+        """Diagonal of the bounding box."""
+        return self.shape.diagonal_mm
+
+
+def make_part(
+    vertices_mm: Float[np.ndarray, "v 3"], faces: np.ndarray, rng: np.random.Generator
+) -> Part:
+    """A part from a closed mesh; seeds are surface points that some sensor sees."""
+    solid = as_manifold(vertices_mm, faces).as_original()
+    shape = Shape(vertices_mm, faces, np.zeros((len(faces), 3)))
+    rays = Rays(shape)
+    points = sample_shape(shape, SEED_POINTS, rng)
+    seen = points.take(rays.seen(points, sensors_around(shape)))
+    if len(seen.points_mm) == 0:
+        raise InputError("no point of the part can be seen from outside; is it inside out?")
+    return Part(solid, shape, seen, rays.thickness_mm(seen))
+
+
+def damage(part: Part, defect: Defect, rng: np.random.Generator) -> Shape:
+    """The part with one defect.
+
+    Raises
+    ------
+    InputError
+        If no place on the part takes this defect.
+    """
+    make = _MAKERS[defect]
+    for _ in range(MAX_ATTEMPTS):
+        i = int(rng.integers(len(part.thickness_mm)))
+        seed = Seed(part.seeds.points_mm[i], part.seeds.normals[i], float(part.thickness_mm[i]))
+        shape = make(part, seed, rng)
+        if shape is not None and (shape.change_mm > 0).any():
+            return shape
+    raise InputError(
+        f"no place for a {defect} was found on the part in {MAX_ATTEMPTS} tries; "
+        "it may be too thin: leave the part out"
+    )
+
+
+def _frame(seed: Seed, rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
+    """Local to part coordinates: z along the normal, x turned at random."""
+    u = np.cross(seed.normal, rng.normal(size=3))
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(seed.normal, u), seed.normal, seed.point_mm], axis=1)
+
+
+def _waves(rng: np.random.Generator, frequency: float) -> Callable[[np.ndarray], np.ndarray]:
+    """A smooth random function of (n, 3) points, about −1…1: a few plane waves."""
+    k = frequency * rng.normal(size=(ROUGHNESS_WAVES, 3))
+    phase = rng.uniform(0, 2 * np.pi, ROUGHNESS_WAVES)
+    return lambda x: np.sin(x @ k.T + phase).mean(axis=1) * 2.0
+
+
+def _lump(radius_mm: float, height_mm: float, rng: np.random.Generator) -> Any:
+    """An uneven ellipsoid about the origin."""
+    wave = _waves(rng, 1.2)
+    stretch = rng.uniform(0.75, 1.3)
+    ball = m3.Manifold.sphere(1.0, 72).warp_batch(lambda x: x * (1 + 0.12 * wave(x))[:, None])
+    return ball.scale((radius_mm * stretch, radius_mm / stretch, height_mm))
+
+
+def _result(part: Part, solid: Any) -> Shape | None:
+    """Shape of a boolean's result: triangles that are not the part's own are new surface."""
+    if not is_valid(solid):
+        return None
+    mesh = solid.to_mesh64()
+    vertices, faces = manifold_arrays(solid)
+    runs = np.asarray(mesh.run_index, dtype=np.int64) // 3
+    origin = np.repeat(np.asarray(mesh.run_original_id), np.diff(runs))
+    new = origin != part.solid.original_id()
+    change = np.where(new[:, None], NEW_SURFACE_MM, 0.0) * np.ones((1, 3))
+    return Shape(vertices, faces, change)
+
+
+def _bulge(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+    radius_mm = rng.uniform(0.04, 0.08) * part.diagonal_mm
+    height_mm = rng.uniform(0.35, 0.7) * radius_mm
+    if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
+        return None
+    # the lump's lower half stays inside the material, or it would bulge on the far side too
+    floor_mm = min(height_mm, 0.9 * seed.thickness_mm)
+    dome = _lump(radius_mm, height_mm, rng).trim_by_plane((0.0, 0.0, 1.0), -floor_mm)
+    return _result(part, part.solid + dome.transform(_frame(seed, rng)).as_original())
+
+
+def _concavity(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+    radius_mm = rng.uniform(0.04, 0.08) * part.diagonal_mm
+    depth_mm = min(rng.uniform(0.35, 0.7) * radius_mm, 0.6 * seed.thickness_mm)
+    if depth_mm < MIN_DEPTH_RATIO * part.diagonal_mm:
+        return None
+    lump = _lump(radius_mm, depth_mm, rng).transform(_frame(seed, rng))
+    return _result(part, part.solid - lump.as_original())
+
+
+def _hole(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+    radius_mm = rng.uniform(0.02, 0.045) * part.diagonal_mm
+    if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
+        return None
+    # through what is thin, blind in what is thick
+    depth_mm = min(1.1 * seed.thickness_mm, 0.12 * part.diagonal_mm)
+    wave = _waves(rng, 1.2)
+    tool = m3.Manifold.cylinder(1.0, 1.0, 1.0, 48).translate((0.0, 0.0, -1.0))
+    tool = tool.scale((radius_mm, radius_mm, depth_mm))
+    tool = tool + m3.Manifold.cylinder(radius_mm, radius_mm, radius_mm, 48)
+    tool = tool.refine_to_length(radius_mm / 3).warp_batch(
+        lambda x: x * (1 + 0.12 * wave(x / radius_mm))[:, None] * (1, 1, 0) + x * (0, 0, 1)
+    )
+    return _result(part, part.solid - tool.transform(_frame(seed, rng)).as_original())
+
+
+def _crack(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+    diagonal_mm = part.diagonal_mm
+    depth_mm = min(rng.uniform(0.03, 0.06) * diagonal_mm, 0.7 * seed.thickness_mm)
+    if depth_mm < MIN_DEPTH_RATIO * diagonal_mm:
+        return None
+    length_mm = rng.uniform(0.12, 0.25) * diagonal_mm
+    width_mm = rng.uniform(0.012, 0.02) * diagonal_mm
+    knots = 9
+    x = np.linspace(-0.5, 0.5, knots) * length_mm
+    y = rng.uniform(-0.05, 0.05, knots) * length_mm
+    half = 0.5 * width_mm * np.sin(np.linspace(0.12, np.pi - 0.12, knots))
+    outline = np.concatenate(
+        [np.stack([x, y - half], axis=1), np.stack([x, y + half], axis=1)[::-1]]
+    )
+    section = m3.CrossSection([outline])
+    # a zigzag slit; it reaches above the seed so as to clear a curved surface
+    # full width outside, a third of it at the bottom: its walls can be seen
+    blade = section.extrude(depth_mm + width_mm, scale_top=(0.9, 0.3))
+    blade = blade.rotate((180.0, 0.0, 0.0)).translate((0.0, 0.0, width_mm))
+    blade = blade.transform(_frame(seed, rng))
+    return _result(part, part.solid - blade.as_original())
+
+
+def _break(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+    """Everything beyond a rough plane is gone: 3 to 12 % of the volume."""
+    diagonal_mm = part.diagonal_mm
+    normal = rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    share = rng.uniform(0.03, 0.12)
+    height = part.shape.vertices_mm @ normal
+    low, high = float(height.min()), float(height.max())
+    volume = part.solid.volume()
+    for _ in range(20):
+        middle = (low + high) / 2
+        beyond = part.solid.trim_by_plane(tuple(normal), middle).volume()
+        low, high = (middle, high) if beyond > share * volume else (low, middle)
+    centre = part.shape.vertices_mm.mean(axis=0)
+    on_plane = centre + (high - centre @ normal) * normal
+    wave = _waves(rng, 1.0 / (0.05 * diagonal_mm))
+    rough_mm = 0.006 * diagonal_mm
+    block = m3.Manifold.cube((3 * diagonal_mm,) * 3, True).translate((0, 0, 1.5 * diagonal_mm))
+
+    def roughen(x: np.ndarray) -> np.ndarray:
+        """Move the block's lower face, which is the fracture, along z."""
+        lift_mm = np.where(x[:, 2] < 1e-9, wave(x) * rough_mm, 0.0)
+        return x + lift_mm[:, None] * (0, 0, 1)
+
+    sheet = block.refine(96).warp_batch(roughen)
+    frame = _frame(Seed(on_plane, normal, 0.0), rng)
+    left = part.solid - sheet.transform(frame).as_original()
+    if not is_valid(left):
+        return None
+    # splinters fall off; whole bodies of a part in several pieces stay
+    kept = [body for body in left.decompose() if body.volume() > SPLINTER_RATIO * volume]
+    return _result(part, m3.Manifold.compose(kept)) if kept else None
+
+
+def _bend(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+    """One end is bent about an axis across the part's longest direction."""
+    diagonal_mm = part.diagonal_mm
+    fine = part.solid.refine_to_length(diagonal_mm / 60)
+    vertices, faces = manifold_arrays(fine)
+    centred = vertices - vertices.mean(axis=0)
+    axes = np.linalg.svd(centred.T @ centred)[0]
+    along = axes[:, 0] * (1 if rng.random() < 0.5 else -1)
+    turn = rng.uniform(0, 2 * np.pi)
+    side = np.cos(turn) * axes[:, 1] + np.sin(turn) * axes[:, 2]
+    u, v = centred @ along, centred @ side
+    start = float(np.quantile(u, rng.uniform(0.55, 0.75)))
+    angle_rad = np.deg2rad(rng.uniform(5.0, 10.0))
+    zone_mm = 0.08 * diagonal_mm
+    # an arc of length `zone`, then straight on: exact bending of the line v = 0
+    reach = np.maximum(u - start, 0.0)
+    phi = angle_rad * np.minimum(reach / zone_mm, 1.0)
+    radius_mm = zone_mm / angle_rad
+    beyond = np.maximum(reach - zone_mm, 0.0)
+    new_u = start + (radius_mm - v) * np.sin(phi) + beyond * np.cos(phi)
+    new_v = radius_mm - (radius_mm - v) * np.cos(phi) + beyond * np.sin(phi)
+    moved = np.where(reach > 0, 1.0, 0.0)
+    shift = moved[:, None] * ((new_u - u)[:, None] * along + (new_v - v)[:, None] * side)
+    change = np.linalg.norm(shift, axis=1)
+    return Shape(vertices + shift, faces, change[faces])
+
+
+_MAKERS: dict[Defect, Callable[[Part, Seed, np.random.Generator], Shape | None]] = {
+    Defect.BULGE: _bulge,
+    Defect.CONCAVITY: _concavity,
+    Defect.HOLE: _hole,
+    Defect.BREAK: _break,
+    Defect.BEND: _bend,
+    Defect.CRACK: _crack,
+}

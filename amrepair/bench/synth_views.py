@@ -1,0 +1,192 @@
+"""What a scanner sees of a shape: visible points, uneven density, noise, a random pose.
+
+A view is a set of sensors: many around the part (a full scan) or one. Points that no sensor sees
+(cavities, the far side) are not in the cloud. It knows nothing of defects beyond carrying along
+how far each point was moved by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from amrepair.device import open3d
+from amrepair.errors import InputError
+from amrepair.template.surface import triangle_areas_normals
+
+# A full scan: this many viewpoints on a sphere leave only true cavities unseen.
+FULL_SENSORS = 32
+# Beyond this angle of incidence structured light returns nothing.
+MAX_INCIDENCE_COS = float(np.cos(np.deg2rad(80.0)))
+SENSOR_DISTANCE_RATIO = 4.0
+CANDIDATES_PER_POINT = 4
+# Ends of the part differ in density by up to e^1.5, about 4.5 times.
+MAX_DENSITY_LOG = 1.5
+MAX_ROUNDS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """A closed surface, and how far each corner was moved by a defect.
+
+    Attributes
+    ----------
+    vertices_mm, faces
+        (v, 3), (f, 3).
+    change_mm
+        (f, 3) by face corner: 0 where the shape is normal.
+    """
+
+    vertices_mm: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    change_mm: Float[np.ndarray, "f 3"]
+
+    @property
+    def diagonal_mm(self) -> float:
+        """Diagonal of the bounding box."""
+        return float(np.linalg.norm(np.ptp(self.vertices_mm, axis=0)))
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Points on a shape: (n, 3) points, (n, 3) outward normals, (n,) change."""
+
+    points_mm: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    change_mm: Float[np.ndarray, " n"]
+
+    def take(self, chosen: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"]) -> Surface:
+        """Some of the points."""
+        return Surface(self.points_mm[chosen], self.normals[chosen], self.change_mm[chosen])
+
+
+class Rays:
+    """Ray casting against a shape (Embree, single precision)."""
+
+    def __init__(self, shape: Shape) -> None:
+        o3d = open3d()
+        self._tensor = o3d.core.Tensor
+        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(shape.vertices_mm.astype(np.float32)),
+            self._tensor(shape.faces.astype(np.uint32)),
+        )
+        self._lift_mm = 1e-4 * shape.diagonal_mm
+
+    def _pack(self, origins: np.ndarray, directions: np.ndarray) -> Any:
+        return self._tensor(np.concatenate([origins, directions], axis=1).astype(np.float32))
+
+    def thickness_mm(self, surface: Surface) -> Float[np.ndarray, " n"]:
+        """(n,) how far the material goes straight below each point."""
+        start = surface.points_mm - self._lift_mm * surface.normals
+        hit = self._scene.cast_rays(self._pack(start, -surface.normals))["t_hit"].numpy()
+        return hit.astype(np.float64) + self._lift_mm
+
+    def seen(
+        self, surface: Surface, sensors_mm: Float[np.ndarray, "k 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """(n,) whether any sensor sees the point."""
+        found = np.zeros(len(surface.points_mm), dtype=bool)
+        start = surface.points_mm + self._lift_mm * surface.normals
+        for sensor in sensors_mm:
+            to_sensor = sensor - start
+            distance = np.linalg.norm(to_sensor, axis=1)
+            facing = (to_sensor * surface.normals).sum(axis=1) > MAX_INCIDENCE_COS * distance
+            ask = np.flatnonzero(facing & ~found)
+            if len(ask):
+                rays = self._pack(start[ask], to_sensor[ask] / distance[ask, None])
+                found[ask] = ~self._scene.test_occlusions(rays).numpy()
+        return found
+
+
+def sample_shape(shape: Shape, count: int, rng: np.random.Generator) -> Surface:
+    """Random points, evenly by area."""
+    areas, normals = triangle_areas_normals(shape.vertices_mm, shape.faces)
+    cumulative = np.cumsum(areas)
+    face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
+    face = np.minimum(face, len(areas) - 1)
+    root, along = np.sqrt(rng.random(count)), rng.random(count)
+    weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
+    corners = shape.vertices_mm[shape.faces[face]]
+    return Surface(
+        points_mm=np.einsum("nk,nkd->nd", weights, corners),
+        normals=normals[face],
+        change_mm=(weights * shape.change_mm[face]).sum(axis=1),
+    )
+
+
+def sensors_around(shape: Shape, count: int = FULL_SENSORS) -> Float[np.ndarray, "k 3"]:
+    """(k, 3) sensors on a Fibonacci sphere about the part."""
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    turn = np.pi * (1 + 5**0.5) * index
+    flat = np.sqrt(1 - z**2)
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    return _centre(shape) + SENSOR_DISTANCE_RATIO * shape.diagonal_mm * directions
+
+
+def sensor_towards(shape: Shape, direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "1 3"]:
+    """(1, 3) one sensor in that direction from the part's centre."""
+    unit = direction / np.linalg.norm(direction)
+    return (_centre(shape) + SENSOR_DISTANCE_RATIO * shape.diagonal_mm * unit)[None, :]
+
+
+def _centre(shape: Shape) -> Float[np.ndarray, " 3"]:
+    low, high = shape.vertices_mm.min(axis=0), shape.vertices_mm.max(axis=0)
+    return (low + high) / 2
+
+
+def look(
+    shape: Shape,
+    rays: Rays,
+    *,
+    sensors_mm: Float[np.ndarray, "k 3"],
+    count: int,
+    sigma_mm: float,
+    rng: np.random.Generator,
+) -> Surface:
+    """`count` visible points of uneven density, with isotropic noise.
+
+    Raises
+    ------
+    InputError
+        If the sensors see next to nothing.
+    """
+    gradient = rng.normal(size=3)
+    gradient *= rng.uniform(0, MAX_DENSITY_LOG) / np.linalg.norm(gradient) / shape.diagonal_mm
+    seen: list[Surface] = []
+    for _ in range(MAX_ROUNDS):
+        candidates = sample_shape(shape, CANDIDATES_PER_POINT * count, rng)
+        seen.append(candidates.take(rays.seen(candidates, sensors_mm)))
+        if sum(len(part.points_mm) for part in seen) >= 2 * count:
+            break
+    pool = Surface(
+        np.concatenate([part.points_mm for part in seen]),
+        np.concatenate([part.normals for part in seen]),
+        np.concatenate([part.change_mm for part in seen]),
+    )
+    if len(pool.points_mm) < count:
+        raise InputError(
+            f"the view sees {len(pool.points_mm)} of {count} points wanted; ask for fewer points"
+        )
+    # Gumbel top-k: a weighted sample without replacement (Efraimidis and Spirakis 2006)
+    log_weight = (pool.points_mm - _centre(shape)) @ gradient
+    keys = log_weight + rng.gumbel(size=len(log_weight))
+    chosen = pool.take(rng.permutation(np.argpartition(-keys, count - 1)[:count]))
+    noisy = chosen.points_mm + rng.normal(0.0, sigma_mm, chosen.points_mm.shape)
+    return Surface(noisy, chosen.normals, chosen.change_mm)
+
+
+def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """Uniform over all rotations (a normalised Gaussian quaternion)."""
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
