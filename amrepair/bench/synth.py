@@ -25,6 +25,7 @@ from amrepair.bench.synth_views import (
     Surface,
     look,
     random_rotation,
+    sample_shape,
     sensor_towards,
     sensors_around,
 )
@@ -39,7 +40,10 @@ VISIBLE_SIGMAS = 2.0
 # A sample counts as anomalous only where the view shows this much of the defect.
 MIN_LABELLED_RATIO = 0.003
 MIN_LABELLED = 8
-MAX_VIEWS = 30
+MAX_VIEWS = 40
+MAX_SINGLE_VIEWS = 25  # then the defect is shown in a full scan
+SIDE_POINTS = 4000
+LOOSENESS = 0.6  # of the view's direction about the defect's normal
 SINGLE_VIEW_RATIO = {Format.SHAPENET: 1 / 3, Format.REAL3D: 2 / 3}
 FIRST_NUMBER = 101  # Real3D-AD names start with a running number
 REAL3D_WORDS = {Defect.CONCAVITY: "sink"}
@@ -236,7 +240,7 @@ def _made(
 ) -> _Made:
     """One view of a shape in a random pose."""
     sigma_mm = options.sigma_ratio * part.diagonal_mm
-    sensors = sensor_towards(shape, rng.normal(size=3)) if single else sensors_around(shape)
+    sensors = sensor_towards(shape, _side(shape, rng)) if single else sensors_around(shape)
     surface = look(
         shape,
         Rays(shape),
@@ -254,6 +258,19 @@ def _made(
     return _Made(cloud, role, kind, index, single, pose)
 
 
+def _side(shape: Shape, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
+    """A direction to look from: any for a normal part, towards the defect for a damaged one."""
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    points = sample_shape(shape, SIDE_POINTS, rng)
+    changed = points.take(points.change_mm > 0)
+    if len(changed.points_mm):
+        outward = changed.normals.mean(axis=0)
+        length = float(np.linalg.norm(outward))
+        direction = outward / max(length, 1e-9) + LOOSENESS * direction
+    return direction
+
+
 def _labels(surface: Surface, sigma_mm: float) -> np.ndarray:
     return (surface.change_mm > VISIBLE_SIGMAS * sigma_mm).astype(np.int64)
 
@@ -268,9 +285,17 @@ def _defective(
     single: bool,
 ) -> _Made:
     """A defect that the view shows; another place or view is drawn until it does."""
-    for _ in range(MAX_VIEWS):
+    for attempt in range(MAX_VIEWS):
         shape = damage(part, defect, rng)
-        made = _made(part, shape, options, rng, kind=str(defect), index=index, single=single)
+        made = _made(
+            part,
+            shape,
+            options,
+            rng,
+            kind=str(defect),
+            index=index,
+            single=single and attempt < MAX_SINGLE_VIEWS,
+        )
         need = max(MIN_LABELLED, MIN_LABELLED_RATIO * len(made.cloud.points))
         if made.cloud.labels.sum() >= need:
             return made

@@ -1,0 +1,188 @@
+"""`amrepair bench`: every method on every class with every seed, resumable, in several processes.
+
+    out/run.json            which data set this folder belongs to
+    out/cells/…             one row for each finished method, class and seed
+    out/partial/…           scores of samples of unfinished cells, and fitted templates
+    out/results.{json,csv,md}   rewritten after every cell
+
+A second run with the same arguments does only what is left.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+
+from amrepair.bench.cells import Cell, Row, run_cell, write_whole
+from amrepair.bench.dataset import BenchData, open_dataset
+from amrepair.bench.registry import METHODS, make_method
+from amrepair.bench.synth import MANIFEST
+from amrepair.bench.tables import as_csv, as_json, as_markdown
+from amrepair.errors import InputError
+from gcode.progress import Progress, silent
+
+DEFAULT_SEEDS = (0, 1, 2)
+# Raised when scores of the same name would come out differently: old cells are then refused.
+LAYOUT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """What a run came to.
+
+    Attributes
+    ----------
+    rows
+        One for each method, class and seed, in that order.
+    json_path, csv_path, markdown_path
+        The files written.
+    """
+
+    rows: tuple[Row, ...]
+    json_path: Path
+    csv_path: Path
+    markdown_path: Path
+
+
+def run_bench(
+    dataset: Path,
+    *,
+    format: str,
+    methods: Sequence[str],
+    out: Path,
+    jobs: int = 1,
+    seeds: Sequence[int] = DEFAULT_SEEDS,
+    classes: Sequence[str] | None = None,
+    progress: Progress = silent,
+) -> BenchReport:
+    """Compare methods on a data set.
+
+    Parameters
+    ----------
+    dataset
+        Its folder.
+    format
+        `anomaly-shapenet` or `real3d-ad`.
+    methods
+        Names out of `METHODS`.
+    out
+        Folder of the results; one with results of the same data set is gone on with.
+    jobs
+        Processes; each does whole cells.
+    seeds
+        Registration and banks are random: three by default, their spread is reported.
+    classes
+        Only these; None takes all.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, the data set cannot be read, or `out` belongs to another one.
+    """
+    data = open_dataset(Path(dataset), format)
+    if not methods or not seeds or jobs < 1:
+        raise InputError(
+            f"a benchmark needs a method, a seed and at least one job; got {len(methods)} methods, "
+            f"{len(seeds)} seeds and {jobs} jobs"
+        )
+    names = list(dict.fromkeys(methods))
+    for name in names:
+        make_method(name)
+    chosen = _choose(data, classes)
+    out = Path(out)
+    _claim(out, data)
+    cells = [
+        Cell(method, one, data.format, seed, out)
+        for one in chosen.classes
+        for method in names
+        for seed in dict.fromkeys(seeds)
+    ]
+    rows: list[Row] = []
+    for row in _work(cells, jobs, progress):
+        rows.append(row)
+        report = _write(out, chosen, rows, len(cells))
+        progress("bench", float(len(rows)), float(len(cells)))
+    shutil.rmtree(out / "partial", ignore_errors=True)
+    return report
+
+
+def _choose(data: BenchData, classes: Sequence[str] | None) -> BenchData:
+    if classes is None:
+        return data
+    known = {one.name: one for one in data.classes}
+    missing = [name for name in classes if name not in known]
+    if missing:
+        raise InputError(f"no class {missing[0]!r} in the data set; there are {', '.join(known)}")
+    return BenchData(data.format, data.root, tuple(known[name] for name in sorted(set(classes))))
+
+
+def _claim(out: Path, data: BenchData) -> None:
+    """Mark the folder as this data set's, or refuse it."""
+    listing = hashlib.sha256()
+    for one in data.classes:
+        for path in (*one.train, *(sample.cloud_path for sample in one.test)):
+            listing.update(f"{one.name}/{path.name}:{path.stat().st_size}\n".encode())
+    said = {"format": str(data.format), "files": listing.hexdigest(), "layout": LAYOUT_VERSION}
+    path = out / "run.json"
+    if path.is_file():
+        try:
+            found = json.loads(path.read_text())
+        except ValueError:
+            found = None
+        if found != said:
+            raise InputError(
+                f"{out} holds results of another data set or version; choose another --out"
+            )
+    write_whole(path, json.dumps(said).encode())
+
+
+def _work(cells: Sequence[Cell], jobs: int, progress: Progress) -> Iterator[Row]:
+    if jobs == 1:
+        for cell in cells:
+            yield run_cell(cell, progress)
+        return
+    threads = max(1, (os.cpu_count() or 1) // jobs)
+    pool = ProcessPoolExecutor(
+        max_workers=jobs,
+        mp_context=multiprocessing.get_context("spawn"),  # threads of open3d do not survive fork
+        initializer=_limit_threads,
+        initargs=(threads,),
+    )
+    try:
+        for done in as_completed([pool.submit(run_cell, cell) for cell in cells]):
+            yield done.result()
+    except BrokenProcessPool as error:
+        raise InputError(
+            "a benchmark process died (out of memory?); run again with fewer --jobs: what is "
+            "done is kept"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _limit_threads(count: int) -> None:
+    """Libraries loaded from here on share the cores among the jobs."""
+    os.environ["OMP_NUM_THREADS"] = str(count)
+
+
+def _write(out: Path, data: BenchData, rows: Sequence[Row], cells: int) -> BenchReport:
+    ordered = sorted(rows, key=lambda r: (METHODS.index(r.method), r.class_name, r.seed))
+    synthetic = (data.root / MANIFEST).is_file()
+    report = BenchReport(
+        tuple(ordered), out / "results.json", out / "results.csv", out / "results.md"
+    )
+    complete = len(rows) == cells
+    said = as_json(ordered, data.format, synthetic=synthetic, complete=complete)
+    write_whole(report.json_path, said.encode())
+    write_whole(report.csv_path, as_csv(ordered).encode())
+    table = as_markdown(ordered, data.format, synthetic=synthetic, complete=complete)
+    write_whole(report.markdown_path, table.encode())
+    return report

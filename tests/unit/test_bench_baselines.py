@@ -1,0 +1,136 @@
+"""Features, banks and baselines against brute force and shapes whose answer is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amrepair.bench import METHODS
+from amrepair.bench.baselines import BankMethod, fpfh_features, raw_features, reweighted
+from amrepair.bench.dataset import Format
+from amrepair.bench.features import coreset, fill_in, fpfh, nearest
+from amrepair.bench.method import ClassInput, noise_mm
+from amrepair.bench.metrics import auroc
+from amrepair.bench.registry import BASELINES, PUBLISHED, make_method
+from amrepair.bench.synth_views import random_rotation
+from amrepair.errors import InputError
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("width", [3, 33])
+def test_nearest_is_brute_force(rng: np.random.Generator, width: int) -> None:
+    # far from the origin, where an expanded square loses its digits
+    queries = (rng.normal(size=(700, width)) + 50).astype(np.float32)
+    bank = (rng.normal(size=(300, width)) + 50).astype(np.float32)
+    gaps = np.linalg.norm(queries[:, None].astype(float) - bank[None].astype(float), axis=2)
+    distance, index = nearest(queries, bank)
+    assert np.allclose(distance, gaps.min(axis=1), rtol=1e-3)
+    assert np.allclose(gaps[np.arange(700), index], distance, atol=1e-6)
+
+
+def test_coreset_is_the_greedy_k_centre(rng: np.random.Generator) -> None:
+    rows = rng.normal(size=(60, 5)).astype(np.float32)
+    found = coreset(rows, 12, np.random.default_rng(3))
+    expected = [int(np.random.default_rng(3).integers(60))]
+    while len(expected) < 12:
+        gaps = np.linalg.norm(rows[:, None] - rows[expected][None], axis=2).min(axis=1)
+        expected.append(int(np.argmax(gaps)))
+    assert found.tolist() == expected
+    assert coreset(rows, 100, rng).tolist() == list(range(60))
+
+
+def test_filling_in_keeps_known_values_and_reproduces_constants(rng: np.random.Generator) -> None:
+    points = rng.uniform(0, 10, (200, 3))
+    chosen = np.sort(rng.permutation(200)[:50])
+    values = rng.uniform(size=50)
+    full = fill_in(points, chosen, values)
+    assert np.allclose(full[chosen], values, atol=1e-6)
+    assert values.min() - 1e-9 <= full.min()
+    assert full.max() <= values.max() + 1e-9
+    assert np.allclose(fill_in(points, chosen, np.full(50, 2.5)), 2.5)
+    order = rng.permutation(200)
+    assert np.allclose(fill_in(points, order, points[order, 0]), points[:, 0])
+
+
+def test_fpfh_does_not_change_with_the_pose(rng: np.random.Generator) -> None:
+    # on a convex, closed surface sampled densely; normals' signs are free, so compare medians
+    points = rng.normal(size=(3000, 3)) * (1.0, 0.7, 0.4)
+    points *= 20 / np.linalg.norm(points, axis=1, keepdims=True)
+    found = fpfh(points, 1.5)
+    assert found.shape == (3000, 33)
+    # three histograms of 11 bins, each a weighted sum of histograms that add up to 100
+    assert np.isfinite(found).all()
+    turned = fpfh(points @ random_rotation(rng).T + 5.0, 1.5)
+    assert np.median(np.abs(turned - found)) < 0.02 * np.median(np.abs(found).max(axis=1))
+
+
+def test_reweighting_lowers_the_score_where_the_bank_is_sparse() -> None:
+    dense = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
+    sparse = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]])
+    query, distance = np.array([[1.0, 1.0]]), np.array([np.sqrt(2.0)])
+    assert 0 < reweighted(query, distance, dense) < distance[0]
+    assert reweighted(query, distance, dense) < reweighted(query, distance, sparse)
+
+
+def sphere(rng: np.random.Generator, count: int, bump: bool) -> tuple[np.ndarray, np.ndarray]:
+    """A sphere of 50 mm radius, labels on a spherical bump of 4 mm."""
+    unit = rng.normal(size=(count, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    angle = np.arccos(unit[:, 2])
+    height = np.where(angle < 0.25, 4.0 * np.cos(angle / 0.25 * np.pi / 2), 0.0) * bump
+    return unit * (50.0 + height)[:, None], (height > 0.2).astype(int)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_bump_on_a_sphere_scores_higher(
+    rng: np.random.Generator, tmp_path: Path, name: str
+) -> None:
+    train = tuple(sphere(rng, 4000, False)[0] for _ in range(2))
+    data = ClassInput("ball", Format.SHAPENET, train, None, 0.05, 1.0)
+    model = make_method(name).fit(data, seed=0, cache=tmp_path)
+    points, labels = sphere(rng, 4000, True)
+    bumped = model.score(points, np.random.default_rng(1))
+    plain = model.score(sphere(rng, 4000, False)[0], np.random.default_rng(1))
+    assert bumped.point.shape == (4000,)
+    assert auroc(labels, bumped.point) > 0.85  # a sphere has one normal feature: easy for all
+    if "fpfh" in name:  # the sphere's mean moves with the bump, which hides it from raw maxima
+        assert bumped.whole > plain.whole
+    again = make_method(name).fit(data, seed=0, cache=tmp_path)
+    assert np.array_equal(again.score(points, np.random.default_rng(1)).point, bumped.point)
+
+
+def test_only_a_share_of_a_large_cloud_is_asked(
+    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("amrepair.bench.baselines.QUERIES", 500)
+    data = ClassInput("ball", Format.SHAPENET, (sphere(rng, 3000, False)[0],), None, 0.05, 1.0)
+    model = BankMethod((raw_features,), greedy=False).fit(data, seed=0, cache=tmp_path)
+    points, labels = sphere(rng, 3000, True)
+    scores = model.score(points, np.random.default_rng(0))
+    assert len(scores.point) == 3000
+    assert auroc(labels, scores.point) > 0.8
+
+
+def test_noise_is_estimated_within_a_fifth(rng: np.random.Generator) -> None:
+    for sigma_mm in (0.02, 0.1):
+        points = sphere(rng, 40_000, False)[0]
+        points = points + rng.normal(0, sigma_mm, points.shape)
+        assert noise_mm(points) == pytest.approx(sigma_mm, rel=0.2)
+
+
+def test_names_are_those_of_the_contract() -> None:
+    assert set(METHODS) == {
+        "pasdf",
+        "pasdf-paper",
+        *(f"{name}{pam}" for name in BASELINES for pam in ("", "+pam")),
+    }
+    with pytest.raises(InputError, match="method 'm3dm' is unknown; choose from pasdf"):
+        make_method("m3dm")
+    assert PUBLISHED[Format.SHAPENET]["patchcore-fpfh+pam"] == (81.4, 86.7)
+    assert fpfh_features(np.random.default_rng(0).normal(size=(50, 3))).shape == (50, 33)
