@@ -19,14 +19,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from amrepair.bench.features import coreset, fill_in, fpfh, nearest
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
 from amrepair.errors import AlignmentError
 
-Extractor = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n d"]]
+Extractor = Callable[
+    [Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "k d"], Int[np.ndarray, " k"]]
+]
+"""Features, and which points they are of (all, or the centres of patches)."""
 Aligner = Callable[
     [Float[np.ndarray, "n 3"], np.random.Generator],
     tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]],
@@ -44,19 +47,25 @@ REWEIGHT_NEIGHBOURS = 3
 SCALE_QUANTILE = 0.99
 
 
-def raw_features(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def raw_features(
+    points_mm: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
     """The coordinates themselves, about their mean as in the published readers."""
-    return np.asarray(points_mm - points_mm.mean(axis=0))
+    return points_mm - points_mm.mean(axis=0), np.arange(len(points_mm))
 
 
-def aligned_raw_features(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def aligned_raw_features(
+    points_mm: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
     """The coordinates as alignment left them."""
-    return points_mm
+    return points_mm, np.arange(len(points_mm))
 
 
-def fpfh_features(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 33"]:
+def fpfh_features(
+    points_mm: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n 33"], Int[np.ndarray, " n"]]:
     """FPFH at the published radii."""
-    return fpfh(points_mm, VOXEL_MM)
+    return fpfh(points_mm, VOXEL_MM), np.arange(len(points_mm))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,18 +88,17 @@ class Bank:
         self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "q d"], Float[np.ndarray, " q"]]:
         """(n,) distances to the bank at all points; features and distances where asked."""
-        count = min(QUERIES, len(points_mm))
-        chosen = np.sort(rng.permutation(len(points_mm))[:count])
-        features = self.extract(points_mm)[chosen]
-        distance, _ = nearest(features, self.features)
-        return fill_in(points_mm, chosen, distance), features, distance
+        features, index = self.extract(points_mm)
+        chosen = np.sort(rng.permutation(len(index))[:QUERIES])
+        distance, _ = nearest(features[chosen], self.features)
+        return fill_in(points_mm, index[chosen], distance), features[chosen], distance
 
 
 def strided_bank(
     clouds: list[Float[np.ndarray, "_ 3"]], extract: Extractor, rng: np.random.Generator
 ) -> Bank:
     """BTF's bank: every k-th feature, about 10,000 in all."""
-    features = np.concatenate([extract(cloud) for cloud in clouds])
+    features = np.concatenate([extract(cloud)[0] for cloud in clouds])
     step = max(1, len(features) // MEMORY_SIZE)
     return _scaled(extract, features[::step], features, rng)
 
@@ -99,7 +107,7 @@ def coreset_bank(
     clouds: list[Float[np.ndarray, "_ 3"]], extract: Extractor, rng: np.random.Generator
 ) -> Bank:
     """PatchCore's bank: a tenth of the features, at most 10,000, chosen greedily."""
-    features = np.concatenate([extract(cloud) for cloud in clouds])
+    features = np.concatenate([extract(cloud)[0] for cloud in clouds])
     candidates = features[np.sort(rng.permutation(len(features))[:CANDIDATES])]
     count = min(MEMORY_SIZE, int(np.ceil(CORESET_RATIO * len(candidates))))
     return _scaled(extract, candidates[coreset(candidates, count, rng)], features, rng)

@@ -74,6 +74,7 @@ class Cell:
     format: Format
     seed: int
     out: Path
+    checkpoint: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -124,7 +125,7 @@ def run_cell(
     if left or not fit_path.is_file():
         started = clock()
         data = class_input(cell.one, cell.format)
-        method = make_method(cell.method)
+        method = make_method(cell.method, checkpoint=cell.checkpoint)
         model = method.fit(data, seed=cell.seed, cache=cell.out / "partial" / "templates")
         _write_fit(fit_path, model, clock() - started, data.sigma_mm)
         for i, sample in enumerate(left):

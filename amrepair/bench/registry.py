@@ -5,6 +5,8 @@ Published figures: PASDF (arXiv 2505.24431), tables 1 to 3, in per cent, on the 
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from amrepair.bench.baselines import (
     BankMethod,
     Extractor,
@@ -19,7 +21,11 @@ from amrepair.errors import InputError
 PAM = "+pam"
 OWN = ("pasdf", "pasdf-paper")
 BASELINES = ("btf-raw", "btf-fpfh", "patchcore-fpfh", "patchcore-fpfh-raw")
-METHODS = (*OWN, *(name + pam for name in BASELINES for pam in ("", PAM)))
+PRETRAINED = ("patchcore-pointmae", "patchcore-pointbert")  # with a checkpoint of the user's
+METHODS = (
+    *OWN,
+    *(name + pam for name in (*BASELINES, *PRETRAINED) for pam in ("", PAM)),
+)
 
 # O-AUROC and P-AUROC, %; None where the paper prints none.
 PUBLISHED: dict[Format, dict[str, tuple[float | None, float | None]]] = {
@@ -66,15 +72,21 @@ PUBLISHED: dict[Format, dict[str, tuple[float | None, float | None]]] = {
 PUBLISHED_REPAIR = {Format.REAL3D: (0.0203, 0.0110), Format.SHAPENET: (0.0445, 0.0228)}
 
 
-def make_method(name: str) -> Method:
+def make_method(name: str, *, checkpoint: Path | None = None) -> Method:
     """A method by its name on the command line.
+
+    Parameters
+    ----------
+    checkpoint
+        Weights, for the methods that need them.
 
     Raises
     ------
     InputError
-        If the name is unknown.
+        If the name is unknown, or the weights it needs are not given or not right.
     """
-    base, pam = name.removesuffix(PAM), name.endswith(PAM)
+    if name not in METHODS:
+        raise InputError(f"the method '{name}' is unknown; choose from {', '.join(METHODS)}")
     if name in OWN:
         from amrepair.bench.house import FieldMethod
 
@@ -84,17 +96,25 @@ def make_method(name: str) -> Method:
             align_method="paper" if paper else "robust",
             as_paper=paper,
         )
-    if base not in BASELINES:
-        raise InputError(f"the method '{name}' is unknown; choose from {', '.join(METHODS)}")
+    base, pam = name.removesuffix(PAM), name.endswith(PAM)
+    features = _extractors(base, pam=pam, checkpoint=checkpoint)
+    if not pam:
+        return BankMethod(features, base.startswith("patchcore"))
+    from amrepair.bench.house import pam_aligner
+
+    return BankMethod(features, base.startswith("patchcore"), pam_aligner)
+
+
+def _extractors(base: str, *, pam: bool, checkpoint: Path | None) -> tuple[Extractor, ...]:
+    if base in PRETRAINED:
+        from amrepair.bench.pointmae import load_checkpoint
+
+        return (load_checkpoint(checkpoint, base.removeprefix("patchcore-")).extract,)
     raw: Extractor = aligned_raw_features if pam else raw_features
-    extractors: dict[str, tuple[Extractor, ...]] = {
+    named: dict[str, tuple[Extractor, ...]] = {
         "btf-raw": (raw,),
         "btf-fpfh": (fpfh_features,),
         "patchcore-fpfh": (fpfh_features,),
         "patchcore-fpfh-raw": (fpfh_features, raw),
     }
-    if pam:
-        from amrepair.bench.house import pam_aligner
-
-        return BankMethod(extractors[base], base.startswith("patchcore"), pam_aligner)
-    return BankMethod(extractors[base], base.startswith("patchcore"))
+    return named[base]

@@ -61,6 +61,7 @@ def run_bench(
     jobs: int = 1,
     seeds: Sequence[int] = DEFAULT_SEEDS,
     classes: Sequence[str] | None = None,
+    checkpoint: Path | None = None,
     progress: Progress = silent,
 ) -> BenchReport:
     """Compare methods on a data set.
@@ -81,6 +82,8 @@ def run_bench(
         Registration and banks are random: three by default, their spread is reported.
     classes
         Only these; None takes all.
+    checkpoint
+        Pretrained weights, for the methods that need them.
 
     Raises
     ------
@@ -95,12 +98,12 @@ def run_bench(
         )
     names = list(dict.fromkeys(methods))
     for name in names:
-        make_method(name)
+        make_method(name, checkpoint=checkpoint)
     chosen = _choose(data, classes)
     out = Path(out)
     _claim(out, data)
     cells = [
-        Cell(method, one, data.format, seed, out)
+        Cell(method, one, data.format, seed, out, checkpoint)
         for one in chosen.classes
         for method in names
         for seed in dict.fromkeys(seeds)
