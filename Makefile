@@ -3,9 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-OUT ?= out/demo
 
-.PHONY: demo test lint suite bench slow peers clean help
+.PHONY: test lint suite slow clean help
 
 help: ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -14,9 +13,6 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
 	touch $@
-
-demo: $(STAMP) ## print the bracket, break it, find what is missing, print only that
-	$(BIN)/amrepair simulate --out $(OUT)
 
 test: lint suite ## what CI runs
 

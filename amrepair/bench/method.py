@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
+from scipy.stats import chi2
 
 from amrepair.bench.dataset import BenchClass, Format, read_points
 from amrepair.bench.metrics import CloudDistance
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     import trimesh
 
 DIAGONAL_MM = 100.0
-NOISE_POINTS, NOISE_NEIGHBOURS = 4000, 16
+NOISE_POINTS, NOISE_NEIGHBOURS, NOISE_QUANTILE = 4000, 10, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +114,18 @@ def class_input(one: BenchClass, format: Format) -> ClassInput:
 
 
 def noise_mm(points_mm: Float[np.ndarray, "n 3"]) -> float:
-    """Noise across the surface: the median residual of planes through 16 neighbours.
+    """Noise across the surface, from the residuals of planes through ten neighbours.
 
-    Half the neighbourhoods of a part are flat enough that curvature stays below the noise; the
-    smallest eigenvalue of 16 points underestimates by the 3 fitted degrees of freedom.
+    On flat ground the smallest eigenvalue of k points is σ² χ² with k − 3 degrees of freedom;
+    edges, curves and thin walls only add to it. So a low quantile is compared with the χ² quantile:
+    one place in five must be flat, not one in two.
     """
     step = max(1, len(points_mm) // NOISE_POINTS)
     count = min(NOISE_NEIGHBOURS, len(points_mm))
+    if count <= 3:
+        return 0.0
     index = cKDTree(points_mm).query(points_mm[::step], k=[*range(1, count + 1)])[1]
     near = points_mm[index] - points_mm[index].mean(axis=1, keepdims=True)
     smallest = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", near, near))[:, 0]
-    return float(np.sqrt(np.median(np.maximum(smallest, 0.0)) / max(count - 3, 1)))
+    low = float(np.quantile(np.maximum(smallest, 0.0), NOISE_QUANTILE))
+    return float(np.sqrt(low / chi2.ppf(NOISE_QUANTILE, count - 3)))

@@ -87,22 +87,14 @@ def make_method(name: str, *, checkpoint: Path | None = None) -> Method:
     """
     if name not in METHODS:
         raise InputError(f"the method '{name}' is unknown; choose from {', '.join(METHODS)}")
-    if name in OWN:
-        from amrepair.bench.house import FieldMethod
-
-        paper = name == "pasdf-paper"
-        return FieldMethod(
-            recipe="paper" if paper else "fast",
-            align_method="paper" if paper else "robust",
-            as_paper=paper,
-        )
     base, pam = name.removesuffix(PAM), name.endswith(PAM)
+    if name in OWN or pam:
+        raise InputError(
+            f"the method '{name}' needs the learned template and the alignment, which this "
+            "version does not have yet; choose a baseline without +pam"
+        )
     features = _extractors(base, pam=pam, checkpoint=checkpoint)
-    if not pam:
-        return BankMethod(features, base.startswith("patchcore"))
-    from amrepair.bench.house import pam_aligner
-
-    return BankMethod(features, base.startswith("patchcore"), pam_aligner)
+    return BankMethod(features, base.startswith("patchcore"))
 
 
 def _extractors(base: str, *, pam: bool, checkpoint: Path | None) -> tuple[Extractor, ...]:

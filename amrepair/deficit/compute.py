@@ -234,7 +234,7 @@ def _merge(
     return merged
 
 
-def _solid_in_box(  # noqa: PLR0917
+def _solid_in_box(
     template: Template,
     evidence: Evidence,
     anomaly: AnomalyMap,

@@ -174,7 +174,7 @@ def _background(
     return (bed & (f_mm > BED_BAND_MM / 2)) | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
 
 
-def _threshold(  # noqa: PLR0917
+def _threshold(
     scan: Scan,
     template: Template,
     surfels: Surfels,
@@ -245,7 +245,7 @@ def _drop_specks(
     return kept
 
 
-def _label_surface(  # noqa: PLR0917
+def _label_surface(
     surface_mm: Float[np.ndarray, "m 3"],
     normals: Float[np.ndarray, "m 3"],
     template: Template,

@@ -32,7 +32,7 @@ def group_points(
     return numbered[tuple(index.T)].astype(np.int64) - 1
 
 
-def find_regions(  # noqa: PLR0917
+def find_regions(
     evidence: Evidence,
     missing: Bool[np.ndarray, " s"],
     excess: Bool[np.ndarray, " s"],

@@ -1,6 +1,5 @@
 """Loops over occupied cells and range images: compiled, no policy."""
 
-# ruff: noqa: PLR0917 - numba knows no keyword-only arguments
 from __future__ import annotations
 
 from typing import Any

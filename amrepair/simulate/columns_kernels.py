@@ -1,5 +1,4 @@
 # mypy: disable-error-code="no-untyped-def"
-# ruff: noqa: PLR0917
 """Kernels on columns: linked lists of solid z-intervals that grow, and flat maps of them.
 
 A column's topmost interval lies in dense arrays `hi`, `lo` (ny, nx), mm; the others hang below it

@@ -1,5 +1,4 @@
 # mypy: disable-error-code="no-untyped-def"
-# ruff: noqa: PLR0917
 """The bead model: plastic under a moving nozzle finds its place among the columns.
 
 Per short step of the path the volume pushed out (1) levels the columns under the nozzle's bore,

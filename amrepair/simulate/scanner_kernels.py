@@ -1,5 +1,4 @@
 # mypy: disable-error-code="no-untyped-def"
-# ruff: noqa: PLR0917
 """Rays against columns: first hits, and the surface as a sensor of finite resolution sees it.
 
 A ray walks the grid (Amanatides and Woo, 1987) over a flat map of the world. The first hit is then

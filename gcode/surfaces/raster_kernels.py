@@ -3,7 +3,6 @@
 Compiled; no allocation policy, no units of its own: everything is in cells' own millimetres.
 """
 
-# ruff: noqa: PLR0917 - numba knows no keyword-only arguments
 from __future__ import annotations
 
 from typing import Any

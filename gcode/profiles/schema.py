@@ -1,20 +1,21 @@
-"""Printer, material and process profiles: load, inherit, validate.
+"""What a printer, a material and a process profile say: keys, units and ranges.
 
-A profile is a TOML file under `profiles/` or a path of the user's. Unknown keys and values out
-of range are refused naming file, key, value and range. Nothing here talks to a printer.
+It does not read files (`store`) and knows no slicer's own format (`importers`).
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 DialectName = Literal["marlin", "prusa", "klipper", "reprap"]
 Positive = Annotated[float, Field(gt=0)]
 Ratio = Annotated[float, Field(ge=0, le=1)]
 Xy = tuple[float, float]
 Xyz = tuple[float, float, float]
+_ROUND_SIDES = 16  # a circumscribed 16-gon is at most 2 % wider than the circle
 
 
 class _Profile(BaseModel):
@@ -41,13 +42,43 @@ class EnvelopeSlice(BaseModel):
 
     `polygon_mm` is relative to the nozzle tip, counter-clockwise; the slice occupies
     `z_from_mm` to the next slice's `z_from_mm` above the tip (the last one: up to infinity).
+    Over a height field, whose columns are solid down to the bed, only `z_from_mm` matters. In a
+    file, `radius_mm` (about the axis) or `box_mm` (x0, y0, x1, y1) may stand for the polygon.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     part: Literal["nozzle", "block", "duct", "carriage", "gantry"]
     z_from_mm: Annotated[float, Field(ge=0)]
-    polygon_mm: tuple[Xy, ...]
+    polygon_mm: Annotated[tuple[Xy, ...], Field(min_length=3)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _outline(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "polygon_mm" in data:
+            return data
+        rest = {key: value for key, value in data.items() if key not in {"radius_mm", "box_mm"}}
+        if "radius_mm" in data:
+            corner_mm = float(data["radius_mm"]) / math.cos(math.pi / _ROUND_SIDES)
+            angles = [2 * math.pi * (k + 0.5) / _ROUND_SIDES for k in range(_ROUND_SIDES)]
+            rest["polygon_mm"] = [
+                (round(corner_mm * math.cos(a), 4), round(corner_mm * math.sin(a), 4))
+                for a in angles
+            ]
+        elif "box_mm" in data:
+            x0, y0, x1, y1 = data["box_mm"]
+            rest["polygon_mm"] = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+        return rest
+
+    @field_validator("polygon_mm")
+    @classmethod
+    def _convex(cls, polygon: tuple[Xy, ...]) -> tuple[Xy, ...]:
+        n = len(polygon)
+        for k in range(n):
+            (ax, ay), (bx, by), (cx, cy) = polygon[k], polygon[(k + 1) % n], polygon[(k + 2) % n]
+            if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) < -1e-9:
+                raise ValueError("must be a convex polygon, counter-clockwise")
+        return polygon
 
 
 class PrinterProfile(_Profile):
@@ -56,6 +87,8 @@ class PrinterProfile(_Profile):
     dialect: DialectName
     bed_size_mm: tuple[Positive, Positive]
     max_z_mm: Positive
+    reach_min_mm: Xy | None = None  # where the nozzle may go off the bed (purge, wiper); the bed
+    reach_max_mm: Xy | None = None  # itself where left out
     nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=2.0)]
     filament_diameter_mm: Annotated[float, Field(ge=1.0, le=3.5)] = 1.75
     max_speed_mm_s: AxisLimits
@@ -79,6 +112,24 @@ class PrinterProfile(_Profile):
     baud: int = 115200
     start_gcode: tuple[str, ...]
     end_gcode: tuple[str, ...]
+    macros: tuple[str, ...] = ()  # commands of this machine beyond its firmware's own
+
+    @field_validator("start_gcode", "end_gcode", mode="before")
+    @classmethod
+    def _lines(cls, value: Any) -> Any:
+        return value.strip().splitlines() if isinstance(value, str) else value
+
+    @property
+    def reach_box_mm(self) -> tuple[float, float, float, float]:
+        """(x_min, y_min, x_max, y_max) where the nozzle may go; at least the bed."""
+        low = self.reach_min_mm or (0.0, 0.0)
+        high = self.reach_max_mm or self.bed_size_mm
+        return (
+            min(low[0], 0.0),
+            min(low[1], 0.0),
+            max(high[0], self.bed_size_mm[0]),
+            max(high[1], self.bed_size_mm[1]),
+        )
 
 
 class MaterialProfile(_Profile):

@@ -1,0 +1,353 @@
+"""`ReportData`: everything a report shows, as plain typed values.
+
+It says what a report holds, not how it looks (`page`, `payload`) nor where the values come from
+(`collect`). All geometry is in the build frame: bed corner at the origin, Z up, mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from gcode.moves import Extrude, LayerChange, Role, Toolpath
+
+
+class Outcome(StrEnum):
+    """How a run ended, in the words of the report's headline."""
+
+    WITHIN_TOLERANCE = "within_tolerance"
+    NOT_WITHIN_TOLERANCE = "not_within_tolerance"
+    NOTHING_TO_REPAIR = "nothing_to_repair"
+    PLANNED = "planned"  # G-code was made; the part has not been scanned since
+    STOPPED = "stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class SolidMesh:
+    """Triangles of a closed surface.
+
+    Attributes
+    ----------
+    vertices_mm
+        (v, 3) build frame.
+    faces
+        (f, 3) vertex indices, counter-clockwise from outside.
+    """
+
+    vertices_mm: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+
+
+@dataclass(frozen=True, slots=True)
+class BeadPath:
+    """The beads of a repair, one segment a row, in the order they are printed.
+
+    Attributes
+    ----------
+    start_mm, end_mm
+        (n, 3) nozzle positions, build frame; the bead hangs below them by its height.
+    width_mm, height_mm
+        (n,) cross-section as drawn.
+    layer
+        (n,) index into `layer_top_mm`, rising.
+    role
+        (n,) index into `roles`.
+    layer_top_mm
+        (k,) nozzle height of each layer.
+    roles
+        Names of the roles that occur.
+    """
+
+    start_mm: Float[np.ndarray, "n 3"]
+    end_mm: Float[np.ndarray, "n 3"]
+    width_mm: Float[np.ndarray, " n"]
+    height_mm: Float[np.ndarray, " n"]
+    layer: Int[np.ndarray, " n"]
+    role: Int[np.ndarray, " n"]
+    layer_top_mm: Float[np.ndarray, " k"]
+    roles: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.layer)
+
+    @classmethod
+    def from_toolpath(cls, toolpath: Toolpath) -> BeadPath | None:
+        """The beads of a toolpath without its skirt; None where nothing is extruded.
+
+        Layers are told by `LayerChange`; chains before the first one open a layer of their own.
+        """
+        starts, ends, widths, heights, layers, roles = [], [], [], [], [], []
+        names: list[str] = []
+        tops_mm: list[float] = []
+        pending_top_mm: float | None = None
+        for move in toolpath:
+            if isinstance(move, LayerChange):
+                pending_top_mm = float(move.z_mm)
+            elif isinstance(move, Extrude) and move.role is not Role.SKIRT:
+                if pending_top_mm is None and not tops_mm:
+                    pending_top_mm = float(move.points_mm[0, 2])
+                if pending_top_mm is not None:
+                    tops_mm.append(pending_top_mm)
+                    pending_top_mm = None
+                if str(move.role) not in names:
+                    names.append(str(move.role))
+                points_mm = np.asarray(move.points_mm, dtype=np.float64)
+                count = len(points_mm) - 1
+                starts.append(points_mm[:-1])
+                ends.append(points_mm[1:])
+                widths.append(np.full(count, move.width_mm))
+                heights.append(np.full(count, move.height_mm))
+                layers.append(np.full(count, len(tops_mm) - 1))
+                roles.append(np.full(count, names.index(str(move.role))))
+        if not starts:
+            return None
+        return cls(
+            start_mm=np.concatenate(starts),
+            end_mm=np.concatenate(ends),
+            width_mm=np.concatenate(widths),
+            height_mm=np.concatenate(heights),
+            layer=np.concatenate(layers),
+            role=np.concatenate(roles),
+            layer_top_mm=np.array(tops_mm),
+            roles=tuple(names),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class HeightMap:
+    """The top surface at one look, seen from above.
+
+    Attributes
+    ----------
+    origin_mm
+        (2,) XY of the corner of cell [0, 0], build frame.
+    cell_mm
+        Edge of a square cell.
+    z_mm
+        (ny, nx) height of the top surface.
+    seen
+        (ny, nx) whether a sensor measured the cell; the others are drawn as unknown.
+    title
+        What is shown, such as `Layer 80, z = 16.0 mm`.
+    outlines_mm
+        Closed XY outlines of the defects, (k, 2) each.
+    """
+
+    origin_mm: Float[np.ndarray, " 2"]
+    cell_mm: float
+    z_mm: Float[np.ndarray, "ny nx"]
+    seen: Bool[np.ndarray, "ny nx"]
+    title: str = "Top surface"
+    outlines_mm: tuple[Float[np.ndarray, "_ 2"], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RegionRow:
+    """One defect, as the table shows it.
+
+    Attributes
+    ----------
+    type
+        `void`, `chip`, `blob`, …
+    box_mm
+        (2, 3) lowest and highest corner, build frame.
+    reachable_ratio
+        Share of the volume that the nozzle can reach, 0..1, or None where nobody asked.
+    note
+        Why it was or was not filled, in a sentence.
+    """
+
+    type: str
+    volume_mm3: float
+    box_mm: Float[np.ndarray, "2 3"]
+    reachable_ratio: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One decision with its reasons.
+
+    Attributes
+    ----------
+    where
+        Such as `Layer 80, z = 16.0 mm`.
+    choice
+        Such as `fill now`.
+    reasons
+        Whole sentences.
+    """
+
+    where: str
+    choice: str
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Counter:
+    """A number from the wire and what it means."""
+
+    name: str
+    value: float
+    meaning: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureSeries:
+    """A heater over the run.
+
+    Attributes
+    ----------
+    time_s
+        (n,) the printer's clock, s.
+    measured_c, target_c
+        (n,) °C; target is None where it is not known.
+    """
+
+    name: str
+    time_s: Float[np.ndarray, " n"]
+    measured_c: Float[np.ndarray, " n"]
+    target_c: Float[np.ndarray, " n"] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One scan and what followed from it.
+
+    Attributes
+    ----------
+    label
+        Such as `Layer 80, before repair`.
+    points_mm
+        (n, 3) scan points, build frame.
+    deviation_mm
+        (n,) signed distance to the expected surface, negative inside: material is missing.
+    label_of_point
+        (n,) 0 ok, 1 missing, 2 excess (`detect.Label`).
+    threshold_mm
+        The limit that the detection used, and in `threshold_source` how it was set.
+    normals
+        (n, 3) unit normals or None; they only shade the drawing.
+    unseen_mm
+        (u, 3) points of the expected surface that no ray reached.
+    missing, excess
+        Solids, or None where there is none.
+    beads
+        What was printed after this look, or None.
+    missing_mm3, excess_mm3
+        Volumes at this look, as measured.
+    height_map
+        The top surface at this look, or None.
+    """
+
+    label: str
+    points_mm: Float[np.ndarray, "n 3"]
+    deviation_mm: Float[np.ndarray, " n"]
+    label_of_point: Int[np.ndarray, " n"]
+    threshold_mm: float
+    threshold_source: str = ""
+    normals: Float[np.ndarray, "n 3"] | None = None
+    unseen_mm: Float[np.ndarray, "u 3"] | None = None
+    missing: SolidMesh | None = None
+    excess: SolidMesh | None = None
+    beads: BeadPath | None = None
+    missing_mm3: float = 0.0
+    excess_mm3: float = 0.0
+    unseen_area_mm2: float = 0.0
+    height_map: HeightMap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """The figures of a run that a person asks for first; None where they are not known."""
+
+    missing_mm3_before: float
+    missing_mm3_after: float | None
+    excess_mm3_before: float
+    excess_mm3_after: float | None
+    repaired_ratio: float | None
+    unreachable_mm3: float
+    unseen_area_mm2: float
+    iterations: int
+    filament_mm: float
+    print_time_s: float
+
+    @classmethod
+    def from_result(cls, result: Mapping[str, object]) -> Figures:
+        """The figures of a `--json` result of `simulate`, `repair` or `loop`."""
+        return cls(
+            missing_mm3_before=_number(result, "missing_mm3_before") or 0.0,
+            missing_mm3_after=_number(result, "missing_mm3_after"),
+            excess_mm3_before=_number(result, "excess_mm3_before") or 0.0,
+            excess_mm3_after=_number(result, "excess_mm3_after"),
+            repaired_ratio=_number(result, "repaired_ratio"),
+            unreachable_mm3=_number(result, "unreachable_mm3") or 0.0,
+            unseen_area_mm2=_number(result, "unseen_area_mm2") or 0.0,
+            iterations=int(_number(result, "iterations") or 0),
+            filament_mm=_number(result, "filament_mm") or 0.0,
+            print_time_s=_number(result, "print_time_s") or 0.0,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ReportData:
+    """Everything that one report shows.
+
+    Attributes
+    ----------
+    title
+        Name of the part or the run.
+    setup
+        Such as printer, material, process, command: shown under the title, in order.
+    expected
+        The part as it should be, or None.
+    looks
+        Scans in the order they were taken.
+    compare
+        Indices of the looks shown side by side at first; None picks the first look with
+        something missing and the last one.
+    seconds
+        Time spent by stage.
+    provenance
+        Versions, profile hashes, seed: what another person needs to repeat the run.
+    """
+
+    title: str
+    outcome: Outcome
+    figures: Figures
+    looks: tuple[Look, ...]
+    setup: Mapping[str, str] = field(default_factory=dict)
+    expected: SolidMesh | None = None
+    regions: tuple[RegionRow, ...] = ()
+    decisions: tuple[Decision, ...] = ()
+    wire: tuple[Counter, ...] = ()
+    temperatures: tuple[TemperatureSeries, ...] = ()
+    compare: tuple[int, int] | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+
+def regions_from_result(result: Mapping[str, object]) -> tuple[RegionRow, ...]:
+    """The `regions` of a `--json` result."""
+    rows = result.get("regions")
+    if not isinstance(rows, (list, tuple)):
+        return ()
+    return tuple(
+        RegionRow(
+            type=str(row["type"]),
+            volume_mm3=float(row["volume_mm3"]),
+            box_mm=np.asarray(row["box_mm"], dtype=np.float64).reshape(2, 3),
+            reachable_ratio=_number(row, "reachable_ratio"),
+        )
+        for row in rows
+    )
+
+
+def _number(result: Mapping[str, object], key: str) -> float | None:
+    value = result.get(key)
+    return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None

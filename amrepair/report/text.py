@@ -1,0 +1,196 @@
+"""Words and numbers for people: the three-line summary, and how quantities are written.
+
+It makes text, never markup; the terminal and the page share it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter as Tally
+from collections.abc import Mapping, Sequence
+
+from amrepair.report.data import Figures, Outcome, RegionRow, ReportData, regions_from_result
+
+# Below this a volume is less than half of the smallest bead that can be placed (0.08 mm³).
+NEGLIGIBLE_MM3 = 0.04
+_NAMES = {
+    "void": ("void", "voids"),
+    "under_extrusion": ("patch of thin extrusion", "patches of thin extrusion"),
+    "chip": ("chip", "chips"),
+    "blob": ("blob", "blobs"),
+    "unknown": ("region of unknown kind", "regions of unknown kind"),
+}
+HEADLINES = {
+    Outcome.WITHIN_TOLERANCE: "Within tolerance",
+    Outcome.NOT_WITHIN_TOLERANCE: "Not within tolerance",
+    Outcome.NOTHING_TO_REPAIR: "Nothing to repair",
+    Outcome.PLANNED: "Repair ready to print",
+    Outcome.STOPPED: "Stopped",
+}
+
+
+def quantity(value: float, unit: str, *, digits: int = 3) -> str:
+    """`1,234 mm³`, `12.3 mm³`, `0.04 mm³`: about three significant digits, no exponent.
+
+    Examples
+    --------
+    >>> quantity(1234.56, "mm³"), quantity(12.34, "mm³"), quantity(0.0449, "mm")
+    ('1,235 mm³', '12.3 mm³', '0.04 mm')
+    """
+    magnitude = abs(value)
+    decimals = 0 if magnitude >= 100 else 1 if magnitude >= 10 else 2
+    decimals = min(decimals, max(digits - 1, 0))
+    text = f"{value:,.{decimals}f}"
+    if float(text.replace(",", "")) == 0:
+        text = "0"
+    return f"{text} {unit}".strip()
+
+
+def percent(ratio: float) -> str:
+    """`95 %`; 100 % and 0 % are said only where they are true to the last digit.
+
+    Examples
+    --------
+    >>> percent(0.953), percent(0.9996), percent(1.0)
+    ('95 %', '99.9 %', '100 %')
+    """
+    if ratio <= 0 or ratio >= 1:
+        return f"{100 * ratio:.0f} %"
+    if ratio >= 0.99 or ratio < 0.01:
+        return f"{min(max(100 * ratio, 0.1), 99.9):.1f} %"
+    return f"{100 * ratio:.0f} %"
+
+
+def duration(seconds: float) -> str:
+    """`1 h 05 min`, `6 min 40 s`, `12 s`, `0.8 s`.
+
+    Examples
+    --------
+    >>> duration(3900), duration(400), duration(12.4), duration(0.81)
+    ('1 h 05 min', '6 min 40 s', '12 s', '0.8 s')
+    """
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def kinds(regions: Sequence[RegionRow]) -> str:
+    """`a void and 2 chips`; empty where there are no regions."""
+    tally = Tally(region.type for region in regions)
+    parts = []
+    for name, count in tally.items():
+        one, many = _NAMES.get(name, (name.replace("_", " "), name.replace("_", " ") + "s"))
+        parts.append(f"{_article(one)} {one}" if count == 1 else f"{count} {many}")
+    if len(parts) < 2:
+        return "".join(parts)
+    return ", ".join(parts[:-1]) + " and " + parts[-1]
+
+
+def summary(
+    outcome: Outcome, figures: Figures, regions: Sequence[RegionRow]
+) -> tuple[str, str, str]:
+    """Three lines: what was found, what was done about it, what is left.
+
+    Examples
+    --------
+    >>> from amrepair.report.data import Figures, Outcome
+    >>> clean = Figures(0.0, None, 0.0, None, None, 0.0, 0.0, 0, 0.0, 0.0)
+    >>> summary(Outcome.NOTHING_TO_REPAIR, clean, ())[0]
+    'Nothing is missing: the part agrees with its template.'
+    """
+    return _found(figures, regions), _done(outcome, figures), _left(outcome, figures)
+
+
+def summary_of(data: ReportData) -> tuple[str, str, str]:
+    """The three lines of a report."""
+    return summary(data.outcome, data.figures, data.regions)
+
+
+def outcome_of(result: Mapping[str, object], *, within_tolerance: bool) -> Outcome:
+    """How a run ended, told from its `--json` result and whether its exit code is 0."""
+    figures = Figures.from_result(result)
+    if not figures.missing_mm3_before > NEGLIGIBLE_MM3 and figures.filament_mm <= 0:
+        return Outcome.NOTHING_TO_REPAIR if within_tolerance else Outcome.NOT_WITHIN_TOLERANCE
+    if figures.missing_mm3_after is None and figures.repaired_ratio is None and within_tolerance:
+        return Outcome.PLANNED
+    return Outcome.WITHIN_TOLERANCE if within_tolerance else Outcome.NOT_WITHIN_TOLERANCE
+
+
+def summary_of_result(
+    result: Mapping[str, object], *, within_tolerance: bool
+) -> tuple[str, str, str]:
+    """The three lines for the terminal, from a `--json` result."""
+    return summary(
+        outcome_of(result, within_tolerance=within_tolerance),
+        Figures.from_result(result),
+        regions_from_result(result),
+    )
+
+
+def _found(figures: Figures, regions: Sequence[RegionRow]) -> str:
+    missing, excess = figures.missing_mm3_before, figures.excess_mm3_before
+    listed = kinds(regions)
+    where = f" ({listed})" if listed else ""
+    if missing > NEGLIGIBLE_MM3 and excess > NEGLIGIBLE_MM3:
+        return (
+            f"Found {quantity(missing, 'mm³')} missing and "
+            f"{quantity(excess, 'mm³')} too much{where}."
+        )
+    if missing > NEGLIGIBLE_MM3:
+        return f"Found {quantity(missing, 'mm³')} missing{where}."
+    if excess > NEGLIGIBLE_MM3:
+        return (
+            f"Nothing is missing, but {quantity(excess, 'mm³')} too much stands there{where}; "
+            "printing cannot take it away."
+        )
+    return "Nothing is missing: the part agrees with its template."
+
+
+def _done(outcome: Outcome, figures: Figures) -> str:
+    if figures.filament_mm <= 0:
+        return "Nothing was printed, and no repair G-code was made."
+    cost = (
+        f"{quantity(figures.filament_mm / 1000, 'm')} of filament in "
+        f"{duration(figures.print_time_s)}"
+    )
+    if outcome is Outcome.PLANNED:
+        return f"The repair takes {cost}; its G-code passed every check and has not been printed."
+    rounds = f" over {figures.iterations} repairs" if figures.iterations > 1 else ""
+    if figures.repaired_ratio is not None:
+        return (
+            f"Printed {cost}{rounds}; {percent(figures.repaired_ratio)} of what was missing "
+            "is there now."
+        )
+    return f"Printed {cost}{rounds}."
+
+
+def _left(outcome: Outcome, figures: Figures) -> str:
+    parts = []
+    if figures.missing_mm3_after is None:
+        if outcome is Outcome.NOTHING_TO_REPAIR:
+            parts.append("Nothing is left to do")
+        else:
+            parts.append("What is left is not known yet: scan again after printing")
+    elif figures.missing_mm3_after > NEGLIGIBLE_MM3:
+        parts.append(f"{quantity(figures.missing_mm3_after, 'mm³')} still missing")
+    else:
+        parts.append("Nothing is missing any more")
+    if figures.excess_mm3_after is not None and figures.excess_mm3_after > NEGLIGIBLE_MM3:
+        parts.append(f"{quantity(figures.excess_mm3_after, 'mm³')} too much")
+    if figures.unreachable_mm3 > NEGLIGIBLE_MM3:
+        parts.append(f"the nozzle cannot reach {quantity(figures.unreachable_mm3, 'mm³')}")
+    if figures.unseen_area_mm2 >= 0.5:
+        parts.append(
+            f"no sensor saw {quantity(figures.unseen_area_mm2, 'mm²')}, which nobody can vouch for"
+        )
+    text = "; ".join(parts)
+    return text[0].upper() + text[1:] + "."
+
+
+def _article(word: str) -> str:
+    return "an" if word[0] in "aeiou" else "a"

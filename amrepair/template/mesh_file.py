@@ -1,0 +1,287 @@
+"""Mesh files in, watertight meshes out: what was mended is said, what cannot be is refused.
+
+It reads STL, OBJ, 3MF and PLY, keeps their units (the project takes them as mm) and never scales,
+decimates or smooths. Mending stops at what leaves the shape in no doubt: welding, winding, small
+holes, overlapping bodies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from amrepair.errors import InputError, TemplateError
+
+if TYPE_CHECKING:
+    import trimesh
+
+_log = logging.getLogger(__name__)
+
+SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
+# Welding tolerance relative to the largest extent: STL stores float32, good to 6e-8 of a value.
+WELD_RATIO = 1e-6
+# More open edges than this share of all edges is a bag of polygons, not a surface with a hole.
+MAX_OPEN_EDGE_RATIO = 0.05
+# trimesh's readers raise whatever their parsing hits; these are the kinds seen in malformed files
+_READ_ERRORS = (
+    ValueError,
+    KeyError,
+    IndexError,
+    TypeError,
+    AttributeError,
+    OSError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    UnicodeError,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeCensus:
+    """How the edges of a welded mesh pair up.
+
+    Attributes
+    ----------
+    total, open, crowded
+        All edges, those of one face, those of more than two.
+    """
+
+    total: int
+    open: int
+    crowded: int
+
+    @property
+    def open_ratio(self) -> float:
+        """Share of open edges."""
+        return self.open / max(self.total, 1)
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def load_mesh(path: Path | str) -> trimesh.Trimesh:
+    """Read a mesh and make it watertight where that leaves its shape in no doubt.
+
+    Parameters
+    ----------
+    path
+        STL, OBJ, 3MF or PLY; coordinates are taken as mm.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        A closed mesh with outward winding. `metadata["notes"]` is a tuple of sentences that say
+        what was mended; each is also logged.
+
+    Raises
+    ------
+    TemplateError
+        If the file is missing, unreadable, empty, holds values that are not finite, or is not a
+        surface that bounds a volume and cannot be made one.
+    """
+    path = Path(path)
+    mesh = _read(path)
+    closed, notes = close_mesh(mesh, source=path.name)
+    for note in notes:
+        _log.warning("%s: %s", path.name, note)
+    closed.metadata["notes"] = notes
+    closed.metadata["source"] = str(path)
+    closed.metadata["sha256"] = file_sha256(path)
+    return closed
+
+
+def _read(path: Path) -> trimesh.Trimesh:
+    import trimesh
+
+    if not path.is_file():
+        raise TemplateError(f"the mesh {path} does not exist or is not a file; check the path")
+    if path.suffix.lower() not in SUFFIXES:
+        raise TemplateError(
+            f"the mesh {path.name} ends in '{path.suffix}'; use one of {', '.join(SUFFIXES)}"
+        )
+    try:
+        loaded = trimesh.load(path, force="mesh", process=False)
+    except _READ_ERRORS as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise TemplateError(
+            f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} ({reason}); "
+            "export it again"
+        ) from error
+    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+        raise TemplateError(f"the mesh {path.name} has no triangles; export it again")
+    return loaded
+
+
+def edge_census(faces: Int[np.ndarray, "f 3"]) -> EdgeCensus:
+    """Count how often each undirected edge is used."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    keys = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
+    counts = np.unique(keys, return_counts=True)[1]
+    return EdgeCensus(
+        total=len(counts), open=int((counts == 1).sum()), crowded=int((counts > 2).sum())
+    )
+
+
+def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
+    """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
+    import manifold3d as m3
+
+    mesh = m3.Mesh64(
+        np.ascontiguousarray(vertices_mm, dtype=np.float64),
+        np.ascontiguousarray(faces, dtype=np.uint64),
+    )
+    return m3.Manifold(mesh)
+
+
+def manifold_arrays(solid: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """(v, 3) float64 vertices and (f, 3) int64 faces of a `manifold3d.Manifold`."""
+    mesh = solid.to_mesh64()
+    vertices = np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3]
+    return np.ascontiguousarray(vertices), np.asarray(mesh.tri_verts).astype(np.int64)
+
+
+def is_valid(solid: Any) -> bool:
+    """Whether manifold3d takes it as a closed, oriented, non-empty solid."""
+    import manifold3d as m3
+
+    return bool(solid.status() == m3.Error.NoError and not solid.is_empty())
+
+
+def close_mesh(mesh: trimesh.Trimesh, *, source: str) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
+    """Weld, orient and close a mesh; returns it with the sentences that say what was mended.
+
+    Raises
+    ------
+    TemplateError
+        If a value is not finite, or the mesh bounds no volume and cannot be made to.
+    """
+    import trimesh
+
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    _refuse_bad_numbers(vertices, source)
+    notes: list[str] = []
+    working = trimesh.Trimesh(vertices, np.asarray(mesh.faces), process=False)
+    extent_mm = float(np.ptp(vertices, axis=0).max())
+    digits = int(np.floor(-np.log10(max(extent_mm, 1e-12) * WELD_RATIO)))
+    working.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=digits)
+    working.update_faces(working.nondegenerate_faces())
+    if len(working.faces) == 0:
+        raise TemplateError(f"the mesh {source} has only triangles without area; export it again")
+    solid = as_manifold(working.vertices, working.faces)
+    if not is_valid(solid):
+        solid = _mend(working, source, notes)
+    solid = _orient(solid, notes)
+    solid = _unite_overlaps(solid, notes)
+    _refuse_flat(solid, extent_mm, source)
+    closed_vertices, closed_faces = manifold_arrays(solid)
+    return trimesh.Trimesh(closed_vertices, closed_faces, process=False), tuple(notes)
+
+
+def _refuse_bad_numbers(vertices: Float[np.ndarray, "v 3"], source: str) -> None:
+    bad = int((~np.isfinite(vertices)).any(axis=1).sum())
+    if bad:
+        raise TemplateError(
+            f"the mesh {source} has {bad} of {len(vertices)} vertices that are not finite numbers "
+            "(NaN or infinity); export it again"
+        )
+    if float(np.ptp(vertices, axis=0).max()) <= 0:
+        raise TemplateError(f"the mesh {source} has no extent; export it again")
+
+
+def _refuse_flat(solid: Any, extent_mm: float, source: str) -> None:
+    volume = float(solid.volume())
+    if volume <= 1e-9 * extent_mm**3:
+        raise TemplateError(
+            f"the mesh {source} encloses {volume:.3g} mm³, which is no solid; export a closed part"
+        )
+
+
+def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str]) -> Any:
+    """Drop doubled faces, fix the winding, fill small holes; refuse what is left open."""
+    import trimesh
+
+    before = edge_census(np.asarray(mesh.faces))
+    if before.open_ratio > MAX_OPEN_EDGE_RATIO:
+        raise TemplateError(
+            f"the mesh {source} is a soup of polygons: {before.open} of {before.total} edges are "
+            f"open ({before.open_ratio:.0%}, the limit is {MAX_OPEN_EDGE_RATIO:.0%}); "
+            "export a closed solid"
+        )
+    mesh.update_faces(mesh.unique_faces())
+    trimesh.repair.fix_winding(mesh)  # type: ignore[no-untyped-call]
+    trimesh.repair.fill_holes(mesh)
+    trimesh.repair.fix_normals(mesh, multibody=True)  # type: ignore[no-untyped-call]
+    solid = as_manifold(mesh.vertices, mesh.faces)
+    if not is_valid(solid):
+        after = edge_census(np.asarray(mesh.faces))
+        raise TemplateError(
+            f"the mesh {source} is not a closed surface and cannot be mended: {after.open} open "
+            f"and {after.crowded} edges of more than two faces are left (0 allowed); "
+            "repair it in the program it came from"
+        )
+    added = len(mesh.faces)
+    notes.append(
+        f"made watertight: {before.open} open and {before.crowded} crowded edges mended, "
+        f"{added} triangles now"
+    )
+    return solid
+
+
+def _orient(solid: Any, notes: list[str]) -> Any:
+    """Turn an inside-out solid around."""
+    if solid.volume() >= 0:
+        return solid
+    vertices, faces = manifold_arrays(solid)
+    notes.append("turned outside out: its triangles faced inwards")
+    return as_manifold(vertices, faces[:, ::-1])
+
+
+def _unite_overlaps(solid: Any, notes: list[str]) -> Any:
+    """Unite bodies that overlap: a ray count would call their common part hollow."""
+    import manifold3d as m3
+
+    parts = solid.decompose()
+    bodies = [part for part in parts if part.volume() > 0]
+    if len(bodies) < 2:
+        return solid
+    united = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
+    lost = sum(part.volume() for part in bodies) - united.volume()
+    if not is_valid(united) or lost <= 1e-6 * united.volume():
+        return solid
+    cavities = [part for part in parts if part.volume() < 0]
+    if cavities:
+        return solid  # which cavity belongs to which body is not ours to guess
+    notes.append(f"{len(bodies)} bodies overlapped by {lost:.3g} mm³ and were united")
+    return united
+
+
+def require_mesh(mesh: Any, *, source: str) -> trimesh.Trimesh:
+    """Check and close a mesh handed over in memory.
+
+    Raises
+    ------
+    InputError
+        If it is not a `trimesh.Trimesh`.
+    TemplateError
+        As `load_mesh`.
+    """
+    import trimesh
+
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(f"{source} is a {type(mesh).__name__}; give a trimesh.Trimesh or a path")
+    if "notes" in mesh.metadata:
+        return mesh
+    if len(mesh.faces) == 0:
+        raise TemplateError(f"the mesh {source} has no triangles")
+    closed, notes = close_mesh(mesh, source=source)
+    closed.metadata["notes"] = notes
+    return closed

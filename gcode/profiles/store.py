@@ -1,0 +1,145 @@
+"""Find and load profiles: by ID from the shipped folder, or by path; single `inherits`.
+
+A profile's hash is of its resolved content, so that a change in a parent changes the child's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import ValidationError
+
+from gcode.errors import ProfileError
+from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
+
+Kind = Literal["printers", "materials", "processes"]
+DEFAULT_PRINTER = "prusa_mk3s"
+DEFAULT_MATERIAL = "pla"
+DEFAULT_PROCESS = "repair_0.20"
+_P = TypeVar("_P", PrinterProfile, MaterialProfile, ProcessProfile)
+
+
+def profile_dir() -> Path:
+    """The shipped profiles: package data when installed, the checkout's folder otherwise."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "profile_data"
+    return installed if installed.is_dir() else package.parent / "profiles"
+
+
+def list_profiles(kind: Kind) -> tuple[str, ...]:
+    """IDs of the shipped profiles of one kind, sorted."""
+    return tuple(sorted(_id_of(path) for path in (profile_dir() / kind).glob("*.toml")))
+
+
+def load_printer(id_or_path: str | Path) -> PrinterProfile:
+    """Load a printer profile by ID or path."""
+    return _load(PrinterProfile, "printers", id_or_path)
+
+
+def load_material(id_or_path: str | Path) -> MaterialProfile:
+    """Load a material profile by ID or path."""
+    return _load(MaterialProfile, "materials", id_or_path)
+
+
+def load_process(id_or_path: str | Path) -> ProcessProfile:
+    """Load a process profile by ID or path."""
+    return _load(ProcessProfile, "processes", id_or_path)
+
+
+def _id_of(path: Path) -> str:
+    return path.name.removesuffix(".toml")
+
+
+def _find(kind: Kind, id_or_path: str | Path, beside: Path | None = None) -> Path:
+    """The file that an ID or a path means."""
+    text = str(id_or_path)
+    if text.endswith(".toml") or "/" in text:
+        path = Path(text)
+        if beside is not None and not path.is_absolute():
+            path = beside / path
+        if not path.is_file():
+            raise ProfileError(f"{path}: no such profile file; give a .toml file or a known ID.")
+        return path
+    folders = [profile_dir() / kind] if beside is None else [beside, profile_dir() / kind]
+    for folder in folders:
+        if (folder / f"{text}.toml").is_file():
+            return folder / f"{text}.toml"
+    known = ", ".join(list_profiles(kind)) or "none"
+    raise ProfileError(
+        f"Unknown {kind[:-1]} profile '{text}'; known are: {known}.".replace(
+            "processe ", "process "
+        )
+    )
+
+
+@lru_cache(maxsize=128)
+def _load_cached(model: type[Any], kind: Kind, path: Path, stamp: int) -> Any:
+    return _validate(model, _resolve(kind, path, ()), path)
+
+
+def _load(model: type[_P], kind: Kind, id_or_path: str | Path) -> _P:
+    path = _find(kind, id_or_path).resolve()
+    if _inherits_from_user(path):
+        return _validate(model, _resolve(kind, path, ()), path)
+    loaded: _P = _load_cached(model, kind, path, path.stat().st_mtime_ns)
+    return loaded
+
+
+def _inherits_from_user(path: Path) -> bool:
+    """Whether a parent could change without the file itself changing."""
+    return not path.is_relative_to(profile_dir().resolve())
+
+
+def _resolve(kind: Kind, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
+    """Content of a file over that of its parent; tables are merged one level deep."""
+    if path in chain:
+        loop = " → ".join(p.name for p in (*chain, path))
+        raise ProfileError(f"{path}: `inherits` runs in a circle ({loop}); remove one link.")
+    try:
+        own = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as e:
+        raise ProfileError(f"{path}: not valid TOML ({e}).") from e
+    except (OSError, UnicodeDecodeError) as e:
+        raise ProfileError(f"{path}: the profile cannot be read ({e}).") from e
+    parent = own.pop("inherits", None)
+    base: dict[str, Any] = {}
+    if parent is not None:
+        if not isinstance(parent, str):
+            raise ProfileError(f"{path}: key 'inherits' = {parent!r} must be one ID or path.")
+        found = _find(kind, parent, beside=path.parent).resolve()
+        base = _resolve(kind, found, (*chain, path))
+    for key, value in own.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            base[key] = {**base[key], **value}
+        else:
+            base[key] = value
+    base["id"] = _id_of(path)
+    return base
+
+
+def _validate(model: type[_P], content: dict[str, Any], path: Path) -> _P:
+    """The profile, or the first thing wrong with it: file, key, value, range."""
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+    if "sha256" in content:
+        raise ProfileError(f"{path}: key 'sha256' is computed, not written; remove it.")
+    try:
+        return model.model_validate({**content, "sha256": digest})
+    except ValidationError as e:
+        first = e.errors()[0]
+        key = ".".join(str(part) for part in first["loc"]) or "(whole file)"
+        more = f" ({e.error_count() - 1} more)" if e.error_count() > 1 else ""
+        if first["type"] == "extra_forbidden":
+            known = ", ".join(sorted(model.model_fields))
+            raise ProfileError(
+                f"{path}: unknown key '{key}' = {first['input']!r}{more}; known keys are: {known}."
+            ) from e
+        if first["type"] == "missing":
+            raise ProfileError(f"{path}: key '{key}' is missing{more}.") from e
+        raise ProfileError(
+            f"{path}: key '{key}' = {first['input']!r} is out of range: {first['msg']}{more}."
+        ) from e

@@ -1,0 +1,168 @@
+"""Fills a region with strokes: solid or sparse rectilinear, grid, concentric.
+
+It decides where lines run, not in which order; `order` does. A solid fill is weighed so that its
+strokes carry exactly the region's area.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from gcode.moves import Role
+from gcode.slicing import infill_kernels as kernels
+from gcode.slicing.beads import Bead, loop_bead
+from gcode.slicing.medial import fill_thin
+from gcode.slicing.regions import flattened, offset, peel, pieces
+
+SOLID_ANGLES_RAD = (math.pi / 4, -math.pi / 4)
+FLOW_SPAN = (0.75, 1.25)  # how far the weighing may move flow before it is a mistake of geometry
+CONNECT_SPACINGS = 2.5
+
+
+def solid_fill(
+    region: Any,
+    *,
+    spacing_mm: float,
+    angle_rad: float,
+    role: Role,
+    least_mm: float,
+    most_mm: float,
+    pattern: Literal["rectilinear", "concentric"] = "rectilinear",
+) -> tuple[list[Bead], float]:
+    """Beads that fill `region`, and the area that none of them could serve.
+
+    What is narrower than about two lines is filled along its medial axis.
+    """
+    area_mm2 = region.area()
+    if area_mm2 <= 0:
+        return [], 0.0
+    if pattern == "concentric":
+        return _concentric(region, spacing_mm, role, least_mm=least_mm, most_mm=most_mm)
+    wide = offset(offset(region, -spacing_mm), spacing_mm)
+    narrow = region - wide
+    beads, lost_mm2 = _thin(narrow, least_mm=least_mm, most_mm=most_mm)
+    laid = rectilinear(
+        offset(wide, -0.5 * spacing_mm), spacing_mm=spacing_mm, angle_rad=angle_rad, role=role
+    )
+    if not laid and wide.area() > 0:
+        more, lost = _thin(wide, least_mm=least_mm, most_mm=most_mm)
+        return beads + more, lost_mm2 + lost
+    weigh_mm2 = wide.area() + lost_mm2  # crumbs along the narrow seams go to their neighbours
+    total_mm2 = sum(bead.area_mm2 for bead in laid)
+    factor = weigh_mm2 / total_mm2 if total_mm2 else 1.0
+    applied = min(max(factor, FLOW_SPAN[0]), FLOW_SPAN[1])
+    left_mm2 = max(0.0, weigh_mm2 - total_mm2 * applied)
+    return beads + [bead.scaled(applied) for bead in laid], left_mm2
+
+
+def sparse_fill(
+    region: Any, *, spacing_mm: float, ratio: float, layer: int, pattern: str
+) -> list[Bead]:
+    """Lines that cover `ratio` of `region`; grid crosses itself in each layer."""
+    if region.is_empty() or ratio <= 0:
+        return []
+    inner = offset(region, -0.5 * spacing_mm)
+    angles: tuple[float, ...]
+    if pattern == "grid":
+        angles, apart_mm = SOLID_ANGLES_RAD, 2 * spacing_mm / ratio
+    else:
+        angles, apart_mm = (SOLID_ANGLES_RAD[layer % 2],), spacing_mm / ratio
+    beads: list[Bead] = []
+    for angle in angles:
+        beads += rectilinear(
+            inner,
+            spacing_mm=apart_mm,
+            angle_rad=angle,
+            role=Role.SPARSE_INFILL,
+            share_mm=spacing_mm,
+            connect_mm=0.0,
+        )
+    return beads
+
+
+def rectilinear(
+    region: Any,
+    *,
+    spacing_mm: float,
+    angle_rad: float,
+    role: Role,
+    share_mm: float | None = None,
+    connect_mm: float | None = None,
+) -> list[Bead]:
+    """Parallel lines across a region, chained to and fro where their ends are near."""
+    points, starts = flattened(region)
+    if len(points) < 3:
+        return []
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    turn = np.array([[c, -s], [s, c]])  # row vectors: world → scan frame
+    turned = np.ascontiguousarray(points @ turn)
+    share = spacing_mm if share_mm is None else share_mm
+    reach = CONNECT_SPACINGS * spacing_mm if connect_mm is None else connect_mm
+    line, low, high, first = kernels.scan_lines(turned, starts, spacing_mm, 0.0)
+    if len(line) == 0:
+        return []
+    order, code = kernels.chain_chords(low, high, first, reach)
+    y = line[order] * spacing_mm
+    backward = (code & 1).astype(bool)
+    x0 = np.where(backward, high[order], low[order])
+    x1 = np.where(backward, low[order], high[order])
+    ends = np.stack([np.stack([x0, y], 1), np.stack([x1, y], 1)], axis=1).reshape(-1, 2)
+    ends = ends @ turn.T
+    cuts = [*(2 * np.flatnonzero(code & 2)).tolist(), len(ends)]
+    return [
+        Bead(ends[a:b], np.full(b - a - 1, share), role, closed=False)
+        for a, b in pairwise(cuts)
+        if b - a >= 2
+    ]
+
+
+def _concentric(
+    region: Any, spacing_mm: float, role: Role, *, least_mm: float, most_mm: float
+) -> tuple[list[Bead], float]:
+    """Rings all the way in, medial beads where they meet."""
+    beads: list[Bead] = []
+    lost_mm2 = 0.0
+    box = region.bounds()
+    count = math.ceil(max(box[2] - box[0], box[3] - box[1]) / spacing_mm) + 1
+    peeled = peel(region, spacing_mm, count)
+    for ring in peeled.rings:
+        beads += ring_beads(ring.centre, ring.area_mm2, spacing_mm, role)
+    for part in peeled.thin:
+        more, lost = _thin(part, least_mm=least_mm, most_mm=most_mm)
+        beads += more
+        lost_mm2 += lost
+    return beads, lost_mm2
+
+
+def ring_beads(centre: Any, area_mm2: float, spacing_mm: float, role: Role) -> list[Bead]:
+    """Closed beads along a ring's centre, weighed to the ring's area."""
+    loops = [loop_bead(np.asarray(c), spacing_mm, role) for c in centre.to_polygons() if len(c) > 2]
+    laid_mm2 = sum(bead.area_mm2 for bead in loops)
+    if laid_mm2 <= 0:
+        return []
+    factor = min(max(area_mm2 / laid_mm2, FLOW_SPAN[0]), FLOW_SPAN[1])
+    return [bead.scaled(factor) for bead in loops]
+
+
+def _thin(region: Any, *, least_mm: float, most_mm: float) -> tuple[list[Bead], float]:
+    """Medial beads of every piece; crumbs count as lost."""
+    beads: list[Bead] = []
+    found_mm2 = 0.0
+    lost_mm2 = 0.0
+    for part in pieces(region, least_mm2=0.25 * least_mm * least_mm):
+        thin = fill_thin(part, least_mm=least_mm, most_mm=most_mm)
+        beads += thin.beads
+        lost_mm2 += thin.lost_mm2
+        found_mm2 += part.area()
+    return beads, lost_mm2 + max(0.0, region.area() - found_mm2)
+
+
+def bounds_of(beads: list[Bead]) -> Float[np.ndarray, " 4"]:
+    """(x_min, y_min, x_max, y_max) of centre lines."""
+    points = np.concatenate([bead.xy_mm for bead in beads])
+    return np.concatenate([points.min(axis=0), points.max(axis=0)])

@@ -1,0 +1,82 @@
+"""Whole parts: the plastic laid balances the solid, and stays inside it."""
+
+from __future__ import annotations
+
+import manifold3d as m3
+import numpy as np
+import pytest
+
+from gcode.moves import Extrude, Role
+from gcode.profiles.schema import MaterialProfile, ProcessProfile
+from gcode.profiles.setup import PrintSetup
+from gcode.slicing.job import slice_part
+from tests.unit.link_helpers import profile
+
+
+@pytest.fixture(scope="module")
+def setup() -> PrintSetup:
+    material = MaterialProfile(
+        id="test",
+        name="test",
+        density_g_cm3=1.24,
+        hotend_c=210.0,
+        first_layer_hotend_c=215.0,
+        bed_c=60.0,
+        bed_release_c=45.0,
+        fan_ratio=1.0,
+        max_volumetric_mm3_s=12.0,
+    )
+    process = ProcessProfile(
+        id="test",
+        name="test",
+        layer_height_mm=0.2,
+        first_layer_height_mm=0.2,
+        line_width_mm=0.45,
+        perimeters=2,
+        infill_ratio=1.0,
+        top_layers=4,
+        bottom_layers=4,
+        skirt_loops=1,
+        skirt_distance_mm=3.0,
+        perimeter_speed_mm_s=45.0,
+        external_perimeter_speed_mm_s=30.0,
+        infill_speed_mm_s=80.0,
+        solid_infill_speed_mm_s=60.0,
+        first_layer_speed_mm_s=20.0,
+        repair_speed_mm_s=20.0,
+        acceleration_mm_s2=1000.0,
+    )
+    return PrintSetup(profile(), material, process)
+
+
+def _beads(solid: m3.Manifold, setup: PrintSetup) -> list[Extrude]:
+    return [b for b in slice_part(solid, setup).extrusions if b.role is not Role.SKIRT]
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        m3.Manifold.cube((20.0, 14.0, 6.0)),
+        m3.Manifold.cylinder(5.0, 8.0, 4.0, 96),
+        m3.Manifold.cube((24.0, 24.0, 4.0))
+        - m3.Manifold.cylinder(9.0, 5.0, 5.0, 64).translate((12.0, 12.0, -1.0)),
+        m3.Manifold.cube((20.0, 0.8, 5.0)),
+    ],
+    ids=["block", "cone", "plate with a hole", "thin wall"],
+)
+def test_a_solid_print_holds_the_solids_volume(solid: m3.Manifold, setup: PrintSetup) -> None:
+    placed = solid.translate((100.0, 100.0, 0.0))
+    laid_mm3 = sum(bead.volume_mm3 for bead in _beads(placed, setup))
+    # the promise of the slicer: half a per cent
+    assert laid_mm3 == pytest.approx(placed.volume(), rel=0.005)
+
+
+def test_no_bead_leaves_the_part(setup: PrintSetup) -> None:
+    beads = _beads(m3.Manifold.cube((20.0, 14.0, 6.0)).translate((50.0, 60.0, 0.0)), setup)
+    points_mm = np.concatenate([bead.points_mm for bead in beads])
+    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
+    # a bead's centre keeps a fifth of a millimetre (half a line, less rounding) from the wall
+    assert (low[:2] > (50.15, 60.15)).all()
+    assert (high[:2] < (69.85, 73.85)).all()
+    assert low[2] == pytest.approx(0.2)
+    assert high[2] == pytest.approx(6.0)
