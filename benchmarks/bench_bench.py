@@ -1,9 +1,9 @@
-"""Ours beside the paper's recipe and the baselines on a synthetic set, all in one run.
+"""The methods beside each other on a synthetic set, all in one run.
 
 Run: python benchmarks/bench_bench.py PART… [--format real3d-ad] [--methods NAME…] [--seeds 0 1 2]
 [--jobs 1] [--out DIR]. Without parts it takes the example parts. Each part becomes a class with
 four training clouds, six normal test samples and two of each of the six defects, in random poses.
-An --out that holds a part of this run already is gone on with.
+The default methods need no alignment. A run with --out goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from amrepair.bench import METHODS, SynthOptions, run_bench, synthesize
 from amrepair.bench.dataset import Format
 from amrepair.simulate.part_files import part_names, part_path
 
-DEFAULT_METHODS = ("pasdf", "patchcore-fpfh", "patchcore-fpfh+pam")
+DEFAULT_METHODS = ("btf-raw", "btf-fpfh", "patchcore-fpfh", "patchcore-fpfh-raw")
 
 
 def say(stage: str, done: float, total: float) -> None:
