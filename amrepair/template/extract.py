@@ -53,8 +53,7 @@ def extract_mesh(template: Template, voxel_mm: float, *, level_mm: float = 0.0) 
     vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
         field, 0.0, spacing=(voxel_mm,) * 3
     )
-    # scikit-image winds towards higher values' inside; outward here is towards positive f
-    return trimesh.Trimesh(vertices + low_mm, faces[:, ::-1], process=False)
+    return trimesh.Trimesh(vertices + low_mm, faces, process=False)
 
 
 def band_field(
