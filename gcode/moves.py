@@ -205,3 +205,34 @@ class Program:
     def lines(self) -> Iterator[str]:
         """Lines without their newline."""
         return iter(self.text.splitlines())
+
+
+@dataclass(frozen=True, slots=True)
+class ModalState:
+    """Where a machine stands between two lines of a program, and in which modes.
+
+    Attributes
+    ----------
+    position_mm
+        (x, y, z) of the nozzle, build frame, whatever G92 made of the coordinates.
+    e_mm
+        Logical extruder position (what `G92 E` would have to say).
+    hotend_c, bed_c
+        Targets, °C.
+    acceleration_mm_s2
+        Of printing moves; None where the program never set it.
+    units_mm
+        False after G20.
+    """
+
+    position_mm: tuple[float, float, float]
+    e_mm: float = 0.0
+    absolute_xyz: bool = True
+    absolute_e: bool = True
+    feed_mm_s: float = 0.0
+    fan_ratio: float = 0.0
+    hotend_c: float = 0.0
+    bed_c: float = 0.0
+    acceleration_mm_s2: float | None = None
+    units_mm: bool = True
+    tool: int = 0
