@@ -1,0 +1,10 @@
+"""Reader: what slicers write, as layers, beads and the machine's state after any line.
+
+It understands Marlin-style text with arcs, relative and absolute modes, G92, inches, and the
+comments of PrusaSlicer, SuperSlicer, OrcaSlicer, Bambu Studio, Cura and ideaMaker. It judges
+nothing; `check` does, with a parser of its own.
+"""
+
+from gcode.reader.job import Beads, Job, JobLayer, read_job
+
+__all__ = ["Beads", "Job", "JobLayer", "read_job"]

@@ -1,0 +1,349 @@
+"""`Job`: a program read into layers and beads."""
+
+from __future__ import annotations
+
+import math
+import re
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gcode.errors import ReadError
+from gcode.moves import ModalState, Program
+from gcode.reader import text_kernels as kernels
+from gcode.units import filament_area_mm2
+
+# G90 and G91 set the extruder's mode too in Marlin alone (printers.md of each firmware's docs).
+_BOTH_MODES = frozenset({"marlin"})
+_LAYER_MARKS = ("LAYER_CHANGE", "CHANGE_LAYER", "BEFORE_LAYER_CHANGE")
+_CURA_LAYER = re.compile(r"LAYER:\s*(-?\d+)")
+_NUMBER = r"([-+]?\d*\.?\d+)"
+_HEIGHT = re.compile(r"(?:HEIGHT|LAYER_HEIGHT):\s*" + _NUMBER)
+_WIDTH = re.compile(r"(?:WIDTH|LINE_WIDTH):\s*" + _NUMBER)
+_ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$")
+_LEAST_LAYER_MM = 0.015
+_SQUARE_LOSS = 1.0 - math.pi / 4.0
+UNKNOWN_ROLE = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class JobLayer:
+    """One layer: lines [first_line, end_line) of the program.
+
+    Attributes
+    ----------
+    z_mm
+        Top of the layer: where the nozzle extrudes.
+    """
+
+    index: int
+    z_mm: float
+    height_mm: float
+    first_line: int
+    end_line: int
+
+
+@dataclass(frozen=True, slots=True)
+class Beads:
+    """All extruding segments in order, build frame; arcs as chords.
+
+    Attributes
+    ----------
+    start_mm, end_mm
+        (n, 3) nozzle positions.
+    section_mm2, width_mm, height_mm
+        (n,) plastic cross-section, and the bead's nominal width and height.
+    role
+        (n,) index into `roles`.
+    layer
+        (n,) index of the layer; -1 before the first.
+    line
+        (n,) program line.
+    """
+
+    start_mm: Float[np.ndarray, "n 3"]
+    end_mm: Float[np.ndarray, "n 3"]
+    section_mm2: Float[np.ndarray, " n"]
+    width_mm: Float[np.ndarray, " n"]
+    height_mm: Float[np.ndarray, " n"]
+    role: Int[np.ndarray, " n"]
+    layer: Int[np.ndarray, " n"]
+    line: Int[np.ndarray, " n"]
+    roles: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    @property
+    def volume_mm3(self) -> float:
+        """Plastic in all beads."""
+        lengths_mm = np.linalg.norm(self.end_mm - self.start_mm, axis=1)
+        return float(lengths_mm @ self.section_mm2)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A program, read.
+
+    Attributes
+    ----------
+    header_end_line
+        First line of the first layer: what is before is the start script.
+    footer_start_line
+        The line after the last bead: what follows retracts, parks, switches off.
+    """
+
+    program: Program
+    layers: tuple[JobLayer, ...]
+    beads: Beads
+    header_end_line: int
+    footer_start_line: int
+    filament_diameter_mm: float
+    filament_mm: float
+    _states: Float[np.ndarray, "m 13"]
+
+    def state_after(self, line: int) -> ModalState:
+        """The machine's state after lines [0, line).
+
+        Raises
+        ------
+        ReadError
+            If the program has no such line, or the nozzle's place is not known there.
+        """
+        if not 0 <= line < len(self._states):
+            raise ReadError(
+                f"Line {line} is not in a program of {len(self._states) - 1} lines."
+            )
+        s = self._states[line]
+        if not np.isfinite(s[:3]).all():
+            raise ReadError(
+                f"Before line {line + 1} the nozzle's place is not known: the program has not "
+                "homed or moved all axes yet."
+            )
+        acceleration = float(s[kernels.S_ACC])
+        return ModalState(
+            position_mm=(float(s[0]), float(s[1]), float(s[2])),
+            e_mm=float(s[kernels.S_E]),
+            absolute_xyz=bool(s[kernels.S_ABS]),
+            absolute_e=bool(s[kernels.S_ABS_E]),
+            feed_mm_s=float(s[kernels.S_FEED]),
+            fan_ratio=float(s[kernels.S_FAN]),
+            hotend_c=float(s[kernels.S_HOT]),
+            bed_c=float(s[kernels.S_BED]),
+            acceleration_mm_s2=None if math.isnan(acceleration) else acceleration,
+            units_mm=bool(s[kernels.S_MM]),
+            tool=int(s[kernels.S_TOOL]),
+        )
+
+
+def read_job(
+    program: Program | str, *, filament_diameter_mm: float = 1.75, dialect: str = "marlin"
+) -> Job:
+    """Read a program.
+
+    Parameters
+    ----------
+    program
+        Text of any slicer; for a bare text, `dialect` says whose modes it follows.
+
+    Raises
+    ------
+    ReadError
+        If it extrudes nothing.
+    """
+    if isinstance(program, str):
+        program = Program(program, dialect)
+    lines = program.text.split("\n")
+    starts, kinds, codes, words = _tokens(program.text, len(lines))
+    states = np.zeros((len(lines) + 1, kernels.STATES))
+    states[0, :3] = np.nan
+    states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
+    states[0, kernels.S_ACC] = np.nan
+    pushed = np.zeros(len(lines))
+    kernels.run(kinds, codes, words, program.dialect in _BOTH_MODES, states, pushed)
+    none3, none1, none0 = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
+    count = kernels.beads(
+        kinds, codes, words, states, pushed, none3, none3, none1, none0, True
+    )
+    if count == 0:
+        raise ReadError("The program extrudes nothing; it is no print job.")
+    start, end = np.zeros((count, 3)), np.zeros((count, 3))
+    filament, owner = np.zeros(count), np.zeros(count, np.int64)
+    kernels.beads(kinds, codes, words, states, pushed, start, end, filament, owner, False)
+    known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
+    start, end, filament, owner = start[known], end[known], filament[known], owner[known]
+    comments = [(int(i), lines[i]) for i in np.flatnonzero(kinds == ord(";"))]
+    layers = _layers(comments, end, owner, filament, len(lines))
+    beads = _beads(comments, layers, start, end, filament, owner, filament_diameter_mm)
+    return Job(
+        program=program,
+        layers=layers,
+        beads=beads,
+        header_end_line=layers[0].first_line,
+        footer_start_line=int(owner[-1]) + 1,
+        filament_diameter_mm=filament_diameter_mm,
+        filament_mm=float(filament.sum()),
+        _states=states,
+    )
+
+
+def _tokens(
+    text: str, count: int
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " n"], Int[np.ndarray, " n"], np.ndarray]:
+    data = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
+    breaks = np.flatnonzero(data == ord("\n")) + 1
+    starts = np.concatenate([[0], breaks, [len(data)]]).astype(np.int64)[: count + 1]
+    kinds, codes = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    words = np.zeros((count, len(kernels.LETTERS)))
+    letters = np.frombuffer(kernels.LETTERS, np.uint8)
+    kernels.parse(data, starts, letters, codes, kinds, words)
+    return starts, kinds, codes, words
+
+
+def _layers(
+    comments: list[tuple[int, str]],
+    end: Float[np.ndarray, "n 3"],
+    owner: Int[np.ndarray, " n"],
+    filament: Float[np.ndarray, " n"],
+    lines: int,
+) -> tuple[JobLayer, ...]:
+    """Layers by the slicer's own marks, else by the heights at which plastic is laid."""
+    marks = _marks(comments)
+    if not marks:
+        marks = _marks_by_height(end, owner, filament)
+    bounds = [*marks, lines]
+    found: list[JobLayer] = []
+    below_mm = 0.0
+    for first, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        a, b = np.searchsorted(owner, [first, stop])
+        if a == b:  # nothing is laid: what is there belongs to the layer before
+            if found:
+                last = found[-1]
+                found[-1] = JobLayer(last.index, last.z_mm, last.height_mm, last.first_line, stop)
+            continue
+        z_mm = _main_height(end[a:b, 2], filament[a:b])
+        found.append(JobLayer(len(found), z_mm, max(z_mm - below_mm, 0.0), first, stop))
+        below_mm = z_mm
+    return _with_heights(found, comments)
+
+
+def _with_heights(
+    layers: list[JobLayer], comments: list[tuple[int, str]]
+) -> tuple[JobLayer, ...]:
+    """Heights as the slicer states them, where it does."""
+    stated = [
+        (line, float(match.group(1)))
+        for line, text in comments
+        if (match := _HEIGHT.search(text)) is not None
+    ]
+    at = [line for line, _ in stated]
+    out = []
+    for layer in layers:
+        k = bisect_right(at, layer.first_line)
+        height_mm = layer.height_mm
+        if k < len(stated) and stated[k][0] < layer.end_line and height_mm <= _LEAST_LAYER_MM:
+            height_mm = stated[k][1]
+        out.append(
+            JobLayer(layer.index, layer.z_mm, height_mm, layer.first_line, layer.end_line)
+        )
+    return tuple(out)
+
+
+def _marks(comments: list[tuple[int, str]]) -> list[int]:
+    """Lines of the slicer's layer marks; one kind of mark only."""
+    by_kind: dict[str, list[int]] = {}
+    for line, text in comments:
+        body = text.strip().lstrip(";").strip()
+        if _CURA_LAYER.match(body):
+            by_kind.setdefault("LAYER:", []).append(line)
+        elif body in _LAYER_MARKS:
+            by_kind.setdefault(body, []).append(line)
+    for kind in ("LAYER_CHANGE", "CHANGE_LAYER", "LAYER:"):
+        if by_kind.get(kind):
+            return by_kind[kind]
+    return []
+
+
+def _marks_by_height(
+    end: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], filament: Float[np.ndarray, " n"]
+) -> list[int]:
+    """First lines of runs of beads at one height."""
+    z = np.round(end[:, 2], 4)
+    marks = [int(owner[0])]
+    current = z[0]
+    for i in np.flatnonzero(np.diff(z) != 0) + 1:
+        if z[i] - current >= _LEAST_LAYER_MM or z[i] < current - _LEAST_LAYER_MM:
+            current = z[i]
+            marks.append(int(owner[i]))
+    return marks
+
+
+def _main_height(z_mm: Float[np.ndarray, " n"], filament: Float[np.ndarray, " n"]) -> float:
+    """The height at which most plastic is laid."""
+    heights, group = np.unique(np.round(z_mm, 4), return_inverse=True)
+    return float(heights[int(np.argmax(np.bincount(group, filament)))])
+
+
+def _beads(
+    comments: list[tuple[int, str]],
+    layers: tuple[JobLayer, ...],
+    start: Float[np.ndarray, "n 3"],
+    end: Float[np.ndarray, "n 3"],
+    filament: Float[np.ndarray, " n"],
+    owner: Int[np.ndarray, " n"],
+    diameter_mm: float,
+) -> Beads:
+    firsts = np.array([layer.first_line for layer in layers])
+    layer = np.searchsorted(firsts, owner, side="right") - 1
+    role_of_line, roles = _roles(comments, owner)
+    width = _stated(comments, owner, _WIDTH)
+    heights = np.array([one.height_mm for one in layers])
+    height = _stated(comments, owner, _HEIGHT)
+    own = np.where(layer >= 0, heights[np.maximum(layer, 0)], heights[0])
+    height = np.where(np.isfinite(height) & (height > 0), height, own)
+    lengths_mm = np.linalg.norm(end - start, axis=1)
+    section = filament * filament_area_mm2(diameter_mm) / lengths_mm
+    guessed = section / np.maximum(height, 1e-6) + height * _SQUARE_LOSS
+    return Beads(
+        start_mm=start,
+        end_mm=end,
+        section_mm2=section,
+        width_mm=np.where(np.isfinite(width) & (width > 0), width, guessed),
+        height_mm=height,
+        role=role_of_line,
+        layer=layer,
+        line=owner,
+        roles=roles,
+    )
+
+
+def _roles(
+    comments: list[tuple[int, str]], owner: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " n"], tuple[str, ...]]:
+    names = [UNKNOWN_ROLE]
+    at, which = [-1], [0]
+    for line, text in comments:
+        match = _ROLE.search(text)
+        if match is not None:
+            if match.group(1) not in names:
+                names.append(match.group(1))
+            at.append(line)
+            which.append(names.index(match.group(1)))
+    index = np.searchsorted(np.array(at), owner, side="right") - 1
+    return np.array(which)[index], tuple(names)
+
+
+def _stated(
+    comments: list[tuple[int, str]], owner: Int[np.ndarray, " n"], pattern: re.Pattern[str]
+) -> Float[np.ndarray, " n"]:
+    """The value that a comment before each bead states; NaN where none does."""
+    at, values = [-1], [math.nan]
+    for line, text in comments:
+        match = pattern.search(text)
+        if match is not None:
+            at.append(line)
+            values.append(float(match.group(1)))
+    index = np.searchsorted(np.array(at), owner, side="right") - 1
+    return np.array(values)[index]
