@@ -103,6 +103,16 @@ class Job:
     filament_diameter_mm: float
     filament_mm: float
     _states: Float[np.ndarray, "m 13"]
+    _pushed_mm: Float[np.ndarray, " k"]
+
+    def moves(
+        self,
+    ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """By program line: (k, 3) displacement, mm (NaN where the place before is not known), (k,)
+        filament pushed, mm, and (k,) commanded speed, mm/s.
+        """
+        steps = np.diff(self._states[:, :3], axis=0)
+        return steps, self._pushed_mm, self._states[1:, kernels.S_FEED]
 
     def state_after(self, line: int) -> ModalState:
         """The machine's state after lines [0, line).
@@ -186,6 +196,7 @@ def read_job(
         filament_diameter_mm=filament_diameter_mm,
         filament_mm=float(filament.sum()),
         _states=states,
+        _pushed_mm=pushed,
     )
 
 
