@@ -1,0 +1,86 @@
+"""`check`: all rules over one program; the only maker of a `CheckedProgram`."""
+
+from __future__ import annotations
+
+import math
+
+from gcode.check.proof import CheckedProgram, CheckReport, _prove
+from gcode.check.rules import Judge, Refusal
+from gcode.check.sweep import sweep
+from gcode.check.words import COMMANDS
+from gcode.errors import CheckRefusedError, InputError
+from gcode.moves import ModalState, Program
+from gcode.profiles import PrintSetup
+from gcode.surfaces import HeightField
+
+
+def find_refusals(
+    program: Program,
+    setup: PrintSetup,
+    *,
+    as_built: HeightField | None = None,
+    initial: ModalState | None = None,
+) -> tuple[Refusal, ...]:
+    """Everything that speaks against printing a program, in its order; see `check`."""
+    return _judge(program, setup, as_built, initial)[0]
+
+
+def check(
+    program: Program,
+    setup: PrintSetup,
+    *,
+    as_built: HeightField | None = None,
+    initial: ModalState | None = None,
+) -> CheckedProgram:
+    """Judge a program.
+
+    Parameters
+    ----------
+    setup
+        The printer that it is for, and its material.
+    as_built
+        What stands on the bed, build frame; the tool head is swept against it, and Z is not homed.
+    initial
+        The machine's state before the first line, for a program within a job; None: a machine
+        that is cold and not homed (with `as_built`: not homed in X and Y, its Z still true).
+
+    Raises
+    ------
+    CheckRefusedError
+        With every refusal; the message tells the first.
+    """
+    refusals, report = _judge(program, setup, as_built, initial)
+    if refusals:
+        more = f" (and {len(refusals) - 1} more)" if len(refusals) > 1 else ""
+        raise CheckRefusedError(f"The checker refuses the program: {refusals[0]}{more}.", refusals)
+    return _prove(program, setup.printer.id, report)
+
+
+def _judge(
+    program: Program,
+    setup: PrintSetup,
+    as_built: HeightField | None,
+    initial: ModalState | None,
+) -> tuple[tuple[Refusal, ...], CheckReport]:
+    if program.dialect not in COMMANDS:
+        raise InputError(
+            f"There is no dialect '{program.dialect}' to check; there are {', '.join(COMMANDS)}."
+        )
+    lines = program.text.split("\n")
+    top_mm = as_built.top_mm if as_built is not None else None
+    judge = Judge(program, setup, top_mm, initial)
+    for number, raw in enumerate(lines, start=1):
+        judge.read(number, raw)
+    judge.end()
+    refusals, clearance_mm = list(judge.refusals), math.inf
+    if as_built is not None:
+        hits, clearance_mm = sweep(judge.moves, lines, setup.printer, as_built)
+        refusals += hits
+    refusals.sort(key=lambda refusal: refusal.line)
+    report = CheckReport(
+        commands=judge.commands,
+        moves=len(judge.moves.line),
+        swept=as_built is not None,
+        least_clearance_mm=clearance_mm if math.isfinite(clearance_mm) else None,
+    )
+    return tuple(refusals), report

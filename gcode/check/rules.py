@@ -1,0 +1,430 @@
+"""The rules that need no geometry of the part: one pass over the text with the machine's state."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+
+from gcode.check.words import COMMANDS, G90_SETS_E, LINE_LIMIT, PROBES
+from gcode.moves import ModalState, Program
+from gcode.profiles import PrintSetup
+
+# Plastic is told in five digits: what is shorter than this is judged with its neighbours.
+SHORT_MM = 0.05
+# Rounding of E and XYZ in the text, and a firmware's own flow, stay within this.
+SECTION_SLACK = 1.05
+FLOW_SLACK = 1.05
+PLACE_SLACK_MM = 0.011
+FASTEST_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
+INCH_MM = 25.4
+MOST_SHOWN = 60  # characters of a line in a message
+HEATER_COMMANDS = {"M104": "hotend", "M109": "hotend", "M140": "bed", "M190": "bed"}
+_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
+_HEAD = re.compile(r"(?:N\d+\s*)?([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+_NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
+_PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
+_MACHINE_LIMITS = {"M201": "max_acceleration_mm_s2", "M203": "max_speed_mm_s"}
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """One reason why a program must not be printed.
+
+    Attributes
+    ----------
+    line
+        Line of the text, counted from 1.
+    text
+        That line.
+    what
+        What is wrong.
+    value, limit
+        As text with units.
+    """
+
+    line: int
+    text: str
+    what: str
+    value: str
+    limit: str
+
+    def __str__(self) -> str:
+        text = self.text.strip()
+        shown = text if len(text) <= MOST_SHOWN else text[: MOST_SHOWN - 1] + "…"
+        return f"line {self.line} ({shown!r}): {self.what}: {self.value}, limit {self.limit}"
+
+
+@dataclass(slots=True)
+class Moves:
+    """Moves with known ends, for the sweep."""
+
+    line: list[int] = field(default_factory=list)
+    start: list[tuple[float, float, float]] = field(default_factory=list)
+    end: list[tuple[float, float, float]] = field(default_factory=list)
+    pushed_mm3: list[float] = field(default_factory=list)
+
+
+class Judge:
+    """Follows a program line by line; collects refusals and moves.
+
+    Parameters
+    ----------
+    standing_top_mm
+        Height of what stands on the bed; None for a bare bed.
+    initial
+        The machine's state before the first line; None: cold and not homed.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        setup: PrintSetup,
+        standing_top_mm: float | None,
+        initial: ModalState | None,
+    ) -> None:
+        self.refusals: list[Refusal] = []
+        self.moves = Moves()
+        self.commands = 0
+        self._setup, self._dialect = setup, program.dialect
+        self._known = COMMANDS[program.dialect] | {m.split()[0].upper() for m in setup.printer.macros}
+        self._area_mm2 = math.pi / 4 * setup.printer.filament_diameter_mm**2
+        self._alone = initial is None
+        self._standing_top_mm = standing_top_mm
+        self._occupied = initial is not None or standing_top_mm is not None
+        state = initial
+        self._place: list[float | None] = [None] * 3 if state is None else [*state.position_mm]
+        # a standing part on a machine that is not switched off: its Z is still true
+        self._homed = [state is not None] * 2 + [self._occupied]
+        self._absolute = state.absolute_xyz if state else True
+        self._absolute_e = state.absolute_e if state else True
+        self._e = state.e_mm if state else 0.0
+        self._feed_mm_s = state.feed_mm_s if state else 0.0
+        self._unit = 1.0 if state is None or state.units_mm else INCH_MM
+        self._hotend_c = state.hotend_c if state else 0.0
+        self._ready_c = self._hotend_c  # what the hotend was waited for
+        self._bed_c = state.bed_c if state else 0.0
+        self._pulled_mm = 0.0
+        self._short_mm = self._short_mm3 = 0.0
+        self._line, self._text = 0, ""
+
+    # ------------------------------------------------------------------ one line
+
+    def read(self, number: int, raw: str) -> None:
+        """Judge one line."""
+        self._line, self._text = number, raw
+        command = raw.partition(";")[0].strip()
+        if not command:
+            return
+        self.commands += 1
+        if not _PLAIN.match(command):
+            self._refuse("character that firmwares do not take", repr(command), "plain ASCII")
+            return
+        if len(command) > LINE_LIMIT[self._dialect]:
+            limit = LINE_LIMIT[self._dialect]
+            self._refuse("line too long", f"{len(command)} characters", f"{limit}")
+        upper = command.upper()
+        head = _HEAD.match(upper)
+        if head is None:
+            self._named(upper)
+            return
+        name = head.group(1) + head.group(2) + (f".{head.group(3)}" if head.group(3) else "")
+        if name not in self._known:
+            self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
+            return
+        if name in {"M117", "M118", "M862.3", "M115"}:
+            return  # free text
+        words = self._words(upper[head.end() :])
+        if words is not None:
+            self._act(name, words)
+
+    def end(self) -> None:
+        """Judge what the program leaves behind."""
+        if not self._alone:
+            return
+        for what, value_c in (("hotend", self._hotend_c), ("bed", self._bed_c)):
+            if value_c > 0:
+                self._refuse(f"{what} left on at the end", f"{value_c:g} °C", "0 °C")
+
+    def _refuse(self, what: str, value: str, limit: str) -> None:
+        self.refusals.append(Refusal(self._line, self._text, what, value, limit))
+
+    def _named(self, command: str) -> None:
+        match = _NAMED.match(command)
+        name = match.group(1) if match else command.split()[0]
+        if name not in self._known:
+            self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
+        elif name in PROBES and self._occupied:
+            self._refuse("probing over a standing part", name, "nothing may stand there")
+
+    def _words(self, rest: str) -> dict[str, float | None] | None:
+        """Words of a command; a letter without a number is a flag."""
+        rest = rest.partition("*")[0]
+        words: dict[str, float | None] = {}
+        at = 0
+        while at < len(rest):
+            if rest[at] in " \t":
+                at += 1
+                continue
+            match = _WORD.match(rest, at)
+            if match is None or (match.end() < len(rest) and rest[match.end()] in ".0123456789"):
+                self._refuse("word that is no number", rest.strip(), "a letter and one number")
+                return None
+            letter, text = match.groups()
+            if letter in words:
+                self._refuse("word given twice", letter, "once")
+                return None
+            words[letter] = None if text is None else float(text)
+            at = match.end()
+        return words
+
+    # ------------------------------------------------------------------ commands
+
+    def _act(self, name: str, words: dict[str, float | None]) -> None:
+        if name in {"G0", "G1"}:
+            self._move(words)
+        elif name in {"G2", "G3"}:
+            self._arc(words, clockwise=name == "G2")
+        elif name == "G28":
+            self._home(words)
+        elif name in PROBES and self._occupied:
+            self._refuse("probing over a standing part", name, "nothing may stand there")
+        elif name in {"G90", "G91"}:
+            self._absolute = name == "G90"
+            if self._dialect in G90_SETS_E:
+                self._absolute_e = self._absolute
+        elif name in {"M82", "M83"}:
+            self._absolute_e = name == "M82"
+        elif name in {"G20", "G21"}:
+            self._unit = INCH_MM if name == "G20" else 1.0
+        elif name == "G92":
+            self._set_place(words)
+        elif name in HEATER_COMMANDS:
+            self._heat(name, words)
+        elif name in {"G10", "G11"}:
+            self._refuse("firmware retraction", name, "its length is not in the program")
+        elif name in _MACHINE_LIMITS:
+            self._limits(name, words)
+        elif name == "M221" and not 50 <= (words.get("S") or 100.0) <= 150:
+            self._refuse("flow factor", f"{words.get('S'):g} %", "50 to 150 %")
+        elif name == "M220" and not 10 <= (words.get("S") or 100.0) <= 200:
+            self._refuse("speed factor", f"{words.get('S'):g} %", "10 to 200 %")
+
+    def _limits(self, name: str, words: dict[str, float | None]) -> None:
+        """Machine limits may be lowered, not raised far above what the profile says."""
+        limits = getattr(self._setup.printer, _MACHINE_LIMITS[name])
+        for letter in "XYZE":
+            value, limit = words.get(letter), getattr(limits, letter.lower())
+            if value is not None and value > 20 * limit:
+                self._refuse(f"machine limit of {letter}", f"{value:g}", f"{limit:g}")
+
+    def _heat(self, name: str, words: dict[str, float | None]) -> None:
+        value_c = words.get("S", words.get("R"))
+        what = HEATER_COMMANDS[name]
+        if value_c is None:
+            self._refuse(f"{what} temperature missing", "no S", "a temperature")
+            return
+        printer = self._setup.printer
+        limit_c = printer.max_hotend_c if what == "hotend" else printer.max_bed_c
+        if not 0 <= value_c <= limit_c:
+            self._refuse(f"{what} temperature", f"{value_c:g} °C", f"{limit_c:g} °C")
+        if what == "bed":
+            self._bed_c = value_c
+        else:
+            self._hotend_c = value_c
+            if name == "M109":
+                self._ready_c = value_c
+            elif value_c < self._ready_c:
+                self._ready_c = value_c
+
+    def _home(self, words: dict[str, float | None]) -> None:
+        axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
+        if 2 in axes and self._occupied:
+            self._refuse("homing Z onto a standing part", "G28 with Z", "G28 X Y only")
+        for axis in axes:
+            self._homed[axis] = True
+            self._place[axis] = None  # the place of an end stop is the firmware's business
+
+    def _set_place(self, words: dict[str, float | None]) -> None:
+        for axis, letter in enumerate("XYZ"):
+            if letter in words:
+                value, here = words[letter] or 0.0, self._place[axis]
+                if here is None or abs(value * self._unit - here) > PLACE_SLACK_MM:
+                    self._refuse("shift of the coordinate system", f"G92 {letter}", "only G92 E")
+        if "E" in words:
+            self._e = (words["E"] or 0.0) * self._unit
+        elif not words:
+            self._e = 0.0
+
+    # ------------------------------------------------------------------ moves
+
+    def _target(self, words: dict[str, float | None]) -> list[float | None]:
+        target = list(self._place)
+        for axis, letter in enumerate("XYZ"):
+            value = words.get(letter)
+            if value is None:
+                continue
+            here = self._place[axis]
+            if self._absolute:
+                target[axis] = value * self._unit
+            elif here is not None:
+                target[axis] = here + value * self._unit
+            elif axis == 2 and value < 0:
+                self._refuse("relative move down from an unknown height", f"{value:g} mm", "up only")
+        return target
+
+    def _pushed(self, words: dict[str, float | None]) -> float:
+        value = words.get("E")
+        if value is None:
+            return 0.0
+        value *= self._unit
+        pushed = value - self._e if self._absolute_e else value
+        self._e += pushed
+        return pushed
+
+    def _feed(self, words: dict[str, float | None]) -> None:
+        value = words.get("F")
+        if value is None:
+            if "F" in words:
+                self._refuse("feed without a number", "F", "mm/min")
+            return
+        feed_mm_s = value * self._unit / 60.0
+        if not 0 < feed_mm_s <= FASTEST_MM_S:
+            self._refuse("feed", f"{feed_mm_s:g} mm/s", f"0 to {FASTEST_MM_S:g} mm/s")
+        self._feed_mm_s = max(feed_mm_s, 1e-3)
+
+    def _move(self, words: dict[str, float | None]) -> None:
+        for letter in "XYZE":
+            if letter in words and words[letter] is None:
+                self._refuse("axis without a number", letter, "a number")
+                return
+        self._feed(words)
+        moved = [axis for axis, letter in enumerate("XYZ") if letter in words]
+        for axis in moved:
+            if not self._homed[axis]:
+                self._refuse("move before homing", "XYZ"[axis], "home first")
+                self._homed[axis] = True  # said once
+        target = self._target(words)
+        self._go(target, self._pushed(words), moved=bool(moved))
+
+    def _arc(self, words: dict[str, float | None], *, clockwise: bool) -> None:
+        self._feed(words)
+        target, here = self._target(words), self._place
+        pushed = self._pushed(words)
+        if None in here or None in target or not self._absolute and "R" in words:
+            self._refuse("arc from an unknown place", "G2/G3", "a known place")
+            return
+        x0, y0, z0 = (float(v or 0.0) for v in here)
+        x1, y1, z1 = (float(v or 0.0) for v in target)
+        if words.get("R") is not None:
+            self._refuse("arc told by its radius", "R", "I and J")
+            return
+        cx = x0 + (words.get("I") or 0.0) * self._unit
+        cy = y0 + (words.get("J") or 0.0) * self._unit
+        r0, r1 = math.hypot(x0 - cx, y0 - cy), math.hypot(x1 - cx, y1 - cy)
+        if r0 < 1e-3 or abs(r0 - r1) > max(0.05, 0.002 * r0):
+            self._refuse("arc whose ends lie on two circles", f"{abs(r0 - r1):.3f} mm", "0.05 mm")
+            return
+        a0 = math.atan2(y0 - cy, x0 - cx)
+        sweep = math.atan2(y1 - cy, x1 - cx) - a0
+        if clockwise:
+            sweep -= 2 * math.pi if sweep >= -1e-9 else 0.0
+        else:
+            sweep += 2 * math.pi if sweep <= 1e-9 else 0.0
+        n = max(2, math.ceil(abs(sweep) * math.sqrt(max(r0, 0.1)) / 0.3))
+        for k in range(1, n + 1):
+            t = k / n
+            point: list[float | None] = [
+                cx + r0 * math.cos(a0 + sweep * t),
+                cy + r0 * math.sin(a0 + sweep * t),
+                z0 + (z1 - z0) * t,
+            ]
+            self._go(target if k == n else point, pushed / n, moved=True)
+
+    def _go(self, target: list[float | None], pushed_mm: float, *, moved: bool) -> None:
+        here = self._place
+        if moved:
+            self._bounds(target)
+        length_mm = 0.0
+        known = None not in here and None not in target
+        if known:
+            start = (float(here[0] or 0), float(here[1] or 0), float(here[2] or 0))
+            end = (float(target[0] or 0), float(target[1] or 0), float(target[2] or 0))
+            length_mm = math.dist(start, end)
+            if length_mm > 0:
+                self.moves.line.append(self._line)
+                self.moves.start.append(start)
+                self.moves.end.append(end)
+                self.moves.pushed_mm3.append(max(pushed_mm, 0.0) * self._area_mm2)
+        elif moved and self._standing_top_mm is not None and pushed_mm <= 0:
+            z = target[2]
+            if z is not None and z < self._standing_top_mm:
+                self._refuse(
+                    "move at an unknown place below the top of what stands there",
+                    f"Z {z:g} mm",
+                    f"{self._standing_top_mm:g} mm",
+                )
+        self._place = target
+        if pushed_mm:
+            self._extrude(pushed_mm, length_mm, known=known)
+
+    def _bounds(self, target: list[float | None]) -> None:
+        x0, y0, x1, y1 = self._setup.printer.reach_box_mm
+        for axis, low, high in ((0, x0, x1), (1, y0, y1), (2, 0.0, self._setup.printer.max_z_mm)):
+            value = target[axis]
+            if value is not None and not low - PLACE_SLACK_MM <= value <= high + PLACE_SLACK_MM:
+                letter = "XYZ"[axis]
+                self._refuse(f"{letter} out of reach", f"{value:g} mm", f"{low:g} to {high:g} mm")
+
+    def _extrude(self, pushed_mm: float, length_mm: float, *, known: bool) -> None:
+        printer = self._setup.printer
+        if pushed_mm > 0 and self._ready_c < printer.min_extrude_c:
+            self._refuse(
+                "cold extrusion", f"hotend waited for at {self._ready_c:g} °C",
+                f"{printer.min_extrude_c:g} °C",
+            )  # fmt: skip
+            self._ready_c = math.inf  # said once
+        if length_mm <= SHORT_MM:
+            self._short(pushed_mm, length_mm)
+            return
+        self._short_mm = self._short_mm3 = 0.0
+        if pushed_mm < 0:
+            self._pull(pushed_mm)
+            return
+        back_mm = min(pushed_mm, self._pulled_mm)  # a wipe or an unretraction on the move
+        self._pulled_mm -= back_mm
+        volume_mm3 = (pushed_mm - back_mm) * self._area_mm2
+        section_mm2 = volume_mm3 / length_mm
+        limit_mm2 = printer.max_bead_section_mm2
+        if section_mm2 > SECTION_SLACK * limit_mm2:
+            self._refuse("bead too thick", f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²")
+        flow = section_mm2 * self._feed_mm_s
+        limit = self._setup.max_volumetric_mm3_s
+        if flow > FLOW_SLACK * limit:
+            self._refuse("melts more than the hotend can", f"{flow:.1f} mm³/s", f"{limit:g} mm³/s")
+
+    def _short(self, pushed_mm: float, length_mm: float) -> None:
+        """Standing, or nearly so: lengths add up until the nozzle has moved on."""
+        printer = self._setup.printer
+        if pushed_mm < 0:
+            self._pull(pushed_mm)
+            return
+        back_mm = min(pushed_mm, self._pulled_mm)
+        self._pulled_mm -= back_mm
+        self._short_mm += length_mm
+        self._short_mm3 += (pushed_mm - back_mm) * self._area_mm2
+        allowed_mm3 = printer.max_extrude_only_mm * self._area_mm2
+        if self._short_mm3 > allowed_mm3:
+            self._refuse(
+                "pushes filament standing still",
+                f"{self._short_mm3 / self._area_mm2:.1f} mm",
+                f"{printer.max_extrude_only_mm:g} mm",
+            )
+            self._short_mm3 = 0.0
+
+    def _pull(self, pushed_mm: float) -> None:
+        self._pulled_mm -= pushed_mm
+        limit_mm = self._setup.printer.max_extrude_only_mm
+        if self._pulled_mm > limit_mm:
+            self._refuse("pulls filament back", f"{self._pulled_mm:.1f} mm", f"{limit_mm:g} mm")
+            self._pulled_mm = 0.0

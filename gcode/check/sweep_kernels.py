@@ -1,0 +1,77 @@
+# mypy: disable-error-code="no-untyped-def"
+"""The tool head swept along moves over a height field that grows by what is laid; compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def sweep(
+    start, end, laid, half_width, field, origin, cell, heights, above, dilated, rows, row_at, slack
+):
+    """Worst contact of every move.
+
+    Parameters: (n, 3) start and end, (n,) 1 where plastic is laid and its half width; the field
+    (ny, nx) of what stands there, which is raised; (s,) heights of the head's slices above the
+    tip, their names' order, (s, ny, nx) the field dilated by each slice; footprint rows (dy, low,
+    high) of each slice at row_at[s]:row_at[s+1]; (s,) allowed contact.
+    Returns (n,) depth of the worst contact (≤ 0: none), and its slice.
+    """
+    n, slices = len(laid), len(heights)
+    ny, nx = field.shape
+    worst = np.full(n, -np.inf)
+    which = np.zeros(n, np.int64)
+    step = 0.5 * cell
+    for k in range(n):
+        dx, dy, dz = end[k, 0] - start[k, 0], end[k, 1] - start[k, 1], end[k, 2] - start[k, 2]
+        count = max(1, int(np.ceil(np.hypot(dx, dy) / step)))
+        for i in range(count + 1):
+            t = i / count
+            x, y, z = start[k, 0] + dx * t, start[k, 1] + dy * t, start[k, 2] + dz * t
+            ix = int(np.floor((x - origin[0]) / cell))
+            iy = int(np.floor((y - origin[1]) / cell))
+            if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
+                continue
+            for s in range(slices):
+                depth = dilated[s, iy, ix] - (z + heights[s]) - slack[s]
+                if depth > worst[k]:
+                    worst[k] = depth
+                    which[k] = above[s]
+        if laid[k] <= 0:
+            continue
+        for i in range(count + 1):  # what is laid now stands there from now on
+            t = i / count
+            x, y, z = start[k, 0] + dx * t, start[k, 1] + dy * t, start[k, 2] + dz * t
+            reach = int(np.ceil(half_width[k] / cell))
+            cx = int(np.floor((x - origin[0]) / cell))
+            cy = int(np.floor((y - origin[1]) / cell))
+            for jy in range(-reach, reach + 1):
+                for jx in range(-reach, reach + 1):
+                    iy, ix = cy + jy, cx + jx
+                    if iy < 0 or ix < 0 or iy >= ny or ix >= nx or field[iy, ix] >= z:
+                        continue
+                    px = origin[0] + (ix + 0.5) * cell - x
+                    py = origin[1] + (iy + 0.5) * cell - y
+                    if px * px + py * py > half_width[k] * half_width[k]:
+                        continue
+                    field[iy, ix] = z
+                    raise_dilated(dilated, rows, row_at, iy, ix, z)
+    return worst, which
+
+
+@njit(cache=True, nogil=True)
+def raise_dilated(dilated, rows, row_at, iy, ix, z):
+    """Every place of the head that covers this column sees the new height."""
+    slices, ny, nx = dilated.shape
+    for s in range(slices):
+        for r in range(row_at[s], row_at[s + 1]):
+            row = iy - rows[r, 0]
+            if row < 0 or row >= ny:
+                continue
+            first = max(0, ix - rows[r, 2])
+            last = min(nx - 1, ix - rows[r, 1])
+            for column in range(first, last + 1):
+                if dilated[s, row, column] < z:
+                    dilated[s, row, column] = z
