@@ -127,9 +127,7 @@ class _Text:
         else:
             self._set(move)
 
-    def _set(
-        self, move: SetHotend | SetBed | SetFan | SetAcceleration | FinishMoves
-    ) -> None:
+    def _set(self, move: SetHotend | SetBed | SetFan | SetAcceleration | FinishMoves) -> None:
         if isinstance(move, SetHotend):
             self.lines.append(f"M{109 if move.wait else 104} S{number(move.temperature_c, 1)}")
         elif isinstance(move, SetBed):

@@ -16,7 +16,7 @@ TOUCH_MM = 1e-9  # intervals this close are one: far below any layer, far above 
 FRESH, FREE = 0, 1  # entries of `meta`
 
 
-@njit(cache=True, inline="never")
+@njit(cache=True, nogil=True, inline="never")
 def allocate(pool, pool_next, meta, lo, hi, following):
     """Take a pool node for (lo, hi); the caller has made sure that there is room."""
     node = meta[FREE]
@@ -31,7 +31,7 @@ def allocate(pool, pool_next, meta, lo, hi, following):
     return node
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def release(pool_next, meta, node):
     """Give a pool node back; returns what followed it."""
     following = pool_next[node]
@@ -40,7 +40,7 @@ def release(pool_next, meta, node):
     return following
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z):
     """Highest solid at or below z (0: the bed); z itself where z lies inside solid."""
     top = hi[iy, ix]
@@ -58,7 +58,7 @@ def surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z):
     return 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     """Unite the column with [a, b]; needs room for one pool node."""
     if hi[iy, ix] <= lo[iy, ix]:
@@ -97,7 +97,7 @@ def insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     nxt[iy, ix] = node
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def cut(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     """Take [a, b] out of the column; needs room for one pool node; returns the length removed."""
     removed = 0.0
@@ -153,7 +153,7 @@ def cut(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     return removed
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def grown(pool, pool_next, meta, room):
     """The same pool with room for at least `room` more nodes."""
     capacity = len(pool_next)
@@ -167,7 +167,7 @@ def grown(pool, pool_next, meta, room):
     return wider_pool, wider_next
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def flatten(hi, lo, nxt, pool, pool_next, y0, y1, x0, x1):
     """Offsets (n + 1,) and intervals (m, 2) by column, rising, of the window [y0:y1, x0:x1]."""
     offsets = np.zeros((y1 - y0) * (x1 - x0) + 1, dtype=np.int64)
@@ -201,7 +201,7 @@ def flatten(hi, lo, nxt, pool, pool_next, y0, y1, x0, x1):
     return offsets, spans
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def merge_flat(hi, lo, nxt, pool, pool_next, meta, y0, x0, width, offsets, spans, subtract):
     """Unite (or cut) flat intervals into the columns; returns the pool and the length changed."""
     changed = 0.0
@@ -220,7 +220,7 @@ def merge_flat(hi, lo, nxt, pool, pool_next, meta, y0, x0, width, offsets, spans
     return pool, pool_next, changed
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def subtract_flat(offsets_a, spans_a, offsets_b, spans_b):
     """A \\ B by column, both flat over the same window; flat again."""
     n = len(offsets_a) - 1
@@ -249,7 +249,7 @@ def subtract_flat(offsets_a, spans_a, offsets_b, spans_b):
     return offsets, spans[:at].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def intersect_flat(offsets_a, spans_a, offsets_b, spans_b):
     """A ∩ B by column, both flat over the same window; flat again."""
     n = len(offsets_a) - 1
@@ -273,7 +273,7 @@ def intersect_flat(offsets_a, spans_a, offsets_b, spans_b):
     return offsets, spans[:at].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def column_lengths(offsets, spans, z_low, z_high):
     """(n,) solid length of each flat column between two heights."""
     lengths = np.zeros(len(offsets) - 1)
@@ -283,7 +283,7 @@ def column_lengths(offsets, spans, z_low, z_high):
     return lengths
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def crossings(triangles, x0, y0, cell, ny, nx):
     """Where vertical lines through column centres cross triangles: column (m,) and z (m,).
 
@@ -331,7 +331,7 @@ def crossings(triangles, x0, y0, cell, ny, nx):
     return column[:count].copy(), height[:count].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def pair_crossings(column, height, n):
     """Flat intervals of a closed surface from its crossings, sorted by column then height."""
     offsets = np.zeros(n + 1, dtype=np.int64)

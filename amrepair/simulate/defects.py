@@ -52,7 +52,8 @@ OPTIONS: dict[DefectKind, dict[str, Option]] = {
         "diameter": Option(0.0, 0.0, 200.0, "mm across; 0: the whole layer"),
     },
     DefectKind.CHIP: {
-        "size": Option(7.0, 1.5, 40.0, "mm across"),
+        "size": Option(8.0, 1.5, 40.0, "mm across"),
+        "depth": Option(1.4, 0.3, 20.0, "mm deep"),
         "roughness": Option(0.15, 0.0, 1.0, "mm, standard deviation of the fracture"),
     },
     DefectKind.BLOB: {

@@ -26,7 +26,7 @@ MOST_RIDGE_STEPS = 4000
 
 
 # The common cases are told twice, inline: a call with arrays costs more than the work itself.
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z):
     """As `surface_below`, the topmost interval first."""
     surface = hi[iy, ix]
@@ -37,7 +37,7 @@ def surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z):
     return surface
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level):
     """As `insert`, for plastic that begins on the topmost solid."""
     if bottom == hi[iy, ix] and (bottom > lo[iy, ix] or bottom == 0.0):
@@ -46,7 +46,7 @@ def stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level):
         insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit):
     """Where plastic coming from height z begins to stack: on what lies below, or hanging."""
     surface = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
@@ -55,7 +55,7 @@ def floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit):
     return surface
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def level_of(floors, count, amount, z):
     """Level to which `amount` (mm of column) fills the first `count` floors, sorted rising."""
     used = 0.0
@@ -70,7 +70,7 @@ def level_of(floors, count, amount, z):
     return z
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def lay(
     hi,
     lo,
@@ -182,7 +182,7 @@ def lay(
     window[3] = max(window[3], cx)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def flow_factor(regions, x, y, z):
     """Product of the flow factors of all defect regions that hold (x, y, z)."""
     factor = 1.0
@@ -197,7 +197,7 @@ def flow_factor(regions, x, y, z):
     return factor
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def deposit(
     hi,
     lo,

@@ -187,22 +187,29 @@ def _under_extrusion(
 def _bite(
     centre_mm: Float[np.ndarray, " 3"],
     radius_mm: float,
+    depth_mm: float,
     roughness_mm: float,
     rng: np.random.Generator,
 ) -> m3.Manifold:
-    """A ball with a rough surface (the fracture), and open above: a bite from the top."""
-    ball = m3.Manifold.sphere(radius_mm, 48).to_mesh64()
+    """A shell-shaped fracture: the rough cap of a ball, `depth_mm` deep, open above.
+
+    `centre_mm` lies on the rim's plane; the ball's own centre is above it where the bite is
+    shallower than a half ball.
+    """
+    ball_mm = 0.5 * (radius_mm**2 + depth_mm**2) / depth_mm
+    ball = m3.Manifold.sphere(ball_mm, 96).to_mesh64()
     corners = np.asarray(ball.vert_properties)[:, :3]
     waves = rng.normal(size=(24, 3)) * (3.0 / radius_mm)
     phases = rng.uniform(0, 2 * np.pi, 24)
     noise = np.sqrt(2 / 24) * np.cos(corners @ waves.T + phases).sum(axis=1)
     limit_mm = min(roughness_mm, 0.15 * radius_mm)
-    corners = corners * (1 + limit_mm * noise / radius_mm)[:, None]
+    corners = corners * (1 + limit_mm * noise / ball_mm)[:, None]
     rough = m3.Manifold(
         m3.Mesh64(np.ascontiguousarray(corners), np.array(ball.tri_verts, dtype=np.uint64))
     )
-    column = m3.Manifold.cylinder(4 * radius_mm, radius_mm, radius_mm, 48)
-    return (rough + column).translate(tuple(centre_mm))
+    cap = rough.translate((0.0, 0.0, ball_mm - depth_mm)).trim_by_plane((0.0, 0.0, -1.0), 0.0)
+    column = m3.Manifold.cylinder(4 * radius_mm, radius_mm, radius_mm, 96)
+    return (cap + column.translate((0.0, 0.0, -1e-3))).translate(tuple(centre_mm))
 
 
 def _chip(
@@ -212,11 +219,11 @@ def _chip(
     rng: np.random.Generator,
     scale: float,
 ) -> PlacedDefect | None:
-    """A bite off an edge of the top: the ball's centre lies on the outline near the top."""
+    """A bite off an edge of the top: its middle lies on the outline near the top."""
     radius_mm = 0.5 * defect.values["size"] * scale
     height_mm = float(part.bounding_box()[5])
-    depth_mm = min(0.05 + 0.3 * radius_mm, 0.2 * height_mm)
-    section = part.slice(height_mm - depth_mm)
+    deep_mm = min(defect.values["depth"] * scale, radius_mm, 0.4 * height_mm)
+    section = part.slice(height_mm - 0.5 * deep_mm)
     outlines = [np.asarray(polygon, dtype=np.float64) for polygon in section.to_polygons()]
     if not outlines or section.area() < 1.0:
         return None
@@ -229,11 +236,11 @@ def _chip(
         pick = int(rng.choice(len(starts), p=weight / weight.sum()))
         on_edge = starts[pick] + rng.random() * (ends[pick] - starts[pick])
         centre = np.array([*on_edge, height_mm])
-        bite = _bite(centre, radius_mm, defect.values["roughness"], rng)
+        bite = _bite(centre, radius_mm, deep_mm, defect.values["roughness"], rng)
         broken = part ^ bite
         volume_mm3 = broken.volume()
-        ball_mm3 = 4 / 3 * np.pi * radius_mm**3
-        if volume_mm3 < 0.05 * ball_mm3 or volume_mm3 < 3.0:
+        whole_mm3 = np.pi / 6 * deep_mm * (3 * radius_mm**2 + deep_mm**2)
+        if volume_mm3 < 0.1 * whole_mm3 or volume_mm3 < 3.0:
             continue
         pieces = (part - bite).decompose()
         # what falls off with it would lie loose on the bed: not a chip

@@ -135,9 +135,10 @@ def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
     import manifold3d as m3
 
+    # copies: the binding takes no read-only arrays, and trimesh's are
     mesh = m3.Mesh64(
-        np.ascontiguousarray(vertices_mm, dtype=np.float64),
-        np.ascontiguousarray(faces, dtype=np.uint64),
+        np.array(vertices_mm, dtype=np.float64, order="C"),
+        np.array(faces, dtype=np.uint64, order="C"),
     )
     return m3.Manifold(mesh)
 

@@ -87,7 +87,8 @@ class Judge:
         self.moves = Moves()
         self.commands = 0
         self._setup, self._dialect = setup, program.dialect
-        self._known = COMMANDS[program.dialect] | {m.split()[0].upper() for m in setup.printer.macros}
+        macros = {macro.split(maxsplit=1)[0].upper() for macro in setup.printer.macros}
+        self._known = COMMANDS[program.dialect] | macros
         self._area_mm2 = math.pi / 4 * setup.printer.filament_diameter_mm**2
         self._alone = initial is None
         self._standing_top_mm = standing_top_mm
@@ -151,7 +152,7 @@ class Judge:
 
     def _named(self, command: str) -> None:
         match = _NAMED.match(command)
-        name = match.group(1) if match else command.split()[0]
+        name = match.group(1) if match else command.split(maxsplit=1)[0]
         if name not in self._known:
             self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
         elif name in PROBES and self._occupied:
@@ -232,9 +233,8 @@ class Judge:
             self._bed_c = value_c
         else:
             self._hotend_c = value_c
-            if name == "M109":
-                self._ready_c = value_c
-            elif value_c < self._ready_c:
+            # waited for, or cooling from now on
+            if name == "M109" or value_c < self._ready_c:
                 self._ready_c = value_c
 
     def _home(self, words: dict[str, float | None]) -> None:
@@ -270,7 +270,8 @@ class Judge:
             elif here is not None:
                 target[axis] = here + value * self._unit
             elif axis == 2 and value < 0:
-                self._refuse("relative move down from an unknown height", f"{value:g} mm", "up only")
+                what = "relative move down from an unknown height"
+                self._refuse(what, f"{value:g} mm", "up only")
         return target
 
     def _pushed(self, words: dict[str, float | None]) -> float:
@@ -311,7 +312,7 @@ class Judge:
         self._feed(words)
         target, here = self._target(words), self._place
         pushed = self._pushed(words)
-        if None in here or None in target or not self._absolute and "R" in words:
+        if None in here or None in target or (not self._absolute and "R" in words):
             self._refuse("arc from an unknown place", "G2/G3", "a known place")
             return
         x0, y0, z0 = (float(v or 0.0) for v in here)

@@ -28,13 +28,18 @@ def sweep(
     """Refusals for every move that touches, and the least clearance of the body."""
     if not moves.line or not as_built.z_mm.size:
         return [], np.inf
-    slices = printer.envelope
+    start, end = np.array(moves.start), np.array(moves.end)
+    lowest_mm = float(min(start[:, 2].min(), end[:, 2].min()))
+    tallest_mm = max(as_built.top_mm, float(end[:, 2].max()))
+    # what stays above everything when the tip is lowest cannot touch
+    slices = [p for p in printer.envelope if p.z_from_mm <= tallest_mm - lowest_mm]
+    if not slices:
+        return [], np.inf
     field = _coarse(as_built, max(1, MAX_CELLS // (len(slices) + 1)))
     tables = [footprint_rows(part.polygon_mm, field.cell_mm) for part in slices]
     rows = np.concatenate([np.stack(table, axis=1) for table in tables])
     row_at = np.concatenate([[0], np.cumsum([len(table[0]) for table in tables])])
     dilated = np.stack([field.max_within(part.polygon_mm) for part in slices])
-    start, end = np.array(moves.start), np.array(moves.end)
     pushed = np.array(moves.pushed_mm3)
     length = np.linalg.norm(end - start, axis=1)
     width = np.clip(pushed / np.maximum(length, 1e-9) / 0.2, 0.0, 2 * printer.nozzle_diameter_mm)

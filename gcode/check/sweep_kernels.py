@@ -73,5 +73,4 @@ def raise_dilated(dilated, rows, row_at, iy, ix, z):
             first = max(0, ix - rows[r, 2])
             last = min(nx - 1, ix - rows[r, 1])
             for column in range(first, last + 1):
-                if dilated[s, row, column] < z:
-                    dilated[s, row, column] = z
+                dilated[s, row, column] = max(dilated[s, row, column], z)

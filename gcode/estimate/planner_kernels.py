@@ -89,5 +89,5 @@ def trapezoid(length, speed, accel, start, end):
     if up + down <= length:
         return (speed - start) / accel + (speed - end) / accel + (length - up - down) / speed
     peak = np.sqrt(max(0.5 * (2 * accel * length + start * start + end * end), 0.0))
-    peak = max(peak, max(start, end))
+    peak = max(peak, start, end)
     return (peak - start) / accel + (peak - end) / accel

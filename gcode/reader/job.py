@@ -6,6 +6,7 @@ import math
 import re
 from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -123,9 +124,7 @@ class Job:
             If the program has no such line, or the nozzle's place is not known there.
         """
         if not 0 <= line < len(self._states):
-            raise ReadError(
-                f"Line {line} is not in a program of {len(self._states) - 1} lines."
-            )
+            raise ReadError(f"Line {line} is not in a program of {len(self._states) - 1} lines.")
         s = self._states[line]
         if not np.isfinite(s[:3]).all():
             raise ReadError(
@@ -166,7 +165,7 @@ def read_job(
     if isinstance(program, str):
         program = Program(program, dialect)
     lines = program.text.split("\n")
-    starts, kinds, codes, words = _tokens(program.text, len(lines))
+    kinds, codes, words = _tokens(program.text, len(lines))
     states = np.zeros((len(lines) + 1, kernels.STATES))
     states[0, :3] = np.nan
     states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
@@ -174,9 +173,7 @@ def read_job(
     pushed = np.zeros(len(lines))
     kernels.run(kinds, codes, words, program.dialect in _BOTH_MODES, states, pushed)
     none3, none1, none0 = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
-    count = kernels.beads(
-        kinds, codes, words, states, pushed, none3, none3, none1, none0, True
-    )
+    count = kernels.beads(kinds, codes, words, states, pushed, none3, none3, none1, none0, True)
     if count == 0:
         raise ReadError("The program extrudes nothing; it is no print job.")
     start, end = np.zeros((count, 3)), np.zeros((count, 3))
@@ -202,7 +199,7 @@ def read_job(
 
 def _tokens(
     text: str, count: int
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " n"], Int[np.ndarray, " n"], np.ndarray]:
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
     data = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
     breaks = np.flatnonzero(data == ord("\n")) + 1
     starts = np.concatenate([[0], breaks, [len(data)]]).astype(np.int64)[: count + 1]
@@ -210,7 +207,7 @@ def _tokens(
     words = np.zeros((count, len(kernels.LETTERS)))
     letters = np.frombuffer(kernels.LETTERS, np.uint8)
     kernels.parse(data, starts, letters, codes, kinds, words)
-    return starts, kinds, codes, words
+    return kinds, codes, words
 
 
 def _layers(
@@ -227,7 +224,7 @@ def _layers(
     bounds = [*marks, lines]
     found: list[JobLayer] = []
     below_mm = 0.0
-    for first, stop in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, stop in pairwise(bounds):
         a, b = np.searchsorted(owner, [first, stop])
         if a == b:  # nothing is laid: what is there belongs to the layer before
             if found:
@@ -240,9 +237,7 @@ def _layers(
     return _with_heights(found, comments)
 
 
-def _with_heights(
-    layers: list[JobLayer], comments: list[tuple[int, str]]
-) -> tuple[JobLayer, ...]:
+def _with_heights(layers: list[JobLayer], comments: list[tuple[int, str]]) -> tuple[JobLayer, ...]:
     """Heights as the slicer states them, where it does."""
     stated = [
         (line, float(match.group(1)))
@@ -256,9 +251,7 @@ def _with_heights(
         height_mm = layer.height_mm
         if k < len(stated) and stated[k][0] < layer.end_line and height_mm <= _LEAST_LAYER_MM:
             height_mm = stated[k][1]
-        out.append(
-            JobLayer(layer.index, layer.z_mm, height_mm, layer.first_line, layer.end_line)
-        )
+        out.append(JobLayer(layer.index, layer.z_mm, height_mm, layer.first_line, layer.end_line))
     return tuple(out)
 
 

@@ -8,7 +8,7 @@ from numba import njit
 
 # Columns of the table of words; the letters in this order.
 LETTERS = b"XYZEFIJRSP"
-X, Y, Z, E, F, I, J, R, S, P = range(10)
+X, Y, Z, E, F, I_, J, R, S, P = range(10)
 # Columns of the table of states.
 S_X, S_Y, S_Z, S_E, S_FEED, S_ABS, S_ABS_E, S_FAN, S_HOT, S_BED, S_ACC, S_MM, S_TOOL = range(13)
 STATES = 13
@@ -134,7 +134,7 @@ def run(kinds, codes, words, both_modes, states, pushed):
                     if every or not np.isnan(w[axis]):
                         now[axis] = 0.0
                         offset[axis] = 0.0
-            elif code == 900 or code == 910:
+            elif code in (900, 910):
                 now[S_ABS] = 1.0 if code == 900 else 0.0
                 if both_modes:
                     now[S_ABS_E] = now[S_ABS]
@@ -149,11 +149,11 @@ def run(kinds, codes, words, both_modes, states, pushed):
                 now[S_ABS_E] = 1.0
             elif code == 830:
                 now[S_ABS_E] = 0.0
-            elif (code == 1040 or code == 1090) and not np.isnan(w[S]):
+            elif code in (1040, 1090) and not np.isnan(w[S]):
                 now[S_HOT] = w[S]
             elif code == 1090 and not np.isnan(w[R]):
                 now[S_HOT] = w[R]
-            elif (code == 1400 or code == 1900) and not np.isnan(w[S]):
+            elif code in (1400, 1900) and not np.isnan(w[S]):
                 now[S_BED] = w[S]
             elif code == 1900 and not np.isnan(w[R]):
                 now[S_BED] = w[R]
@@ -184,7 +184,7 @@ def chords(x0, y0, x1, y1, w, unit, clockwise):
         cx = 0.5 * (x0 + x1) - side * h * dy / d
         cy = 0.5 * (y0 + y1) + side * h * dx / d
     else:
-        cx = x0 + (0.0 if np.isnan(w[I]) else w[I] * unit)
+        cx = x0 + (0.0 if np.isnan(w[I_]) else w[I_] * unit)
         cy = y0 + (0.0 if np.isnan(w[J]) else w[J] * unit)
     radius = np.hypot(x0 - cx, y0 - cy)
     if radius < 1e-9:
@@ -209,7 +209,7 @@ def beads(kinds, codes, words, states, pushed, start, end, filament, owner, coun
             continue
         a, b = states[line], states[line + 1]
         code = codes[line]
-        if code == 20 or code == 30:
+        if code in (20, 30):
             unit = 1.0 if a[S_MM] > 0 else INCH_MM
             cx, cy, radius, a0, sweep, n = chords(
                 a[0], a[1], b[0], b[1], words[line], unit, code == 20

@@ -1,0 +1,89 @@
+"""Where the nozzle can be: the tool head's envelope over what stands there, height by height.
+
+A column is out of reach at a height where any slice of the envelope, placed there, would touch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gcode.profiles import EnvelopeSlice, PrinterProfile
+from gcode.surfaces import HeightField
+
+# The flat may press this deep into the plastic beside it: a layer less than a contact that
+# moves a part; with the noise of a scan it stays under the checker's limit.
+TIP_PRESS_MM = 0.15
+BODY_CLEARANCE_MM = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """One slice of the envelope over the field: how high the tip must at least be, by column."""
+
+    part: EnvelopeSlice
+    least_tip_mm: Float[np.ndarray, "ny nx"]
+
+    @property
+    def is_tip(self) -> bool:
+        """Whether it is the flat around the bore."""
+        return self.part.z_from_mm < 1e-9
+
+
+class Reach:
+    """Answers where the tip may go.
+
+    Parameters
+    ----------
+    field
+        What stands there; its grid is the answers' grid.
+    lowest_tip_mm
+        The tip is never asked about below this height.
+    """
+
+    def __init__(
+        self, field: HeightField, printer: PrinterProfile, *, lowest_tip_mm: float = 0.0
+    ) -> None:
+        self.field = field
+        # a slice that stays above everything when the tip is lowest cannot touch
+        high_mm = field.top_mm - lowest_tip_mm + BODY_CLEARANCE_MM
+        self.obstacles = tuple(
+            Obstacle(
+                part,
+                field.max_within(part.polygon_mm)
+                - part.z_from_mm
+                + (-TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_CLEARANCE_MM),
+            )
+            for part in printer.envelope
+            if part.z_from_mm <= high_mm
+        )
+
+    def at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
+        """Columns over which the tip may be at this height."""
+        free = np.ones(self.field.shape, dtype=bool)
+        for obstacle in self.obstacles:
+            free &= obstacle.least_tip_mm <= z_mm + 1e-9
+        return free
+
+    def free_at_points(
+        self, points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "ny nx"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Values of an answer of `at` at points; outside the field nothing stands."""
+        index = self.field.cells_of(points_mm)
+        ny, nx = self.field.shape
+        inside = ((index >= 0) & (index < (ny, nx))).all(axis=1)
+        index = np.where(inside[:, None], index, 0)
+        return ~inside | free[index[:, 0], index[:, 1]]
+
+    def reason_at(self, iy: int, ix: int, z_mm: float) -> str:
+        """What stands in the way at one column, or why nothing does."""
+        worst, part = 0.0, None
+        for obstacle in self.obstacles:
+            depth = float(obstacle.least_tip_mm[iy, ix]) - z_mm
+            if depth > worst:
+                worst, part = depth, obstacle.part
+        if part is None:
+            return "covered by what stands above it"
+        return f"the {part.part} would touch what stands beside it by {worst:.1f} mm"
