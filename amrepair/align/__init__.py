@@ -1,1 +1,6 @@
 """Align: where a scan lies in the template. Returns a `Registration` or raises, never guesses."""
+
+from amrepair.align.align import align
+from amrepair.align.registration import Registration
+
+__all__ = ["Registration", "align"]

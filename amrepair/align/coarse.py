@@ -1,0 +1,97 @@
+"""Poses to start from, when nothing is known: features propose, the field disposes.
+
+KISS-Matcher (H. Lim et al., ICRA 2025) on two voxel sizes, and the 24 ways to lay the principal
+axes on each other; each is refined on the field and scored there.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.template.port import Template
+
+VOXEL_RATIOS = (0.012, 0.02)  # of the template's diagonal
+SURFACE_POINTS = 30_000
+
+
+def proposals(
+    points_mm: Float[np.ndarray, "n 3"], template: Template
+) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """Candidate poses (template from scan), features' first."""
+    low, high = template.bounds_mm
+    diagonal_mm = float(np.linalg.norm(high - low))
+    area_guess = diagonal_mm**2
+    surface, _ = template.surface_points(max(np.sqrt(area_guess / SURFACE_POINTS), 1e-3))
+    for ratio in VOXEL_RATIOS:
+        found = _kiss(points_mm, surface, ratio * diagonal_mm)
+        if found is not None:
+            yield found
+    yield from _by_axes(points_mm, surface)
+
+
+def _kiss(
+    points_mm: Float[np.ndarray, "n 3"], surface_mm: Float[np.ndarray, "m 3"], voxel_mm: float
+) -> Float[np.ndarray, "4 4"] | None:
+    import kiss_matcher
+
+    # about their own centres: the matcher computes in single precision
+    source, target = points_mm.mean(axis=0), surface_mm.mean(axis=0)
+    matcher = kiss_matcher.KISSMatcher(
+        kiss_matcher.KISSMatcherConfig(voxel_size=voxel_mm, enable_noise_bound_clamping=False)
+    )
+    answer = matcher.estimate(
+        (points_mm - source).astype(np.float32), (surface_mm - target).astype(np.float32)
+    )
+    rotation = np.asarray(answer.rotation, dtype=np.float64)
+    if not answer.valid or not np.isfinite(rotation).all():
+        return None
+    u, _, vt = np.linalg.svd(rotation)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    shift = np.asarray(answer.translation, dtype=np.float64).reshape(3)
+    return _pose(rotation, target + shift - rotation @ source)
+
+
+def _by_axes(
+    points_mm: Float[np.ndarray, "n 3"], surface_mm: Float[np.ndarray, "m 3"]
+) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """The 24 rotations that lay box on box."""
+    source, target = _axes(points_mm), _axes(surface_mm)
+    for turn in cube_rotations():
+        rotation = target[0] @ turn @ source[0].T
+        yield _pose(rotation, target[1] - rotation @ source[1])
+
+
+def _axes(
+    points_mm: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+    centre = points_mm.mean(axis=0)
+    axes = np.linalg.eigh(np.cov((points_mm - centre).T))[1]
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1.0
+    local = (points_mm - centre) @ axes
+    middle = 0.5 * (local.min(axis=0) + local.max(axis=0))
+    return axes, centre + axes @ middle
+
+
+def cube_rotations() -> list[Float[np.ndarray, "3 3"]]:
+    """The 24 proper rotations of a cube."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            if np.linalg.det(matrix) > 0:
+                found.append(matrix)
+    return found
+
+
+def _pose(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix

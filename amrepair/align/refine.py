@@ -1,0 +1,157 @@
+"""Refinement on the field: robust Gauss–Newton on the template's own distance (idea 3).
+
+No correspondences: a point's residual is f(x), its direction the field's gradient. The loss is
+Geman–McClure with a scale that shrinks from the error of the guess to the noise; a prior keeps
+what the scan does not determine where the guess had it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.frames import rotation_from_vector
+from amrepair.template.port import Template
+
+SHRINK = 0.6  # of the loss's scale, from one iteration to the next
+STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
+MAX_ITERATIONS = 60
+INLIER_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """How well the guess is known: standard deviations about the guess, scan's centroid.
+
+    Attributes
+    ----------
+    rotation_rad, translation_mm
+        (3,) each, about and along the template's axes.
+    """
+
+    rotation_rad: Float[np.ndarray, " 3"]
+    translation_mm: Float[np.ndarray, " 3"]
+
+    @property
+    def information(self) -> Float[np.ndarray, " 6"]:
+        """(6,) inverse variances, rotation first."""
+        return 1.0 / np.concatenate([self.rotation_rad, self.translation_mm]) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """A pose at a minimum, or where the iterations ended.
+
+    Attributes
+    ----------
+    matrix
+        (4, 4) template from scan.
+    information
+        (6, 6) JᵀWJ / σ², rotation about the centroid first; the prior is not in it.
+    residual_mm
+        (n,) f at the points.
+    """
+
+    matrix: Float[np.ndarray, "4 4"]
+    information: Float[np.ndarray, "6 6"]
+    residual_mm: Float[np.ndarray, " n"]
+    converged: bool
+    iterations: int
+
+    def inliers(self, limit_mm: float) -> Float[np.ndarray, " n"]:
+        """(n,) 1 where |f| is within the limit."""
+        return (np.abs(self.residual_mm) <= limit_mm).astype(np.float64)
+
+
+def refine(
+    points_mm: Float[np.ndarray, "n 3"],
+    template: Template,
+    matrix: Float[np.ndarray, "4 4"],
+    *,
+    start_scale_mm: float,
+    end_scale_mm: float,
+    sigma_mm: float,
+    prior: Prior | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+) -> Refined:
+    """Move a pose to the nearest minimum of Σ ρ(f(T x)).
+
+    Parameters
+    ----------
+    points_mm
+        (n, 3) in the scan's frame.
+    matrix
+        (4, 4) first guess, template from scan.
+    start_scale_mm, end_scale_mm
+        Scale of the Geman–McClure loss ρ(r) = r²/(r² + s²), first and last.
+    sigma_mm
+        Noise of a point, for the information.
+    """
+    centre = points_mm.mean(axis=0)
+    reach_mm = float(np.linalg.norm(points_mm - centre, axis=1).max())
+    rotation, place = matrix[:3, :3].copy(), matrix[:3, :3] @ centre + matrix[:3, 3]
+    first_rotation, first_place = rotation.copy(), place.copy()
+    local = points_mm - centre
+    scale, converged, hessian = start_scale_mm, False, np.zeros((6, 6))
+    f = np.zeros(len(points_mm))
+    iteration = 0
+    for iteration in range(1, max_iterations + 1):
+        turned = local @ rotation.T
+        f, gradient = template.distance_and_gradient(turned + place)
+        weight = (scale**2 / (f**2 + scale**2)) ** 2
+        jacobian = np.concatenate([np.cross(turned, gradient), gradient], axis=1)
+        weighted = jacobian * weight[:, None]
+        hessian = weighted.T @ jacobian / sigma_mm**2
+        slope = weighted.T @ f / sigma_mm**2
+        matrix6 = hessian + 1e-9 * np.trace(hessian) / 6 * np.eye(6)
+        if prior is not None:
+            offset = np.concatenate([_vector(rotation @ first_rotation.T), place - first_place])
+            matrix6 = matrix6 + np.diag(prior.information)
+            slope = slope + prior.information * offset
+        step = -np.linalg.solve(matrix6, slope)
+        turn = float(np.linalg.norm(step[:3]))
+        if turn > 0.2:  # a step this wide has left the linear range
+            step *= 0.2 / turn
+        rotation = rotation_from_vector(step[:3]) @ rotation
+        place = place + step[3:]
+        moved_mm = float(np.linalg.norm(step[3:])) + reach_mm * float(np.linalg.norm(step[:3]))
+        if scale <= end_scale_mm * (1 + 1e-9) and moved_mm < STEP_MM:
+            converged = True
+            break
+        if moved_mm < 0.25 * scale:
+            scale = max(end_scale_mm, scale * SHRINK)
+    u, _, vt = np.linalg.svd(rotation)
+    rotation = u @ vt
+    found = np.eye(4)
+    found[:3, :3] = rotation
+    found[:3, 3] = place - rotation @ centre
+    residual = template.distance(local @ rotation.T + place)
+    return Refined(found, hessian, residual, converged, iteration)
+
+
+def _vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
+    """Axis-angle vector of a small rotation."""
+    skew = 0.5 * (rotation - rotation.T)
+    return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+
+
+def thin_out(
+    points_mm: Float[np.ndarray, "n 3"], count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "m 3"]:
+    """About `count` points, evenly over space: one of each voxel, chosen by the generator."""
+    if len(points_mm) <= count:
+        return np.array(points_mm, dtype=np.float64)
+    shuffled = points_mm[rng.permutation(len(points_mm))]
+    low = shuffled.min(axis=0)
+    extent_mm = float((shuffled.max(axis=0) - low).max())
+    voxel_mm = max(extent_mm / 400.0, 1e-6)
+    for _ in range(40):
+        key = np.floor((shuffled - low) / voxel_mm).astype(np.int64)
+        flat = (key[:, 0] * 2_000_003 + key[:, 1]) * 2_000_003 + key[:, 2]
+        _, first = np.unique(flat, return_index=True)
+        if len(first) <= count:
+            return np.ascontiguousarray(shuffled[np.sort(first)])
+        voxel_mm *= 1.0 + 0.5 * min(1.0, np.sqrt(len(first) / count) - 1.0) + 0.02
+    return np.ascontiguousarray(shuffled[:count])
