@@ -96,8 +96,9 @@ def refine(
     local = points_mm - centre
     scale, converged, hessian = start_scale_mm, False, np.zeros((6, 6))
     f = np.zeros(len(points_mm))
-    iteration = 0
-    for iteration in range(1, max_iterations + 1):
+    iterations = 0
+    while iterations < max_iterations:
+        iterations += 1
         turned = local @ rotation.T
         f, gradient = template.distance_and_gradient(turned + place)
         weight = (scale**2 / (f**2 + scale**2)) ** 2
@@ -128,7 +129,7 @@ def refine(
     found[:3, :3] = rotation
     found[:3, 3] = place - rotation @ centre
     residual = template.distance(local @ rotation.T + place)
-    return Refined(found, hessian, residual, converged, iteration)
+    return Refined(found, hessian, residual, converged, iterations)
 
 
 def _vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:

@@ -123,7 +123,7 @@ def _inspect(data: ReportData) -> str:
         return ""
     return (
         f'<div class="toolbar">{_look_picker(data, drawn, "look", "Scan")}{_presets()}</div>'
-        '<div class="stage"><figure class="view" id="scene" tabindex="0" role="group" '
+        '<div class="stage"><figure class="view" id="viewer" tabindex="0" role="group" '
         f'aria-label="{_alt(data)}" aria-describedby="scene-help">'
         '<div class="plot"></div></figure>'
         f'<aside class="panel" aria-label="What is drawn">{_layers()}{_scale()}{_views()}'

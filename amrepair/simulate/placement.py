@@ -19,6 +19,7 @@ _LEAST_ROOM_MM2 = 0.02
 _TRIES = 60
 _CRUMB_MM3 = 0.05  # too small to be found, let alone printed
 _EVERYWHERE_MM = 1e9
+EVEN_RATIO = 0.97
 
 
 def place(
@@ -163,7 +164,9 @@ def _under_extrusion(
 ) -> PlacedDefect | None:
     flow = defect.values["flow"]
     diameter_mm = defect.values["diameter"] * scale
-    for layers in _layer_ranges(defect, tops_mm, rng):
+    ranges = _layer_ranges(defect, tops_mm, rng)
+    # where a face ends within the range its thin film is within any tolerance: others first
+    for layers in sorted(ranges, key=lambda r: not _even(part, r, tops_mm)):
         room = _solid_through(part, layers, tops_mm)
         if room.area() < 1.0:
             continue
@@ -182,6 +185,14 @@ def _under_extrusion(
         region = [*centre, 1.0, 0.0, half_mm, half_mm, low, high, flow]
         return PlacedDefect(defect.kind, tuple(layers), np.array([region]), None, None, box)
     return None
+
+
+def _even(part: m3.Manifold, layers: range, tops_mm: Float[np.ndarray, " n"]) -> bool:
+    """Whether the part's section stays the same over the layers."""
+    room = _solid_through(part, layers, tops_mm).area()
+    bottoms = np.concatenate([[0.0], tops_mm[:-1]])
+    areas = [part.slice(float(0.5 * (bottoms[k] + tops_mm[k]))).area() for k in layers]
+    return bool(room >= EVEN_RATIO * max(areas))
 
 
 def _bite(

@@ -1,4 +1,26 @@
-"""Template: the part as it should be, as a signed distance field.
+"""Templates: the part as it should be, as a signed distance field.
 
-Learned, exact or planned from G-code, all behind one port. It knows nothing of scans' poses.
+Learned (`LearnedSdf`), exact (`MeshSdf`), planned from the job's beads (`PlannedSdf`); a layer's cut of any of them. It does not know scans'
+poses, nor what is done about a difference. torch is imported only while fitting.
 """
+
+from amrepair.template.cut import CutTemplate
+from amrepair.template.extract import extract_mesh
+from amrepair.template.fitting import fit_template, load_or_fit
+from amrepair.template.learned import LearnedSdf
+from amrepair.template.mesh_file import load_mesh
+from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.planned import PlannedSdf
+from amrepair.template.port import Template
+
+__all__ = [
+    "CutTemplate",
+    "LearnedSdf",
+    "MeshSdf",
+    "PlannedSdf",
+    "Template",
+    "extract_mesh",
+    "fit_template",
+    "load_mesh",
+    "load_or_fit",
+]

@@ -366,8 +366,8 @@
     if ($("temperatures")) temperatures();
   }
   function start() {
-    if ($("scene")) {
-      main = new Scene("scene");
+    if ($("viewer")) {
+      main = new Scene("viewer");
       const select = $("range");
       [...new Set(data.scales)].forEach((v) => { const o = document.createElement("option"); o.value = v; o.textContent = "±" + number(v, 3) + " mm"; select.append(o); });
       select.value = range;

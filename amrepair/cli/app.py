@@ -1,0 +1,45 @@
+"""The application: one file for each group of commands."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import amrepair
+from amrepair.cli import benchmark, console, inspect, mend, simulation, templates
+
+app = typer.Typer(
+    name="amrepair",
+    help="Scan a print, find what is missing, print only that, scan again, resume.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        console.out.print(f"amrepair {amrepair.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Options before a command."""
+
+
+simulation.add_to(app)
+templates.add_to(app)
+inspect.add_to(app)
+mend.add_to(app)
+benchmark.add_to(app)
+
+
+def main() -> None:
+    """Entry point."""
+    console.run(app, "amrepair")

@@ -1,0 +1,61 @@
+"""`amrepair bench` and `amrepair synth`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amrepair.cli import console
+from amrepair.cli.options import SeedOption
+
+FormatOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or real3d-ad.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command("bench")(bench)
+    app.command("synth")(synth)
+
+
+def bench(
+    dataset: Annotated[Path, typer.Argument(help="Folder of the data set.")],
+    layout: FormatOption,
+    method: Annotated[list[str], typer.Option("--method", help="May be repeated.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; gone on with if it has some.")],
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="Pretrained weights, for the methods that need them.")
+    ] = None,
+) -> None:
+    """Compare methods on a data set."""
+    from amrepair.bench.runner import run_bench
+
+    bars = console.Bars()
+    with bars.shown():
+        report = run_bench(
+            dataset,
+            format=layout,
+            methods=method,
+            out=out,
+            jobs=jobs,
+            checkpoint=checkpoint,
+            progress=bars,
+        )
+    console.out.print(f"Results: {report.markdown_path}")
+
+
+def synth(
+    parts: Annotated[list[Path], typer.Argument(help="Meshes; each becomes a class.")],
+    out: Annotated[Path, typer.Option(help="Folder of the data set.")],
+    layout: FormatOption,
+    seed: SeedOption = 0,
+) -> None:
+    """Make a data set with labelled defects from meshes."""
+    from amrepair.bench.synth import synthesize
+
+    bars = console.Bars()
+    with bars.shown():
+        made = synthesize(parts, out, layout, seed, progress=bars)
+    console.out.print(f"Data set: {made}")

@@ -1,0 +1,81 @@
+"""What every command shares: progress bars, errors as one sentence, results as JSON or text."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from amrepair.errors import AmrepairError
+from gcode.errors import GcodeError
+
+NOT_WITHIN_TOLERANCE = 3
+INTERRUPTED = 130
+SAY_EVERY_S = 10.0  # how often a log without a terminal hears of progress
+
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
+out = Console(highlight=False, soft_wrap=True)
+
+
+class Bars:
+    """A bar for every stage on a terminal; a line now and then where there is none."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._tasks: dict[str, TaskID] = {}
+        self._said_s = clock()
+        self._bars = Progress(
+            TextColumn("{task.description:<24}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+            console=errors,
+            transient=False,
+        )
+
+    def __call__(self, stage: str, done: float, total: float) -> None:
+        """Report that `done` of `total` of `stage` is finished."""
+        if not errors.is_terminal:
+            now_s = self._clock()
+            if now_s - self._said_s >= SAY_EVERY_S:
+                self._said_s = now_s
+                errors.print(f"{stage}: {100 * done / max(total, 1e-9):.0f} %")
+            return
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(stage, total=total)
+        self._bars.update(self._tasks[stage], completed=done, total=total)
+
+    @contextmanager
+    def shown(self) -> Iterator[Bars]:
+        """Draw while something runs."""
+        if errors.is_terminal:
+            with self._bars:
+                yield self
+        else:
+            yield self
+
+
+def show_json(result: Mapping[str, Any]) -> None:
+    """One object on standard output, nothing else there."""
+    sys.stdout.write(json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+
+
+def run(app: typer.Typer, name: str) -> None:
+    """Run an application; an error becomes one sentence and its exit code."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    try:
+        app(prog_name=name)
+    except (AmrepairError, GcodeError) as error:
+        errors.print(f"{name}: {error}", style="bold red" if errors.is_terminal else None)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        errors.print(f"{name}: interrupted")
+        sys.exit(INTERRUPTED)

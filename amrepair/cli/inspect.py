@@ -1,0 +1,148 @@
+"""`amrepair align` and `amrepair detect`: look, touch nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from amrepair.cli import console
+from amrepair.cli.files import open_template, write_whole
+from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors
+from amrepair.repair import Stopwatch
+from amrepair.report.collect import rounded
+from amrepair.report.folder import RunFolder
+from amrepair.scans import read_scan, write_ply
+
+_COLOURS = np.array([[180, 180, 180], [0, 90, 200], [220, 120, 0]])  # ok, missing, excess
+
+TemplateOption = Annotated[
+    Path, typer.Option("--template", help="Template file, or the part's mesh.")
+]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command("align")(align)
+    app.command("detect")(detect)
+
+
+def align(
+    scan: Annotated[Path, typer.Argument(help="Point cloud, height map or scanned mesh, mm.")],
+    template: TemplateOption,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The scan in the template's frame (.ply).")
+    ] = None,
+    method: Annotated[str, typer.Option(help="robust, or paper.")] = "robust",
+    sensor_at: SensorOption = None,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Find where a scan lies in its template."""
+    from amrepair.align import align as align_scan
+
+    watch, bars = Stopwatch(), console.Bars()
+    cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
+    with bars.shown():
+        field = open_template(template, progress=bars)
+        with watch("align"):
+            found = align_scan(
+                cloud, field, method=method, rng=np.random.default_rng(seed), progress=bars
+            )
+    if output is not None:
+        moved = cloud.moved(found.template_from_scan)
+        write_whole(output, lambda path: write_ply(moved, path))
+    # the pose is an input of other programs: all its digits
+    result: dict[str, Any] = {
+        "template_from_scan": found.template_from_scan.matrix.tolist(),
+        "rmse_mm": found.rmse_mm,
+        "inlier_ratio": found.inlier_ratio,
+        "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
+        "method": found.method,
+        "iterations": found.iterations,
+        "seconds": round(watch.seconds["align"], 3),
+    }
+    if as_json:
+        console.show_json(result)
+        return
+    console.out.print(
+        f"Aligned: {found.rmse_mm:.3f} mm rms over {found.inlier_ratio:.1%} of the points, "
+        f"{len(found.symmetric_alternatives)} other poses fit as well."
+    )
+    console.out.print(np.array2string(found.template_from_scan.matrix, precision=6))
+
+
+def detect(
+    scan: Annotated[Path, typer.Argument(help="Point cloud, height map or scanned mesh, mm.")],
+    template: TemplateOption,
+    out: Annotated[Path, typer.Option(help="Folder for anomaly.npz, anomaly.ply, result.json.")],
+    sensor_at: SensorOption = None,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Align a scan and say what is missing and what is too much."""
+    from amrepair.align import align as align_scan
+    from amrepair.detect import detect as detect_defects
+
+    watch, bars = Stopwatch(), console.Bars()
+    cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
+    folder = RunFolder(out)
+    with bars.shown():
+        field = open_template(template, progress=bars)
+        with watch("align"):
+            found = align_scan(cloud, field, rng=np.random.default_rng(seed), progress=bars)
+        with watch("detect"):
+            anomaly = detect_defects(cloud.moved(found.template_from_scan), field, progress=bars)
+    arrays = {
+        "points_mm": cloud.points_mm,
+        "deviation_mm": anomaly.deviation_mm,
+        "score": anomaly.score,
+        "label": anomaly.label,
+        "template_points_mm": anomaly.template_points_mm,
+        "template_label": anomaly.template_label,
+    }
+    write_whole(folder.file("anomaly.npz"), lambda path: np.savez_compressed(path, **arrays))
+    write_whole(
+        folder.file("anomaly.ply"),
+        lambda path: write_ply(
+            cloud,
+            path,
+            colours=_COLOURS[anomaly.label],
+            scalars={"deviation": anomaly.deviation_mm, "label": anomaly.label},
+        ),
+    )
+    result = {
+        "object_score": anomaly.object_score,
+        "threshold": anomaly.threshold_mm,
+        "threshold_source": anomaly.threshold_source,
+        "regions": [
+            {
+                "label": region.label.name.lower(),
+                "type": str(region.type),
+                "volume_mm3": region.volume_mm3,
+                "area_mm2": region.area_mm2,
+                "depth_mm": region.depth_mm,
+                "box_mm": region.box_mm,
+            }
+            for region in anomaly.regions
+        ],
+        "template_from_scan": found.template_from_scan.matrix.tolist(),
+        "rmse_mm": found.rmse_mm,
+        "seconds": {stage: round(spent, 3) for stage, spent in watch.seconds.items()},
+    }
+    result = dict(rounded(result))
+    folder.write_json("result.json", result)
+    if as_json:
+        console.show_json(result)
+        return
+    console.out.print(
+        f"{len(anomaly.regions)} regions beyond {anomaly.threshold_mm:.3f} mm "
+        f"({anomaly.threshold_source}); object score {anomaly.object_score:.3f} mm."
+    )
+    for region in anomaly.regions:
+        console.out.print(
+            f"  {region.label.name.lower()} {region.type}: {region.volume_mm3:.1f} mm³, "
+            f"{region.depth_mm:.2f} mm deep"
+        )

@@ -1,0 +1,211 @@
+"""`amrepair simulate`: a whole run on an emulated printer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from amrepair.cli import console
+from amrepair.cli.options import (
+    JsonOption,
+    MaterialOption,
+    PrinterOption,
+    ProcessOption,
+    SeedOption,
+    scaled_mesh,
+)
+from amrepair.repair import Stopwatch
+from amrepair.report import (
+    Figures,
+    ReportData,
+    TemperatureSeries,
+    outcome_of,
+    summary_of_result,
+    write_report,
+)
+from amrepair.report.collect import (
+    decision_of,
+    look_of,
+    loop_result,
+    region_rows,
+    rounded,
+    solid_mesh,
+    versions,
+    wire_counters,
+)
+from amrepair.report.folder import RunFolder
+from amrepair.simulate.defects import DefectKind, parse_defect
+from amrepair.simulate.part_files import bracket_path
+from amrepair.simulate.run import SimulatedRun, prepare_run, simulate_run
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, load_setup
+
+DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("simulate")(simulate)
+
+
+def simulate(
+    part: Annotated[
+        Path | None,
+        typer.Argument(help="STL, OBJ, 3MF or PLY, mm. Default: the bracket of the examples."),
+    ] = None,
+    defect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--defect",
+            help="TYPE[:key=value,…]: void, under_extrusion, chip, blob or none; may be repeated. "
+            f"Default: {', '.join(DEFAULT_DEFECTS)}.",
+        ),
+    ] = None,
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
+    process: ProcessOption = DEFAULT_PROCESS,
+    scale: Annotated[
+        str, typer.Option(help="Factor for the part, or 'fit': as large as the printer allows.")
+    ] = "1",
+    max_iterations: Annotated[
+        int, typer.Option(min=0, max=10, help="Repairs at one stop, at most.")
+    ] = 3,
+    seed: SeedOption = 0,
+    out: Annotated[Path, typer.Option(help="Folder for result, G-code, scans, report.")] = Path(
+        "out/simulate"
+    ),
+    as_json: JsonOption = False,
+) -> None:
+    """Print a part on an emulated printer, break it, find what is missing and print only that."""
+    watch, bars = Stopwatch(), console.Bars()
+    defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
+    defects = [d for d in defects if d.kind is not DefectKind.NONE]
+    setup = load_setup(printer, material, process)
+    path = part or bracket_path()
+    mesh = scaled_mesh(path, scale, setup)
+    with bars.shown():
+        from amrepair.template import load_or_fit
+
+        with watch("template"):
+            template = load_or_fit(mesh, seed=seed, progress=bars)
+        prepared = prepare_run(
+            template, setup, defects, title=path.stem, seed=seed, watch=watch, progress=bars
+        )
+        folder = RunFolder(out)
+        folder.write_text("job.gcode", prepared.checked.program.text)
+        run = simulate_run(
+            prepared,
+            wire_log=folder.file("wire.log"),
+            max_iterations=max_iterations,
+            record=folder.record,
+            watch=watch,
+            progress=bars,
+        )
+    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
+    result = _result(run, folder, seed, seconds)
+    folder.write_json("result.json", result)
+    with watch("report"):
+        write_report(_report_data(run, path, result, seconds), folder.file("report.html"))
+    within = run.report.within_tolerance
+    if as_json:
+        console.show_json(result)
+    else:
+        _say(run, result, folder, within)
+    if not within:
+        raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def _result(
+    run: SimulatedRun, folder: RunFolder, seed: int, seconds: dict[str, float]
+) -> dict[str, Any]:
+    printed = [look for look in run.report.looks if look.printed]
+    last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
+    result = loop_result(
+        run.report,
+        repaired_ratio=run.repaired_ratio,
+        gcode=last,
+        seed=seed,
+        seconds=seconds,
+        setup=run.prepared.setup,
+    )
+    speed = run.printer_clock_s / run.print_wall_s if run.print_wall_s > 0 else 0.0
+    return {
+        **result,
+        "truth": rounded(
+            [
+                {
+                    "type": t.kind,
+                    "stop": t.label,
+                    "missing_mm3": t.missing_mm3,
+                    "filled_mm3": t.filled_mm3,
+                    "excess_mm3": t.excess_mm3,
+                    "repaired_ratio": t.filled_mm3 / t.missing_mm3 if t.missing_mm3 > 0 else None,
+                }
+                for t in run.truth
+            ]
+        ),
+        "job": {
+            "gcode": str(folder.file("job.gcode")),
+            "lines": run.prepared.checked.program.text.count("\n"),
+            "layers": len(run.prepared.job.layers),
+            "printer_clock_s": round(run.printer_clock_s, 1),
+            "unprintable_mm3": rounded(sum(u.volume_mm3 for u in run.prepared.plan.unprintable)),
+        },
+        "speed_up": round(speed, 1),
+    }
+
+
+def _report_data(
+    run: SimulatedRun, path: Path, result: dict[str, Any], seconds: dict[str, float]
+) -> ReportData:
+    prepared, report = run.prepared, run.report
+    setup = prepared.setup
+    within = report.within_tolerance
+    clock, hotend, bed = run.temperatures.T
+    return ReportData(
+        title=f"Simulated run: {path.name}",
+        outcome=outcome_of(result, within_tolerance=within),
+        figures=Figures.from_result(result),
+        looks=tuple(
+            look_of(
+                look.plan,
+                f"{look.stop.label}, scan {look.number}",
+                printed=look.printed,
+            )
+            for look in report.looks
+        ),
+        setup={
+            "part": path.name,
+            "printer": setup.printer.name,
+            "material": setup.material.name,
+            "process": setup.process.name,
+            "defects": ", ".join(str(t.kind) for t in run.truth) or "none",
+        },
+        expected=solid_mesh(prepared.part),
+        regions=tuple(row for look in report.first_looks for row in region_rows(look.plan)),
+        decisions=tuple(decision_of(look) for look in report.looks),
+        wire=wire_counters(report),
+        temperatures=(
+            TemperatureSeries("hotend", clock, hotend),
+            TemperatureSeries("bed", clock, bed),
+        ),
+        seconds=seconds,
+        provenance={"seed": str(prepared.seed), **versions(setup)},
+    )
+
+
+def _say(run: SimulatedRun, result: dict[str, Any], folder: RunFolder, within: bool) -> None:
+    table = Table(title=None, show_edge=False, pad_edge=False)
+    for name in ("defect", "stop", "missing mm³", "filled mm³", "ratio"):
+        table.add_column(name, justify="left" if name in {"defect", "stop"} else "right")
+    for t in run.truth:
+        ratio = f"{t.filled_mm3 / t.missing_mm3:.3f}" if t.missing_mm3 > 0 else "–"
+        table.add_row(t.kind, t.label, f"{t.missing_mm3:.1f}", f"{t.filled_mm3:.1f}", ratio)
+    if run.truth:
+        console.out.print(table)
+    for line in summary_of_result(result, within_tolerance=within):
+        console.out.print(line)
+    console.out.print(f"Printed {result['speed_up']:g} times as fast as the printer's own clock.")
+    console.out.print(f"Report: {folder.file('report.html')}")

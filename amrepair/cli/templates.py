@@ -1,0 +1,62 @@
+"""`amrepair template fit` and `amrepair template mesh`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amrepair.cli import console
+from amrepair.cli.files import open_template, writable, write_mesh
+from amrepair.cli.options import SeedOption
+
+template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the group."""
+    app.add_typer(template_app, name="template")
+
+
+@template_app.command("fit")
+def fit(
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(help="A mesh of the part as it should be, mm."),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Template file (.safetensors).")],
+    recipe: Annotated[str, typer.Option(help="fast, or paper for the published network.")] = "fast",
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    seed: SeedOption = 0,
+) -> None:
+    """Fit the signed distance field that scans are held against."""
+    from amrepair.template import fit_template
+
+    writable(output)
+    bars = console.Bars()
+    with bars.shown():
+        template = fit_template(inputs, recipe=recipe, device=device, seed=seed, progress=bars)
+    template.save(output)
+    console.errors.print(f"{output}: surface good to {template.bias_mm:.3f} mm (99 %)")
+
+
+@template_app.command("mesh")
+def mesh(
+    file: Annotated[Path, typer.Argument(help="Template file.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="STL, OBJ, PLY or 3MF to write.")],
+    level_mm: Annotated[float, typer.Option(help="Level of the field, mm.")] = 0.0,
+    voxel_mm: Annotated[float, typer.Option(help="Edge of a voxel, mm.")] = 0.2,
+    below_z_mm: Annotated[
+        float | None, typer.Option(help="Only what is printed up to this height.")
+    ] = None,
+) -> None:
+    """Extract the template's surface as a closed mesh."""
+    from amrepair.template import extract_mesh
+
+    writable(output)
+    bars = console.Bars()
+    template = open_template(file, progress=bars)
+    cut = template if below_z_mm is None else template.below_z(below_z_mm)
+    with bars.shown():
+        write_mesh(extract_mesh(cut, voxel_mm, level_mm=level_mm), output)

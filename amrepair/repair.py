@@ -1,0 +1,301 @@
+"""Repair: from one scan to a checked program that fills what is missing, read top to bottom.
+
+`plan_repair` is the whole offline algorithm. It moves nothing and writes no file: the loop sends
+what it makes, the command line writes it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.align import align
+from amrepair.align.registration import Registration
+from amrepair.deficit import Deficit, compute_deficit
+from amrepair.detect import AnomalyMap, Label, Region, detect
+from amrepair.errors import AlignmentError
+from amrepair.frames import Transform
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+from gcode.check import CheckedProgram, check
+from gcode.estimate import Estimate, estimate
+from gcode.moves import ModalState, Program
+from gcode.profiles import PrintSetup
+from gcode.progress import Progress, silent
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import PatchPlan, slice_patch
+from gcode.writer import write
+
+# A stop of the print, and heat beside the wound, must be worth it.
+MIN_REPAIR_MM3 = 2.0
+# Material standing out less than two layers is ploughed by the layers after it, or is a bump.
+EXCESS_LAYERS = 2.0
+# A planned template ends below; so near to its end its distances are not to be trusted.
+PLANNED_EDGE_MM = 1.0
+# Two poses whose repairs share less than this are two different repairs.
+SAME_REPAIR_RATIO = 0.8
+
+
+class Stopwatch:
+    """Seconds by stage; stages of the same name add up."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time what is done inside."""
+        start_s = self._clock()
+        try:
+            yield
+        finally:
+            spent_s = self._clock() - start_s
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent_s
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What is expected where: all that a scan is held against.
+
+    Attributes
+    ----------
+    template
+        The expected geometry at this moment (a layer's cut, or the finished part); the scan is
+        aligned to it.
+    planned
+        Where the inside is planned to be open: the job's own beads, in the template's frame, by
+        which the last millimetres are judged instead.
+    setup
+        Printer, material, process.
+    grid
+        Layers of the job: repair layers lie on them.
+    build_from_template
+        Where the part stands on the bed; None where the scan is in the build frame and the
+        alignment itself says so.
+    printed_z_mm
+        Height printed so far, build frame; None for a finished part.
+    allowance_mm
+        What the process may leave (half a layer for a CAD template, 0 for planned beads).
+    """
+
+    template: Template
+    setup: PrintSetup
+    grid: LayerGrid
+    build_from_template: Transform | None = None
+    printed_z_mm: float | None = None
+    allowance_mm: float = 0.1
+    planned: Template | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RepairPlan:
+    """One scan's verdict, and the program that follows from it.
+
+    Attributes
+    ----------
+    checked
+        The program that fills what is missing; None where there is nothing that a bead can fill.
+    build_from_scan
+        Where the scan lies on the bed.
+    scan
+        What was judged, in the template's frame.
+    """
+
+    registration: Registration
+    anomaly: AnomalyMap
+    deficit: Deficit
+    patch: PatchPlan | None
+    checked: CheckedProgram | None
+    estimate: Estimate | None
+    build_from_scan: Transform
+    layer_height_mm: float
+    scan: Scan
+
+    @property
+    def to_fill(self) -> tuple[Region, ...]:
+        """Missing regions that are worth a repair."""
+        return tuple(
+            region
+            for region in self.deficit.regions
+            if region.label is Label.MISSING and region.volume_mm3 >= MIN_REPAIR_MM3
+        )
+
+    @property
+    def too_much(self) -> tuple[Region, ...]:
+        """Regions in excess that stand out."""
+        least_mm = EXCESS_LAYERS * self.layer_height_mm
+        return tuple(
+            region
+            for region in self.deficit.regions
+            if region.label is Label.EXCESS
+            and region.volume_mm3 >= MIN_REPAIR_MM3
+            and region.depth_mm >= least_mm
+        )
+
+    @property
+    def within_tolerance(self) -> bool:
+        """No region is left that is worth a repair, or that stands out."""
+        return not self.to_fill and not self.too_much
+
+    @property
+    def unreachable_mm3(self) -> float:
+        """Missing volume that the nozzle cannot get to."""
+        return sum(u.volume_mm3 for u in self.patch.unreachable) if self.patch else 0.0
+
+
+def plan_repair(
+    scan: Scan,
+    site: Site,
+    *,
+    title: str,
+    guess: Transform | None = None,
+    interruption: ModalState | None = None,
+    rng: np.random.Generator | None = None,
+    watch: Stopwatch | None = None,
+    progress: Progress = silent,
+) -> RepairPlan:
+    """Align, detect, make the deficit, slice it, write and check it.
+
+    Parameters
+    ----------
+    scan
+        In whatever frame its sensor has.
+    guess
+        A pose (template from the scan's frame) known beforehand; None searches from any pose.
+    interruption
+        The state of the machine in mid-job; None makes a whole program for a standing part.
+
+    Raises
+    ------
+    AlignmentError
+        If the scan cannot be aligned, or equally good poses lead to different repairs.
+    DeficitError
+        If the deficit is no valid solid.
+    gcode.errors.GcodeError
+        If the deficit cannot be sliced or the checker refuses the program.
+    """
+    watch = watch or Stopwatch()
+    with watch("align"):
+        registration = align(scan, site.template, guess=guess, rng=rng, progress=progress)
+    placed = _build_from_template(site, scan, registration)
+    build_from_scan = placed @ registration.template_from_scan
+    with watch("detect"):
+        moved = scan.moved(registration.template_from_scan)
+        expected = site.planned or site.template
+        moved = _in_view(moved, site)
+        anomaly = detect(moved, expected, allowance_mm=site.allowance_mm, progress=progress)
+    with watch("deficit"):
+        deficit = compute_deficit(
+            moved,
+            expected,
+            anomaly,
+            build_from_template=placed,
+            printed_z_mm=site.printed_z_mm,
+            progress=progress,
+        )
+        _refuse_ambiguity(scan, site, registration, deficit)
+    layer_mm = site.setup.process.layer_height_mm
+    fillable = _fillable(deficit)
+    if fillable.is_empty():
+        return RepairPlan(
+            registration, anomaly, deficit, None, None, None, build_from_scan, layer_mm, moved
+        )
+    with watch("slice"):
+        patch = slice_patch(
+            fillable,
+            site.setup,
+            as_built=deficit.as_built,
+            grid=site.grid,
+            standalone=interruption is None,
+            start_mm=_start_of(interruption),
+            progress=progress,
+        )
+    if not patch.toolpath.extrusions:
+        return RepairPlan(
+            registration, anomaly, deficit, patch, None, None, build_from_scan, layer_mm, moved
+        )
+    with watch("check"):
+        program = write(patch.toolpath, site.setup, title=title, resume=interruption, restore=False)
+        checked = check(program, site.setup, as_built=deficit.as_built, initial=interruption)
+        cost = estimate(program, site.setup.printer)
+    return RepairPlan(
+        registration, anomaly, deficit, patch, checked, cost, build_from_scan, layer_mm, moved
+    )
+
+
+def _in_view(scan: Scan, site: Site) -> Scan:
+    """What a planned template can judge: its own last millimetres; all of it otherwise."""
+    if site.planned is None:
+        return scan
+    low_mm = float(site.planned.bounds_mm[0, 2]) + PLANNED_EDGE_MM
+    return _subset(scan, scan.points_mm[:, 2] > low_mm)
+
+
+def _build_from_template(site: Site, scan: Scan, registration: Registration) -> Transform:
+    """Where the part stands: as told, or as seen by a scan that is in the build frame."""
+    if site.build_from_template is not None:
+        return site.build_from_template
+    if scan.frame != "build":
+        raise AlignmentError(
+            f"the scan {scan.source} is in frame '{scan.frame}' and nobody said where the part "
+            "stands on the bed; give its pose, since an aligned shape does not tell"
+        )
+    return registration.template_from_scan.inverse()
+
+
+def _refuse_ambiguity(scan: Scan, site: Site, registration: Registration, deficit: Deficit) -> None:
+    """Refuse a pose that fits no better than another which would repair something else."""
+    if site.build_from_template is None or deficit.missing.is_empty():
+        return  # the scan is in the build frame: every pose that fits puts the repair there
+    for other in registration.symmetric_alternatives:
+        # the same scanned hole, seen in the template through the other pose
+        motion = (
+            site.build_from_template
+            @ other
+            @ registration.template_from_scan.inverse()
+            @ site.build_from_template.inverse()
+        )
+        turned = deficit.missing.transform(motion.matrix[:3])
+        shared_mm3 = (turned ^ deficit.missing).volume()
+        if shared_mm3 < SAME_REPAIR_RATIO * deficit.missing_mm3:
+            raise AlignmentError(
+                f"the scan {scan.source} fits its template in "
+                f"{1 + len(registration.symmetric_alternatives)} poses equally well, and they would repair different places; scan in the build "
+                "frame or give a pose closer to the truth"
+            )
+
+
+def _fillable(deficit: Deficit) -> manifold3d.Manifold:
+    """The missing pieces that are worth a repair."""
+    pieces = [piece for piece in deficit.missing.decompose() if piece.volume() >= MIN_REPAIR_MM3]
+    if not pieces:
+        return manifold3d.Manifold()
+    return manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add)
+
+
+def _start_of(interruption: ModalState | None) -> tuple[float, float, float] | None:
+    if interruption is None:
+        return None
+    x, y, z = interruption.position_mm
+    return (float(x), float(y), float(z))
+
+
+def solid_arrays(
+    solid: manifold3d.Manifold,
+) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
+    """(v, 3) vertices, mm, and (f, 3) faces of a solid."""
+    mesh = solid.to_mesh64()
+    vertices = np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3]
+    return vertices, np.asarray(mesh.tri_verts).astype(np.int64)
+
+
+def program_of(plan: RepairPlan) -> Program | None:
+    """The text of a plan's program."""
+    return plan.checked.program if plan.checked is not None else None

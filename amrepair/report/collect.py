@@ -1,0 +1,273 @@
+"""From looks and plans to the `--json` result and to what the page shows.
+
+It adds up and translates; every figure comes from the plan, the link or the world's truth.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from amrepair.detect import Label
+from amrepair.loop import Look as LoopLook
+from amrepair.loop import LoopReport
+from amrepair.repair import RepairPlan, solid_arrays
+from amrepair.report.data import (
+    BeadPath,
+    Counter,
+    Decision,
+    HeightMap,
+    Look,
+    RegionRow,
+    SolidMesh,
+)
+from gcode.profiles import PrintSetup
+
+DIGITS = 6  # of every figure in a result: beyond what any scan can tell
+_LIBRARIES = (
+    "amrepair",
+    "manifold3d",
+    "numba",
+    "numpy",
+    "open3d",
+    "scikit-image",
+    "scipy",
+    "torch",
+)
+_NOTE_TOO_SMALL = "smaller than one bead; left as it is"
+_NOTE_EXCESS = "too much material; printing cannot take it away"
+
+
+def versions(setup: PrintSetup | None = None) -> dict[str, str]:
+    """Versions of what computed the result, and hashes of the profiles."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    if setup is not None:
+        found |= {f"profiles/{key}": value[:16] for key, value in setup.hashes.items()}
+    return found
+
+
+def rounded(value: Any) -> Any:
+    """The same structure with floats rounded to `DIGITS` significant digits."""
+    if isinstance(value, (bool, str)) or value is None:
+        return value
+    if isinstance(value, (float, np.floating)):
+        return float(f"{float(value):.{DIGITS}g}")
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, Mapping):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, (Iterable, np.ndarray)):
+        return [rounded(item) for item in value]
+    raise TypeError(f"a result cannot hold a {type(value).__name__}")
+
+
+def region_rows(plan: RepairPlan) -> tuple[RegionRow, ...]:
+    """The regions of one look, with what is known of reaching them."""
+    rows = []
+    for region in plan.deficit.regions:
+        note, reach = "", None
+        if region.label is Label.EXCESS:
+            note = _NOTE_EXCESS
+        elif region.below_bead:
+            note = _NOTE_TOO_SMALL
+        elif plan.patch is not None:
+            reach = _reachable_ratio(plan, region.box_mm)
+            if reach is not None and reach < 0.999:
+                note = "; ".join(sorted({u.reason for u in plan.patch.unreachable}))
+        rows.append(RegionRow(str(region.type), region.volume_mm3, region.box_mm, reach, note))
+    return tuple(rows)
+
+
+def _reachable_ratio(plan: RepairPlan, box_mm: Any) -> float | None:
+    """Share of the patch's region that overlaps this box the most."""
+    assert plan.patch is not None
+    best, found = 0.0, None
+    low, high = np.asarray(box_mm, dtype=np.float64).reshape(2, 3)
+    for part in plan.patch.regions:
+        other_low, other_high = np.asarray(part.box_mm, dtype=np.float64).reshape(2, 3)
+        overlap = np.minimum(high, other_high) - np.maximum(low, other_low)
+        shared = float(np.prod(np.maximum(overlap, 0.0)))
+        if shared > best:
+            best, found = shared, float(part.reachable_ratio)
+    return found
+
+
+def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None) -> dict[str, Any]:
+    """Volumes over the first and last look of every stop; `last` None where not rescanned."""
+    ends = first if last is None else last
+    return {
+        "missing_mm3_before": sum(p.deficit.missing_mm3 for p in first),
+        "missing_mm3_after": None if last is None else sum(p.deficit.missing_mm3 for p in last),
+        "excess_mm3_before": sum(p.deficit.excess_mm3 for p in first),
+        "excess_mm3_after": None if last is None else sum(p.deficit.excess_mm3 for p in last),
+        "unreachable_mm3": sum(p.unreachable_mm3 for p in ends),
+        "unseen_area_mm2": ends[-1].deficit.unseen_area_mm2 if ends else 0.0,
+        "regions": [
+            {
+                "type": row.type,
+                "volume_mm3": row.volume_mm3,
+                "box_mm": row.box_mm,
+                "reachable_ratio": row.reachable_ratio,
+            }
+            for plan in first
+            for row in region_rows(plan)
+        ],
+    }
+
+
+def cost_figures(plans: Sequence[RepairPlan]) -> dict[str, float]:
+    """Filament and time of the repairs' programs."""
+    costs = [plan.estimate for plan in plans if plan.estimate is not None]
+    return {
+        "filament_mm": float(sum(cost.filament_mm for cost in costs)),
+        "print_time_s": float(sum(cost.print_time_s for cost in costs)),
+    }
+
+
+def loop_result(
+    report: LoopReport,
+    *,
+    repaired_ratio: float | None,
+    gcode: str | None,
+    seed: int | None,
+    seconds: Mapping[str, float],
+    setup: PrintSetup,
+) -> dict[str, Any]:
+    """The keys that every result of `simulate` and `loop` has."""
+    printed = [look.plan for look in report.looks if look.printed]
+    result = {
+        **plan_figures(
+            [look.plan for look in report.first_looks], [look.plan for look in report.last_looks]
+        ),
+        "repaired_ratio": repaired_ratio,
+        "iterations": len(printed),
+        "gcode": gcode,
+        **cost_figures(printed),
+        "seconds": dict(seconds),
+        "seed": seed,
+        "versions": versions(setup),
+        "stops": [_stop_row(look) for look in report.looks],
+    }
+    return dict(rounded(result))
+
+
+def _stop_row(look: LoopLook) -> dict[str, Any]:
+    plan = look.plan
+    return {
+        "look": look.number,
+        "stop": look.stop.label,
+        "z_mm": look.stop.z_mm,
+        "missing_mm3": plan.deficit.missing_mm3,
+        "excess_mm3": plan.deficit.excess_mm3,
+        "tolerance_mm": plan.deficit.tolerance_mm,
+        "rmse_mm": plan.registration.rmse_mm,
+        "within_tolerance": plan.within_tolerance,
+        "printed": look.printed,
+    }
+
+
+def plan_result(
+    plan: RepairPlan,
+    *,
+    gcode: str | None,
+    seed: int | None,
+    seconds: Mapping[str, float],
+    setup: PrintSetup,
+) -> dict[str, Any]:
+    """The keys of a result of `repair`: planned, not printed."""
+    result = {
+        **plan_figures([plan], None),
+        "repaired_ratio": None,
+        "iterations": 0 if plan.checked is None else 1,
+        "gcode": gcode,
+        **cost_figures([plan]),
+        "seconds": dict(seconds),
+        "seed": seed,
+        "versions": versions(setup),
+        "build_from_scan": plan.build_from_scan.matrix,
+        "rmse_mm": plan.registration.rmse_mm,
+        "inlier_ratio": plan.registration.inlier_ratio,
+    }
+    return dict(rounded(result))
+
+
+def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
+    """What the page shows of one scan."""
+    build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    anomaly, field = plan.anomaly, plan.deficit.as_built
+    unseen = anomaly.template_points_mm[anomaly.template_label == int(Label.UNSEEN)]
+    beads = None
+    if plan.patch is not None and (printed or plan.checked is not None):
+        beads = BeadPath.from_toolpath(plan.patch.toolpath)
+    return Look(
+        label=label,
+        points_mm=build_from_template.apply(plan.scan.points_mm),
+        deviation_mm=anomaly.deviation_mm,
+        label_of_point=anomaly.label,
+        threshold_mm=anomaly.threshold_mm,
+        threshold_source=anomaly.threshold_source,
+        unseen_mm=build_from_template.apply(unseen) if len(unseen) else None,
+        missing=solid_mesh(plan.deficit.missing),
+        excess=solid_mesh(plan.deficit.excess),
+        beads=beads,
+        missing_mm3=plan.deficit.missing_mm3,
+        excess_mm3=plan.deficit.excess_mm3,
+        unseen_area_mm2=plan.deficit.unseen_area_mm2,
+        height_map=HeightMap(field.origin_mm, field.cell_mm, field.z_mm, field.seen, label),
+    )
+
+
+def solid_mesh(solid: Any) -> SolidMesh | None:
+    """Triangles of a solid; None where it is empty."""
+    if solid.is_empty():
+        return None
+    vertices, faces = solid_arrays(solid)
+    return SolidMesh(vertices, faces)
+
+
+def decision_of(look: LoopLook) -> Decision:
+    """What was decided at a look, and why."""
+    plan = look.plan
+    found = [
+        f"{len(plan.to_fill)} regions are large enough for a bead, "
+        f"{plan.deficit.missing_mm3:.1f} mm³ in all."
+        if plan.to_fill
+        else "Nothing is missing that a bead could fill."
+    ]
+    if look.printed:
+        choice = "fill now"
+    elif look.declined:
+        choice = "leave: the operator declined"
+    elif plan.within_tolerance:
+        choice = "go on"
+    elif not plan.to_fill:
+        choice = "go on: only excess, which printing cannot take away"
+    elif plan.checked is None:
+        choice = "go on: nothing of it can be reached"
+    else:
+        choice = "go on: the last repair changed next to nothing, or was the last one allowed"
+    if plan.unreachable_mm3 > 0:
+        found.append(f"The nozzle cannot reach {plan.unreachable_mm3:.1f} mm³.")
+    return Decision(f"{look.stop.label}, z = {look.stop.z_mm:.2f} mm", choice, tuple(found))
+
+
+def wire_counters(report: LoopReport) -> tuple[Counter, ...]:
+    """What the link counted, over the job and all repairs."""
+    prints = (*report.job_prints, *report.repair_prints)
+    slowest_s = max((p.round_trip_s[2] for p in prints), default=0.0)
+    return (
+        Counter("lines acknowledged", float(sum(p.lines_acked for p in prints))),
+        Counter("resends", float(sum(p.resends for p in prints)), "lines asked for again"),
+        Counter("stalls", float(sum(p.stalls for p in prints)), "silences that had to be probed"),
+        Counter("bytes sent", float(sum(p.bytes_sent for p in prints))),
+        Counter("slowest round trip, ms", 1e3 * slowest_s, "99th percentile"),
+    )

@@ -1,0 +1,81 @@
+"""The folder of a run: `result.json`, programs, scans, deficits, report; whole files or none."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+from amrepair.errors import InputError
+from amrepair.loop import Look
+from amrepair.repair import solid_arrays
+from amrepair.scans import write_ply
+
+
+class RunFolder:
+    """Writes the files of a run.
+
+    Parameters
+    ----------
+    path
+        Made where it is not there; must be writable.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made or written, before anything else happens.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            probe = path / f".write-test-{os.getpid()}"
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise InputError(
+                f"the output folder {path} cannot be written ({error.strerror}); name another one"
+            ) from error
+
+    def file(self, name: str) -> Path:
+        """Path of a file in it."""
+        return self.path / name
+
+    def write_text(self, name: str, text: str) -> Path:
+        """Write a text whole or not at all."""
+        return self._whole(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> Path:
+        """Write an object, keys in their order."""
+        return self.write_text(name, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+
+    def record(self, look: Look) -> None:
+        """Write scan, deficit and program of one look."""
+        n, plan = look.number, look.plan
+        self._whole(f"scan-{n}.ply", lambda path: write_ply(look.scan, path))
+        if not plan.deficit.missing.is_empty():
+            self.write_solid(f"deficit-{n}.stl", plan.deficit.missing)
+        if plan.checked is not None and look.printed:
+            self.write_text(f"repair-{n}.gcode", plan.checked.program.text)
+
+    def write_solid(self, name: str, solid: Any) -> Path:
+        """Write a `manifold3d.Manifold` as binary STL."""
+        vertices, faces = solid_arrays(solid)
+        data = trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl")
+        return self._whole(name, lambda path: path.write_bytes(data))
+
+    def _whole(self, name: str, write: Callable[[Path], object]) -> Path:
+        target = self.path / name
+        # the ending stays last: writers choose their format by it
+        temporary = self.path / f".{os.getpid()}-{name}"
+        try:
+            write(temporary)
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
+        return target

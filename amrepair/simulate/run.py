@@ -1,0 +1,318 @@
+"""A simulated run: slice a part, print it on an emulated printer, break it, let the loop mend it.
+
+Everything between the G-code and the nozzle is real: the serial adapter, a pseudo-terminal, the
+protocol, the emulated firmware. Only plastic and light are simulated (`world`, `scanner`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.errors import InputError
+from amrepair.frames import Transform
+from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, plan_stops, run_loop
+from amrepair.repair import RepairPlan, Site, Stopwatch
+from amrepair.simulate.defects import Defect, PlacedDefect
+from amrepair.simulate.placement import place
+from amrepair.simulate.scanner import (
+    ScannerModel,
+    SimulatedScanner,
+    default_sensors_mm,
+    seeded_pose,
+)
+from amrepair.simulate.stage import DefectTruth, Stage
+from amrepair.simulate.world import World
+from amrepair.template import PlannedSdf
+from amrepair.template.port import Template
+from gcode.check import CheckedProgram, check
+from gcode.firmware import EmulatedPrinterProcess
+from gcode.hosts import connect
+from gcode.profiles import PrintSetup
+from gcode.progress import Progress, silent
+from gcode.reader import Job, read_job
+from gcode.slicing.job import PartPlan, plan_part
+from gcode.slicing.layers import LayerGrid
+from gcode.writer import write
+
+# Below this share of infill a layer's inside is planned to be open: beads, not CAD, are expected.
+SOLID_RATIO = 0.999
+# Truth is compared this far around the part, so that ooze beside it counts too.
+TRUTH_MARGIN_MM = 3.0
+FIT_SHARE = 0.9  # of bed and height, for `scale_to_fit`
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedRun:
+    """All that is settled before the nozzle moves.
+
+    Attributes
+    ----------
+    part
+        The solid in the build frame.
+    defects
+        What will go wrong, and where.
+    stops
+        When the job rests to be scanned.
+    """
+
+    setup: PrintSetup
+    template: Template
+    build_from_template: Transform
+    part: manifold3d.Manifold
+    plan: PartPlan
+    job: Job
+    checked: CheckedProgram
+    defects: tuple[PlacedDefect, ...]
+    stops: tuple[Stop, ...]
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRun:
+    """What became of it.
+
+    Attributes
+    ----------
+    truth
+        By defect, as the world knows it.
+    printer_clock_s
+        Time that passed for the printer.
+    print_wall_s
+        Time that the wall's clock spent on the same.
+    temperatures
+        (n, 3) printer clock s, hotend °C, bed °C as they were at every stop.
+    """
+
+    prepared: PreparedRun
+    report: LoopReport
+    truth: tuple[DefectTruth, ...]
+    printer_clock_s: float
+    print_wall_s: float
+    temperatures: Float[np.ndarray, "n 3"]
+
+    @property
+    def repaired_ratio(self) -> float | None:
+        """Volume newly filled where it was missing over volume missing; None without a defect."""
+        missing = sum(t.missing_mm3 for t in self.truth)
+        return sum(t.filled_mm3 for t in self.truth) / missing if missing > 0 else None
+
+
+def place_on_bed(bounds_mm: Float[np.ndarray, "2 3"], setup: PrintSetup) -> Transform:
+    """Pose of a part that stands in the middle of the bed as its file has it.
+
+    Raises
+    ------
+    InputError
+        If it is larger than the printer.
+    """
+    low, high = bounds_mm
+    size = high - low
+    printer = setup.printer
+    room = np.array([*printer.bed_size_mm, printer.max_z_mm])
+    if (size > room).any():
+        raise InputError(
+            f"the part is {size[0]:.1f}×{size[1]:.1f}×{size[2]:.1f} mm, larger than the "
+            f"{room[0]:g}×{room[1]:g}×{room[2]:g} mm of printer '{printer.id}'; "
+            "use --scale fit, or a factor below 1"
+        )
+    middle = 0.5 * (low + high)
+    shift = np.array([0.5 * room[0] - middle[0], 0.5 * room[1] - middle[1], -low[2]])
+    return Transform.from_rotation_translation(
+        "build", "template", rotation=np.eye(3), translation_mm=shift
+    )
+
+
+def scale_to_fit(bounds_mm: Float[np.ndarray, "2 3"], setup: PrintSetup) -> float:
+    """Factor that makes a part fit the printer with a margin; never above 1."""
+    size = bounds_mm[1] - bounds_mm[0]
+    room = np.array([*setup.printer.bed_size_mm, setup.printer.max_z_mm])
+    return float(min(1.0, (FIT_SHARE * room / size).min()))
+
+
+def prepare_run(
+    template: Template,
+    setup: PrintSetup,
+    defects: Sequence[Defect],
+    *,
+    title: str,
+    seed: int = 0,
+    watch: Stopwatch | None = None,
+    progress: Progress = silent,
+) -> PreparedRun:
+    """Slice, write, check and read the job; find places for the defects.
+
+    Raises
+    ------
+    InputError
+        If the part is too large, or has no room for a defect.
+    GcodeError
+        If it cannot be sliced, or the checker refuses its job.
+    """
+    watch = watch or Stopwatch()
+    build_from_template = place_on_bed(template.bounds_mm, setup)
+    solid: Any = template.solid()
+    part = solid.transform(build_from_template.matrix[:3])
+    with watch("slice job"):
+        plan = plan_part(part, setup, progress=progress)
+        program = write(plan.toolpath, setup, title=title)
+    with watch("check job"):
+        progress("check job", 0.0, 1.0)
+        checked = check(program, setup)
+        job = read_job(
+            program,
+            filament_diameter_mm=setup.printer.filament_diameter_mm,
+            dialect=program.dialect,
+        )
+        progress("check job", 1.0, 1.0)
+    rng = np.random.default_rng([seed, 1])
+    tops_mm = np.array(plan.grid.tops_mm)
+    placed = tuple(place(defect, part, tops_mm, rng) for defect in defects)
+    layers = [d.last_layer for d in placed if d.last_layer is not None and len(d.layers)]
+    if not any(d.layers or d.removed or d.added for d in placed):
+        layers = [len(job.layers) // 2]  # nothing will be wrong: look once on the way all the same
+    return PreparedRun(
+        setup=setup,
+        template=template,
+        build_from_template=build_from_template,
+        part=part,
+        plan=plan,
+        job=job,
+        checked=checked,
+        defects=tuple(d for d in placed if d.layers or d.removed or d.added),
+        stops=plan_stops(job, layers),
+        seed=seed,
+    )
+
+
+def simulate_run(
+    run: PreparedRun,
+    *,
+    wire_log: Path | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+    approve: Callable[[RepairPlan], bool] = lambda plan: True,
+    record: Callable[[Look], None] = lambda look: None,
+    model: ScannerModel | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    watch: Stopwatch | None = None,
+    progress: Progress = silent,
+) -> SimulatedRun:
+    """Print the job on an emulated printer and let the loop mend what goes wrong.
+
+    Raises
+    ------
+    AmrepairError, GcodeError
+        Whatever stops the loop.
+    """
+    watch = watch or Stopwatch(clock)
+    printer_profile = run.setup.printer
+    box = run.part.bounding_box()
+    centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
+    world = World(
+        printer_profile.bed_size_mm,
+        nozzle_diameter_mm=printer_profile.nozzle_diameter_mm,
+        filament_diameter_mm=printer_profile.filament_diameter_mm,
+    )
+    rng = np.random.default_rng([run.seed, 2])
+    sensors_mm = default_sensors_mm(centre, distance_mm=max(300.0, 2.0 * float(box[5]) + 100.0))
+    pose = seeded_pose(rng, centre_mm=centre)
+    temperatures: list[tuple[float, float, float]] = []
+    with EmulatedPrinterProcess(printer_profile.dialect, printer=printer_profile) as machine:
+        stage = Stage(
+            world,
+            defects=run.defects,
+            scanner=SimulatedScanner(world, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model),
+            take_motion=machine.take_motion,
+            box_mm=(
+                box[0] - TRUTH_MARGIN_MM,
+                box[1] - TRUTH_MARGIN_MM,
+                box[3] + TRUTH_MARGIN_MM,
+                box[4] + TRUTH_MARGIN_MM,
+            ),
+        )
+        printer = connect(
+            machine.port,
+            dialect=printer_profile.dialect,
+            baud=printer_profile.baud,
+            wire_log=wire_log,
+        )
+        printer.connect()
+
+        def recorded(look: Look) -> None:
+            now = printer.temperatures()
+            temperatures.append((machine.clock_s(), now.hotend_c, now.bed_c or 0.0))
+            record(look)
+
+        try:
+            report = run_loop(
+                run.job,
+                run.checked,
+                printer,
+                stage,
+                lambda stop: _site(run, stop),
+                stops=run.stops,
+                max_iterations=max_iterations,
+                approve=approve,
+                record=recorded,
+                rng=np.random.default_rng([run.seed, 3]),
+                watch=watch,
+                progress=progress,
+            )
+        finally:
+            printer.close()
+        stage.finish()
+        printer_clock_s = machine.clock_s()
+    return SimulatedRun(
+        prepared=run,
+        report=report,
+        truth=stage.truth,
+        printer_clock_s=printer_clock_s,
+        print_wall_s=watch.seconds.get("print", 0.0) + watch.seconds.get("repair", 0.0),
+        temperatures=np.array(temperatures, dtype=np.float64).reshape(-1, 3),
+    )
+
+
+def _site(run: PreparedRun, stop: Stop) -> Site:
+    """What is expected at a stop.
+
+    A finished part and solid layers are judged by the template; a layer with sparse infill by the
+    beads that the job planned.
+    """
+    process = run.setup.process
+    grid = LayerGrid.from_tops(
+        [layer.z_mm for layer in run.job.layers], layer_height_mm=process.layer_height_mm
+    )
+    if stop.layer_index is None:
+        return Site(run.template, run.setup, grid, run.build_from_template)
+    z_mm = stop.z_mm - float(run.build_from_template.translation_mm[2])
+    template = run.template.below_z(z_mm)
+    if process.infill_ratio >= SOLID_RATIO:
+        return Site(template, run.setup, grid, run.build_from_template, stop.z_mm)
+    return Site(
+        template,
+        run.setup,
+        grid,
+        run.build_from_template,
+        stop.z_mm,
+        planned=_planned(run, stop),
+    )
+
+
+def _planned(run: PreparedRun, stop: Stop) -> Template:
+    """The beads of the job up to a stop, in the template's frame."""
+    beads = run.job.beads
+    done = (beads.line < stop.line) & (beads.layer >= 0)
+    template_from_build = run.build_from_template.inverse()
+    return PlannedSdf.from_beads(
+        template_from_build.apply(beads.start_mm[done]),
+        template_from_build.apply(beads.end_mm[done]),
+        beads.section_mm2[done],
+        beads.height_mm[done],
+    )

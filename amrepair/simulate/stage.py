@@ -1,0 +1,164 @@
+"""The stage: an emulated printer's motion becomes a world, and a scanner looks at it.
+
+`Stage` is the `Scanner` that a simulated loop uses, and the only one who knows the truth: beside
+the world with its defects it keeps a reference, printed by the same motion without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from amrepair.frames import Transform
+from amrepair.scans import Scan, ScanRequest
+from amrepair.simulate.columns import IntervalMap, Window
+from amrepair.simulate.defects import PlacedDefect
+from amrepair.simulate.scanner import SimulatedScanner
+from amrepair.simulate.world import World
+from gcode.firmware.motion import MotionBatch
+
+
+@dataclass(frozen=True, slots=True)
+class DefectTruth:
+    """What became of one defect, by the world's own truth.
+
+    Attributes
+    ----------
+    kind
+        void, under_extrusion, chip, blob.
+    label
+        The stop at which it was scanned.
+    missing_mm3
+        Volume that it took away, measured against the reference at that stop.
+    filled_mm3
+        Of that volume, what is solid after the last repair of that stop.
+    excess_mm3
+        Volume that it added.
+    """
+
+    kind: str
+    label: str
+    missing_mm3: float
+    filled_mm3: float
+    excess_mm3: float
+
+
+@dataclass(slots=True)
+class _Wound:
+    """A defect that has happened."""
+
+    defect: PlacedDefect
+    label: str
+    missing: IntervalMap
+    excess_mm3: float
+    filled_mm3: float = 0.0
+
+
+class Stage:
+    """A simulated scanner over a world that the printer's motion builds.
+
+    Parameters
+    ----------
+    world
+        Empty.
+    defects
+        Those with layers act on the job's motion; the others on the finished part.
+    scanner
+        Looks at `world`.
+    take_motion
+        Hands over what the printer did since it was last asked.
+    box_mm
+        XY box (x_min, y_min, x_max, y_max) that truth is compared in.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        defects: Sequence[PlacedDefect],
+        scanner: SimulatedScanner,
+        take_motion: Callable[[], MotionBatch],
+        box_mm: tuple[float, float, float, float],
+    ) -> None:
+        self.world = world
+        self.reference = world.copy()
+        self._defects = tuple(defects)
+        self._scanner = scanner
+        self._take_motion = take_motion
+        self._box_mm = box_mm
+        self._wounds: list[_Wound] = []
+        self._stops: list[str] = []
+
+    @property
+    def build_from_scanner(self) -> Transform:
+        """Calibrated pose."""
+        return self._scanner.build_from_scanner
+
+    @property
+    def truth(self) -> tuple[DefectTruth, ...]:
+        """What became of every defect that has happened."""
+        return tuple(
+            DefectTruth(
+                kind=str(wound.defect.kind),
+                label=wound.label,
+                missing_mm3=wound.missing.volume_mm3,
+                filled_mm3=wound.filled_mm3,
+                excess_mm3=wound.excess_mm3,
+            )
+            for wound in self._wounds
+        )
+
+    def scan(self, request: ScanRequest) -> Scan:
+        """Lay what was printed since the last look, then look; points in the scanner frame."""
+        motion = self._take_motion()
+        if request.label in self._stops:  # a repair: it is laid in the broken world alone
+            self.world.deposit(motion)
+        else:
+            self._stops.append(request.label)
+            self._print_job(motion)
+            self._break(request)
+        self._measure(request.label)
+        return self._scanner.scan(request)
+
+    def finish(self) -> None:
+        """Lay what was printed after the last look."""
+        self._print_job(self._take_motion())
+
+    def _print_job(self, motion: MotionBatch) -> None:
+        """The same motion, in the world with its defects and in the reference without."""
+        flow = [defect for defect in self._defects if len(defect.flow_regions)]
+        with ThreadPoolExecutor(2) as pool:
+            twin = pool.submit(self.reference.deposit, motion)
+            self.world.deposit(motion, flow)
+            twin.result()
+
+    def _break(self, request: ScanRequest) -> None:
+        """Let the defects of this stop happen, and take their measure."""
+        due = [d for d in self._defects if d.last_layer == request.layer_index]
+        for defect in due:
+            if defect.removed is not None:
+                self.world.remove(defect.removed)
+            if defect.added is not None:
+                self.world.add(defect.added)
+        window = self._window()
+        mine, other = self.world.snapshot(window), self.reference.snapshot(window)
+        missing, excess = other.minus(mine), mine.minus(other)
+        for wound in self._wounds:
+            missing = missing.minus(wound.missing)
+        for defect in due:
+            own = missing.clipped(defect.box_mm)
+            missing = missing.minus(own)
+            extra_mm3 = excess.clipped(defect.box_mm).volume_mm3
+            self._wounds.append(_Wound(defect, request.label, own, extra_mm3))
+
+    def _measure(self, label: str) -> None:
+        """How much of this stop's missing volume is solid now."""
+        standing = self.world.snapshot(self._window())
+        for wound in self._wounds:
+            if wound.label == label:
+                wound.filled_mm3 = wound.missing.common(standing).volume_mm3
+
+    def _window(self) -> Window:
+        x0, y0, x1, y1 = self._box_mm
+        return self.world.columns.box_window((x0, y0), (x1, y1))

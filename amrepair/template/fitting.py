@@ -1,0 +1,116 @@
+"""`fit_template` and `load_or_fit`: from a mesh to a template, or from the cache."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import amrepair
+from amrepair.errors import TemplateError
+from amrepair.template.fit import fit_fast
+from amrepair.template.learned import FORMAT_VERSION, LearnedSdf
+from amrepair.template.mesh_file import load_mesh, require_mesh
+from amrepair.template.mesh_sdf import MeshSdf
+from gcode.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import trimesh
+
+RECIPES = ("fast",)
+
+
+def fit_template(
+    source: Path | str | trimesh.Trimesh | Sequence[Path],
+    *,
+    recipe: str = "fast",
+    device: str = "auto",
+    seed: int = 0,
+    progress: Progress = silent,
+) -> LearnedSdf:
+    """Fit a template to a part.
+
+    Parameters
+    ----------
+    source
+        A mesh or its file, mm; made watertight where that leaves the shape in no doubt.
+
+    Raises
+    ------
+    TemplateError
+        If the recipe is unknown, or the mesh bounds no volume.
+    """
+    if recipe not in RECIPES:
+        raise TemplateError(f"the recipe '{recipe}' is unknown; choose {', '.join(RECIPES)}")
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        if len(source) != 1:
+            raise TemplateError(
+                f"a template is fitted to one mesh, {len(source)} inputs were given"
+            )
+        source = source[0]
+    mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
+    closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
+    metadata = {
+        "recipe": recipe,
+        "seed": str(seed),
+        "part_sha256": mesh_sha256(closed),
+        "version": amrepair.__version__,
+        "notes": "; ".join(closed.metadata.get("notes", ())),
+    }
+    return fit_fast(
+        MeshSdf.from_mesh(closed), device=device, seed=seed, metadata=metadata, progress=progress
+    )
+
+
+def load_or_fit(
+    source: Path | str | trimesh.Trimesh,
+    *,
+    cache_dir: Path | None = None,
+    recipe: str = "fast",
+    device: str = "auto",
+    seed: int = 0,
+    progress: Progress = silent,
+) -> LearnedSdf:
+    """The template of a part: from the cache, keyed by the part's hash, or fitted and kept there.
+
+    Parameters
+    ----------
+    cache_dir
+        Default: `$XDG_CACHE_HOME/amrepair/templates`, or `~/.cache/amrepair/templates`.
+    """
+    mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
+    closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
+    folder = cache_dir or default_cache_dir()
+    key = json.dumps([mesh_sha256(closed), recipe, seed, FORMAT_VERSION, amrepair.__version__])
+    path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.safetensors"
+    if path.is_file():
+        try:
+            return LearnedSdf.load(path)
+        except TemplateError:
+            path.unlink(missing_ok=True)  # a crash while it was written, or another version
+    template = fit_template(closed, recipe=recipe, device=device, seed=seed, progress=progress)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        template.save(path)
+    except (OSError, TemplateError):
+        return template  # a cache that cannot be written is no reason to stop
+    return template
+
+
+def default_cache_dir() -> Path:
+    """Where fitted templates are kept."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "amrepair" / "templates"
+
+
+def mesh_sha256(mesh: trimesh.Trimesh) -> str:
+    """SHA-256 of a mesh's vertices and faces, hexadecimal."""
+    digest = hashlib.sha256()
+    digest.update(np.ascontiguousarray(mesh.vertices, dtype=np.float64).tobytes())
+    digest.update(np.ascontiguousarray(mesh.faces, dtype=np.int64).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,170 @@
+"""`PlannedSdf`: what a layer should look like, from the job's own beads (idea 2 of the design).
+
+Sparse infill is no defect: the expected solid is the union of the beads that were planned, told
+as a distance field between voxels of about a layer's height. Only the last millimetres below the
+layer are held; what is farther down was looked at before, and is covered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from amrepair.errors import TemplateError
+from amrepair.template import planned_kernels as kernels
+from amrepair.template.cut import CutTemplate
+from amrepair.template.port import Template
+
+DEPTH_MM = 4.0
+MARGIN_MM = 3.0
+LEAST_VOXEL_MM, MOST_VOXEL_MM = 0.1, 0.25
+MAX_VOXELS = 60_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSdf:
+    """The union of planned beads near the last layer (`Template`).
+
+    Attributes
+    ----------
+    origin_mm, voxel_mm
+        Corner of the grid and edge of a voxel.
+    bounds_mm
+        (2, 3) box of the beads within reach.
+    """
+
+    origin_mm: Float[np.ndarray, " 3"]
+    voxel_mm: float
+    bounds_mm: Float[np.ndarray, "2 3"]
+    _field: Float[np.ndarray, "x y z"] = field(repr=False)
+    _solid: Bool[np.ndarray, "x y z"] = field(repr=False)
+
+    @classmethod
+    def from_beads(
+        cls,
+        start_mm: Float[np.ndarray, "n 3"],
+        end_mm: Float[np.ndarray, "n 3"],
+        section_mm2: Float[np.ndarray, " n"],
+        height_mm: Float[np.ndarray, " n"],
+        *,
+        depth_mm: float = DEPTH_MM,
+    ) -> PlannedSdf:
+        """Make the field of beads.
+
+        Parameters
+        ----------
+        start_mm, end_mm
+            (n, 3) nozzle positions; a bead hangs below them by its height.
+        section_mm2, height_mm
+            (n,) its plastic and its height: as wide as their ratio.
+
+        Raises
+        ------
+        TemplateError
+            If there is no bead, or the grid would be too large.
+        """
+        if len(start_mm) == 0:
+            raise TemplateError("there are no beads to make a planned template of")
+        top_mm = float(np.maximum(start_mm[:, 2], end_mm[:, 2]).max())
+        near = np.minimum(start_mm[:, 2], end_mm[:, 2]) > top_mm - depth_mm - 1e-6
+        start, end = start_mm[near], end_mm[near]
+        height = np.ascontiguousarray(height_mm[near])
+        width = section_mm2[near] / np.maximum(height, 1e-6)
+        voxel_mm = float(np.clip(np.median(height), LEAST_VOXEL_MM, MOST_VOXEL_MM))
+        reach = 0.5 * float(width.max())
+        low = np.minimum(start, end).min(axis=0) - [reach, reach, float(height.max())]
+        high = np.maximum(start, end).max(axis=0) + [reach, reach, 0.0]
+        # faces of voxels lie on the last layer's top
+        levels = int(np.ceil((top_mm - max(low[2], 0.0)) / voxel_mm - 1e-6))
+        above = int(np.ceil(MARGIN_MM / voxel_mm))
+        origin = np.array([low[0] - MARGIN_MM, low[1] - MARGIN_MM, top_mm - levels * voxel_mm])
+        size = np.ceil((high[:2] + MARGIN_MM - origin[:2]) / voxel_mm).astype(int)
+        shape = (int(size[0]), int(size[1]), levels + above)
+        if np.prod([float(n) for n in shape]) > MAX_VOXELS:
+            raise TemplateError(
+                f"a planned template of {shape[0]}×{shape[1]}×{shape[2]} voxels is over the limit "
+                f"of {MAX_VOXELS:,}; look at fewer copies at once"
+            )
+        solid = np.zeros(shape, dtype=bool)
+        kernels.fill(
+            np.ascontiguousarray(start, dtype=np.float64),
+            np.ascontiguousarray(end, dtype=np.float64),
+            np.ascontiguousarray(width, dtype=np.float64),
+            height.astype(np.float64),
+            origin,
+            voxel_mm,
+            solid,
+        )
+        bounds = np.array([[low[0], low[1], origin[2]], [high[0], high[1], top_mm]])
+        return cls(origin, voxel_mm, bounds, _signed(solid, voxel_mm), solid)
+
+    @property
+    def bias_mm(self) -> float:
+        """A quarter of a voxel: what walls lose between voxel centres."""
+        return 0.25 * self.voxel_mm
+
+    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) signed distance, mm; below the grid that of its lowest slice."""
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        if (points[:, 2] < self.origin_mm[2]).any():
+            points = points.copy()
+            points[:, 2] = np.maximum(points[:, 2], self.origin_mm[2] + 0.5 * self.voxel_mm)
+        return np.asarray(kernels.interpolate(points, self.origin_mm, self.voxel_mm, self._field))
+
+    def distance_and_gradient(
+        self, points_mm: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """(n,) signed distance and (n, 3) its gradient, by central differences over a voxel."""
+        gradient = np.empty((len(points_mm), 3))
+        for axis in range(3):
+            offset = np.zeros(3)
+            offset[axis] = 0.5 * self.voxel_mm
+            ahead, behind = self.distance(points_mm + offset), self.distance(points_mm - offset)
+            gradient[:, axis] = (ahead - behind) / self.voxel_mm
+        return self.distance(points_mm), gradient
+
+    def below_z(self, z_mm: float) -> Template:
+        """The beads printed so far, cut."""
+        return CutTemplate(self, z_mm)
+
+    def surface_points(
+        self, spacing_mm: float
+    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+        """(m, 3) middles of voxel faces on the surface, thinned to the spacing, and normals."""
+        points, normals = [], []
+        padded = np.pad(self._solid, 1)
+        padded[:, :, 0] = padded[:, :, 1]  # the lowest slice goes on downwards
+        inner = (slice(1, -1),) * 3
+        for axis in range(3):
+            for side in (-1, 1):
+                open_face = self._solid & ~np.roll(padded, -side, axis=axis)[inner]
+                index = np.argwhere(open_face)
+                normal = np.zeros(3)
+                normal[axis] = side
+                centre = self.origin_mm + (index + 0.5 + 0.5 * normal) * self.voxel_mm
+                points.append(centre)
+                normals.append(np.tile(normal, (len(index), 1)))
+        every = max(1, round((spacing_mm / self.voxel_mm) ** 2))
+        return np.concatenate(points)[::every], np.concatenate(normals)[::every]
+
+    def solid(self) -> Any:
+        """The level set f = 0 as a `manifold3d.Manifold`."""
+        from amrepair.template.extract import extract_mesh
+        from amrepair.template.mesh_file import as_manifold
+
+        mesh = extract_mesh(self, self.voxel_mm)
+        return as_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def _signed(solid: Bool[np.ndarray, "x y z"], voxel_mm: float) -> Float[np.ndarray, "x y z"]:
+    """Signed distances at voxel centres; the surface lies midway between unlike ones."""
+    outside = ndimage.distance_transform_edt(~solid)
+    # what is below the grid is solid where the lowest slice is: it must not look like a surface
+    deep = np.concatenate([np.repeat(solid[:, :, :1], 24, axis=2), solid], axis=2)
+    inside = ndimage.distance_transform_edt(deep)[:, :, 24:]
+    signed = np.where(solid, 0.5 - inside, outside - 0.5) * voxel_mm
+    return np.ascontiguousarray(signed, dtype=np.float32)
