@@ -228,17 +228,23 @@ def run_loop(
 
 
 def _print_job(
-    printer: Printer, checked: CheckedProgram, first: int, end: int, total: int, progress: Progress
+    printer: Printer,
+    checked: CheckedProgram,
+    first: int,
+    end: int,
+    of_lines: int,
+    progress: Progress,
 ) -> PrintReport:
     """Send lines [first, end) of the job and wait until the nozzle rests."""
 
-    def whole_job(stage: str, done: float, of: float) -> None:
-        progress("print", float(first) + done, float(total))
+    def whole_job(stage: str, done: float, total: float) -> None:
+        """The link tells of this part; people want to know of the job."""
+        progress("print", float(first) + done, float(of_lines))
 
     report = printer.print(checked, lines=range(first, end), progress=whole_job)
     if not report.ok:
         raise LoopError(
-            f"the job was stopped at line {report.next_line + 1} of {total}; heaters are off"
+            f"the job was stopped at line {report.next_line + 1} of {of_lines}; heaters are off"
         )
     printer.finish_moves()
     return report

@@ -9,11 +9,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
@@ -230,6 +230,16 @@ def plan_repair(
     )
 
 
+def _subset(scan: Scan, keep: Bool[np.ndarray, " n"]) -> Scan:
+    """Some points of a scan."""
+    return replace(
+        scan,
+        points_mm=scan.points_mm[keep],
+        normals=None if scan.normals is None else scan.normals[keep],
+        sensor_index=None if scan.sensor_index is None else scan.sensor_index[keep],
+    )
+
+
 def _in_view(scan: Scan, site: Site) -> Scan:
     """What a planned template can judge: its own last millimetres; all of it otherwise."""
     if site.planned is None:
@@ -267,8 +277,8 @@ def _refuse_ambiguity(scan: Scan, site: Site, registration: Registration, defici
         if shared_mm3 < SAME_REPAIR_RATIO * deficit.missing_mm3:
             raise AlignmentError(
                 f"the scan {scan.source} fits its template in "
-                f"{1 + len(registration.symmetric_alternatives)} poses equally well, and they would repair different places; scan in the build "
-                "frame or give a pose closer to the truth"
+                f"{1 + len(registration.symmetric_alternatives)} poses equally well, and they "
+                "would repair different places; scan in the build frame or give a pose closer to the truth"
             )
 
 

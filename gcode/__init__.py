@@ -2,3 +2,5 @@
 
 It knows nothing of scans, templates or learning; `amrepair` stands on it, never the reverse.
 """
+
+__version__ = "0.1.0"

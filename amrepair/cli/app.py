@@ -7,7 +7,10 @@ from typing import Annotated
 import typer
 
 import amrepair
-from amrepair.cli import benchmark, console, inspect, mend, simulation, templates
+from amrepair.cli import benchmark, inspect, mend, simulation, templates
+from amrepair.errors import AmrepairError
+from gcode.cli import console
+from gcode.errors import GcodeError
 
 app = typer.Typer(
     name="amrepair",
@@ -42,4 +45,4 @@ benchmark.add_to(app)
 
 def main() -> None:
     """Entry point."""
-    console.run(app, "amrepair")
+    console.run(app, "amrepair", (AmrepairError, GcodeError))

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from amrepair.cli import console
 from amrepair.cli.options import SeedOption
+from gcode.cli import console
 
 FormatOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or real3d-ad.")]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ from amrepair.errors import InputError
 from amrepair.template import LearnedSdf, load_or_fit
 from amrepair.template.mesh_file import SUFFIXES
 from amrepair.template.port import Template
+from gcode.cli.console import write_whole
 from gcode.progress import Progress, silent
 
 TEMPLATE_SUFFIX = ".safetensors"
@@ -33,32 +32,6 @@ def open_template(path: Path, *, progress: Progress = silent) -> Template:
         f"the template {path} is neither a {TEMPLATE_SUFFIX} file nor a mesh "
         f"({', '.join(SUFFIXES)}); fit one with 'amrepair template fit'"
     )
-
-
-def writable(path: Path) -> None:
-    """Refuse an output that cannot be written, before any work is done.
-
-    Raises
-    ------
-    InputError
-        Naming it.
-    """
-    folder = path.parent
-    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"{path} cannot be written; name a file in a folder that is there")
-
-
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under another name, then put it in place."""
-    writable(path)
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_mesh(mesh: Any, path: Path) -> None:

@@ -8,13 +8,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from amrepair.cli import console
-from amrepair.cli.files import open_template, write_whole
+from amrepair.cli.files import open_template
 from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors
 from amrepair.repair import Stopwatch
 from amrepair.report.collect import rounded
 from amrepair.report.folder import RunFolder
 from amrepair.scans import read_scan, write_ply
+from gcode.cli import console
 
 _COLOURS = np.array([[180, 180, 180], [0, 90, 200], [220, 120, 0]])  # ok, missing, excess
 
@@ -53,7 +53,7 @@ def align(
             )
     if output is not None:
         moved = cloud.moved(found.template_from_scan)
-        write_whole(output, lambda path: write_ply(moved, path))
+        console.write_whole(output, lambda path: write_ply(moved, path))
     # the pose is an input of other programs: all its digits
     result: dict[str, Any] = {
         "template_from_scan": found.template_from_scan.matrix.tolist(),
@@ -103,8 +103,10 @@ def detect(
         "template_points_mm": anomaly.template_points_mm,
         "template_label": anomaly.template_label,
     }
-    write_whole(folder.file("anomaly.npz"), lambda path: np.savez_compressed(path, **arrays))
-    write_whole(
+    console.write_whole(
+        folder.file("anomaly.npz"), lambda path: np.savez_compressed(path, **arrays)
+    )  # type: ignore[arg-type]
+    console.write_whole(
         folder.file("anomaly.ply"),
         lambda path: write_ply(
             cloud,

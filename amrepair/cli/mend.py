@@ -8,8 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from amrepair.cli import console
-from amrepair.cli.files import open_template, writable, write_whole
+from amrepair.cli.files import open_template
 from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.options import (
     JsonOption,
@@ -27,6 +26,7 @@ from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
 from amrepair.report import Figures, ReportData, outcome_of, summary_of_result, write_report
 from amrepair.report.collect import look_of, plan_result, region_rows, solid_mesh, versions
 from amrepair.scans import read_scan
+from gcode.cli import console
 from gcode.moves import Program
 from gcode.profiles import (
     DEFAULT_MATERIAL,
@@ -85,7 +85,7 @@ def repair(
             "the part stands on the bed"
         )
     for path in filter(None, (output, report)):
-        writable(path)
+        console.writable(path)
     placed = part_pose(pose) if pose is not None else None
     setup = load_setup(printer, material, process)
     watch, bars = Stopwatch(), console.Bars()
@@ -108,7 +108,7 @@ def repair(
     program = plan.checked.program if plan.checked is not None else None
     if program is not None:
         text = program.text
-        write_whole(output, lambda path: path.write_text(text, encoding="utf-8"))
+        console.write_whole(output, lambda path: path.write_text(text, encoding="utf-8"))
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     result = plan_result(
         plan,
@@ -120,7 +120,7 @@ def repair(
     within = plan.within_tolerance or (plan.checked is not None and _all_reached(plan))
     if report is not None:
         data = _report_data(plan, scan, result, setup, field, within=within)
-        write_whole(report, lambda path: write_report(data, path))
+        console.write_whole(report, lambda path: write_report(data, path))
     if as_json:
         console.show_json(result)
     else:
@@ -135,7 +135,8 @@ def repair(
 def _all_reached(plan: RepairPlan) -> bool:
     """Whether the program fills all that is missing, and nothing else is wrong."""
     assert plan.patch is not None
-    left = sum(u.volume_mm3 for u in (*plan.patch.unreachable, *plan.patch.unprintable))
+    left = sum(u.volume_mm3 for u in plan.patch.unreachable)
+    left += sum(u.volume_mm3 for u in plan.patch.unprintable)
     return not plan.too_much and left <= 0.05 * plan.deficit.missing_mm3
 
 

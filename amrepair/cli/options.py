@@ -42,7 +42,7 @@ def scaled_mesh(path: Path, scale: str, setup: PrintSetup) -> Any:
         if not 1e-3 <= factor <= 1e3:
             raise InputError(f"--scale is {scale!r}; give a factor from 0.001 to 1000, or 'fit'")
     if factor != 1.0:
-        mesh.apply_scale(factor)
+        mesh.apply_scale(factor)  # type: ignore[no-untyped-call]
     return mesh
 
 

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from amrepair.cli import console
 from amrepair.cli.options import (
     JsonOption,
     MaterialOption,
@@ -40,6 +39,7 @@ from amrepair.report.folder import RunFolder
 from amrepair.simulate.defects import DefectKind, parse_defect
 from amrepair.simulate.part_files import bracket_path
 from amrepair.simulate.run import SimulatedRun, prepare_run, simulate_run
+from gcode.cli import console
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, load_setup
 
 DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")

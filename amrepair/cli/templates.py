@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from amrepair.cli import console
-from amrepair.cli.files import open_template, writable, write_mesh
+from amrepair.cli.files import open_template, write_mesh
 from amrepair.cli.options import SeedOption
+from gcode.cli import console
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
 
@@ -33,7 +33,7 @@ def fit(
     """Fit the signed distance field that scans are held against."""
     from amrepair.template import fit_template
 
-    writable(output)
+    console.writable(output)
     bars = console.Bars()
     with bars.shown():
         template = fit_template(inputs, recipe=recipe, device=device, seed=seed, progress=bars)
@@ -54,7 +54,7 @@ def mesh(
     """Extract the template's surface as a closed mesh."""
     from amrepair.template import extract_mesh
 
-    writable(output)
+    console.writable(output)
     bars = console.Bars()
     template = open_template(file, progress=bars)
     cut = template if below_z_mm is None else template.below_z(below_z_mm)

@@ -66,8 +66,8 @@ class RunFolder:
     def write_solid(self, name: str, solid: Any) -> Path:
         """Write a `manifold3d.Manifold` as binary STL."""
         vertices, faces = solid_arrays(solid)
-        data = trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl")
-        return self._whole(name, lambda path: path.write_bytes(data))
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        return self._whole(name, lambda path: mesh.export(path, file_type="stl"))
 
     def _whole(self, name: str, write: Callable[[Path], object]) -> Path:
         target = self.path / name

@@ -32,7 +32,6 @@ def evaluate(
     """(n,) signed distance, mm; beyond the grid the distance to its box is added."""
     n = len(points)
     out = np.empty(n, np.float64)
-    nx, ny, nz = base.shape
     levels = len(level_cells)
     for k in prange(n):
         beyond = 0.0

@@ -77,7 +77,7 @@ class PlannedSdf:
         voxel_mm = float(np.clip(np.median(height), LEAST_VOXEL_MM, MOST_VOXEL_MM))
         reach = 0.5 * float(width.max())
         low = np.minimum(start, end).min(axis=0) - [reach, reach, float(height.max())]
-        high = np.maximum(start, end).max(axis=0) + [reach, reach, 0.0]
+        high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
         # faces of voxels lie on the last layer's top
         levels = int(np.ceil((top_mm - max(low[2], 0.0)) / voxel_mm - 1e-6))
         above = int(np.ceil(MARGIN_MM / voxel_mm))

@@ -449,7 +449,7 @@ def _contour(mask: Bool[np.ndarray, "ny nx"], model: _Model) -> Any:
     padded = np.pad(mask.astype(np.float64), 1)
     smooth = ndimage.gaussian_filter(padded, 0.8)
     polygons = []
-    for line in measure.find_contours(smooth, 0.5):
+    for line in measure.find_contours(smooth, 0.5):  # type: ignore[no-untyped-call]
         if len(line) < 4:
             continue
         xy = (line[:-1, ::-1] - 0.5) * model.cell_mm + model.origin_mm
@@ -606,7 +606,8 @@ def _left_over(model: _Model) -> tuple[tuple[Unreachable, ...], tuple[PatchRegio
     unreachable: list[Unreachable] = []
     regions: list[PatchRegion] = []
     for piece in model.deficit.decompose():
-        box: Box = tuple(float(v) for v in piece.bounding_box())
+        x0, y0, z0, x1, y1, z1 = (float(v) for v in piece.bounding_box())
+        box: Box = (x0, y0, z0, x1, y1, z1)
         cells = _cells_of(model, box)
         whole_mm3 = float(wanted[cells].sum()) * cell_mm2
         stuck_mm3 = float(left[cells].sum()) * cell_mm2

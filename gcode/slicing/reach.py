@@ -75,7 +75,8 @@ class Reach:
         ny, nx = self.field.shape
         inside = ((index >= 0) & (index < (ny, nx))).all(axis=1)
         index = np.where(inside[:, None], index, 0)
-        return ~inside | free[index[:, 0], index[:, 1]]
+        found: Bool[np.ndarray, " n"] = ~inside | free[index[:, 0], index[:, 1]]
+        return found
 
     def reason_at(self, iy: int, ix: int, z_mm: float) -> str:
         """What stands in the way at one column, or why nothing does."""

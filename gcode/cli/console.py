@@ -1,21 +1,22 @@
-"""What every command shares: progress bars, errors as one sentence, results as JSON or text."""
+"""What every command of both programs shares: bars, errors as one sentence, JSON, whole files."""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from amrepair.errors import AmrepairError
-from gcode.errors import GcodeError
+from gcode.errors import InputError
 
 NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130
@@ -38,7 +39,6 @@ class Bars:
             TextColumn("{task.percentage:>3.0f} %"),
             TimeRemainingColumn(elapsed_when_finished=True),
             console=errors,
-            transient=False,
         )
 
     def __call__(self, stage: str, done: float, total: float) -> None:
@@ -68,14 +68,48 @@ def show_json(result: Mapping[str, Any]) -> None:
     sys.stdout.write(json.dumps(result, indent=2, ensure_ascii=False) + "\n")
 
 
-def run(app: typer.Typer, name: str) -> None:
-    """Run an application; an error becomes one sentence and its exit code."""
+def writable(path: Path) -> None:
+    """Refuse an output that cannot be written, before any work is done.
+
+    Raises
+    ------
+    InputError
+        Naming it.
+    """
+    folder = path.parent
+    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(f"{path} cannot be written; name a file in a folder that is there.")
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file under another name, then put it in place.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    writable(path)
+    temporary = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}).") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None:
+    """Run an application; a known error becomes one sentence and its exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     try:
         app(prog_name=name)
-    except (AmrepairError, GcodeError) as error:
-        errors.print(f"{name}: {error}", style="bold red" if errors.is_terminal else None)
-        sys.exit(error.exit_code)
+    except known as error:
+        errors.print(
+            f"{name}: {error}", style="bold red" if errors.is_terminal else None, markup=False
+        )
+        sys.exit(getattr(error, "exit_code", 2))
     except KeyboardInterrupt:
         errors.print(f"{name}: interrupted")
         sys.exit(INTERRUPTED)

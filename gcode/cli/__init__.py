@@ -1,0 +1,9 @@
+"""The command line of `gcode`: arguments and wiring; the same exit codes as `amrepair`.
+
+Exit 0 done, 2 bad input or refused, 4 printer or link. `--json` prints one object on standard
+output; messages and progress go to standard error.
+"""
+
+from gcode.cli.app import main
+
+__all__ = ["main"]

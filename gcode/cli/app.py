@@ -1,0 +1,351 @@
+"""The commands of `gcode`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import gcode
+from gcode.check import check as check_program
+from gcode.check import find_refusals
+from gcode.cli import console
+from gcode.errors import GcodeError, InputError
+from gcode.estimate import estimate as estimate_program
+from gcode.firmware import serve_forever
+from gcode.firmware.faults import parse_faults
+from gcode.hosts import connect
+from gcode.moves import Program
+from gcode.profiles import (
+    DEFAULT_MATERIAL,
+    DEFAULT_PRINTER,
+    DEFAULT_PROCESS,
+    list_profiles,
+    load_material,
+    load_printer,
+    load_process,
+    load_setup,
+)
+from gcode.reader import read_job
+from gcode.slicing.job import slice_part
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import slice_patch
+from gcode.solids import SUFFIXES, read_solid
+from gcode.surfaces import HeightField
+from gcode.writer import write
+
+AS_BUILT_CELL_MM = 0.2
+AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
+
+PrinterOption = Annotated[str, typer.Option(help="Printer profile: an ID or a TOML file.")]
+MaterialOption = Annotated[str, typer.Option(help="Material profile: an ID or a TOML file.")]
+ProcessOption = Annotated[str, typer.Option(help="Process profile: an ID or a TOML file.")]
+AsBuiltOption = Annotated[
+    Path | None,
+    typer.Option(help="What stands on the bed: a mesh, or a height map (.npz, .tif, .npy)."),
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
+]
+FileArgument = Annotated[Path, typer.Argument(help="G-code file.")]
+
+app = typer.Typer(
+    name="gcode",
+    help="Slice solids, check and estimate programs, send them, emulate a printer.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
+app.add_typer(profiles_app, name="profiles")
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        console.out.print(f"gcode {gcode.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Options before a command."""
+
+
+@app.command("slice")
+def slice_solid(
+    solid: Annotated[Path, typer.Argument(help="Solid in the build frame, mm.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
+    process: ProcessOption = DEFAULT_PROCESS,
+    as_built: AsBuiltOption = None,
+    job: Annotated[
+        Path | None, typer.Option(help="The job's G-code: layers lie on its layers.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Slice a solid: a whole job, or with --as-built a patch on top of what stands there."""
+    console.writable(output)
+    setup = load_setup(printer, material, process)
+    shape = read_solid(solid)
+    bars = console.Bars()
+    lost: tuple[Any, ...] = ()
+    with bars.shown():
+        if as_built is None:
+            field = None
+            toolpath = slice_part(shape, setup, progress=bars)
+        else:
+            field = _as_built(as_built)
+            plan = slice_patch(
+                shape,
+                setup,
+                as_built=field,
+                grid=_grid(job, setup),
+                standalone=True,
+                progress=bars,
+            )
+            toolpath, lost = plan.toolpath, (*plan.unreachable, *plan.unprintable)
+        if not toolpath.extrusions:
+            raise InputError(f"{solid}: nothing of it can be printed: {_reasons(lost)}.")
+        program = write(toolpath, setup, title=f"{solid.name}")
+    check_program(program, setup, as_built=field)
+    console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
+    cost = estimate_program(program, setup.printer)
+    result = {
+        "gcode": str(output),
+        "solid_mm3": round(float(shape.volume()), 4),
+        "beads_mm3": round(toolpath.volume_mm3, 4),
+        "filament_mm": round(cost.filament_mm, 2),
+        "print_time_s": round(cost.print_time_s, 1),
+        "left_out": [
+            {"volume_mm3": round(u.volume_mm3, 4), "box_mm": list(u.box_mm), "reason": u.reason}
+            for u in lost
+        ],
+    }
+    if as_json:
+        console.show_json(result)
+        return
+    console.out.print(
+        f"{output}: {result['beads_mm3']} mm³ of {result['solid_mm3']} mm³ as beads, "
+        f"{cost.filament_mm / 1000:.2f} m of filament, {cost.print_time_s / 60:.1f} min; checked."
+    )
+    for thing in lost:
+        console.out.print(f"left out: {thing.volume_mm3:.3f} mm³: {thing.reason}")
+
+
+@app.command("check")
+def check(
+    file: FileArgument,
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
+    as_built: AsBuiltOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Judge a program: limits, temperatures, sections, and the tool head against --as-built."""
+    setup = load_setup(printer, material)
+    program = Program(_text(file), setup.printer.dialect)
+    field = _as_built(as_built) if as_built is not None else None
+    refusals = find_refusals(program, setup, as_built=field)
+    if as_json:
+        console.show_json(
+            {
+                "ok": not refusals,
+                "printer": setup.printer.id,
+                "sha256": program.sha256,
+                "refusals": [
+                    {
+                        "line": r.line,
+                        "move": r.text.strip(),
+                        "what": r.what,
+                        "value": r.value,
+                        "limit": r.limit,
+                    }
+                    for r in refusals
+                ],
+            }
+        )
+    elif refusals:
+        for refusal in refusals[:20]:
+            console.errors.print(str(refusal), markup=False)
+        if len(refusals) > 20:
+            console.errors.print(f"and {len(refusals) - 20} more")
+    else:
+        console.out.print(f"{file}: nothing speaks against it on {setup.printer.name}.")
+    if refusals:
+        raise typer.Exit(2)
+
+
+@app.command("estimate")
+def estimate(
+    file: FileArgument,
+    printer: Annotated[
+        str | None, typer.Option(help="Printer profile; a plain machine where left out.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Tell how long a program takes and what it uses; heating left out."""
+    machine = load_printer(printer) if printer is not None else None
+    dialect = machine.dialect if machine is not None else "marlin"
+    found = estimate_program(Program(_text(file), dialect), machine)
+    result = {
+        "print_time_s": round(found.print_time_s, 1),
+        "filament_mm": round(found.filament_mm, 2),
+        "filament_mm3": round(found.filament_mm3, 2),
+        "layers": found.layers,
+        "bounds_mm": [round(v, 3) for v in found.bounds_mm],
+    }
+    if as_json:
+        console.show_json(result)
+        return
+    console.out.print(
+        f"{found.print_time_s / 60:.1f} min, {found.filament_mm / 1000:.3f} m of filament "
+        f"({found.filament_mm3 / 1000:.2f} cm³), {found.layers} layers."
+    )
+
+
+@app.command("send")
+def send(
+    file: FileArgument,
+    port: Annotated[str, typer.Option(help="Device path, or file:PATH.")],
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
+    wire_log: Annotated[Path | None, typer.Option(help="Log of every byte, with times.")] = None,
+    journal: Annotated[
+        Path | None, typer.Option(help="Journal of the job, written ahead of the wire.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
+    setup = load_setup(printer, material)
+    checked = check_program(Program(_text(file), setup.printer.dialect), setup)
+    machine = connect(
+        port,
+        dialect=setup.printer.dialect,
+        baud=setup.printer.baud,
+        wire_log=wire_log,
+        journal=journal,
+    )
+    bars = console.Bars()
+    machine.connect()
+    try:
+        with bars.shown():
+            report = machine.print(checked, progress=bars)
+            machine.finish_moves()
+    except BaseException:
+        machine.abort()
+        raise
+    finally:
+        machine.close()
+    result = {
+        "ok": report.ok,
+        "lines_acked": report.lines_acked,
+        "resends": report.resends,
+        "stalls": report.stalls,
+        "bytes_sent": report.bytes_sent,
+        "seconds": round(report.seconds, 3),
+    }
+    if as_json:
+        console.show_json(result)
+    else:
+        console.out.print(
+            f"{report.lines_acked} lines acknowledged, {report.resends} resent, "
+            f"{report.seconds:.1f} s."
+        )
+    if not report.ok:
+        raise typer.Exit(4)
+
+
+@app.command("emulate")
+def emulate(
+    firmware: Annotated[str, typer.Option(help="marlin, prusa, klipper or reprap.")] = "marlin",
+    printer: PrinterOption = DEFAULT_PRINTER,
+    faults: Annotated[Path | None, typer.Option(help="Fault script.")] = None,
+    link: Annotated[Path | None, typer.Option(help="Name for the pseudo-terminal.")] = None,
+    accelerated: Annotated[bool, typer.Option(help="Let the printer's clock jump.")] = False,
+) -> None:
+    """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
+    script = parse_faults(_text(faults)) if faults is not None else None
+    serve_forever(
+        load_printer(printer),
+        firmware=firmware,
+        faults=script,
+        link=link,
+        accelerated=accelerated,
+        on_port=lambda path: typer.echo(path),
+    )
+
+
+@profiles_app.command("list")
+def profiles_list(as_json: JsonOption = False) -> None:
+    """List the shipped profiles."""
+    found = {kind: list(list_profiles(kind)) for kind in ("printers", "materials", "processes")}
+    if as_json:
+        console.show_json(found)
+        return
+    for kind, names in found.items():
+        console.out.print(f"{kind}: {', '.join(names)}")
+
+
+@profiles_app.command("show")
+def profiles_show(
+    profile: Annotated[str, typer.Argument(help="ID or TOML file.")],
+    kind: Annotated[
+        str, typer.Option(help="printers, materials or processes, where an ID is in several.")
+    ] = "",
+) -> None:
+    """Show a profile with everything it inherits, as JSON."""
+    loaders: dict[str, Any] = {
+        "printers": load_printer,
+        "materials": load_material,
+        "processes": load_process,
+    }
+    for name, load in loaders.items():
+        if kind not in {"", name}:
+            continue
+        if kind == name or profile in list_profiles(name):  # type: ignore[arg-type]
+            console.show_json(load(profile).model_dump(mode="json"))
+            return
+    raise InputError(
+        f"There is no profile '{profile}'; 'gcode profiles list' names them (for a file of your "
+        "own, say --kind)."
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).") from error
+
+
+def _as_built(path: Path) -> HeightField:
+    """A height field from a height map, or from a mesh with room around it."""
+    if path.suffix.lower() not in SUFFIXES:
+        if not path.is_file():
+            raise InputError(f"{path}: there is no such file.")
+        return HeightField.read(path)
+    solid = read_solid(path)
+    return HeightField.from_manifold(solid, AS_BUILT_CELL_MM, margin_mm=AROUND_MM)
+
+
+def _grid(job: Path | None, setup: Any) -> LayerGrid:
+    if job is None:
+        return LayerGrid.from_setup(setup)
+    read = read_job(Program(_text(job), setup.printer.dialect))
+    return LayerGrid.from_tops(
+        [layer.z_mm for layer in read.layers], layer_height_mm=setup.process.layer_height_mm
+    )
+
+
+def _reasons(lost: tuple[Any, ...]) -> str:
+    return "; ".join(sorted({thing.reason for thing in lost})) or "it is too small"
+
+
+def main() -> None:
+    """Entry point."""
+    console.run(app, "gcode", (GcodeError,))
