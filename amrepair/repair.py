@@ -278,7 +278,7 @@ def _refuse_ambiguity(scan: Scan, site: Site, registration: Registration, defici
             raise AlignmentError(
                 f"the scan {scan.source} fits its template in "
                 f"{1 + len(registration.symmetric_alternatives)} poses equally well, and they "
-                "would repair different places; scan in the build frame or give a pose closer to the truth"
+                "would repair different places; scan in the build frame or give a better pose"
             )
 
 

@@ -95,17 +95,18 @@ def detect(
             found = align_scan(cloud, field, rng=np.random.default_rng(seed), progress=bars)
         with watch("detect"):
             anomaly = detect_defects(cloud.moved(found.template_from_scan), field, progress=bars)
-    arrays = {
-        "points_mm": cloud.points_mm,
-        "deviation_mm": anomaly.deviation_mm,
-        "score": anomaly.score,
-        "label": anomaly.label,
-        "template_points_mm": anomaly.template_points_mm,
-        "template_label": anomaly.template_label,
-    }
     console.write_whole(
-        folder.file("anomaly.npz"), lambda path: np.savez_compressed(path, **arrays)
-    )  # type: ignore[arg-type]
+        folder.file("anomaly.npz"),
+        lambda path: np.savez_compressed(
+            path,
+            points_mm=cloud.points_mm,
+            deviation_mm=anomaly.deviation_mm,
+            score=anomaly.score,
+            label=anomaly.label,
+            template_points_mm=anomaly.template_points_mm,
+            template_label=anomaly.template_label,
+        ),
+    )
     console.write_whole(
         folder.file("anomaly.ply"),
         lambda path: write_ply(

@@ -1,7 +1,8 @@
 """Templates: the part as it should be, as a signed distance field.
 
 Learned (`LearnedSdf`), exact (`MeshSdf`), planned from the job's beads (`PlannedSdf`); a layer's
-cut of any of them. It does not know scans' poses, nor what is done about a difference. torch is imported only while fitting.
+cut of any of them. It does not know scans' poses, nor what is done about a difference. torch is
+imported only while fitting.
 """
 
 from amrepair.template.cut import CutTemplate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -270,14 +271,16 @@ def emulate(
 ) -> None:
     """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
     script = parse_faults(_text(faults)) if faults is not None else None
-    serve_forever(
-        load_printer(printer),
-        firmware=firmware,
-        faults=script,
-        link=link,
-        accelerated=accelerated,
-        on_port=lambda path: typer.echo(path),
-    )
+    machine = load_printer(printer)
+    with tempfile.TemporaryDirectory(prefix="gcode-emulate-") as folder:
+        serve_forever(
+            machine,
+            firmware=firmware,
+            faults=script,
+            link=link or Path(folder) / "ttyEMU0",
+            accelerated=accelerated,
+            on_port=typer.echo,
+        )
 
 
 @profiles_app.command("list")

@@ -75,8 +75,7 @@ class Reach:
         ny, nx = self.field.shape
         inside = ((index >= 0) & (index < (ny, nx))).all(axis=1)
         index = np.where(inside[:, None], index, 0)
-        found: Bool[np.ndarray, " n"] = ~inside | free[index[:, 0], index[:, 1]]
-        return found
+        return np.asarray(~inside | np.asarray(free)[index[:, 0], index[:, 1]])
 
     def reason_at(self, iy: int, ix: int, z_mm: float) -> str:
         """What stands in the way at one column, or why nothing does."""
