@@ -106,7 +106,10 @@ def refine(
         weighted = jacobian * weight[:, None]
         hessian = weighted.T @ jacobian / sigma_mm**2
         slope = weighted.T @ f / sigma_mm**2
-        matrix6 = hessian + 1e-9 * np.trace(hessian) / 6 * np.eye(6)
+        # neighbouring points err alike (process, calibration): against a prior all of them
+        # together count as one
+        matrix6 = (hessian + 1e-9 * np.trace(hessian) / 6 * np.eye(6)) / len(points_mm)
+        slope = slope / len(points_mm)
         if prior is not None:
             offset = np.concatenate([_vector(rotation @ first_rotation.T), place - first_place])
             matrix6 = matrix6 + np.diag(prior.information)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.table import Table
 
@@ -38,7 +39,7 @@ from amrepair.report.collect import (
 from amrepair.report.folder import RunFolder
 from amrepair.simulate.defects import DefectKind, parse_defect
 from amrepair.simulate.part_files import bracket_path
-from amrepair.simulate.run import SimulatedRun, prepare_run, simulate_run
+from amrepair.simulate.run import SimulatedRun, place_on_bed, prepare_run, simulate_run
 from gcode.cli import console
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, load_setup
 
@@ -85,6 +86,8 @@ def simulate(
     setup = load_setup(printer, material, process)
     path = part or bracket_path()
     mesh = scaled_mesh(path, scale, setup)
+    place_on_bed(np.asarray(mesh.bounds, dtype=np.float64), setup)  # refused before any work
+    folder = RunFolder(out)
     with bars.shown():
         from amrepair.template import load_or_fit
 
@@ -93,7 +96,6 @@ def simulate(
         prepared = prepare_run(
             template, setup, defects, title=path.stem, seed=seed, watch=watch, progress=bars
         )
-        folder = RunFolder(out)
         folder.write_text("job.gcode", prepared.checked.program.text)
         run = simulate_run(
             prepared,

@@ -22,7 +22,7 @@ class RunFolder:
     Parameters
     ----------
     path
-        Made where it is not there; must be writable.
+        Made with its first file, where it is not there.
 
     Raises
     ------
@@ -32,19 +32,25 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            probe = path / f".write-test-{os.getpid()}"
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
+        there = next(p for p in (path, *path.absolute().parents) if p.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK):
             raise InputError(
-                f"the output folder {path} cannot be written ({error.strerror}); name another one"
-            ) from error
+                f"the output folder {path} cannot be written ({there} does not allow it); name "
+                "another one"
+            )
 
     def file(self, name: str) -> Path:
-        """Path of a file in it."""
+        """Path of a file in the folder, which is there from now on."""
+        self._make()
         return self.path / name
+
+    def _make(self) -> None:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"the output folder {self.path} cannot be made ({error.strerror})"
+            ) from error
 
     def write_text(self, name: str, text: str) -> Path:
         """Write a text whole or not at all."""
@@ -70,6 +76,7 @@ class RunFolder:
         return self._whole(name, lambda path: mesh.export(path, file_type="stl"))
 
     def _whole(self, name: str, write: Callable[[Path], object]) -> Path:
+        self._make()
         target = self.path / name
         # the ending stays last: writers choose their format by it
         temporary = self.path / f".{os.getpid()}-{name}"

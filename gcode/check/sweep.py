@@ -18,7 +18,7 @@ from gcode.surfaces.heightfield import footprint_rows
 TIP_SLACK_MM = 0.2
 # The head's body must clear what stands there, up to the noise of the height field.
 BODY_SLACK_MM = 0.1
-MAX_CELLS = 1_500_000  # of the field and all its slices; beyond that cells are joined
+MAX_CELLS = 12_000_000  # of the field and all its slices: 96 MB; beyond that cells are joined
 MOST_SAID = 20
 
 

@@ -54,12 +54,12 @@ MOST_THICK_NOZZLES = 0.8
 # The floor was measured, the deficit computed from it: they agree within this.
 AGREE_MM = 0.08
 # A gap of more than this share of the thickest bead is not filled from above.
-DEEP_RATIO = 1.6
+DEEP_RATIO = 1.7
 HOLD_MM = 0.6  # how far a bead may hang over a hole beside what holds it
 STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4
 LEAST_SECTION_MM2 = 0.004
-SPREAD_NOZZLES = 1.6  # from a bead's centre, as far as plastic is pressed sideways
+SPREAD_NOZZLES = 2.0  # from a bead's centre, as far as plastic is pressed sideways
 ROUNDING_MM = 2e-3  # more than the text's last digit
 NEAR_MM = 1.0  # a travel as short as this needs no lift
 CLEAR_MM = 0.5  # of the tip over everything on a travel
@@ -220,7 +220,7 @@ class _Model:
         )
         return np.maximum(below.reshape(self.shape), 0.0)
 
-    def free_at(self, reach: Bool[np.ndarray, "ny nx"]) -> Bool[np.ndarray, "ny nx"]:
+    def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the nozzle may be, from an answer of `reach`."""
         return self.reach.free_at_points(self.points_mm, reach).reshape(self.shape)
 
@@ -313,16 +313,16 @@ def _plan_pass(
     runs = [run for bead in beads for run in _free_runs(bead, reach, model)]
     if not runs:
         return None
-    chains, served = _weighed(runs, thick, model, setup)
+    chains, laid = _weighed(runs, thick, model, setup)
     if not chains:
         return None
     lost_mm3 = lost_mm2 * height_mm
     if lost_mm3 > NOT_LISTED_MM3:
         model.lost.append(_thin(region, z_mm, height_mm, lost_mm3))
     # over a bridge the surface is the nozzle's height, whatever lies open below
-    risen = np.where(z_mm - model.surface_mm > most_mm, z_mm, model.surface_mm + thick)
-    model.surface_mm = np.where(served, risen, model.surface_mm)
-    model.laid_mm = np.where(served, model.laid_mm + thick, model.laid_mm)
+    bridged = (laid > 0) & (z_mm - model.surface_mm > DEEP_RATIO * most_mm)
+    model.surface_mm = np.where(bridged, z_mm, model.surface_mm + laid)
+    model.laid_mm = model.laid_mm + laid
     return _Pass(z_mm, height_mm, index, tuple(chains), reach)
 
 
@@ -371,7 +371,7 @@ def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: _Model) -> l
             points[a : b + 1],
             np.ones(b - a),
             bead.role,
-            closed=bead.closed and b - a == len(owner),
+            closed=bool(bead.closed and b - a == len(owner)),
         )
         for a, b in zip(edges[::2], edges[1::2], strict=True)
         if pieces_mm[a:b].sum() >= LEAST_RUN_MM
@@ -379,7 +379,7 @@ def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: _Model) -> l
 
 
 def _surely_free(
-    points_mm: Float[np.ndarray, "n 2"], reach: Bool[np.ndarray, "ny nx"], model: _Model
+    points_mm: Float[np.ndarray, "n 2"], reach: Bool[np.ndarray, "_ry _rx"], model: _Model
 ) -> Bool[np.ndarray, " n"]:
     """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
     ok = np.ones(len(points_mm), dtype=bool)
@@ -391,11 +391,11 @@ def _surely_free(
 
 def _weighed(
     runs: list[Bead], thick: Float[np.ndarray, "ny nx"], model: _Model, setup: PrintSetup
-) -> tuple[list[_Chain], Bool[np.ndarray, "ny nx"]]:
+) -> tuple[list[_Chain], Float[np.ndarray, "ny nx"]]:
     """Cross-sections such that every column's thickness goes to the nearest piece of a bead.
 
-    Returns the chains, and the columns that are served: those no further from a bead than it can
-    spread. So plastic is the volume that is missing, to the column.
+    So plastic is the volume that is missing, to the column. Returns the chains, and the thickness
+    that columns get: none beyond where a bead can spread, less where a bead would be too wide.
     """
     nozzle_mm = setup.printer.nozzle_diameter_mm
     middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
@@ -405,8 +405,6 @@ def _weighed(
         model.points_mm[filled], distance_upper_bound=SPREAD_NOZZLES * nozzle_mm
     )
     near = np.isfinite(distance)
-    served = np.zeros(thick.size, dtype=bool)
-    served[filled[near]] = True
     cell_mm3 = model.cell_mm**2 * model.weight
     volume = np.bincount(
         nearest[near], thick.ravel()[filled[near]] * cell_mm3, minlength=len(middles)
@@ -415,6 +413,7 @@ def _weighed(
     number = np.bincount(nearest[near], minlength=len(middles))
     depth = reach / np.maximum(number, 1)
     chains: list[_Chain] = []
+    given = np.zeros(len(middles))  # share of what its columns want that a piece lays
     at = 0
     for run in runs:
         n = len(run.xy_mm) - 1
@@ -422,9 +421,13 @@ def _weighed(
         at += n
         section = _smooth(volume[own] / np.maximum(lengths[own], 1e-9), closed=run.closed)
         most = np.maximum(depth[own], LEAST_THICK_MM) * MOST_NOZZLES * nozzle_mm
-        section = np.minimum(section, np.minimum(most, setup.printer.max_bead_section_mm2))
+        most = np.minimum(most, setup.printer.max_bead_section_mm2)
+        given[own] = np.minimum(1.0, most / np.maximum(section, 1e-9))
+        section = np.minimum(section, most)
         chains += _split(_Chain(run.xy_mm, section, run.role))
-    return chains, served.reshape(thick.shape)
+    laid = np.zeros(thick.size)
+    laid[filled[near]] = thick.ravel()[filled[near]] * given[nearest[near]]
+    return chains, laid.reshape(thick.shape)
 
 
 def _smooth(values: Float[np.ndarray, " n"], *, closed: bool) -> Float[np.ndarray, " n"]:
@@ -632,6 +635,8 @@ def _reason(model: _Model, cells: tuple[slice, slice], stuck: Float[np.ndarray, 
     """What keeps the nozzle from the column with most left."""
     iy, ix = np.unravel_index(int(np.argmax(stuck)), stuck.shape)
     iy, ix = int(iy) + cells[0].start, int(ix) + cells[1].start
+    if model.floor_mm[iy, ix] > model.top_mm[iy, ix] + LEAST_THICK_MM:
+        return "covered by what stands above it"
     point = model.points_mm.reshape(*model.shape, 2)[iy, ix]
     field = model.reach.field
     row, column = (int(v) for v in field.cells_of(point[None])[0])

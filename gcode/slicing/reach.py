@@ -73,7 +73,7 @@ class Reach:
         """Values of an answer of `at` at points; outside the field nothing stands."""
         index = self.field.cells_of(points_mm)
         ny, nx = self.field.shape
-        inside = ((index >= 0) & (index < (ny, nx))).all(axis=1)
+        inside = np.asarray(((index >= 0) & (index < (ny, nx))).all(axis=1))
         index = np.where(inside[:, None], index, 0)
         return np.asarray(~inside | np.asarray(free)[index[:, 0], index[:, 1]])
 

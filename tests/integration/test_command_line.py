@@ -1,0 +1,263 @@
+"""Both programs as people and scripts call them: exit codes, sentences, JSON, whole files."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import manifold3d as m3
+import numpy as np
+import pytest
+import trimesh
+
+ROOT = Path(__file__).parents[2]
+BIN = Path(sys.executable).parent
+KNOB = ROOT / "examples" / "parts" / "knob.stl"
+DATA = os.environ.get("AMREPAIR_DATA")
+
+
+def call(*words: str | Path, program: str = "amrepair") -> subprocess.CompletedProcess[str]:
+    code = f"from {program}.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+        cwd=ROOT,
+    )
+
+
+def refused(done: subprocess.CompletedProcess[str], said: str) -> None:
+    """Exit 2 with one sentence, no traceback."""
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+def write_mesh(path: Path, mesh: trimesh.Trimesh) -> Path:
+    mesh.export(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def bad(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("bad")
+    rng = np.random.default_rng(0)
+    soup = trimesh.Trimesh(rng.uniform(0, 30, (300, 3)), np.arange(300).reshape(-1, 3))
+    box = trimesh.creation.box((10, 10, 10))
+    nan = folder / "nan.obj"
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices]
+    lines[3] = "v nan 1 2"
+    lines += ["f " + " ".join(str(v + 1) for v in face) for face in box.faces]
+    nan.write_text("\n".join(lines))
+    (folder / "empty.stl").write_bytes(b"")
+    (folder / "words.stl").write_text("this is no mesh")
+    return {
+        "missing": folder / "nothing.stl",
+        "empty": folder / "empty.stl",
+        "words": folder / "words.stl",
+        "soup": write_mesh(folder / "soup.stl", soup),
+        "nan": nan,
+        "large": write_mesh(folder / "large.stl", trimesh.creation.box((500, 20, 20))),
+        "folder": folder,
+    }
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "words", "soup", "nan", "large", "folder"])
+def test_a_bad_part_is_refused_in_one_sentence(
+    bad: dict[str, Path], kind: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    refused(call("simulate", bad[kind], "--out", out), "larger" if kind == "large" else "mesh")
+    assert not out.exists()
+
+
+@pytest.mark.skipif(DATA is None, reason="AMREPAIR_DATA is not set")
+@pytest.mark.parametrize("name", ["empty.stl", "soup.stl", "busted.STL", "wallhole.obj"])
+def test_broken_meshes_from_the_wild_end_in_words(name: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = call("template", "fit", Path(str(DATA)) / "bad" / name, "-o", out)
+    if done.returncode != 0:
+        refused(done, "mesh")
+        assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["simulate", "--printer", "toaster"], "toaster"),
+        (["simulate", "--material", "cheese"], "cheese"),
+        (["simulate", "--process", "no/such.toml"], "no such profile"),
+        (["simulate", "--defect", "earthquake"], "earthquake"),
+        (["simulate", "--defect", "void:diameter=-1"], "diameter"),
+        (["simulate", "--scale", "huge"], "--scale"),
+        (["repair", "x.ply", "--template", "y.stl", "-o", "z.gcode", "--scan-frame", "unknown"],
+         "--part-pose"),
+        (["repair", "x.ply", "--template", "y.stl", "-o", "z.gcode"], "no such file"),
+        (["detect", "x.ply", "--template", "y.stl", "--out", "/proc/nowhere"], "no such file"),
+        (["template", "mesh", "nothing.safetensors", "-o", "/tmp/x.stl"], "does not exist"),
+    ],
+)  # fmt: skip
+def test_bad_usage_is_refused(words: list[str], said: str) -> None:
+    refused(call(*words), said)
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_work_begins() -> None:
+    refused(call("simulate", KNOB, "--out", "/proc/nowhere/out"), "cannot be written")
+
+
+def test_an_unknown_option_is_a_usage_error() -> None:
+    done = call("simulate", "--nonsense")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("program", ["amrepair", "gcode"])
+def test_help_and_version(program: str) -> None:
+    assert call("--help", program=program).returncode == 0
+    assert "0.1.0" in call("--version", program=program).stdout
+
+
+@pytest.fixture(scope="module")
+def chipped(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A block on the bed with a corner gone, scanned from above and around."""
+    folder = tmp_path_factory.mktemp("chipped")
+    block = m3.Manifold.cube((40.0, 30.0, 12.0))
+    corner = m3.Manifold.cube((8.0, 8.0, 1.2)).translate((32.0, 22.0, 10.8))
+    meshes = {}
+    for name, solid in (("part", block), ("broken", block - corner)):
+        mesh = solid.to_mesh64()
+        tri = trimesh.Trimesh(np.array(mesh.vert_properties), np.array(mesh.tri_verts))
+        meshes[name] = tri
+        tri.export(folder / f"{name}.stl")
+    points, faces = trimesh.sample.sample_surface(meshes["broken"], 150_000, seed=1)
+    normals = meshes["broken"].face_normals[faces]
+    seen = normals[:, 2] > -0.5
+    rng = np.random.default_rng(0)
+    points = np.asarray(points)[seen] + rng.normal(size=(int(seen.sum()), 3)) * 0.03
+    np.savetxt(folder / "scan.xyz", points + np.array([100.0, 80.0, 0.0]), fmt="%.4f")
+    return {name: folder / name for name in ("part.stl", "broken.stl", "scan.xyz", "")}
+
+
+def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: Path) -> None:
+    out, report = tmp_path / "repair.gcode", tmp_path / "report.html"
+    words = ["repair", chipped["scan.xyz"], "--template", chipped["part.stl"], "-o", out]
+    words += ["--part-pose", "100,80,0,0", "--report", report, "--json"]
+    words += [
+        "--sensor-at",
+        "120,95,400",
+        "--sensor-at",
+        "420,395,300",
+        "--sensor-at",
+        "-180,-205,300",
+    ]
+    done = call(*words)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["missing_mm3_before"] == pytest.approx(8 * 8 * 1.2, rel=0.08)
+    assert result["missing_mm3_after"] is None
+    assert result["regions"][0]["reachable_ratio"] > 0.9
+    text = out.read_text()
+    homing = [line for line in text.splitlines() if line.startswith("G28")]
+    assert homing == ["G28 X Y"]
+    assert report.stat().st_size > 10_000
+    checked = call("check", out, "--json", program="gcode")
+    assert checked.returncode in (0, 2)  # without --as-built Z is not homed: it may say so
+    estimate = json.loads(call("estimate", out, "--json", program="gcode").stdout)
+    assert estimate["filament_mm"] == pytest.approx(result["filament_mm"], rel=0.01)
+    (x0, y0, _), (x1, y1, z1) = result["regions"][0]["box_mm"]
+    assert 131 < x0 < 133.5
+    assert 101 < y0 < 103.5
+    assert (x1, y1, z1) == pytest.approx((140.0, 110.0, 12.0), abs=0.4)
+
+
+def test_align_and_detect_write_what_the_contract_says(
+    chipped: dict[str, Path], tmp_path: Path
+) -> None:
+    words = [chipped["scan.xyz"], "--template", chipped["part.stl"], "--json"]
+    aligned = call("align", *words, "-o", tmp_path / "aligned.ply")
+    assert aligned.returncode == 0, aligned.stderr
+    result = json.loads(aligned.stdout)
+    assert {"template_from_scan", "rmse_mm", "inlier_ratio", "symmetric_alternatives",
+            "seconds"} <= set(result)  # fmt: skip
+    assert np.array(result["template_from_scan"]).shape == (4, 4)
+    detected = call("detect", *words, "--out", tmp_path / "d")
+    assert detected.returncode == 0, detected.stderr
+    archive = np.load(tmp_path / "d" / "anomaly.npz")
+    count = len(np.loadtxt(chipped["scan.xyz"]))
+    assert archive["points_mm"].shape == (count, 3)
+    assert {int(v) for v in np.unique(archive["label"])} <= {0, 1, 2}
+    assert {int(v) for v in np.unique(archive["template_label"])} <= {0, 1, 3}
+    assert (archive["label"] == 1).any()
+    assert {"object_score", "threshold", "regions"} <= set(json.loads(detected.stdout))
+
+
+def test_slice_check_and_estimate_work_together(chipped: dict[str, Path], tmp_path: Path) -> None:
+    placed = trimesh.load(chipped["part.stl"])
+    placed.apply_translation((100, 80, 0))
+    placed.export(tmp_path / "placed.stl")
+    job = tmp_path / "job.gcode"
+    sliced = call("slice", tmp_path / "placed.stl", "-o", job, "--json", program="gcode")
+    assert sliced.returncode == 0, sliced.stderr
+    result = json.loads(sliced.stdout)
+    assert result["beads_mm3"] == pytest.approx(40 * 30 * 12, rel=0.02)
+    assert call("check", job, program="gcode").returncode == 0
+    broken = tmp_path / "broken.gcode"
+    broken.write_text(job.read_text().replace("M109 S215", "M109 S415", 1))
+    done = call("check", broken, "--json", program="gcode")
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["refusals"][0]["limit"] == "300 °C"
+    done = call("slice", chipped["broken.stl"], "-o", "/proc/x.gcode", program="gcode")
+    assert done.returncode == 2
+
+
+def test_a_patch_on_what_stands_there(chipped: dict[str, Path], tmp_path: Path) -> None:
+    names = {}
+    for name in ("broken", "part"):
+        mesh = trimesh.load(chipped[f"{name}.stl"])
+        mesh.apply_translation((100, 80, 0))
+        names[name] = tmp_path / f"{name}.stl"
+        mesh.export(names[name])
+    piece = m3.Manifold.cube((8.0, 8.0, 1.2)).translate((132.0, 102.0, 10.8)).to_mesh64()
+    solid = trimesh.Trimesh(np.array(piece.vert_properties), np.array(piece.tri_verts))
+    solid.export(tmp_path / "piece.stl")
+    out = tmp_path / "patch.gcode"
+    words = ["slice", tmp_path / "piece.stl", "-o", out, "--as-built", names["broken"], "--json"]
+    done = call(*words, program="gcode")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["beads_mm3"] == pytest.approx(76.8, rel=0.08)
+    done = call("check", out, "--as-built", names["broken"], program="gcode")
+    assert done.returncode == 0, done.stderr
+    # the same program on the part as it should be would plough through it
+    assert call("check", out, "--as-built", names["part"], program="gcode").returncode == 2
+
+
+def test_profiles_are_listed_and_shown() -> None:
+    listed = json.loads(call("profiles", "list", "--json", program="gcode").stdout)
+    assert "prusa_mk3s" in listed["printers"]
+    shown = json.loads(call("profiles", "show", "standard_0.20", program="gcode").stdout)
+    assert shown["infill_ratio"] == 0.15
+    refused(call("profiles", "show", "nothing", program="gcode"), "no profile")
+
+
+def test_send_prints_on_an_emulated_printer(tmp_path: Path) -> None:
+    from gcode.firmware import EmulatedPrinterProcess
+    from gcode.profiles import load_printer
+
+    job = tmp_path / "job.gcode"
+    lines = ["G21", "G90", "M83", "M140 S60", "M104 S215", "M190 S60", "M109 S215", "G28 W"]
+    lines += ["G1 Z0.3 F720", "G1 X50 Y50 F6000", "G1 X90 E3 F1000", "M104 S0", "M140 S0"]
+    job.write_text("\n".join(lines) + "\n")
+    with EmulatedPrinterProcess("prusa", printer=load_printer("prusa_mk3s")) as machine:
+        done = call("send", job, "--port", machine.port, "--json", program="gcode")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["lines_acked"] == len(lines)
+        motion = machine.take_motion()
+    assert motion.filament_mm.sum() == pytest.approx(3.0)
+    assert call("send", job, "--port", "/dev/nothing", program="gcode").returncode == 4

@@ -1,0 +1,173 @@
+"""The whole loop on a small part: slicer, wire, emulated printer, world, scanner, repair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.errors import AmrepairError, InputError, LoopError
+from amrepair.loop import Look, plan_stops
+from amrepair.repair import RepairPlan
+from amrepair.report.collect import look_of, loop_result
+from amrepair.simulate.defects import parse_defect
+from amrepair.simulate.run import (
+    PreparedRun,
+    SimulatedRun,
+    place_on_bed,
+    prepare_run,
+    scale_to_fit,
+    simulate_run,
+)
+from amrepair.template import MeshSdf
+from gcode.errors import LinkError
+from gcode.profiles import PrintSetup, load_setup
+
+KEYS = {
+    "missing_mm3_before", "missing_mm3_after", "excess_mm3_before", "excess_mm3_after",
+    "repaired_ratio", "unreachable_mm3", "unseen_area_mm2", "iterations", "regions", "gcode",
+    "filament_mm", "print_time_s", "seconds", "seed", "versions",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def template() -> MeshSdf:
+    block = trimesh.creation.box(bounds=((0, 0, 0), (26, 22, 4)))
+    step = trimesh.creation.box(bounds=((3, 3, 3.9), (18, 16, 6)))
+    return MeshSdf.from_mesh(trimesh.boolean.union([block, step], engine="manifold"))
+
+
+def prepared(template: MeshSdf, *defects: str, process: str = "repair_0.20") -> PreparedRun:
+    parsed = [parse_defect(text) for text in defects]
+    return prepare_run(template, load_setup(process=process), parsed, title="test", seed=3)
+
+
+def result_of(run: SimulatedRun) -> dict[str, object]:
+    return loop_result(
+        run.report,
+        repaired_ratio=run.repaired_ratio,
+        gcode=None,
+        seed=run.prepared.seed,
+        seconds={},
+        setup=run.prepared.setup,
+    )
+
+
+@pytest.fixture(scope="module")
+def broken(template: MeshSdf, tmp_path_factory: pytest.TempPathFactory) -> SimulatedRun:
+    run = prepared(template, "void:diameter=7,layers=3", "chip:size=6,depth=1.2")
+    return simulate_run(run, wire_log=tmp_path_factory.mktemp("wire") / "wire.log")
+
+
+def test_most_of_what_was_missing_is_there_again(broken: SimulatedRun) -> None:
+    assert {t.kind for t in broken.truth} == {"void", "chip"}
+    assert all(t.missing_mm3 > 3.0 for t in broken.truth)
+    assert broken.repaired_ratio is not None
+    assert broken.repaired_ratio >= 0.85
+    assert broken.report.repair_prints
+    assert all(p.ok for p in (*broken.report.job_prints, *broken.report.repair_prints))
+
+
+def test_the_printer_runs_far_ahead_of_the_clock(broken: SimulatedRun) -> None:
+    # machines differ, a thousand-fold margin does not: virtual time must really jump
+    assert broken.printer_clock_s > 2.0 * broken.print_wall_s
+
+
+def test_a_result_has_the_keys_of_the_contract(broken: SimulatedRun) -> None:
+    result = result_of(broken)
+    assert set(result) >= KEYS
+    assert result["iterations"] == len(broken.report.repair_prints)
+    assert all({"type", "volume_mm3", "box_mm", "reachable_ratio"} <= set(r)
+               for r in result["regions"])  # type: ignore[attr-defined]  # fmt: skip
+
+
+def test_every_repair_starts_and_ends_parked(broken: SimulatedRun) -> None:
+    for look in broken.report.looks:
+        if look.plan.patch is not None and look.printed:
+            places = [p for move in look.plan.patch.toolpath if hasattr(move, "points_mm")
+                      for p in np.asarray(move.points_mm)]  # fmt: skip
+            assert places[-1][:2] == pytest.approx(broken.prepared.setup.printer.park_mm[:2])
+
+
+def test_looks_become_pictures(broken: SimulatedRun) -> None:
+    first = broken.report.looks[0]
+    shown = look_of(first.plan, "first", printed=first.printed)
+    assert shown.missing is not None
+    assert shown.beads is not None
+    assert len(shown.points_mm) == len(shown.label_of_point)
+
+
+@pytest.mark.parametrize("process", ["repair_0.20", "standard_0.20"])
+def test_a_clean_print_is_left_alone(template: MeshSdf, process: str) -> None:
+    run = simulate_run(prepared(template, process=process))
+    assert run.repaired_ratio is None
+    assert not run.report.repair_prints
+    assert len(run.report.looks) == 2  # one on the way, one at the end
+
+
+def test_the_same_seed_gives_the_same_result(template: MeshSdf) -> None:
+    twice = [
+        result_of(simulate_run(prepared(template, "void:diameter=6,layers=2"))) for _ in range(2)
+    ]
+    assert twice[0] == twice[1]
+
+
+def test_excess_is_reported_and_nothing_is_printed(template: MeshSdf) -> None:
+    run = simulate_run(prepared(template, "blob:size=5,height=1.5"))
+    assert not run.report.repair_prints
+    assert not run.report.within_tolerance
+    assert result_of(run)["excess_mm3_before"] > 3.0  # type: ignore[operator]
+
+
+def test_a_declined_repair_is_not_printed(template: MeshSdf) -> None:
+    asked: list[RepairPlan] = []
+
+    def decline(plan: RepairPlan) -> bool:
+        asked.append(plan)
+        return False
+
+    run = simulate_run(prepared(template, "void:diameter=7,layers=3"), approve=decline)
+    assert asked
+    assert not run.report.repair_prints
+    assert any(look.declined for look in run.report.looks)
+    assert not run.report.within_tolerance
+
+
+def test_heaters_are_off_when_the_loop_breaks(template: MeshSdf, tmp_path: Path) -> None:
+    log = tmp_path / "wire.log"
+
+    def fail(look: Look) -> None:
+        raise LoopError("the scanner caught fire")
+
+    with pytest.raises(LoopError, match="fire"):
+        simulate_run(prepared(template), record=fail, wire_log=log)
+    tail = log.read_bytes()[-2000:].decode(errors="replace")
+    assert "M104 S0" in tail
+    assert "M140 S0" in tail
+
+
+def test_stops_are_after_layers_that_there_are(template: MeshSdf) -> None:
+    job = prepared(template).job
+    stops = plan_stops(job, [5, 3, 5])
+    assert [stop.layer_index for stop in stops] == [3, 5, None]
+    assert stops[0].line == job.layers[4].first_line
+    with pytest.raises(LoopError, match="no layer 999"):
+        plan_stops(job, [999])
+
+
+def test_a_part_larger_than_the_bed_is_refused_and_can_be_scaled() -> None:
+    setup: PrintSetup = load_setup()
+    large = np.array([[0.0, 0.0, 0.0], [400.0, 100.0, 50.0]])
+    with pytest.raises(InputError, match="larger than the"):
+        place_on_bed(large, setup)
+    factor = scale_to_fit(large, setup)
+    place_on_bed(large * factor, setup)
+    assert 0.5 < factor < 0.6
+
+
+def test_error_trees_carry_exit_codes() -> None:
+    assert (AmrepairError("x").exit_code, LoopError("x").exit_code, LinkError("x").exit_code) == (
+        2, 4, 4,
+    )  # fmt: skip

@@ -1,0 +1,132 @@
+"""Alignment: known poses come back; what cannot be aligned is an error, never a guess."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from jaxtyping import Float
+
+from amrepair.align import align
+from amrepair.align.coarse import cube_rotations
+from amrepair.errors import AlignmentError, InputError
+from amrepair.frames import Transform, rotation_from_vector
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf, load_mesh
+
+BRACKET = Path(__file__).parents[2] / "examples" / "parts" / "bracket.stl"
+
+
+@pytest.fixture(scope="module")
+def template() -> MeshSdf:
+    return MeshSdf.from_mesh(load_mesh(BRACKET))
+
+
+def cloud(template: MeshSdf, *, sigma_mm: float, seed: int) -> Float[np.ndarray, "n 3"]:
+    points, _ = trimesh.sample.sample_surface(template.mesh, 30_000, seed=seed)
+    rng = np.random.default_rng(seed)
+    return np.asarray(points) + rng.normal(size=points.shape) * sigma_mm
+
+
+def pose(seed: int, *, turn_rad: float, shift_mm: float) -> Transform:
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    return Transform.from_rotation_translation(
+        "template",
+        "scanner",
+        rotation=rotation_from_vector(turn_rad * axis / np.linalg.norm(axis)),
+        translation_mm=shift_mm * rng.normal(size=3),
+    )
+
+
+def worst_mm(found: Transform, truth: Transform, points: Float[np.ndarray, "n 3"]) -> float:
+    return float(np.linalg.norm(found.apply(points) - truth.apply(points), axis=1).max())
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_guess_is_refined_to_hundredths_with_a_piece_missing(
+    template: MeshSdf, seed: int
+) -> None:
+    points = cloud(template, sigma_mm=0.04, seed=seed)
+    points = points[np.linalg.norm(points - points[77], axis=1) > 6.0]
+    error = pose(seed, turn_rad=np.deg2rad(0.3), shift_mm=0.3)
+    truth = Transform.identity("template", "scanner")
+    scan = Scan(points, 0.04, "scanner")
+    found = align(scan, template, guess=error, rng=np.random.default_rng(0))
+    assert worst_mm(found.template_from_scan, truth, points) < 0.03
+    assert found.inlier_ratio > 0.98
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_any_pose_is_found(template: MeshSdf, seed: int) -> None:
+    truth = pose(seed, turn_rad=2.5, shift_mm=60.0)
+    points = truth.inverse().apply(cloud(template, sigma_mm=0.04, seed=seed))
+    found = align(Scan(points, 0.04, "scanner"), template, rng=np.random.default_rng(0))
+    assert worst_mm(found.template_from_scan, truth, points) < 0.05
+    assert not found.symmetric_alternatives
+
+
+def test_the_same_seed_gives_the_same_pose(template: MeshSdf) -> None:
+    scan = Scan(cloud(template, sigma_mm=0.04, seed=5), 0.04, "scanner")
+    guess = pose(1, turn_rad=0.003, shift_mm=0.2)
+    twice = [align(scan, template, guess=guess, rng=np.random.default_rng(3)) for _ in range(2)]
+    assert np.array_equal(*(t.template_from_scan.matrix for t in twice))
+
+
+def test_a_symmetric_part_reports_its_other_poses() -> None:
+    plate = MeshSdf.from_mesh(trimesh.creation.box((40.0, 24.0, 8.0)))
+    points, _ = trimesh.sample.sample_surface(plate.mesh, 20_000, seed=1)
+    found = align(Scan(np.asarray(points), 0.03, "scanner"), plate)
+    assert len(found.symmetric_alternatives) == 3  # a box maps onto itself in four ways
+
+
+def test_the_bed_tells_a_layer_that_is_low_from_a_part_that_is_low() -> None:
+    block = MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (40, 30, 10))))
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 40, 20_000), rng.uniform(0, 30, 20_000)
+    top = np.column_stack([x, y, np.full(20_000, 9.7)])  # all of it 0.3 mm low
+    walls, _ = trimesh.sample.sample_surface(block.mesh, 12_000, seed=1)
+    walls = np.asarray(walls)[(np.asarray(walls)[:, 2] > 0.1) & (np.asarray(walls)[:, 2] < 9.6)]
+    bed = np.column_stack([rng.uniform(-8, 48, (9_000, 2)), np.zeros(9_000)])
+    bed = bed[(bed[:, 0] < -0.5) | (bed[:, 0] > 40.5) | (bed[:, 1] < -0.5) | (bed[:, 1] > 30.5)]
+    points = np.concatenate([top, walls, bed])
+    points = points + rng.normal(size=points.shape) * 0.03
+    guess = pose(2, turn_rad=0.001, shift_mm=0.1)
+    found = align(Scan(points, 0.03, "scanner"), block, guess=guess)
+    moved = found.template_from_scan.apply(np.array([[20.0, 15.0, 9.7]]))
+    assert moved[0, 2] == pytest.approx(9.7, abs=0.03)
+
+
+def test_another_part_is_refused(template: MeshSdf) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
+    with pytest.raises(AlignmentError, match="does not fit"):
+        align(Scan(np.asarray(ball.vertices), 0.03, "scanner"), template)
+
+
+def test_a_part_far_from_its_guess_is_refused(template: MeshSdf) -> None:
+    points = cloud(template, sigma_mm=0.03, seed=0)
+    far = pose(4, turn_rad=0.0, shift_mm=9.0)
+    with pytest.raises(AlignmentError):
+        align(Scan(points, 0.03, "scanner"), template, guess=far)
+
+
+@pytest.mark.parametrize(("factor", "hint"), [(1e-3, "metres"), (25.0, "same part")])
+def test_another_unit_is_told(template: MeshSdf, factor: float, hint: str) -> None:
+    points = cloud(template, sigma_mm=0.0, seed=0) * factor
+    with pytest.raises(AlignmentError, match=hint):
+        align(Scan(points, 0.03, "scanner"), template)
+
+
+def test_few_points_and_unknown_methods_are_refused(template: MeshSdf) -> None:
+    with pytest.raises(AlignmentError, match="needs"):
+        align(Scan(np.zeros((3, 3)), 0.03, "scanner"), template)
+    with pytest.raises(InputError, match="unknown"):
+        align(Scan(cloud(template, sigma_mm=0, seed=0), 0.03, "scanner"), template, method="magic")
+
+
+def test_a_cube_turns_in_24_ways() -> None:
+    turns = np.array(cube_rotations())
+    assert len(np.unique(turns.reshape(-1, 9), axis=0)) == 24
+    assert np.linalg.det(turns) == pytest.approx(np.ones(24))

@@ -1,0 +1,198 @@
+"""The checker: a good program passes, and every planted fault is refused by name."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcode.check import CheckedProgram, CheckReport, check, find_refusals
+from gcode.errors import CheckRefusedError, LocalProtocolError
+from gcode.moves import ModalState, Program
+from gcode.profiles import load_setup
+from gcode.surfaces import HeightField
+
+SETUP = load_setup()
+GOOD = """; a good program
+G21
+G90
+M83
+M104 S215
+M140 S60
+M190 S60
+M109 S215
+G28 W
+G92 E0
+G1 Z0.3 F720
+G1 X50 Y50 F6000
+G1 X90 E3 F1000
+G1 E-0.8 F2100
+G1 Z1 F720
+G1 X60 Y60 F6000
+G1 Z0.5
+G1 E0.8 F2100
+G1 X80 E0.7 F1200
+G3 X80 Y70 I0 J5 E0.5
+G1 E-0.8 F2100
+G1 Z10 F720
+M104 S0
+M140 S0
+M107
+M84
+"""
+MID = ModalState((60.0, 60.0, 5.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+
+
+def program(text: str) -> Program:
+    return Program(text, SETUP.printer.dialect)
+
+
+def test_a_good_program_passes() -> None:
+    checked = check(program(GOOD), SETUP)
+    assert isinstance(checked, CheckedProgram)
+    assert checked.lines(0, 2) == ("; a good program", "G21")
+    assert not checked.report.swept
+
+
+FAULTS = {
+    "x out of reach": ("G1 X90 E3 F1000", "G1 X290 E3 F1000", "X out of reach"),
+    "y out of reach": ("Y50 F6000", "Y-20 F6000", "Y out of reach"),
+    "too high": ("G1 Z10 F720", "G1 Z400 F720", "Z out of reach"),
+    "below the bed": ("G1 Z0.5", "G1 Z-0.5", "Z out of reach"),
+    "hotend too hot": ("M109 S215", "M109 S350", "hotend temperature"),
+    "bed too hot": ("M190 S60", "M190 S150", "bed temperature"),
+    "negative temperature": ("M140 S60", "M140 S-5", "bed temperature"),
+    "temperature without a number": ("M109 S215", "M109", "temperature missing"),
+    "not waited for": ("M109 S215\n", "", "cold extrusion"),
+    "never heated": ("M104 S215\n", "M104 S0\n", None),
+    "turned down before printing": ("G1 E0.8 F2100", "M104 S100\nG1 E0.8 F2100", "cold extrusion"),
+    "bead too thick": ("X80 E0.7", "X80 E17", "bead too thick"),
+    "melts too much": ("X80 E0.7 F1200", "X80 E3.5 F12000", "melts more"),
+    "absolute values in relative mode": ("X80 E0.7", "X80 E210.7", "bead too thick"),
+    "relative mode lost": ("M83\n", "M82\n", None),
+    "blob while standing": ("G1 E0.8 F2100", "G1 E80 F2100", "standing still"),
+    "pulls the filament out": ("G1 E-0.8 F2100\nG1 Z1", "G1 E-90 F2100\nG1 Z1", "pulls filament"),
+    "moves before homing": ("G28 W\n", "", "before homing"),
+    "heater left on": ("M104 S0\n", "", "left on"),
+    "bed left on": ("M140 S0\n", "", "left on"),
+    "unknown command": ("M107\n", "M9999\n", "unknown"),
+    "cold extrusion allowed": ("M83\n", "M83\nM302 S0\n", "unknown or not allowed"),
+    "steps changed": ("M83\n", "M83\nM92 E500\n", "not allowed"),
+    "settings stored": ("M83\n", "M83\nM500\n", "not allowed"),
+    "home offset": ("M83\n", "M83\nM206 Z5\n", "not allowed"),
+    "frame shifted": ("G1 Z0.5", "G92 Z0\nG1 Z0.5", "coordinate system"),
+    "feed of zero": ("X80 E0.7 F1200", "X80 E0.7 F0", "feed"),
+    "feed in another unit": ("X80 E0.7 F1200", "X80 E0.7 F1200000", "feed"),
+    "two numbers in one word": ("X80 E0.7", "X8.0.1 E0.7", "no number"),
+    "not a number": ("X80 E0.7", "Xnan E0.7", None),
+    "axis without a number": ("X80 E0.7", "X E0.7", "without a number"),
+    "a word twice": ("X80 E0.7", "X80 X85 E0.7", "twice"),
+    "named command": ("M107\n", "DROP_EVERYTHING\n", "unknown"),
+    "a line cut by the firmware": ("G1 X80 E0.7", "G1 X80" + " " * 100 + "E0.7", "line too long"),
+    "not ascii": ("G1 X80 E0.7", "G1 X80 É0.7", "character"),
+    "arc off its circle": ("I0 J5 E0.5", "I0 J9 E0.5", "two circles"),
+    "arc by radius": ("I0 J5 E0.5", "R5 E0.5", "radius"),
+    "arc beyond the bed": (
+        "G3 X80 Y70 I0 J5 E0.5",
+        "G1 X245 E0 F6000\nG3 X245 Y80 I0 J10 E1",
+        "out of reach",
+    ),
+    "firmware retraction": ("G1 E-0.8 F2100\nG1 Z1", "G10\nG1 Z1", "firmware retraction"),
+    "flow factor": ("M83\n", "M83\nM221 S900\n", "flow factor"),
+    "speed factor": ("M83\n", "M83\nM220 S900\n", "speed factor"),
+    "machine limit": ("M83\n", "M83\nM203 Z9000\n", "machine limit"),
+    "inches": ("G21\n", "G20\n", "out of reach"),
+    "relative moves": ("G1 X80 E0.7", "G91\nG1 X200 E0.7", "out of reach"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_refused(name: str) -> None:
+    old, new, said = FAULTS[name]
+    assert old in GOOD
+    text = GOOD.replace(old, new, 1)
+    if name == "never heated":
+        text = text.replace("M109 S215", "M109 S20")
+    if name == "relative mode lost":  # E falls back, then pushes what it seems to owe
+        text = text.replace("X80 E0.7", "X80 E40")
+    refusals = find_refusals(program(text), SETUP)
+    assert refusals, name
+    if said is not None:
+        assert any(said in refusal.what for refusal in refusals), [str(r) for r in refusals]
+
+
+def test_a_refusal_names_line_move_value_and_limit() -> None:
+    with pytest.raises(CheckRefusedError, match=r"line 13 .*'G1 X290.*290 mm, limit 0 to 250") as e:
+        check(program(GOOD.replace("G1 X90 E3 F1000", "G1 X290 E3 F1000")), SETUP)
+    assert {refusal.what for refusal in e.value.refusals} == {"X out of reach"}
+
+
+@pytest.mark.parametrize("text", ["G28\n", "G28 Z\n", "G28 X Z\n", "G29\n", "G80\n"])
+def test_nothing_homes_or_probes_onto_a_standing_part(text: str) -> None:
+    refusals = find_refusals(program(text), SETUP, initial=MID)
+    assert any("standing part" in refusal.what for refusal in refusals)
+    assert not find_refusals(program("G28 X Y\n"), SETUP, initial=MID)
+
+
+def test_only_the_checker_makes_the_proof() -> None:
+    with pytest.raises(LocalProtocolError):
+        CheckedProgram(program(GOOD), "prusa_mk3s", CheckReport(0, 0, False, None))
+    checked = check(program(GOOD), SETUP)
+    for steal in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(LocalProtocolError):
+            steal(checked)
+
+
+def standing(height_mm: float, x0: float, x1: float) -> HeightField:
+    """A wall from x0 to x1 along y, on a bare bed."""
+    z = np.zeros((600, 600))
+    z[:, round(x0 / 0.25) : round(x1 / 0.25)] = height_mm
+    return HeightField(np.zeros(2), 0.25, z, np.ones((600, 600), bool))
+
+
+def travel(x0: float, x1: float, z: float) -> str:
+    return f"G1 X{x0} Y60 Z{z} F3000\nG1 X{x1} Y60\n"
+
+
+def test_a_travel_into_the_part_is_refused_and_one_above_it_passes() -> None:
+    wall = standing(10.0, 80.0, 84.0)
+    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    low, high = travel(60, 100, 9.0), travel(60, 100, 10.5)
+    refusals = find_refusals(program(low), SETUP, as_built=wall, initial=start)
+    assert any("hits what stands there" in r.what for r in refusals)
+    assert not find_refusals(program(high), SETUP, as_built=wall, initial=start)
+
+
+@pytest.mark.parametrize(("gap", "hits"), [(6.0, True), (40.0, False)])
+def test_the_heater_block_is_a_body_too(gap: float, hits: bool) -> None:
+    # the tip stays beside a wall 7 mm higher: the block, 4.5 mm above the tip, must not meet it
+    wall = standing(8.0, 80.0, 84.0)
+    start = ModalState((10.0, 60.0, 30.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    x = 80.0 - gap
+    text = f"G1 X{x} Y60 F3000\nG1 Z1 F600\n"
+    refusals = find_refusals(program(text), SETUP, as_built=wall, initial=start)
+    assert bool(refusals) == hits
+    if hits:
+        assert any("block" in r.what for r in refusals)
+
+
+def test_what_is_laid_stands_in_the_way_of_what_follows() -> None:
+    bare = HeightField.flat((150.0, 150.0), 0.25)
+    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    tower = "".join(f"G1 Z{0.2 * k:.1f} F600\nG1 X{70 - 10 * (k % 2)} E0.4 F1200\n"
+                    for k in range(1, 12))  # fmt: skip
+    through = tower + "G1 X65 Y70 F6000\nG1 Z0.4 F600\nG1 Y50 F6000\n"
+    assert not find_refusals(program(tower), SETUP, as_built=bare, initial=start)
+    assert find_refusals(program(through), SETUP, as_built=bare, initial=start)
+
+
+@pytest.mark.skipif("AMREPAIR_DATA" not in os.environ, reason="AMREPAIR_DATA is not set")
+@pytest.mark.parametrize("name", ["plant-sign", "prusaslicer-cube", "screw", "vase"])
+def test_real_files_for_this_printer_pass(name: str) -> None:
+    path = Path(os.environ["AMREPAIR_DATA"]) / "gcode" / f"{name}.gcode"
+    text = path.read_text(errors="replace")
+    assert not find_refusals(program(text), SETUP)

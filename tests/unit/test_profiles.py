@@ -1,0 +1,92 @@
+"""Profiles: everything shipped loads; what is wrong is named with file, key and limit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gcode.errors import ProfileError
+from gcode.profiles import (
+    expand_script,
+    list_profiles,
+    load_material,
+    load_printer,
+    load_process,
+    load_setup,
+)
+
+
+@pytest.mark.parametrize("name", list_profiles("printers"))
+def test_every_shipped_printer_loads_and_fits_its_own_bed(name: str) -> None:
+    printer = load_printer(name)
+    x0, y0, x1, y1 = printer.reach_box_mm
+    for x, y, z in (printer.park_mm, printer.prime_mm):
+        assert x0 <= x <= x1
+        assert y0 <= y <= y1
+        assert 0 <= z <= printer.max_z_mm
+    assert printer.envelope[0].z_from_mm == 0
+    assert len(printer.sha256) == 64
+
+
+@pytest.mark.parametrize("name", list_profiles("materials"))
+def test_every_shipped_material_suits_the_default_printer(name: str) -> None:
+    assert load_setup(material=name).material.id == name
+
+
+@pytest.mark.parametrize("name", list_profiles("processes"))
+def test_every_shipped_process_loads(name: str) -> None:
+    assert load_process(name).layer_height_mm <= 0.8 * 0.4
+
+
+def test_a_user_profile_inherits_and_changes_its_hash(tmp_path: Path) -> None:
+    own = tmp_path / "mine.toml"
+    own.write_text('inherits = "prusa_mk3s"\nname = "Mine"\nmax_z_mm = 100.0\n')
+    printer = load_printer(own)
+    assert (printer.id, printer.max_z_mm) == ("mine", 100.0)
+    assert printer.bed_size_mm == load_printer("prusa_mk3s").bed_size_mm
+    assert printer.sha256 != load_printer("prusa_mk3s").sha256
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('inherits = "pla"\ncolour = "red"\n', "colour"),
+        ('inherits = "pla"\nfan_ratio = 1.5\n', "fan_ratio"),
+        ('inherits = "nothing"\n', "Unknown material"),
+        ('inherits = "other.toml"\n', "no such profile file"),
+        ("name = ", "not valid TOML"),
+        ('name = "bare"\n', "missing"),
+    ],
+)
+def test_a_wrong_profile_is_refused_in_one_sentence(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(text)
+    with pytest.raises(ProfileError, match=said):
+        load_material(path)
+
+
+def test_a_circle_of_inheritance_is_refused(tmp_path: Path) -> None:
+    for one, other in (("a", "b"), ("b", "a")):
+        (tmp_path / f"{one}.toml").write_text(f'inherits = "{other}"\n')
+    with pytest.raises(ProfileError, match="circle"):
+        load_material(tmp_path / "a.toml")
+
+
+def test_an_unknown_printer_names_the_known_ones() -> None:
+    with pytest.raises(ProfileError, match="prusa_mk3s"):
+        load_printer("toaster")
+
+
+def test_a_material_too_hot_for_the_printer_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "hot.toml"
+    path.write_text('inherits = "pla"\nname = "hot"\nhotend_c = 400.0\n')
+    with pytest.raises(ProfileError, match="400"):
+        load_setup(material=path)
+
+
+def test_a_script_with_an_unknown_name_is_refused() -> None:
+    setup = load_setup()
+    assert expand_script(("M104 S{hotend_c}",), setup) == ("M104 S210",)
+    with pytest.raises(ProfileError, match="nonsense"):
+        expand_script(("M104 S{nonsense}",), setup)

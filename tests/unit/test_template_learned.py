@@ -1,0 +1,140 @@
+"""The learned and the planned template: near to exact fields, files that are refused in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.errors import TemplateError
+from amrepair.template import LearnedSdf, MeshSdf, PlannedSdf, fit_template, load_or_fit
+
+KNOB = Path(__file__).parents[2] / "examples" / "parts" / "knob.stl"
+
+
+@pytest.fixture(scope="module")
+def knob() -> LearnedSdf:
+    return fit_template(KNOB, seed=1)
+
+
+@pytest.fixture(scope="module")
+def exact(knob: LearnedSdf) -> MeshSdf:
+    return MeshSdf.from_mesh(knob.mesh)
+
+
+def test_the_surface_lies_where_it_should(knob: LearnedSdf) -> None:
+    points, _ = trimesh.sample.sample_surface(knob.mesh, 40_000, seed=9)
+    error_mm = np.abs(knob.distance(np.asarray(points)))
+    assert error_mm.mean() < 0.012
+    assert np.quantile(error_mm, 0.99) < 0.1
+    assert np.quantile(error_mm, 0.99) < 1.5 * knob.bias_mm
+
+
+@pytest.mark.parametrize("offset_mm", [0.05, 0.5, 2.0])
+def test_distances_and_signs_hold_away_from_it(
+    knob: LearnedSdf, exact: MeshSdf, offset_mm: float
+) -> None:
+    points, _ = trimesh.sample.sample_surface(knob.mesh, 20_000, seed=4)
+    rng = np.random.default_rng(0)
+    way = rng.normal(size=points.shape)
+    away = np.asarray(points) + offset_mm * way / np.linalg.norm(way, axis=1, keepdims=True)
+    truth, found = exact.distance(away), knob.distance(away)
+    assert np.abs(found - truth).mean() < 0.01 + 0.01 * offset_mm
+    wrong = (np.sign(found) != np.sign(truth)) & (np.abs(truth) > 0.15)
+    assert wrong.mean() < 1e-4
+
+
+def test_far_points_are_far(knob: LearnedSdf, exact: MeshSdf) -> None:
+    far = np.array([[200.0, 0.0, 0.0], [0.0, -300.0, 50.0], [0.0, 0.0, 500.0]])
+    assert knob.distance(far) == pytest.approx(exact.distance(far), rel=0.1)
+
+
+def test_gradients_point_outwards(knob: LearnedSdf) -> None:
+    points, normals = knob.surface_points(1.5)
+    _, gradient = knob.distance_and_gradient(points)
+    agree = np.einsum("ij,ij->i", gradient, normals)
+    assert np.median(agree) > 0.99
+    assert (agree > 0.7).mean() > 0.9
+
+
+def test_a_file_comes_back_bit_for_bit(knob: LearnedSdf, tmp_path: Path) -> None:
+    path = tmp_path / "knob.safetensors"
+    knob.save(path)
+    again = LearnedSdf.load(path)
+    points = np.random.default_rng(0).uniform(*knob.bounds_mm, (5_000, 3))
+    assert np.array_equal(again.distance(points), knob.distance(points))
+    assert again.metadata["recipe"] == "fast"
+    assert again.solid().volume() == pytest.approx(knob.solid().volume())
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "foreign", "text"])
+def test_a_damaged_file_is_refused(knob: LearnedSdf, tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "t.safetensors"
+    if damage == "truncated":
+        knob.save(path)
+        path.write_bytes(path.read_bytes()[:5000])
+    elif damage == "foreign":
+        from safetensors.numpy import save_file
+
+        save_file({"weights": np.zeros(3)}, path)
+    elif damage != "missing":
+        path.write_bytes(b"" if damage == "empty" else b"not a template at all")
+    with pytest.raises(TemplateError, match=r"t\.safetensors"):
+        LearnedSdf.load(path)
+
+
+def test_the_cache_is_used_and_survives_damage(tmp_path: Path) -> None:
+    box = trimesh.creation.box((10.0, 8.0, 6.0))
+    first = load_or_fit(box, cache_dir=tmp_path)
+    (kept,) = tmp_path.glob("*.safetensors")
+    stamp = kept.stat().st_mtime_ns
+    second = load_or_fit(box, cache_dir=tmp_path)
+    assert kept.stat().st_mtime_ns == stamp
+    points = np.random.default_rng(0).uniform(-6, 6, (1000, 3))
+    assert np.array_equal(first.distance(points), second.distance(points))
+    kept.write_bytes(b"half")
+    assert load_or_fit(box, cache_dir=tmp_path).bias_mm == first.bias_mm
+
+
+def test_an_unknown_recipe_is_refused() -> None:
+    with pytest.raises(TemplateError, match="recipe"):
+        fit_template(KNOB, recipe="magic")
+
+
+def beads(gap: bool) -> PlannedSdf:
+    """A plate of parallel beads, 20×20 mm, five layers of 0.2 mm; one bead left out if asked."""
+    lines, pitch, height = 40, 0.5, 0.2
+    y = 10 + (np.arange(lines) + 0.5) * pitch
+    starts, ends = [], []
+    for k in range(5):
+        keep = np.ones(lines, bool)
+        if gap and k == 4:
+            keep[18:22] = False
+        z = np.full(keep.sum(), height * (k + 1))
+        starts.append(np.column_stack([np.full(keep.sum(), 10.0), y[keep], z]))
+        ends.append(np.column_stack([np.full(keep.sum(), 30.0), y[keep], z]))
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    section = np.full(len(start), pitch * height)
+    return PlannedSdf.from_beads(start, end, section, np.full(len(start), height))
+
+
+def test_a_planned_plate_is_where_its_beads_are() -> None:
+    plate = beads(gap=False)
+    middle = np.array([[20.0, 20.0, z] for z in (1.0, 1.3, 0.9, 0.6)])
+    assert plate.distance(middle) == pytest.approx([0.0, 0.3, -0.1, -0.4], abs=0.02)
+    assert plate.distance(np.array([[20.0, 8.0, 0.5]]))[0] == pytest.approx(2.0, abs=0.15)
+
+
+def test_an_open_groove_is_planned_to_be_open() -> None:
+    groove = beads(gap=True)
+    floor = np.array([[20.0, 20.0, 0.8]])
+    assert abs(groove.distance(floor)[0]) < 0.06
+    assert beads(gap=False).distance(floor)[0] == pytest.approx(-0.2, abs=0.03)
+
+
+def test_no_beads_no_template() -> None:
+    none = np.zeros((0, 3))
+    with pytest.raises(TemplateError, match="no beads"):
+        PlannedSdf.from_beads(none, none, np.zeros(0), np.zeros(0))
