@@ -88,10 +88,14 @@ def make_method(name: str, *, checkpoint: Path | None = None) -> Method:
     if name not in METHODS:
         raise InputError(f"the method '{name}' is unknown; choose from {', '.join(METHODS)}")
     base, pam = name.removesuffix(PAM), name.endswith(PAM)
+    if name == "pasdf":
+        from amrepair.bench.house import FieldMethod
+
+        return FieldMethod()
     if name in OWN or pam:
         raise InputError(
-            f"the method '{name}' needs the learned template and the alignment, which this "
-            "version does not have yet; choose a baseline without +pam"
+            f"the method '{name}' needs the published recipe and alignment (PAM), which this "
+            "version does not have yet; choose pasdf, or a baseline without +pam"
         )
     features = _extractors(base, pam=pam, checkpoint=checkpoint)
     return BankMethod(features, base.startswith("patchcore"))

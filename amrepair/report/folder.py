@@ -32,12 +32,20 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        there = next(p for p in (path, *path.absolute().parents) if p.exists())
-        if not there.is_dir() or not os.access(there, os.W_OK):
+        new = [p for p in (path.absolute(), *path.absolute().parents) if not p.exists()]
+        probe = path / f".write-test-{os.getpid()}"
+        try:  # permissions alone do not tell: a file system may refuse root, too
+            path.mkdir(parents=True, exist_ok=True)
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
             raise InputError(
-                f"the output folder {path} cannot be written ({there} does not allow it); name "
-                "another one"
-            )
+                f"the output folder {path} cannot be written ({error.strerror}); name another one"
+            ) from error
+        finally:
+            for folder in new:
+                if folder.is_dir():
+                    folder.rmdir()
 
     def file(self, name: str) -> Path:
         """Path of a file in the folder, which is there from now on."""
@@ -45,12 +53,7 @@ class RunFolder:
         return self.path / name
 
     def _make(self) -> None:
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"the output folder {self.path} cannot be made ({error.strerror})"
-            ) from error
+        self.path.mkdir(parents=True, exist_ok=True)
 
     def write_text(self, name: str, text: str) -> Path:
         """Write a text whole or not at all."""
