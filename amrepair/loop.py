@@ -15,7 +15,7 @@ import numpy as np
 
 from amrepair.errors import LoopError
 from amrepair.frames import Transform
-from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
+from amrepair.repair import MIN_REPAIR_MM3, RepairPlan, Site, Stopwatch, plan_repair
 from amrepair.scans import Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram, check
 from gcode.errors import GcodeError
@@ -30,6 +30,8 @@ MAX_ITERATIONS = 3
 PARK_LIFT_MM = 10.0
 # A repair that leaves more than this share of what it found has met something else than noise.
 STUCK_RATIO = 0.8
+# Of what was missing at a stop, this share may be left, and as much may stand out.
+LEFT_RATIO = 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +107,41 @@ class LoopReport:
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether every stop was left within tolerance."""
-        return all(look.plan.within_tolerance for look in self.last_looks)
+        """Whether every stop was left within tolerance (`left_well`)."""
+        found_mm3, well = 0.0, True
+        for stop in self.stops:
+            looks = self.at_stop(stop)
+            found_mm3 += looks[0].plan.deficit.missing_mm3
+            well = well and left_well(looks, found_mm3)
+        return well
+
+
+def left_well(looks: Sequence[Look], found_mm3: float) -> bool:
+    """Whether a stop was left within tolerance.
+
+    Nothing that is worth a repair is left, beyond a share of what was found; and no more than
+    that share stands out: a repair's own rims are not a new defect.
+
+    Parameters
+    ----------
+    looks
+        Those of the stop.
+    found_mm3
+        Volume found missing in the job so far: a later look sees earlier repairs, too.
+    """
+    last = looks[-1].plan
+    if last.within_tolerance:
+        return True
+    allowed_mm3 = LEFT_RATIO * found_mm3
+    missing_mm3 = sum(region.volume_mm3 for region in last.to_fill)
+    excess_mm3 = sum(region.volume_mm3 for region in last.too_much)
+    before_mm3 = sum(region.volume_mm3 for region in looks[0].plan.too_much)
+    unmended_mm3 = min(before_mm3, excess_mm3)  # excess that was there before the repair
+    return (
+        missing_mm3 <= allowed_mm3
+        and excess_mm3 - unmended_mm3 <= allowed_mm3
+        and unmended_mm3 <= max(allowed_mm3, MIN_REPAIR_MM3)
+    )
 
 
 def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[Stop, ...]:
@@ -199,7 +234,8 @@ def run_loop(
                 )
                 before = looks[-1] if looks and looks[-1].stop == stop else None
                 wanted = plan.checked is not None and iteration < max_iterations
-                wanted = wanted and not _stuck(before, plan)
+                here = [look for look in looks if look.stop == stop]
+                wanted = wanted and not _stuck(before, plan) and not _done(here, plan)
                 granted = wanted and approve(plan)
                 look = Look(
                     len(looks) + 1,
@@ -262,6 +298,14 @@ def _stuck(before: Look | None, plan: RepairPlan) -> bool:
     if before is None or not before.printed:
         return False
     return plan.deficit.missing_mm3 > STUCK_RATIO * before.plan.deficit.missing_mm3
+
+
+def _done(looks: Sequence[Look], plan: RepairPlan) -> bool:
+    """Whether what is left is a small share of what was found: more passes would only add rims."""
+    if not looks:
+        return False
+    left_mm3 = sum(region.volume_mm3 for region in plan.to_fill)
+    return left_mm3 <= LEFT_RATIO * looks[0].plan.deficit.missing_mm3
 
 
 def _park(printer: Printer, setup: PrintSetup, state: ModalState) -> ModalState:

@@ -247,14 +247,12 @@ def decision_of(look: LoopLook) -> Decision:
         choice = "fill now"
     elif look.declined:
         choice = "leave: the operator declined"
-    elif plan.within_tolerance:
-        choice = "go on"
-    elif not plan.to_fill:
-        choice = "go on: only excess, which printing cannot take away"
+    elif plan.within_tolerance or not plan.to_fill:
+        choice = "go on" if plan.within_tolerance else "go on: printing cannot take excess away"
     elif plan.checked is None:
         choice = "go on: nothing of it can be reached"
     else:
-        choice = "go on: the last repair changed next to nothing, or was the last one allowed"
+        choice = "go on: little is left, or the last repair changed little or was the last allowed"
     if plan.unreachable_mm3 > 0:
         found.append(f"The nozzle cannot reach {plan.unreachable_mm3:.1f} mm³.")
     return Decision(f"{look.stop.label}, z = {look.stop.z_mm:.2f} mm", choice, tuple(found))

@@ -52,14 +52,14 @@ LEAST_THICK_MM = 0.06
 # A bead thicker than this share of the bore no longer presses onto its floor.
 MOST_THICK_NOZZLES = 0.8
 # The floor was measured, the deficit computed from it: they agree within this.
-AGREE_MM = 0.08
+AGREE_MM = 0.04
 # A gap of more than this share of the thickest bead is not filled from above.
 DEEP_RATIO = 1.7
 HOLD_MM = 0.6  # how far a bead may hang over a hole beside what holds it
 STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4
 LEAST_SECTION_MM2 = 0.004
-SPREAD_NOZZLES = 2.0  # from a bead's centre, as far as plastic is pressed sideways
+SPREAD_NOZZLES = 1.6  # from a bead's centre, as far as plastic is pressed sideways
 ROUNDING_MM = 2e-3  # more than the text's last digit
 NEAR_MM = 1.0  # a travel as short as this needs no lift
 CLEAR_MM = 0.5  # of the tip over everything on a travel
