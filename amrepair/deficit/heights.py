@@ -110,4 +110,7 @@ def _footprint(
     covered = np.zeros(shape, bool)
     covered[index[ok, 1], index[ok, 0]] = True
     reach = max(1, round(0.9 / cell_mm))
-    return np.asarray(ndimage.binary_dilation(covered, iterations=reach))
+    # closed, not grown: a rim of unseen cells around the part would bar the nozzle from its edges
+    padded = np.pad(covered, reach + 1)
+    closed = ndimage.binary_closing(padded, iterations=reach)
+    return np.asarray(closed[reach + 1 : -reach - 1, reach + 1 : -reach - 1])

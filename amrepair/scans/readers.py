@@ -54,8 +54,8 @@ def read_scan(
     sigma_mm
         Noise of one point; None takes the file's word, else 0.04 mm.
     sensor_at
-        (3,) or (k, 3) origin of the rays, in `frame`; with several, each point goes to the
-        sensor that the file names, else to the nearest.
+        (3,) or (k, 3) origin of the rays, in `frame`; with several, the file must name the
+        sensor of each point.
     cell_mm, origin_mm
         Placement of height maps that do not carry it.
 
@@ -94,8 +94,14 @@ def _with_word(
     if sensor_at is not None:
         sensors = np.asarray(sensor_at, dtype=np.float64).reshape(-1, 3)
         if index is None or int(index.max()) >= len(sensors):
-            apart = np.linalg.norm(scan.points_mm[:, None, :] - sensors[None], axis=2)
-            index = np.argmin(apart, axis=1)
+            if len(sensors) > 1:
+                # a wrong ray crosses the part and calls it empty: the nearest is only a guess
+                raise InputError(
+                    f"{scan.source}: {len(sensors)} sensor positions are given, but the file does "
+                    "not say which of them saw each point; give one, or a PLY with a 'sensor' "
+                    "property"
+                )
+            index = np.zeros(len(scan.points_mm), np.int64)
     return Scan(
         points_mm=scan.points_mm,
         sigma_mm=scan.sigma_mm if sigma_mm is None else sigma_mm,

@@ -155,7 +155,7 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     result = json.loads(done.stdout)
     assert result["missing_mm3_before"] == pytest.approx(8 * 8 * 1.2, rel=0.08)
     assert result["missing_mm3_after"] is None
-    assert result["regions"][0]["reachable_ratio"] > 0.9
+    assert result["regions"][0]["reachable_ratio"] > 0.75
     text = out.read_text()
     homing = [line for line in text.splitlines() if line.startswith("G28")]
     assert homing == ["G28 X Y"]

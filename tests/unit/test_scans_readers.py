@@ -183,3 +183,12 @@ def test_damage_is_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_scan(tmp_path / "gone.ply", frame="scanner")
+
+
+def test_several_sensors_need_to_be_told_apart(tmp_path: Path) -> None:
+    # regression: the nearest sensor was taken, its rays crossed the part and called it empty
+    path = tmp_path / "scan.xyz"
+    path.write_text("0 0 0\n1 0 0\n0 1 0\n")
+    with pytest.raises(InputError, match="which of them saw each point"):
+        read_scan(path, frame="scanner", sensor_at=np.array([[0, 0, 300.0], [300.0, 0, 300.0]]))
+    assert read_scan(path, frame="scanner", sensor_at=(0, 0, 300.0)).sensor_index is not None
