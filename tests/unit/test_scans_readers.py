@@ -191,4 +191,4 @@ def test_several_sensors_need_to_be_told_apart(tmp_path: Path) -> None:
     path.write_text("0 0 0\n1 0 0\n0 1 0\n")
     with pytest.raises(InputError, match="which of them saw each point"):
         read_scan(path, frame="scanner", sensor_at=np.array([[0, 0, 300.0], [300.0, 0, 300.0]]))
-    assert read_scan(path, frame="scanner", sensor_at=(0, 0, 300.0)).sensor_index is not None
+    assert read_scan(path, frame="scanner", sensor_at=(0.0, 0.0, 300.0)).sensor_index is not None
