@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import amrepair
-from amrepair.cli import benchmark, inspect, mend, simulation, templates
+from amrepair.cli import benchmark, inspect, mend, printing, simulation, templates
 from amrepair.errors import AmrepairError
 from gcode.cli import console
 from gcode.errors import GcodeError
@@ -40,6 +40,7 @@ simulation.add_to(app)
 templates.add_to(app)
 inspect.add_to(app)
 mend.add_to(app)
+printing.add_to(app)
 benchmark.add_to(app)
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import manifold3d as m3
@@ -254,3 +255,49 @@ def test_send_prints_on_an_emulated_printer(tmp_path: Path) -> None:
         motion = machine.take_motion()
     assert motion.filament_mm.sum() == pytest.approx(3.0)
     assert call("send", job, "--port", "/dev/nothing", program="gcode").returncode == 4
+
+
+def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
+    chipped: dict[str, Path], tmp_path: Path
+) -> None:
+    from gcode.firmware import EmulatedPrinterProcess
+    from gcode.profiles import load_printer
+
+    placed = trimesh.load(chipped["part.stl"])
+    placed.apply_scale((1.0, 1.0, 0.15))
+    placed.export(tmp_path / "part.stl")
+    placed.apply_translation((100, 80, 0))
+    placed.export(tmp_path / "placed.stl")
+    job, drop, out = tmp_path / "job.gcode", tmp_path / "scans", tmp_path / "run"
+    drop.mkdir()
+    assert call("slice", tmp_path / "placed.stl", "-o", job, program="gcode").returncode == 0
+    stop = threading.Event()
+
+    def scan() -> None:
+        """A sensor that looks every second, whatever the printer does."""
+        rng = np.random.default_rng(0)
+        points, faces = trimesh.sample.sample_surface(placed, 60_000, seed=1)
+        points = np.asarray(points)[placed.face_normals[faces][:, 2] > -0.5]
+        k = 0
+        while not stop.wait(1.0):
+            k += 1
+            noisy = points + rng.normal(size=points.shape) * 0.03
+            np.savetxt(tmp_path / "partial.xyz", noisy, fmt="%.4f")
+            (tmp_path / "partial.xyz").rename(drop / f"scan{k}.xyz")
+
+    eye = threading.Thread(target=scan)
+    eye.start()
+    try:
+        with EmulatedPrinterProcess("prusa", printer=load_printer("prusa_mk3s")) as machine:
+            words = ["loop", job, "--template", tmp_path / "part.stl", "--port", machine.port]
+            words += ["--scanner", f"watch:{drop}", "--approve", "auto", "--out", out, "--json"]
+            done = call(*words)
+    finally:
+        stop.set()
+        eye.join()
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["iterations"] == 0  # the part is whole
+    assert result["missing_mm3_after"] is not None
+    assert (out / "report.html").is_file()
+    assert (out / "scan-1.ply").is_file()

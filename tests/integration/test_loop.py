@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from amrepair.errors import AmrepairError, InputError, LoopError
-from amrepair.loop import Look, plan_stops
+from amrepair.errors import AlignmentError, AmrepairError, InputError, LoopError
+from amrepair.loop import Look, locate_part, plan_stops
 from amrepair.repair import RepairPlan
 from amrepair.report.collect import look_of, loop_result
 from amrepair.simulate.defects import parse_defect
@@ -146,6 +146,20 @@ def test_heaters_are_off_when_the_loop_breaks(template: MeshSdf, tmp_path: Path)
     tail = log.read_bytes()[-2000:].decode(errors="replace")
     assert "M104 S0" in tail
     assert "M140 S0" in tail
+
+
+def test_the_part_is_found_in_its_job(template: MeshSdf) -> None:
+    run = prepared(template)
+    placed = locate_part(run.job, template, layer_height_mm=0.2)
+    corners = template.bounds_mm
+    truth = run.build_from_template.apply(corners)
+    assert np.abs(placed.apply(corners) - truth).max() < 0.03
+
+
+def test_another_part_is_not_found_in_the_job(template: MeshSdf) -> None:
+    other = MeshSdf.from_mesh(trimesh.creation.box((30.0, 18.0, 6.0)))
+    with pytest.raises(AlignmentError):
+        locate_part(prepared(template).job, other, layer_height_mm=0.2)
 
 
 def test_stops_are_after_layers_that_there_are(template: MeshSdf) -> None:
