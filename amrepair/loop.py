@@ -234,6 +234,7 @@ def run_loop(
                     title=f"repair of {stop.label}, pass {iteration + 1}",
                     guess=_guess(site, scanner),
                     interruption=parked,
+                    strict=False,
                     rng=rng,
                     watch=watch,
                     progress=progress,

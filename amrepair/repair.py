@@ -17,13 +17,14 @@ from jaxtyping import Bool, Float
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
-from amrepair.deficit import Deficit, compute_deficit
+from amrepair.deficit import Deficit, as_built_heights, compute_deficit
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
+from gcode.errors import CheckRefusedError
 from gcode.estimate import Estimate, estimate
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
@@ -38,6 +39,10 @@ MIN_REPAIR_MM3 = 2.0
 EXCESS_LAYERS = 2.0
 # A planned template ends below; so near to its end its distances are not to be trusted.
 PLANNED_EDGE_MM = 1.0
+AS_BUILT_CELL_MM = 0.25
+# Deeper inside than this, beyond a calibration's error, infill is open (or something is missing:
+# that tells nothing of the pose, either).
+OPEN_INFILL_MM = 0.5
 # Two poses whose repairs share less than this are two different repairs.
 SAME_REPAIR_RATIO = 0.8
 
@@ -106,6 +111,8 @@ class RepairPlan:
         Where the scan lies on the bed.
     scan
         What was judged, in the template's frame.
+    refused
+        Why the checker refused the program, where it did and the caller wanted to go on.
     """
 
     registration: Registration
@@ -117,6 +124,7 @@ class RepairPlan:
     build_from_scan: Transform
     layer_height_mm: float
     scan: Scan
+    refused: str = ""
 
     @property
     def to_fill(self) -> tuple[Region, ...]:
@@ -157,6 +165,7 @@ def plan_repair(
     title: str,
     guess: Transform | None = None,
     interruption: ModalState | None = None,
+    strict: bool = True,
     rng: np.random.Generator | None = None,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
@@ -171,6 +180,9 @@ def plan_repair(
         A pose (template from the scan's frame) known beforehand; None searches from any pose.
     interruption
         The state of the machine in mid-job; None makes a whole program for a standing part.
+    strict
+        Raise where the checker refuses the program; else return a plan without one, that says so:
+        a job must not die of a patch that is never sent.
 
     Raises
     ------
@@ -183,13 +195,14 @@ def plan_repair(
     """
     watch = watch or Stopwatch()
     with watch("align"):
-        registration = align(scan, site.template, guess=guess, rng=rng, progress=progress)
+        outer = _outside_open_infill(scan, site, guess)
+        registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
     placed = _build_from_template(site, scan, registration)
     build_from_scan = placed @ registration.template_from_scan
     with watch("detect"):
-        moved = scan.moved(registration.template_from_scan)
+        whole = scan.moved(registration.template_from_scan)
         expected = site.planned or site.template
-        moved = _in_view(moved, site)
+        moved = _in_view(whole, site)
         anomaly = detect(moved, expected, allowance_mm=site.allowance_mm, progress=progress)
     with watch("deficit"):
         deficit = compute_deficit(
@@ -200,6 +213,17 @@ def plan_repair(
             printed_z_mm=site.printed_z_mm,
             progress=progress,
         )
+        if site.planned is not None and anomaly.evidence is not None:
+            # what stands there is all that was seen, the bottoms of open cells too
+            standing = as_built_heights(
+                whole,
+                site.template,
+                anomaly.evidence,
+                build_from_template=placed,
+                printed_z_mm=site.printed_z_mm,
+                cell_mm=AS_BUILT_CELL_MM,
+            )
+            deficit = replace(deficit, as_built=standing)
         _refuse_ambiguity(scan, site, registration, deficit)
     layer_mm = site.setup.process.layer_height_mm
     fillable = _fillable(deficit)
@@ -223,7 +247,15 @@ def plan_repair(
         )
     with watch("check"):
         program = write(patch.toolpath, site.setup, title=title, resume=interruption, restore=False)
-        checked = check(program, site.setup, as_built=deficit.as_built, initial=interruption)
+        try:
+            checked = check(program, site.setup, as_built=deficit.as_built, initial=interruption)
+        except CheckRefusedError as error:
+            if strict:
+                raise
+            return RepairPlan(
+                registration, anomaly, deficit, patch, None, None, build_from_scan, layer_mm, moved,
+                refused=str(error),
+            )  # fmt: skip
         cost = estimate(program, site.setup.printer)
     return RepairPlan(
         registration, anomaly, deficit, patch, checked, cost, build_from_scan, layer_mm, moved
@@ -238,6 +270,14 @@ def _subset(scan: Scan, keep: Bool[np.ndarray, " n"]) -> Scan:
         normals=None if scan.normals is None else scan.normals[keep],
         sensor_index=None if scan.sensor_index is None else scan.sensor_index[keep],
     )
+
+
+def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Scan:
+    """Without the points that look into sparse infill: deep inside the part, as CAD has it."""
+    if site.planned is None or guess is None:
+        return scan
+    inside_mm = site.template.distance(guess.apply(scan.points_mm))
+    return _subset(scan, inside_mm > -OPEN_INFILL_MM)
 
 
 def _in_view(scan: Scan, site: Site) -> Scan:

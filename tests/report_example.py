@@ -232,9 +232,9 @@ def example(count: int = 60_000, *, title: str = "bracket.stl") -> ReportData:
             Decision("After repair 1", "done", ("1.9 mm³ are left, below the tolerance.",)),
         ),
         wire=(
-            Counter("Lines acknowledged", 48213, "each proved to have been received"),
-            Counter("Resends", 3, "lines that the printer asked for again"),
-            Counter("Stalls", 0, "times without an answer for longer than allowed"),
+            Counter("Lines acknowledged", 48213.0, "each proved to have been received"),
+            Counter("Resends", 3.0, "lines that the printer asked for again"),
+            Counter("Stalls", 0.0, "times without an answer for longer than allowed"),
         ),
         temperatures=(
             TemperatureSeries("Hotend", time_s, hotend, np.full(400, 215.0)),

@@ -249,6 +249,9 @@ def decision_of(look: LoopLook) -> Decision:
         choice = "leave: the operator declined"
     elif plan.within_tolerance or not plan.to_fill:
         choice = "go on" if plan.within_tolerance else "go on: printing cannot take excess away"
+    elif plan.refused:
+        choice = "go on: the checker refused the repair"
+        found.append(plan.refused)
     elif plan.checked is None:
         choice = "go on: nothing of it can be reached"
     else:

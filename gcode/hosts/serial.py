@@ -470,7 +470,7 @@ class SerialPrinter:
             if self._link.ended or not self._link.idle:
                 data = b"\n" + b"".join(command.encode() + b"\n" for command in SAFE_COMMANDS)
                 self._write_raw(data)
-                self._note("heaters off, unnumbered")
+                self._note("heaters told to switch off by unnumbered lines; nothing confirms it")
             else:
                 self.heaters_off()
                 self._lift()

@@ -171,3 +171,19 @@ def test_a_killed_sender_leaves_heaters_off_and_a_whole_journal(tmp_path: Path) 
                 time.sleep(0.02)
             assert "heaters off" in journal.notes()[-1]
             journal.close()
+
+
+def test_a_lost_link_never_claims_that_the_heaters_are_off(tmp_path: Path) -> None:
+    # regression: the log said "heaters off" although nobody had confirmed it
+    wire = tmp_path / "wire.log"
+    job = program([*HEAT, *moves(200)])
+    with (
+        EmulatedPrinterProcess(printer=profile(), faults="line 120 silence s=60") as emulator,
+        pytest.raises(LinkLostError),
+        SerialPrinter(emulator.port, wire_log=wire, timing=QUICK) as printer,
+    ):
+        printer.print(job)
+    notes = [line for line in wire.read_bytes().splitlines() if b"heaters" in line.lower()]
+    assert notes
+    assert any(b"nothing confirms it" in note for note in notes)
+    assert not any(b"heaters off, unnumbered" in note for note in notes)

@@ -107,6 +107,16 @@ def test_a_clean_print_is_left_alone(template: MeshSdf, process: str) -> None:
     assert len(run.report.looks) == 2  # one on the way, one at the end
 
 
+def test_a_void_in_sparse_infill_is_mended_and_its_cells_are_left_open(template: MeshSdf) -> None:
+    run = simulate_run(
+        prepared(template, "void:diameter=6,layers=3,layer=8", process="standard_0.20")
+    )
+    laid_mm3 = sum(look.plan.patch.beads_mm3 for look in run.report.looks
+                   if look.printed and look.plan.patch)  # fmt: skip
+    missing = sum(t.missing_mm3 for t in run.truth)
+    assert laid_mm3 < 1.5 * missing + 2.0
+
+
 def test_the_same_seed_gives_the_same_result(template: MeshSdf) -> None:
     twice = [
         result_of(simulate_run(prepared(template, "void:diameter=6,layers=2"))) for _ in range(2)

@@ -1,0 +1,196 @@
+"""The report page: self-contained, escaped, faithful to its data, bounded, the same every time."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amrepair.errors import InputError
+from amrepair.report import Figures, Outcome, ReportData, encode, payload, write_report
+from amrepair.report import document as document_module
+from amrepair.report.document import render_report
+from tests.report_example import HOSTILE, POCKET_MM3, example
+
+LOADING = {"src", "href", "srcset", "data", "poster", "action", "formaction", "background"}
+
+
+class Elements(HTMLParser):
+    """Start tags, and the text of script and style elements."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.blocks: list[tuple[str, dict[str, str | None], str]] = []
+        self.visible: list[str] = []
+        self._open: tuple[str, dict[str, str | None]] | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._open = (tag, dict(attrs)) if tag in ("script", "style") else None
+
+    def handle_data(self, data: str) -> None:
+        if self._open:
+            self.blocks.append((*self._open, data))
+        else:
+            self.visible.append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        self._open = None
+
+
+def values_of(page: str) -> dict:
+    found = re.search(r'id="report-data">(.*?)</script>', page, re.S)
+    assert found
+    return json.loads(found.group(1))
+
+
+def empty(**changes: object) -> ReportData:
+    nothing = Figures(0.0, None, 0.0, None, None, 0.0, 0.0, 0, 0.0, 0.0)
+    return replace(ReportData("part", Outcome.NOTHING_TO_REPAIR, nothing, ()), **changes)
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    return example(20_000)
+
+
+@pytest.fixture(scope="module")
+def page(data: ReportData) -> str:
+    return render_report(data)
+
+
+def test_nothing_is_loaded_from_elsewhere(page: str) -> None:
+    elements = Elements(page)
+    for tag, attributes in elements.tags:
+        assert tag not in ("link", "iframe", "object", "embed", "base")
+        for name in LOADING & set(attributes):
+            assert (attributes[name] or "").startswith(("#", "data:")), (tag, name)
+    for tag, _, text in elements.blocks:
+        if tag == "style":
+            assert "@import" not in text
+            assert not re.search(r"url\((?!['\"]?data:)", text)
+    policy = [a["content"] for t, a in elements.tags if t == "meta" and "content" in a]
+    assert any("default-src 'none'" in (text or "") for text in policy)
+
+
+def test_hostile_text_stays_text(data: ReportData) -> None:
+    looks = tuple(replace(look, label=HOSTILE) for look in data.looks)
+    hostile = replace(
+        data,
+        title=HOSTILE,
+        looks=looks,
+        setup={HOSTILE: HOSTILE},
+        provenance={HOSTILE: HOSTILE},
+        regions=tuple(replace(row, type=HOSTILE, note=HOSTILE) for row in data.regions),
+        decisions=tuple(replace(d, where=HOSTILE, reasons=(HOSTILE,)) for d in data.decisions),
+        wire=tuple(replace(c, name=HOSTILE, meaning=HOSTILE) for c in data.wire),
+        temperatures=tuple(replace(t, name=HOSTILE) for t in data.temperatures),
+    )
+    plain, attacked = Elements(render_report(data)), Elements(render_report(hostile))
+    assert not [a for t, a in attacked.tags if "onerror" in a or t == "img"]
+    count = [sum(t == "script" for t, _ in e.tags) for e in (plain, attacked)]
+    assert count[0] == count[1] == 3
+    assert any("evil.example" in text for text in attacked.visible)
+    assert "<img" not in json.dumps(values_of(render_report(hostile)))
+
+
+def test_the_drawing_holds_the_data(data: ReportData, page: str) -> None:
+    values = values_of(page)
+    assert [look["total"] for look in values["looks"]] == [
+        len(look.points_mm) for look in data.looks
+    ]
+    for shown, look in zip(values["looks"], data.looks, strict=True):
+        inside = payload.near_part(look, payload.bounds(data))
+        kept = encode.thinned(
+            inside.points_mm, inside.label_of_point != 0, budget=payload.POINTS_PER_LOOK
+        )
+        points = encode.decoded(shown["points"])
+        assert np.abs(points - inside.points_mm[kept]).max() < 0.001
+        deviation = encode.decoded(shown["deviation"]).reshape(-1)
+        assert np.abs(deviation - inside.deviation_mm[kept]).max() < 0.001
+        assert sum(shown["histogram"]["counts"]) == len(inside.points_mm)
+    assert values["volumes"]["missing"] == [POCKET_MM3, 1.9]
+    solid = values["looks"][0]["missing"]
+    corners = encode.decoded(solid["vertices"])[encode.decoded(solid["faces"])]
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert volume == pytest.approx(POCKET_MM3, rel=1e-3)
+    beads = data.looks[0].beads
+    assert beads is not None
+    ends = encode.decoded(values["looks"][0]["beads"]["ends"])
+    assert np.abs(ends - np.hstack([beads.start_mm, beads.end_mm])).max() < 0.001
+    assert values["temperatures"][0]["target"][0] == 215.0
+
+
+def test_tables_are_on_the_page(data: ReportData, page: str) -> None:
+    seen = " ".join(Elements(page).visible)
+    for text in ("Within tolerance", "48,213", "Prusa MK3S", "fill now", "chip", "9f0c"):
+        assert text in seen, text
+
+
+def test_same_data_same_bytes(data: ReportData, tmp_path: Path) -> None:
+    write_report(data, tmp_path / "a.html")
+    write_report(example(20_000), tmp_path / "b.html")
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "b.html"]
+
+
+def test_half_a_million_points_stay_in_budget_and_it_is_said() -> None:
+    page = render_report(example(500_000))
+    assert len(page.encode()) < 15e6
+    for look in values_of(page)["looks"]:
+        assert look["shown"] <= payload.POINTS_PER_LOOK < look["total"]
+    seen = " ".join(Elements(page).visible)
+    assert "use every point" in seen  # the counts themselves: the script's caption
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"outcome": Outcome.STOPPED},
+        {
+            "outcome": Outcome.PLANNED,
+            "looks": (
+                replace(example(500).looks[1], excess=None, unseen_mm=None, height_map=None),
+            ),
+        },
+        {
+            "looks": (
+                replace(
+                    example(500).looks[1],
+                    points_mm=np.zeros((0, 3)),
+                    deviation_mm=np.zeros(0),
+                    label_of_point=np.zeros(0, dtype=np.int64),
+                    normals=None,
+                ),
+            )
+        },
+        {"looks": (replace(example(500).looks[1], missing_mm3=float("nan")),)},
+        {"figures": Figures.from_result({"repaired_ratio": float("nan")})},
+    ],
+    ids=["no looks", "stopped", "one bare look", "no points", "nan volume", "nan result"],
+)
+def test_unknown_or_absent_values(changes: dict) -> None:
+    page = render_report(empty(**changes))
+    seen = " ".join(Elements(page).visible)
+    assert values_of(page)
+    assert not re.search(r"\bnan\b|\bNone\b", seen)
+
+
+def test_an_unwritable_place_is_one_sentence(data: ReportData, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(data, tmp_path / "file" / "report.html")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_assets_are_found_as_package_data() -> None:
+    for name in ("report.css", "report.js"):
+        assert len(document_module._asset(name)) > 1000
