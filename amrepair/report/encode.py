@@ -158,7 +158,7 @@ def _packed(array: np.ndarray, **extra: Sequence[float]) -> Encoded:
     }
 
 
-def _items(value: object) -> list[float]:
+def _items(value: object) -> list[int | float]:
     if not isinstance(value, list):
         raise TypeError(f"an encoded array holds a list here, not {type(value).__name__}")
     return value

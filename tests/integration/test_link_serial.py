@@ -150,9 +150,13 @@ def test_a_killed_sender_leaves_heaters_off_and_a_whole_journal(tmp_path: Path) 
             sender.wait()
             sender.stdout.close()
             until_s = time.monotonic() + 5.0  # the stated time
-            while emulator.state()["hotend_target_c"] and time.monotonic() < until_s:
-                time.sleep(0.02)
             state = emulator.state()
+            # one command switches each heater: both within the stated time, not at once
+            while (
+                state["hotend_target_c"] or state["bed_target_c"]
+            ) and time.monotonic() < until_s:
+                time.sleep(0.02)
+                state = emulator.state()
             assert state["hotend_target_c"] == 0
             assert state["bed_target_c"] == 0
             journal = Journal(journal_path)
