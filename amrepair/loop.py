@@ -346,7 +346,10 @@ def _return(printer: Printer, setup: PrintSetup, state: ModalState, parked: Moda
     ]
     if machine.retraction_mm > 0:
         moves.append(Retract(-machine.retraction_mm, machine.retraction_speed_mm_s))
-    _send(printer, setup, moves, state, "go on with the job", restore=True, initial=parked)
+    # the way back starts from the park; the modes are put back once the nozzle has arrived
+    _send(printer, setup, moves, parked, "back to the job", restore=False)
+    arrived = replace(parked, position_mm=state.position_mm)
+    _send(printer, setup, [], state, "go on with the job", restore=True, initial=arrived)
 
 
 def _send(

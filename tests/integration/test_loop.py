@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from amrepair.errors import AlignmentError, AmrepairError, InputError, LoopError
-from amrepair.loop import Look, locate_part, plan_stops
+from amrepair.loop import Look, _park, _return, locate_part, plan_stops
 from amrepair.repair import RepairPlan
 from amrepair.report.collect import look_of, loop_result
 from amrepair.simulate.defects import parse_defect
@@ -23,7 +23,11 @@ from amrepair.simulate.run import (
 )
 from amrepair.template import MeshSdf
 from gcode.errors import LinkError
+from gcode.hosts.file import FilePrinter
+from gcode.hosts.port import PrintableProgram, PrintReport
+from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
+from gcode.reader import read_job
 
 KEYS = {
     "missing_mm3_before", "missing_mm3_after", "excess_mm3_before", "excess_mm3_after",
@@ -156,6 +160,36 @@ def test_heaters_are_off_when_the_loop_breaks(template: MeshSdf, tmp_path: Path)
     tail = log.read_bytes()[-2000:].decode(errors="replace")
     assert "M104 S0" in tail
     assert "M140 S0" in tail
+
+
+def test_the_nozzle_is_back_where_the_job_left_it_before_it_goes_on(
+    broken: SimulatedRun, tmp_path: Path
+) -> None:
+    # regression: the way back was written as if the nozzle had never parked, so X and Y were left
+    # out, and the nozzle came down and unretracted at the park corner
+    run = broken.prepared
+    state = run.job.state_after(run.stops[0].line)
+    sent: list[str] = []
+
+    class Recorder(FilePrinter):
+        def print(self, checked: PrintableProgram, **_: object) -> PrintReport:
+            sent.append(checked.program.text)
+            return PrintReport(True, 0, 0, 0, 0, 0, 0.0, 0, (0.0, 0.0, 0.0))
+
+    recorder = Recorder(tmp_path / "unused.gcode")
+    parked = _park(recorder, run.setup, state)
+    _return(recorder, run.setup, state, parked)
+    head = run.job.program.text.split("\n")[: run.stops[0].line]
+    text = "\n".join([*head, *sent])
+    after = read_job(Program(text, run.setup.printer.dialect)).state_after(text.count("\n"))
+    assert after.position_mm == pytest.approx(state.position_mm, abs=1e-3)
+    assert after.e_mm == pytest.approx(state.e_mm, abs=1e-4)
+    assert (after.absolute_xyz, after.absolute_e) == (state.absolute_xyz, state.absolute_e)
+    # it comes down over its own place, and pushes the filament back only there
+    way = [line for line in sent[1].split("\n") if line.startswith("G1 ")]
+    assert "X" in way[0]
+    assert "Z" in way[1]
+    assert "E" in way[2]
 
 
 def test_the_part_is_found_in_its_job(template: MeshSdf) -> None:
