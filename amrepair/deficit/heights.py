@@ -24,9 +24,12 @@ UNSEEN_MARGIN_MM = 1.0
 AROUND_MM = 8.0
 # Points within this of a cell's top are one surface with its noise.
 TOP_BAND_MM = 0.3
+# An unseen patch smaller than this between seen ones is a gap of sampling, not a place to hide.
+GAP_MM2 = 1.0
 FINE_CELL_MM, MOST_CELLS = 0.1, 2_000_000
 # The scan may stand out this much before it overrules the solids: their tolerance, and noise.
 TRUST_MM = 0.3
+NOISE_MM = 0.1
 # Two layers: thinner material over a void is the solids' own rounding at its rim.
 FILM_MM = 0.4
 
@@ -50,7 +53,6 @@ def as_built_heights(
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
     solid_z = top_z + UNSEEN_MARGIN_MM
     z, seen = _tops(points, low[:2], cell_mm, (int(shape[0]), int(shape[1])))
-    z, seen = _close_gaps(z, seen)
     if not evidence.has_rays:
         # without rays nothing tells empty from unseen: beside the part the bed is taken as bare
         bare = ~seen & ~_footprint(template, build_from_template, low, cell_mm, z.shape)
@@ -58,6 +60,9 @@ def as_built_heights(
         known = seen | bare
     else:
         known = seen
+    z, closed = _close_gaps(z, known, cell_mm)
+    seen = seen | (closed & ~known)
+    known = closed
     return HeightField(
         origin_mm=low[:2].copy(),
         cell_mm=cell_mm,
@@ -104,10 +109,12 @@ def standing_heights(
     around = 2 * round(1.5 * seen.cell_mm / cell_mm) + 1
     highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
     by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
+    # where nothing is missing and the scan agrees, its noise would only raise what is highest
+    filled = (columns[1][0][1:] == columns[1][0][:-1]).reshape(ny, nx)
+    agrees = filled & (np.abs(seen.z_mm[at] - z_mm) < NOISE_MM)
     known = seen.seen[at]
-    return HeightField(
-        fine.origin_mm, cell_mm, np.where(known & by_wall, z_mm, seen.z_mm[at]), known.copy()
-    )
+    sharp = known & (by_wall | agrees)
+    return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known.copy())
 
 
 def _columns(
@@ -156,13 +163,17 @@ def _tops(
 
 
 def _close_gaps(
-    z_mm: Float[np.ndarray, "ny nx"], seen: Bool[np.ndarray, "ny nx"]
+    z_mm: Float[np.ndarray, "ny nx"], seen: Bool[np.ndarray, "ny nx"], cell_mm: float
 ) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
-    """A cell that sampling left empty among seen ones takes its highest neighbour."""
-    around = ndimage.uniform_filter(seen.astype(float), 3) * 9
-    gap = ~seen & (around >= 4.5)
+    """A few cells that sampling left empty among seen ones take their highest neighbour."""
+    groups, count = ndimage.label(~seen, structure=np.ones((3, 3)))
+    if count == 0:
+        return z_mm, seen
+    size = np.bincount(groups.ravel(), minlength=count + 1)
+    small = (size <= max(1, int(GAP_MM2 / cell_mm**2)))[groups] & ~seen
     highest = ndimage.maximum_filter(np.where(seen, z_mm, -np.inf), 3)
-    return np.where(gap, highest, z_mm), seen | gap
+    by_group = ndimage.maximum(highest, groups, index=np.arange(count + 1))
+    return np.where(small, np.asarray(by_group)[groups], z_mm), seen | small
 
 
 def _footprint(

@@ -21,7 +21,7 @@ TIP_SLACK_MM = 0.2
 BODY_SLACK_MM = 0.1
 MAX_CELLS = 12_000_000  # of the field and all its slices: 96 MB; beyond that cells are joined
 # Slices of the head that reach farther than this are swept over cells of this size.
-WIDE_MM, WIDE_CELL_MM = 2.5, 0.25
+WIDE_MM, WIDE_CELL_MM = 2.5, 0.2
 MOST_SAID = 20
 
 

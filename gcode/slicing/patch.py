@@ -54,7 +54,7 @@ MOST_THICK_NOZZLES = 0.8
 # The floor was measured, the deficit computed from it: they agree within this.
 AGREE_MM = 0.04
 # A gap of more than this share of the thickest bead is not filled from above.
-DEEP_RATIO = 1.25
+DEEP_RATIO = 1.3
 HOLD_MM = 0.4  # how far a bead may hang over a hole beside what holds it
 STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4

@@ -17,9 +17,9 @@ from gcode.surfaces import HeightField
 # The flat may press this deep into the plastic beside it: half a layer; with what a scan gets
 # wrong it stays under the checker's limit.
 TIP_PRESS_MM = 0.1
-BODY_CLEARANCE_MM = 0.1
+BODY_CLEARANCE_MM = 0.0
 # Slices that reach farther than this are looked at in cells of this size.
-WIDE_MM, WIDE_CELL_MM = 2.5, 0.25
+WIDE_MM, WIDE_CELL_MM = 2.5, 0.2
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,7 @@ def reachable(
     for k in range(missing.shape[2]):
         if not missing[:, :, k].any():
             continue
-        tip_mm = low_z_mm + (k + 1) * size_z_mm
+        tip_mm = low_z_mm + (k + 1) * size_z_mm + 0.5 * layer_mm  # a bead lies below its tip
         free = tip_mm >= least_mm - allowed_mm
         near = ndimage.distance_transform_edt(~free) * cell_mm <= 0.5 * bead_mm
         if low_z_mm + (k - below) * size_z_mm > 0 and k >= below:

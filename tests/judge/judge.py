@@ -188,7 +188,7 @@ def _contact(
 ) -> tuple[float, int]:
     """Deepest contact of the head with what stood there, mm, and its line."""
     worst, line = -np.inf, 0
-    for part in head:
+    for part in head if len(steps.line) else ():
         if part.box_mm is None:
             n = int(np.ceil(part.radius_mm / cell))
             i, j = np.mgrid[-n : n + 1, -n : n + 1]
