@@ -16,7 +16,7 @@ from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
 from gcode.firmware.faults import parse_faults
-from gcode.hosts import connect
+from gcode.hosts import Printer, connect
 from gcode.moves import Program
 from gcode.profiles import (
     DEFAULT_MATERIAL,
@@ -212,7 +212,13 @@ def estimate(
 @app.command("send")
 def send(
     file: FileArgument,
-    port: Annotated[str, typer.Option(help="Device path, or file:PATH.")],
+    port: Annotated[
+        str,
+        typer.Option(
+            help="Device path, octoprint+http://HOST:PORT, moonraker+http://HOST:PORT, file:PATH; "
+            "keys by OCTOPRINT_API_KEY, MOONRAKER_API_KEY."
+        ),
+    ],
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
     wire_log: Annotated[Path | None, typer.Option(help="Log of every byte, with times.")] = None,
@@ -238,7 +244,7 @@ def send(
             report = machine.print(checked, progress=bars)
             machine.finish_moves()
     except BaseException:
-        machine.abort()
+        _abort(machine)
         raise
     finally:
         machine.close()
@@ -317,6 +323,14 @@ def profiles_show(
         f"There is no profile '{profile}'; 'gcode profiles list' names them (for a file of your "
         "own, say --kind)."
     )
+
+
+def _abort(machine: Printer) -> None:
+    """End the job; the failure that led here stays the one that is reported."""
+    try:
+        machine.abort()
+    except GcodeError as error:
+        console.errors.print(f"gcode: the printer could not be made safe: {error}", markup=False)
 
 
 def _text(path: Path) -> str:

@@ -63,6 +63,7 @@ class MoonrakerPrinter:
         self._wire_log = wire_log
         self._log: WebLog | None = None
         self._lock = PortLock(address.spec)
+        self._tried_safety = False
         self._open: MoonrakerSession | None = None
         self._aborted = False
 
@@ -77,8 +78,8 @@ class MoonrakerPrinter:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if error is not None:
-                self.abort()
+            if error is not None and not self._tried_safety:
+                self._make_safe(error)
         finally:
             self.close()
 
@@ -182,7 +183,7 @@ class MoonrakerPrinter:
     ) -> PrintReport:
         """Upload a program or a part of it, have it printed, return when it is done."""
         require_checked(checked)
-        start_s = self._clock()
+        start_s, self._tried_safety = self._clock(), False
         self._refuse_unless_ready()
         job = JobFile.of(checked, lines)
         self._upload(job)
@@ -190,9 +191,11 @@ class MoonrakerPrinter:
         self._start(job)
         try:
             ok = self._follow(job, progress)
-        except LinkError as error:
+        except BaseException as error:  # an interrupt, too: the server would print on by itself
             self._make_safe(error)
             raise
+        if ok:
+            progress("printing", 1.0, 1.0)
         self._session.request("DELETE", f"/server/files/gcodes/{job.name}")
         # Klipper carries out every line that it has taken, so the position is a lower bound.
         next_line = job.end if ok else job.line_at(self._session.state.file_position)
@@ -352,14 +355,18 @@ class MoonrakerPrinter:
         """Switch every heater and the fan off."""
         self.command("TURN_OFF_HEATERS\nM107")
 
-    def _make_safe(self, error: LinkError) -> None:
+    def _make_safe(self, error: BaseException) -> None:
         """Make safe what can be reached, and add to the error how that went."""
         try:
             self.abort()
             word = "Heaters are off."
         except (LinkError, LocalProtocolError) as second:
             word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
-        error.args = (f"{error.args[0]} {word}", *error.args[1:])
+        self._tried_safety = True
+        if isinstance(error, LinkError):
+            error.args = (f"{error.args[0]} {word}", *error.args[1:])
+        else:
+            error.add_note(word)
 
 
 def _line(text: str) -> str:

@@ -64,6 +64,7 @@ class OctoPrintPrinter:
         self._wire_log = wire_log
         self._log: WebLog | None = None
         self._lock = PortLock(address.spec)
+        self._tried_safety = False
         self._open: OctoPrintSession | None = None
         self._capabilities: Capabilities | None = None
 
@@ -78,8 +79,8 @@ class OctoPrintPrinter:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if error is not None:
-                self.abort()
+            if error is not None and not self._tried_safety:
+                self._make_safe(error)
         finally:
             self.close()
 
@@ -182,7 +183,7 @@ class OctoPrintPrinter:
     ) -> PrintReport:
         """Upload a program or a part of it, have it printed, return when it is done."""
         require_checked(checked)
-        start_s = self._clock()
+        start_s, self._tried_safety = self._clock(), False
         self._refuse_unless_ready()
         job = JobFile.of(checked, lines)
         self._upload(job)
@@ -190,9 +191,11 @@ class OctoPrintPrinter:
         self._start(job)
         try:
             ok = self._follow(job, progress)
-        except LinkError as error:
+        except BaseException as error:  # an interrupt, too: the server would print on by itself
             self._make_safe(error)
             raise
+        if ok:
+            progress("printing", 1.0, 1.0)
         self._session.request("DELETE", f"{_FILES}/{job.name}")  # 409 where it is held: harmless
         return PrintReport(
             ok=ok,
@@ -347,11 +350,15 @@ class OctoPrintPrinter:
         """Switch hotend, bed and fan off, acknowledged."""
         self._session.ask(*SAFE_COMMANDS)
 
-    def _make_safe(self, error: LinkError) -> None:
+    def _make_safe(self, error: BaseException) -> None:
         """Make safe what can be reached, and add to the error how that went."""
         try:
             self.abort()
             word = "Heaters are off."
         except (LinkError, LocalProtocolError) as second:
             word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
-        error.args = (f"{error.args[0]} {word}", *error.args[1:])
+        self._tried_safety = True
+        if isinstance(error, LinkError):
+            error.args = (f"{error.args[0]} {word}", *error.args[1:])
+        else:
+            error.add_note(word)

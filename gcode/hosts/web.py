@@ -223,15 +223,18 @@ class PushSocket:
         self._on_message = on_message
         self._on_closed = on_closed
         self.alive = True
+        self._stack = contextlib.ExitStack()
         try:
-            self._socket: ClientConnection = connect(
-                address.socket_url(path),
-                additional_headers=dict(headers),
-                open_timeout=timing.request_s,
-                close_timeout=1.0,
-                max_size=MAX_MESSAGE_BYTES,
-                proxy=None,
-                logger=_MUTE,
+            self._socket: ClientConnection = self._stack.enter_context(
+                connect(
+                    address.socket_url(path),
+                    additional_headers=dict(headers),
+                    open_timeout=timing.request_s,
+                    close_timeout=1.0,
+                    max_size=MAX_MESSAGE_BYTES,
+                    proxy=None,
+                    logger=_MUTE,
+                )
             )
         except (OSError, WebSocketException, TimeoutError) as error:
             raise LinkError(
@@ -258,7 +261,7 @@ class PushSocket:
         """End it; harmless when it has ended."""
         self.alive = False
         with contextlib.suppress(OSError, WebSocketException):
-            self._socket.close()
+            self._stack.close()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout=5.0)
 
