@@ -1,0 +1,32 @@
+"""Prints a file with Printrun's printcore; runs in Printrun's environment.
+
+Run: `python printcore_send.py PORT FILE`; ends with 0 when printcore says that it is done.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+
+from printrun import gcoder
+from printrun.printcore import printcore
+
+
+def main() -> None:
+    done, online = threading.Event(), threading.Event()
+    core = printcore()
+    core.onlinecb = online.set
+    core.endcb = done.set
+    core.connect(sys.argv[1], 115200)
+    if not online.wait(20):
+        sys.exit("printcore does not come online")
+    core.startprint(gcoder.LightGCode(Path(sys.argv[2]).read_text().split("\n")))
+    finished = done.wait(60)
+    core.disconnect()
+    if not finished:
+        sys.exit("printcore does not finish")
+
+
+if __name__ == "__main__":
+    main()
