@@ -145,16 +145,28 @@ class OctoPrintPrinter:
         return self._capabilities
 
     def temperatures(self) -> Temperatures:
-        """Return the temperatures that OctoPrint polls."""
+        """Return the temperatures that OctoPrint polls; ask (M105) where it has none yet."""
         heaters = self._session.status().get("temperature", {})
-        hotend, bed = heaters.get("tool0") or {}, heaters.get("bed") or {}
-        if hotend.get("actual") is None:
-            raise LinkError(f"{self.address.name} knows no hotend temperature yet; try again.")
+        pairs = {
+            name: (heater.get("actual"), heater.get("target"))
+            for name, heater in heaters.items()
+            if isinstance(heater, dict)
+        }
+        if pairs.get("tool0", (None,))[0] is None:
+            for reply in self._session.ask("M105"):
+                if isinstance(reply, ev.TemperatureReport):
+                    names = {"T": "tool0", "T0": "tool0", "B": "bed"}
+                    for name, heater in reply.heaters.items():
+                        pairs[names.get(name, name)] = (heater.current_c, heater.target_c)
+        hotend_c, hotend_target_c = pairs.get("tool0", (None, None))
+        bed_c, bed_target_c = pairs.get("bed", (None, None))
+        if hotend_c is None:
+            raise LinkError(f"The printer of {self.address.name} reports no hotend temperature.")
         return Temperatures(
-            float(hotend["actual"]),
-            float(hotend.get("target") or 0.0),
-            float(bed["actual"]) if bed.get("actual") is not None else None,
-            float(bed.get("target") or 0.0) if bed.get("actual") is not None else None,
+            float(hotend_c),
+            float(hotend_target_c or 0.0),
+            float(bed_c) if bed_c is not None else None,
+            float(bed_target_c or 0.0) if bed_c is not None else None,
         )
 
     def position_mm(self) -> tuple[float, float, float]:

@@ -102,6 +102,7 @@ class FakeOctoPrint:
         for text in command["commands"]:
             self.commands.append(text)
             answers = {
+                "M105": ["T:21.50 /60.00 B:22.00 /0.00"],
                 "M114": ["X:1.50 Y:2.25 Z:3.00 E:0.00 Count X:150"],
                 "M115": ["FIRMWARE_NAME:Marlin 2.1.2 PROTOCOL_VERSION:1.0", "Cap:EEPROM:1"],
             }.get(text, [])
@@ -199,6 +200,14 @@ def test_questions_are_answered_from_the_terminal(fake: FakeOctoPrint) -> None:
         printer.finish_moves()
     assert (there.hotend_c, there.hotend_target_c, there.bed_c) == (205.4, 205.0, None)
     assert fake.commands == ["M114", "M115", "M400"]
+
+
+def test_temperatures_that_nobody_polled_yet_are_asked_for(fake: FakeOctoPrint) -> None:
+    fake.heaters = {}
+    with printer_at(fake) as printer:
+        there = printer.temperatures()
+    assert (there.hotend_c, there.hotend_target_c) == (21.5, 60.0)
+    assert (there.bed_c, there.bed_target_c) == (22.0, 0.0)
 
 
 def test_the_key_travels_in_the_header_and_shows_nowhere_else(
