@@ -9,14 +9,16 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from conftest import HERE, Printing, Web, end, free_port, peer, process, wait_for
 from link_helpers import program
+from peer_harness import HERE, Printing, Web, end, free_port, peer, process, wait_for
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts import LinkLostError
 from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.web import Address, WebTiming
+
+pytestmark = pytest.mark.peers
 
 # dev_mode: nothing is looked up outside. Nobody is trusted: every client needs the key.
 CONFIG = """\

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from conftest import Printing, Web, end, free_port, peer, process, wait_for
 from link_helpers import profile, program
+from peer_harness import Printing, Web, end, free_port, peer, process, wait_for
 
 from gcode.errors import LinkError, PortBusyError
 from gcode.firmware import EmulatedPrinterProcess
@@ -19,6 +19,8 @@ from gcode.hosts import LinkLostError
 from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.web import Address, WebTiming
+
+pytestmark = pytest.mark.peers
 
 KEY = "0123456789ABCDEF0123456789ABCDEF"
 # Nothing is looked up outside, nothing reports home.

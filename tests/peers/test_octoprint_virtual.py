@@ -9,13 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from conftest import HERE, peer
 from link_helpers import program
+from peer_harness import HERE, peer
 
 from gcode.errors import LinkError, PrinterError
 from gcode.hosts import LinkLostError
 from gcode.hosts.serial import SerialPrinter
 from gcode.protocol import LinkTiming
+
+pytestmark = pytest.mark.peers
 
 # The printer takes the time that its moves would take, from 200 mm/min on.
 JOB = ["G28", "G90", "G1 F60000", *(f"G1 X{50 + i / 100:.2f} Y50" for i in range(250))]

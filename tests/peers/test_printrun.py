@@ -5,10 +5,13 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from conftest import HERE, peer
+import pytest
 from link_helpers import moves, profile
+from peer_harness import HERE, peer
 
 from gcode.firmware import EmulatedPrinterProcess
+
+pytestmark = pytest.mark.peers
 
 OWN = ("M105", "M110")  # what printcore asks of its own accord
 
