@@ -11,7 +11,7 @@ import typer
 import gcode
 from gcode.check import check as check_program
 from gcode.check import find_refusals
-from gcode.cli import console
+from gcode.cli import console, importing
 from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
@@ -60,6 +60,7 @@ app = typer.Typer(
 )
 profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
 app.add_typer(profiles_app, name="profiles")
+importing.add_to(profiles_app)
 
 
 def _version(asked: bool) -> None:
