@@ -58,6 +58,8 @@ layer_height = 0.1
 [print:0.10mm DETAIL]
 inherits = *common*; *fine*
 perimeters = 4
+; [print:0.05mm OLD]
+; layer_height = 0.05
 [print:LOST]
 inherits = *gone*
 [filament:PLA]
@@ -296,6 +298,7 @@ def test_files_that_are_none_of_these(tmp_path: Path, name: str, text: str, said
     ("outline", "why"),
     [
         ("-100x-100,100x-100,100x100,-100x100", "corner is not at the origin"),
+        ("5x0,215x0,215x220,5x220", "corner is not at the origin"),  # ours would be too large
         ("0x0,100x0,50x80", "no rectangle"),
         ("round", "no outline"),
     ],
@@ -303,6 +306,20 @@ def test_files_that_are_none_of_these(tmp_path: Path, name: str, text: str, said
 def test_beds_that_ours_cannot_say(tmp_path: Path, outline: str, why: str) -> None:
     text = PRUSA.replace("0x0,180x0,180x180,0x180", outline)
     assert why in reasons(read(tmp_path, "a.ini", text))["bed_shape"]
+
+
+def test_a_bed_that_begins_below_the_origin_is_used_from_there(tmp_path: Path) -> None:
+    text = PRUSA.replace("0x0,180x0,180x180,0x180", "-10x-15,298x-15,298x230,-10x230")
+    assert read(tmp_path, "a.ini", text).profiles[0].values["bed_size_mm"] == [298.0, 230.0]
+
+
+@pytest.mark.parametrize(
+    ("model", "parent"),
+    [("MK4IS", "prusa_mk4"), ("ENDER3V2", "ender_3"), ("Voron 2.4 300", "voron_2_4")],
+)
+def test_a_known_machine_is_inherited_from(tmp_path: Path, model: str, parent: str) -> None:
+    text = PRUSA.replace("SOMETHING", model)
+    assert read(tmp_path, "a.ini", text).profiles[0].inherits == parent
 
 
 def test_the_command_writes_lists_and_never_overwrites(tmp_path: Path) -> None:

@@ -29,7 +29,15 @@ _MODELS: dict[Kind, type[PrinterProfile | MaterialProfile | ProcessProfile]] = {
     "materials": MaterialProfile,
     "processes": ProcessProfile,
 }
-_MARKS = {"prusa_mk3s": "MK3", "prusa_mk4": "MK4", "prusa_mini": "MINI"}
+_MARKS = {
+    "prusa_mk3s": "MK3",
+    "prusa_mk4": "MK4",
+    "prusa_mini": "MINI",
+    "ender_3": "ENDER3",
+    "creality_k1": "CREALITYK1",
+    "voron_2_4": "VORON2.4",
+}
+"""Shipped machines, by what their names hold once spaces and dashes are left out."""
 _GENERIC = {
     "marlin": "generic_marlin",
     "klipper": "generic_klipper",
@@ -133,6 +141,7 @@ def _parent(kind: Kind, source: Source, rules: dict[str, Rule]) -> str:
     if rules is KLIPPER:
         return _GENERIC["klipper"]
     model = f"{source.values.get('printer_model', '')} {source.name}".upper()
+    model = re.sub(r"[\s_-]", "", model)
     for profile, mark in _MARKS.items():
         if mark in model:
             return profile

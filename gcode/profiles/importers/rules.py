@@ -134,6 +134,9 @@ def apply(
 
 # ---------------------------------------------------------------------- conversions
 
+OVERHANG_RATIO = 0.2
+"""A bed may begin this share of its size below the origin."""
+
 
 def first(text: str) -> str:
     """Return the first of several extruders' or modes' values."""
@@ -212,8 +215,10 @@ def corners(text: str, source: Source) -> list[float]:
     x_mm, y_mm = {pair[0] for pair in pairs}, {pair[1] for pair in pairs}
     if len(pairs) != 4 or len(x_mm) != 2 or len(y_mm) != 2:
         raise NotMappedError("the bed is no rectangle")
-    if min(x_mm) != 0.0 or min(y_mm) != 0.0:
-        raise NotMappedError("the bed's corner is not at the origin")
+    for axis in (x_mm, y_mm):
+        # What reaches below the origin is given away; a bed about the origin would be a quarter.
+        if not -OVERHANG_RATIO * max(axis) <= min(axis) <= 0.0:
+            raise NotMappedError("the bed's corner is not at the origin")
     return [max(x_mm), max(y_mm)]
 
 

@@ -190,7 +190,9 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
     InputError
         If the file is neither, or the preset is not in it.
     """
-    parser = configparser.RawConfigParser(delimiters=("=",), comment_prefixes=("#",), strict=False)
+    parser = configparser.RawConfigParser(
+        delimiters=("=",), comment_prefixes=("#", ";"), strict=False
+    )
     try:
         parser.read_string("[\0]\n" + text)
     except configparser.Error as error:
