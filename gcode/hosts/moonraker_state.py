@@ -73,8 +73,8 @@ class KlippyState:
         method = message.get("method")
         if isinstance(number := message.get("id"), int):
             self.answers[number] = message
-        elif method in _KLIPPY_NEWS:
-            self.klippy = _KLIPPY_NEWS[str(method)]
+        elif isinstance(method, str) and method in _KLIPPY_NEWS:
+            self.klippy = _KLIPPY_NEWS[method]
             self.stale = True
         elif method == "notify_status_update":
             parameters = message.get("params")

@@ -96,7 +96,11 @@ class OctoPrintPrinter:
             self._open = OctoPrintSession(
                 self.address, self._key, self._timing, self._clock, self._log
             )
-            self._open.get("/api/version")
+            if "Moonraker" in str(self._open.get("/api/version").get("text")):
+                raise LinkError(
+                    f"{self.address.base} is a Moonraker that answers as OctoPrint; write "
+                    f"moonraker+{self.address.base}."
+                )
             self._refuse_unless_ready()
             self._open.listen()
         except BaseException:
@@ -125,11 +129,10 @@ class OctoPrintPrinter:
         flags = self._session.status()["state"]["flags"]
         self._session.state.flags = dict(flags)
         if any(flags.get(name) for name in ("printing", "paused", "pausing", "cancelling")):
-            job = self._session.get("/api/job")
-            done = job["progress"].get("completion") or 0.0
+            name, percent = self._session.printing()
             raise PortBusyError(
-                f"{self.address.name} is printing {job['job']['file'].get('name')!r} already "
-                f"({done:.0f} %); wait for it, or cancel it there."
+                f"{self.address.name} is printing {name!r} already ({percent:.0f} %); wait for it, "
+                f"or cancel it there."
             )
 
     def capabilities(self) -> Capabilities:

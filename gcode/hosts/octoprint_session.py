@@ -15,9 +15,9 @@ from typing import Any
 import httpx
 
 from gcode.errors import LinkError
-from gcode.hosts.octoprint_state import ServerState
+from gcode.hosts.octoprint_state import ServerState, part_of
 from gcode.hosts.secret import ApiKey
-from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, sentence
+from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, json_object, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
@@ -75,8 +75,8 @@ class OctoPrintSession:
     def listen(self) -> None:
         """Open the push socket: a login for the session, then the subscription."""
         answer = self._client.request("POST", "/api/login", json={"passive": True})
-        user = answer.json() if answer.status_code == 200 else {}
-        if not isinstance(user, dict) or not user.get("session"):
+        user = (json_object(answer) or {}) if answer.status_code == 200 else {}
+        if not user.get("session"):
             raise LinkError(
                 f"{self.address.name} grants no session to the API key ({sentence(answer)}); use "
                 f"a user's or an application's key."
@@ -92,7 +92,7 @@ class OctoPrintSession:
             on_message=self._on_message,
             on_closed=self._on_closed,
         )
-        self._socket.send({"auth": f"{user['name']}:{user['session']}"})
+        self._socket.send({"auth": f"{user.get('name')}:{user['session']}"})
         self._socket.send({"subscribe": SUBSCRIPTION})
         with self.news:
             if not self.news.wait_for(lambda: self.state.connected, self._timing.request_s):
@@ -127,7 +127,26 @@ class OctoPrintSession:
                 f"The printer of {self.address.name} is not operational (it says "
                 f"{str(job.get('state', 'nothing'))!r}); connect it there first."
             )
-        return dict(answer.json())
+        body = json_object(answer) or {}
+        self._flags(answer)
+        return body
+
+    def _flags(self, answer: httpx.Response) -> dict[str, bool]:
+        """The flags of `/api/printer`; none where the printer is not operational."""
+        if answer.status_code != 200:
+            return {}
+        state = (json_object(answer) or {}).get("state")
+        flags = state.get("flags") if isinstance(state, dict) else None
+        if not isinstance(flags, dict):
+            raise LinkError(f"{self.address.name} does not answer as OctoPrint does; what is it?")
+        return {str(name): bool(value) for name, value in flags.items()}
+
+    def printing(self) -> tuple[str, float]:
+        """Return what is printed there, and how far it is, per cent."""
+        report = self.get("/api/job")
+        done = part_of(report, "progress").get("completion")
+        name = part_of(part_of(report, "job"), "file").get("name")
+        return str(name), float(done) if isinstance(done, int | float) else 0.0
 
     def look(self) -> bool:
         """Ask for the state, listening anew where the socket has ended.
@@ -140,7 +159,7 @@ class OctoPrintSession:
             self.listen()
         report = self.get("/api/job")
         answer = self.request("GET", "/api/printer", params={"exclude": "temperature,sd"})
-        flags = answer.json()["state"]["flags"] if answer.status_code == 200 else {}
+        flags = self._flags(answer)
         with self.news:
             return self.state.look(report, flags)
 

@@ -78,18 +78,19 @@ class ServerState:
         if isinstance(state, dict):
             self.text, self.error = str(state.get("text", "")), str(state.get("error") or "")
             flags = state.get("flags")
-            self.flags = dict(flags) if isinstance(flags, dict) else {}
+            self.flags = {k: bool(v) for k, v in flags.items()} if isinstance(flags, dict) else {}
         resends = news.get("resends")
         if isinstance(resends, dict) and isinstance(resends.get("count"), int):
             self.resends = resends["count"]
         self._take_progress(news)
         if with_log and self.terminal is not None:
-            self.terminal.extend(str(line) for line in news.get("logs") or ())
+            logs = news.get("logs")
+            self.terminal.extend(str(line) for line in (logs if isinstance(logs, list) else ()))
 
     def _take_progress(self, news: dict[str, Any]) -> None:
         if _path(news) != self.file:
             return
-        position = (news.get("progress") or {}).get("filepos")
+        position = part_of(news, "progress").get("filepos")
         if isinstance(position, int):  # goes back to None once cancelled: the last one stays
             self.moved = self.moved or position != self.file_position
             self.file_position = position
@@ -120,14 +121,18 @@ class ServerState:
             return True
         if not self.at_rest:
             return _path(report) == self.file
-        done = (report.get("progress") or {}).get("completion")
+        done = part_of(report, "progress").get("completion")
         if _path(report) == self.file and isinstance(done, int | float) and done >= 100.0:
             self.outcome = "PrintDone"
             return True
         return False
 
 
+def part_of(news: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return an object in an object, an empty one where it is none."""
+    found = news.get(name)
+    return found if isinstance(found, dict) else {}
+
+
 def _path(news: dict[str, Any]) -> str:
-    job = news.get("job")
-    file = job.get("file") if isinstance(job, dict) else None
-    return str(file.get("path")) if isinstance(file, dict) else ""
+    return str(part_of(part_of(news, "job"), "file").get("path"))

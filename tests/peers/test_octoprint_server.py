@@ -13,7 +13,7 @@ import pytest
 from link_helpers import profile, program
 from peer_harness import Printing, Web, end, free_port, peer, process, wait_for
 
-from gcode.errors import LinkError, PortBusyError
+from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import LinkLostError
 from gcode.hosts.octoprint import OctoPrintPrinter
@@ -124,6 +124,19 @@ def test_pause_resume_cancel(server: Server) -> None:
     assert report is not None, printing.error
     assert not report.ok
     assert report.next_line == 0, "what OctoPrint had sent is not known"
+
+
+def test_an_emergency_stop_ends_the_print(tmp_path: Path) -> None:
+    with octoprint(tmp_path, "VIRTUAL") as server:
+        printer = server.printer()
+        printer.connect()
+        printing = Printing(printer, program(LONG))
+        printing.wait_until(200.0)
+        printer.emergency_stop()
+        printing.finish()
+        printer.close()
+    assert isinstance(printing.error, LinkLostError | PrinterError)
+    assert "HEATERS COULD NOT BE REACHED" in str(printing.error)
 
 
 def test_a_wrong_key_and_a_second_sender(server: Server) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import re
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from hashlib import sha1
@@ -251,6 +255,22 @@ def test_a_server_without_a_printer_is_refused(fake: FakeOctoPrint) -> None:
         printer_at(fake).connect()
 
 
+def test_a_moonraker_that_answers_as_octoprint_is_named(fake: FakeOctoPrint) -> None:
+    text = {"text": "OctoPrint (Moonraker v0.11.0)"}
+    fake.refuse["GET", "/api/version"] = (200, text)
+    with pytest.raises(LinkError, match=r"write moonraker\+http://127"):
+        printer_at(fake).connect()
+
+
+@pytest.mark.parametrize("answer", [None, [], {}, {"state": 1}, {"state": {"flags": []}}])
+def test_something_else_behind_the_address_is_one_sentence(
+    fake: FakeOctoPrint, answer: object
+) -> None:
+    fake.refuse["GET", "/api/printer"] = (200, answer)
+    with pytest.raises(LinkError, match="does not answer as OctoPrint does"):
+        printer_at(fake).connect()
+
+
 def test_a_printer_that_prints_already_is_refused(fake: FakeOctoPrint) -> None:
     fake.flags, fake.file, fake.completion = {"printing": True}, "benchy.gcode", 31.0
     with pytest.raises(PortBusyError, match=r"printing 'benchy.gcode' already \(31 %\)"):
@@ -388,6 +408,31 @@ def test_the_emergency_stop_is_m112_at_once(fake: FakeOctoPrint) -> None:
     with printer_at(fake) as printer:
         printer.emergency_stop()
     assert fake.commands == ["M112"]
+
+
+def test_gcode_send_prints_through_it(fake: FakeOctoPrint, tmp_path: Path) -> None:
+    job = tmp_path / "job.gcode"
+    job.write_text("G28\nG1 X10 Y10 F6000\n")
+    main = "from gcode.cli import main; main()"
+    port = f"octoprint+{fake.server.base}"
+
+    def send(key: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-c", main, "send", job, "--port", port, "--json"],
+            env={**os.environ, "OCTOPRINT_API_KEY": key},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    done = send(KEY)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["lines_acked"] == 2
+    assert fake.commands == ["M400"]
+    refused = send("WR0NG")
+    assert (refused.returncode, refused.stdout) == (4, "")
+    assert "refuses the API key" in refused.stderr
+    assert "WR0NG" not in refused.stderr
 
 
 # ---------------------------------------------------------------------- addresses and keys
