@@ -24,10 +24,16 @@ from gcode.hosts.port import (
     Temperatures,
 )
 from gcode.hosts.proof import require_checked
-from gcode.hosts.safety import LIFT_COMMANDS
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import Address, WebLog, WebTiming, sentence
+from gcode.hosts.web import (
+    LIFT_COMMANDS,
+    Address,
+    WebLog,
+    WebTiming,
+    heaters_word,
+    sentence,
+)
 from gcode.progress import Progress, silent
 
 LOOK_EVERY = 5
@@ -91,7 +97,7 @@ class MoonrakerPrinter:
             return
         self._lock.acquire()
         try:
-            self._log = WebLog(self._wire_log, self._clock) if self._wire_log else None
+            self._log = WebLog(self._wire_log) if self._wire_log else None
             self._open = MoonrakerSession(
                 self.address, self._key, self._timing, self._clock, self._log
             )
@@ -329,7 +335,9 @@ class MoonrakerPrinter:
         self._session.call("printer.print.resume", limit_s=None)
 
     def abort(self) -> None:
-        """Cancel the print, heaters off, nozzle lifted where it is homed."""
+        """Cancel the print, heaters off, nozzle lifted where homed; harmless unconnected."""
+        if self._open is None:
+            return
         session = self._session
         session.look()
         if session.state.stopped:
@@ -359,7 +367,7 @@ class MoonrakerPrinter:
         """Make safe what can be reached, and add to the error how that went."""
         try:
             self.abort()
-            word = "Heaters are off."
+            word = heaters_word(self.temperatures)
         except (LinkError, LocalProtocolError) as second:
             word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
         self._tried_safety = True

@@ -23,10 +23,17 @@ from gcode.hosts.port import (
     Temperatures,
 )
 from gcode.hosts.proof import require_checked
-from gcode.hosts.safety import LIFT_COMMANDS, SAFE_COMMANDS
+from gcode.hosts.safety import SAFE_COMMANDS
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import Address, WebLog, WebTiming, sentence
+from gcode.hosts.web import (
+    LIFT_COMMANDS,
+    Address,
+    WebLog,
+    WebTiming,
+    heaters_word,
+    sentence,
+)
 from gcode.progress import Progress, silent
 from gcode.protocol import events as ev
 
@@ -92,7 +99,7 @@ class OctoPrintPrinter:
             return
         self._lock.acquire()
         try:
-            self._log = WebLog(self._wire_log, self._clock) if self._wire_log else None
+            self._log = WebLog(self._wire_log) if self._wire_log else None
             self._open = OctoPrintSession(
                 self.address, self._key, self._timing, self._clock, self._log
             )
@@ -337,7 +344,9 @@ class OctoPrintPrinter:
             raise LinkError(f"{self.address.name} does not {what} ({sentence(answer)}).")
 
     def abort(self) -> None:
-        """Cancel the print, heaters off, nozzle lifted."""
+        """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""
+        if self._open is None:
+            return
         answer = self._session.request("POST", "/api/job", json={"command": "cancel"})
         if answer.status_code == 204:
             self._await_rest()
@@ -369,7 +378,7 @@ class OctoPrintPrinter:
         """Make safe what can be reached, and add to the error how that went."""
         try:
             self.abort()
-            word = "Heaters are off."
+            word = heaters_word(self.temperatures)
         except (LinkError, LocalProtocolError) as second:
             word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
         self._tried_safety = True

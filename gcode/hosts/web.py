@@ -10,6 +10,7 @@ import contextlib
 import json
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +22,12 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from gcode.errors import InputError, LinkError
+from gcode.hosts.port import Temperatures
 from gcode.hosts.secret import VARIABLES, ApiKey
 from gcode.hosts.wirelog import WireLog
 
 MAX_MESSAGE_BYTES = 16_000_000  # OctoPrint's history holds half an hour of temperatures
+LIFT_COMMANDS = ("G91", "G1 Z5 F600", "G90")
 _NAMES = {"octoprint": "OctoPrint", "moonraker": "Moonraker"}
 # websockets logs frames and headers when somebody asks for DEBUG, and with them keys and sessions.
 _MUTE = logging.Logger("gcode.hosts.web.frames", logging.CRITICAL + 1)
@@ -108,7 +111,7 @@ class Address:
 class WebLog:
     """The wire log of a server's adapter: one line for every request and piece of news."""
 
-    def __init__(self, path: Path, clock: Callable[[], float]) -> None:
+    def __init__(self, path: Path, clock: Callable[[], float] = time.time) -> None:
         self._log = WireLog(path)
         self._clock = clock
         self._mutex = threading.Lock()  # news come in a thread of their own
@@ -314,3 +317,14 @@ def sentence(answer: httpx.Response) -> str:
 def _shown(kwargs: Mapping[str, Any]) -> str:
     """What the wire log shows of a request: its JSON; never a file's content or a header."""
     return json.dumps(kwargs["json"]) if "json" in kwargs else ""
+
+
+def heaters_word(read: Callable[[], Temperatures]) -> str:
+    """Return what may be said of heaters that were just told to switch off."""
+    try:
+        now = read()
+    except LinkError:
+        return "Heaters were told to switch off."
+    if now.hotend_target_c == 0.0 and not now.bed_target_c:
+        return "Heaters are off."
+    return "Heaters were told to switch off."

@@ -325,7 +325,7 @@ def test_a_failing_command_in_the_file_is_the_printers_fault(fake: FakeMoonraker
         printer_at(fake) as p,
     ):
         p.print(JOB)
-    assert "Heaters are off" in str(caught.value)
+    assert "Heaters were told to switch off." in str(caught.value), "its target is still 205"
     assert fake.scripts.count("TURN_OFF_HEATERS\nM107") == 1
 
 

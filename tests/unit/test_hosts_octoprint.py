@@ -273,8 +273,11 @@ def test_something_else_behind_the_address_is_one_sentence(
 
 def test_a_printer_that_prints_already_is_refused(fake: FakeOctoPrint) -> None:
     fake.flags, fake.file, fake.completion = {"printing": True}, "benchy.gcode", 31.0
+    printer = printer_at(fake)
     with pytest.raises(PortBusyError, match=r"printing 'benchy.gcode' already \(31 %\)"):
-        printer_at(fake).connect()
+        printer.connect()
+    printer.abort()
+    assert fake.flags == {"printing": True}, "another's print was cancelled"
 
 
 def test_somebody_else_who_starts_first_keeps_the_printer(fake: FakeOctoPrint) -> None:
@@ -390,7 +393,7 @@ def test_a_server_that_forgot_the_print_is_a_lost_job(fake: FakeOctoPrint) -> No
     with printer_at(fake) as printer, pytest.raises(LinkLostError) as caught:
         printer.print(JOB, lines=range(3, 12))
     assert (caught.value.last_executed_line, caught.value.last_sent_line) == (2, 11)
-    assert "Heaters are off" in str(caught.value)
+    assert "Heaters were told to switch off." in str(caught.value), "its target is still 205"
 
 
 def test_a_server_that_stays_away_may_print_on(fake: FakeOctoPrint) -> None:
