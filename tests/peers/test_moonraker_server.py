@@ -107,14 +107,15 @@ def test_upload_print_temperatures_position(stack: Stack) -> None:
     with stack.printer() as printer:
         assert printer.capabilities().firmware == "Klipper stand-in-1"
         printer.command("M104 S205\nM140 S60")
-        report = printer.print(program(SHORT))
+        job, half = program(SHORT), len(SHORT) // 2
+        parts = [printer.print(job, lines=part) for part in (range(half), range(half, len(SHORT)))]
         printer.finish_moves()
         there = printer.temperatures()
         assert printer.position_mm() == pytest.approx((14.9, 50.0, 0.0))
         printer.heaters_off()
         assert printer.temperatures().hotend_target_c == 0.0
-    assert report.ok
-    assert report.lines_acked == len(SHORT)
+    assert all(part.ok for part in parts)
+    assert sum(part.lines_acked for part in parts) == len(SHORT)
     assert stack.executed() == SHORT
     assert (there.hotend_target_c, there.bed_target_c) == (205.0, 60.0)
 

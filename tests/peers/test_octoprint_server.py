@@ -126,6 +126,18 @@ def test_pause_resume_cancel(server: Server) -> None:
     assert report.next_line == 0, "what OctoPrint had sent is not known"
 
 
+def test_a_users_own_key_will_do(server: Server) -> None:
+    """The global key ends with OctoPrint 1.13."""
+    web = Web(server.base, KEY)
+    answer = web.http.post("/api/access/users/me/apikey")
+    web.http.close()
+    assert answer.status_code == 200, answer.text
+    key = ApiKey(answer.json()["apikey"])
+    with OctoPrintPrinter(Address.parse(f"octoprint+{server.base}"), key, timing=QUICK) as printer:
+        assert printer.print(program(SHORT[:20])).ok
+        assert printer.position_mm()[1] == pytest.approx(50.0)
+
+
 def test_an_emergency_stop_ends_the_print(tmp_path: Path) -> None:
     with octoprint(tmp_path, "VIRTUAL") as server:
         printer = server.printer()
@@ -158,11 +170,12 @@ def test_octoprint_prints_through_our_emulator_and_dies(tmp_path: Path) -> None:
     ):
         printer = server.printer()
         printer.connect()
-        report = printer.print(program(lines))
+        job = program(lines)
+        parts = [printer.print(job, lines=part) for part in (range(150), range(150, len(lines)))]
         printer.finish_moves()
         assert printer.position_mm() == pytest.approx((59.9, 50.0, 0.0))
         executed = [row for row in record.read_text().splitlines() if row in set(lines)]
-        assert report.ok
+        assert all(part.ok for part in parts)
         assert executed == lines
         end(server.running)
         with pytest.raises(LinkError, match="cannot be reached"):
