@@ -15,14 +15,22 @@ from printrun.printcore import printcore
 
 def main() -> None:
     done, online = threading.Event(), threading.Event()
+    threads: list[threading.Thread] = []
+
+    def end() -> None:
+        threads.append(threading.current_thread())
+        done.set()
+
     core = printcore()
     core.onlinecb = online.set
-    core.endcb = done.set
+    core.endcb = end
     core.connect(sys.argv[1], 115200)
     if not online.wait(20):
         sys.exit("printcore does not come online")
     core.startprint(gcoder.LightGCode(Path(sys.argv[2]).read_text().split("\n")))
     finished = done.wait(60)
+    for thread in threads:  # it starts another as it ends, which disconnect() trips over
+        thread.join(10)
     core.disconnect()
     if not finished:
         sys.exit("printcore does not finish")
