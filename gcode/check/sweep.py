@@ -6,6 +6,8 @@ only their lower faces can touch. What is laid on the way stands there for the m
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -43,15 +45,23 @@ def sweep(
     width = np.clip(pushed / np.maximum(length, 1e-9) / 0.2, 0.0, 2 * printer.nozzle_diameter_mm)
     worst = np.full(len(start), -np.inf)
     which = np.zeros(len(start), dtype=np.int64)
+    # what stands there, or will
+    laid_mm = float(end[pushed > 0, 2].max()) if (pushed > 0).any() else 0.0
+    stands_mm = max(as_built.top_mm, laid_mm)
     reach = [float(np.abs(np.array(part.polygon_mm)).max()) for part in slices]
     # what is wide is swept over joined cells, each as high as its highest: never too low
     for wide in (False, True):
         own = [k for k, mm in enumerate(reach) if (mm > WIDE_MM) == wide]
         if not own:
             continue
-        field = _coarse(
-            as_built, max(1, MAX_CELLS // (len(own) + 1)), WIDE_CELL_MM if wide else 0.0
-        )
+        around_mm = max(reach[k] for k in own) + 2 * WIDE_CELL_MM
+        lowest_slice_mm = min(slices[k].z_from_mm for k in own)
+        low = np.minimum(start[:, 2], end[:, 2]) + lowest_slice_mm <= stands_mm
+        least_cell_mm = WIDE_CELL_MM if wide else 0.0
+        near = _where_low(as_built, start[low], end[low], around_mm, least_cell_mm)
+        if not near.z_mm.size:
+            continue
+        field = _coarse(near, max(1, MAX_CELLS // (len(own) + 1)), least_cell_mm)
         depth, of_own = _swept(field, [slices[k] for k in own], start, end, pushed, width)
         deeper = depth > worst
         worst = np.where(deeper, depth, worst)
@@ -72,6 +82,28 @@ def sweep(
         )
     body = worst[np.isfinite(worst) & ~tip[which]]
     return refusals, float(-(body.max() + BODY_SLACK_MM)) if len(body) else np.inf
+
+
+def _where_low(
+    field: HeightField,
+    start: Float[np.ndarray, "n 3"],
+    end: Float[np.ndarray, "n 3"],
+    around_mm: float,
+    least_cell_mm: float,
+) -> HeightField:
+    """The field around the moves that are low enough to touch something in it."""
+    x0, y0, x1, y1 = field.box_mm
+    low, high = np.minimum(start, end)[:, :2] - around_mm, np.maximum(start, end)[:, :2] + around_mm
+    over = ((high > (x0, y0)) & (low < (x1, y1))).all(axis=1)
+    if not over.any():
+        return field.crop((x0, y0, x0, y0))
+    a, b = low[over].min(axis=0), high[over].max(axis=0)
+    # begin on a joined cell of the whole field, so that joining gives the same cells
+    factor = max(1, math.ceil(least_cell_mm / field.cell_mm - 1e-6))
+    step_mm = factor * field.cell_mm
+    a = field.origin_mm + np.floor((a - field.origin_mm) / step_mm) * step_mm
+    little = 0.25 * field.cell_mm
+    return field.crop((float(a[0]) + little, float(a[1]) + little, float(b[0]), float(b[1])))
 
 
 def _swept(

@@ -24,6 +24,11 @@ def sweep(
     worst = np.full(n, -np.inf)
     which = np.zeros(n, np.int64)
     step = 0.5 * cell
+    # what is laid can only be hit by a slice that comes below it afterwards
+    later = np.empty(n + 1)
+    later[n] = np.inf
+    for k in range(n - 1, -1, -1):
+        later[k] = min(later[k + 1], start[k, 2], end[k, 2])
     for k in range(n):
         dx, dy, dz = end[k, 0] - start[k, 0], end[k, 1] - start[k, 1], end[k, 2] - start[k, 2]
         count = max(1, int(np.ceil(np.hypot(dx, dy) / step)))
@@ -57,15 +62,17 @@ def sweep(
                     if px * px + py * py > half_width[k] * half_width[k]:
                         continue
                     field[iy, ix] = z
-                    raise_dilated(dilated, rows, row_at, iy, ix, z)
+                    raise_dilated(dilated, rows, row_at, iy, ix, z, heights, slack, later[k])
     return worst, which
 
 
 @njit(cache=True, nogil=True)
-def raise_dilated(dilated, rows, row_at, iy, ix, z):
+def raise_dilated(dilated, rows, row_at, iy, ix, z, heights, slack, later):
     """Every place of the head that covers this column sees the new height."""
     slices, ny, nx = dilated.shape
     for s in range(slices):
+        if z - slack[s] <= later + heights[s]:
+            continue
         for r in range(row_at[s], row_at[s + 1]):
             row = iy - rows[r, 0]
             if row < 0 or row >= ny:
