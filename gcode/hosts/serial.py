@@ -7,6 +7,7 @@ means, is `Link`'s business. DTR is left as it is: raising it resets most boards
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import threading
@@ -42,6 +43,8 @@ Answer = TypeVar("Answer")
 PAUSE_LIFT_MM = 5.0
 PROGRESS_EVERY_LINES = 500
 QUERY_TRIES = 3
+TEMPERATURE_EVERY_S = 10.0
+"""How often the journal hears of temperatures; a bed loses about a degree in that time."""
 
 
 class SerialPrinter:
@@ -112,6 +115,9 @@ class SerialPrinter:
         self._go_on = threading.Event()
         self._abort_asked = threading.Event()
         self._printing = False
+        self._first_line = 0
+        self._reserved = 0  # end of the journal's open step; 0 if none is open
+        self._noted_s = self._asked_s = -math.inf
         self.actions: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> SerialPrinter:
@@ -288,10 +294,19 @@ class SerialPrinter:
                 heard += self._pump()
             if command in self._asked:
                 self._asked[command] += 1
+            self._close_step()
             self._write(self._link.send(command, self._clock()))
             while not self._link.idle:
                 heard += self._pump()
             return heard
+
+    def _close_step(self) -> None:
+        """Tell the journal that the next wire number is no program line's."""
+        if self._journal is not None and self._reserved:
+            line = self._last_sent_line(self._first_line) + 1
+            number = self._link.last_sent + 1
+            self._journal.reserve(line, number, line, self._executed_line + 1)
+            self._reserved = 0
 
     def _prove(self) -> None:
         """Make sure that the printer has received every line, whatever its `ok`s say.
@@ -329,6 +344,7 @@ class SerialPrinter:
         self._abort_asked.clear()
         self._sent_lines.clear()
         self._executed_line = first - 1
+        self._first_line, self._reserved = first, 0
         self._printing = True
         try:
             with self._mutex:
@@ -338,10 +354,13 @@ class SerialPrinter:
                 self._prove()
                 self._executed_line = self._last_sent_line(first)
                 if self._journal is not None:
-                    self._journal.acknowledged(self._executed_line + 1, self._link.last_acked)
+                    self._journal.acknowledged(self._executed_line + 1)
                     if whole and end >= total:
                         self._journal.finish()
         except (LinkError, LocalProtocolError):
+            if self._journal is not None:
+                sent = max(self._last_sent_line(first), self._executed_line)
+                self._journal.lost(self._executed_line + 1, sent + 1)
             self.make_safe()
             raise
         finally:
@@ -367,16 +386,21 @@ class SerialPrinter:
         """Send the lines; False if the job was aborted."""
         link, clock, journal, trips = self._link, self._clock, self._journal, self._round_trips
         asked = self._asked
-        reserved = first
         for index, command in _commands(checked, first, end):
-            if journal is not None and index >= reserved:
-                step = journal.step_lines if link.dialect.verifies else 1
-                reserved = index + step
-                journal.reserve(reserved, link.last_sent + 1 - index, self._executed_line + 1)
             if self._pause_asked.is_set() and not self._sit_out_pause(checked, index):
                 return False
             if self._abort_asked.is_set():
                 return False
+            if journal is not None:
+                if clock() >= self._asked_s + TEMPERATURE_EVERY_S:
+                    self._asked_s = clock()
+                    self._ask("M105")
+                if index >= self._reserved or not self._reserved:
+                    step = journal.step_lines if link.dialect.verifies else 1
+                    self._reserved = min(index + step, end)
+                    journal.reserve(
+                        index, link.last_sent + 1, self._reserved, self._executed_line + 1
+                    )
             sent_s = clock()
             self._sent_lines.append((link.last_sent + 1, index))
             if command[:4] in asked:
@@ -474,9 +498,18 @@ class SerialPrinter:
             else:
                 self.heaters_off()
                 self._lift()
-                self._note("heaters off, nozzle lifted")
+                self._note(f"{self._heaters_now()}, nozzle lifted")
         except (LinkError, LocalProtocolError, OSError) as error:
             self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+
+    def _heaters_now(self) -> str:
+        """What the printer says of its heaters; an `ok` alone confirms nothing."""
+        for event in self._ask("M105"):
+            if isinstance(event, ev.TemperatureReport) and all(
+                heater.target_c == 0.0 for heater in event.heaters.values()
+            ):
+                return "heaters off (the printer reports targets of 0)"
+        return "heaters told to switch off, nothing confirms it"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -556,6 +589,7 @@ class SerialPrinter:
     def _on_event(self, event: ev.Event) -> None:
         if isinstance(event, ev.TemperatureReport):
             self._temperatures = event
+            self._journal_temperatures(event)
         elif isinstance(event, ev.PositionReport):
             self._position = event
             self._heard["M114"] += 1
@@ -582,6 +616,17 @@ class SerialPrinter:
             )
         elif isinstance(event, ev.LinkLost):
             self._failure = self._lost_error(event.why)
+
+    def _journal_temperatures(self, report: ev.TemperatureReport) -> None:
+        """Write temperatures down, some of the many that come while something heats."""
+        now_s = self._clock()
+        if self._journal is None or now_s < self._noted_s + TEMPERATURE_EVERY_S / 2:
+            return
+        heaters = report.heaters
+        hotend, bed = heaters.get("T") or heaters.get("T0"), heaters.get("B")
+        if hotend is not None:
+            self._noted_s = now_s
+            self._journal.temperature(hotend.current_c, bed.current_c if bed else None)
 
     def _lost(self, why: str) -> NoReturn:
         """Raise for a dead port."""

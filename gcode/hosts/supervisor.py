@@ -6,13 +6,25 @@ of the sender's death, and the open port. It imports nothing of ours.
 
 import contextlib
 import os
+import re
 import select
 import sqlite3
 import sys
 import time
 
-COMMANDS = (b"M104 S0", b"M140 S0", b"M107", b"G91", b"G1 Z5 F600", b"G90", b"M104 S0", b"M140 S0")
-"""Heaters first; then the nozzle away from the part; heaters again, a line may have been lost."""
+HEATERS_OFF = (b"M104 S0", b"M140 S0")
+COMMANDS = (
+    b"M108",  # ends a wait for temperature, where the firmware lets it pass the queue
+    *HEATERS_OFF,
+    b"M107",
+    b"G91",
+    b"G1 Z5 F600",
+    b"G90",
+    *HEATERS_OFF,  # again: a line may have been lost
+)
+"""Heaters first; then the nozzle away from the part."""
+QUESTIONS = 3
+_TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 ANSWER_S = 0.5
 
 
@@ -36,10 +48,26 @@ def make_safe(port_fd: int) -> str:
     for command in COMMANDS:
         if not write(port_fd, command + b"\n"):
             return "supervisor: THE PORT IS GONE, heaters could not be reached"
-        answered += wait(port_fd, ANSWER_S)
+        answered += wait(port_fd, ANSWER_S)[0]
     if not answered:
         return "supervisor: heaters told to switch off, NO ANSWER"
-    return "supervisor: sender died; heaters off, nozzle lifted"
+    if confirmed_off(port_fd):
+        return "supervisor: sender died; heaters off (the printer reports targets of 0), lifted"
+    return "supervisor: sender died; heaters told to switch off, nothing confirms it"
+
+
+def confirmed_off(port_fd: int) -> bool:
+    """Whether the printer itself reports that its heaters aim at 0.
+
+    An `ok` proves nothing: it may answer a line of the dead sender's.
+    """
+    for _ in range(QUESTIONS):
+        if not write(port_fd, b"M105\n"):
+            return False
+        targets = dict(_TARGET.findall(wait(port_fd, ANSWER_S)[1]))
+        if b"T" in targets:
+            return all(float(value) == 0.0 for value in targets.values())
+    return False
 
 
 def write(port_fd: int, data: bytes) -> bool:
@@ -54,22 +82,22 @@ def write(port_fd: int, data: bytes) -> bool:
     return True
 
 
-def wait(port_fd: int, seconds: float) -> bool:
-    """Read until an `ok` line or until time is up; True if there was one."""
+def wait(port_fd: int, seconds: float) -> tuple[bool, bytes]:
+    """Read until an `ok` line or until time is up; whether there was one, and all that came."""
     until_s, heard = time.monotonic() + seconds, b""
     while (left_s := until_s - time.monotonic()) > 0:
         if not select.select([port_fd], [], [], left_s)[0]:
-            return False
+            break
         try:
             data = os.read(port_fd, 4096)
         except OSError:
-            return False
+            break
         if not data:
-            return False
+            break
         heard += data
         if any(line.startswith(b"ok") for line in heard.split(b"\n")[:-1]):
-            return True
-    return False
+            return True, heard
+    return False, heard
 
 
 if __name__ == "__main__":
