@@ -17,6 +17,9 @@ from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
 from gcode.firmware.faults import parse_faults
 from gcode.hosts import connect
+from gcode.hosts.journal import default_path
+from gcode.hosts.resume import resume as resume_job
+from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
 from gcode.profiles import (
     DEFAULT_MATERIAL,
@@ -215,9 +218,21 @@ def send(
     port: Annotated[str, typer.Option(help="Device path, or file:PATH.")],
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the job that the journal knows, or say why not."),
+    ] = False,
+    pose_confirmed: Annotated[
+        bool,
+        typer.Option(
+            "--pose-confirmed",
+            help="A rescan has shown that the part still stands where it stood (with --resume).",
+        ),
+    ] = False,
     wire_log: Annotated[Path | None, typer.Option(help="Log of every byte, with times.")] = None,
     journal: Annotated[
-        Path | None, typer.Option(help="Journal of the job, written ahead of the wire.")
+        Path | None,
+        typer.Option(help="Journal, written ahead of the wire; one a port where left out."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -229,13 +244,24 @@ def send(
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=wire_log,
-        journal=journal,
+        journal=journal or default_path(port),
     )
+    if resume and not isinstance(machine, SerialPrinter):
+        raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")
     bars = console.Bars()
-    machine.connect()
     try:
         with bars.shown():
-            report = machine.print(checked, progress=bars)
+            if resume and isinstance(machine, SerialPrinter):
+                report = resume_job(
+                    machine,
+                    checked,
+                    release_c=setup.material.bed_release_c,
+                    pose_confirmed=pose_confirmed,
+                    progress=bars,
+                )
+            else:
+                machine.connect()
+                report = machine.print(checked, progress=bars)
             machine.finish_moves()
     except BaseException:
         machine.abort()
@@ -244,10 +270,18 @@ def send(
         machine.close()
     result = {
         "ok": report.ok,
+        "first_line": report.first_line,
+        "next_line": report.next_line,
         "lines_acked": report.lines_acked,
         "resends": report.resends,
         "stalls": report.stalls,
+        "spare_oks": report.spare_oks,
         "bytes_sent": report.bytes_sent,
+        "round_trip_ms": {
+            name: round(1000 * seconds, 3)
+            for name, seconds in zip(("p50", "p95", "p99"), report.round_trip_s, strict=True)
+        },
+        "warnings": list(report.warnings),
         "seconds": round(report.seconds, 3),
     }
     if as_json:

@@ -13,6 +13,8 @@ It stores what was sent and said; what follows from that is decided in `resume`.
 
 from __future__ import annotations
 
+import hashlib
+import os
 import random
 import sqlite3
 import time
@@ -67,6 +69,12 @@ CREATE TABLE IF NOT EXISTS temperature (
     bed_c REAL
 );
 """
+
+
+def default_path(port: str) -> Path:
+    """Where a port's journal is kept unless told otherwise: one a printer, in the user's state."""
+    folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return folder / "gcode" / f"{hashlib.sha256(port.encode()).hexdigest()[:16]}.sqlite"
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +143,7 @@ class Journal:
             ) from error
         self._job: int | None = None
         self._session: int | None = None
+        self._settled: int | None = None
 
     def _prepare(self) -> None:
         tables = self._db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
@@ -147,13 +156,10 @@ class Journal:
         self._db.executescript(_SCHEMA)
         self._db.execute(f"PRAGMA user_version = {VERSION}")
 
-    def open_session(self, *, resumes: int | None = None) -> int:
+    def open_session(self) -> int:
         """Begin a conversation; returns the number to set the printer to, never used before.
 
-        Parameters
-        ----------
-        resumes
-            The job to go on with, settled before (`settle`), or None.
+        A job settled before is the one that it is to go on with.
         """
         row = self._run(
             "SELECT MAX(base), (SELECT MAX(number + reserved - line) FROM step) FROM session"
@@ -165,10 +171,10 @@ class Journal:
         cursor = self._run(
             "INSERT INTO session (base, resumes, time_s) VALUES (?, ?, ?)",
             base,
-            resumes,
+            self._settled,
             self._clock(),
         )
-        self._session = cursor.lastrowid
+        self._session, self._settled = cursor.lastrowid, None
         return base
 
     def begin(self, program_sha256: str, port: str, first: int, end: int) -> None:
@@ -198,25 +204,21 @@ class Journal:
         )
         self._job = cursor.lastrowid
 
-    def reserve(self, line: int, number: int, up_to: int, acked: int) -> None:
+    def reserve(self, line: int, number: int | None, up_to: int, acked: int) -> None:
         """Say, before it happens, that lines [line, up_to) may be sent.
 
         Parameters
         ----------
         number
             Wire number of the first of them; with `up_to == line`: of a command of the host's.
+            None where the firmware does not count.
         acked
             Every program line below is acknowledged.
         """
         self._run("BEGIN IMMEDIATE")
-        self._run(
-            "INSERT INTO step VALUES (?, ?, ?, ?, ?)",
-            self._job,
-            line,
-            number,
-            up_to,
-            self._clock(),
-        )
+        if number is not None:
+            row = (self._job, line, number, up_to, self._clock())
+            self._run("INSERT INTO step VALUES (?, ?, ?, ?, ?)", *row)
         self._run("UPDATE job SET reserved = ?, acked = ? WHERE id = ?", up_to, acked, self._job)
         self._run("COMMIT")
 
@@ -233,7 +235,7 @@ class Journal:
 
         Notes and temperatures are that job's from here on.
         """
-        self._job = job
+        self._job = self._settled = job
         self._run("UPDATE job SET acked = ?, reserved = ? WHERE id = ?", line, line, job)
 
     def finish(self) -> None:
@@ -269,13 +271,11 @@ class Journal:
         )
         return tuple(Step(*row) for row in rows)
 
-    def session(self, session: int | None = None) -> Session | None:
-        """Return a session, or the latest; None if there is none."""
+    def session_of(self, number: int) -> Session | None:
+        """Return the session that gave out a wire number; None if none did."""
         row = self._run(
-            "SELECT id, base, resumes FROM session WHERE id = ?"
-            " OR (? IS NULL AND id = (SELECT MAX(id) FROM session))",
-            session,
-            session,
+            "SELECT id, base, resumes FROM session WHERE base <= ? ORDER BY base DESC LIMIT 1",
+            number,
         ).fetchone()
         return None if row is None else Session(*row)
 
@@ -300,6 +300,12 @@ class Journal:
     def temperatures(self) -> tuple[tuple[float, float, float | None], ...]:
         """Return (time_s, hotend_c, bed_c) as noted, oldest first."""
         return tuple(self._run("SELECT time_s, hotend_c, bed_c FROM temperature ORDER BY rowid"))
+
+    def heaters_left_alone(self) -> bool:
+        """Whether no temperature was noted since the heaters were last told to switch off."""
+        off = [row[0] for row in self._run("SELECT time_s, text FROM note") if "heaters" in row[1]]
+        noted_s = self._run("SELECT MAX(time_s) FROM temperature").fetchone()[0]
+        return bool(off) and (noted_s is None or max(off) > noted_s)
 
     def last_heard_s(self) -> float | None:
         """Return when anything was last noted of the latest job, s since the epoch."""

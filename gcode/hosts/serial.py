@@ -34,15 +34,17 @@ from gcode.hosts.port import (
 from gcode.hosts.proof import require_checked
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
 from gcode.hosts.telemetry import RoundTrips
+from gcode.hosts.whereabouts import last_number
 from gcode.hosts.wirelog import WireLog
 from gcode.progress import Progress, silent
-from gcode.protocol import Link, LinkTiming
+from gcode.protocol import Link, LinkDialect, LinkTiming
 from gcode.protocol import events as ev
 
 Answer = TypeVar("Answer")
 PAUSE_LIFT_MM = 5.0
 PROGRESS_EVERY_LINES = 500
 QUERY_TRIES = 3
+TEMPERATURE_STEP_C = 2.0
 TEMPERATURE_EVERY_S = 10.0
 """How often the journal hears of temperatures; a bed loses about a degree in that time."""
 
@@ -117,7 +119,7 @@ class SerialPrinter:
         self._printing = False
         self._first_line = 0
         self._reserved = 0  # end of the journal's open step; 0 if none is open
-        self._noted_s = self._asked_s = -math.inf
+        self._noted_s = self._asked_s = self._noted_bed_c = -math.inf
         self.actions: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> SerialPrinter:
@@ -136,15 +138,25 @@ class SerialPrinter:
 
     # ------------------------------------------------------------------ connection
 
-    def connect(self) -> None:
-        """Open the port, agree on line numbers and ask who is there."""
+    def connect(self, *, before_hello: Callable[[int | None], None] | None = None) -> None:
+        """Open the port, agree on line numbers and ask who is there.
+
+        Parameters
+        ----------
+        before_hello
+            Told the number of the last line that the printer has received (None: it does not
+            say), before a hello makes it forget that; what it raises ends the attempt.
+        """
         if self._serial is not None:
             return
         self._lock.acquire()
         try:
             self._log = WireLog(self._wire_log) if self._wire_log is not None else None
             self._open_port()
-            self._greet()
+            if before_hello is not None:
+                self._ask_number(before_hello)
+            counted = self._journal is not None and self._link.dialect.verifies
+            self._greet(self._journal.open_session() if self._journal and counted else 0)
             if self._guard and self._link.dialect.verifies:
                 self._test_guard()
             self._learn()
@@ -181,6 +193,28 @@ class SerialPrinter:
             attributes = termios.tcgetattr(self._fd)
             attributes[2] &= ~termios.HUPCL
             termios.tcsetattr(self._fd, termios.TCSANOW, attributes)
+
+    def _ask_number(self, before_hello: Callable[[int | None], None]) -> None:
+        number = None
+        if self._link.dialect.verifies:
+            try:
+                number = last_number(
+                    self._fd, timing=self._link.timing, clock=self._clock, note=self._log_wire
+                )
+            except OSError as error:
+                raise LinkError(
+                    f"{self.port} failed ({error}) when asked for its line number; check the "
+                    f"printer and its cable."
+                ) from error
+        try:
+            before_hello(number)
+        except LinkError:
+            self.make_safe()
+            raise
+
+    def _log_wire(self, direction: bytes, data: bytes) -> None:
+        if self._log is not None:
+            self._log.add(self._clock(), direction, data)
 
     def _greet(self, number: int = 0) -> None:
         self._greeted = False
@@ -250,6 +284,16 @@ class SerialPrinter:
 
     # ------------------------------------------------------------------ questions
 
+    @property
+    def journal(self) -> Journal | None:
+        """Where the job is written down."""
+        return self._journal
+
+    @property
+    def dialect(self) -> LinkDialect:
+        """How the firmware speaks."""
+        return self._link.dialect
+
     def capabilities(self) -> Capabilities:
         """Return what the firmware said on connecting."""
         return self._capabilities
@@ -273,6 +317,11 @@ class SerialPrinter:
         """Ask for the logical position (M114)."""
         report = self._where()
         return report.x_mm, report.y_mm, report.z_mm
+
+    def place(self) -> ev.PositionReport:
+        """Ask for the logical position, extruder included, once all moves are made."""
+        self._ask("M400")
+        return self._where()
 
     def _where(self) -> ev.PositionReport:
         return self._answer("M114", lambda: self._position, "position")
@@ -304,9 +353,11 @@ class SerialPrinter:
         """Tell the journal that the next wire number is no program line's."""
         if self._journal is not None and self._reserved:
             line = self._last_sent_line(self._first_line) + 1
-            number = self._link.last_sent + 1
-            self._journal.reserve(line, number, line, self._executed_line + 1)
+            self._journal.reserve(line, self._next_number(), line, self._executed_line + 1)
             self._reserved = 0
+
+    def _next_number(self) -> int | None:
+        return self._link.last_sent + 1 if self._link.dialect.verifies else None
 
     def _prove(self) -> None:
         """Make sure that the printer has received every line, whatever its `ok`s say.
@@ -380,13 +431,14 @@ class SerialPrinter:
             next_line=end if whole else self._executed_line + 1,
             round_trip_s=self._round_trips.summary_s(),
             warnings=tuple(self._warnings),
+            first_line=first,
         )
 
     def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
         """Send the lines; False if the job was aborted."""
         link, clock, journal, trips = self._link, self._clock, self._journal, self._round_trips
         asked = self._asked
-        for index, command in _commands(checked, first, end):
+        for index, command in commands_of(checked, first, end):
             if self._pause_asked.is_set() and not self._sit_out_pause(checked, index):
                 return False
             if self._abort_asked.is_set():
@@ -398,9 +450,8 @@ class SerialPrinter:
                 if index >= self._reserved or not self._reserved:
                     step = journal.step_lines if link.dialect.verifies else 1
                     self._reserved = min(index + step, end)
-                    journal.reserve(
-                        index, link.last_sent + 1, self._reserved, self._executed_line + 1
-                    )
+                    acked = self._executed_line + 1
+                    journal.reserve(index, self._next_number(), self._reserved, acked)
             sent_s = clock()
             self._sent_lines.append((link.last_sent + 1, index))
             if command[:4] in asked:
@@ -619,14 +670,16 @@ class SerialPrinter:
 
     def _journal_temperatures(self, report: ev.TemperatureReport) -> None:
         """Write temperatures down, some of the many that come while something heats."""
-        now_s = self._clock()
-        if self._journal is None or now_s < self._noted_s + TEMPERATURE_EVERY_S / 2:
-            return
         heaters = report.heaters
         hotend, bed = heaters.get("T") or heaters.get("T0"), heaters.get("B")
-        if hotend is not None:
-            self._noted_s = now_s
-            self._journal.temperature(hotend.current_c, bed.current_c if bed else None)
+        if self._journal is None or hotend is None:
+            return
+        now_s = self._clock()
+        bed_c = bed.current_c if bed else None
+        change_c = abs((bed_c or 0.0) - self._noted_bed_c)
+        if now_s >= self._noted_s + TEMPERATURE_EVERY_S / 2 or change_c >= TEMPERATURE_STEP_C:
+            self._noted_s, self._noted_bed_c = now_s, bed_c or 0.0
+            self._journal.temperature(hotend.current_c, bed_c)
 
     def _lost(self, why: str) -> NoReturn:
         """Raise for a dead port."""
@@ -652,7 +705,7 @@ def _wrong_number(number: int) -> bytes:
     return b"%b*%d\n" % (body, value)
 
 
-def _commands(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
+def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
     """Lines to send with their numbers in the program; comments and empty lines left out."""
     step = 4096
     for start in range(first, end, step):

@@ -124,7 +124,8 @@ def test_how_cold_the_bed_was_counts_from_when_it_was_warm(tmp_path: Path) -> No
         journal.temperature(200.0, bed_c)
     assert journal.lowest_bed_c(40.0) == 45.0
     assert journal.lowest_bed_c(70.0) is None
-    journal.open_session(resumes=1)
+    journal.settle(1, 5)
+    journal.open_session()
     journal.begin("a", "port", 5, 10)  # the same program goes on: its part stood there all along
     journal.temperature(200.0, 38.0)
     assert journal.lowest_bed_c(40.0) == 38.0
