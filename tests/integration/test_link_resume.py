@@ -6,6 +6,7 @@ import functools
 import json
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,6 +112,23 @@ def test_a_sender_killed_while_it_gets_ready_to_go_on_loses_nothing(bench: Bench
     assert bench.executed() == BEADS
 
 
+def test_a_sender_killed_in_a_pause_is_gone_on_from(bench: Bench) -> None:
+    """Its questions and its lift have wire numbers, too, that are no program lines."""
+    sender = bench.send(pause=True)
+    until(lambda: bench.record.exists() and "G1 Z5 F600" in bench.record.read_text())
+    until(lambda: bench.record.read_text().count("M105") > 2)
+    bench.forks.kill(sender)
+    bench.go_on()
+    assert bench.executed() == BEADS
+
+
+def test_motors_that_may_have_let_go_need_a_rescan(bench: Bench) -> None:
+    bench.kill_after(bench.send(), 600)
+    assert "lets go of its motors" in bench.go_on(later_s=130.0)["error"]
+    assert bench.go_on(later_s=130.0, pose_confirmed=True)["first_line"] > 600
+    assert bench.executed() == BEADS
+
+
 def test_a_pulled_cable_is_gone_on_from(forks: Forks, tmp_path: Path) -> None:
     bench = Bench(forks, tmp_path, faults="line 800 disconnect s=0.1")
     assert bench.forks.wait(bench.send()) == 4
@@ -211,6 +229,38 @@ def test_klipper_is_asked_for_its_place(forks: Forks, tmp_path: Path) -> None:
     told = bench.go_on()
     assert "counts no lines" in told["error"]
     assert told["executed"] <= len(bench.executed()) + HEAD <= told["sent"] + 2
+
+
+def test_the_command_line_goes_on_after_a_kill(bench: Bench) -> None:
+    file = bench.folder / "job.gcode"
+    file.write_text("\n".join([*job_lines(LINES), "M107"]) + "\n")
+    words = ["send", str(file), "--port", str(bench.port), "--printer", "generic_marlin"]
+    words += ["--journal", str(bench.journal), "--json"]
+    code = "from gcode.cli import main; main()"
+    command = [sys.executable, "-W", "ignore", "-c", code, *words]
+    first = subprocess.Popen(command, stdout=subprocess.PIPE)
+    until(lambda: len(bench.executed()) > 1000)
+    first.kill()
+    first.communicate()
+    assert first.returncode == -signal.SIGKILL
+    until(lambda: b"targets of 0" in _notes(bench.journal))
+    done = subprocess.run(
+        [*command, "--resume"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["ok"]
+    assert told["first_line"] > 1000
+    assert told["lines_acked"] == LINES + HEAD + 3 - told["first_line"]
+    assert 0 < told["round_trip_ms"]["p50"] <= told["round_trip_ms"]["p99"]
+    assert bench.executed() == BEADS
+    again = subprocess.run(
+        [*command, "--resume"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert again.returncode == 4
+    assert "printed to its end" in again.stderr
+    assert len(again.stderr.strip().splitlines()) == 1
+    assert bench.executed() == BEADS
 
 
 def _notes(journal: Path) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 import traceback
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from gcode.firmware.serve import PtyServer
 from gcode.hosts import LinkLostError, ResumeRefusedError
 from gcode.hosts.journal import Journal
 from gcode.hosts.resume import resume
+from gcode.progress import Progress, silent
 from gcode.protocol import LinkTiming
 
 QUICK = LinkTiming(
@@ -54,6 +56,16 @@ def emulate(
     return 0
 
 
+def _pause_once(printer: serial_host.SerialPrinter) -> Progress:
+    """Pause in the middle, and never go on: a kill will end it."""
+
+    def progress(stage: str, done: float, total: float) -> None:
+        if done > total / 4:
+            printer.pause()
+
+    return progress
+
+
 def send(
     port: str,
     journal: str,
@@ -62,6 +74,8 @@ def send(
     go_on: bool = False,
     pose_confirmed: bool = False,
     dialect: str = "marlin",
+    later_s: float = 0.0,
+    pause: bool = False,
 ) -> int:
     """Print, or go on; what became of it is written to the file `outcome`."""
     serial_host.require_checked = lambda checked: None
@@ -72,10 +86,16 @@ def send(
     printer = serial_host.SerialPrinter(port, journal=book, dialect=dialect, timing=QUICK)
     try:
         if go_on:
-            report = resume(printer, job, release_c=40.0, pose_confirmed=pose_confirmed)
+            report = resume(
+                printer,
+                job,
+                release_c=40.0,
+                pose_confirmed=pose_confirmed,
+                wall_clock=lambda: time.time() + later_s,
+            )
         else:
             printer.connect()
-            report = printer.print(job)
+            report = printer.print(job, progress=_pause_once(printer) if pause else silent)
         told = {"first_line": report.first_line, "next_line": report.next_line}
     except (LinkLostError, ResumeRefusedError) as error:
         told = {
