@@ -89,10 +89,15 @@ class LinkLostError(LinkError):
         The last program line known to be executed, -1 if none.
     last_sent_line
         The last program line sent: those between may or may not have been executed.
+    why
+        What happened to the link, in a few words.
     """
 
-    def __init__(self, message: str, last_executed_line: int, last_sent_line: int) -> None:
+    def __init__(
+        self, message: str, last_executed_line: int, last_sent_line: int, *, why: str = ""
+    ) -> None:
         super().__init__(message)
+        self.why = why
         self.last_executed_line = last_executed_line
         self.last_sent_line = last_sent_line
 

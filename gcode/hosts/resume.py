@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from gcode.hosts.journal import FOREIGN_LINES, JobRecord, Journal, Step
 from gcode.hosts.modes import Modes, follow, modes_after
-from gcode.hosts.port import PrintableProgram, PrintReport, ResumeRefusedError
+from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
 from gcode.hosts.serial import PAUSE_LIFT_MM, SerialPrinter, commands_of
 from gcode.progress import Progress, silent
 from gcode.protocol.events import PositionReport
@@ -77,10 +77,19 @@ class _Resumption:
 
     def run(self, progress: Progress) -> PrintReport:
         printer = self._printer
+        try:
+            line = self._prepare()
+        except LinkLostError as error:  # it knows nothing of the job's lines: none was sent
+            self._refuse(f"the link was lost again ({error.why})")
+        return printer.print(self._checked, lines=range(line, self._total), progress=progress)
+
+    def _prepare(self) -> int:
+        """Connect, find the line, judge, and bring the machine back to it."""
+        printer = self._printer
         printer.connect(before_hello=self._settle)
         try:
             place = printer.place()
-            line = self._line_by_place(place) if not printer.dialect.verifies else self._job.acked
+            line = self._job.acked if printer.dialect.verifies else self._line_by_place(place)
             modes = modes_after(self._checked, line, printer.dialect.name)
             self._require_place(place, modes, line)
             if not self._pose_confirmed:
@@ -90,7 +99,7 @@ class _Resumption:
             printer.make_safe()
             raise
         self._restore(place, modes)
-        return printer.print(self._checked, lines=range(line, self._total), progress=progress)
+        return line
 
     # ------------------------------------------------------------------ which line
 

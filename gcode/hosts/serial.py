@@ -688,12 +688,18 @@ class SerialPrinter:
 
     def _lost_error(self, why: str) -> LinkLostError:
         last_sent = max((line for _, line in self._sent_lines), default=self._executed_line)
+        doubt = (
+            f"lines {self._executed_line + 2} to {last_sent + 1} are uncertain"
+            if last_sent > self._executed_line
+            else "no later line was sent"
+        )
         return LinkLostError(
             f"The link to {self.port} is lost: {why}; program lines up to "
-            f"{self._executed_line + 1} are executed, lines {self._executed_line + 2} to "
-            f"{last_sent + 1} are uncertain; find out where the printer is before going on.",
+            f"{self._executed_line + 1} are acknowledged, {doubt}; find out where the printer is "
+            f"before going on.",
             self._executed_line,
             last_sent,
+            why=why,
         )
 
 
