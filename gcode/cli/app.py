@@ -12,6 +12,7 @@ import gcode
 from gcode.check import check as check_program
 from gcode.check import find_refusals
 from gcode.cli import console
+from gcode.cli.resuming import resume_at_command
 from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
@@ -63,6 +64,7 @@ app = typer.Typer(
 )
 profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
 app.add_typer(profiles_app, name="profiles")
+app.command("resume-at")(resume_at_command)
 
 
 def _version(asked: bool) -> None:
