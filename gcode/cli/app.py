@@ -220,6 +220,7 @@ def send(
     port: Annotated[str, typer.Option(help="Device path, or file:PATH.")],
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
+    as_built: AsBuiltOption = None,
     resume: Annotated[
         bool,
         typer.Option("--resume", help="Go on with the job that the journal knows, or say why not."),
@@ -240,7 +241,8 @@ def send(
 ) -> None:
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
     setup = load_setup(printer, material)
-    checked = check_program(Program(_text(file), setup.printer.dialect), setup)
+    field = _as_built(as_built) if as_built is not None else None
+    checked = check_program(Program(_text(file), setup.printer.dialect), setup, as_built=field)
     machine = connect(
         port,
         dialect=setup.printer.dialect,

@@ -29,12 +29,20 @@ def resume_at_command(
     material: Annotated[
         str, typer.Option(help="Material profile: an ID or a TOML file.")
     ] = DEFAULT_MATERIAL,
+    standing: Annotated[
+        Path | None,
+        typer.Option(help="Height map (.npz) to write: what must stand there, for --as-built."),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
     ] = False,
 ) -> None:
     """Make a checked job from a layer on: heated, primed, lowered onto the part, Z not homed."""
     console.writable(output)
+    if standing is not None:
+        if standing.suffix != ".npz":
+            raise InputError(f"{standing}: what stands there is written as .npz; rename it.")
+        console.writable(standing)
     setup = load_setup(printer, material)
     try:
         text = job.read_text(encoding="utf-8", errors="replace")
@@ -45,6 +53,8 @@ def resume_at_command(
     )
     program = made.checked.program
     console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
+    if standing is not None:
+        console.write_whole(standing, made.standing.write)
     if as_json:
         console.show_json(
             {
@@ -52,7 +62,7 @@ def resume_at_command(
                 "layer": made.layer.index,
                 "z_mm": round(made.layer.z_mm, 4),
                 "first_line": made.first_line,
-                "standing_mm": round(made.standing_mm, 4),
+                "standing_mm": round(made.standing.top_mm, 4),
                 "hotend_c": made.hotend_c,
                 "bed_c": made.bed_c,
                 "primed": made.primed,
@@ -63,6 +73,6 @@ def resume_at_command(
         return
     console.out.print(
         f"{output}: {job.name} from layer {made.layer.index} ({made.layer.z_mm:g} mm) on, line "
-        f"{made.first_line + 1}; {made.standing_mm:g} mm must stand there, and Z must be true; "
+        f"{made.first_line + 1}; {made.standing.top_mm:g} mm must stand there, and Z must be true; "
         f"primed {made.primed}; checked."
     )

@@ -22,6 +22,7 @@ from gcode.reader import Job, read_job
 from gcode.reader.job import JobLayer
 from gcode.resumption.settings import Settings, settings_before
 from gcode.resumption.standing import bare_place, room_for_line, standing_field
+from gcode.surfaces import HeightField
 from gcode.units import filament_area_mm2, mm_min_from_mm_s
 
 LIFT_MM = 10.0
@@ -41,16 +42,16 @@ class Resumption:
         The first layer that is printed.
     first_line
         The job's line that the program goes on with, from 0.
-    standing_mm
-        Height of what must stand on the bed already.
+    standing
+        What must stand on the bed already.
     primed
         `on the bed`, or `in the air` where the head does not fit beside the part.
     """
 
     checked: CheckedProgram
+    standing: HeightField
     layer: JobLayer
     first_line: int
-    standing_mm: float
     hotend_c: float
     bed_c: float
     primed: str
@@ -114,9 +115,9 @@ def resume_at(
     text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
     return Resumption(
         checked=check(Program(text, program.dialect), setup, as_built=field),
+        standing=field,
         layer=first,
         first_line=line,
-        standing_mm=field.top_mm,
         hotend_c=hotend_c,
         bed_c=bed_c,
         primed="on the bed" if place is not None else "in the air",

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from gcode.errors import ReadError
 from gcode.reader import Job
 
-REPLAYED = frozenset(
-    ("M201", "M203", "M204", "M205", "M220", "M221", "M486", "M566", "M572", "M593", "M900")
-    + ("M141", "G17", "G18", "G19")
-    + ("SET_VELOCITY_LIMIT", "SET_PRESSURE_ADVANCE", "EXCLUDE_OBJECT_DEFINE")
-)
+_LIMITS = ("M201", "M203", "M204", "M205", "M566", "M593", "SET_VELOCITY_LIMIT")
+_FACTORS = ("M220", "M221", "M572", "M900", "SET_PRESSURE_ADVANCE")
+_OTHERS = ("M141", "M486", "EXCLUDE_OBJECT_DEFINE", "G17", "G18", "G19")
+REPLAYED = frozenset((*_LIMITS, *_FACTORS, *_OTHERS))
 """Limits, factors, pressure advance, planes, chamber, names of objects: the last word counts."""
 _PLANES = frozenset({"G17", "G18", "G19"})
 _NAME = re.compile(r"([GMT]\d+(?:\.\d+)?|[A-Z_]{3,}\w*)\s*(.*)")

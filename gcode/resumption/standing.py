@@ -10,7 +10,7 @@ from gcode.reader.job import Beads
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 
-CELL_MM = 0.5
+CELL_MM = 1.0
 SPAN = 2_000_000  # samples at a time: 50 MB
 INSET_MM = 5.0  # from the bed's edge
 EVERY_MM = 10.0
@@ -24,7 +24,7 @@ def standing_field(beads: Beads, line: int, printer: PrinterProfile) -> HeightFi
     z_mm = np.zeros(ny * nx)
     count = int(np.searchsorted(beads.line, line))
     start, end = beads.start_mm[:count], beads.end_mm[:count]
-    half_mm = 0.5 * np.clip(beads.width_mm[:count], CELL_MM, 3.0)
+    half_mm = 0.5 * np.clip(beads.width_mm[:count], 0.3, 3.0)
     steps = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / (0.5 * CELL_MM)), 1.0)
     first = 0
     bounds = np.concatenate([[0], np.cumsum(steps + 1)])
