@@ -293,7 +293,9 @@ def send(
     else:
         console.out.print(
             f"{report.lines_acked} lines acknowledged, {report.resends} resent, "
-            f"{report.seconds:.1f} s."
+            f"{report.stalls} stalls, {report.seconds:.1f} s; round trip "
+            f"{1000 * report.round_trip_s[0]:.2f} ms, 99 % within "
+            f"{1000 * report.round_trip_s[2]:.2f} ms."
         )
     if not report.ok:
         raise typer.Exit(4)

@@ -151,7 +151,8 @@ class SerialPrinter:
             return
         self._lock.acquire()
         try:
-            self._log = WireLog(self._wire_log) if self._wire_log is not None else None
+            if self._wire_log is not None:
+                self._log = WireLog(self._wire_log, epoch_s=time.time() - self._clock())
             self._open_port()
             if before_hello is not None:
                 self._ask_number(before_hello)
