@@ -18,7 +18,7 @@ from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
 from gcode.firmware.faults import parse_faults
 from gcode.hosts import connect
-from gcode.hosts.journal import default_path
+from gcode.hosts.journal import default_path, is_device
 from gcode.hosts.resume import resume as resume_job
 from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
@@ -248,7 +248,7 @@ def send(
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=wire_log,
-        journal=journal or default_path(port),
+        journal=journal or (default_path(port) if is_device(port) else None),
     )
     if resume and not isinstance(machine, SerialPrinter):
         raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")

@@ -23,6 +23,8 @@ MAX_CMD_SIZE = 96
 _NUMBERED = re.compile(rb"N\s*(-?\d+)\s*")
 _EMERGENCY = re.compile(rb"(?:^|\n)(?:N\d+ ?)?(M108|M112|M410)\b")
 _BUSY_EVERY_S = 2.0
+_MOST_REPORTS = 5000
+"""In one command: an accelerated clock would otherwise tell of years of waiting."""
 
 
 class FirmwareCore:
@@ -276,7 +278,7 @@ class FirmwareCore:
         end_s = min(wait.end_s, limit_s)
         if math.isinf(end_s):
             return False  # only a user ends it
-        while True:
+        for _ in range(_MOST_REPORTS):
             report_s = wait.next_report_s if wait.heating else math.inf
             busy_s = wait.next_busy_s if self.variant.keepalive else math.inf
             event_s = min(report_s, busy_s)

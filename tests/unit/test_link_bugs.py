@@ -253,6 +253,30 @@ def test_bug_13_a_slow_command_never_forces_the_next_line() -> None:
     assert link.state is State.PROBING
 
 
+@pytest.mark.parametrize("dialect", ["klipper", "marlin"])
+def test_bug_14_a_long_script_does_not_time_out(dialect: str) -> None:
+    """Moonraker#437: a macro takes as long as its moves; 25 minutes without a word are none too
+    many, nothing is sent again that cannot be, and its ok is taken when it comes.
+
+    (The adapter of Moonraker itself has its own: scripts go by the websocket, without a limit.)
+    """
+    link = Link(dialect)
+    link.hello(0.0)
+    link.receive(b"ok\n", 0.0)
+    line = link.send("PRINT_START EXTRUDER_TEMP=210 BED_TEMP=60", 0.0)
+    now_s = 0.0
+    while now_s < 1500.0:
+        now_s = min(link.next_deadline_s(), 1500.0)
+        link.tick(now_s)
+        assert link.take_output() in ((b"",) if dialect == "klipper" else (b"", line))
+        assert not link.ended
+        assert not link.ready
+    link.receive(b"ok\n", 1500.0)
+    assert link.idle
+    link.send("G1 X1", 1500.0)
+    assert link.next_deadline_s() < 1500.0 + 61.0  # an ordinary line is not waited for so long
+
+
 def test_bug_15_advanced_ok_numbers_are_not_believed_blindly() -> None:
     """Marlin#2952: numbers off by whatever; the job goes on all the same."""
     link = greeted(window=4)
