@@ -79,15 +79,19 @@ class _Resumption:
         printer = self._printer
         try:
             line = self._prepare()
-        except LinkLostError as error:  # it knows nothing of the job's lines: none was sent
-            self._refuse(f"the link was lost again ({error.why})")
+        except ResumeRefusedError as error:
+            safe = printer.notes[-1] if printer.notes else "nothing was sent to the printer"
+            message = f"{error} Now: {safe}."
+            raise ResumeRefusedError(
+                message, error.last_executed_line, error.last_sent_line
+            ) from error
         return printer.print(self._checked, lines=range(line, self._total), progress=progress)
 
     def _prepare(self) -> int:
         """Connect, find the line, judge, and bring the machine back to it."""
         printer = self._printer
-        printer.connect(before_hello=self._settle)
         try:
+            printer.connect(before_hello=self._settle)
             place = printer.place()
             line = self._job.acked if printer.dialect.verifies else self._line_by_place(place)
             modes = modes_after(self._checked, line, printer.dialect.name)
@@ -95,10 +99,13 @@ class _Resumption:
             if not self._pose_confirmed:
                 self._require_motors()
                 self._require_warm(modes)
+            self._restore(place, modes)
+        except LinkLostError as error:  # it knows nothing of the job's lines: none was sent
+            printer.make_safe()
+            self._refuse(f"the link was lost again ({error.why})")
         except ResumeRefusedError:
             printer.make_safe()
             raise
-        self._restore(place, modes)
         return line
 
     # ------------------------------------------------------------------ which line

@@ -33,6 +33,7 @@ from gcode.hosts.port import (
 )
 from gcode.hosts.proof import require_checked
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
+from gcode.hosts.supervisor import make_safe
 from gcode.hosts.telemetry import RoundTrips
 from gcode.hosts.whereabouts import last_number
 from gcode.hosts.wirelog import WireLog
@@ -210,7 +211,7 @@ class SerialPrinter:
         try:
             before_hello(number)
         except LinkError:
-            self.make_safe()
+            self._note(make_safe(self._fd))
             raise
 
     def _log_wire(self, direction: bytes, data: bytes) -> None:

@@ -33,7 +33,7 @@ def main() -> None:
     pipe_fd, port_fd, journal = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     if os.read(pipe_fd, 1):
         return
-    outcome = make_safe(port_fd)
+    outcome = f"supervisor: sender died; {make_safe(port_fd)}"
     if journal:
         with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(journal)) as db:
             db.execute("INSERT INTO note SELECT MAX(id), ?, ? FROM job", (time.time(), outcome))
@@ -47,13 +47,13 @@ def make_safe(port_fd: int) -> str:
     wait(port_fd, 0.05)
     for command in COMMANDS:
         if not write(port_fd, command + b"\n"):
-            return "supervisor: THE PORT IS GONE, heaters could not be reached"
+            return "THE PORT IS GONE, heaters could not be reached"
         answered += wait(port_fd, ANSWER_S)[0]
     if not answered:
-        return "supervisor: heaters told to switch off, NO ANSWER"
+        return "heaters told to switch off, NO ANSWER"
     if confirmed_off(port_fd):
-        return "supervisor: sender died; heaters off (the printer reports targets of 0), lifted"
-    return "supervisor: sender died; heaters told to switch off, nothing confirms it"
+        return "heaters off (the printer reports targets of 0), nozzle lifted"
+    return "heaters told to switch off, nothing confirms it"
 
 
 def confirmed_off(port_fd: int) -> bool:

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,28 @@ def test_motors_that_may_have_let_go_need_a_rescan(bench: Bench) -> None:
     assert bench.executed() == BEADS
 
 
+def test_a_bad_line_and_kills_together_lose_nothing(forks: Forks, tmp_path: Path) -> None:
+    faults = "every 37 corrupt_in\nevery 53 garble_ok\nevery 71 noise_out\nevery 97 double_ok"
+    bench = Bench(forks, tmp_path, lines=1500, faults=faults + "\nalways resend_without_ok")
+    for attempt, beads in enumerate((300, 600, 900)):
+        bench.kill_after(bench.send(go_on=attempt > 0), beads)
+    bench.go_on()
+    assert bench.executed() == bench.beads
+
+
+def test_heaters_go_off_even_while_the_printer_waits_for_them(forks: Forks, tmp_path: Path) -> None:
+    """In real time: M109 takes minutes, and what comes after it would have to wait."""
+    bench = Bench(forks, tmp_path, accelerated=False)
+    sender = bench.send()
+    until(lambda: bench.record.exists() and "M190 S60" in bench.record.read_text())
+    died_s = time.monotonic()
+    bench.forks.kill(sender)
+    until(lambda: bench.record.read_text().count("M140 S0") >= 1)
+    assert time.monotonic() - died_s < 5.0  # the stated time
+    assert "M104 S0" in bench.record.read_text()
+    until(lambda: b"targets of 0" in _notes(bench.journal))
+
+
 def test_a_pulled_cable_is_gone_on_from(forks: Forks, tmp_path: Path) -> None:
     bench = Bench(forks, tmp_path, faults="line 800 disconnect s=0.1")
     assert bench.forks.wait(bench.send()) == 4
@@ -160,6 +183,7 @@ def test_a_printer_that_was_reset_is_refused_with_the_true_interval(
     assert told["sent"] - told["executed"] < 64 + 80 + 4
     assert f"up to {told['executed'] + 1} are executed" in told["error"]
     assert bench.executed() == BEADS[:before]
+    assert "Now: heaters off (the printer reports targets of 0)" in told["error"]
     # It stays refused: the first attempt has not made the printer look as if it knew.
     assert "reset" in bench.go_on()["error"]
     assert bench.executed() == BEADS[:before]
@@ -173,6 +197,7 @@ def test_a_bed_that_was_cold_needs_a_rescan(bench: Bench) -> None:
     assert "the bed fell to 22" in told["error"]
     assert "below the 40" in told["error"]
     assert "--pose-confirmed" in told["error"]
+    assert "Now: heaters off (the printer reports targets of 0)" in told["error"]
     # Warming it up again changes nothing: the journal remembers.
     bench.say(b"M190 S60")
     assert "the bed fell to 22" in bench.go_on()["error"]
@@ -213,18 +238,21 @@ def test_what_there_is_nothing_to_go_on_with_is_refused(bench: Bench) -> None:
     assert bench.executed() == BEADS
 
 
-def test_klipper_is_asked_for_its_place(forks: Forks, tmp_path: Path) -> None:
-    """It counts no lines: one line at most is in doubt, and where the nozzle is decides."""
-    bench = Bench(forks, tmp_path, firmware="klipper", lines=1200)
+@pytest.mark.parametrize("firmware", ["klipper", "reprap"])
+def test_firmware_that_counts_no_lines_is_asked_for_its_place(
+    firmware: str, forks: Forks, tmp_path: Path
+) -> None:
+    """One line at most is in doubt, and where the nozzle is decides."""
+    bench = Bench(forks, tmp_path, firmware=firmware, lines=1200)
     bench.kill_after(bench.send(), 300)
     bench.kill_after(bench.send(go_on=True), 900)
     assert bench.go_on()["first_line"] > 900
     assert bench.executed() == bench.beads
     (tmp_path / "b").mkdir()
-    bench = Bench(forks, tmp_path / "b", firmware="klipper")
+    bench = Bench(forks, tmp_path / "b", firmware=firmware)
     bench.kill_after(bench.send(), 300)
     bench.forks.kill(bench.printer)  # and its host, too
-    bench.printer = forks.printer(tmp_path / "port2", bench.record, firmware="klipper")
+    bench.printer = forks.printer(tmp_path / "port2", bench.record, firmware=firmware)
     (tmp_path / "port2").replace(bench.port)
     told = bench.go_on()
     assert "counts no lines" in told["error"]
