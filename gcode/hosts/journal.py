@@ -158,8 +158,10 @@ class Journal:
                 f"The journal {self.path} is of version {version}, this program writes version "
                 f"{VERSION}; name another file."
             )
-        self._db.executescript(_SCHEMA)
-        self._db.execute(f"PRAGMA user_version = {VERSION}")
+        if not tables:  # in one transaction: a kill leaves all of it or nothing
+            self._db.executescript(
+                f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;"
+            )
 
     def open_session(self) -> int:
         """Begin a conversation; returns the number to set the printer to, never used before.

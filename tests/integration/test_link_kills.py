@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
+from link_bench import HEAD, Bench
 from link_forks import Forks
-from test_link_resume import HEAD, Bench
 
 from gcode.hosts.journal import Journal
 

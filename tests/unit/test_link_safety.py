@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
+import sqlite3
 import sys
 import threading
 from pathlib import Path
@@ -13,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
+from gcode.errors import JournalError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import supervisor
 from gcode.hosts.journal import Journal
@@ -133,3 +136,31 @@ def test_how_cold_the_bed_was_counts_from_when_it_was_warm(tmp_path: Path) -> No
     journal.begin("a", "port", 0, 10)  # anew, on an empty bed
     assert journal.lowest_bed_c(40.0) is None
     journal.close()
+
+
+def test_a_journal_is_made_whole_or_not_at_all(tmp_path: Path) -> None:
+    # regression: killed between its tables and its version, it could never be opened again
+    path = tmp_path / "journal.sqlite"
+    said: list[str] = []
+    original = sqlite3.connect
+
+    class Watched(sqlite3.Connection):
+        def executescript(self, script: str, /) -> sqlite3.Cursor:
+            said.append(script)
+            return super().executescript(script)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sqlite3, "connect", lambda *a, **k: original(*a, **k, factory=Watched))
+        Journal(path).close()
+    (script,) = said  # tables and version
+    assert script.startswith("BEGIN IMMEDIATE;")
+    assert script.endswith("PRAGMA user_version = 2; COMMIT;")
+    Journal(path).close()
+
+
+def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        db.execute("CREATE TABLE job (id INTEGER)")
+    with pytest.raises(JournalError, match="version 0"):
+        Journal(path)
