@@ -13,6 +13,7 @@ It stores what was sent and said; what follows from that is decided in `resume`.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import random
@@ -223,11 +224,17 @@ class Journal:
             Every program line below is acknowledged.
         """
         self._run("BEGIN IMMEDIATE")
-        if number is not None:
-            row = (self._job, line, number, up_to, self._clock())
-            self._run("INSERT INTO step VALUES (?, ?, ?, ?, ?)", *row)
-        self._run("UPDATE job SET reserved = ?, acked = ? WHERE id = ?", up_to, acked, self._job)
-        self._run("COMMIT")
+        try:
+            if number is not None:
+                row = (self._job, line, number, up_to, self._clock())
+                self._run("INSERT INTO step VALUES (?, ?, ?, ?, ?)", *row)
+            progress = (up_to, acked, self._job)
+            self._run("UPDATE job SET reserved = ?, acked = ? WHERE id = ?", *progress)
+            self._run("COMMIT")
+        except JournalError:
+            with contextlib.suppress(JournalError):
+                self._run("ROLLBACK")
+            raise
 
     def acknowledged(self, acked: int) -> None:
         """Say that every program line below `acked` has been received, proved by an answer."""

@@ -6,6 +6,7 @@ Just enough to come back after a pause and to compare with M114; the full reader
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from gcode.hosts.port import PrintableProgram
@@ -39,6 +40,17 @@ class Modes:
         if self.unit_mm != 1.0:
             commands.append("G20")
         return tuple(commands)
+
+
+def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
+    """Lines to send with their numbers in the program; comments and empty lines left out."""
+    step = 4096
+    for start in range(first, end, step):
+        stop = min(end, start + step)
+        for offset, line in enumerate(checked.lines(start, stop)):
+            command = line.partition(";")[0].strip()
+            if command:
+                yield start + offset, command
 
 
 def modes_after(checked: PrintableProgram, line: int, dialect: str) -> Modes:

@@ -15,9 +15,9 @@ from itertools import islice
 from typing import NoReturn
 
 from gcode.hosts.journal import FOREIGN_LINES, JobRecord, Journal, Step
-from gcode.hosts.modes import Modes, follow, modes_after
+from gcode.hosts.modes import Modes, commands_of, follow, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
-from gcode.hosts.serial import PAUSE_LIFT_MM, SerialPrinter, commands_of
+from gcode.hosts.serial import PAUSE_LIFT_MM, SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.protocol.events import PositionReport
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import serial
 
 sys.path.insert(0, str(Path(__file__).parent))
 from link_harness import Conversation
@@ -226,13 +227,13 @@ def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
 def test_bug_12_opening_the_port_raises_no_dtr(monkeypatch: pytest.MonkeyPatch) -> None:
     """pyserial#124, Printrun#1068: DTR must be down before the port is opened."""
     seen: list[bool] = []
-    original = serial_host.serial.Serial.open
+    original = serial.Serial.open
 
     def watch(self: object) -> None:
         seen.extend((self.dtr, self.rts))  # type: ignore[attr-defined]
         original(self)
 
-    monkeypatch.setattr(serial_host.serial.Serial, "open", watch)
+    monkeypatch.setattr(serial.Serial, "open", watch)
     with EmulatedPrinterProcess(printer=profile()) as emulator:
         printer = SerialPrinter(emulator.port, supervise=False)
         printer.connect()

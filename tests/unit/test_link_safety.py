@@ -138,6 +138,30 @@ def test_how_cold_the_bed_was_counts_from_when_it_was_warm(tmp_path: Path) -> No
     journal.close()
 
 
+class FullDisk(Journal):
+    """Takes the job's beginning, then nothing more."""
+
+    def _run(self, sql: str, *values: object) -> sqlite3.Cursor:
+        if "UPDATE" in sql or "note" in sql:
+            raise JournalError("The journal cannot be written (disk full).")
+        return super()._run(sql, *values)
+
+
+def test_a_full_disk_does_not_keep_the_heaters_on(tmp_path: Path) -> None:
+    # regression: the safe exit's own remark was the next thing that could not be written
+    journal = FullDisk(tmp_path / "journal.sqlite")
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, journal=journal, supervise=False)
+        printer.connect()
+        printer.command("M104 S100")
+        with pytest.raises(JournalError, match="disk full"):
+            printer.print(program(moves(100)))
+        state = emulator.state()
+        printer.close()
+    assert state["hotend_target_c"] == 0
+    assert "heaters off" in printer.notes[-1]
+
+
 def test_a_journal_is_made_whole_or_not_at_all(tmp_path: Path) -> None:
     # regression: killed between its tables and its version, it could never be opened again
     path = tmp_path / "journal.sqlite"
