@@ -32,7 +32,11 @@ def bench(forks: Forks, tmp_path: Path) -> Bench:
     return Bench(forks, tmp_path)
 
 
-def test_a_killed_sender_is_gone_on_from_and_every_line_runs_once(bench: Bench) -> None:
+@pytest.mark.parametrize("firmware", ["marlin", "prusa"])
+def test_a_killed_sender_is_gone_on_from_and_every_line_runs_once(
+    firmware: str, forks: Forks, tmp_path: Path
+) -> None:
+    bench = Bench(forks, tmp_path, firmware=firmware)
     for attempt, beads in enumerate((400, 900, 1500, 2200)):
         bench.kill_after(bench.send(go_on=attempt > 0), beads)
     told = bench.go_on()
