@@ -37,7 +37,7 @@ def test_a_killed_sender_is_gone_on_from_and_every_line_runs_once(
     firmware: str, forks: Forks, tmp_path: Path
 ) -> None:
     bench = Bench(forks, tmp_path, firmware=firmware)
-    for attempt, beads in enumerate((400, 900, 1500, 2200)):
+    for attempt, beads in enumerate((400, 500, 600, 700)):
         bench.kill_after(bench.send(go_on=attempt > 0), beads)
     told = bench.go_on()
     assert told["first_line"] > 2200
@@ -73,7 +73,7 @@ def test_a_sender_killed_in_a_pause_is_gone_on_from(bench: Bench) -> None:
 def test_a_bad_line_and_kills_together_lose_nothing(forks: Forks, tmp_path: Path) -> None:
     faults = "every 37 corrupt_in\nevery 53 garble_ok\nevery 71 noise_out\nevery 97 double_ok"
     bench = Bench(forks, tmp_path, lines=800, faults=faults + "\nalways resend_without_ok")
-    for attempt, beads in enumerate((250, 500)):
+    for attempt, beads in enumerate((250, 250)):
         bench.kill_after(bench.send(go_on=attempt > 0), beads)
     bench.go_on()
     assert bench.executed() == bench.beads
@@ -109,8 +109,8 @@ def test_firmware_that_counts_no_lines_is_asked_for_its_place(
     """One line at most is in doubt, and where the nozzle is decides."""
     bench = Bench(forks, tmp_path, firmware=firmware, lines=1200)
     bench.kill_after(bench.send(), 300)
-    bench.kill_after(bench.send(go_on=True), 900)
-    assert bench.go_on()["first_line"] > 900
+    bench.kill_after(bench.send(go_on=True), 400)
+    assert bench.go_on()["first_line"] > 700
     assert bench.executed() == bench.beads
     (tmp_path / "b").mkdir()
     bench = Bench(forks, tmp_path / "b", firmware=firmware)

@@ -17,17 +17,29 @@ LINES = 3000
 BEADS = beads_of("\n".join(job_lines(LINES)))
 HEAD = len(job_lines(0)) - 2
 assert len(set(BEADS)) == LINES
+SLOW = "always slow_reader s=0.0005"
+"""So that a busy machine cannot let a job end before it is killed in its middle."""
 
 
 class Bench:
     """A printer, a journal, and one sender after another."""
 
-    def __init__(self, forks: Forks, folder: Path, *, lines: int = LINES, **printer: Any) -> None:
+    def __init__(
+        self,
+        forks: Forks,
+        folder: Path,
+        *,
+        lines: int = LINES,
+        slow: bool = True,
+        **printer: Any,
+    ) -> None:
         self.lines, self.beads = lines, BEADS[:lines]
         self.forks, self.folder = forks, folder
         self.port, self.journal = folder / "port", folder / "journal.sqlite"
         self.record, self.outcome = folder / "executed", folder / "outcome"
         self.dialect = printer.get("firmware", "marlin")
+        if slow:
+            printer["faults"] = f"{printer.get('faults', '')}\n{SLOW}"
         self.printer = forks.printer(self.port, self.record, **printer)
 
     def send(self, **options: Any) -> int:
@@ -45,8 +57,9 @@ class Bench:
         return beads_of(self.record.read_text()) if self.record.exists() else []
 
     def kill_after(self, sender: int, beads: int) -> None:
-        """Kill the sender once the printer has executed so many beads."""
-        until(lambda: len(self.executed()) >= beads)
+        """Kill the sender once the printer has executed so many beads more."""
+        done = len(self.executed())
+        until(lambda: len(self.executed()) >= done + beads)
         assert self.forks.kill(sender) == -signal.SIGKILL
 
     def heated(self, times: int) -> bool:
