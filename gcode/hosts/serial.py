@@ -335,7 +335,7 @@ class SerialPrinter(SerialConversation):
         return True
 
     def _lift(self) -> None:
-        for command in ("G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
+        for command in ("G21", "G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
             self._ask(command)
 
     def emergency_stop(self) -> None:

@@ -17,6 +17,7 @@ COMMANDS = (
     b"M108",  # ends a wait for temperature, where the firmware lets it pass the queue
     *HEATERS_OFF,
     b"M107",
+    b"G21",  # the program may have been in inches
     b"G91",
     b"G1 Z5 F600",
     b"G90",

@@ -224,6 +224,36 @@ def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
     assert place == pytest.approx((150.0, 0.0, 3.0), abs=0.01)
 
 
+def test_bug_11_a_program_in_inches_is_lifted_by_millimetres() -> None:
+    """Found in review: G91 and Z5 after G20 are five inches."""
+    lines = ["G28", "G20", "G90", "G1 Z0.1 F20", "G91", "M83"] + ["G1 X0.004 F100"] * 1500
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        asked = threading.Event()
+
+        def tell(stage: str, count: float, total: float) -> None:
+            if count and not asked.is_set():
+                printer.pause()
+                asked.set()
+
+        def go_on() -> None:
+            asked.wait(20)
+            while "paused" not in printer.notes:
+                asked.wait(0.01)
+            printer.resume()
+
+        thread = threading.Thread(target=go_on)
+        thread.start()
+        printer.print(program(lines), progress=tell)
+        thread.join(20)
+        place = printer.position_mm()
+        highest_mm = emulator.take_motion().end_mm[:, 2].max()
+        printer.close()
+    assert place == pytest.approx((152.4, 0.0, 2.54), abs=0.01)
+    assert highest_mm == pytest.approx(7.54, abs=0.01)
+
+
 def test_bug_12_opening_the_port_raises_no_dtr(monkeypatch: pytest.MonkeyPatch) -> None:
     """pyserial#124, Printrun#1068: DTR must be down before the port is opened."""
     seen: list[bool] = []

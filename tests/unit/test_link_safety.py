@@ -53,7 +53,7 @@ def test_an_ok_alone_does_not_make_heaters_off(monkeypatch: pytest.MonkeyPatch) 
     said, heard = answering(b"ok\n")
     assert "heaters off" not in said
     assert "told to switch off" in said
-    assert heard.index(b"M104 S0") < heard.index(b"G1 Z5 F600")
+    assert heard.index(b"M104 S0") < heard.index(b"G21") < heard.index(b"G1 Z5 F600")
 
 
 def test_targets_above_zero_are_not_called_off() -> None:
