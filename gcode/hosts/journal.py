@@ -2,8 +2,8 @@
 
 Before a line goes out, the journal already says that it may (`reserved`): after a crash the
 uncertain interval is [acked, reserved), never smaller than the truth. Lines are reserved in steps,
-one synchronous commit each, so that the wire does not wait for the disk; where the printer
-cannot be asked how far it came (no line numbers) the step is one line.
+one synchronous commit each, so that the wire does not wait for the disk; where the printer counts
+no lines the step is short, for its place must tell them apart.
 A step also says which wire number its first line gets, and every command of the host's own is
 preceded by an empty step: so the number that a printer has reached names one program line.
 Numbers begin anew with every session, above all that were used before: a printer whose number

@@ -32,6 +32,9 @@ from gcode.protocol import events as ev
 
 PAUSE_LIFT_MM = 5.0
 PROGRESS_EVERY_LINES = 500
+UNCOUNTED_STEP = 16
+"""Lines reserved by one commit where the printer counts none: few enough for its place to tell one
+from another, many enough for a slow disk not to hold up short moves."""
 TEMPERATURE_STEP_C = 2.0
 TEMPERATURE_EVERY_S = 10.0
 """How often the journal hears of temperatures; a bed loses about a degree in that time."""
@@ -267,7 +270,7 @@ class SerialPrinter(SerialConversation):
                     self._asked_s = clock()
                     self._ask("M105")
                 if index >= self._reserved or not self._reserved:
-                    step = journal.step_lines if link.dialect.verifies else 1
+                    step = journal.step_lines if link.dialect.verifies else UNCOUNTED_STEP
                     self._reserved = min(index + step, end)
                     acked = self._executed_line + 1
                     journal.reserve(index, self._next_number(), self._reserved, acked)

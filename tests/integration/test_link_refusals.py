@@ -107,3 +107,13 @@ def test_what_there_is_nothing_to_go_on_with_is_refused(bench: Bench) -> None:
     journal.close()
     assert "another program" in bench.go_on()["error"]
     assert bench.executed() == BEADS
+
+
+def test_a_place_that_fits_several_lines_is_refused(forks: Forks, tmp_path: Path) -> None:
+    """Klipper counts no lines, and the job goes to and fro between two places."""
+    bench = Bench(forks, tmp_path, firmware="klipper")
+    bench.kill_after(bench.send(there_and_back=True), 300)
+    told = bench.go_on(there_and_back=True)
+    assert "the nozzle's place fits" in told["error"]
+    assert told["executed"] - HEAD + 1 <= len(bench.executed()) <= told["sent"] - HEAD + 1
+    assert told["sent"] - told["executed"] <= 17

@@ -76,10 +76,14 @@ def send(
     dialect: str = "marlin",
     later_s: float = 0.0,
     pause: bool = False,
+    there_and_back: bool = False,
 ) -> int:
     """Print, or go on; what became of it is written to the file `outcome`."""
     serial_host.require_checked = lambda checked: None
-    job = program(job_lines(lines))
+    text = job_lines(lines)
+    if there_and_back:
+        text[8:-2] = [f"G1 X{20 + 20 * (i % 2)} Y20 E0.01 F6000" for i in range(lines)]
+    job = program(text)
     told: dict[str, object] = {}
     code = 0
     book = Journal(Path(journal), step_lines=64)
