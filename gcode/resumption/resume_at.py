@@ -130,7 +130,7 @@ def _first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:
         raise InputError("Say either a height or a layer to go on from, one of the two.")
     if z_mm is not None:
         tops = [one.z_mm for one in layers]
-        if any(b <= a for a, b in pairwise(tops)):
+        if any(b < a for a, b in pairwise(tops)):
             raise InputError(
                 "The job prints one object after another, so that a height names no single "
                 "layer; name the layer instead."
