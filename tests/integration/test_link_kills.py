@@ -76,7 +76,9 @@ class Gallows:
         self.seen["printers killed"] += 1
         assert status in (0, 4, 5), told
         done = len(bench.executed())
-        if status == 4 and "sent" in told and done:
+        ended = "printed to its end" in told.get("error", "")
+        assert not ended or done == LINES
+        if status == 4 and "sent" in told and done and not ended:
             # From 0; beads begin after the head of the program, none is counted within it.
             assert told["executed"] - HEAD + 1 <= done <= told["sent"] - HEAD + 1, told
             self.seen["intervals true"] += 1
@@ -84,7 +86,7 @@ class Gallows:
         again = bench.folder / "again"
         bench.printer = self.forks.printer(again, bench.record)
         again.replace(bench.port)
-        if status != 0 and done and self.rng.random() < 0.2:
+        if status != 0 and done and not ended and self.rng.random() < 0.2:
             assert "cannot be resumed" in bench.go_on()["error"]
             assert len(bench.executed()) == done
             self.seen["resets refused"] += 1
