@@ -17,7 +17,7 @@ from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
 from gcode.firmware.faults import parse_faults
-from gcode.hosts import connect
+from gcode.hosts import PrintReport, connect
 from gcode.hosts.journal import default_path, is_device
 from gcode.hosts.resume import resume as resume_job
 from gcode.hosts.serial import SerialPrinter
@@ -272,31 +272,7 @@ def send(
         raise
     finally:
         machine.close()
-    result = {
-        "ok": report.ok,
-        "first_line": report.first_line,
-        "next_line": report.next_line,
-        "lines_acked": report.lines_acked,
-        "resends": report.resends,
-        "stalls": report.stalls,
-        "spare_oks": report.spare_oks,
-        "bytes_sent": report.bytes_sent,
-        "round_trip_ms": {
-            name: round(1000 * seconds, 3)
-            for name, seconds in zip(("p50", "p95", "p99"), report.round_trip_s, strict=True)
-        },
-        "warnings": list(report.warnings),
-        "seconds": round(report.seconds, 3),
-    }
-    if as_json:
-        console.show_json(result)
-    else:
-        console.out.print(
-            f"{report.lines_acked} lines acknowledged, {report.resends} resent, "
-            f"{report.stalls} stalls, {report.seconds:.1f} s; round trip "
-            f"{1000 * report.round_trip_s[0]:.2f} ms, 99 % within "
-            f"{1000 * report.round_trip_s[2]:.2f} ms."
-        )
+    _tell(report, as_json=as_json)
     if not report.ok:
         raise typer.Exit(4)
 
@@ -364,6 +340,35 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}).") from error
+
+
+def _tell(report: PrintReport, *, as_json: bool) -> None:
+    """What became of a print, with the counters of its link."""
+    result = {
+        "ok": report.ok,
+        "first_line": report.first_line,
+        "next_line": report.next_line,
+        "lines_acked": report.lines_acked,
+        "resends": report.resends,
+        "stalls": report.stalls,
+        "spare_oks": report.spare_oks,
+        "bytes_sent": report.bytes_sent,
+        "round_trip_ms": {
+            name: round(1000 * seconds, 3)
+            for name, seconds in zip(("p50", "p95", "p99"), report.round_trip_s, strict=True)
+        },
+        "warnings": list(report.warnings),
+        "seconds": round(report.seconds, 3),
+    }
+    if as_json:
+        console.show_json(result)
+    else:
+        console.out.print(
+            f"{report.lines_acked} lines acknowledged, {report.resends} resent, "
+            f"{report.stalls} stalls, {report.seconds:.1f} s; round trip "
+            f"{1000 * report.round_trip_s[0]:.2f} ms, 99 % within "
+            f"{1000 * report.round_trip_s[2]:.2f} ms."
+        )
 
 
 def _as_built(path: Path) -> HeightField:

@@ -220,15 +220,9 @@ class SerialPrinter(SerialConversation):
         self._printing = True
         try:
             with self._mutex:
-                if self._journal is not None:
-                    self._journal.begin(checked.program.sha256, self.port, first, end)
-                whole = self._stream(checked, first, end, progress)
-                self._prove()
-                self._executed_line = self._last_sent_line(first)
-                if self._journal is not None:
-                    self._journal.acknowledged(self._executed_line + 1)
-                    if whole and end >= total:
-                        self._journal.finish()
+                whole = self._carry_out(checked, first, end, progress)
+                if whole and end >= total and self._journal is not None:
+                    self._journal.finish()
         except (LinkError, LocalProtocolError):
             if self._journal is not None:
                 sent = max(self._last_sent_line(first), self._executed_line)
@@ -255,6 +249,19 @@ class SerialPrinter(SerialConversation):
             warnings=tuple(self._warnings),
             first_line=first,
         )
+
+    def _carry_out(
+        self, checked: PrintableProgram, first: int, end: int, progress: Progress
+    ) -> bool:
+        """Stream, and prove that all has arrived; False if the job was aborted."""
+        if self._journal is not None:
+            self._journal.begin(checked.program.sha256, self.port, first, end)
+        whole = self._stream(checked, first, end, progress)
+        self._prove()
+        self._executed_line = self._last_sent_line(first)
+        if self._journal is not None:
+            self._journal.acknowledged(self._executed_line + 1)
+        return whole
 
     def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
         """Send the lines; False if the job was aborted."""

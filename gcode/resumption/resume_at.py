@@ -97,21 +97,10 @@ def resume_at(
     )
     head.lift_and_home(settings)
     head.heat(hotend_c, bed_c)
-    place = room_for_line(field, setup.printer, head.prime_length_mm)
-    if place is not None:
-        head.prime_on_bed(*place)
-    elif (aside := bare_place(field, setup.printer)) is not None:
-        head.prime_in_air(*aside)
-    else:
-        raise InputError(
-            "There is no bare place on the bed to prime at; take something off the bed and leave "
-            "it out of the job."
-        )
+    primed = _prime(head, field, setup.printer)
     head.come_down(_pulled_mm(job, line))
     head.restore(settings)
-    body = program.text.split("\n")[line:]
-    while body and not body[-1].strip():
-        body.pop()
+    body = program.text.rstrip().split("\n")[line:]
     text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
     return Resumption(
         checked=check(Program(text, program.dialect), setup, as_built=field),
@@ -120,8 +109,24 @@ def resume_at(
         first_line=line,
         hotend_c=hotend_c,
         bed_c=bed_c,
-        primed="on the bed" if place is not None else "in the air",
+        primed=primed,
     )
+
+
+def _prime(head: _Head, field: HeightField, printer: PrinterProfile) -> str:
+    """Prime where there is room; says where that was."""
+    place = room_for_line(field, printer, head.prime_length_mm)
+    if place is not None:
+        head.prime_on_bed(*place)
+        return "on the bed"
+    aside = bare_place(field, printer)
+    if aside is None:
+        raise InputError(
+            "There is no bare place on the bed to prime at; take something off the bed and leave "
+            "it out of the job."
+        )
+    head.prime_in_air(*aside)
+    return "in the air"
 
 
 def _first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:
