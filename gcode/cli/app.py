@@ -11,13 +11,13 @@ import typer
 import gcode
 from gcode.check import check as check_program
 from gcode.check import find_refusals
-from gcode.cli import console
+from gcode.cli import console, importing
 from gcode.cli.resuming import resume_at_command
 from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
 from gcode.firmware.faults import parse_faults
-from gcode.hosts import PrintReport, connect
+from gcode.hosts import Printer, PrintReport, connect
 from gcode.hosts.journal import default_path, is_device
 from gcode.hosts.resume import resume as resume_job
 from gcode.hosts.serial import SerialPrinter
@@ -65,6 +65,7 @@ app = typer.Typer(
 profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
 app.add_typer(profiles_app, name="profiles")
 app.command("resume-at")(resume_at_command)
+importing.add_to(profiles_app)
 
 
 def _version(asked: bool) -> None:
@@ -217,7 +218,13 @@ def estimate(
 @app.command("send")
 def send(
     file: FileArgument,
-    port: Annotated[str, typer.Option(help="Device path, or file:PATH.")],
+    port: Annotated[
+        str,
+        typer.Option(
+            help="Device path, octoprint+http://HOST:PORT, moonraker+http://HOST:PORT, file:PATH; "
+            "keys by OCTOPRINT_API_KEY, MOONRAKER_API_KEY."
+        ),
+    ],
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
     as_built: AsBuiltOption = None,
@@ -253,6 +260,8 @@ def send(
     if resume and not isinstance(machine, SerialPrinter):
         raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")
     bars = console.Bars()
+    if not resume:
+        machine.connect()  # a printer that refuses us is not ours to abort
     try:
         with bars.shown():
             if resume and isinstance(machine, SerialPrinter):
@@ -264,11 +273,10 @@ def send(
                     progress=bars,
                 )
             else:
-                machine.connect()
                 report = machine.print(checked, progress=bars)
             machine.finish_moves()
     except BaseException:
-        machine.abort()
+        _abort(machine)
         raise
     finally:
         machine.close()
@@ -333,6 +341,14 @@ def profiles_show(
         f"There is no profile '{profile}'; 'gcode profiles list' names them (for a file of your "
         "own, say --kind)."
     )
+
+
+def _abort(machine: Printer) -> None:
+    """End the job; the failure that led here stays the one that is reported."""
+    try:
+        machine.abort()
+    except GcodeError as error:
+        console.errors.print(f"gcode: the printer could not be made safe: {error}", markup=False)
 
 
 def _text(path: Path) -> str:
