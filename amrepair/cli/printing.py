@@ -44,6 +44,7 @@ from amrepair.template.port import Template
 from gcode.check import check
 from gcode.cli import console
 from gcode.hosts import connect
+from gcode.hosts.journal import default_path, is_device
 from gcode.moves import Program
 from gcode.profiles import (
     DEFAULT_MATERIAL,
@@ -110,6 +111,7 @@ def loop(
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=folder.file("wire.log"),
+        journal=default_path(port) if is_device(port) else None,
     )
     machine.connect()
     try:

@@ -12,11 +12,15 @@ import gcode
 from gcode.check import check as check_program
 from gcode.check import find_refusals
 from gcode.cli import console, importing
+from gcode.cli.resuming import resume_at_command
 from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
 from gcode.firmware.faults import parse_faults
-from gcode.hosts import Printer, connect
+from gcode.hosts import Printer, PrintReport, connect
+from gcode.hosts.journal import default_path, is_device
+from gcode.hosts.resume import resume as resume_job
+from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
 from gcode.profiles import (
     DEFAULT_MATERIAL,
@@ -60,6 +64,7 @@ app = typer.Typer(
 )
 profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
 app.add_typer(profiles_app, name="profiles")
+app.command("resume-at")(resume_at_command)
 importing.add_to(profiles_app)
 
 
@@ -222,48 +227,60 @@ def send(
     ],
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
+    as_built: AsBuiltOption = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the job that the journal knows, or say why not."),
+    ] = False,
+    pose_confirmed: Annotated[
+        bool,
+        typer.Option(
+            "--pose-confirmed",
+            help="A rescan has shown that the part still stands where it stood (with --resume).",
+        ),
+    ] = False,
     wire_log: Annotated[Path | None, typer.Option(help="Log of every byte, with times.")] = None,
     journal: Annotated[
-        Path | None, typer.Option(help="Journal of the job, written ahead of the wire.")
+        Path | None,
+        typer.Option(help="Journal, written ahead of the wire; one a port where left out."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
     setup = load_setup(printer, material)
-    checked = check_program(Program(_text(file), setup.printer.dialect), setup)
+    field = _as_built(as_built) if as_built is not None else None
+    checked = check_program(Program(_text(file), setup.printer.dialect), setup, as_built=field)
     machine = connect(
         port,
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=wire_log,
-        journal=journal,
+        journal=journal or (default_path(port) if is_device(port) else None),
     )
+    if resume and not isinstance(machine, SerialPrinter):
+        raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")
     bars = console.Bars()
-    machine.connect()
+    if not resume:
+        machine.connect()  # a printer that refuses us is not ours to abort
     try:
         with bars.shown():
-            report = machine.print(checked, progress=bars)
+            if resume and isinstance(machine, SerialPrinter):
+                report = resume_job(
+                    machine,
+                    checked,
+                    release_c=setup.material.bed_release_c,
+                    pose_confirmed=pose_confirmed,
+                    progress=bars,
+                )
+            else:
+                report = machine.print(checked, progress=bars)
             machine.finish_moves()
     except BaseException:
         _abort(machine)
         raise
     finally:
         machine.close()
-    result = {
-        "ok": report.ok,
-        "lines_acked": report.lines_acked,
-        "resends": report.resends,
-        "stalls": report.stalls,
-        "bytes_sent": report.bytes_sent,
-        "seconds": round(report.seconds, 3),
-    }
-    if as_json:
-        console.show_json(result)
-    else:
-        console.out.print(
-            f"{report.lines_acked} lines acknowledged, {report.resends} resent, "
-            f"{report.seconds:.1f} s."
-        )
+    _tell(report, as_json=as_json)
     if not report.ok:
         raise typer.Exit(4)
 
@@ -339,6 +356,35 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}).") from error
+
+
+def _tell(report: PrintReport, *, as_json: bool) -> None:
+    """What became of a print, with the counters of its link."""
+    result = {
+        "ok": report.ok,
+        "first_line": report.first_line,
+        "next_line": report.next_line,
+        "lines_acked": report.lines_acked,
+        "resends": report.resends,
+        "stalls": report.stalls,
+        "spare_oks": report.spare_oks,
+        "bytes_sent": report.bytes_sent,
+        "round_trip_ms": {
+            name: round(1000 * seconds, 3)
+            for name, seconds in zip(("p50", "p95", "p99"), report.round_trip_s, strict=True)
+        },
+        "warnings": list(report.warnings),
+        "seconds": round(report.seconds, 3),
+    }
+    if as_json:
+        console.show_json(result)
+    else:
+        console.out.print(
+            f"{report.lines_acked} lines acknowledged, {report.resends} resent, "
+            f"{report.stalls} stalls, {report.seconds:.1f} s; round trip "
+            f"{1000 * report.round_trip_s[0]:.2f} ms, 99 % within "
+            f"{1000 * report.round_trip_s[2]:.2f} ms."
+        )
 
 
 def _as_built(path: Path) -> HeightField:

@@ -20,9 +20,12 @@ from gcode.firmware.variants import VARIANTS, Variant
 from gcode.profiles import PrinterProfile
 
 MAX_CMD_SIZE = 96
-_NUMBERED = re.compile(rb"N\s*(-?\d+)\s*")
+_NUMBERED = re.compile(rb"N\s*(-?\d{1,10})\s*")
+_RENUMBERED = re.compile(rb"N(-?\d{1,10})")
 _EMERGENCY = re.compile(rb"(?:^|\n)(?:N\d+ ?)?(M108|M112|M410)\b")
 _BUSY_EVERY_S = 2.0
+_MOST_REPORTS = 5000
+"""In one command: an accelerated clock would otherwise tell of years of waiting."""
 
 
 class FirmwareCore:
@@ -177,7 +180,7 @@ class FirmwareCore:
             return command
         number = int(match.group(1))
         renumbers = b"M110" in command
-        if renumbers and (again := re.search(rb"N(-?\d+)", command[4:])) is not None:
+        if renumbers and (again := _RENUMBERED.search(command[4:])) is not None:
             number = int(again.group(1))
         if not renumbers and number != self.last_number + 1:
             self._reject("Line Number is not Last Line Number+1", faults)
@@ -224,7 +227,7 @@ class FirmwareCore:
     def _execute(self, command: bytes, faults: dict[str, Fault]) -> None:
         machine = self.machine
         if command.startswith(b"M110"):
-            if match := re.search(rb"N(-?\d+)", command):
+            if match := _RENUMBERED.search(command):
                 self.last_number = int(match.group(1))
         elif machine.execute(command) and self.record is not None:
             self.record(command)
@@ -276,7 +279,7 @@ class FirmwareCore:
         end_s = min(wait.end_s, limit_s)
         if math.isinf(end_s):
             return False  # only a user ends it
-        while True:
+        for _ in range(_MOST_REPORTS):
             report_s = wait.next_report_s if wait.heating else math.inf
             busy_s = wait.next_busy_s if self.variant.keepalive else math.inf
             event_s = min(report_s, busy_s)

@@ -22,6 +22,9 @@ ARC_SEGMENT_MM = 0.5
 """Chord of an arc (Marlin's MIN_ARC_SEGMENT_MM … MAX_ARC_SEGMENT_MM lie around it)."""
 MAX_EXTRUDE_MM = 200.0
 """EXTRUDE_MAXLENGTH of Marlin."""
+LARGEST = 1e7
+"""No number of a command counts for more; nor does it where it is none."""
+MOST_CHORDS = 10_000
 SOFT_MARGIN_MM = 10.0
 """How far over the bed's edge the head reaches (purge lines beside the bed)."""
 HOMING_MM_S = 50.0
@@ -145,6 +148,8 @@ class Machine:
                 value = float(token[1:])
             except ValueError:
                 return self._g1_words(_words(rest))
+            if not -LARGEST <= value <= LARGEST:
+                return self._g1_words(_words(rest))
             if letter == 88:  # X
                 x = value * unit - self.offset[0] if self.absolute else x + value * unit
             elif letter == 89:  # Y
@@ -153,7 +158,7 @@ class Machine:
                 z = value * unit - self.offset[2] if self.absolute else z + value * unit
             elif letter == 69:  # E
                 de = value * unit - self.e if self.absolute_e else value * unit
-            elif letter == 70:  # F
+            elif letter == 70 and value > 0:  # F; Marlin takes no other for a feed
                 self.feed_mm_s = value * unit / 60.0
         self._move((x, y, z), de)
         return None
@@ -235,7 +240,7 @@ class Machine:
         if sweep < 1e-9:
             sweep = 2 * math.pi  # the end is the start: a full circle
         length = math.hypot(radius * sweep, target[2] - start[2])
-        count = max(1, math.ceil(length / ARC_SEGMENT_MM))
+        count = min(max(1, math.ceil(length / ARC_SEGMENT_MM)), MOST_CHORDS)
         for index in range(1, count + 1):
             ratio = index / count
             angle = first + (-sweep if clockwise else sweep) * ratio
@@ -509,7 +514,8 @@ def _words(rest: bytes) -> dict[str, float]:
     """Parameters by letter; a letter without a number counts as 0."""
     words: dict[str, float] = {}
     for letter, number in _WORD.findall(rest.upper()):
-        words[letter.decode()] = float(number) if number.strip(b"+-.") else 0.0
+        value = float(number) if number.strip(b"+-.") else 0.0
+        words[letter.decode()] = min(max(value, -LARGEST), LARGEST)
     return words
 
 

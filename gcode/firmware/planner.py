@@ -15,6 +15,9 @@ from dataclasses import dataclass
 BLOCK_BUFFER_SIZE = 16
 """Marlin's default."""
 
+LEAST_MM_S = 0.05
+"""MINIMUM_PLANNER_SPEED of Marlin."""
+
 Xyz = tuple[float, float, float]
 
 
@@ -88,7 +91,7 @@ class Planner:
                 return
             acceleration = self.retract_acceleration
         unit = (dx / length, dy / length, dz / length, filament_mm / length)
-        speed, jerk, previous = feed_mm_s, 1e9, self._unit
+        speed, jerk, previous = max(feed_mm_s, LEAST_MM_S), 1e9, self._unit
         for axis in range(4):
             share = abs(unit[axis])
             if share > 1e-9:

@@ -11,6 +11,7 @@ from gcode.hosts.port import (
     PrintableProgram,
     Printer,
     PrintReport,
+    ResumeRefusedError,
     Temperatures,
 )
 
@@ -20,6 +21,7 @@ __all__ = [
     "PrintReport",
     "PrintableProgram",
     "Printer",
+    "ResumeRefusedError",
     "Temperatures",
     "connect",
 ]

@@ -2,13 +2,21 @@
 
 Before a line goes out, the journal already says that it may (`reserved`): after a crash the
 uncertain interval is [acked, reserved), never smaller than the truth. Lines are reserved in steps,
-one synchronous commit each, so that the wire does not wait for the disk; where the printer
-cannot be asked how far it came (no line numbers) the step is one line.
-It stores what was sent and said; what follows from that is decided in `recover`.
+one synchronous commit each, so that the wire does not wait for the disk; where the printer counts
+no lines the step is short, for its place must tell them apart.
+A step also says which wire number its first line gets, and every command of the host's own is
+preceded by an empty step: so the number that a printer has reached names one program line.
+Numbers begin anew with every session, above all that were used before: a printer whose number
+does not belong to the session was reset, or somebody else has spoken to it.
+It stores what was sent and said; what follows from that is decided in `resume`.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
+import random
 import sqlite3
 import time
 from collections.abc import Callable
@@ -17,9 +25,23 @@ from pathlib import Path
 
 from gcode.errors import JournalError
 
+VERSION = 2
+"""Of the tables below; a journal of another version is not read."""
+FIRST_BASES = (10_000, 20_000)
+"""Range of a new journal's first number: no firmware is there by itself after a reset."""
+FOREIGN_LINES = 50_000
+"""Most commands of the host's own after a step: a question a second for half a day of pause."""
+
 _SCHEMA = """
+CREATE TABLE IF NOT EXISTS session (
+    id INTEGER PRIMARY KEY,
+    base INTEGER NOT NULL,        -- M110 sets the printer's number to this
+    resumes INTEGER,              -- the job that this session is to go on with, or NULL
+    time_s REAL NOT NULL
+);
 CREATE TABLE IF NOT EXISTS job (
     id INTEGER PRIMARY KEY,
+    session INTEGER,              -- NULL where lines carry no numbers of ours
     program_sha256 TEXT NOT NULL,
     port TEXT NOT NULL,
     first_line INTEGER NOT NULL,
@@ -32,8 +54,8 @@ CREATE TABLE IF NOT EXISTS job (
 CREATE TABLE IF NOT EXISTS step (
     job INTEGER NOT NULL REFERENCES job (id),
     line INTEGER NOT NULL,        -- program line from which on
-    number INTEGER NOT NULL,      -- this wire number was given to that line
-    reserved INTEGER NOT NULL,
+    number INTEGER NOT NULL,      -- the wire number of the first command from there on
+    reserved INTEGER NOT NULL,    -- end of the step; `line`, if no program line is sent
     time_s REAL NOT NULL
 );
 CREATE TABLE IF NOT EXISTS note (
@@ -50,6 +72,17 @@ CREATE TABLE IF NOT EXISTS temperature (
 """
 
 
+def is_device(port: str) -> bool:
+    """Whether a port's name is a device path: a server or a file keeps no journal here."""
+    return "://" not in port and not port.startswith("file:")
+
+
+def default_path(port: str) -> Path:
+    """Where a port's journal is kept unless told otherwise: one a printer, in the user's state."""
+    folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return folder / "gcode" / f"{hashlib.sha256(port.encode()).hexdigest()[:16]}.sqlite"
+
+
 @dataclass(frozen=True, slots=True)
 class JobRecord:
     """What the journal knows of its latest job; lines are program lines, half-open."""
@@ -62,6 +95,25 @@ class JobRecord:
     acked: int
     reserved: int
     phase: str
+    session: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Program lines [line, reserved) were given wire numbers from `number` on."""
+
+    line: int
+    number: int
+    reserved: int
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One conversation with the printer; `resumes` is the job it was to go on with."""
+
+    id: int
+    base: int
+    resumes: int | None
 
 
 class Journal:
@@ -90,12 +142,48 @@ class Journal:
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.execute("PRAGMA busy_timeout=5000")
-            self._db.executescript(_SCHEMA)
+            self._prepare()
         except (sqlite3.Error, OSError) as error:
             raise JournalError(
                 f"The journal {path} cannot be used ({error}); name another file."
             ) from error
         self._job: int | None = None
+        self._session: int | None = None
+        self._settled: int | None = None
+
+    def _prepare(self) -> None:
+        tables = self._db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
+        version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        if tables and version != VERSION:
+            raise JournalError(
+                f"The journal {self.path} is of version {version}, this program writes version "
+                f"{VERSION}; name another file."
+            )
+        if not tables:  # in one transaction: a kill leaves all of it or nothing
+            self._db.executescript(
+                f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;"
+            )
+
+    def open_session(self) -> int:
+        """Begin a conversation; returns the number to set the printer to, never used before.
+
+        A job settled before is the one that it is to go on with.
+        """
+        row = self._run(
+            "SELECT MAX(base), (SELECT MAX(number + reserved - line) FROM step) FROM session"
+        ).fetchone()
+        if row[0] is None:
+            base = random.randrange(*FIRST_BASES)
+        else:
+            base = max(row[0], row[1] or 0) + FOREIGN_LINES
+        cursor = self._run(
+            "INSERT INTO session (base, resumes, time_s) VALUES (?, ?, ?)",
+            base,
+            self._settled,
+            self._clock(),
+        )
+        self._session, self._settled = cursor.lastrowid, None
+        return base
 
     def begin(self, program_sha256: str, port: str, first: int, end: int) -> None:
         """Begin a job, or the next part of the one under way."""
@@ -105,13 +193,15 @@ class Journal:
             and latest is not None
             and latest.program_sha256 == program_sha256
             and latest.phase == "printing"
+            and latest.session == self._session
             and first >= latest.acked
         ):
             self._run("UPDATE job SET end_line = ? WHERE id = ?", end, self._job)
             return
         cursor = self._run(
-            "INSERT INTO job (program_sha256, port, first_line, end_line, acked, reserved, phase,"
-            " started_s) VALUES (?, ?, ?, ?, ?, ?, 'printing', ?)",
+            "INSERT INTO job (session, program_sha256, port, first_line, end_line, acked,"
+            " reserved, phase, started_s) VALUES (?, ?, ?, ?, ?, ?, ?, 'printing', ?)",
+            self._session,
             program_sha256,
             port,
             first,
@@ -122,31 +212,45 @@ class Journal:
         )
         self._job = cursor.lastrowid
 
-    def reserve(self, up_to: int, number_offset: int, acked: int) -> None:
-        """Say, before it happens, that lines below `up_to` may be sent.
+    def reserve(self, line: int, number: int | None, up_to: int, acked: int) -> None:
+        """Say, before it happens, that lines [line, up_to) may be sent.
 
         Parameters
         ----------
-        number_offset
-            Wire number of the next line less its program line.
+        number
+            Wire number of the first of them; with `up_to == line`: of a command of the host's.
+            None where the firmware does not count.
         acked
             Every program line below is acknowledged.
         """
         self._run("BEGIN IMMEDIATE")
-        self._run(
-            "INSERT INTO step VALUES (?, ?, ?, ?, ?)",
-            self._job,
-            acked,
-            number_offset,
-            up_to,
-            self._clock(),
-        )
-        self._run("UPDATE job SET reserved = ?, acked = ? WHERE id = ?", up_to, acked, self._job)
-        self._run("COMMIT")
+        try:
+            if number is not None:
+                row = (self._job, line, number, up_to, self._clock())
+                self._run("INSERT INTO step VALUES (?, ?, ?, ?, ?)", *row)
+            progress = (up_to, acked, self._job)
+            self._run("UPDATE job SET reserved = ?, acked = ? WHERE id = ?", *progress)
+            self._run("COMMIT")
+        except JournalError:
+            with contextlib.suppress(JournalError):
+                self._run("ROLLBACK")
+            raise
 
-    def acknowledged(self, acked: int, number: int) -> None:
+    def acknowledged(self, acked: int) -> None:
         """Say that every program line below `acked` has been received, proved by an answer."""
         self._run("UPDATE job SET acked = ?, reserved = ? WHERE id = ?", acked, acked, self._job)
+
+    def lost(self, acked: int, sent: int) -> None:
+        """Say that the link is lost: acknowledged below `acked`, nothing sent from `sent` on."""
+        self._run("UPDATE job SET acked = ?, reserved = ? WHERE id = ?", acked, sent, self._job)
+
+    def settle(self, job: int, line: int) -> None:
+        """Say of an earlier session's job: all below `line` is executed, nothing else was sent.
+
+        Notes and temperatures are that job's from here on.
+        """
+        self._job = self._settled = job
+        self._run("UPDATE job SET acked = ?, reserved = ? WHERE id = ?", line, line, job)
 
     def finish(self) -> None:
         """Say that the job is done."""
@@ -169,17 +273,62 @@ class Journal:
     def latest(self) -> JobRecord | None:
         """Return the latest job, or None."""
         row = self._run(
-            "SELECT id, program_sha256, port, first_line, end_line, acked, reserved, phase"
-            " FROM job ORDER BY id DESC LIMIT 1"
+            "SELECT id, program_sha256, port, first_line, end_line, acked, reserved, phase,"
+            " session FROM job ORDER BY id DESC LIMIT 1"
         ).fetchone()
         return None if row is None else JobRecord(*row)
 
-    def lowest_bed_c(self) -> float | None:
-        """Return the lowest bed temperature noted during the latest job, or None."""
+    def steps(self, job: int) -> tuple[Step, ...]:
+        """Return the steps of a job, oldest first."""
+        rows = self._run(
+            "SELECT line, number, reserved FROM step WHERE job = ? ORDER BY rowid", job
+        )
+        return tuple(Step(*row) for row in rows)
+
+    def session_of(self, number: int) -> Session | None:
+        """Return the session that gave out a wire number; None if none did."""
         row = self._run(
-            "SELECT MIN(bed_c) FROM temperature WHERE job = (SELECT MAX(id) FROM job)"
+            "SELECT id, base, resumes FROM session WHERE base <= ? ORDER BY base DESC LIMIT 1",
+            number,
         ).fetchone()
-        return row[0]
+        return None if row is None else Session(*row)
+
+    def lowest_bed_c(self, warm_c: float) -> float | None:
+        """Return the lowest bed temperature since the bed was first at `warm_c`.
+
+        Of the latest program's jobs in a row: whatever was printed then still stands there.
+        None where the bed was never noted that warm.
+        """
+        jobs = (
+            "SELECT id FROM job WHERE program_sha256 ="
+            " (SELECT program_sha256 FROM job ORDER BY id DESC LIMIT 1)"
+            " AND id >= (SELECT COALESCE(MAX(id), 0) FROM job WHERE first_line = 0)"
+        )
+        row = self._run(
+            f"SELECT MIN(bed_c) FROM temperature WHERE job IN ({jobs}) AND rowid >= (SELECT"
+            f" MIN(rowid) FROM temperature WHERE job IN ({jobs}) AND bed_c >= ?)",
+            warm_c,
+        ).fetchone()
+        return None if row[0] is None else float(row[0])
+
+    def temperatures(self) -> tuple[tuple[float, float, float | None], ...]:
+        """Return (time_s, hotend_c, bed_c) as noted, oldest first."""
+        return tuple(self._run("SELECT time_s, hotend_c, bed_c FROM temperature ORDER BY rowid"))
+
+    def heaters_left_alone(self) -> bool:
+        """Whether no temperature was noted since the heaters were last told to switch off."""
+        off = [row[0] for row in self._run("SELECT time_s, text FROM note") if "heaters" in row[1]]
+        noted_s = self._run("SELECT MAX(time_s) FROM temperature").fetchone()[0]
+        return bool(off) and (noted_s is None or max(off) > noted_s)
+
+    def last_heard_s(self) -> float | None:
+        """Return when anything was last noted of the latest job, s since the epoch."""
+        row = self._run(
+            "SELECT MAX(time_s) FROM (SELECT time_s, job FROM step UNION ALL SELECT time_s, job"
+            " FROM note UNION ALL SELECT time_s, job FROM temperature)"
+            " WHERE job = (SELECT MAX(id) FROM job)"
+        ).fetchone()
+        return None if row[0] is None else float(row[0])
 
     def notes(self) -> tuple[str, ...]:
         """Return the remarks, oldest first."""

@@ -6,6 +6,7 @@ Just enough to come back after a pause and to compare with M114; the full reader
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from gcode.hosts.port import PrintableProgram
@@ -23,6 +24,9 @@ class Modes:
     unit_mm: float = 1.0
     feed_mm_min: float | None = None
     position_mm: dict[str, float] = field(default_factory=dict)
+    hotend_c: float = 0.0
+    bed_c: float = 0.0
+    fan: float = 0.0  # 0..255
 
     def restore(self, x_mm: float, y_mm: float, z_mm: float, e_mm: float) -> tuple[str, ...]:
         """Commands that bring the machine to a place and back into these modes."""
@@ -36,6 +40,17 @@ class Modes:
         if self.unit_mm != 1.0:
             commands.append("G20")
         return tuple(commands)
+
+
+def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
+    """Lines to send with their numbers in the program; comments and empty lines left out."""
+    step = 4096
+    for start in range(first, end, step):
+        stop = min(end, start + step)
+        for offset, line in enumerate(checked.lines(start, stop)):
+            command = line.partition(";")[0].strip()
+            if command:
+                yield start + offset, command
 
 
 def modes_after(checked: PrintableProgram, line: int, dialect: str) -> Modes:
@@ -70,11 +85,25 @@ def follow(modes: Modes, text: str, dialect: str) -> Modes:
         place = {letter: words[letter] * modes.unit_mm for letter in "XYZE" if letter in words}
         return replace(modes, position_mm={**modes.position_mm, **place})
     if name == "G28":
-        gone = {letter for letter in "XYZ" if letter in command[3:]} or set("XYZ")
+        gone: set[str] = {letter for letter in "XYZ" if letter in command[3:]} or set("XYZ")
         return replace(
             modes,
             position_mm={k: v for k, v in modes.position_mm.items() if k not in gone},
         )
+    return _heat(modes, name, words)
+
+
+def _heat(modes: Modes, name: str, words: dict[str, float]) -> Modes:
+    """Heaters and the part's fan (further ones have a P)."""
+    value = words.get("S", words.get("R"))
+    if name in ("M104", "M109") and value is not None:
+        return replace(modes, hotend_c=value)
+    if name in ("M140", "M190") and value is not None:
+        return replace(modes, bed_c=value)
+    if name == "M106" and not words.get("P"):
+        return replace(modes, fan=words.get("S", 255.0))
+    if name == "M107":
+        return replace(modes, fan=0.0)
     return modes
 
 

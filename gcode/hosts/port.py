@@ -61,8 +61,8 @@ class PrintReport:
         Every line is acknowledged and proved to have been received.
     lines_acked
         Program lines acknowledged (comments and empty lines are never sent).
-    next_line
-        The first program line not known to be executed.
+    first_line, next_line
+        The first program line asked for, and the first not known to be executed.
     round_trip_s
         Percentiles 50, 95 and 99 of the time from a line to its `ok`.
     """
@@ -77,6 +77,7 @@ class PrintReport:
     next_line: int
     round_trip_s: tuple[float, float, float]
     warnings: tuple[str, ...] = ()
+    first_line: int = 0
 
 
 class LinkLostError(LinkError):
@@ -88,6 +89,28 @@ class LinkLostError(LinkError):
         The last program line known to be executed, -1 if none.
     last_sent_line
         The last program line sent: those between may or may not have been executed.
+    why
+        What happened to the link, in a few words.
+    """
+
+    def __init__(
+        self, message: str, last_executed_line: int, last_sent_line: int, *, why: str = ""
+    ) -> None:
+        super().__init__(message)
+        self.why = why
+        self.last_executed_line = last_executed_line
+        self.last_sent_line = last_sent_line
+
+
+class ResumeRefusedError(LinkError):
+    """A job cannot be gone on with; what is uncertain is named, by program line from 0.
+
+    Attributes
+    ----------
+    last_executed_line
+        The last program line known to be executed, -1 if none.
+    last_sent_line
+        No line after this one was ever sent.
     """
 
     def __init__(self, message: str, last_executed_line: int, last_sent_line: int) -> None:

@@ -19,7 +19,6 @@ import gcode
 SAFE_COMMANDS = ("M104 S0", "M140 S0", "M107")
 """Heaters and fan off."""
 
-LIFT_COMMANDS = ("G91", "G1 Z5 F600", "G90")
 FAREWELL = b"."
 _TIMEOUT_S = 5.0
 

@@ -1,50 +1,46 @@
-"""A printer on a serial port or pseudo-terminal: `protocol.Link` with a port and a clock.
+"""A printer on a serial port or pseudo-terminal: prints programs, keeps the journal, exits safely.
 
-It owns the port, the lock, the wire log and the safe exit; what may be sent, and what an answer
-means, is `Link`'s business. DTR is left as it is: raising it resets most boards in mid-print.
+It owns the lock, the supervisor and the job; the port and the questions are `conversation`'s, what
+may be sent and what an answer means is `protocol.Link`'s.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
-import select
+import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import NoReturn, TypeVar
 
-import serial
-
-from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.errors import JournalError, LinkError, LocalProtocolError, PrinterError
+from gcode.hosts.conversation import SerialConversation
 from gcode.hosts.journal import Journal
 from gcode.hosts.lock import PortLock
-from gcode.hosts.modes import modes_after
-from gcode.hosts.port import (
-    Capabilities,
-    LinkLostError,
-    PrintableProgram,
-    PrintReport,
-    Temperatures,
-)
+from gcode.hosts.modes import commands_of, modes_after
+from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport
 from gcode.hosts.proof import require_checked
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
+from gcode.hosts.supervisor import make_safe
 from gcode.hosts.telemetry import RoundTrips
-from gcode.hosts.wirelog import WireLog
+from gcode.hosts.whereabouts import last_number
 from gcode.progress import Progress, silent
-from gcode.protocol import Link, LinkTiming
+from gcode.protocol import LinkTiming
 from gcode.protocol import events as ev
 
-Answer = TypeVar("Answer")
 PAUSE_LIFT_MM = 5.0
 PROGRESS_EVERY_LINES = 500
-QUERY_TRIES = 3
+UNCOUNTED_STEP = 16
+"""Lines reserved by one commit where the printer counts none: few enough for its place to tell one
+from another, many enough for a slow disk not to hold up short moves."""
+TEMPERATURE_STEP_C = 2.0
+TEMPERATURE_EVERY_S = 10.0
+"""How often the journal hears of temperatures; a bed loses about a degree in that time."""
 
 
-class SerialPrinter:
+class SerialPrinter(SerialConversation):
     """A printer behind a serial port.
 
     Parameters
@@ -80,38 +76,31 @@ class SerialPrinter:
         supervise: bool = True,
         guard: bool = True,
     ) -> None:
-        self.port = port
-        self._baud = baud
-        self._clock = clock
-        self._link = Link(dialect, window=window, timing=timing)
-        self._wire_log = wire_log
-        self._log: WireLog | None = None
+        super().__init__(
+            port,
+            baud=baud,
+            dialect=dialect,
+            window=window,
+            wire_log=wire_log,
+            timing=timing,
+            clock=clock,
+        )
         self._journal = journal
         self._supervise = supervise
         self._guard = guard
         self._supervisor: Supervisor | None = None
         self._lock = PortLock(port)
-        self._serial: serial.Serial | None = None
-        self._fd = -1
-        self._poll = select.poll()
-        self._mutex = threading.RLock()
-        self._capabilities = Capabilities("")
         self._sent_lines: deque[tuple[int, int]] = deque(maxlen=1024)
-        self._position: ev.PositionReport | None = None
-        self._temperatures: ev.TemperatureReport | None = None
-        self._asked = {"M114": 0, "M115": 0}
-        self._heard = {"M114": 0, "M115": 0}
-        self._failure: Exception | None = None
-        self._warnings: deque[str] = deque(maxlen=100)
         self._round_trips = RoundTrips()
-        self._stalls = self._bytes_sent = self._lines_acked = 0
-        self._refused_numbers: list[int] = []
-        self._greeted = False
+        self._lines_acked = 0
         self._executed_line = -1
         self._pause_asked = threading.Event()
         self._go_on = threading.Event()
         self._abort_asked = threading.Event()
         self._printing = False
+        self._first_line = 0
+        self._reserved = 0  # end of the journal's open step; 0 if none is open
+        self._noted_s = self._asked_s = self._noted_bed_c = -math.inf
         self.actions: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> SerialPrinter:
@@ -130,15 +119,24 @@ class SerialPrinter:
 
     # ------------------------------------------------------------------ connection
 
-    def connect(self) -> None:
-        """Open the port, agree on line numbers and ask who is there."""
+    def connect(self, *, before_hello: Callable[[int | None], None] | None = None) -> None:
+        """Open the port, agree on line numbers and ask who is there.
+
+        Parameters
+        ----------
+        before_hello
+            Told the number of the last line that the printer has received (None: it does not
+            say), before a hello makes it forget that; what it raises ends the attempt.
+        """
         if self._serial is not None:
             return
         self._lock.acquire()
         try:
-            self._log = WireLog(self._wire_log) if self._wire_log is not None else None
             self._open_port()
-            self._greet()
+            if before_hello is not None:
+                self._ask_number(before_hello)
+            counted = self._journal is not None and self._link.dialect.verifies
+            self._greet(self._journal.open_session() if self._journal and counted else 0)
             if self._guard and self._link.dialect.verifies:
                 self._test_guard()
             self._learn()
@@ -152,159 +150,48 @@ class SerialPrinter:
     def _journal_path(self) -> Path | None:
         return self._journal.path if self._journal is not None else None
 
-    def _open_port(self) -> None:
-        device = serial.Serial(baudrate=self._baud, timeout=0, exclusive=False)
-        device.port = self.port
-        device.dtr = False  # a rising DTR resets the board (pyserial#124)
-        device.rts = False
-        try:
-            device.open()
-        except (serial.SerialException, OSError) as error:
-            raise LinkError(f"{self.port} cannot be opened ({error}); check the path.") from error
-        self._serial = device
-        self._fd = device.fileno()
-        self._keep_line_up()
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
-
-    def _keep_line_up(self) -> None:
-        """Clear HUPCL: closing the port must not drop DTR and so reset the printer."""
-        import termios
-
-        with contextlib.suppress(termios.error):
-            attributes = termios.tcgetattr(self._fd)
-            attributes[2] &= ~termios.HUPCL
-            termios.tcsetattr(self._fd, termios.TCSANOW, attributes)
-
-    def _greet(self, number: int = 0) -> None:
-        self._greeted = False
-        self._failure = None
-        self._write(self._link.hello(self._clock(), number=number))
-        while not self._greeted:
-            self._pump()
-        self._settle()
-
-    def _settle(self, quiet_s: float = 0.05) -> None:
-        """Hear out what a half line or an earlier sender may still cause."""
-        until_s = self._clock() + quiet_s
-        while (now_s := self._clock()) < until_s:
-            if self._pump(limit_s=until_s - now_s):
-                until_s = self._clock() + quiet_s / 2
-
-    def _test_guard(self) -> None:
-        """Send a line with a wrong checksum and one with a wrong number: both must bounce."""
-        number = self._link.last_sent + 1
-        for what, line in (
-            ("checksums", b"N%d M105*0\n" % number),
-            ("line numbers", _wrong_number(number + 7)),
-        ):
-            refused = False
-            for _ in range(QUERY_TRIES):
-                self._refused_numbers.clear()
-                self._write(line)
-                until_s = self._clock() + max(self._link.timing.doubt_s, 0.3)
-                while not self._refused_numbers and (left_s := until_s - self._clock()) > 0:
-                    self._pump(limit_s=left_s)
-                if self._refused_numbers:
-                    refused = True
-                    break
-            self._settle(0.02)
-            if not refused:
-                self._link.give_up(f"the firmware ignores {what}")
-                raise LinkError(
-                    f"The printer on {self.port} takes lines with wrong {what}: corruption could "
-                    f"not be noticed and nothing was printed; use another firmware or cable."
+    def _ask_number(self, before_hello: Callable[[int | None], None]) -> None:
+        number = None
+        if self._link.dialect.verifies:
+            try:
+                number = last_number(
+                    self._fd, timing=self._link.timing, clock=self._clock, note=self._log_wire
                 )
-        self._failure = None
-        self._greet(self._link.last_sent)
-
-    def _learn(self) -> None:
-        caps: dict[str, bool] = {}
-        firmware = ""
-        for event in self._ask("M115"):
-            if isinstance(event, ev.FirmwareInfo):
-                firmware = event.name
-            elif isinstance(event, ev.Capability):
-                caps[event.name] = event.enabled
-        self._capabilities = Capabilities(firmware, caps)
+            except OSError as error:
+                raise LinkError(
+                    f"{self.port} failed ({error}) when asked for its line number; check the "
+                    f"printer and its cable."
+                ) from error
+        try:
+            before_hello(number)
+        except LinkError:
+            self._note(make_safe(self._fd))
+            raise
 
     def close(self) -> None:
         """Let go of the printer; heaters stay as they are (`make_safe` switches them off)."""
         if self._supervisor is not None:
             self._supervisor.stand_down()
             self._supervisor = None
-        if self._serial is not None:
-            with contextlib.suppress(OSError, serial.SerialException):
-                self._serial.close()
-            self._serial = None
+        self._close_port()
         self._lock.release()
-        if self._log is not None:
-            self._log.close()
-            self._log = None
 
     # ------------------------------------------------------------------ questions
 
-    def capabilities(self) -> Capabilities:
-        """Return what the firmware said on connecting."""
-        return self._capabilities
+    @property
+    def journal(self) -> Journal | None:
+        """Where the job is written down."""
+        return self._journal
 
-    def temperatures(self) -> Temperatures:
-        """Ask for temperatures (M105)."""
-        report = self._answer("M105", lambda: self._temperatures, "temperatures")
-        heaters = report.heaters
-        hotend = heaters.get("T") or heaters.get("T0")
-        if hotend is None:
-            raise LinkError("The printer reports no hotend temperature; check its firmware.")
-        bed = heaters.get("B")
-        return Temperatures(
-            hotend.current_c,
-            hotend.target_c or 0.0,
-            bed.current_c if bed else None,
-            (bed.target_c or 0.0) if bed else None,
-        )
+    def _before_own_command(self) -> None:
+        """Tell the journal that the next wire number is no program line's."""
+        if self._journal is not None and self._reserved:
+            line = self._last_sent_line(self._first_line) + 1
+            self._journal.reserve(line, self._next_number(), line, self._executed_line + 1)
+            self._reserved = 0
 
-    def position_mm(self) -> tuple[float, float, float]:
-        """Ask for the logical position (M114)."""
-        report = self._where()
-        return report.x_mm, report.y_mm, report.z_mm
-
-    def _where(self) -> ev.PositionReport:
-        return self._answer("M114", lambda: self._position, "position")
-
-    def _answer(self, command: str, read: Callable[[], Answer | None], what: str) -> Answer:
-        for _ in range(QUERY_TRIES):
-            self._temperatures = self._position = None
-            self._ask(command)
-            value = read()
-            if value is not None:
-                return value
-        raise LinkError(f"The printer does not report its {what} to {command}; is it a printer?")
-
-    def _ask(self, command: str) -> list[ev.Event]:
-        """Send one command outside of any job and return what is said until its `ok`."""
-        with self._mutex:
-            heard: list[ev.Event] = []
-            while not self._link.ready:
-                heard += self._pump()
-            if command in self._asked:
-                self._asked[command] += 1
-            self._write(self._link.send(command, self._clock()))
-            while not self._link.idle:
-                heard += self._pump()
-            return heard
-
-    def _prove(self) -> None:
-        """Make sure that the printer has received every line, whatever its `ok`s say.
-
-        A question is carried out once and answered once: when all questions of a kind are
-        answered, the last of them has been received, and with it every line before.
-        """
-        for kind in (*("M114",) * 4, "M115", "M114", "M115"):
-            self._ask(kind)
-            if self._heard[kind] >= self._asked[kind]:
-                self._link.confirm()
-                return
-        self._lost("the printer does not prove that it received the last lines")
+    def _next_number(self) -> int | None:
+        return self._link.last_sent + 1 if self._link.dialect.verifies else None
 
     # ------------------------------------------------------------------ printing
 
@@ -329,19 +216,18 @@ class SerialPrinter:
         self._abort_asked.clear()
         self._sent_lines.clear()
         self._executed_line = first - 1
+        self._first_line, self._reserved = first, 0
         self._printing = True
         try:
             with self._mutex:
-                if self._journal is not None:
-                    self._journal.begin(checked.program.sha256, self.port, first, end)
-                whole = self._stream(checked, first, end, progress)
-                self._prove()
-                self._executed_line = self._last_sent_line(first)
-                if self._journal is not None:
-                    self._journal.acknowledged(self._executed_line + 1, self._link.last_acked)
-                    if whole and end >= total:
-                        self._journal.finish()
+                whole = self._carry_out(checked, first, end, progress)
+                if whole and end >= total and self._journal is not None:
+                    self._journal.finish()
         except (LinkError, LocalProtocolError):
+            if self._journal is not None:
+                sent = max(self._last_sent_line(first), self._executed_line)
+                with contextlib.suppress(JournalError):  # heaters come first
+                    self._journal.lost(self._executed_line + 1, sent + 1)
             self.make_safe()
             raise
         finally:
@@ -361,22 +247,40 @@ class SerialPrinter:
             next_line=end if whole else self._executed_line + 1,
             round_trip_s=self._round_trips.summary_s(),
             warnings=tuple(self._warnings),
+            first_line=first,
         )
+
+    def _carry_out(
+        self, checked: PrintableProgram, first: int, end: int, progress: Progress
+    ) -> bool:
+        """Stream, and prove that all has arrived; False if the job was aborted."""
+        if self._journal is not None:
+            self._journal.begin(checked.program.sha256, self.port, first, end)
+        whole = self._stream(checked, first, end, progress)
+        self._prove()
+        self._executed_line = self._last_sent_line(first)
+        if self._journal is not None:
+            self._journal.acknowledged(self._executed_line + 1)
+        return whole
 
     def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
         """Send the lines; False if the job was aborted."""
         link, clock, journal, trips = self._link, self._clock, self._journal, self._round_trips
         asked = self._asked
-        reserved = first
-        for index, command in _commands(checked, first, end):
-            if journal is not None and index >= reserved:
-                step = journal.step_lines if link.dialect.verifies else 1
-                reserved = index + step
-                journal.reserve(reserved, link.last_sent + 1 - index, self._executed_line + 1)
+        for index, command in commands_of(checked, first, end):
             if self._pause_asked.is_set() and not self._sit_out_pause(checked, index):
                 return False
             if self._abort_asked.is_set():
                 return False
+            if journal is not None:
+                if clock() >= self._asked_s + TEMPERATURE_EVERY_S:
+                    self._asked_s = clock()
+                    self._ask("M105")
+                if index >= self._reserved or not self._reserved:
+                    step = journal.step_lines if link.dialect.verifies else UNCOUNTED_STEP
+                    self._reserved = min(index + step, end)
+                    acked = self._executed_line + 1
+                    journal.reserve(index, self._next_number(), self._reserved, acked)
             sent_s = clock()
             self._sent_lines.append((link.last_sent + 1, index))
             if command[:4] in asked:
@@ -394,14 +298,6 @@ class SerialPrinter:
 
     def _last_sent_line(self, first: int) -> int:
         return self._sent_lines[-1][1] if self._sent_lines else first - 1
-
-    def finish_moves(self) -> None:
-        """Return when every buffered move has been made."""
-        self._ask("M400")
-
-    def command(self, text: str) -> None:
-        """Send one command of the host's own (parking, heating), outside any program."""
-        self._ask(text)
 
     # ------------------------------------------------------------------ pause, abort, stop
 
@@ -449,7 +345,7 @@ class SerialPrinter:
         return True
 
     def _lift(self) -> None:
-        for command in ("G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
+        for command in ("G21", "G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
             self._ask(command)
 
     def emergency_stop(self) -> None:
@@ -472,11 +368,26 @@ class SerialPrinter:
                 self._write_raw(data)
                 self._note("heaters told to switch off by unnumbered lines; nothing confirms it")
             else:
-                self.heaters_off()
-                self._lift()
-                self._note("heaters off, nozzle lifted")
+                self._switch_off()
         except (LinkError, LocalProtocolError, OSError) as error:
             self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+
+    def _switch_off(self) -> None:
+        try:
+            self.heaters_off()
+            self._lift()
+            self._note(f"{self._heaters_now()}, nozzle lifted")
+        except JournalError:  # numbered lines must be written down first, these need not
+            self._note(make_safe(self._fd))
+
+    def _heaters_now(self) -> str:
+        """What the printer says of its heaters; an `ok` alone confirms nothing."""
+        for event in self._ask("M105"):
+            if isinstance(event, ev.TemperatureReport) and all(
+                heater.target_c == 0.0 for heater in event.heaters.values()
+            ):
+                return "heaters off (the printer reports targets of 0)"
+        return "heaters told to switch off, nothing confirms it"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -488,61 +399,12 @@ class SerialPrinter:
         if self._log is not None:
             self._log.add(self._clock(), b"#", text.encode("ascii", "replace"))
         if self._journal is not None:
-            self._journal.note(text)
+            with contextlib.suppress(JournalError):  # a full disk must not stop a safe exit
+                self._journal.note(text)
 
-    # ------------------------------------------------------------------ the wire
+    # ------------------------------------------------------------------ what is heard
 
-    def _write(self, data: bytes) -> None:
-        self._write_raw(data)
-        self._bytes_sent += len(data)
-
-    def _write_raw(self, data: bytes) -> None:
-        if self._log is not None:
-            self._log.add(self._clock(), b">", data)
-        try:
-            written = os.write(self._fd, data)
-            while written < len(data):
-                select.select([], [self._fd], [], 1.0)
-                written += os.write(self._fd, data[written:])
-        except OSError as error:
-            self._lost(f"the port failed ({error})")
-
-    def _pump(self, limit_s: float | None = None) -> list[ev.Event]:
-        """Wait for the printer or for a deadline of the link, and act on what comes."""
-        link = self._link
-        now_s = self._clock()
-        wait_s = link.next_deadline_s() - now_s
-        if limit_s is not None:
-            wait_s = min(wait_s, limit_s)
-        wait_s = min(max(wait_s, 0.0), 0.5)
-        if self._poll.poll(wait_s * 1000 + 0.5 if wait_s else 0):
-            try:
-                data = os.read(self._fd, 65536)
-            except BlockingIOError:
-                return []
-            except OSError as error:
-                self._lost(f"the port failed ({error})")
-            if not data:
-                self._lost("the port was closed")
-            now_s = self._clock()
-            if self._log is not None:
-                self._log.add(now_s, b"<", data)
-            events = link.receive(data, now_s)
-        else:
-            events = link.tick(self._clock())
-        if output := link.take_output():
-            self._write(output)
-        for event in events:
-            if type(event) is ev.Acknowledged:
-                self._acked(event.number)
-            else:
-                self._on_event(event)
-        if self._failure is not None:
-            failure, self._failure = self._failure, None
-            raise failure
-        return events
-
-    def _acked(self, number: int) -> None:
+    def _on_acknowledged(self, number: int) -> None:
         lines = self._sent_lines
         if lines and lines[-1][0] == number:
             self._executed_line = lines[-1][1]
@@ -553,66 +415,45 @@ class SerialPrinter:
                 self._executed_line = lines[index][1]
             self._lines_acked += 1
 
-    def _on_event(self, event: ev.Event) -> None:
+    def _on_other_event(self, event: ev.Event) -> None:
         if isinstance(event, ev.TemperatureReport):
-            self._temperatures = event
-        elif isinstance(event, ev.PositionReport):
-            self._position = event
-            self._heard["M114"] += 1
-        elif isinstance(event, ev.FirmwareInfo):
-            self._heard["M115"] += 1
-        elif isinstance(event, ev.Greeted):
-            self._greeted = True
-        elif isinstance(event, ev.ResendRequested):
-            self._refused_numbers.append(event.number)
-        elif isinstance(event, ev.Probed):
-            self._stalls += 1
+            self._journal_temperatures(event)
         elif isinstance(event, ev.HostAction):
             self.actions.append(event.action)
             if event.action.split()[0] in ("pause", "cancel"):
                 (self.pause if event.action.startswith("pause") else self.abort)()
-        elif isinstance(event, ev.UnknownCommand):
-            self._warnings.append(event.text)
-        elif self._failure is not None:
-            return  # the first fault is the cause, the rest its consequences
-        elif isinstance(event, ev.CommandFailed):
-            self._failure = PrinterError(
-                f"The printer reports a fault: {event.text}; the last program line known to be "
-                f"executed is {self._executed_line + 1}."
-            )
-        elif isinstance(event, ev.LinkLost):
-            self._failure = self._lost_error(event.why)
 
-    def _lost(self, why: str) -> NoReturn:
-        """Raise for a dead port."""
-        self._link.give_up(why)
-        raise self._lost_error(why)
+    def _fault(self, text: str) -> Exception:
+        return PrinterError(
+            f"The printer reports a fault: {text}; the last program line known to be executed is "
+            f"{self._executed_line + 1}."
+        )
+
+    def _journal_temperatures(self, report: ev.TemperatureReport) -> None:
+        """Write temperatures down, some of the many that come while something heats."""
+        heaters = report.heaters
+        hotend, bed = heaters.get("T") or heaters.get("T0"), heaters.get("B")
+        if self._journal is None or hotend is None:
+            return
+        now_s = self._clock()
+        bed_c = bed.current_c if bed else None
+        change_c = abs((bed_c or 0.0) - self._noted_bed_c)
+        if now_s >= self._noted_s + TEMPERATURE_EVERY_S / 2 or change_c >= TEMPERATURE_STEP_C:
+            self._noted_s, self._noted_bed_c = now_s, bed_c or 0.0
+            self._journal.temperature(hotend.current_c, bed_c)
 
     def _lost_error(self, why: str) -> LinkLostError:
         last_sent = max((line for _, line in self._sent_lines), default=self._executed_line)
+        doubt = (
+            f"lines {self._executed_line + 2} to {last_sent + 1} are uncertain"
+            if last_sent > self._executed_line
+            else "no later line was sent"
+        )
         return LinkLostError(
             f"The link to {self.port} is lost: {why}; program lines up to "
-            f"{self._executed_line + 1} are executed, lines {self._executed_line + 2} to "
-            f"{last_sent + 1} are uncertain; find out where the printer is before going on.",
+            f"{self._executed_line + 1} are acknowledged, {doubt}; find out where the printer is "
+            f"before going on.",
             self._executed_line,
             last_sent,
+            why=why,
         )
-
-
-def _wrong_number(number: int) -> bytes:
-    body = b"N%d M105" % number
-    value = 0
-    for byte in body:
-        value ^= byte
-    return b"%b*%d\n" % (body, value)
-
-
-def _commands(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
-    """Lines to send with their numbers in the program; comments and empty lines left out."""
-    step = 4096
-    for start in range(first, end, step):
-        stop = min(end, start + step)
-        for offset, line in enumerate(checked.lines(start, stop)):
-            command = line.partition(";")[0].strip()
-            if command:
-                yield start + offset, command

@@ -6,13 +6,26 @@ of the sender's death, and the open port. It imports nothing of ours.
 
 import contextlib
 import os
+import re
 import select
 import sqlite3
 import sys
 import time
 
-COMMANDS = (b"M104 S0", b"M140 S0", b"M107", b"G91", b"G1 Z5 F600", b"G90", b"M104 S0", b"M140 S0")
-"""Heaters first; then the nozzle away from the part; heaters again, a line may have been lost."""
+HEATERS_OFF = (b"M104 S0", b"M140 S0")
+COMMANDS = (
+    b"M108",  # ends a wait for temperature, where the firmware lets it pass the queue
+    *HEATERS_OFF,
+    b"M107",
+    b"G21",  # the program may have been in inches
+    b"G91",
+    b"G1 Z5 F600",
+    b"G90",
+    *HEATERS_OFF,  # again: a line may have been lost
+)
+"""Heaters first; then the nozzle away from the part."""
+QUESTIONS = 3
+_TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 ANSWER_S = 0.5
 
 
@@ -21,7 +34,7 @@ def main() -> None:
     pipe_fd, port_fd, journal = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     if os.read(pipe_fd, 1):
         return
-    outcome = make_safe(port_fd)
+    outcome = f"supervisor: sender died; {make_safe(port_fd)}"
     if journal:
         with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(journal)) as db:
             db.execute("INSERT INTO note SELECT MAX(id), ?, ? FROM job", (time.time(), outcome))
@@ -35,11 +48,27 @@ def make_safe(port_fd: int) -> str:
     wait(port_fd, 0.05)
     for command in COMMANDS:
         if not write(port_fd, command + b"\n"):
-            return "supervisor: THE PORT IS GONE, heaters could not be reached"
-        answered += wait(port_fd, ANSWER_S)
+            return "THE PORT IS GONE, heaters could not be reached"
+        answered += wait(port_fd, ANSWER_S)[0]
     if not answered:
-        return "supervisor: heaters told to switch off, NO ANSWER"
-    return "supervisor: sender died; heaters off, nozzle lifted"
+        return "heaters told to switch off, NO ANSWER"
+    if confirmed_off(port_fd):
+        return "heaters off (the printer reports targets of 0), nozzle lifted"
+    return "heaters told to switch off, nothing confirms it"
+
+
+def confirmed_off(port_fd: int) -> bool:
+    """Whether the printer itself reports that its heaters aim at 0.
+
+    An `ok` proves nothing: it may answer a line of the dead sender's.
+    """
+    for _ in range(QUESTIONS):
+        if not write(port_fd, b"M105\n"):
+            return False
+        targets = dict(_TARGET.findall(wait(port_fd, ANSWER_S)[1]))
+        if b"T" in targets:
+            return all(float(value) == 0.0 for value in targets.values())
+    return False
 
 
 def write(port_fd: int, data: bytes) -> bool:
@@ -54,22 +83,22 @@ def write(port_fd: int, data: bytes) -> bool:
     return True
 
 
-def wait(port_fd: int, seconds: float) -> bool:
-    """Read until an `ok` line or until time is up; True if there was one."""
+def wait(port_fd: int, seconds: float) -> tuple[bool, bytes]:
+    """Read until an `ok` line or until time is up; whether there was one, and all that came."""
     until_s, heard = time.monotonic() + seconds, b""
     while (left_s := until_s - time.monotonic()) > 0:
         if not select.select([port_fd], [], [], left_s)[0]:
-            return False
+            break
         try:
             data = os.read(port_fd, 4096)
         except OSError:
-            return False
+            break
         if not data:
-            return False
+            break
         heard += data
         if any(line.startswith(b"ok") for line in heard.split(b"\n")[:-1]):
-            return True
-    return False
+            return True, heard
+    return False, heard
 
 
 if __name__ == "__main__":

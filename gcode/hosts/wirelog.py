@@ -9,6 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 FLUSH_ENTRIES = 2000
+FLUSH_S = 1.0
+"""A killed sender's log ends no earlier than this before its death."""
 
 
 class WireLog:
@@ -18,10 +20,16 @@ class WireLog:
     ----------
     max_bytes
         Size at which the file is renamed `.1` (`.1` to `.2`, and so on up to `keep`).
+    epoch_s
+        Added to every time: what turns the caller's clock into seconds since 1970.
     """
 
-    def __init__(self, path: Path, *, max_bytes: int = 64_000_000, keep: int = 3) -> None:
+    def __init__(
+        self, path: Path, *, max_bytes: int = 64_000_000, keep: int = 3, epoch_s: float = 0.0
+    ) -> None:
         self.path = path
+        self._epoch_s = epoch_s
+        self._flush_s = float("inf")
         self._max_bytes = max_bytes
         self._keep = keep
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -32,8 +40,10 @@ class WireLog:
     def add(self, now_s: float, direction: bytes, data: bytes) -> None:
         """Note bytes; they are written in batches."""
         entries = self._entries
+        if not entries:
+            self._flush_s = now_s + FLUSH_S
         entries.append((now_s, direction, data))
-        if len(entries) >= FLUSH_ENTRIES:
+        if len(entries) >= FLUSH_ENTRIES or now_s >= self._flush_s:
             self.flush()
 
     def flush(self) -> None:
@@ -41,7 +51,8 @@ class WireLog:
         if not self._entries:
             return
         rows = [
-            b"%.6f %b %b" % (now_s, direction, data.rstrip(b"\n").replace(b"\n", b"\\n"))
+            b"%.6f %b %b"
+            % (self._epoch_s + now_s, direction, data.rstrip(b"\n").replace(b"\n", b"\\n"))
             for now_s, direction, data in self._entries
         ]
         self._entries.clear()

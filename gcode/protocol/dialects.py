@@ -25,6 +25,8 @@ class LinkDialect:
         Receive buffer of the firmware: what may be under way beyond one line.
     greets
         The firmware prints a banner when it starts, so that a reset can be told.
+    buffered_lines
+        Most lines that are acknowledged and not yet moved: what a reset loses.
     """
 
     name: str
@@ -33,15 +35,18 @@ class LinkDialect:
     max_line_bytes: int
     rx_bytes: int
     greets: bool
+    buffered_lines: int = 80
 
 
 LINK_DIALECTS: dict[str, LinkDialect] = {
+    # BUFSIZE 4 to 16 and BLOCK_BUFFER_SIZE 16 to 64 in Marlin's shipped configurations.
     # MAX_CMD_SIZE 96, RX_BUFFER_SIZE 128 (Configuration_adv.h of Marlin 2.1).
     "marlin": LinkDialect("marlin", True, True, 95, 120, True),
     "prusa": LinkDialect("prusa", True, True, 95, 120, True),
     # gcode.py strips N and checksum unread; a pseudo-terminal loses nothing, so a lost answer
-    # means a lost host process: nothing can be proved and nothing is sent again.
-    "klipper": LinkDialect("klipper", False, False, 4095, 4095, False),
+    # means a lost host process: nothing can be proved and nothing is sent again. Its look-ahead
+    # is seconds long (toolhead.py, BUFFER_TIME_HIGH 2 s): 1000 of the shortest moves.
+    "klipper": LinkDialect("klipper", False, False, 4095, 4095, False, 1000),
     # RepRapFirmware 3.6 drops a line with a bad checksum silently and executes a repeated
     # number again: a line without an answer cannot be sent twice.
     "reprap": LinkDialect("reprap", True, False, 255, 255, False),

@@ -18,6 +18,7 @@ What it does not do: judge G-code, know what a job is, retry by reopening, or sl
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from dataclasses import dataclass
 from functools import reduce
@@ -62,6 +63,9 @@ SLOW_COMMANDS = frozenset(
     )
 )
 """Commands that may take minutes without an answer (OctoPrint's longRunningCommands and more)."""
+
+_MACRO = re.compile(r"[A-Za-z_]{2}")
+"""A command by name (Klipper) may be a whole script, and takes as long as its moves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +243,8 @@ class Link:
                     f"that {self.dialect.name} takes before cutting it silently; shorten it: "
                     f"{command[:60]!r}."
                 )
-        slow = text.split(b" ", 1)[0].decode("ascii", "replace") in SLOW_COMMANDS
+        name = text.split(b" ", 1)[0].decode("ascii", "replace")
+        slow = name in SLOW_COMMANDS or _MACRO.match(name) is not None
         self._history.append(data)
         self._slow.append(slow)
         self._last = number
@@ -294,6 +299,10 @@ class Link:
             for raw in lines:
                 if self._skipping:
                     self._skipping = False
+                    continue
+                if len(raw) > MAX_REPLY_BYTES:
+                    self._events.append(Unrecognised(raw[:80]))
+                    self._doubt(now_s)
                     continue
                 self._reply(raw.rstrip(b"\r"), now_s)
         if len(self._inbox) > MAX_REPLY_BYTES:

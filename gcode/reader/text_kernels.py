@@ -157,9 +157,9 @@ def run(kinds, codes, words, both_modes, states, pushed):
                 now[S_BED] = w[S]
             elif code == 1900 and not np.isnan(w[R]):
                 now[S_BED] = w[R]
-            elif code == 1060:
+            elif code == 1060 and not w[P] > 0:  # with P: another fan than the part's
                 now[S_FAN] = 1.0 if np.isnan(w[S]) else w[S] / 255.0
-            elif code == 1070:
+            elif code == 1070 and not w[P] > 0:
                 now[S_FAN] = 0.0
             elif code == 2040:
                 if not np.isnan(w[P]):

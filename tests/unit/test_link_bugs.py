@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import serial
 
 sys.path.insert(0, str(Path(__file__).parent))
 from link_harness import Conversation
@@ -234,16 +235,46 @@ def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
     assert place == pytest.approx((150.0, 0.0, 3.0), abs=0.01)
 
 
+def test_bug_11_a_program_in_inches_is_lifted_by_millimetres() -> None:
+    """Found in review: G91 and Z5 after G20 are five inches."""
+    lines = ["G28", "G20", "G90", "G1 Z0.1 F20", "G91", "M83"] + ["G1 X0.004 F100"] * 1500
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        asked = threading.Event()
+
+        def tell(stage: str, count: float, total: float) -> None:
+            if count and not asked.is_set():
+                printer.pause()
+                asked.set()
+
+        def go_on() -> None:
+            asked.wait(20)
+            while "paused" not in printer.notes:
+                asked.wait(0.01)
+            printer.resume()
+
+        thread = threading.Thread(target=go_on)
+        thread.start()
+        printer.print(program(lines), progress=tell)
+        thread.join(20)
+        place = printer.position_mm()
+        highest_mm = emulator.take_motion().end_mm[:, 2].max()
+        printer.close()
+    assert place == pytest.approx((152.4, 0.0, 2.54), abs=0.01)
+    assert highest_mm == pytest.approx(7.54, abs=0.01)
+
+
 def test_bug_12_opening_the_port_raises_no_dtr(monkeypatch: pytest.MonkeyPatch) -> None:
     """pyserial#124, Printrun#1068: DTR must be down before the port is opened."""
     seen: list[bool] = []
-    original = serial_host.serial.Serial.open
+    original = serial.Serial.open
 
     def watch(self: object) -> None:
         seen.extend((self.dtr, self.rts))  # type: ignore[attr-defined]
         original(self)
 
-    monkeypatch.setattr(serial_host.serial.Serial, "open", watch)
+    monkeypatch.setattr(serial.Serial, "open", watch)
     with EmulatedPrinterProcess(printer=profile()) as emulator:
         printer = SerialPrinter(emulator.port, supervise=False)
         printer.connect()
@@ -262,6 +293,30 @@ def test_bug_13_a_slow_command_never_forces_the_next_line() -> None:
         assert link.take_output() in (b"", line)  # the same line at most: it is idempotent
         assert not link.ready
     assert link.state is State.PROBING
+
+
+@pytest.mark.parametrize("dialect", ["klipper", "marlin"])
+def test_bug_14_a_long_script_does_not_time_out(dialect: str) -> None:
+    """Moonraker#437: a macro takes as long as its moves; 25 minutes without a word are none too
+    many, nothing is sent again that cannot be, and its ok is taken when it comes.
+
+    (The adapter of Moonraker itself has its own: scripts go by the websocket, without a limit.)
+    """
+    link = Link(dialect)
+    link.hello(0.0)
+    link.receive(b"ok\n", 0.0)
+    line = link.send("PRINT_START EXTRUDER_TEMP=210 BED_TEMP=60", 0.0)
+    now_s = 0.0
+    while now_s < 1500.0:
+        now_s = min(link.next_deadline_s(), 1500.0)
+        link.tick(now_s)
+        assert link.take_output() in ((b"",) if dialect == "klipper" else (b"", line))
+        assert not link.ended
+        assert not link.ready
+    link.receive(b"ok\n", 1500.0)
+    assert link.idle
+    link.send("G1 X1", 1500.0)
+    assert link.next_deadline_s() < 1500.0 + 61.0  # an ordinary line is not waited for so long
 
 
 def test_bug_15_advanced_ok_numbers_are_not_believed_blindly() -> None:

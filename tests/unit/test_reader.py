@@ -101,3 +101,11 @@ def test_real_files_use_the_filament_that_they_state(name: str) -> None:
     assert job.filament_mm == pytest.approx(expected, rel=0.015)
     tops = np.array([layer.z_mm for layer in job.layers])
     assert (np.diff(tops) > 0).all()
+
+
+def test_another_fan_than_the_parts_is_not_the_parts() -> None:
+    # regression: M106 P2 S255 (a chamber's fan) was read as the part's fan at full speed
+    text = "G28\nM106 S127.5\nM106 P2 S255\nG1 X1 Y1 Z1\nG1 X9 E1\nM107 P2\nG1 X1 E2\nM107\n"
+    job = read_job(text)
+    assert job.state_after(7).fan_ratio == 0.5
+    assert job.state_after(8).fan_ratio == 0.0

@@ -1,0 +1,78 @@
+"""The command `gcode resume-at`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gcode.cli import console
+from gcode.errors import InputError
+from gcode.moves import Program
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, load_setup
+from gcode.resumption import resume_at
+
+
+def resume_at_command(
+    job: Annotated[Path, typer.Argument(help="The whole job's G-code, of any slicer.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
+    z_mm: Annotated[
+        float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
+    ] = None,
+    layer: Annotated[
+        int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
+    ] = None,
+    printer: Annotated[
+        str, typer.Option(help="Printer profile: an ID or a TOML file.")
+    ] = DEFAULT_PRINTER,
+    material: Annotated[
+        str, typer.Option(help="Material profile: an ID or a TOML file.")
+    ] = DEFAULT_MATERIAL,
+    standing: Annotated[
+        Path | None,
+        typer.Option(help="Height map (.npz) to write: what must stand there, for --as-built."),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
+    ] = False,
+) -> None:
+    """Make a checked job from a layer on: heated, primed, lowered onto the part, Z not homed."""
+    console.writable(output)
+    if standing is not None:
+        if standing.suffix != ".npz":
+            raise InputError(f"{standing}: what stands there is written as .npz; rename it.")
+        console.writable(standing)
+    setup = load_setup(printer, material)
+    try:
+        text = job.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{job} cannot be read ({error.strerror}).") from error
+    made = resume_at(
+        Program(text, setup.printer.dialect), setup, z_mm=z_mm, layer=layer, title=job.name
+    )
+    program = made.checked.program
+    console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
+    if standing is not None:
+        console.write_whole(standing, made.standing.write)
+    if as_json:
+        console.show_json(
+            {
+                "gcode": str(output),
+                "layer": made.layer.index,
+                "z_mm": round(made.layer.z_mm, 4),
+                "first_line": made.first_line,
+                "standing_mm": round(made.standing.top_mm, 4),
+                "hotend_c": made.hotend_c,
+                "bed_c": made.bed_c,
+                "primed": made.primed,
+                "least_clearance_mm": made.checked.report.least_clearance_mm,
+                "sha256": program.sha256,
+            }
+        )
+        return
+    console.out.print(
+        f"{output}: {job.name} from layer {made.layer.index} ({made.layer.z_mm:g} mm) on, line "
+        f"{made.first_line + 1}; {made.standing.top_mm:g} mm must stand there, and Z must be true; "
+        f"primed {made.primed}; checked."
+    )

@@ -1,0 +1,349 @@
+"""One conversation with a printer on a serial port: `protocol.Link` with a port and a clock.
+
+It opens the port, greets, tests, asks and listens; it knows nothing of programs and journals
+(`serial` does). DTR is left as it is: raising it resets most boards in mid-print.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn, TypeVar
+
+import serial
+
+from gcode.errors import LinkError
+from gcode.hosts.port import Capabilities, LinkLostError, Temperatures
+from gcode.hosts.wirelog import WireLog
+from gcode.protocol import Link, LinkDialect, LinkTiming, checksum
+from gcode.protocol import events as ev
+
+Answer = TypeVar("Answer")
+QUERY_TRIES = 3
+
+
+class SerialConversation:
+    """A printer that can be asked things; see `SerialPrinter` for the parameters.
+
+    Those who build on it are told of acknowledgements and of what else is said, by the methods
+    that begin with `_on`, `_before`, `_fault` and `_lost_error`.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        *,
+        baud: int,
+        dialect: str,
+        window: int,
+        wire_log: Path | None,
+        timing: LinkTiming | None,
+        clock: Callable[[], float],
+    ) -> None:
+        self.port = port
+        self._baud = baud
+        self._clock = clock
+        self._link = Link(dialect, window=window, timing=timing)
+        self._wire_log = wire_log
+        self._log: WireLog | None = None
+        self._serial: serial.Serial | None = None
+        self._fd = -1
+        self._poll = select.poll()
+        self._mutex = threading.RLock()
+        self._capabilities = Capabilities("")
+        self._position: ev.PositionReport | None = None
+        self._temperatures: ev.TemperatureReport | None = None
+        self._asked = {"M114": 0, "M115": 0}
+        self._heard = {"M114": 0, "M115": 0}
+        self._failure: Exception | None = None
+        self._warnings: deque[str] = deque(maxlen=100)
+        self._stalls = self._bytes_sent = 0
+        self._refused_numbers: list[int] = []
+        self._greeted = False
+
+    # ------------------------------------------------------------------ for those who build on it
+
+    def _before_own_command(self) -> None:
+        """Take note that the next line on the wire is none of a program's."""
+
+    def _on_acknowledged(self, number: int) -> None:
+        """Take note that line `number` is acknowledged."""
+
+    def _on_other_event(self, event: ev.Event) -> None:
+        """Take note of an event that the conversation itself has no use for."""
+
+    def _fault(self, text: str) -> Exception:
+        return LinkError(f"The printer reports a fault: {text}.")
+
+    def _lost_error(self, why: str) -> LinkLostError:
+        return LinkLostError(f"The link to {self.port} is lost: {why}.", -1, -1, why=why)
+
+    # ------------------------------------------------------------------ connection
+
+    def _open_port(self) -> None:
+        if self._wire_log is not None:
+            self._log = WireLog(self._wire_log, epoch_s=time.time() - self._clock())
+        device = serial.Serial(baudrate=self._baud, timeout=0, exclusive=False)
+        device.port = self.port
+        device.dtr = False  # a rising DTR resets the board (pyserial#124)
+        device.rts = False
+        try:
+            device.open()
+        except (serial.SerialException, OSError) as error:
+            raise LinkError(f"{self.port} cannot be opened ({error}); check the path.") from error
+        self._serial = device
+        self._fd = device.fileno()
+        self._keep_line_up()
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+
+    def _keep_line_up(self) -> None:
+        """Clear HUPCL: closing the port must not drop DTR and so reset the printer."""
+        import termios
+
+        with contextlib.suppress(termios.error):
+            attributes = termios.tcgetattr(self._fd)
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._fd, termios.TCSANOW, attributes)
+
+    def _close_port(self) -> None:
+        if self._serial is not None:
+            with contextlib.suppress(OSError, serial.SerialException):
+                self._serial.close()
+            self._serial = None
+        if self._log is not None:
+            self._log.close()
+            self._log = None
+
+    def _greet(self, number: int = 0) -> None:
+        self._greeted = False
+        self._failure = None
+        self._write(self._link.hello(self._clock(), number=number))
+        while not self._greeted:
+            self._pump()
+        self._settle()
+
+    def _settle(self, quiet_s: float = 0.05) -> None:
+        """Hear out what a half line or an earlier sender may still cause."""
+        until_s = self._clock() + quiet_s
+        while (now_s := self._clock()) < until_s:
+            if self._pump(limit_s=until_s - now_s):
+                until_s = self._clock() + quiet_s / 2
+
+    def _test_guard(self) -> None:
+        """Send a line with a wrong checksum and one with a wrong number: both must bounce."""
+        number = self._link.last_sent + 1
+        for what, line in (
+            ("checksums", b"N%d M105*0\n" % number),
+            ("line numbers", _wrong_number(number + 7)),
+        ):
+            refused = False
+            for _ in range(QUERY_TRIES):
+                self._refused_numbers.clear()
+                self._write(line)
+                until_s = self._clock() + max(self._link.timing.doubt_s, 0.3)
+                while not self._refused_numbers and (left_s := until_s - self._clock()) > 0:
+                    self._pump(limit_s=left_s)
+                if self._refused_numbers:
+                    refused = True
+                    break
+            self._settle(0.02)
+            if not refused:
+                self._link.give_up(f"the firmware ignores {what}")
+                raise LinkError(
+                    f"The printer on {self.port} takes lines with wrong {what}: corruption could "
+                    f"not be noticed and nothing was printed; use another firmware or cable."
+                )
+        self._failure = None
+        self._greet(self._link.last_sent)
+
+    def _learn(self) -> None:
+        caps: dict[str, bool] = {}
+        firmware = ""
+        for event in self._ask("M115"):
+            if isinstance(event, ev.FirmwareInfo):
+                firmware = event.name
+            elif isinstance(event, ev.Capability):
+                caps[event.name] = event.enabled
+        self._capabilities = Capabilities(firmware, caps)
+
+    def _log_wire(self, direction: bytes, data: bytes) -> None:
+        if self._log is not None:
+            self._log.add(self._clock(), direction, data)
+
+    # ------------------------------------------------------------------ questions
+
+    @property
+    def dialect(self) -> LinkDialect:
+        """How the firmware speaks."""
+        return self._link.dialect
+
+    def capabilities(self) -> Capabilities:
+        """Return what the firmware said on connecting."""
+        return self._capabilities
+
+    def temperatures(self) -> Temperatures:
+        """Ask for temperatures (M105)."""
+        report = self._answer("M105", lambda: self._temperatures, "temperatures")
+        heaters = report.heaters
+        hotend = heaters.get("T") or heaters.get("T0")
+        if hotend is None:
+            raise LinkError("The printer reports no hotend temperature; check its firmware.")
+        bed = heaters.get("B")
+        return Temperatures(
+            hotend.current_c,
+            hotend.target_c or 0.0,
+            bed.current_c if bed else None,
+            (bed.target_c or 0.0) if bed else None,
+        )
+
+    def position_mm(self) -> tuple[float, float, float]:
+        """Ask for the logical position (M114)."""
+        report = self._where()
+        return report.x_mm, report.y_mm, report.z_mm
+
+    def place(self) -> ev.PositionReport:
+        """Ask for the logical position, extruder included, once all moves are made."""
+        self._ask("M400")
+        return self._where()
+
+    def _where(self) -> ev.PositionReport:
+        return self._answer("M114", lambda: self._position, "position")
+
+    def _answer(self, command: str, read: Callable[[], Answer | None], what: str) -> Answer:
+        for _ in range(QUERY_TRIES):
+            self._temperatures = self._position = None
+            self._ask(command)
+            value = read()
+            if value is not None:
+                return value
+        raise LinkError(f"The printer does not report its {what} to {command}; is it a printer?")
+
+    def _ask(self, command: str) -> list[ev.Event]:
+        """Send one command outside of any job and return what is said until its `ok`."""
+        with self._mutex:
+            heard: list[ev.Event] = []
+            while not self._link.ready:
+                heard += self._pump()
+            if command in self._asked:
+                self._asked[command] += 1
+            self._before_own_command()
+            self._write(self._link.send(command, self._clock()))
+            while not self._link.idle:
+                heard += self._pump()
+            return heard
+
+    def _prove(self) -> None:
+        """Make sure that the printer has received every line, whatever its `ok`s say.
+
+        A question is carried out once and answered once: when all questions of a kind are
+        answered, the last of them has been received, and with it every line before.
+        """
+        for kind in (*("M114",) * 4, "M115", "M114", "M115"):
+            self._ask(kind)
+            if self._heard[kind] >= self._asked[kind]:
+                self._link.confirm()
+                return
+        self._lost("the printer does not prove that it received the last lines")
+
+    def command(self, text: str) -> None:
+        """Send one command of the host's own (parking, heating), outside any program."""
+        self._ask(text)
+
+    def finish_moves(self) -> None:
+        """Return when every buffered move has been made."""
+        self._ask("M400")
+
+    # ------------------------------------------------------------------ the wire
+
+    def _write(self, data: bytes) -> None:
+        self._write_raw(data)
+        self._bytes_sent += len(data)
+
+    def _write_raw(self, data: bytes) -> None:
+        if self._log is not None:
+            self._log.add(self._clock(), b">", data)
+        try:
+            written = os.write(self._fd, data)
+            while written < len(data):
+                select.select([], [self._fd], [], 1.0)
+                written += os.write(self._fd, data[written:])
+        except OSError as error:
+            self._lost(f"the port failed ({error})")
+
+    def _pump(self, limit_s: float | None = None) -> list[ev.Event]:
+        """Wait for the printer or for a deadline of the link, and act on what comes."""
+        link = self._link
+        now_s = self._clock()
+        wait_s = link.next_deadline_s() - now_s
+        if limit_s is not None:
+            wait_s = min(wait_s, limit_s)
+        wait_s = min(max(wait_s, 0.0), 0.5)
+        if self._poll.poll(wait_s * 1000 + 0.5 if wait_s else 0):
+            try:
+                data = os.read(self._fd, 65536)
+            except BlockingIOError:
+                return []
+            except OSError as error:
+                self._lost(f"the port failed ({error})")
+            if not data:
+                self._lost("the port was closed")
+            now_s = self._clock()
+            if self._log is not None:
+                self._log.add(now_s, b"<", data)
+            events = link.receive(data, now_s)
+        else:
+            events = link.tick(self._clock())
+        if output := link.take_output():
+            self._write(output)
+        for event in events:
+            if type(event) is ev.Acknowledged:
+                self._on_acknowledged(event.number)
+            else:
+                self._on_event(event)
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+        return events
+
+    def _lost(self, why: str) -> NoReturn:
+        """Raise for a dead port."""
+        self._link.give_up(why)
+        raise self._lost_error(why)
+
+    def _on_event(self, event: ev.Event) -> None:
+        if isinstance(event, ev.Acknowledged):
+            self._on_acknowledged(event.number)
+        elif isinstance(event, ev.TemperatureReport):
+            self._temperatures = event
+        elif isinstance(event, ev.PositionReport):
+            self._position = event
+            self._heard["M114"] += 1
+        elif isinstance(event, ev.FirmwareInfo):
+            self._heard["M115"] += 1
+        elif isinstance(event, ev.Greeted):
+            self._greeted = True
+        elif isinstance(event, ev.ResendRequested):
+            self._refused_numbers.append(event.number)
+        elif isinstance(event, ev.Probed):
+            self._stalls += 1
+        elif isinstance(event, ev.UnknownCommand):
+            self._warnings.append(event.text)
+        elif self._failure is not None:
+            pass  # the first fault is the cause, the rest its consequences
+        elif isinstance(event, ev.CommandFailed):
+            self._failure = self._fault(event.text)
+        elif isinstance(event, ev.LinkLost):
+            self._failure = self._lost_error(event.why)
+        self._on_other_event(event)
+
+
+def _wrong_number(number: int) -> bytes:
+    body = b"N%d M105" % number
+    return b"%b*%d\n" % (body, checksum(body))

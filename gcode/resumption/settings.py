@@ -1,0 +1,94 @@
+"""What a job has set before a line, besides modes and position: to be said again."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from gcode.errors import ReadError
+from gcode.reader import Job
+
+_LIMITS = ("M201", "M203", "M204", "M205", "M566", "M593", "SET_VELOCITY_LIMIT")
+_FACTORS = ("M220", "M221", "M572", "M900", "SET_PRESSURE_ADVANCE")
+_OTHERS = ("M141", "M486", "EXCLUDE_OBJECT_DEFINE", "G17", "G18", "G19")
+REPLAYED = frozenset((*_LIMITS, *_FACTORS, *_OTHERS))
+"""Limits, factors, pressure advance, planes, chamber, names of objects: the last word counts."""
+_PLANES = frozenset({"G17", "G18", "G19"})
+_NAME = re.compile(r"([GMT]\d+(?:\.\d+)?|[A-Z_]{3,}\w*)\s*(.*)")
+_KEY = re.compile(r"([A-Z_]+)=?")
+_MACRO_HEAT = re.compile(
+    r"\b(BED|EXTRUDER|HOTEND|NOZZLE|TOOL)\w*?(?:_?TEMP\w*)?\s*=\s*(\d+(?:\.\d+)?)"
+)
+_LEVELLING = frozenset({"G29", "M420"})
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What lines [0, line) of a job set.
+
+    Attributes
+    ----------
+    commands
+        To be said again, in their order.
+    hotend_c, bed_c
+        Targets, °C, a macro's parameters included; None where the job says nothing.
+    levelled
+        The job has a mesh of the bed measured or switched on.
+    """
+
+    commands: tuple[str, ...]
+    hotend_c: float | None
+    bed_c: float | None
+    levelled: bool
+
+
+def settings_before(job: Job, line: int) -> Settings:
+    """Read the settings in force before a line.
+
+    Raises
+    ------
+    ReadError
+        If the job has shifted its coordinate system: the shift is lost with the printer's memory.
+    """
+    last: dict[tuple[str, ...], str] = {}
+    macro_c: dict[str, float] = {}
+    says_bed = levelled = False
+    for number, raw in enumerate(job.program.text.split("\n")[:line], start=1):
+        command = raw.partition(";")[0].strip()
+        match = _NAME.match(command)
+        if match is None:
+            continue
+        name, rest = match.groups()
+        if name == "G92" and re.search(r"[XYZ]", rest):
+            raise ReadError(
+                f"Line {number} ({command!r}) shifts the coordinate system, which a job begun "
+                f"later cannot know to be in force; send the whole job, or slice it anew."
+            )
+        if name in REPLAYED or (name == "M106" and re.search(r"P\s*[1-9]", rest)):
+            key = _key(name, rest)
+            last.pop(key, None)  # the order is that of the last word
+            last[key] = command
+        elif name in _LEVELLING:
+            levelled = True
+        elif name in ("M140", "M190"):
+            says_bed = True
+        elif name[0] not in "GMT":
+            for what, value in _MACRO_HEAT.findall(rest.upper()):
+                macro_c["bed" if what == "BED" else "hotend"] = float(value)
+    state = job.state_after(line)
+    bed_c = state.bed_c or macro_c.get("bed", 0.0)
+    return Settings(
+        commands=tuple(last.values()),
+        hotend_c=state.hotend_c or macro_c.get("hotend"),
+        bed_c=bed_c if bed_c or says_bed else None,
+        levelled=levelled,
+    )
+
+
+def _key(name: str, rest: str) -> tuple[str, ...]:
+    """Commands that set the same things: the later one replaces the earlier."""
+    if name in _PLANES:
+        return ("plane",)
+    if name in ("EXCLUDE_OBJECT_DEFINE", "M106"):
+        return (name, rest)
+    return (name, *sorted(_KEY.findall(re.sub(r"[-+]?\d*\.?\d+", " ", rest.upper()))))

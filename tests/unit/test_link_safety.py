@@ -1,0 +1,190 @@
+"""What is said of heaters is what a reply confirmed; temperatures reach the journal."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import sqlite3
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from link_helpers import moves, profile, program
+
+import gcode.hosts.serial as serial_host
+from gcode.errors import JournalError
+from gcode.firmware import EmulatedPrinterProcess
+from gcode.hosts import supervisor
+from gcode.hosts.journal import Journal
+from gcode.hosts.serial import SerialPrinter
+
+
+@pytest.fixture(autouse=True)
+def _no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_host, "require_checked", lambda checked: None)
+
+
+def answering(report: bytes | None) -> tuple[str, list[bytes]]:
+    """Let the supervisor speak to a port that says ok to all and `report` to M105."""
+    ours, theirs = socket.socketpair()
+    heard: list[bytes] = []
+
+    def serve() -> None:
+        with theirs, theirs.makefile("rwb", buffering=0) as port:
+            for line in port:
+                heard.append(line.strip())
+                if line.strip() and report is not None:
+                    port.write(report if line == b"M105\n" else b"ok\n")
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    with ours:
+        said = supervisor.make_safe(ours.fileno())
+        ours.shutdown(socket.SHUT_RDWR)
+    thread.join(10)
+    return said, heard
+
+
+def test_an_ok_alone_does_not_make_heaters_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    # regression: eight ok and the log said "heaters off"; they may answer the dead sender's lines
+    said, heard = answering(b"ok\n")
+    assert "heaters off" not in said
+    assert "told to switch off" in said
+    assert heard.index(b"M104 S0") < heard.index(b"G21") < heard.index(b"G1 Z5 F600")
+
+
+def test_targets_above_zero_are_not_called_off() -> None:
+    said, _ = answering(b"ok T:201.1 /0.0 B:60.0 /60.0 @:0\n")
+    assert "told to switch off" in said
+
+
+@pytest.mark.parametrize(
+    "report",
+    [b"ok T:201.1 /0.0 B:60.0 /0.0 @:0\n", b"T:20 /0 B:20 /0\nok\n", b"ok B:9 /0.0 T0:9 /0.0\n"],
+)
+def test_targets_of_zero_are_called_off(report: bytes) -> None:
+    said, heard = answering(report)
+    assert "heaters off" in said
+    assert heard[-1] == b"M105"
+
+
+def test_no_answer_at_all_is_said_to_be_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "ANSWER_S", 0.01)
+    said, _ = answering(None)
+    assert "NO ANSWER" in said
+
+
+@pytest.mark.parametrize(
+    ("commands", "said"), [(None, "heaters off"), (("M107",), "told to switch off")]
+)
+def test_a_safe_exit_says_off_only_where_the_printer_reports_it(
+    commands: tuple[str, ...] | None, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if commands is not None:  # a firmware that takes M104 S0 and does nothing
+        monkeypatch.setattr(serial_host, "SAFE_COMMANDS", commands)
+    with (
+        EmulatedPrinterProcess(printer=profile()) as emulator,
+        SerialPrinter(emulator.port, supervise=False) as printer,
+    ):
+        printer.command("M104 S100")
+        printer.make_safe()
+        notes = printer.notes
+        target_c = emulator.state()["hotend_target_c"]
+    assert said in notes[-1]
+    assert ("heaters off" in notes[-1]) == (target_c == 0)
+
+
+def test_temperatures_reach_the_journal(tmp_path: Path) -> None:
+    # regression: nothing called Journal.temperature(), so nothing was known of the bed
+    journal = Journal(tmp_path / "journal.sqlite")
+    clock = iter(range(10**9))
+    with (
+        EmulatedPrinterProcess(printer=profile()) as emulator,
+        SerialPrinter(
+            emulator.port,
+            journal=journal,
+            supervise=False,
+            clock=lambda: next(clock) * 0.01,  # every look at the clock takes 10 ms
+        ) as printer,
+    ):
+        lines = ["M190 S60", "M109 S205", "G28", "M83", *moves(3000), "M140 S0", "G4 S3600"]
+        report = printer.print(program([*lines, *moves(1500)]))
+    assert report.ok
+    noted = journal.temperatures()
+    assert len(noted) > 10
+    assert max(hotend_c for _, hotend_c, _ in noted) == pytest.approx(205.0, abs=1.0)
+    assert min(bed_c for _, _, bed_c in noted if bed_c is not None) < 30.0
+    journal.close()
+
+
+def test_how_cold_the_bed_was_counts_from_when_it_was_warm(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.sqlite", clock=lambda: 0.0)
+    journal.begin("a", "port", 0, 10)
+    for bed_c in (22.0, 39.0, 60.0, 45.0, 60.0):
+        journal.temperature(200.0, bed_c)
+    assert journal.lowest_bed_c(40.0) == 45.0
+    assert journal.lowest_bed_c(70.0) is None
+    journal.settle(1, 5)
+    journal.open_session()
+    journal.begin("a", "port", 5, 10)  # the same program goes on: its part stood there all along
+    journal.temperature(200.0, 38.0)
+    assert journal.lowest_bed_c(40.0) == 38.0
+    journal.open_session()
+    journal.begin("a", "port", 0, 10)  # anew, on an empty bed
+    assert journal.lowest_bed_c(40.0) is None
+    journal.close()
+
+
+class FullDisk(Journal):
+    """Takes the job's beginning, then nothing more."""
+
+    def _run(self, sql: str, *values: object) -> sqlite3.Cursor:
+        if "UPDATE" in sql or "note" in sql:
+            raise JournalError("The journal cannot be written (disk full).")
+        return super()._run(sql, *values)
+
+
+def test_a_full_disk_does_not_keep_the_heaters_on(tmp_path: Path) -> None:
+    # regression: the safe exit's own remark was the next thing that could not be written
+    journal = FullDisk(tmp_path / "journal.sqlite")
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, journal=journal, supervise=False)
+        printer.connect()
+        printer.command("M104 S100")
+        with pytest.raises(JournalError, match="disk full"):
+            printer.print(program(moves(100)))
+        state = emulator.state()
+        printer.close()
+    assert state["hotend_target_c"] == 0
+    assert "heaters off" in printer.notes[-1]
+
+
+def test_a_journal_is_made_whole_or_not_at_all(tmp_path: Path) -> None:
+    # regression: killed between its tables and its version, it could never be opened again
+    path = tmp_path / "journal.sqlite"
+    said: list[str] = []
+    original = sqlite3.connect
+
+    class Watched(sqlite3.Connection):
+        def executescript(self, script: str, /) -> sqlite3.Cursor:
+            said.append(script)
+            return super().executescript(script)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sqlite3, "connect", lambda *a, **k: original(*a, **k, factory=Watched))
+        Journal(path).close()
+    (script,) = said  # tables and version
+    assert script.startswith("BEGIN IMMEDIATE;")
+    assert script.endswith("PRAGMA user_version = 2; COMMIT;")
+    Journal(path).close()
+
+
+def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        db.execute("CREATE TABLE job (id INTEGER)")
+    with pytest.raises(JournalError, match="version 0"):
+        Journal(path)
