@@ -44,7 +44,17 @@ FRAMES = ("build", "unknown")
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("repair")(repair)
+    app.command(
+        "repair",
+        epilog=console.examples(
+            "amrepair repair scan.ply --template part.safetensors -o repair.gcode "
+            "--report report.html",
+            "amrepair repair scan.ply --template part.stl -o repair.gcode "
+            "--scan-frame unknown --part-pose 100,80,0,90",
+            "amrepair repair scan.ply --template part.stl -o repair.gcode --printer ender_3 "
+            "--material petg --job job.gcode",
+        ),
+    )(repair)
 
 
 def repair(

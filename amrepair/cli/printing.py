@@ -60,7 +60,15 @@ APPROVALS = ("ask", "auto")
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("loop")(loop)
+    app.command(
+        "loop",
+        epilog=console.examples(
+            "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
+            "--scanner watch:scans --every 20",
+            "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
+            "--scanner watch:scans --approve auto --json",
+        ),
+    )(loop)
 
 
 def loop(

@@ -48,7 +48,15 @@ DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("simulate")(simulate)
+    app.command(
+        "simulate",
+        epilog=console.examples(
+            "amrepair simulate",
+            "amrepair simulate part.stl --defect void:diameter=8,layers=4 --defect chip "
+            "--seed 3 --out out/run",
+            "amrepair simulate part.stl --printer voron_2_4 --material petg --scale fit --json",
+        ),
+    )(simulate)
 
 
 def simulate(

@@ -7,7 +7,7 @@ imported only while fitting.
 
 from amrepair.template.cut import CutTemplate
 from amrepair.template.extract import extract_mesh
-from amrepair.template.fitting import fit_template, load_or_fit
+from amrepair.template.fitting import default_cache_dir, fit_template, load_or_fit
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh
 from amrepair.template.mesh_sdf import MeshSdf
@@ -20,6 +20,7 @@ __all__ = [
     "MeshSdf",
     "PlannedSdf",
     "Template",
+    "default_cache_dir",
     "extract_mesh",
     "fit_template",
     "load_mesh",
