@@ -11,15 +11,14 @@ from pathlib import Path
 import click
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from amrepair.cli.app import app as amrepair_app
 from gcode.cli.app import app as gcode_app
 
 ROOT = Path(__file__).parents[2]
-ROOTS = {
-    "amrepair": typer.main.get_command(amrepair_app),
-    "gcode": typer.main.get_command(gcode_app),
-}
+APPS = {"amrepair": amrepair_app, "gcode": gcode_app}
+ROOTS = {name: typer.main.get_command(app) for name, app in APPS.items()}
 
 
 def commands(command: click.Command, path: tuple[str, ...]) -> list[tuple[str, click.Command]]:
@@ -64,13 +63,17 @@ def test_every_command_and_option_says_what_it_is(name: str, command: click.Comm
 def test_bash_completes(typed: str, offered: set[str]) -> None:
     program = typed.split(maxsplit=1)[0]
     count = len(typed.split()) - (0 if typed.endswith(" ") else 1)
-    done = subprocess.run(
-        [sys.executable, "-c", f"from {program}.cli import main; main()"],
-        capture_output=True, text=True, timeout=120, check=False, cwd=ROOT,
-        env={**os.environ, f"_{program.upper()}_COMPLETE": "complete_bash", "COMP_WORDS": typed,
-             "COMP_CWORD": str(count)},
-    )  # fmt: skip
-    assert set(done.stdout.split()) == offered, done.stderr
+    done = CliRunner().invoke(
+        APPS[program],
+        [],
+        prog_name=program,
+        env={
+            f"_{program.upper()}_COMPLETE": "complete_bash",
+            "COMP_WORDS": typed,
+            "COMP_CWORD": str(count),
+        },
+    )
+    assert set(done.stdout.split()) == offered, done.output
 
 
 def test_a_completion_script_can_be_had() -> None:
