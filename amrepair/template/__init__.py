@@ -11,6 +11,7 @@ from amrepair.template.fitting import default_cache_dir, fit_template, load_or_f
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh
 from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.opening import open_template
 from amrepair.template.planned import PlannedSdf
 from amrepair.template.port import Template
 
@@ -25,4 +26,5 @@ __all__ = [
     "fit_template",
     "load_mesh",
     "load_or_fit",
+    "open_template",
 ]
