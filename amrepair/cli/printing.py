@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -22,21 +22,8 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import Stop, locate_part, plan_stops, run_loop
 from amrepair.repair import RepairPlan, Site, Stopwatch
-from amrepair.report import (
-    Figures,
-    ReportData,
-    outcome_of,
-    summary_of_result,
-    write_report,
-)
-from amrepair.report.collect import (
-    decision_of,
-    look_of,
-    loop_result,
-    region_rows,
-    versions,
-    wire_counters,
-)
+from amrepair.report import report_of_loop, summary_of_result, write_report
+from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scanner, WatchedFolderScanner
 from amrepair.template import PlannedSdf
@@ -142,20 +129,13 @@ def loop(
     )
     folder.write_json("result.json", result)
     within = report.within_tolerance
-    data = ReportData(
+    data = report_of_loop(
+        report,
+        result,
         title=f"Run: {job_file.name}",
-        outcome=outcome_of(result, within_tolerance=within),
-        figures=Figures.from_result(result),
-        looks=tuple(
-            look_of(look.plan, f"{look.stop.label}, scan {look.number}", printed=look.printed)
-            for look in report.looks
-        ),
-        setup={"job": job_file.name, "printer": setup.printer.name},
-        regions=tuple(row for look in report.first_looks for row in region_rows(look.plan)),
-        decisions=tuple(decision_of(look) for look in report.looks),
-        wire=wire_counters(report),
-        seconds=seconds,
-        provenance=versions(setup),
+        setup=setup,
+        about={"job": job_file.name},
+        expected=_placed_solid(field, placed),
     )
     write_report(data, folder.file("report.html"))
     if as_json:
@@ -200,6 +180,12 @@ def _scanner(spec: str, calibration: Path | None, timeout_s: float) -> Scanner:
         pose = Transform("build", "scanner", matrix)
     folder = Path(spec.removeprefix("watch:"))
     return WatchedFolderScanner(folder, build_from_scanner=pose, timeout_s=timeout_s)
+
+
+def _placed_solid(template: Template, placed: Transform) -> Any:
+    """The part as it should be, where it stands."""
+    solid: Any = template.solid()
+    return solid.transform(placed.matrix[:3])
 
 
 def _site(job: Job, stop: Stop, template: Template, placed: Transform, setup: PrintSetup) -> Site:

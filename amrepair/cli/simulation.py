@@ -19,23 +19,13 @@ from amrepair.cli.options import (
 )
 from amrepair.repair import Stopwatch
 from amrepair.report import (
-    Figures,
     ReportData,
     TemperatureSeries,
-    outcome_of,
+    report_of_loop,
     summary_of_result,
     write_report,
 )
-from amrepair.report.collect import (
-    decision_of,
-    look_of,
-    loop_result,
-    region_rows,
-    rounded,
-    solid_mesh,
-    versions,
-    wire_counters,
-)
+from amrepair.report.collect import loop_result, rounded
 from amrepair.report.folder import RunFolder
 from amrepair.simulate.defects import DefectKind, parse_defect
 from amrepair.simulate.part_files import bracket_path
@@ -117,7 +107,7 @@ def simulate(
     result = _result(run, folder, seed, seconds)
     folder.write_json("result.json", result)
     with watch("report"):
-        write_report(_report_data(run, path, result, seconds), folder.file("report.html"))
+        write_report(_report_data(run, path, result), folder.file("report.html"))
     within = run.report.within_tolerance
     if as_json:
         console.show_json(result)
@@ -167,42 +157,23 @@ def _result(
     }
 
 
-def _report_data(
-    run: SimulatedRun, path: Path, result: dict[str, Any], seconds: dict[str, float]
-) -> ReportData:
-    prepared, report = run.prepared, run.report
-    setup = prepared.setup
-    within = report.within_tolerance
+def _report_data(run: SimulatedRun, path: Path, result: dict[str, Any]) -> ReportData:
+    prepared = run.prepared
     clock, hotend, bed = run.temperatures.T
-    return ReportData(
+    return report_of_loop(
+        run.report,
+        result,
         title=f"Simulated run: {path.name}",
-        outcome=outcome_of(result, within_tolerance=within),
-        figures=Figures.from_result(result),
-        looks=tuple(
-            look_of(
-                look.plan,
-                f"{look.stop.label}, scan {look.number}",
-                printed=look.printed,
-            )
-            for look in report.looks
-        ),
-        setup={
+        setup=prepared.setup,
+        about={
             "part": path.name,
-            "printer": setup.printer.name,
-            "material": setup.material.name,
-            "process": setup.process.name,
             "defects": ", ".join(str(t.kind) for t in run.truth) or "none",
         },
-        expected=solid_mesh(prepared.part),
-        regions=tuple(row for look in report.first_looks for row in region_rows(look.plan)),
-        decisions=tuple(decision_of(look) for look in report.looks),
-        wire=wire_counters(report),
+        expected=prepared.part,
         temperatures=(
             TemperatureSeries("hotend", clock, hotend),
             TemperatureSeries("bed", clock, bed),
         ),
-        seconds=seconds,
-        provenance={"seed": str(prepared.seed), **versions(setup)},
     )
 
 

@@ -45,6 +45,19 @@ def quantity(value: float, unit: str, *, digits: int = 3) -> str:
     return f"{text} {unit}".strip()
 
 
+def length(length_mm: float) -> str:
+    """Filament: `36 mm`, `1.24 m`.
+
+    Examples
+    --------
+    >>> length(36.4), length(1240.0)
+    ('36 mm', '1.24 m')
+    """
+    if abs(length_mm) < 1000:
+        return f"{length_mm:.0f} mm" if abs(length_mm) >= 10 else quantity(length_mm, "mm")
+    return quantity(length_mm / 1000, "m")
+
+
 def percent(ratio: float) -> str:
     """`95 %`; 100 % and 0 % are said only where they are true to the last digit.
 
@@ -103,7 +116,7 @@ def summary(
     >>> summary(Outcome.NOTHING_TO_REPAIR, clean, ())[0]
     'Nothing is missing: the part agrees with its template.'
     """
-    return _found(figures, regions), _done(outcome, figures), _left(outcome, figures)
+    return _found(figures, regions), _done(figures), _left(outcome, figures)
 
 
 def summary_of(data: ReportData) -> tuple[str, str, str]:
@@ -151,14 +164,11 @@ def _found(figures: Figures, regions: Sequence[RegionRow]) -> str:
     return "Nothing is missing: the part agrees with its template."
 
 
-def _done(outcome: Outcome, figures: Figures) -> str:
+def _done(figures: Figures) -> str:
     if figures.filament_mm <= 0:
         return "Nothing was printed, and no repair G-code was made."
-    cost = (
-        f"{quantity(figures.filament_mm / 1000, 'm')} of filament in "
-        f"{duration(figures.print_time_s)}"
-    )
-    if outcome is Outcome.PLANNED:
+    cost = f"{length(figures.filament_mm)} of filament in {duration(figures.print_time_s)}"
+    if figures.missing_mm3_after is None and figures.repaired_ratio is None:
         return f"The repair takes {cost}; its G-code passed every check and has not been printed."
     rounds = f" over {figures.iterations} repairs" if figures.iterations > 1 else ""
     if figures.repaired_ratio is not None:

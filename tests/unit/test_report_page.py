@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 
 from amrepair.errors import InputError
-from amrepair.report import Figures, Outcome, ReportData, encode, payload, write_report
+from amrepair.report import (
+    Figures,
+    Outcome,
+    ReportData,
+    encode,
+    payload,
+    summary,
+    write_report,
+)
 from amrepair.report import document as document_module
 from amrepair.report.document import render_report
 from tests.report_example import HOSTILE, POCKET_MM3, example
@@ -194,3 +202,10 @@ def test_an_unwritable_place_is_one_sentence(data: ReportData, tmp_path: Path) -
 def test_assets_are_found_as_package_data() -> None:
     for name in ("report.css", "report.js"):
         assert len(document_module._asset(name)) > 1000
+
+
+def test_a_plan_that_leaves_something_is_not_said_to_be_printed() -> None:
+    figures = Figures(44.0, None, 0.0, None, None, 20.0, 0.0, 1, 12.0, 36.0)
+    said = summary(Outcome.NOT_WITHIN_TOLERANCE, figures, ())[1]
+    assert said.startswith("The repair takes 12 mm of filament in 36 s")
+    assert "has not been printed" in said
