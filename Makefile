@@ -4,14 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint suite slow clean help
+.PHONY: demo test lint suite slow docs clean help
 
 help: ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev,docs]'
 	touch $@
 
 demo: $(STAMP) ## print a part in simulation, break it, find what is missing, print only that
@@ -30,6 +30,9 @@ suite: $(STAMP)
 
 slow: $(STAMP) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
+
+docs: $(STAMP) ## the documentation, into out/site; nothing is fetched
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean: ## remove the environment and what runs left behind
 	rm -rf $(VENV) out runs build dist

@@ -8,18 +8,13 @@ import importlib
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-import manifold3d as m3
-import numpy as np
 import pytest
-import trimesh
 
 import amrepair
 import gcode
-from amrepair.scans import Scan, write_ply
 
 # A name that goes, goes with a new major version; one that comes, comes with a new minor one.
 NAMES = {
@@ -34,47 +29,6 @@ NAMES = {
     },
 }  # fmt: skip
 HEAVY = {"numpy", "torch", "open3d", "scipy", "trimesh", "numba", "plotly", "pydantic"}
-PLACE_MM = (100.0, 80.0, 0.0)
-
-
-def write_mesh(solid: m3.Manifold, path: Path) -> trimesh.Trimesh:
-    mesh = solid.to_mesh64()
-    made = trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
-    made.export(path)
-    return made
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_fits() -> Iterator[None]:
-    """The block is flat: a tenth of the work fits it as well."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"GRID_CELLS": 64, "SAMPLES": 40_000, "STEPS": 30}.items():
-            patch.setattr(f"amrepair.template.fit.{name}", value)
-        yield
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the examples find in the folder they run in: a stepped block that lost a corner."""
-    where = tmp_path_factory.mktemp("examples")
-    part = m3.Manifold.cube((30.0, 20.0, 6.0))
-    part += m3.Manifold.cube((18.0, 20.0, 4.0)).translate((0.0, 0.0, 5.0))
-    part -= m3.Manifold.cube((10.0, 10.0, 2.0)).translate((0.0, 12.0, 7.5))
-    corner = m3.Manifold.cube((7.0, 8.0, 1.6)).translate((23.0, 0.0, 4.4))
-    write_mesh(part, where / "part.stl")
-    write_mesh(part.translate(PLACE_MM), where / "placed.stl")
-    standing = write_mesh((part - corner).translate(PLACE_MM), where / "standing.stl")
-    points, faces = trimesh.sample.sample_surface(standing, 60_000, seed=1)
-    normals = np.asarray(standing.face_normals)[faces]
-    seen = normals[:, 2] > -0.5
-    noise = np.random.default_rng(0).normal(scale=0.03, size=points.shape)
-    noisy = np.asarray(points) + noise
-    write_ply(Scan(noisy[seen], 0.03, "build", normals[seen]), where / "scan.ply")
-    setup = gcode.load_setup()
-    toolpath = gcode.slice_part(gcode.read_solid(where / "placed.stl"), setup)
-    (where / "job.gcode").write_text(gcode.write_program(toolpath, setup, title="job").text)
-    amrepair.fit_template(where / "part.stl").save(where / "part.safetensors")
-    return where
 
 
 @pytest.mark.parametrize("package", [amrepair, gcode], ids=["amrepair", "gcode"])
@@ -130,13 +84,14 @@ def examples() -> list[str]:
     ]
 
 
+@pytest.mark.usefixtures("small_fits")
 @pytest.mark.parametrize("name", examples())
-def test_its_example_runs(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_example_runs(name: str, example_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package, _, attribute = name.partition(".")
     module = importlib.import_module(package)
     thing = getattr(module, attribute) if attribute else module
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+    monkeypatch.chdir(example_files)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(example_files / "cache"))
     found = doctest.DocTestParser().get_doctest(thing.__doc__ or "", {}, name, None, None)
     assert found.examples, f"{name} has no example"
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
