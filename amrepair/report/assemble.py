@@ -6,6 +6,7 @@ The command line and scripts share it; figures come from `collect`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from amrepair.loop import LoopReport
@@ -60,7 +61,7 @@ def report_of_plan(
         outcome=outcome_of(result, within_tolerance=plan_is_enough(plan)),
         figures=Figures.from_result(result),
         looks=(look_of(plan, "as scanned", printed=False),),
-        setup={"scan": scan_name or plan.scan.source, **_profiles(setup)},
+        setup={"scan": scan_name or Path(plan.scan.source).name, **_profiles(setup)},
         expected=solid_mesh(solid.transform(placed.matrix[:3])),
         regions=region_rows(plan),
         seconds=result["seconds"],

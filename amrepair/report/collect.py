@@ -11,6 +11,7 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from amrepair.detect import Label
 from amrepair.loop import Look as LoopLook
@@ -28,6 +29,7 @@ from amrepair.report.data import (
 from gcode.profiles import PrintSetup
 
 DIGITS = 6  # of every figure in a result: beyond what any scan can tell
+OUTLINE_MM = 0.05  # finer than a pixel of the drawing
 _LIBRARIES = (
     "amrepair",
     "manifold3d",
@@ -203,18 +205,19 @@ def plan_result(
 def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
     """What the page shows of one scan."""
     build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
-    anomaly, field = plan.anomaly, plan.deficit.as_built
+    scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
     unseen = anomaly.template_points_mm[anomaly.template_label == int(Label.UNSEEN)]
     beads = None
     if plan.patch is not None and (printed or plan.checked is not None):
         beads = BeadPath.from_toolpath(plan.patch.toolpath)
     return Look(
         label=label,
-        points_mm=build_from_template.apply(plan.scan.points_mm),
+        points_mm=build_from_template.apply(scan.points_mm),
         deviation_mm=anomaly.deviation_mm,
         label_of_point=anomaly.label,
         threshold_mm=anomaly.threshold_mm,
         threshold_source=anomaly.threshold_source,
+        normals=None if scan.normals is None else build_from_template.rotate(scan.normals),
         unseen_mm=build_from_template.apply(unseen) if len(unseen) else None,
         missing=solid_mesh(plan.deficit.missing),
         excess=solid_mesh(plan.deficit.excess),
@@ -222,8 +225,25 @@ def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
         missing_mm3=plan.deficit.missing_mm3,
         excess_mm3=plan.deficit.excess_mm3,
         unseen_area_mm2=plan.deficit.unseen_area_mm2,
-        height_map=HeightMap(field.origin_mm, field.cell_mm, field.z_mm, field.seen, label),
+        height_map=HeightMap(
+            field.origin_mm,
+            field.cell_mm,
+            field.z_mm,
+            field.seen,
+            f"Top surface, {label}",
+            outlines_mm(plan),
+        ),
     )
+
+
+def outlines_mm(plan: RepairPlan) -> tuple[Float[np.ndarray, "_ 2"], ...]:
+    """Closed XY outlines of what is missing and what is too much, build frame."""
+    outlines = []
+    for solid in (plan.deficit.missing, plan.deficit.excess):
+        if not solid.is_empty():
+            smooth = solid.project().simplify(OUTLINE_MM)
+            outlines += [np.asarray(ring, dtype=np.float64) for ring in smooth.to_polygons()]
+    return tuple(outlines)
 
 
 def solid_mesh(solid: Any) -> SolidMesh | None:

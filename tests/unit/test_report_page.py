@@ -11,8 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import amrepair
+import gcode
 from amrepair.errors import InputError
 from amrepair.report import (
+    Counter,
     Figures,
     Outcome,
     ReportData,
@@ -22,6 +25,7 @@ from amrepair.report import (
     write_report,
 )
 from amrepair.report import document as document_module
+from amrepair.report.collect import look_of
 from amrepair.report.document import render_report
 from tests.report_example import HOSTILE, POCKET_MM3, example
 
@@ -182,12 +186,29 @@ def test_half_a_million_points_stay_in_budget_and_it_is_said() -> None:
         },
         {"looks": (replace(example(500).looks[1], missing_mm3=float("nan")),)},
         {"figures": Figures.from_result({"repaired_ratio": float("nan")})},
+        {
+            "figures": Figures(
+                *[float("nan")] * 7, iterations=1, filament_mm=20.0, print_time_s=float("nan")
+            ),
+            "wire": (Counter("resends", float("nan")),),
+            "seconds": {"print": float("nan")},
+        },
     ],
-    ids=["no looks", "stopped", "one bare look", "no points", "nan volume", "nan result"],
+    ids=[
+        "no looks",
+        "stopped",
+        "one bare look",
+        "no points",
+        "nan volume",
+        "nan result",
+        "nan everywhere",
+    ],
 )
 def test_unknown_or_absent_values(changes: dict) -> None:
     page = render_report(empty(**changes))
-    seen = " ".join(Elements(page).visible)
+    elements = Elements(page)
+    seen = " ".join(elements.visible)
+    seen += " ".join(str(v) for _, attributes in elements.tags for v in attributes.values() if v)
     assert values_of(page)
     assert not re.search(r"\bnan\b|\bNone\b", seen)
 
@@ -209,3 +230,31 @@ def test_a_plan_that_leaves_something_is_not_said_to_be_printed() -> None:
     said = summary(Outcome.NOT_WITHIN_TOLERANCE, figures, ())[1]
     assert said.startswith("The repair takes 12 mm of filament in 36 s")
     assert "has not been printed" in said
+
+
+def test_a_scan_without_normals_is_drawn_as_bright_as_one_with() -> None:
+    """Seen from the first view, whose sides look left, front and up."""
+    sides = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+    rng = np.random.default_rng(0)
+    for normal in sides:
+        flat = rng.uniform(0.0, 10.0, (400, 3)) * (normal == 0)
+        told = encode.shading(flat, np.tile(normal, (400, 1)))
+        untold = encode.shading(flat, None)
+        assert abs(told.mean() - untold.mean()) < 0.7
+
+
+def test_a_look_of_a_plan_carries_normals_and_outlines(example_files: Path) -> None:
+    site = amrepair.Site.of_part(
+        amrepair.open_template(example_files / "part.safetensors"), gcode.load_setup()
+    )
+    scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
+    plan = amrepair.plan_repair(scan, site, title="repair")
+    shown = look_of(plan, "as scanned", printed=False)
+    assert shown.normals is not None
+    assert scan.normals is not None
+    assert np.abs(shown.normals - scan.normals).max() < 0.02  # both in the build frame
+    assert shown.height_map is not None
+    (outline,) = shown.height_map.outlines_mm
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    assert low == pytest.approx([123.0, 80.0], abs=0.4)
+    assert high == pytest.approx([130.0, 88.0], abs=0.4)
