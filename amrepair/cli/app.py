@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import amrepair
-from amrepair.cli import benchmark, health, inspect, mend, printing, simulation, templates
+from amrepair.cli import benchmark, health, inspect, live, mend, printing, simulation, templates
 from amrepair.errors import AmrepairError
 from gcode.cli import console
 from gcode.errors import GcodeError
@@ -43,6 +43,7 @@ mend.add_to(app)
 printing.add_to(app)
 benchmark.add_to(app)
 health.add_to(app)
+live.add_to(app)
 
 
 def main() -> None:

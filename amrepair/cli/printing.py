@@ -11,6 +11,14 @@ import typer
 
 from amrepair.cli.files import open_template
 from amrepair.cli.inspect import TemplateOption
+from amrepair.cli.live import (
+    VIEW_PORT,
+    HostOption,
+    PortOption,
+    TokenOption,
+    ViewOption,
+    live_view,
+)
 from amrepair.cli.options import (
     JsonOption,
     MaterialOption,
@@ -25,6 +33,7 @@ from amrepair.repair import RepairPlan, Site, Stopwatch
 from amrepair.report import report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
+from amrepair.report.guarded import LOOPBACK
 from amrepair.scans import Scanner, WatchedFolderScanner
 from amrepair.template import PlannedSdf
 from amrepair.template.port import Template
@@ -53,6 +62,8 @@ def add_to(app: typer.Typer) -> None:
             "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
             "--scanner watch:scans --every 20",
             "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
+            "--scanner watch:scans --view",
+            "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
             "--scanner watch:scans --approve auto --json",
         ),
     )(loop)
@@ -79,6 +90,10 @@ def loop(
     ] = None,
     scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
     out: Annotated[Path, typer.Option(help="Folder for result, scans, report.")] = Path("out/loop"),
+    view: ViewOption = False,
+    view_host: HostOption = LOOPBACK,
+    view_port: PortOption = VIEW_PORT,
+    token: TokenOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -103,24 +118,30 @@ def loop(
         baud=setup.printer.baud,
         wire_log=folder.file("wire.log"),
     )
-    machine.connect()
-    try:
-        with bars.shown():
-            report = run_loop(
-                job,
-                checked,
-                machine,
-                eye,
-                lambda stop: _site(job, stop, field, placed, setup),
-                stops=stops,
-                approve=_ask if approve == "ask" else lambda plan: True,
-                record=folder.record,
-                rng=np.random.default_rng(seed),
-                watch=watch,
-                progress=bars,
-            )
-    finally:
-        machine.close()
+    ask = approve == "ask"
+    with live_view(
+        view, ask=ask, title=job_file.name, host=view_host, port=view_port, token=token
+    ) as page:
+        page.show_run(job, _placed_solid(field, placed))
+        machine.connect()
+        page.drives(machine.pause, machine.resume)
+        try:
+            with bars.shown():
+                report = run_loop(
+                    job,
+                    checked,
+                    machine,
+                    eye,
+                    lambda stop: _site(job, stop, field, placed, setup),
+                    stops=stops,
+                    approve=(page.approve if view else _ask) if ask else lambda plan: True,
+                    record=page.recording(folder.record),
+                    rng=np.random.default_rng(seed),
+                    watch=watch,
+                    progress=page.watching(bars),
+                )
+        finally:
+            machine.close()
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     printed = [look for look in report.looks if look.printed]
     last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None

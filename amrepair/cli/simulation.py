@@ -9,6 +9,14 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from amrepair.cli.live import (
+    VIEW_PORT,
+    HostOption,
+    PortOption,
+    TokenOption,
+    ViewOption,
+    live_view,
+)
 from amrepair.cli.options import (
     JsonOption,
     MaterialOption,
@@ -27,6 +35,7 @@ from amrepair.report import (
 )
 from amrepair.report.collect import loop_result, rounded
 from amrepair.report.folder import RunFolder
+from amrepair.report.guarded import LOOPBACK
 from amrepair.simulate.defects import DefectKind, parse_defect
 from amrepair.simulate.part_files import bracket_path
 from amrepair.simulate.run import SimulatedRun, place_on_bed, prepare_run, simulate_run
@@ -71,6 +80,10 @@ def simulate(
     max_iterations: Annotated[
         int, typer.Option(min=0, max=10, help="Repairs at one stop, at most.")
     ] = 3,
+    view: ViewOption = False,
+    view_host: HostOption = LOOPBACK,
+    view_port: PortOption = VIEW_PORT,
+    token: TokenOption = None,
     seed: SeedOption = 0,
     out: Annotated[Path, typer.Option(help="Folder for result, G-code, scans, report.")] = Path(
         "out/simulate"
@@ -95,14 +108,19 @@ def simulate(
             template, setup, defects, title=path.stem, seed=seed, watch=watch, progress=bars
         )
         folder.write_text("job.gcode", prepared.checked.program.text)
-        run = simulate_run(
-            prepared,
-            wire_log=folder.file("wire.log"),
-            max_iterations=max_iterations,
-            record=folder.record,
-            watch=watch,
-            progress=bars,
-        )
+        with live_view(
+            view, ask=True, title=path.name, host=view_host, port=view_port, token=token
+        ) as page:
+            page.show_run(prepared.job, prepared.part)
+            run = simulate_run(
+                prepared,
+                wire_log=folder.file("wire.log"),
+                max_iterations=max_iterations,
+                approve=page.approve,
+                record=page.recording(folder.record),
+                watch=watch,
+                progress=page.watching(bars),
+            )
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     result = _result(run, folder, seed, seconds)
     folder.write_json("result.json", result)
