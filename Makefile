@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+EXTRAS := $(VENV)/.extras
 
 .PHONY: demo test lint suite slow docs clean help
 
@@ -11,7 +12,11 @@ help: ## say what there is
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev,docs]'
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+$(EXTRAS): $(STAMP)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev,docs,browser]'
 	touch $@
 
 demo: $(STAMP) ## print a part in simulation, break it, find what is missing, print only that
@@ -25,13 +30,13 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-suite: $(STAMP)
+suite: $(EXTRAS)
 	$(BIN)/python -m pytest -n auto --dist loadscope
 
-slow: $(STAMP) ## the tests that take longer than a minute
+slow: $(EXTRAS) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
 
-docs: $(STAMP) ## the documentation, into out/site; nothing is fetched
+docs: $(EXTRAS) ## the documentation, into out/site; nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean: ## remove the environment and what runs left behind

@@ -225,11 +225,14 @@ class LiveView:
     def show_plan(self, plan: RepairPlan, label: str) -> None:
         """Draw a scan with its deviations, what is missing, what is too much, and the patch."""
         build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+        anomaly = plan.anomaly
+        # what is far off and yet no defect is the bed, the skirt or clutter
+        near = (anomaly.label != 0) | (np.abs(anomaly.deviation_mm) < anomaly.threshold_mm)
         self.show_cloud(
             "scan",
-            build_from_template.apply(plan.scan.points_mm),
-            plan.anomaly.deviation_mm,
-            range_mm=4 * plan.anomaly.threshold_mm,
+            build_from_template.apply(plan.scan.points_mm[near]),
+            np.asarray(anomaly.deviation_mm[near]),
+            range_mm=4 * anomaly.threshold_mm,
         )
         self.show_solid("missing", plan.deficit.missing, MISSING, opacity=0.6)
         self.show_solid("too much", plan.deficit.excess, EXCESS)
