@@ -104,8 +104,8 @@ def detect(
     >>> scan = read_scan(Path("scan.ply"), frame="build")
     >>> pose = align_scan(scan, template).template_from_scan
     >>> anomaly = detect_defects(scan.moved(pose), template)
-    >>> [(r.label.name, round(r.depth_mm, 1)) for r in anomaly.regions if r.volume_mm3 > 2.0]
-    [('MISSING', 1.6)]
+    >>> [(r.label.name, 1.4 < r.depth_mm < 1.8) for r in anomaly.regions if r.volume_mm3 > 2.0]
+    [('MISSING', True)]
     """
     if scan.frame != "template":
         raise InputError(

@@ -72,6 +72,7 @@ class LiveView:
         self.server = guarded.start(host=host, port=port, token=token, title=title)
         self._host, self._token = host, token
         self._operator = operator
+        self._open = True
         self._job_steps: list[tuple[int, Any]] = []
         self._switches: dict[str, Any] = {}
         self._handles: dict[str, Any] = {}
@@ -99,7 +100,9 @@ class LiveView:
 
     def close(self) -> None:
         """Stop serving; a question that waits is answered with skip."""
+        self._open = False
         if self._operator is not None:
+            self._operator.changed = lambda: None  # what is answered now is drawn nowhere
             self._operator.close()
         self.server.stop()
 
@@ -213,6 +216,8 @@ class LiveView:
 
         def told(stage: str, done: float, total: float) -> None:
             progress(stage, done, total)
+            if not self._open:
+                return
             share = 100 * done / max(total, 1e-9)
             self._stage.content = f"**{stage}**: {share:.0f} %"
             if stage == "print":
@@ -224,6 +229,8 @@ class LiveView:
 
     def show_plan(self, plan: RepairPlan, label: str) -> None:
         """Draw a scan with its deviations, what is missing, what is too much, and the patch."""
+        if not self._open:
+            return
         build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
         anomaly = plan.anomaly
         # what is far off and yet no defect is the bed, the skirt or clutter

@@ -48,10 +48,9 @@ def example_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     standing = write_mesh((part - corner).translate(PLACE_MM), where / "standing.stl")
     points, faces = trimesh.sample.sample_surface(standing, 60_000, seed=1)
     normals = np.asarray(standing.face_normals)[faces]
-    seen = normals[:, 2] > -0.5
     rng = np.random.default_rng(0)
     noisy = np.asarray(points) + rng.normal(scale=0.03, size=points.shape)
-    write_ply(Scan(noisy[seen], 0.03, "build", normals[seen]), where / "scan.ply")
+    write_ply(Scan(noisy, 0.03, "build", normals), where / "scan.ply")
     flat = np.column_stack([rng.uniform(0.0, 200.0, (5000, 2)), rng.normal(scale=0.03, size=5000)])
     write_ply(Scan(flat, 0.03, "scanner"), where / "bed.ply")
     setup = gcode.load_setup()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -243,7 +244,7 @@ def test_buttons_are_dead_until_a_question_is_asked(view: LiveView, plan: Repair
     thread, found = answer_of(lambda: view.approve(plan))
     assert waiting.wait(WAIT_S)
     assert not view._approve.disabled
-    assert "88.4 mm³ in 1 region\n" in view._found.content
+    assert re.search(r"missing: (8[89]|9\d)\.\d mm³ in 1 region\n", view._found.content)
     assert {"scan", "missing", "repair"} <= set(view._handles)
     operator.decide(Verdict.APPROVE)
     thread.join(WAIT_S)
@@ -304,3 +305,16 @@ def test_nothing_but_our_own_words_on_standard_output(tmp_path: Path) -> None:
         [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
     )
     assert json.loads(done.stdout) == {"ok": True}
+
+
+def test_a_view_that_is_closed_no_longer_draws(plan: RepairPlan) -> None:
+    view = LiveView(title="test", operator=Operator())
+    thread, found = answer_of(lambda: view.approve(plan))
+    assert view._operator is not None
+    Watcher(view._operator).until(lambda: view._operator is not None and view._operator.asked)
+    view.close()
+    thread.join(WAIT_S)
+    assert found == [False]
+    told = view.watching(lambda stage, done, total: None)
+    told("print", 1.0, 2.0)  # a warning would be an error here
+    assert view.approve(plan) is False
