@@ -30,11 +30,18 @@ def mesh_of(solid: m3.Manifold) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, np.array(mesh.tri_verts), process=False)
 
 
-def scan_of(solid: m3.Manifold, *, frame: str, count: int = 80_000, seed: int = 0) -> Scan:
-    """What a scanner all around and above would measure, noise 0.03 mm; nothing sees below."""
+def scan_of(
+    solid: m3.Manifold,
+    *,
+    frame: str,
+    count: int = 80_000,
+    seed: int = 0,
+    underside: bool = False,
+) -> Scan:
+    """What a scanner all around and above would measure, noise 0.03 mm; below only if asked."""
     mesh = mesh_of(solid)
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
     normals = np.asarray(mesh.face_normals)[faces]
-    seen = normals[:, 2] > -0.5
+    seen = (normals[:, 2] > -0.5) | underside
     noise = np.random.default_rng(seed).normal(scale=0.03, size=points.shape)
     return Scan((np.asarray(points) + noise)[seen], 0.03, frame, normals[seen], source="example")
