@@ -11,9 +11,10 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from amrepair.detect import Label
+from amrepair.detect.detection import BED_BAND_MM
 from amrepair.loop import Look as LoopLook
 from amrepair.loop import LoopReport
 from amrepair.repair import RepairPlan, solid_arrays
@@ -206,18 +207,19 @@ def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
     """What the page shows of one scan."""
     build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
+    shown = of_the_part(plan)
     unseen = anomaly.template_points_mm[anomaly.template_label == int(Label.UNSEEN)]
     beads = None
     if plan.patch is not None and (printed or plan.checked is not None):
         beads = BeadPath.from_toolpath(plan.patch.toolpath)
     return Look(
         label=label,
-        points_mm=build_from_template.apply(scan.points_mm),
-        deviation_mm=anomaly.deviation_mm,
-        label_of_point=anomaly.label,
+        points_mm=build_from_template.apply(scan.points_mm[shown]),
+        deviation_mm=anomaly.deviation_mm[shown],
+        label_of_point=anomaly.label[shown],
         threshold_mm=anomaly.threshold_mm,
         threshold_source=anomaly.threshold_source,
-        normals=None if scan.normals is None else build_from_template.rotate(scan.normals),
+        normals=None if scan.normals is None else build_from_template.rotate(scan.normals[shown]),
         unseen_mm=build_from_template.apply(unseen) if len(unseen) else None,
         missing=solid_mesh(plan.deficit.missing),
         excess=solid_mesh(plan.deficit.excess),
@@ -234,6 +236,21 @@ def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
             outlines_mm(plan),
         ),
     )
+
+
+def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
+    """(n,) points of the scan that show the part: detection's own word on what is bed and skirt.
+
+    The bed beside the part lies outside of it, and is no excess: drawn in its colour, it would be
+    taken for some.
+    """
+    anomaly = plan.anomaly
+    foot_mm = (
+        float(anomaly.template_points_mm[:, 2].min()) if len(anomaly.template_points_mm) else 0
+    )
+    flat = plan.scan.points_mm[:, 2] < foot_mm + BED_BAND_MM
+    outside = anomaly.deviation_mm > anomaly.threshold_mm
+    return ~(flat & outside & (anomaly.label == int(Label.OK)))
 
 
 def outlines_mm(plan: RepairPlan) -> tuple[Float[np.ndarray, "_ 2"], ...]:

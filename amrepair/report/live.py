@@ -13,6 +13,7 @@ from jaxtyping import Float
 from amrepair.loop import Look
 from amrepair.repair import RepairPlan, solid_arrays
 from amrepair.report import guarded
+from amrepair.report.collect import of_the_part
 from amrepair.report.operator import Operator, Verdict
 from amrepair.report.text import duration, length, quantity
 from gcode.moves import Extrude, Toolpath
@@ -233,8 +234,7 @@ class LiveView:
             return
         build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
         anomaly = plan.anomaly
-        # what is far off and yet no defect is the bed, the skirt or clutter
-        near = (anomaly.label != 0) | (np.abs(anomaly.deviation_mm) < anomaly.threshold_mm)
+        near = of_the_part(plan)
         self.show_cloud(
             "scan",
             build_from_template.apply(plan.scan.points_mm[near]),

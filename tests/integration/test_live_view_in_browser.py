@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -168,3 +171,17 @@ def test_a_wrong_token_shows_nothing(browser: Any) -> None:
 def test_a_picture_for_the_docs() -> None:
     """Taken anew with --regenerate-golden; it is there otherwise."""
     assert (PICTURES / "live-view.png").stat().st_size < 700_000
+
+
+def test_the_command_line_runs_with_a_view_and_json_stays_alone(tmp_path: Path) -> None:
+    part = tmp_path / "plate.stl"
+    trimesh.creation.box(bounds=((0, 0, 0), (20, 16, 2))).export(part)
+    code = "from amrepair.cli import main; main()"
+    words = ["simulate", part, "--defect", "none", "--out", tmp_path / "run", "--json"]
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *words, "--view", "--view-port", "0"],
+        capture_output=True, text=True, timeout=280, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["iterations"] == 0  # one object and nothing else
+    assert "Open http://localhost:" in done.stderr

@@ -27,6 +27,7 @@ from amrepair.report import (
 from amrepair.report import document as document_module
 from amrepair.report.collect import look_of
 from amrepair.report.document import render_report
+from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
 
 LOADING = {"src", "href", "srcset", "data", "poster", "action", "formaction", "background"}
@@ -258,3 +259,19 @@ def test_a_look_of_a_plan_carries_normals_and_outlines(example_files: Path) -> N
     low, high = outline.min(axis=0), outline.max(axis=0)
     assert low == pytest.approx([123.0, 80.0], abs=0.4)
     assert high == pytest.approx([130.0, 88.0], abs=0.4)
+
+
+def test_the_bed_beside_the_part_is_not_drawn_as_excess(example_files: Path) -> None:
+    site = amrepair.Site.of_part(
+        amrepair.open_template(example_files / "part.safetensors"), gcode.load_setup()
+    )
+    scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
+    x, y = np.meshgrid(np.arange(95.0, 99.0, 0.3), np.arange(75.0, 105.0, 0.3))
+    bed = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    both = Scan(np.vstack([scan.points_mm, bed]), 0.03, "build")
+    plan = amrepair.plan_repair(both, site, title="repair")
+    shown = look_of(plan, "as scanned", printed=False)
+    assert len(shown.points_mm) == len(shown.deviation_mm) == len(shown.label_of_point)
+    assert shown.points_mm[:, 0].min() > 99.0  # nothing of the bed
+    kept = len(shown.points_mm) / len(scan.points_mm)
+    assert kept == pytest.approx(1.0, abs=0.002)  # and all of the part
