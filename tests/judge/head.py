@@ -22,10 +22,10 @@ class HeadSlice:
 # fan duct of a Prusa MK3S, off the published drawings.
 MK3S_HEAD = (
     HeadSlice(0.0, radius_mm=0.5),
-    HeadSlice(0.8, radius_mm=1.5),
-    HeadSlice(2.0, radius_mm=4.1),
-    HeadSlice(5.0, box_mm=(-8.5, -17.0, 13.0, 8.5)),
-    HeadSlice(6.5, box_mm=(-23.0, -31.0, 23.0, 21.0)),
+    HeadSlice(0.8, radius_mm=1.6),
+    HeadSlice(2.0, radius_mm=4.2),
+    HeadSlice(4.5, box_mm=(-9.0, -18.0, 14.0, 9.0)),
+    HeadSlice(6.0, box_mm=(-24.0, -32.0, 24.0, 22.0)),
 )
 
 
@@ -61,6 +61,7 @@ def _highest_under(tops, under, corner, shape):  # type: ignore[no-untyped-def]
 
 def reachable(
     missing: np.ndarray,
+    stands: np.ndarray,
     low_z_mm: float,
     size_z_mm: float,
     tops_mm: np.ndarray,
@@ -69,18 +70,26 @@ def reachable(
     head: tuple[HeadSlice, ...],
     *,
     bead_mm: float,
+    layer_mm: float,
     allowed_mm: float,
 ) -> np.ndarray:
-    """Missing voxels that a bead gets to: half its width from a free tip."""
+    """Missing voxels that a bead gets to: half its width from a free tip, and not over air.
+
+    A layer down, what stands or is filled must lie within a bead's width.
+    """
     reach = np.zeros(missing.shape, bool)
     least_mm = np.max(
         [grown(tops_mm, cell_mm, part, window) - part.above_mm for part in head], axis=0
     )
+    below = max(1, round(layer_mm / size_z_mm))
     for k in range(missing.shape[2]):
         if not missing[:, :, k].any():
             continue
-        tip_mm = low_z_mm + (k + 1) * size_z_mm
+        tip_mm = low_z_mm + (k + 1) * size_z_mm + 0.5 * layer_mm  # a bead lies below its tip
         free = tip_mm >= least_mm - allowed_mm
         near = ndimage.distance_transform_edt(~free) * cell_mm <= 0.5 * bead_mm
+        if low_z_mm + (k - below) * size_z_mm > 0 and k >= below:
+            floor = stands[:, :, k - below] | reach[:, :, k - below]
+            near &= ndimage.distance_transform_edt(~floor) * cell_mm <= bead_mm
         reach[:, :, k] = missing[:, :, k] & near
     return reach

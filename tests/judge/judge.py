@@ -87,8 +87,8 @@ def judge(
     before, aim = occupancy(stands, box), occupancy(wanted, box)
     missing = aim & ~before
     reach = reachable(
-        missing, low[2], FINE_MM[2], tops, window, cell, head,
-        bead_mm=bead_mm, allowed_mm=0.1,
+        missing, before, low[2], FINE_MM[2], tops, window, cell, head,
+        bead_mm=bead_mm, layer_mm=HANGING_MM, allowed_mm=0.1,
     )  # fmt: skip
     contact, line = _contact(steps, tops, field_low, cell, head)
     state = before.astype(np.uint8)
@@ -96,6 +96,7 @@ def judge(
         steps.start_mm, steps.end_mm, steps.pushed_mm3, state, box.low_mm, box.size_mm,
         *_disc(nozzle_mm, cell), MOST_GAP_MM, HANGING_MM,
     )  # fmt: skip
+    welled = lost.sum()
     laid = state >= 2
     hanging = state == 3
     held = (
@@ -109,8 +110,8 @@ def judge(
         reachable_mm3=reach.sum() * v,
         filled_mm3=(laid & missing).sum() * v,
         filled_reachable_mm3=(laid & reach).sum() * v,
-        laid_mm3=laid.sum() * v + lost,
-        outside_mm3=(laid & ~aim).sum() * v + lost,
+        laid_mm3=laid.sum() * v + welled,
+        outside_mm3=(laid & ~aim).sum() * v + welled,
         in_air_mm3=(hanging & ~held).sum() * v,
         widest_mm=widest,
         deepest_contact_mm=contact,
@@ -139,7 +140,7 @@ def _lay(starts, ends, pushed, state, low, size, disc, distance, most_gap, hangi
     """Lay every bead: the nearest column first, from its surface up to the tip."""
     voxel = size[0] * size[1] * size[2]
     nx, ny, nz = state.shape
-    lost, widest, carry = 0.0, 0.0, 0.0
+    lost, widest, carry = np.zeros(len(pushed)), 0.0, 0.0
     for m in range(len(pushed)):
         if pushed[m] <= 0:
             continue
@@ -153,7 +154,7 @@ def _lay(starts, ends, pushed, state, low, size, disc, distance, most_gap, hangi
             carry += pushed[m] / count
             ci = int(np.floor((p[0] - low[0]) / size[0]))
             cj = int(np.floor((p[1] - low[1]) / size[1]))
-            kz = int(np.floor((p[2] - low[2]) / size[2] + 0.02))
+            kz = int(np.floor((p[2] - low[2]) / size[2] + 0.5))
             if ci < -5 or cj < -5 or ci > nx + 5 or cj > ny + 5:
                 carry = 0.0  # far away: the prime line
                 continue
@@ -177,7 +178,7 @@ def _lay(starts, ends, pushed, state, low, size, disc, distance, most_gap, hangi
                     k += 1
                     widest = max(widest, 2 * distance[c])
             if carry > 4 * voxel:
-                lost += carry - 4 * voxel  # no room within two nozzle widths: it wells up
+                lost[m] += carry - 4 * voxel  # no room within two nozzle widths: it wells up
                 carry = 4 * voxel
     return lost, widest
 
@@ -187,7 +188,7 @@ def _contact(
 ) -> tuple[float, int]:
     """Deepest contact of the head with what stood there, mm, and its line."""
     worst, line = -np.inf, 0
-    for part in head:
+    for part in head if len(steps.line) else ():
         if part.box_mm is None:
             n = int(np.ceil(part.radius_mm / cell))
             i, j = np.mgrid[-n : n + 1, -n : n + 1]
