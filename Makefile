@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+EXTRAS := $(VENV)/.extras
 
-.PHONY: demo test lint suite slow peers clean help
+.PHONY: demo test lint suite slow docs peers clean help
 
 help: ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -12,6 +13,10 @@ help: ## say what there is
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+$(EXTRAS): $(STAMP)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev,docs,browser]'
 	touch $@
 
 demo: $(STAMP) ## print a part in simulation, break it, find what is missing, print only that
@@ -25,15 +30,18 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-suite: $(STAMP)
+suite: $(EXTRAS)
 	$(BIN)/python -m pytest -n auto --dist loadscope
 
-slow: $(STAMP) ## the tests that take longer than a minute
+slow: $(EXTRAS) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
 
-peers: $(STAMP) ## print through and beside OctoPrint, Moonraker and Printrun, each in its own environment
+peers: $(EXTRAS) ## print through and beside OctoPrint, Moonraker and Printrun, each in its own environment
 	$(BIN)/python tests/peers/environments.py
 	$(BIN)/python -m pytest -m peers tests/peers
+
+docs: $(EXTRAS) ## the documentation, into out/site; nothing is fetched
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean: ## remove the environment and what runs left behind
 	rm -rf $(VENV) .peers out runs build dist

@@ -1,3 +1,84 @@
-"""amrepair turns scans into a solid that is missing; `gcode` turns that solid into G-code."""
+"""amrepair turns scans into a solid that is missing; `gcode` turns that solid into G-code.
+
+From a scan file to checked G-code:
+
+>>> from pathlib import Path
+>>> import amrepair, gcode
+>>> setup = gcode.load_setup("prusa_mk3s", "pla", "repair_0.20")
+>>> template = amrepair.open_template(Path("part.safetensors"))  # or the part's mesh
+>>> scan = amrepair.read_scan(Path("scan.ply"), frame="build")
+>>> site = amrepair.Site.of_part(template, setup)
+>>> plan = amrepair.plan_repair(scan, site, title="repair of scan.ply")
+>>> if plan.checked is not None:
+...     written = Path("repair.gcode").write_text(plan.checked.program.text)
+>>> print(f"{plan.deficit.missing_mm3:.0f} mm³ missing in {len(plan.to_fill)} region")
+89 mm³ missing in 1 region
+
+The names below are all there is to learn for that; they are loaded when first used, so that
+importing this package costs nothing. Each room (`amrepair.scans`, `amrepair.align`, …) has more.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from amrepair.align import align as align_scan
+    from amrepair.detect import detect as detect_defects
+    from amrepair.errors import AmrepairError
+    from amrepair.frames import Transform
+    from amrepair.loop import run_loop
+    from amrepair.repair import RepairPlan, Site, plan_repair
+    from amrepair.scans import Scan, Scanner, read_scan
+    from amrepair.template import fit_template, open_template
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "AmrepairError",
+    "RepairPlan",
+    "Scan",
+    "Scanner",
+    "Site",
+    "Transform",
+    "align_scan",
+    "detect_defects",
+    "fit_template",
+    "open_template",
+    "plan_repair",
+    "read_scan",
+    "run_loop",
+]
+
+# `align` and `detect` are rooms of this package: their functions go by a longer name up here.
+_HOMES = {
+    "AmrepairError": ("amrepair.errors", "AmrepairError"),
+    "RepairPlan": ("amrepair.repair", "RepairPlan"),
+    "Scan": ("amrepair.scans", "Scan"),
+    "Scanner": ("amrepair.scans", "Scanner"),
+    "Site": ("amrepair.repair", "Site"),
+    "Transform": ("amrepair.frames", "Transform"),
+    "align_scan": ("amrepair.align", "align"),
+    "detect_defects": ("amrepair.detect", "detect"),
+    "fit_template": ("amrepair.template", "fit_template"),
+    "open_template": ("amrepair.template", "open_template"),
+    "plan_repair": ("amrepair.repair", "plan_repair"),
+    "read_scan": ("amrepair.scans", "read_scan"),
+    "run_loop": ("amrepair.loop", "run_loop"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name when it is first used (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _HOMES[name]
+    found = getattr(import_module(module), attribute)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """What there is, loaded or not."""
+    return sorted({*globals(), *__all__})

@@ -7,7 +7,18 @@ from __future__ import annotations
 
 
 class AmrepairError(Exception):
-    """Root of every error that `amrepair` raises on purpose."""
+    """Root of every error that `amrepair` raises on purpose.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from amrepair import AmrepairError, read_scan
+    >>> try:
+    ...     read_scan(Path("nothing.ply"), frame="build")
+    ... except AmrepairError as error:
+    ...     print(error, "→ exit code", error.exit_code)
+    nothing.ply: there is no such file → exit code 2
+    """
 
     exit_code: int = 2
 

@@ -30,6 +30,20 @@ class Transform:
     ------
     InputError
         If the matrix is not rigid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from amrepair import Transform
+    >>> build_from_template = Transform.from_rotation_translation(
+    ...     "build", "template", rotation=np.eye(3), translation_mm=np.array([100.0, 80.0, 0.0])
+    ... )
+    >>> build_from_template.apply(np.array([[1.0, 2.0, 3.0]]))
+    array([[101.,  82.,   3.]])
+    >>> build_from_template @ build_from_template.inverse() @ build_from_template.inverse()
+    Traceback (most recent call last):
+    ...
+    amrepair.errors.InputError: cannot compose build_from_build with template_from_build: build ...
     """
 
     target: str

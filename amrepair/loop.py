@@ -207,6 +207,32 @@ def run_loop(
     ------
     AmrepairError, GcodeError
         Whatever stopped the run; heaters are told to switch off first.
+
+    Examples
+    --------
+    A printer that is a file, and a scanner that is one: what would be sent lies in `sent.gcode`.
+
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> from amrepair import Site, open_template, run_loop
+    >>> from amrepair.loop import locate_part, plan_stops
+    >>> from amrepair.scans import FileScanner
+    >>> setup, template = gcode.load_setup(), open_template(Path("part.safetensors"))
+    >>> job = gcode.read_job(Path("job.gcode").read_text(), dialect="prusa")
+    >>> placed = locate_part(job, template, layer_height_mm=0.2)
+    >>> printer = gcode.connect("file:sent.gcode", dialect="prusa")
+    >>> printer.connect()
+    >>> report = run_loop(
+    ...     job,
+    ...     gcode.check_program(job.program, setup),
+    ...     printer,
+    ...     FileScanner(Path("scan.ply")),
+    ...     lambda stop: Site.of_part(template, setup, build_from_template=placed),
+    ...     stops=plan_stops(job, []),
+    ... )
+    >>> printer.close()
+    >>> [look.printed for look in report.looks]  # the scan did not change: it tries once
+    [True, False]
     """
     watch = watch or Stopwatch()
     total = checked.program.text.count("\n")

@@ -88,6 +88,15 @@ class Site:
         Height printed so far, build frame; None for a finished part.
     allowance_mm
         What the process may leave (half a layer for a CAD template, 0 for planned beads).
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> from amrepair import Site, open_template
+    >>> site = Site.of_part(open_template(Path("part.safetensors")), gcode.load_setup())
+    >>> site.setup.printer.id, site.grid.layer_height_mm
+    ('prusa_mk3s', 0.2)
     """
 
     template: Template
@@ -97,6 +106,13 @@ class Site:
     printed_z_mm: float | None = None
     allowance_mm: float = 0.1
     planned: Template | None = None
+
+    @classmethod
+    def of_part(
+        cls, template: Template, setup: PrintSetup, *, build_from_template: Transform | None = None
+    ) -> Site:
+        """A finished part on the layers of the process profile."""
+        return cls(template, setup, LayerGrid.from_setup(setup), build_from_template)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +129,18 @@ class RepairPlan:
         What was judged, in the template's frame.
     refused
         Why the checker refused the program, where it did and the caller wanted to go on.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> from amrepair import Site, open_template, plan_repair, read_scan
+    >>> site = Site.of_part(open_template(Path("part.safetensors")), gcode.load_setup())
+    >>> plan = plan_repair(read_scan(Path("scan.ply"), frame="build"), site, title="repair")
+    >>> plan.within_tolerance, len(plan.to_fill), plan.too_much
+    (False, 1, ())
+    >>> round(plan.unreachable_mm3 / plan.deficit.missing_mm3, 1)  # a strip beside the cliff
+    0.2
     """
 
     registration: Registration
@@ -192,6 +220,16 @@ def plan_repair(
         If the deficit is no valid solid.
     gcode.errors.GcodeError
         If the deficit cannot be sliced or the checker refuses the program.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> from amrepair import Site, open_template, plan_repair, read_scan
+    >>> site = Site.of_part(open_template(Path("part.safetensors")), gcode.load_setup())
+    >>> plan = plan_repair(read_scan(Path("scan.ply"), frame="build"), site, title="repair")
+    >>> "G28 X Y" in plan.checked.program.text  # Z is never homed onto a part
+    True
     """
     watch = watch or Stopwatch()
     with watch("align"):

@@ -1,6 +1,89 @@
 """gcode turns a solid into bytes on a wire: slice, check, estimate, send, emulate.
 
 It knows nothing of scans, templates or learning; `amrepair` stands on it, never the reverse.
+
+From a mesh to a program that a printer may have:
+
+>>> from pathlib import Path
+>>> import gcode
+>>> setup = gcode.load_setup("prusa_mk3s", "pla", "standard_0.20")
+>>> toolpath = gcode.slice_part(gcode.read_solid(Path("placed.stl")), setup)
+>>> checked = gcode.check_program(gcode.write_program(toolpath, setup, title="block"), setup)
+>>> printer = gcode.connect("file:block.gcode")  # or /dev/ttyACM0
+>>> printer.connect()
+>>> printer.print(checked).ok
+True
+>>> printer.close()
+
+The names below are loaded when first used, so that importing this package costs nothing.
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gcode.check import CheckedProgram
+    from gcode.check import check as check_program
+    from gcode.errors import GcodeError
+    from gcode.estimate import estimate as estimate_program
+    from gcode.hosts import connect
+    from gcode.moves import Program
+    from gcode.profiles import load_setup
+    from gcode.reader import read_job
+    from gcode.slicing.job import slice_part
+    from gcode.slicing.patch import slice_patch
+    from gcode.solids import read_solid
+    from gcode.surfaces import HeightField
+    from gcode.writer import write as write_program
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "CheckedProgram",
+    "GcodeError",
+    "HeightField",
+    "Program",
+    "check_program",
+    "connect",
+    "estimate_program",
+    "load_setup",
+    "read_job",
+    "read_solid",
+    "slice_part",
+    "slice_patch",
+    "write_program",
+]
+
+# `check` and `estimate` are rooms of this package: their functions go by a longer name up here.
+_HOMES = {
+    "CheckedProgram": ("gcode.check", "CheckedProgram"),
+    "GcodeError": ("gcode.errors", "GcodeError"),
+    "HeightField": ("gcode.surfaces", "HeightField"),
+    "Program": ("gcode.moves", "Program"),
+    "check_program": ("gcode.check", "check"),
+    "connect": ("gcode.hosts", "connect"),
+    "estimate_program": ("gcode.estimate", "estimate"),
+    "load_setup": ("gcode.profiles", "load_setup"),
+    "read_job": ("gcode.reader", "read_job"),
+    "read_solid": ("gcode.solids", "read_solid"),
+    "slice_part": ("gcode.slicing.job", "slice_part"),
+    "slice_patch": ("gcode.slicing.patch", "slice_patch"),
+    "write_program": ("gcode.writer", "write"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name when it is first used (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _HOMES[name]
+    found = getattr(import_module(module), attribute)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """What there is, loaded or not."""
+    return sorted({*globals(), *__all__})

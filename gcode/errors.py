@@ -8,7 +8,17 @@ from __future__ import annotations
 
 
 class GcodeError(Exception):
-    """Root of every error that `gcode` raises on purpose."""
+    """Root of every error that `gcode` raises on purpose.
+
+    Examples
+    --------
+    >>> import gcode
+    >>> try:
+    ...     gcode.load_setup("prusa_mk3s", "chocolate")
+    ... except gcode.GcodeError as error:
+    ...     print(error)
+    Unknown material profile 'chocolate'; known are: abs, asa, petg, pla, pla_cf, tpu.
+    """
 
     exit_code: int = 2
 

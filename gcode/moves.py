@@ -193,6 +193,13 @@ class Program:
         Lines ended by a newline.
     dialect
         A name that `dialects` knows: marlin, prusa, klipper, reprap.
+
+    Examples
+    --------
+    >>> import gcode
+    >>> program = gcode.Program("G28\\nM84\\n", "marlin")
+    >>> list(program.lines())
+    ['G28', 'M84']
     """
 
     text: str

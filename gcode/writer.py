@@ -68,6 +68,15 @@ def write(
     ------
     SliceError
         If a bead does not begin where the nozzle is.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> setup = gcode.load_setup()
+    >>> toolpath = gcode.slice_part(gcode.read_solid(Path("placed.stl")), setup)
+    >>> gcode.write_program(toolpath, setup, title="block").text.splitlines()[0]
+    '; block'
     """
     text = _Text(setup, resume)
     text.comment(title)

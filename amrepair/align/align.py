@@ -67,6 +67,17 @@ def align(
         If no pose explains the scan, the refinement does not converge, or it leaves the guess.
     InputError
         If the method is unknown, or the guess starts from another frame.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from amrepair import align_scan, open_template, read_scan
+    >>> scan = read_scan(Path("scan.ply"), frame="scanner")
+    >>> found = align_scan(scan, open_template(Path("part.safetensors")))
+    >>> [round(float(v)) for v in found.template_from_scan.translation_mm]  # x = 100, y = 80
+    [-100, -80, 0]
+    >>> found.rmse_mm < 0.05
+    True
     """
     if method not in METHODS:
         raise InputError(f"the method '{method}' is unknown; choose one of {', '.join(METHODS)}")

@@ -3,6 +3,28 @@
 Nothing is computed here; messages and progress go to standard error, results to standard output.
 """
 
-from amrepair.cli.app import main
+from __future__ import annotations
+
+import sys
 
 __all__ = ["main"]
+
+
+def main() -> None:
+    """Entry point; where a library is missing, it says which and how to mend it."""
+    try:
+        from amrepair.cli.app import main as run
+    except ImportError as error:
+        sys.stderr.write(f"amrepair: a library that it needs cannot be loaded: {error}\n")
+        _say_what_is_wrong()
+        sys.exit(2)
+    run()
+
+
+def _say_what_is_wrong() -> None:
+    """The doctor's findings, without any of the libraries that may be what is missing."""
+    from amrepair.doctor import State, examine
+
+    for finding in examine():
+        if finding.state is not State.OK:
+            sys.stderr.write(f"{finding.name}: {finding.found}\n    {finding.mend}\n")

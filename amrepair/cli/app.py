@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import amrepair
-from amrepair.cli import benchmark, inspect, mend, printing, simulation, templates
+from amrepair.cli import benchmark, health, inspect, live, mend, printing, simulation, templates
 from amrepair.errors import AmrepairError
 from gcode.cli import console
 from gcode.errors import GcodeError
@@ -16,15 +16,15 @@ app = typer.Typer(
     name="amrepair",
     help="Scan a print, find what is missing, print only that, scan again, resume.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
 
-def _version(asked: bool) -> None:
+def _version(asked: bool) -> bool:
     if asked:
         console.out.print(f"amrepair {amrepair.__version__}")
         raise typer.Exit
+    return asked
 
 
 @app.callback()
@@ -42,6 +42,8 @@ inspect.add_to(app)
 mend.add_to(app)
 printing.add_to(app)
 benchmark.add_to(app)
+health.add_to(app)
+live.add_to(app)
 
 
 def main() -> None:

@@ -15,8 +15,21 @@ FormatOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    app.command("bench")(bench)
-    app.command("synth")(synth)
+    app.command(
+        "bench",
+        epilog=console.examples(
+            "amrepair bench out/synth --format anomaly-shapenet --method pasdf --out out/bench",
+            "amrepair bench out/synth --format anomaly-shapenet --method pasdf "
+            "--method btf-fpfh --out out/bench --jobs 2",
+        ),
+    )(bench)
+    app.command(
+        "synth",
+        epilog=console.examples(
+            "amrepair synth examples/parts/knob.stl --format anomaly-shapenet --out out/synth",
+            "amrepair synth one.stl two.stl --format real3d-ad --seed 7 --out out/synth",
+        ),
+    )(synth)
 
 
 def bench(

@@ -1,4 +1,4 @@
-"""Files that commands read and write: templates, meshes, whole files or none."""
+"""Files that commands read and write: whole, or none."""
 
 from __future__ import annotations
 
@@ -6,32 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from amrepair.errors import InputError
-from amrepair.template import LearnedSdf, load_or_fit
+from amrepair.template import open_template
 from amrepair.template.mesh_file import SUFFIXES
-from amrepair.template.port import Template
 from gcode.cli.console import write_whole
-from gcode.progress import Progress, silent
 
-TEMPLATE_SUFFIX = ".safetensors"
-
-
-def open_template(path: Path, *, progress: Progress = silent) -> Template:
-    """A fitted template, or a mesh that is fitted now (or taken from the cache).
-
-    Raises
-    ------
-    InputError
-        If it is neither.
-    """
-    suffix = path.suffix.lower()
-    if suffix == TEMPLATE_SUFFIX:
-        return LearnedSdf.load(path)
-    if suffix in SUFFIXES:
-        return load_or_fit(path, progress=progress)
-    raise InputError(
-        f"the template {path} is neither a {TEMPLATE_SUFFIX} file nor a mesh "
-        f"({', '.join(SUFFIXES)}); fit one with 'amrepair template fit'"
-    )
+__all__ = ["open_template", "write_mesh"]
 
 
 def write_mesh(mesh: Any, path: Path) -> None:

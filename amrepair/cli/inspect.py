@@ -25,8 +25,21 @@ TemplateOption = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    app.command("align")(align)
-    app.command("detect")(detect)
+    app.command(
+        "align",
+        epilog=console.examples(
+            "amrepair align scan.ply --template part.safetensors",
+            "amrepair align scan.ply --template part.stl -o aligned.ply --json",
+        ),
+    )(align)
+    app.command(
+        "detect",
+        epilog=console.examples(
+            "amrepair detect scan.ply --template part.safetensors --out out/detect",
+            "amrepair detect scan.ply --template part.stl --sensor-at 120,100,400 "
+            "--out out/detect --json",
+        ),
+    )(detect)
 
 
 def align(

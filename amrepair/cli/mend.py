@@ -21,10 +21,9 @@ from amrepair.cli.options import (
     sensors,
 )
 from amrepair.errors import InputError
-from amrepair.frames import Transform
-from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
-from amrepair.report import Figures, ReportData, outcome_of, summary_of_result, write_report
-from amrepair.report.collect import look_of, plan_result, region_rows, solid_mesh, versions
+from amrepair.repair import Site, Stopwatch, plan_repair
+from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
+from amrepair.report.collect import plan_result
 from amrepair.scans import read_scan
 from gcode.cli import console
 from gcode.moves import Program
@@ -44,7 +43,17 @@ FRAMES = ("build", "unknown")
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("repair")(repair)
+    app.command(
+        "repair",
+        epilog=console.examples(
+            "amrepair repair scan.ply --template part.safetensors -o repair.gcode "
+            "--report report.html",
+            "amrepair repair scan.ply --template part.stl -o repair.gcode "
+            "--scan-frame unknown --part-pose 100,80,0,90",
+            "amrepair repair scan.ply --template part.stl -o repair.gcode --printer ender_3 "
+            "--material petg --job job.gcode",
+        ),
+    )(repair)
 
 
 def repair(
@@ -117,9 +126,16 @@ def repair(
         seconds=seconds,
         setup=setup,
     )
-    within = plan.within_tolerance or (plan.checked is not None and _all_reached(plan))
+    within = plan_is_enough(plan)
     if report is not None:
-        data = _report_data(plan, scan, result, setup, field, within=within)
+        data = report_of_plan(
+            plan,
+            result,
+            title=f"Repair of {scan.name}",
+            setup=setup,
+            template=field,
+            scan_name=scan.name,
+        )
         console.write_whole(report, lambda path: write_report(data, path))
     if as_json:
         console.show_json(result)
@@ -130,14 +146,6 @@ def repair(
             console.out.print(f"Repair: {output}")
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
-
-
-def _all_reached(plan: RepairPlan) -> bool:
-    """Whether the program fills all that is missing, and nothing else is wrong."""
-    assert plan.patch is not None
-    left = sum(u.volume_mm3 for u in plan.patch.unreachable)
-    left += sum(u.volume_mm3 for u in plan.patch.unprintable)
-    return not plan.too_much and left <= 0.05 * plan.deficit.missing_mm3
 
 
 def _grid(job: Path | None, setup: PrintSetup) -> LayerGrid:
@@ -155,33 +163,4 @@ def _grid(job: Path | None, setup: PrintSetup) -> LayerGrid:
     )
     return LayerGrid.from_tops(
         [layer.z_mm for layer in read.layers], layer_height_mm=setup.process.layer_height_mm
-    )
-
-
-def _report_data(
-    plan: RepairPlan,
-    scan: Path,
-    result: dict[str, object],
-    setup: PrintSetup,
-    field: object,
-    *,
-    within: bool,
-) -> ReportData:
-    placed: Transform = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
-    solid = field.solid().transform(placed.matrix[:3])  # type: ignore[attr-defined]
-    return ReportData(
-        title=f"Repair of {scan.name}",
-        outcome=outcome_of(result, within_tolerance=within),
-        figures=Figures.from_result(result),
-        looks=(look_of(plan, "as scanned", printed=False),),
-        setup={
-            "scan": scan.name,
-            "printer": setup.printer.name,
-            "material": setup.material.name,
-            "process": setup.process.name,
-        },
-        expected=solid_mesh(solid),
-        regions=region_rows(plan),
-        seconds=result["seconds"],  # type: ignore[arg-type]
-        provenance=versions(setup),
     )

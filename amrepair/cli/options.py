@@ -12,11 +12,30 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.simulate.run import scale_to_fit
 from amrepair.template import load_mesh
+from gcode.cli import console
 from gcode.profiles import PrintSetup
 
-PrinterOption = Annotated[str, typer.Option(help="Printer profile: an ID or a TOML file.")]
-MaterialOption = Annotated[str, typer.Option(help="Material profile: an ID or a TOML file.")]
-ProcessOption = Annotated[str, typer.Option(help="Process profile: an ID or a TOML file.")]
+PrinterOption = Annotated[
+    str,
+    typer.Option(
+        help="Printer profile: an ID or a TOML file.",
+        autocompletion=console.profile_ids("printers"),
+    ),
+]
+MaterialOption = Annotated[
+    str,
+    typer.Option(
+        help="Material profile: an ID or a TOML file.",
+        autocompletion=console.profile_ids("materials"),
+    ),
+]
+ProcessOption = Annotated[
+    str,
+    typer.Option(
+        help="Process profile: an ID or a TOML file.",
+        autocompletion=console.profile_ids("processes"),
+    ),
+]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of everything that is drawn.")]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")

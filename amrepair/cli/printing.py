@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from amrepair.cli.files import open_template
 from amrepair.cli.inspect import TemplateOption
+from amrepair.cli.live import (
+    VIEW_PORT,
+    HostOption,
+    PortOption,
+    TokenOption,
+    ViewOption,
+    live_view,
+)
 from amrepair.cli.options import (
     JsonOption,
     MaterialOption,
@@ -22,22 +30,10 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import Stop, locate_part, plan_stops, run_loop
 from amrepair.repair import RepairPlan, Site, Stopwatch
-from amrepair.report import (
-    Figures,
-    ReportData,
-    outcome_of,
-    summary_of_result,
-    write_report,
-)
-from amrepair.report.collect import (
-    decision_of,
-    look_of,
-    loop_result,
-    region_rows,
-    versions,
-    wire_counters,
-)
+from amrepair.report import report_of_loop, summary_of_result, write_report
+from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
+from amrepair.report.guarded import LOOPBACK
 from amrepair.scans import Scanner, WatchedFolderScanner
 from amrepair.template import PlannedSdf
 from amrepair.template.port import Template
@@ -61,7 +57,17 @@ APPROVALS = ("ask", "auto")
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("loop")(loop)
+    app.command(
+        "loop",
+        epilog=console.examples(
+            "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
+            "--scanner watch:scans --every 20",
+            "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
+            "--scanner watch:scans --view",
+            "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
+            "--scanner watch:scans --approve auto --json",
+        ),
+    )(loop)
 
 
 def loop(
@@ -88,6 +94,10 @@ def loop(
     ] = None,
     scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
     out: Annotated[Path, typer.Option(help="Folder for result, scans, report.")] = Path("out/loop"),
+    view: ViewOption = False,
+    view_host: HostOption = LOOPBACK,
+    view_port: PortOption = VIEW_PORT,
+    token: TokenOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -113,24 +123,30 @@ def loop(
         wire_log=folder.file("wire.log"),
         journal=default_path(port) if is_device(port) else None,
     )
-    machine.connect()
-    try:
-        with bars.shown():
-            report = run_loop(
-                job,
-                checked,
-                machine,
-                eye,
-                lambda stop: _site(job, stop, field, placed, setup),
-                stops=stops,
-                approve=_ask if approve == "ask" else lambda plan: True,
-                record=folder.record,
-                rng=np.random.default_rng(seed),
-                watch=watch,
-                progress=bars,
-            )
-    finally:
-        machine.close()
+    ask = approve == "ask"
+    with live_view(
+        view, ask=ask, title=job_file.name, host=view_host, port=view_port, token=token
+    ) as page:
+        page.show_run(job, _placed_solid(field, placed))
+        machine.connect()
+        page.drives(machine.pause, machine.resume)
+        try:
+            with bars.shown():
+                report = run_loop(
+                    job,
+                    checked,
+                    machine,
+                    eye,
+                    lambda stop: _site(job, stop, field, placed, setup),
+                    stops=stops,
+                    approve=(page.approve if view else _ask) if ask else lambda plan: True,
+                    record=page.recording(folder.record),
+                    rng=np.random.default_rng(seed),
+                    watch=watch,
+                    progress=page.watching(bars),
+                )
+        finally:
+            machine.close()
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     printed = [look for look in report.looks if look.printed]
     last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
@@ -139,20 +155,13 @@ def loop(
     )
     folder.write_json("result.json", result)
     within = report.within_tolerance
-    data = ReportData(
+    data = report_of_loop(
+        report,
+        result,
         title=f"Run: {job_file.name}",
-        outcome=outcome_of(result, within_tolerance=within),
-        figures=Figures.from_result(result),
-        looks=tuple(
-            look_of(look.plan, f"{look.stop.label}, scan {look.number}", printed=look.printed)
-            for look in report.looks
-        ),
-        setup={"job": job_file.name, "printer": setup.printer.name},
-        regions=tuple(row for look in report.first_looks for row in region_rows(look.plan)),
-        decisions=tuple(decision_of(look) for look in report.looks),
-        wire=wire_counters(report),
-        seconds=seconds,
-        provenance=versions(setup),
+        setup=setup,
+        about={"job": job_file.name},
+        expected=_placed_solid(field, placed),
     )
     write_report(data, folder.file("report.html"))
     if as_json:
@@ -197,6 +206,12 @@ def _scanner(spec: str, calibration: Path | None, timeout_s: float) -> Scanner:
         pose = Transform("build", "scanner", matrix)
     folder = Path(spec.removeprefix("watch:"))
     return WatchedFolderScanner(folder, build_from_scanner=pose, timeout_s=timeout_s)
+
+
+def _placed_solid(template: Template, placed: Transform) -> Any:
+    """The part as it should be, where it stands."""
+    solid: Any = template.solid()
+    return solid.transform(placed.matrix[:3])
 
 
 def _site(job: Job, stop: Stop, template: Template, placed: Transform, setup: PrintSetup) -> Site:

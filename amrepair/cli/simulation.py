@@ -9,6 +9,14 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from amrepair.cli.live import (
+    VIEW_PORT,
+    HostOption,
+    PortOption,
+    TokenOption,
+    ViewOption,
+    live_view,
+)
 from amrepair.cli.options import (
     JsonOption,
     MaterialOption,
@@ -19,24 +27,15 @@ from amrepair.cli.options import (
 )
 from amrepair.repair import Stopwatch
 from amrepair.report import (
-    Figures,
     ReportData,
     TemperatureSeries,
-    outcome_of,
+    report_of_loop,
     summary_of_result,
     write_report,
 )
-from amrepair.report.collect import (
-    decision_of,
-    look_of,
-    loop_result,
-    region_rows,
-    rounded,
-    solid_mesh,
-    versions,
-    wire_counters,
-)
+from amrepair.report.collect import loop_result, rounded
 from amrepair.report.folder import RunFolder
+from amrepair.report.guarded import LOOPBACK
 from amrepair.simulate.defects import DefectKind, parse_defect
 from amrepair.simulate.part_files import bracket_path
 from amrepair.simulate.run import SimulatedRun, place_on_bed, prepare_run, simulate_run
@@ -48,7 +47,15 @@ DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("simulate")(simulate)
+    app.command(
+        "simulate",
+        epilog=console.examples(
+            "amrepair simulate",
+            "amrepair simulate part.stl --defect void:diameter=8,layers=4 --defect chip "
+            "--seed 3 --out out/run",
+            "amrepair simulate part.stl --printer voron_2_4 --material petg --scale fit --json",
+        ),
+    )(simulate)
 
 
 def simulate(
@@ -73,6 +80,10 @@ def simulate(
     max_iterations: Annotated[
         int, typer.Option(min=0, max=10, help="Repairs at one stop, at most.")
     ] = 3,
+    view: ViewOption = False,
+    view_host: HostOption = LOOPBACK,
+    view_port: PortOption = VIEW_PORT,
+    token: TokenOption = None,
     seed: SeedOption = 0,
     out: Annotated[Path, typer.Option(help="Folder for result, G-code, scans, report.")] = Path(
         "out/simulate"
@@ -97,19 +108,24 @@ def simulate(
             template, setup, defects, title=path.stem, seed=seed, watch=watch, progress=bars
         )
         folder.write_text("job.gcode", prepared.checked.program.text)
-        run = simulate_run(
-            prepared,
-            wire_log=folder.file("wire.log"),
-            max_iterations=max_iterations,
-            record=folder.record,
-            watch=watch,
-            progress=bars,
-        )
+        with live_view(
+            view, ask=True, title=path.name, host=view_host, port=view_port, token=token
+        ) as page:
+            page.show_run(prepared.job, prepared.part)
+            run = simulate_run(
+                prepared,
+                wire_log=folder.file("wire.log"),
+                max_iterations=max_iterations,
+                approve=page.approve,
+                record=page.recording(folder.record),
+                watch=watch,
+                progress=page.watching(bars),
+            )
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     result = _result(run, folder, seed, seconds)
     folder.write_json("result.json", result)
     with watch("report"):
-        write_report(_report_data(run, path, result, seconds), folder.file("report.html"))
+        write_report(_report_data(run, path, result), folder.file("report.html"))
     within = run.report.within_tolerance
     if as_json:
         console.show_json(result)
@@ -159,42 +175,23 @@ def _result(
     }
 
 
-def _report_data(
-    run: SimulatedRun, path: Path, result: dict[str, Any], seconds: dict[str, float]
-) -> ReportData:
-    prepared, report = run.prepared, run.report
-    setup = prepared.setup
-    within = report.within_tolerance
+def _report_data(run: SimulatedRun, path: Path, result: dict[str, Any]) -> ReportData:
+    prepared = run.prepared
     clock, hotend, bed = run.temperatures.T
-    return ReportData(
+    return report_of_loop(
+        run.report,
+        result,
         title=f"Simulated run: {path.name}",
-        outcome=outcome_of(result, within_tolerance=within),
-        figures=Figures.from_result(result),
-        looks=tuple(
-            look_of(
-                look.plan,
-                f"{look.stop.label}, scan {look.number}",
-                printed=look.printed,
-            )
-            for look in report.looks
-        ),
-        setup={
+        setup=prepared.setup,
+        about={
             "part": path.name,
-            "printer": setup.printer.name,
-            "material": setup.material.name,
-            "process": setup.process.name,
             "defects": ", ".join(str(t.kind) for t in run.truth) or "none",
         },
-        expected=solid_mesh(prepared.part),
-        regions=tuple(row for look in report.first_looks for row in region_rows(look.plan)),
-        decisions=tuple(decision_of(look) for look in report.looks),
-        wire=wire_counters(report),
+        expected=prepared.part,
         temperatures=(
             TemperatureSeries("hotend", clock, hotend),
             TemperatureSeries("bed", clock, bed),
         ),
-        seconds=seconds,
-        provenance={"seed": str(prepared.seed), **versions(setup)},
     )
 
 

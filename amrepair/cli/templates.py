@@ -19,7 +19,13 @@ def add_to(app: typer.Typer) -> None:
     app.add_typer(template_app, name="template")
 
 
-@template_app.command("fit")
+@template_app.command(
+    "fit",
+    epilog=console.examples(
+        "amrepair template fit part.stl -o part.safetensors",
+        "amrepair template fit part.3mf -o part.safetensors --device cpu --seed 1",
+    ),
+)
 def fit(
     inputs: Annotated[
         list[Path],
@@ -41,7 +47,13 @@ def fit(
     console.errors.print(f"{output}: surface good to {template.bias_mm:.3f} mm (99 %)")
 
 
-@template_app.command("mesh")
+@template_app.command(
+    "mesh",
+    epilog=console.examples(
+        "amrepair template mesh part.safetensors -o part.stl",
+        "amrepair template mesh part.safetensors -o half.stl --below-z-mm 12 --voxel-mm 0.15",
+    ),
+)
 def mesh(
     file: Annotated[Path, typer.Argument(help="Template file.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="STL, OBJ, PLY or 3MF to write.")],

@@ -95,6 +95,17 @@ def detect(
     ------
     InputError
         If the scan is not in the template's frame, or its size contradicts the template's.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from amrepair import align_scan, detect_defects, open_template, read_scan
+    >>> template = open_template(Path("part.safetensors"))
+    >>> scan = read_scan(Path("scan.ply"), frame="build")
+    >>> pose = align_scan(scan, template).template_from_scan
+    >>> anomaly = detect_defects(scan.moved(pose), template)
+    >>> [(r.label.name, 1.4 < r.depth_mm < 1.8) for r in anomaly.regions if r.volume_mm3 > 2.0]
+    [('MISSING', True)]
     """
     if scan.frame != "template":
         raise InputError(

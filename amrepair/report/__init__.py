@@ -1,5 +1,6 @@
 """Report: what people see of a run. It reads results and never changes them."""
 
+from amrepair.report.assemble import plan_is_enough, report_of_loop, report_of_plan
 from amrepair.report.data import (
     BeadPath,
     Counter,
@@ -30,8 +31,11 @@ __all__ = [
     "SolidMesh",
     "TemperatureSeries",
     "outcome_of",
+    "plan_is_enough",
     "regions_from_result",
     "render_report",
+    "report_of_loop",
+    "report_of_plan",
     "summary",
     "summary_of",
     "summary_of_result",

@@ -11,8 +11,10 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from amrepair.detect import Label
+from amrepair.detect.detection import BED_BAND_MM
 from amrepair.loop import Look as LoopLook
 from amrepair.loop import LoopReport
 from amrepair.repair import RepairPlan, solid_arrays
@@ -28,6 +30,7 @@ from amrepair.report.data import (
 from gcode.profiles import PrintSetup
 
 DIGITS = 6  # of every figure in a result: beyond what any scan can tell
+OUTLINE_MM = 0.05  # finer than a pixel of the drawing
 _LIBRARIES = (
     "amrepair",
     "manifold3d",
@@ -203,18 +206,20 @@ def plan_result(
 def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
     """What the page shows of one scan."""
     build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
-    anomaly, field = plan.anomaly, plan.deficit.as_built
+    scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
+    shown = of_the_part(plan)
     unseen = anomaly.template_points_mm[anomaly.template_label == int(Label.UNSEEN)]
     beads = None
     if plan.patch is not None and (printed or plan.checked is not None):
         beads = BeadPath.from_toolpath(plan.patch.toolpath)
     return Look(
         label=label,
-        points_mm=build_from_template.apply(plan.scan.points_mm),
-        deviation_mm=anomaly.deviation_mm,
-        label_of_point=anomaly.label,
+        points_mm=build_from_template.apply(scan.points_mm[shown]),
+        deviation_mm=anomaly.deviation_mm[shown],
+        label_of_point=anomaly.label[shown],
         threshold_mm=anomaly.threshold_mm,
         threshold_source=anomaly.threshold_source,
+        normals=None if scan.normals is None else build_from_template.rotate(scan.normals[shown]),
         unseen_mm=build_from_template.apply(unseen) if len(unseen) else None,
         missing=solid_mesh(plan.deficit.missing),
         excess=solid_mesh(plan.deficit.excess),
@@ -222,8 +227,40 @@ def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
         missing_mm3=plan.deficit.missing_mm3,
         excess_mm3=plan.deficit.excess_mm3,
         unseen_area_mm2=plan.deficit.unseen_area_mm2,
-        height_map=HeightMap(field.origin_mm, field.cell_mm, field.z_mm, field.seen, label),
+        height_map=HeightMap(
+            field.origin_mm,
+            field.cell_mm,
+            field.z_mm,
+            field.seen,
+            f"Top surface, {label}",
+            outlines_mm(plan),
+        ),
     )
+
+
+def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
+    """(n,) points of the scan that show the part: detection's own word on what is bed and skirt.
+
+    The bed beside the part lies outside of it, and is no excess: drawn in its colour, it would be
+    taken for some.
+    """
+    anomaly = plan.anomaly
+    foot_mm = (
+        float(anomaly.template_points_mm[:, 2].min()) if len(anomaly.template_points_mm) else 0
+    )
+    flat = plan.scan.points_mm[:, 2] < foot_mm + BED_BAND_MM
+    outside = anomaly.deviation_mm > anomaly.threshold_mm
+    return ~(flat & outside & (anomaly.label == int(Label.OK)))
+
+
+def outlines_mm(plan: RepairPlan) -> tuple[Float[np.ndarray, "_ 2"], ...]:
+    """Closed XY outlines of what is missing and what is too much, build frame."""
+    outlines = []
+    for solid in (plan.deficit.missing, plan.deficit.excess):
+        if not solid.is_empty():
+            smooth = solid.project().simplify(OUTLINE_MM)
+            outlines += [np.asarray(ring, dtype=np.float64) for ring in smooth.to_polygons()]
+    return tuple(outlines)
 
 
 def solid_mesh(solid: Any) -> SolidMesh | None:

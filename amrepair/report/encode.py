@@ -25,8 +25,9 @@ NORMAL_NEIGHBOURS = 10
 SHADE_LEVELS = 16
 # Head-high light from the front left, as drawings have it.
 LIGHT = np.array([-0.42, -0.54, 0.73])
-# A floor, then the share of |nx|, |ny|, |nz|: tops brightest, the two kinds of walls apart.
-UNORIENTED_SHADE = np.array([0.2, 0.12, 0.3, 0.72])
+# Where nobody knows which side is out, the side towards the light is drawn: as bright as a
+# look with normals shows it from the first view.
+UNORIENTED_SHADE = 0.5 * np.array([1.0, 0.42, 0.54, 0.73])
 MORTON_BITS = 16
 
 Encoded = dict[str, object]

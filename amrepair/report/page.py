@@ -6,11 +6,12 @@ Every text that comes from outside passes `html.escape` here.
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Sequence
 
 from amrepair.report.data import Look, Outcome, ReportData
 from amrepair.report.payload import drawn_looks
-from amrepair.report.text import HEADLINES, duration, percent, quantity, summary_of
+from amrepair.report.text import HEADLINES, duration, length, percent, quantity, summary_of
 
 _TONES = {
     Outcome.WITHIN_TOLERANCE: ("good", "✓"),
@@ -88,8 +89,8 @@ def _tiles(data: ReportData) -> Iterable[tuple[str, str, str]]:
         "not scanned again" if after is None else "as the last scan measured it",
     )
     if figures.repaired_ratio is not None:
-        value, unit = percent(figures.repaired_ratio).rsplit(" ", 1)
-        yield "Repaired", f"{value} <small>{unit}</small>", "by the true volume"
+        value = percent(figures.repaired_ratio).replace(" %", " <small>%</small>")
+        yield "Repaired", value, "by the true volume"
     if figures.excess_mm3_before > 0 or (figures.excess_mm3_after or 0) > 0:
         yield (
             "Too much",
@@ -107,12 +108,12 @@ def _tiles(data: ReportData) -> Iterable[tuple[str, str, str]]:
         yield (
             "Repair",
             f"<span>{escape(duration(figures.print_time_s))}</span>",
-            f"{quantity(figures.filament_mm / 1000, 'm')} of filament",
+            f"{length(figures.filament_mm)} of filament",
         )
 
 
 def _big(value: float | None, unit: str) -> str:
-    if value is None:
+    if value is None or not math.isfinite(value):
         return f'<span aria-label="not known">{_DASH}</span>'
     return f"{quantity(value, '')} <small>{unit}</small>"
 
@@ -311,7 +312,7 @@ def _run(data: ReportData) -> str:
     wire = table(
         "What went over the wire",
         ("Counter", "Value", "Meaning"),
-        [(escape(c.name), f"{c.value:,.10g}", escape(c.meaning)) for c in data.wire],
+        [(escape(c.name), _counted(c.value), escape(c.meaning)) for c in data.wire],
         numeric=(1,),
     )
     seconds = table(
@@ -330,6 +331,11 @@ def _run(data: ReportData) -> str:
     )
     blocks = [block for block in (wire, seconds, provenance) if block]
     return f'<div class="columns">{"".join(blocks)}</div>' if blocks else ""
+
+
+def _counted(value: float) -> str:
+    """A counter, whole where it is whole; a dash where nobody knows."""
+    return f"{value:,.10g}" if math.isfinite(value) else _DASH
 
 
 def _footer(data: ReportData) -> str:

@@ -5,6 +5,7 @@ It makes text, never markup; the terminal and the page share it.
 
 from __future__ import annotations
 
+import math
 from collections import Counter as Tally
 from collections.abc import Mapping, Sequence
 
@@ -12,6 +13,7 @@ from amrepair.report.data import Figures, Outcome, RegionRow, ReportData, region
 
 # Below this a volume is less than half of the smallest bead that can be placed (0.08 mm³).
 NEGLIGIBLE_MM3 = 0.04
+UNKNOWN = "not known"
 _NAMES = {
     "void": ("void", "voids"),
     "under_extrusion": ("patch of thin extrusion", "patches of thin extrusion"),
@@ -36,6 +38,8 @@ def quantity(value: float, unit: str, *, digits: int = 3) -> str:
     >>> quantity(1234.56, "mm³"), quantity(12.34, "mm³"), quantity(0.0449, "mm")
     ('1,235 mm³', '12.3 mm³', '0.04 mm')
     """
+    if not math.isfinite(value):
+        return UNKNOWN
     magnitude = abs(value)
     decimals = 0 if magnitude >= 100 else 1 if magnitude >= 10 else 2
     decimals = min(decimals, max(digits - 1, 0))
@@ -43,6 +47,21 @@ def quantity(value: float, unit: str, *, digits: int = 3) -> str:
     if float(text.replace(",", "")) == 0:
         text = "0"
     return f"{text} {unit}".strip()
+
+
+def length(length_mm: float) -> str:
+    """Filament: `36 mm`, `1.24 m`.
+
+    Examples
+    --------
+    >>> length(36.4), length(1240.0)
+    ('36 mm', '1.24 m')
+    """
+    if not math.isfinite(length_mm):
+        return UNKNOWN
+    if abs(length_mm) < 1000:
+        return f"{length_mm:.0f} mm" if abs(length_mm) >= 10 else quantity(length_mm, "mm")
+    return quantity(length_mm / 1000, "m")
 
 
 def percent(ratio: float) -> str:
@@ -53,6 +72,8 @@ def percent(ratio: float) -> str:
     >>> percent(0.953), percent(0.9996), percent(1.0)
     ('95 %', '99.9 %', '100 %')
     """
+    if not math.isfinite(ratio):
+        return UNKNOWN
     if ratio <= 0 or ratio >= 1:
         return f"{100 * ratio:.0f} %"
     if ratio >= 0.99 or ratio < 0.01:
@@ -68,6 +89,8 @@ def duration(seconds: float) -> str:
     >>> duration(3900), duration(400), duration(12.4), duration(0.81)
     ('1 h 05 min', '6 min 40 s', '12 s', '0.8 s')
     """
+    if not math.isfinite(seconds):
+        return UNKNOWN
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)
@@ -103,7 +126,7 @@ def summary(
     >>> summary(Outcome.NOTHING_TO_REPAIR, clean, ())[0]
     'Nothing is missing: the part agrees with its template.'
     """
-    return _found(figures, regions), _done(outcome, figures), _left(outcome, figures)
+    return _found(figures, regions), _done(figures), _left(outcome, figures)
 
 
 def summary_of(data: ReportData) -> tuple[str, str, str]:
@@ -151,17 +174,16 @@ def _found(figures: Figures, regions: Sequence[RegionRow]) -> str:
     return "Nothing is missing: the part agrees with its template."
 
 
-def _done(outcome: Outcome, figures: Figures) -> str:
+def _done(figures: Figures) -> str:
     if figures.filament_mm <= 0:
         return "Nothing was printed, and no repair G-code was made."
-    cost = (
-        f"{quantity(figures.filament_mm / 1000, 'm')} of filament in "
-        f"{duration(figures.print_time_s)}"
-    )
-    if outcome is Outcome.PLANNED:
+    cost = f"{length(figures.filament_mm)} of filament"
+    if math.isfinite(figures.print_time_s):
+        cost += f" in {duration(figures.print_time_s)}"
+    if figures.missing_mm3_after is None and figures.repaired_ratio is None:
         return f"The repair takes {cost}; its G-code passed every check and has not been printed."
     rounds = f" over {figures.iterations} repairs" if figures.iterations > 1 else ""
-    if figures.repaired_ratio is not None:
+    if figures.repaired_ratio is not None and math.isfinite(figures.repaired_ratio):
         return (
             f"Printed {cost}{rounds}; {percent(figures.repaired_ratio)} of what was missing "
             "is there now."

@@ -63,6 +63,14 @@ def read_scan(
     ------
     InputError
         If the file is missing, damaged, empty or of an unknown kind.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from amrepair import read_scan
+    >>> scan = read_scan(Path("scan.ply"), frame="build")
+    >>> scan.points_mm.shape[1], scan.sigma_mm
+    (3, 0.03)
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -36,6 +36,15 @@ class Scan:
     ------
     InputError
         If there is no point, a value is not finite, or the arrays do not match.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from amrepair import Scan
+    >>> grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0), [2.0]), axis=-1).reshape(-1, 3)
+    >>> scan = Scan(grid, sigma_mm=0.04, frame="build", source="a plane")
+    >>> len(scan)
+    20
     """
 
     points_mm: Float[np.ndarray, "n 3"]

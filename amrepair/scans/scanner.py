@@ -36,6 +36,22 @@ class Scanner(Protocol):
     ----------
     build_from_scanner
         The calibrated pose of the scanner frame, good to about a tenth of a millimetre.
+
+    Examples
+    --------
+    Any object with these two members is one; nothing need be inherited.
+
+    >>> import numpy as np
+    >>> from amrepair import Scan, Scanner, Transform
+    >>> class FlatBed:
+    ...     build_from_scanner = Transform.identity("build", "scanner")
+    ...
+    ...     def scan(self, request):
+    ...         x, y = np.meshgrid(np.arange(0.0, 200.0, 5.0), np.arange(0.0, 200.0, 5.0))
+    ...         points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    ...         return Scan(points, sigma_mm=0.05, frame="scanner", source=request.label)
+    >>> isinstance(FlatBed(), Scanner)
+    True
     """
 
     @property

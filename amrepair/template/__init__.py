@@ -7,10 +7,11 @@ imported only while fitting.
 
 from amrepair.template.cut import CutTemplate
 from amrepair.template.extract import extract_mesh
-from amrepair.template.fitting import fit_template, load_or_fit
+from amrepair.template.fitting import default_cache_dir, fit_template, load_or_fit
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh
 from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.opening import open_template
 from amrepair.template.planned import PlannedSdf
 from amrepair.template.port import Template
 
@@ -20,8 +21,10 @@ __all__ = [
     "MeshSdf",
     "PlannedSdf",
     "Template",
+    "default_cache_dir",
     "extract_mesh",
     "fit_template",
     "load_mesh",
     "load_or_fit",
+    "open_template",
 ]

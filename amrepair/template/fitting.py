@@ -44,6 +44,15 @@ def fit_template(
     ------
     TemplateError
         If the recipe is unknown, or the mesh bounds no volume.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from amrepair import fit_template
+    >>> template = fit_template(Path("part.stl"))
+    >>> template.save(Path("part.safetensors"))
+    >>> template.bias_mm < 0.1  # error on the surface, 99 %
+    True
     """
     if recipe not in RECIPES:
         raise TemplateError(f"the recipe '{recipe}' is unknown; choose {', '.join(RECIPES)}")

@@ -48,6 +48,16 @@ def check(
     ------
     CheckRefusedError
         With every refusal; the message tells the first.
+
+    Examples
+    --------
+    >>> import gcode
+    >>> cold = gcode.Program("G28\\nG1 X50 Y50 E5 F1200\\n", "prusa")
+    >>> try:
+    ...     gcode.check_program(cold, gcode.load_setup())
+    ... except gcode.GcodeError as error:
+    ...     print(error)  # doctest: +ELLIPSIS
+    The checker refuses the program: ...cold...
     """
     refusals, report = _judge(program, setup, as_built, initial)
     if refusals:

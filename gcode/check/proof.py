@@ -40,6 +40,15 @@ class CheckedProgram:
     ------
     LocalProtocolError
         If anybody else makes, copies or unpickles one.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> program = gcode.Program(Path("job.gcode").read_text(), "prusa")
+    >>> checked = gcode.check_program(program, gcode.load_setup())
+    >>> checked.printer_id, checked.report.swept
+    ('prusa_mk3s', False)
     """
 
     __slots__ = ("_lines", "_printer_id", "_program", "_report")

@@ -43,9 +43,27 @@ from gcode.writer import write
 AS_BUILT_CELL_MM = 0.2
 AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
 
-PrinterOption = Annotated[str, typer.Option(help="Printer profile: an ID or a TOML file.")]
-MaterialOption = Annotated[str, typer.Option(help="Material profile: an ID or a TOML file.")]
-ProcessOption = Annotated[str, typer.Option(help="Process profile: an ID or a TOML file.")]
+PrinterOption = Annotated[
+    str,
+    typer.Option(
+        help="Printer profile: an ID or a TOML file.",
+        autocompletion=console.profile_ids("printers"),
+    ),
+]
+MaterialOption = Annotated[
+    str,
+    typer.Option(
+        help="Material profile: an ID or a TOML file.",
+        autocompletion=console.profile_ids("materials"),
+    ),
+]
+ProcessOption = Annotated[
+    str,
+    typer.Option(
+        help="Process profile: an ID or a TOML file.",
+        autocompletion=console.profile_ids("processes"),
+    ),
+]
 AsBuiltOption = Annotated[
     Path | None,
     typer.Option(help="What stands on the bed: a mesh, or a height map (.npz, .tif, .npy)."),
@@ -59,7 +77,6 @@ app = typer.Typer(
     name="gcode",
     help="Slice solids, check and estimate programs, send them, emulate a printer.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
@@ -68,10 +85,11 @@ app.command("resume-at")(resume_at_command)
 importing.add_to(profiles_app)
 
 
-def _version(asked: bool) -> None:
+def _version(asked: bool) -> bool:
     if asked:
         console.out.print(f"gcode {gcode.__version__}")
         raise typer.Exit
+    return asked
 
 
 @app.callback()
@@ -83,7 +101,14 @@ def _root(
     """Options before a command."""
 
 
-@app.command("slice")
+@app.command(
+    "slice",
+    epilog=console.examples(
+        "gcode slice solid.stl -o job.gcode --printer ender_3 --material petg "
+        "--process standard_0.20",
+        "gcode slice piece.stl -o patch.gcode --as-built standing.stl --job job.gcode",
+    ),
+)
 def slice_solid(
     solid: Annotated[Path, typer.Argument(help="Solid in the build frame, mm.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
@@ -145,7 +170,13 @@ def slice_solid(
         console.out.print(f"left out: {thing.volume_mm3:.3f} mm³: {thing.reason}")
 
 
-@app.command("check")
+@app.command(
+    "check",
+    epilog=console.examples(
+        "gcode check job.gcode --printer ender_3",
+        "gcode check repair.gcode --as-built standing.stl --json",
+    ),
+)
 def check(
     file: FileArgument,
     printer: PrinterOption = DEFAULT_PRINTER,
@@ -187,7 +218,13 @@ def check(
         raise typer.Exit(2)
 
 
-@app.command("estimate")
+@app.command(
+    "estimate",
+    epilog=console.examples(
+        "gcode estimate job.gcode",
+        "gcode estimate job.gcode --printer voron_2_4 --json",
+    ),
+)
 def estimate(
     file: FileArgument,
     printer: Annotated[
@@ -215,7 +252,14 @@ def estimate(
     )
 
 
-@app.command("send")
+@app.command(
+    "send",
+    epilog=console.examples(
+        "gcode send repair.gcode --port /dev/ttyACM0",
+        "gcode send job.gcode --port /dev/ttyUSB0 --printer ender_3 --wire-log wire.log "
+        "--journal job.journal",
+    ),
+)
 def send(
     file: FileArgument,
     port: Annotated[
@@ -285,7 +329,13 @@ def send(
         raise typer.Exit(4)
 
 
-@app.command("emulate")
+@app.command(
+    "emulate",
+    epilog=console.examples(
+        "gcode emulate",
+        "gcode emulate --firmware klipper --printer voron_2_4 --link /tmp/printer --accelerated",
+    ),
+)
 def emulate(
     firmware: Annotated[str, typer.Option(help="marlin, prusa, klipper or reprap.")] = "marlin",
     printer: PrinterOption = DEFAULT_PRINTER,
@@ -307,7 +357,13 @@ def emulate(
         )
 
 
-@profiles_app.command("list")
+@profiles_app.command(
+    "list",
+    epilog=console.examples(
+        "gcode profiles list",
+        "gcode profiles list --json",
+    ),
+)
 def profiles_list(as_json: JsonOption = False) -> None:
     """List the shipped profiles."""
     found = {kind: list(list_profiles(kind)) for kind in ("printers", "materials", "processes")}
@@ -318,7 +374,13 @@ def profiles_list(as_json: JsonOption = False) -> None:
         console.out.print(f"{kind}: {', '.join(names)}")
 
 
-@profiles_app.command("show")
+@profiles_app.command(
+    "show",
+    epilog=console.examples(
+        "gcode profiles show prusa_mk3s",
+        "gcode profiles show mine.toml --kind printers",
+    ),
+)
 def profiles_show(
     profile: Annotated[str, typer.Argument(help="ID or TOML file.")],
     kind: Annotated[

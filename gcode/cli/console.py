@@ -17,6 +17,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from gcode.errors import InputError
+from gcode.profiles import list_profiles
+from gcode.profiles.store import Kind
 
 NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130
@@ -61,6 +63,20 @@ class Bars:
                 yield self
         else:
             yield self
+
+
+def examples(*lines: str) -> str:
+    """The end of a command's help: lines that can be typed as they are."""
+    return "\n\n".join(["Examples:", *(f"$ {line}" for line in lines)])
+
+
+def profile_ids(kind: Kind) -> Callable[[str], list[str]]:
+    """What a shell offers after `--printer` and the like."""
+
+    def matching(incomplete: str) -> list[str]:
+        return [name for name in list_profiles(kind) if name.startswith(incomplete)]
+
+    return matching
 
 
 def show_json(result: Mapping[str, Any]) -> None:

@@ -47,6 +47,15 @@ def estimate(program: Program | Job, printer: PrinterProfile | None = None) -> E
     ------
     ReadError
         If it extrudes nothing.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> job = gcode.Program(Path("job.gcode").read_text(), "prusa")
+    >>> cost = gcode.estimate_program(job, gcode.load_setup().printer)
+    >>> cost.layers, cost.print_time_s > 60.0
+    (45, True)
     """
     diameter_mm = printer.filament_diameter_mm if printer is not None else _PLAIN_DIAMETER_MM
     job = program

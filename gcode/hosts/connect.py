@@ -35,6 +35,17 @@ def connect(
     ------
     InputError
         If the name is none of these, or carries a secret.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> job = gcode.Program(Path("job.gcode").read_text(), "prusa")
+    >>> printer = gcode.connect("file:copy.gcode")  # or "/dev/ttyACM0"
+    >>> printer.connect()
+    >>> printer.print(gcode.check_program(job, gcode.load_setup())).ok
+    True
+    >>> printer.close()
     """
     if port.startswith("file:"):
         return FilePrinter(Path(port.removeprefix("file:")))

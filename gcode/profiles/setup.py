@@ -54,6 +54,13 @@ def load_setup(
     ------
     ProfileError
         Where one is unknown, malformed, or the material is too hot for the printer.
+
+    Examples
+    --------
+    >>> import gcode
+    >>> setup = gcode.load_setup("voron_2_4", "petg", "repair_0.10")
+    >>> setup.printer.dialect, setup.process.layer_height_mm
+    ('klipper', 0.1)
     """
     setup = PrintSetup(load_printer(printer), load_material(material), load_process(process))
     hottest_c = max(setup.material.hotend_c, setup.material.first_layer_hotend_c)

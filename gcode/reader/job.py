@@ -161,6 +161,14 @@ def read_job(
     ------
     ReadError
         If it extrudes nothing.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> job = gcode.read_job(Path("job.gcode").read_text(), dialect="prusa")
+    >>> len(job.layers), round(job.layers[-1].z_mm, 2)
+    (45, 9.0)
     """
     if isinstance(program, str):
         program = Program(program, dialect)

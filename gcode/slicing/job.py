@@ -66,7 +66,17 @@ class _Layer:
 
 
 def slice_part(solid: Any, setup: PrintSetup, *, progress: Progress = silent) -> Toolpath:
-    """Slice a solid (`manifold3d.Manifold`, build frame) into a whole job."""
+    """Slice a solid (`manifold3d.Manifold`, build frame) into a whole job.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> solid = gcode.read_solid(Path("placed.stl"))
+    >>> toolpath = gcode.slice_part(solid, gcode.load_setup())
+    >>> 0.97 < toolpath.volume_mm3 / solid.volume() < 1.03
+    True
+    """
     return plan_part(solid, setup, progress=progress).toolpath
 
 

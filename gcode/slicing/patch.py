@@ -140,6 +140,23 @@ def slice_patch(
     ------
     SliceError
         If the deficit is empty, or `start_mm` is missing in mid-job.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> from gcode.slicing.layers import LayerGrid
+    >>> setup = gcode.load_setup()
+    >>> whole, broken = (gcode.read_solid(Path(f"{name}.stl")) for name in ("placed", "standing"))
+    >>> patch = gcode.slice_patch(
+    ...     whole - broken,
+    ...     setup,
+    ...     as_built=gcode.HeightField.from_manifold(broken, 0.2, margin_mm=30.0),
+    ...     grid=LayerGrid.from_setup(setup),
+    ...     standalone=True,
+    ... )
+    >>> 0.8 < patch.beads_mm3 / (whole - broken).volume() < 1.05
+    True
     """
     if deficit.is_empty() or deficit.volume() <= 0:
         raise SliceError("The deficit is empty (0 mm³); there is nothing to print.")

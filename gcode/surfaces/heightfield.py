@@ -40,6 +40,14 @@ class HeightField:
         is safe for collisions (idea 7 of the design: unseen is solid), and are False in `seen`.
     seen
         (ny, nx) whether a sensor measured the cell.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> standing = gcode.HeightField.from_manifold(gcode.read_solid(Path("placed.stl")), 0.5)
+    >>> round(standing.top_mm, 1)
+    9.0
     """
 
     origin_mm: Float[np.ndarray, " 2"]

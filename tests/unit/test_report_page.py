@@ -11,10 +11,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import amrepair
+import gcode
 from amrepair.errors import InputError
-from amrepair.report import Figures, Outcome, ReportData, encode, payload, write_report
+from amrepair.report import (
+    Counter,
+    Figures,
+    Outcome,
+    ReportData,
+    encode,
+    payload,
+    summary,
+    write_report,
+)
 from amrepair.report import document as document_module
+from amrepair.report.collect import look_of
 from amrepair.report.document import render_report
+from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
 
 LOADING = {"src", "href", "srcset", "data", "poster", "action", "formaction", "background"}
@@ -174,12 +187,29 @@ def test_half_a_million_points_stay_in_budget_and_it_is_said() -> None:
         },
         {"looks": (replace(example(500).looks[1], missing_mm3=float("nan")),)},
         {"figures": Figures.from_result({"repaired_ratio": float("nan")})},
+        {
+            "figures": Figures(
+                *[float("nan")] * 7, iterations=1, filament_mm=20.0, print_time_s=float("nan")
+            ),
+            "wire": (Counter("resends", float("nan")),),
+            "seconds": {"print": float("nan")},
+        },
     ],
-    ids=["no looks", "stopped", "one bare look", "no points", "nan volume", "nan result"],
+    ids=[
+        "no looks",
+        "stopped",
+        "one bare look",
+        "no points",
+        "nan volume",
+        "nan result",
+        "nan everywhere",
+    ],
 )
 def test_unknown_or_absent_values(changes: dict) -> None:
     page = render_report(empty(**changes))
-    seen = " ".join(Elements(page).visible)
+    elements = Elements(page)
+    seen = " ".join(elements.visible)
+    seen += " ".join(str(v) for _, attributes in elements.tags for v in attributes.values() if v)
     assert values_of(page)
     assert not re.search(r"\bnan\b|\bNone\b", seen)
 
@@ -194,3 +224,54 @@ def test_an_unwritable_place_is_one_sentence(data: ReportData, tmp_path: Path) -
 def test_assets_are_found_as_package_data() -> None:
     for name in ("report.css", "report.js"):
         assert len(document_module._asset(name)) > 1000
+
+
+def test_a_plan_that_leaves_something_is_not_said_to_be_printed() -> None:
+    figures = Figures(44.0, None, 0.0, None, None, 20.0, 0.0, 1, 12.0, 36.0)
+    said = summary(Outcome.NOT_WITHIN_TOLERANCE, figures, ())[1]
+    assert said.startswith("The repair takes 12 mm of filament in 36 s")
+    assert "has not been printed" in said
+
+
+def test_a_scan_without_normals_is_drawn_as_bright_as_one_with() -> None:
+    """Seen from the first view, whose sides look left, front and up."""
+    sides = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+    rng = np.random.default_rng(0)
+    for normal in sides:
+        flat = rng.uniform(0.0, 10.0, (400, 3)) * (normal == 0)
+        told = encode.shading(flat, np.tile(normal, (400, 1)))
+        untold = encode.shading(flat, None)
+        assert abs(told.mean() - untold.mean()) < 0.7
+
+
+def test_a_look_of_a_plan_carries_normals_and_outlines(example_files: Path) -> None:
+    site = amrepair.Site.of_part(
+        amrepair.open_template(example_files / "part.safetensors"), gcode.load_setup()
+    )
+    scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
+    plan = amrepair.plan_repair(scan, site, title="repair")
+    shown = look_of(plan, "as scanned", printed=False)
+    assert shown.normals is not None
+    assert scan.normals is not None
+    assert np.abs(shown.normals - scan.normals).max() < 0.02  # both in the build frame
+    assert shown.height_map is not None
+    (outline,) = shown.height_map.outlines_mm
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    assert low == pytest.approx([123.0, 80.0], abs=0.4)
+    assert high == pytest.approx([130.0, 88.0], abs=0.4)
+
+
+def test_the_bed_beside_the_part_is_not_drawn_as_excess(example_files: Path) -> None:
+    site = amrepair.Site.of_part(
+        amrepair.open_template(example_files / "part.safetensors"), gcode.load_setup()
+    )
+    scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
+    x, y = np.meshgrid(np.arange(95.0, 99.0, 0.3), np.arange(75.0, 105.0, 0.3))
+    bed = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    both = Scan(np.vstack([scan.points_mm, bed]), 0.03, "build")
+    plan = amrepair.plan_repair(both, site, title="repair")
+    shown = look_of(plan, "as scanned", printed=False)
+    assert len(shown.points_mm) == len(shown.deviation_mm) == len(shown.label_of_point)
+    assert shown.points_mm[:, 0].min() > 99.0  # nothing of the bed
+    kept = len(shown.points_mm) / len(scan.points_mm)
+    assert kept == pytest.approx(1.0, abs=0.002)  # and all of the part

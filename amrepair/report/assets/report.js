@@ -6,7 +6,7 @@
   const $ = (id) => document.getElementById(id);
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const plain = (text) => { const t = document.createElement("textarea"); t.innerHTML = text; return t.value; };
-  const number = (v, digits = 2) => v.toLocaleString("en", { maximumFractionDigits: digits });
+  const number = (v, digits = 2) => v === null || Number.isNaN(v) ? "not known" : v.toLocaleString("en", { maximumFractionDigits: digits });
   const STILL = { displayModeBar: false, responsive: true, scrollZoom: true };
 
   // ---- arrays -------------------------------------------------------------------------------
@@ -133,14 +133,35 @@
   }
 
   // ---- a scene ------------------------------------------------------------------------------
-  const VIEWS = {
-    overview: { eye: { x: -0.88, y: -1.22, z: 0.82 }, up: { x: 0, y: 0, z: 1 } },
-    top: { eye: { x: 0, y: -0.001, z: 2 }, up: { x: 0, y: 1, z: 0 } },
-    front: { eye: { x: 0, y: -2, z: 0 }, up: { x: 0, y: 0, z: 1 } },
-    right: { eye: { x: 2, y: 0, z: 0 }, up: { x: 0, y: 0, z: 1 } },
+  const VIEWS = {  // direction to the eye, and which way is up
+    overview: { eye: [-0.88, -1.22, 0.82], up: [0, 0, 1] },
+    top: { eye: [0, -0.0005, 1], up: [0, 1, 0] },
+    front: { eye: [0, -1, 0], up: [0, 0, 1] },
+    right: { eye: [1, 0, 0], up: [0, 0, 1] },
   };
   const copy = (v) => JSON.parse(JSON.stringify(v));
-  const cameraOf = (name) => Object.assign({ center: { x: 0, y: 0, z: -0.06 }, projection: { type: "perspective" } }, copy(VIEWS[name]));
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const unit = (a) => { const n = Math.hypot(...a); return a.map((v) => v / n); };
+  const point = (a) => ({ x: a[0], y: a[1], z: a[2] });
+  const HALF_FIELD = Math.tan(Math.PI / 8);  // plotly's perspective sees 45° from top to bottom
+  const ROOM = 0.86;  // the rest is for the numbers along the axes
+  // As near as the whole box fits the pane: all eight corners are inside, whatever its shape.
+  function cameraOf(name, pane) {
+    const view = VIEWS[name], back = unit(view.eye), right = unit(cross(view.up, back)), up = cross(back, right);
+    const side = [0, 1, 2].map((n) => data.bounds[1][n] - data.bounds[0][n]), mean = Math.cbrt(side[0] * side[1] * side[2]);
+    const plot = pane.querySelector(".plot"), wide = Math.max(plot.clientWidth, 200) / Math.max(plot.clientHeight, 200);
+    const corners = [...Array(8).keys()].map((n) => side.map((s, axis) => (n >> axis & 1 ? 0.5 : -0.5) * s / mean));
+    let far = 0, center = [0, 0, 0];
+    for (let turn = 0; turn < 4; turn++) {  // near corners look larger: what is in the middle moves
+      const seen = corners.map((c) => { const d = c.map((v, axis) => v - center[axis]); return [dot(d, right), dot(d, up), dot(d, back)]; });
+      far = Math.max(...seen.map(([x, y, z]) => z + Math.max(Math.abs(y), Math.abs(x) / wide) / (HALF_FIELD * ROOM)));
+      const middle = (k) => { const at = seen.map((s) => s[k] / (far - s[2])); return 0.5 * (Math.min(...at) + Math.max(...at)) * far; };
+      const [dx, dy] = [middle(0), middle(1)];
+      if (turn < 3) center = center.map((v, axis) => v + dx * right[axis] + dy * up[axis]);
+    }
+    return { eye: point(center.map((v, axis) => v + back[axis] * far)), up: point(view.up), center: point(center), projection: { type: "perspective" } };
+  }
   function axis(title, n) {
     return { title: { text: title, font: { size: 11, color: css("--ink-3") } }, range: [data.bounds[0][n], data.bounds[1][n]],
       color: css("--ink-3"), gridcolor: css("--grid"), linecolor: css("--line"), zeroline: false, showbackground: false,
@@ -164,7 +185,7 @@
     constructor(id) {
       this.pane = $(id); this.div = this.pane.querySelector(".plot");
       this.look = 0; this.layer = 0; this.shown = new Set(["scan", "ghost"]); this.linked = []; this.queue = Promise.resolve();
-      this.camera = cameraOf("overview");
+      this.camera = cameraOf("overview", this.pane);
       this.pane.addEventListener("keydown", (event) => this.key(event));
       // The wheel belongs to the page until the drawing has been chosen.
       this.pane.addEventListener("wheel", (event) => { if (!this.pane.contains(document.activeElement)) event.stopPropagation(); }, { capture: true });
@@ -205,18 +226,19 @@
     restyle(change, names) { return this.then(() => Plotly.restyle(this.div, change, names.map((n) => ORDER.indexOf(n)))); }
     key(event) {
       if (event.target !== this.pane || event.altKey || event.ctrlKey || event.metaKey) return;
-      const camera = copy(this.camera), eye = camera.eye;
+      const camera = copy(this.camera), at = camera.center || { x: 0, y: 0, z: 0 };
+      const eye = { x: camera.eye.x - at.x, y: camera.eye.y - at.y, z: camera.eye.z - at.z };
       let radius = Math.hypot(eye.x, eye.y, eye.z), azimuth = Math.atan2(eye.y, eye.x), height = Math.asin(eye.z / radius);
       const step = Math.PI / 24;
       if (event.key === "ArrowLeft") azimuth -= step; else if (event.key === "ArrowRight") azimuth += step;
       else if (event.key === "ArrowUp") height += step; else if (event.key === "ArrowDown") height -= step;
       else if (event.key === "+" || event.key === "=") radius /= 1.12; else if (event.key === "-") radius *= 1.12;
-      else if (event.key === "0") { event.preventDefault(); this.turnAll(cameraOf("overview")); return; }
+      else if (event.key === "0") { event.preventDefault(); this.turnAll(cameraOf("overview", this.pane)); return; }
       else return;
       event.preventDefault();
       height = Math.min(Math.max(height, -1.5), 1.5);
       camera.up = { x: 0, y: 0, z: 1 };
-      camera.eye = { x: radius * Math.cos(height) * Math.cos(azimuth), y: radius * Math.cos(height) * Math.sin(azimuth), z: radius * Math.sin(height) };
+      camera.eye = { x: at.x + radius * Math.cos(height) * Math.cos(azimuth), y: at.y + radius * Math.cos(height) * Math.sin(azimuth), z: at.z + radius * Math.sin(height) };
       this.turnAll(camera);
     }
   }
@@ -356,7 +378,8 @@
   }
   function compared(scene, id) {
     const look = data.looks[scene.look];
-    $(id + "-figure").textContent = number(data.volumes.missing[look.index], 1) + " mm³ missing · " + number(data.volumes.excess[look.index], 1) + " mm³ too much";
+    const volume = (v) => v === null ? "not known how much" : number(v, 1) + " mm³";
+    $(id + "-figure").textContent = volume(data.volumes.missing[look.index]) + " missing · " + volume(data.volumes.excess[look.index]) + " too much";
     return scene.draw();
   }
   function theme() {
@@ -378,7 +401,7 @@
         if (box.checked) main.shown.add(box.dataset.layer); else main.shown.delete(box.dataset.layer);
         show(main.shown);
       }));
-      document.querySelectorAll("[data-view]").forEach((b) => b.addEventListener("click", () => main.turn(cameraOf(b.dataset.view))));
+      document.querySelectorAll("[data-view]").forEach((b) => b.addEventListener("click", () => main.turn(cameraOf(b.dataset.view, main.pane))));
       if ($("player")) { $("layer").addEventListener("input", (e) => { stop(); toLayer(Number(e.target.value)); }); $("play").addEventListener("click", play); }
       $("look").value = data.compare[0];
       selectLook(data.compare[0]);

@@ -1,0 +1,71 @@
+"""`amrepair doctor`: what this machine lacks, and how to mend it."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from typing import Any
+
+import typer
+
+import amrepair
+from amrepair.cli.options import JsonOption
+from amrepair.doctor import Finding, State, examine
+from gcode.cli import console
+
+_MARKS = {State.OK: "ok  ", State.NOTE: "note", State.BAD: "BAD "}
+_COLOURS = {State.OK: "green", State.NOTE: "yellow", State.BAD: "bold red"}
+BAD_EXIT = 2
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(
+        "doctor",
+        epilog=console.examples("amrepair doctor", "amrepair doctor --json > doctor.json"),
+    )(doctor)
+
+
+def doctor(as_json: JsonOption = False) -> None:
+    """Check Python, libraries, torch, open3d, profiles, ports, disk and cache; say how to mend.
+
+    Exit 0 where every command can work, 2 where one cannot.
+    """
+    with console.errors.status("doctor") as status:
+        findings = examine(lambda name: status.update(f"doctor: {name}"))
+    healthy = all(finding.state is not State.BAD for finding in findings)
+    if as_json:
+        console.show_json(_result(findings, healthy))
+    else:
+        for finding in findings:
+            _say(finding)
+    if not healthy:
+        raise typer.Exit(BAD_EXIT)
+
+
+def _say(finding: Finding) -> None:
+    colour = _COLOURS[finding.state]
+    console.out.print(_MARKS[finding.state], style=colour, end=" ")
+    console.out.print(f"{finding.name:<17}{finding.found}", markup=False)
+    if finding.mend:
+        console.out.print(f"{'':22}→ {finding.mend}", markup=False)
+
+
+def _result(findings: tuple[Finding, ...], healthy: bool) -> dict[str, Any]:
+    return {
+        "ok": healthy,
+        "checks": [
+            {
+                "name": finding.name,
+                "state": str(finding.state),
+                "found": finding.found,
+                "mend": finding.mend or None,
+            }
+            for finding in findings
+        ],
+        "versions": {
+            "amrepair": amrepair.__version__,
+            "python": platform.python_version(),
+            "executable": sys.executable,
+        },
+    }

@@ -1,0 +1,215 @@
+"""`amrepair view`: files on a page; and the live view that `loop` and `simulate` share."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from amrepair.errors import InputError
+from amrepair.loop import Look
+from amrepair.repair import RepairPlan
+from amrepair.report.guarded import LOOPBACK
+from amrepair.report.operator import Operator
+from amrepair.scans import read_scan
+from amrepair.scans.files import SUFFIXES as SCAN_SUFFIXES
+from amrepair.template import LearnedSdf
+from amrepair.template.mesh_file import SUFFIXES as MESH_SUFFIXES
+from amrepair.template.mesh_file import load_mesh
+from gcode.cli import console
+from gcode.progress import Progress
+from gcode.reader import Job, read_job
+
+if TYPE_CHECKING:
+    from amrepair.report.live import LiveView
+
+JOB_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".nc"})
+VIEW_PORT = 8642
+TOKEN_VARIABLE = "AMREPAIR_TOKEN"
+
+HostOption = Annotated[
+    str, typer.Option(help="Address to serve on; any but this machine's own needs --token.")
+]
+PortOption = Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")]
+ViewOption = Annotated[
+    bool, typer.Option("--view", help="Show the run in a browser, with buttons that drive it.")
+]
+TokenOption = Annotated[
+    str | None,
+    typer.Option(
+        envvar=TOKEN_VARIABLE, help="Secret that the page's address must carry; see --host."
+    ),
+]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(
+        "view",
+        epilog=console.examples(
+            "amrepair view scan.ply part.stl",
+            "amrepair view out/demo/scan-1.ply out/demo/deficit-1.stl out/demo/repair-1.gcode",
+        ),
+    )(view)
+
+
+def view(
+    files: Annotated[
+        list[Path], typer.Argument(help="Scans, meshes, templates (.safetensors), G-code.")
+    ],
+    host: HostOption = LOOPBACK,
+    port: PortOption = VIEW_PORT,
+    token: TokenOption = None,
+) -> None:
+    """Show files together in a browser, each with a box to hide it; Ctrl+C ends it."""
+    from amrepair.report.live import LiveView
+
+    for path in files:
+        _refuse(path)
+    page = LiveView(title="amrepair view", host=host, port=port, token=token)
+    try:
+        for path in files:
+            show_file(page, path)
+        page.say("Files", [path.name for path in files])
+        console.out.print(f"Open {page.url} (Ctrl+C ends it)", markup=False)
+        _until_interrupted()
+    finally:
+        page.close()
+
+
+def show_file(page: LiveView, path: Path) -> None:
+    """Put a file on the page, by the ending of its name.
+
+    Raises
+    ------
+    InputError
+        If it is none that can be shown.
+    """
+    from amrepair.report.live import PART
+
+    _refuse(path)
+    suffix = path.suffix.lower()
+    if suffix in JOB_SUFFIXES:
+        text = path.read_text(encoding="utf-8", errors="replace")
+        page.show_job(read_job(text), name=path.name, grown=True)
+    elif suffix == ".safetensors":
+        page.show_solid(path.name, LearnedSdf.load(path).solid(), PART)
+    elif suffix in MESH_SUFFIXES and not _is_cloud(path):
+        mesh = load_mesh(path)
+        page.show_mesh(path.name, np.asarray(mesh.vertices), np.asarray(mesh.faces), PART)
+    else:
+        page.show_cloud(path.name, np.array(read_scan(path, frame="file").points_mm))
+
+
+def _refuse(path: Path) -> None:
+    known = JOB_SUFFIXES | {".safetensors"} | set(MESH_SUFFIXES) | SCAN_SUFFIXES
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file")
+    if path.suffix.lower() not in known:
+        raise InputError(f"{path} cannot be shown; it is one of {', '.join(sorted(known))}")
+
+
+def _is_cloud(path: Path) -> bool:
+    """A PLY without faces is a scan."""
+    if path.suffix.lower() != ".ply":
+        return False
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return b"element face" not in head or b"element face 0" in head
+
+
+def _until_interrupted() -> None:
+    """Wait for Ctrl+C or a polite kill."""
+    over = threading.Event()
+    with contextlib.suppress(ValueError):  # not the main thread
+        signal.signal(signal.SIGTERM, lambda *_: over.set())
+    try:
+        over.wait()
+    except KeyboardInterrupt:
+        return
+
+
+class NoView:
+    """What a run tells where nobody looks."""
+
+    def show_run(self, job: Job, part: Any) -> None:
+        """Nothing is shown."""
+
+    def drives(self, pause: Callable[[], None], resume: Callable[[], None]) -> None:
+        """Nothing is driven."""
+
+    def approve(self, plan: RepairPlan) -> bool:
+        """Nobody is asked."""
+        return True
+
+    def recording(self, record: Callable[[Look], None]) -> Callable[[Look], None]:
+        """The same."""
+        return record
+
+    def watching(self, progress: Progress) -> Progress:
+        """The same."""
+        return progress
+
+
+@dataclass(frozen=True, slots=True)
+class ShownRun:
+    """A run on a page, with its operator."""
+
+    page: LiveView
+    operator: Operator
+    ask: bool
+
+    def show_run(self, job: Job, part: Any) -> None:
+        """The part as it should be, and the beads that will appear."""
+        from amrepair.report.live import PART
+
+        self.page.show_solid("part", part, PART, opacity=0.25)
+        self.page.show_job(job)
+
+    def drives(self, pause: Callable[[], None], resume: Callable[[], None]) -> None:
+        """What the pause button calls."""
+        self.operator.on_pause, self.operator.on_resume = pause, resume
+
+    def approve(self, plan: RepairPlan) -> bool:
+        """Wait for a button, where the run asks at all."""
+        return self.page.approve(plan) if self.ask else True
+
+    def recording(self, record: Callable[[Look], None]) -> Callable[[Look], None]:
+        """Record a look, then show it."""
+
+        def both(look: Look) -> None:
+            record(look)
+            self.page.record(look)
+
+        return both
+
+    def watching(self, progress: Progress) -> Progress:
+        """Report progress here and on the page."""
+        return self.page.watching(progress)
+
+
+@contextmanager
+def live_view(
+    asked: bool, *, ask: bool, title: str, host: str, port: int, token: str | None
+) -> Iterator[NoView | ShownRun]:
+    """A page with buttons for a run, or nothing where nobody asked for one."""
+    if not asked:
+        yield NoView()
+        return
+    from amrepair.report.live import LiveView
+
+    operator = Operator()
+    page = LiveView(title=title, operator=operator, host=host, port=port, token=token)
+    console.errors.print(f"Open {page.url}: approve, skip and pause are there.", markup=False)
+    try:
+        yield ShownRun(page, operator, ask)
+    finally:
+        page.close()

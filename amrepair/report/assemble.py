@@ -1,0 +1,117 @@
+"""`ReportData` of whole runs: one planned repair, or a loop over a job.
+
+The command line and scripts share it; figures come from `collect`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from amrepair.loop import LoopReport
+from amrepair.repair import RepairPlan
+from amrepair.report.collect import (
+    decision_of,
+    look_of,
+    region_rows,
+    solid_mesh,
+    versions,
+    wire_counters,
+)
+from amrepair.report.data import Figures, ReportData, TemperatureSeries
+from amrepair.report.text import outcome_of
+from amrepair.template.port import Template
+from gcode.profiles import PrintSetup
+
+LEFT_OUT_RATIO = 0.05  # of what is missing may stay out of reach
+
+
+def plan_is_enough(plan: RepairPlan) -> bool:
+    """Whether the program fills all that is missing, and nothing else is wrong."""
+    if plan.within_tolerance:
+        return True
+    if plan.checked is None or plan.patch is None or plan.too_much:
+        return False
+    left_mm3 = sum(u.volume_mm3 for u in plan.patch.unreachable)
+    left_mm3 += sum(u.volume_mm3 for u in plan.patch.unprintable)
+    return left_mm3 <= LEFT_OUT_RATIO * plan.deficit.missing_mm3
+
+
+def report_of_plan(
+    plan: RepairPlan,
+    result: Mapping[str, Any],
+    *,
+    title: str,
+    setup: PrintSetup,
+    template: Template,
+    scan_name: str = "",
+) -> ReportData:
+    """The page of one planned repair.
+
+    Parameters
+    ----------
+    result
+        Of `plan_result`.
+    """
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    solid: Any = template.solid()
+    return ReportData(
+        title=title,
+        outcome=outcome_of(result, within_tolerance=plan_is_enough(plan)),
+        figures=Figures.from_result(result),
+        looks=(look_of(plan, "as scanned", printed=False),),
+        setup={"scan": scan_name or Path(plan.scan.source).name, **_profiles(setup)},
+        expected=solid_mesh(solid.transform(placed.matrix[:3])),
+        regions=region_rows(plan),
+        seconds=result["seconds"],
+        provenance=versions(setup),
+    )
+
+
+def report_of_loop(
+    report: LoopReport,
+    result: Mapping[str, Any],
+    *,
+    title: str,
+    setup: PrintSetup,
+    about: Mapping[str, str] | None = None,
+    expected: Any = None,
+    temperatures: tuple[TemperatureSeries, ...] = (),
+) -> ReportData:
+    """The page of a job with its looks.
+
+    Parameters
+    ----------
+    result
+        Of `loop_result`.
+    about
+        What else stands under the title.
+    expected
+        The part as it should be (`manifold3d.Manifold`, build frame), or None.
+    """
+    return ReportData(
+        title=title,
+        outcome=outcome_of(result, within_tolerance=report.within_tolerance),
+        figures=Figures.from_result(result),
+        looks=tuple(
+            look_of(look.plan, f"{look.stop.label}, scan {look.number}", printed=look.printed)
+            for look in report.looks
+        ),
+        setup={**_profiles(setup), **(about or {})},
+        expected=None if expected is None else solid_mesh(expected),
+        regions=tuple(row for look in report.first_looks for row in region_rows(look.plan)),
+        decisions=tuple(decision_of(look) for look in report.looks),
+        wire=wire_counters(report),
+        temperatures=temperatures,
+        seconds=result["seconds"],
+        provenance={"seed": str(result.get("seed")), **versions(setup)},
+    )
+
+
+def _profiles(setup: PrintSetup) -> dict[str, str]:
+    return {
+        "printer": setup.printer.name,
+        "material": setup.material.name,
+        "process": setup.process.name,
+    }

@@ -1,0 +1,106 @@
+"""The documentation builds without warnings, fetches nothing, and what it says to type works."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from html.parser import HTMLParser
+from importlib.util import find_spec
+from pathlib import Path
+
+import click
+import pytest
+import typer
+
+from amrepair.cli.app import app as amrepair_app
+from gcode.cli.app import app as gcode_app
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+APPS = {"amrepair": amrepair_app, "gcode": gcode_app}
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+
+
+def typed(page: Path) -> list[str]:
+    """Lines of shell blocks that call our programs."""
+    text = "\n".join(blocks(page, "sh")).replace("\\\n", " ")
+    return [line for line in text.splitlines() if line.split(" ")[0] in APPS]
+
+
+SHELL = [(page, line) for page in (*PAGES, ROOT / "README.md") for line in typed(page)]
+
+
+@pytest.mark.parametrize(
+    ("page", "line"), SHELL, ids=[f"{page.stem}: {line[:40]}" for page, line in SHELL]
+)
+def test_what_is_typed_is_understood(page: Path, line: str) -> None:
+    words = shlex.split(line, comments=True)
+    command: click.Command = typer.main.get_command(APPS[words[0]])
+    rest = words[1:]
+    while getattr(command, "commands", None):
+        command = command.commands[rest.pop(0)]  # type: ignore[attr-defined]
+    command.make_context(words[0], rest)  # parses, runs nothing
+
+
+WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
+
+
+@pytest.mark.usefixtures("small_fits")
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.stem)
+def test_python_on_a_page_runs(
+    page: Path, example_files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(example_files)
+    names: dict[str, object] = {}
+    for block in blocks(page, "python"):  # a page is read from top to bottom
+        exec(compile(block, str(page), "exec"), names)
+    if page.stem == "tutorial":
+        assert (example_files / "repair.gcode").is_file()
+
+
+def test_every_example_is_on_its_page() -> None:
+    said = (DOCS / "examples.md").read_text(encoding="utf-8")
+    for path in (ROOT / "examples").glob("[0-9]*.py"):
+        assert f"`examples/{path.name}`" in said
+
+
+class Fetched(HTMLParser):
+    """What a browser would load while it shows a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        if tag in {"script", "img", "iframe", "source"} and values.get("src"):
+            self.found.append(str(values["src"]))
+        if tag == "link" and values.get("rel") in {"stylesheet", "preconnect", "icon"}:
+            self.found.append(str(values["href"]))
+
+
+@pytest.mark.skipif(find_spec("mkdocs") is None, reason="the extra 'docs' is not installed")
+def test_it_builds_without_warnings_and_fetches_nothing(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path / "site"],
+        capture_output=True, text=True, timeout=200, check=False, cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) >= len(PAGES)
+    for page in pages:
+        fetched = Fetched()
+        fetched.feed(page.read_text(encoding="utf-8"))
+        assert not [url for url in fetched.found if "//" in url], page
+    reference = (tmp_path / "site" / "reference" / "amrepair.html").read_text(encoding="utf-8")
+    assert "build_from_template" in reference  # taken from the docstrings
+    assert "amrepair repair" in (tmp_path / "site" / "reference" / "commands.html").read_text()
