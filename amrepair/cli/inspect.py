@@ -9,7 +9,8 @@ import numpy as np
 import typer
 
 from amrepair.cli.files import open_template
-from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors
+from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors, with_settings
+from amrepair.errors import InputError
 from amrepair.repair import Stopwatch
 from amrepair.report.collect import rounded
 from amrepair.report.folder import RunFolder
@@ -35,21 +36,37 @@ def align(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="The scan in the template's frame (.ply).")
     ] = None,
-    method: Annotated[str, typer.Option(help="robust, or paper.")] = "robust",
+    method: Annotated[str, typer.Option(help="robust, or paper (PAM).")] = "robust",
+    pam: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Setting of the method paper, name=value; variant=code is the released code, "
+            "ransac=off, icp=off or iterate=off an ablation. May be repeated."
+        ),
+    ] = None,
     sensor_at: SensorOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Find where a scan lies in its template."""
     from amrepair.align import align as align_scan
+    from amrepair.align.pam import VARIANTS
 
+    if pam and method != "paper":
+        raise InputError(f"--pam belongs to --method paper, the method is {method}")
+    settings = with_settings(VARIANTS, pam, "--pam")
     watch, bars = Stopwatch(), console.Bars()
     cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
     with bars.shown():
         field = open_template(template, progress=bars)
         with watch("align"):
             found = align_scan(
-                cloud, field, method=method, rng=np.random.default_rng(seed), progress=bars
+                cloud,
+                field,
+                method=method,
+                pam_options=settings,
+                rng=np.random.default_rng(seed),
+                progress=bars,
             )
     if output is not None:
         moved = cloud.moved(found.template_from_scan)
