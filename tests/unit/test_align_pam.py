@@ -1,4 +1,4 @@
-"""PAM: poses come back to the accuracy of point-to-point ICP; each ablation loses what it should."""
+"""PAM: poses come back to what point-to-point ICP can do; each ablation loses what it should."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from amrepair.scans import Scan
 from amrepair.template import MeshSdf, load_mesh
 
 BRACKET = Path(__file__).parents[2] / "examples" / "parts" / "bracket.stl"
-QUICK = replace(PAPER, target_points=15_000)
+# Well placed clouds of these sizes have a loss of 2.8e-4, all of it sampling; a pose 1 mm off has
+# 4.5e-4, which the paper's own limit of 0.016 lets pass.
+STRICT = replace(PAPER, target_points=15_000, threshold=3.3e-4, threshold_step=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,7 @@ def run(template: MeshSdf, points: np.ndarray, options: PamOptions) -> Registrat
     )
 
 
-@pytest.mark.parametrize("options", [QUICK, replace(CODE, target_points=15_000)])
+@pytest.mark.parametrize("options", [STRICT, replace(CODE, target_points=15_000)])
 def test_a_full_scan_is_found_from_far_away(template: MeshSdf, options: PamOptions) -> None:
     points, truth = turned(cloud(template, 1), 1, 2.5)
     found = run(template, points, options)
@@ -66,15 +68,15 @@ def test_a_full_scan_is_found_from_far_away(template: MeshSdf, options: PamOptio
 
 def test_without_ransac_it_stays_where_it_started(template: MeshSdf) -> None:
     points, _ = turned(cloud(template, 2), 2, 2.0)
-    with pytest.raises(AlignmentError, match="did not converge|does not fit"):
-        run(template, points, replace(QUICK, ransac=False, iterate=False))
+    with pytest.raises(AlignmentError, match=r"did not converge|does not fit"):
+        run(template, points, replace(STRICT, ransac=False, iterate=False))
 
 
 def test_without_icp_it_is_coarse(template: MeshSdf) -> None:
     points, truth = turned(cloud(template, 3), 3, 2.0)
     off_mm = {}
     for icp in (True, False):
-        found = run(template, points, replace(QUICK, icp=icp))
+        found = run(template, points, replace(STRICT, icp=icp))
         apart = found.template_from_scan.apply(points) - truth.apply(points)
         off_mm[icp] = float(np.linalg.norm(apart, axis=1).max())
     assert off_mm[True] < 0.15
@@ -115,12 +117,12 @@ def test_the_pose_does_not_depend_on_scale_or_frame(template: MeshSdf) -> None:
 def test_another_part_is_refused(template: MeshSdf) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
     with pytest.raises(AlignmentError):
-        run(template, np.asarray(ball.vertices), replace(QUICK, iterations=2))
+        run(template, np.asarray(ball.vertices), replace(STRICT, iterations=2))
 
 
 def test_metres_are_told(template: MeshSdf) -> None:
     with pytest.raises(AlignmentError, match="metres"):
-        run(template, cloud(template, 0) * 1e-3, QUICK)
+        run(template, cloud(template, 0) * 1e-3, STRICT)
 
 
 def test_settings_by_name() -> None:
