@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from amrepair.errors import InputError
-from amrepair.template import LearnedSdf, load_or_fit
+from amrepair.template import load_or_fit, load_template
 from amrepair.template.mesh_file import SUFFIXES
 from amrepair.template.port import Template
 from gcode.cli.console import write_whole
@@ -25,7 +25,7 @@ def open_template(path: Path, *, progress: Progress = silent) -> Template:
     """
     suffix = path.suffix.lower()
     if suffix == TEMPLATE_SUFFIX:
-        return LearnedSdf.load(path)
+        return load_template(path)
     if suffix in SUFFIXES:
         return load_or_fit(path, progress=progress)
     raise InputError(

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from amrepair.cli.files import open_template, write_mesh
-from amrepair.cli.options import SeedOption
+from amrepair.cli.options import SeedOption, with_settings
+from amrepair.errors import InputError
 from gcode.cli import console
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
@@ -27,16 +28,29 @@ def fit(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Template file (.safetensors).")],
     recipe: Annotated[str, typer.Option(help="fast, or paper for the published network.")] = "fast",
+    paper: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Setting of the recipe paper, name=value; variant=code is the released code, "
+            "encoding=off an ablation, epochs=N shortens it. May be repeated."
+        ),
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     seed: SeedOption = 0,
 ) -> None:
     """Fit the signed distance field that scans are held against."""
     from amrepair.template import fit_template
+    from amrepair.template.paper import VARIANTS
 
+    if paper and recipe != "paper":
+        raise InputError(f"--paper belongs to --recipe paper, the recipe is {recipe}")
+    settings = with_settings(VARIANTS, paper, "--paper")
     console.writable(output)
     bars = console.Bars()
     with bars.shown():
-        template = fit_template(inputs, recipe=recipe, device=device, seed=seed, progress=bars)
+        template = fit_template(
+            inputs, recipe=recipe, paper=settings, device=device, seed=seed, progress=bars
+        )
     template.save(output)
     console.errors.print(f"{output}: surface good to {template.bias_mm:.3f} mm (99 %)")
 

@@ -6,7 +6,6 @@ answers without torch. Fitting is `fit`'s business.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,15 +16,21 @@ from jaxtyping import Bool, Float, Int
 from amrepair.errors import TemplateError
 from amrepair.template import learned_kernels as kernels
 from amrepair.template.cut import CutTemplate
+from amrepair.template.file import (
+    read_template,
+    require_kind,
+    stored_mesh,
+    stored_metadata,
+    write_template,
+)
 from amrepair.template.mesh_file import as_manifold
 from amrepair.template.port import Template
-from amrepair.template.surface import count_for_spacing, sample_surface, triangle_areas_normals
+from amrepair.template.surface import mesh_points
 
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = "amrepair-template"
-FORMAT_VERSION = 1
+KIND = "grid"
 # Central differences of the gradient, in coarse cells: wide enough for float32, within an edge.
 GRADIENT_CELLS = 0.1
 _ARRAYS = ("base", "active", "tables", "w1", "b1", "w2", "b2", "w3", "b3", "vertices_mm", "faces")
@@ -178,12 +183,7 @@ class LearnedSdf:
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
         """(m, 3) points of the part's surface, each for spacing² of area, and their normals."""
-        vertices, faces = np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces)
-        areas, _ = triangle_areas_normals(vertices, faces)
-        points, normals, _ = sample_surface(
-            vertices, faces, count=count_for_spacing(areas, spacing_mm)
-        )
-        return points, normals
+        return mesh_points(self.mesh, spacing_mm)
 
     def solid(self) -> Any:
         """The part as a `manifold3d.Manifold`."""
@@ -197,10 +197,6 @@ class LearnedSdf:
 
     def save(self, path: Path) -> None:
         """Write the template's file, whole or not at all."""
-        import os
-
-        from safetensors.numpy import save
-
         t = self.tables
         arrays = {
             "base": t.base,
@@ -212,30 +208,14 @@ class LearnedSdf:
             "faces": np.asarray(self.mesh.faces, dtype=np.int32),
         }  # fmt: skip
         head = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "units": "mm",
-            "frame": "template",
+            "kind": KIND,
             "origin_mm": t.origin_mm.tolist(),
             "cell_mm": t.cell_mm,
             "level_cells_mm": t.level_cells_mm.tolist(),
             "bias_mm": self.bias_mm,
             **self.metadata,
         }
-        data = save(
-            {name: np.ascontiguousarray(array) for name, array in arrays.items()},
-            metadata={"amrepair": json.dumps(head)},
-        )
-        temporary = path.with_name(f".{os.getpid()}-{path.name}")
-        try:
-            temporary.write_bytes(data)
-            temporary.replace(path)
-        except OSError as error:
-            raise TemplateError(
-                f"the template {path} cannot be written ({error.strerror})"
-            ) from error
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_template(path, arrays, head)
 
     @classmethod
     def load(cls, path: Path) -> LearnedSdf:
@@ -246,9 +226,16 @@ class LearnedSdf:
         TemplateError
             If it is missing, truncated, or no template of ours.
         """
-        arrays, head = _read(Path(path))
-        import trimesh
+        return cls.unpacked(Path(path), *read_template(Path(path)))
 
+    @classmethod
+    def unpacked(
+        cls, path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]
+    ) -> LearnedSdf:
+        """The template in a file's arrays and head."""
+        require_kind(path, head.get("kind", KIND), KIND)
+        if not set(_ARRAYS) <= set(arrays):
+            raise TemplateError(f"{path} lacks parts of a template; fit it again")
         base = arrays["base"]
         cells = np.array(head["level_cells_mm"], dtype=np.float64)
         cell_mm = float(head["cell_mm"])
@@ -262,36 +249,9 @@ class LearnedSdf:
         tables = bare.trained(*(arrays[name] for name in _ARRAYS[2:9]))
         bits = np.unpackbits(arrays["active"])[: tables.active.size]
         tables.active[...] = bits.reshape(tables.active.shape).astype(bool)
-        mesh = trimesh.Trimesh(arrays["vertices_mm"], arrays["faces"], process=False)
-        mesh.metadata["notes"] = ()
-        mesh.metadata["source"] = str(path)
-        known = ("recipe", "seed", "part_sha256", "version", "notes")
-        metadata = {key: str(head[key]) for key in known if key in head}
-        return cls(tables=tables, mesh=mesh, bias_mm=float(head["bias_mm"]), metadata=metadata)
-
-
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and head of a file that is really ours."""
-    from safetensors import SafetensorError, safe_open
-
-    if not path.is_file():
-        raise TemplateError(f"the template {path} does not exist or is not a file")
-    try:
-        with safe_open(path, framework="np") as file:
-            head = json.loads((file.metadata() or {}).get("amrepair", "null"))
-            names = set(file.keys())
-            if not isinstance(head, dict) or head.get("format") != FORMAT:
-                raise TemplateError(
-                    f"{path} is a safetensors file, but no template of ours; fit one with "
-                    "'amrepair template fit'"
-                )
-            if head.get("format_version") != FORMAT_VERSION or not set(_ARRAYS) <= names:
-                raise TemplateError(
-                    f"{path} is a template of another version ({head.get('format_version')}, this "
-                    f"one reads {FORMAT_VERSION}); fit it again"
-                )
-            return {name: file.get_tensor(name) for name in _ARRAYS}, head
-    except (SafetensorError, OSError, ValueError) as error:
-        raise TemplateError(
-            f"the template {path} is truncated or no template ({error}); fit it again"
-        ) from error
+        return cls(
+            tables=tables,
+            mesh=stored_mesh(path, arrays),
+            bias_mm=float(head["bias_mm"]),
+            metadata=stored_metadata(head),
+        )
