@@ -36,8 +36,13 @@ def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
     assert row["cd"] is not None
 
 
-def test_the_published_system_runs_by_name_and_says_what_was_shortened(tmp_path: Path) -> None:
-    options = SynthOptions(train=1, normal=2, per_defect=1, points=4000)
+def test_the_published_system_runs_by_name_and_says_what_was_shortened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = replace(PAPER, ransac_iterations=5_000, target_points=5_000)
+    monkeypatch.setattr("amrepair.bench.paper.pam_options", lambda format: quick)
+    monkeypatch.setattr("amrepair.bench.house.SURFACE_SPACING_MM", 2.0)
+    options = SynthOptions(train=1, normal=1, per_defect=1, points=3000)
     data = synthesize([KNOB], tmp_path / "set", "anomaly-shapenet", 0, options=options)
     short = replace(BENCH_PAPER, epochs=4, batch=512, rate=3e-3, dropout=0.0, width=96)
     report = run_bench(
