@@ -169,6 +169,8 @@ def pam(
     """
     o3d = open3d()
     o3d.utility.random.seed(int(rng.integers(2**31)))
+    # its warnings go to standard output, which belongs to the caller
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     middle, start = target_mm.mean(axis=0), source_mm.mean(axis=0)
     radius_mm = float(np.linalg.norm(target_mm - middle, axis=1).max())
     target = (target_mm - middle) / radius_mm

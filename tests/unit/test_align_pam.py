@@ -125,6 +125,15 @@ def test_metres_are_told(template: MeshSdf) -> None:
         run(template, cloud(template, 0) * 1e-3, STRICT)
 
 
+def test_open3d_keeps_off_standard_output(capfd: pytest.CaptureFixture[str]) -> None:
+    # regression: "Too few correspondences after mutual filter" stood before the JSON of --json
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3))
+    with pytest.raises(PamError):
+        pam(points, points[::-1] ** 3, options=replace(STRICT, threshold=0.0, iterate=False),
+            rng=np.random.default_rng(0))  # fmt: skip
+    assert capfd.readouterr().out == ""
+
+
 def test_settings_by_name() -> None:
     words = ["voxel=0.02", "icp=off", "variant=code", "iterations=3"]
     assert with_settings(VARIANTS, words, "--pam") == replace(
