@@ -39,7 +39,7 @@ def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
 def test_the_published_system_runs_by_name_and_says_what_was_shortened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quick = replace(PAPER, ransac_iterations=2_000, iterate=False)
+    quick = replace(PAPER, ransac_iterations=2_000, threshold=1.0)
     monkeypatch.setattr("amrepair.bench.paper.TARGET_POINTS", 5_000)
     monkeypatch.setattr("amrepair.bench.paper.pam_options", lambda format: quick)
     monkeypatch.setattr("amrepair.bench.house.SURFACE_SPACING_MM", 2.0)
