@@ -21,7 +21,8 @@ from amrepair.errors import InputError
 from amrepair.frames import rotation_from_vector
 from amrepair.template import MeshSdf
 
-KNOB = Path(__file__).parents[2] / "examples" / "parts" / "knob.stl"
+PARTS = Path(__file__).parents[2] / "examples" / "parts"
+KNOB, BRACKET = PARTS / "knob.stl", PARTS / "bracket.stl"
 
 
 def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
@@ -39,13 +40,13 @@ def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
 def test_the_published_system_runs_by_name_and_says_what_was_shortened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quick = replace(PAPER, ransac_iterations=2_000, threshold=1.0)
+    quick = replace(PAPER, ransac_iterations=20_000, threshold=1.0)
     monkeypatch.setattr("amrepair.bench.paper.TARGET_POINTS", 5_000)
     monkeypatch.setattr("amrepair.bench.paper.pam_options", lambda format: quick)
     monkeypatch.setattr("amrepair.bench.house.SURFACE_SPACING_MM", 2.0)
-    options = SynthOptions(train=1, normal=1, per_defect=1, points=3000)
-    data = synthesize([KNOB], tmp_path / "set", "anomaly-shapenet", 0, options=options)
-    short = replace(BENCH_PAPER, epochs=4, batch=512, rate=3e-3, dropout=0.0, width=96)
+    options = SynthOptions(train=1, normal=1, per_defect=1, points=5000)
+    data = synthesize([BRACKET], tmp_path / "set", "anomaly-shapenet", 0, options=options)
+    short = replace(BENCH_PAPER, epochs=16, batch=512, rate=3e-3, dropout=0.0, width=96)
     report = run_bench(
         data,
         format="anomaly-shapenet",
@@ -61,8 +62,8 @@ def test_the_published_system_runs_by_name_and_says_what_was_shortened(
     assert rows["pasdf-paper"]["p_auroc"] > 0.55
     assert rows["pasdf-paper"]["to_surface"] > 0
     assert rows["btf-raw+pam"]["badly_aligned"] is not None
-    assert said["paper_recipe"]["epochs"] == 4
-    assert "epochs 4 instead of 2000" in report.markdown_path.read_text()
+    assert said["paper_recipe"]["epochs"] == 16
+    assert "epochs 16 instead of 2000" in report.markdown_path.read_text()
     with pytest.raises(InputError, match="another recipe"):
         run_bench(
             data,
@@ -70,7 +71,7 @@ def test_the_published_system_runs_by_name_and_says_what_was_shortened(
             methods=["pasdf-paper"],
             out=tmp_path / "out",
             seeds=[0],
-            paper=replace(short, epochs=5),
+            paper=replace(short, epochs=17),
         )
 
 
