@@ -46,7 +46,7 @@ def test_the_published_system_runs_by_name_and_says_what_was_shortened(
     monkeypatch.setattr("amrepair.bench.house.SURFACE_SPACING_MM", 2.0)
     options = SynthOptions(train=1, normal=1, per_defect=1, points=5000)
     data = synthesize([BRACKET], tmp_path / "set", "anomaly-shapenet", 0, options=options)
-    short = replace(BENCH_PAPER, epochs=16, batch=512, rate=3e-3, dropout=0.0, width=96)
+    short = replace(BENCH_PAPER, epochs=16, batch=256, rate=1e-3, dropout=0.0, width=128)
     report = run_bench(
         data,
         format="anomaly-shapenet",

@@ -16,7 +16,7 @@ from amrepair.template.network import Architecture
 from amrepair.template.paper import CODE, PAPER, VARIANTS, _from_cloud, _queries, fit_paper
 
 # Seconds instead of hours, the same arithmetic.
-QUICK = replace(PAPER, batch=512, rate=3e-3, epochs=10, dropout=0.0, width=96)
+QUICK = replace(PAPER, batch=512, rate=2e-3, epochs=10, dropout=0.0, width=96)
 RADIUS_MM = 10.0
 
 
