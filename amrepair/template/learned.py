@@ -135,6 +135,29 @@ class Tables:
 
 
 @dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How far normal parts differ, where several scans of them disagreed.
+
+    Attributes
+    ----------
+    origin_mm, cell_mm
+        Corner and edge of the cells, template frame.
+    spread_mm
+        (x, y, z) standard deviation between normal parts; 0 away from the surface.
+    """
+
+    origin_mm: Float[np.ndarray, " 3"]
+    cell_mm: float
+    spread_mm: Float[np.ndarray, "x y z"]
+
+    def at(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) spread at the points; beyond the cells that of the nearest."""
+        index = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
+        index = np.clip(index, 0, np.array(self.spread_mm.shape) - 1)
+        return self.spread_mm[tuple(index.T)].astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True)
 class LearnedSdf:
     """A fitted template (`Template`).
 
@@ -146,12 +169,15 @@ class LearnedSdf:
         99th percentile of |f| on points of the surface that training never saw.
     metadata
         Recipe, hashes, seed, versions.
+    tolerance
+        Of templates that were learned from several scans.
     """
 
     tables: Tables
     mesh: trimesh.Trimesh
     bias_mm: float
     metadata: dict[str, str] = field(default_factory=dict)
+    tolerance: Tolerance | None = None
 
     @property
     def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
@@ -174,6 +200,10 @@ class LearnedSdf:
             ahead, behind = self.distance(points_mm + offset), self.distance(points_mm - offset)
             gradient[:, axis] = (ahead - behind) / (2.0 * step_mm)
         return self.distance(points_mm), gradient
+
+    def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) standard deviation between normal parts, 0 where none is known."""
+        return np.zeros(len(points_mm)) if self.tolerance is None else self.tolerance.at(points_mm)
 
     def below_z(self, z_mm: float) -> Template:
         """The part printed so far."""
@@ -215,6 +245,10 @@ class LearnedSdf:
             "bias_mm": self.bias_mm,
             **self.metadata,
         }
+        if self.tolerance is not None:
+            arrays["spread_mm"] = self.tolerance.spread_mm.astype(np.float32)
+            head["spread_origin_mm"] = self.tolerance.origin_mm.tolist()
+            head["spread_cell_mm"] = self.tolerance.cell_mm
         write_template(path, arrays, head)
 
     @classmethod
@@ -254,4 +288,15 @@ class LearnedSdf:
             mesh=stored_mesh(path, arrays),
             bias_mm=float(head["bias_mm"]),
             metadata=stored_metadata(head),
+            tolerance=_stored_tolerance(arrays, head),
         )
+
+
+def _stored_tolerance(arrays: dict[str, np.ndarray], head: dict[str, Any]) -> Tolerance | None:
+    if "spread_mm" not in arrays:
+        return None
+    return Tolerance(
+        np.array(head["spread_origin_mm"], dtype=np.float64),
+        float(head["spread_cell_mm"]),
+        arrays["spread_mm"],
+    )
