@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from amrepair.cli.files import open_template, write_mesh
+from amrepair.cli.files import open_template, sort_inputs, write_mesh
 from amrepair.cli.options import SeedOption, with_settings
 from amrepair.errors import InputError
+from amrepair.template import LearnedSdf, NetworkSdf
 from gcode.cli import console
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
@@ -24,7 +25,9 @@ def add_to(app: typer.Typer) -> None:
 def fit(
     inputs: Annotated[
         list[Path],
-        typer.Argument(help="A mesh of the part as it should be, mm."),
+        typer.Argument(
+            help="A mesh of the part as it should be, or normal scans of it, or both; mm."
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Template file (.safetensors).")],
     recipe: Annotated[str, typer.Option(help="fast, or paper for the published network.")] = "fast",
@@ -47,12 +50,35 @@ def fit(
     settings = with_settings(VARIANTS, paper, "--paper")
     console.writable(output)
     bars = console.Bars()
+    meshes, scans = sort_inputs(inputs)
+    if scans and recipe == "paper" and not meshes:
+        raise InputError("the recipe paper needs a mesh; fit the scans with --recipe fast")
+    template: LearnedSdf | NetworkSdf
     with bars.shown():
-        template = fit_template(
-            inputs, recipe=recipe, paper=settings, device=device, seed=seed, progress=bars
-        )
+        if scans and recipe == "fast":
+            template = _from_scans(scans, meshes, device, seed, bars)
+        else:
+            template = fit_template(
+                meshes, recipe=recipe, paper=settings, device=device, seed=seed, progress=bars
+            )
     template.save(output)
     console.errors.print(f"{output}: surface good to {template.bias_mm:.3f} mm (99 %)")
+    for note in filter(None, template.metadata.get("notes", "").split("; ")):
+        console.errors.print(f"  {note}")
+
+
+def _from_scans(
+    scans: list[Path], meshes: list[Path], device: str, seed: int, bars: console.Bars
+) -> LearnedSdf:
+    from amrepair.consensus import fit_from_scans
+    from amrepair.scans import read_scan
+    from amrepair.template import load_mesh
+
+    if len(meshes) > 1:
+        raise InputError(f"a template has one nominal mesh, {len(meshes)} were given")
+    clouds = [read_scan(path, frame="scanner") for path in scans]
+    mesh = load_mesh(meshes[0]) if meshes else None
+    return fit_from_scans(clouds, mesh=mesh, device=device, seed=seed, progress=bars).template
 
 
 @template_app.command("mesh")

@@ -9,15 +9,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from amrepair.consensus import consensus_kernels as kernels
 
 PLANE_POINTS = 25  # that a plane is fitted to, on average
-DIRECTIONS = 64
+DIRECTIONS = 256  # a deep hole is open in one direction of a hundred
+# Cells that look around themselves; the others are told by their neighbours.
+LOOKING = 4
 # Rays start this many cells away from a surface, so that it does not hide itself.
 SKIP_CELLS = 2.2
 NOISE_QUANTILE = 0.1
+AGREE_ROUNDS = 60  # cells that a verdict travels
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +61,6 @@ def spacing_of(points_mm: Float[np.ndarray, "n 3"]) -> float:
 
     Random points of density ρ have their 8th neighbour at sqrt(8 / πρ) on average.
     """
-    from scipy.spatial import cKDTree
-
     step = max(1, len(points_mm) // 2_000)
     count = min(9, len(points_mm))
     reach = cKDTree(points_mm).query(points_mm[::step], k=[count])[0][:, 0]
@@ -113,14 +116,52 @@ def outward(
     places, first, cell_of = np.unique(key, return_index=True, return_inverse=True)
     occupied = np.zeros(tuple(shape), dtype=bool)
     occupied.reshape(-1)[places] = True
+    # no ray slips through a cell that happens to hold no point
+    occupied |= ndimage.binary_closing(occupied, np.ones((3, 3, 3), dtype=bool))
     count = np.bincount(cell_of)
-    centre = np.stack(
-        [np.bincount(cell_of, weights=points_mm[:, a]) / count for a in range(3)], axis=1
-    )
-    votes = kernels.open_side(centre, directions(), occupied, low, cell_mm, SKIP_CELLS)
-    side = (normals * votes[cell_of]).sum(axis=1)
-    # a cell's points are turned together where they lie in one plane
+
+    def total(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "s 3"]:
+        return np.stack([np.bincount(cell_of, weights=values[:, a]) for a in range(3)], axis=1)
+
+    centre = total(points_mm) / count[:, None]
     same = np.sign((normals * normals[first][cell_of]).sum(axis=1))
-    together = np.bincount(cell_of, weights=side * same)[cell_of] * same
-    flat = np.abs((normals * normals[first][cell_of]).sum(axis=1)) > 0.8
-    return normals * np.where(np.where(flat, together, side) < 0, -1.0, 1.0)[:, None]
+    plane = total(normals * same[:, None])
+    plane /= np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
+    votes = np.zeros_like(centre)
+    votes[::LOOKING] = kernels.open_side(
+        centre[::LOOKING], directions(), occupied, low, cell_mm, SKIP_CELLS
+    )
+    side = _agreed(centre, plane, (plane * votes).sum(axis=1), cell_mm)
+    along = (normals * plane[cell_of]).sum(axis=1)
+    # where a cell holds two planes, the nearest that looked around decides for the other
+    looked = votes[::LOOKING][cKDTree(centre[::LOOKING]).query(centre)[1]]
+    own = (normals * looked[cell_of]).sum(axis=1)
+    sign = np.where(np.abs(along) > 0.5, along * np.sign(side)[cell_of], own)
+    return normals * np.where(sign < 0, -1.0, 1.0)[:, None]
+
+
+def _agreed(
+    centre_mm: Float[np.ndarray, "s 3"],
+    plane: Float[np.ndarray, "s 3"],
+    side: Float[np.ndarray, " s"],
+    cell_mm: float,
+) -> Float[np.ndarray, " s"]:
+    """(s,) the sides, after cells in one plane have told each other: a face turns as a whole."""
+    from scipy.sparse import coo_matrix
+
+    pairs = cKDTree(centre_mm).query_pairs(1.9 * cell_mm, output_type="ndarray")
+    i, j = pairs[:, 0], pairs[:, 1]
+    cosine = (plane[i] * plane[j]).sum(axis=1)
+    offset = centre_mm[j] - centre_mm[i]
+    reach = np.linalg.norm(offset, axis=1)
+    height = np.abs((offset * (plane[i] + np.sign(cosine)[:, None] * plane[j])).sum(axis=1)) / 2
+    together = (np.abs(cosine) > 0.8) & (height < 0.35 * reach)
+    weight = np.where(together, cosine, 0.0)
+    count = len(centre_mm)
+    graph = coo_matrix((weight, (i, j)), shape=(count, count)).tocsr()
+    graph = graph + graph.T
+    degree = np.maximum(np.asarray(np.abs(graph).sum(axis=1)).ravel(), 1.0)
+    found = side
+    for _ in range(AGREE_ROUNDS):
+        found = 0.05 * side + 0.95 * (graph @ found) / degree
+    return np.where(found == 0, side, found)

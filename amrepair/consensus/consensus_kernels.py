@@ -12,6 +12,8 @@ from numba import njit, prange
 
 # Most points that one fit looks at; denser clouds are thinned before.
 MAX_NEAR = 2048
+# The scans' own variance is taken off twice: at edges they differ by where their points fell.
+NOISE_FACTOR = 2.0
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -123,7 +125,7 @@ def open_side(places, directions, occupied, low, cell, skip):
                 ):
                     break
                 if occupied[ix, iy, iz]:
-                    weight = 0.3 * min(t / longest, 1.0)
+                    weight = 0.02 * min(t / longest, 1.0)
                     break
                 t += step
             for a in range(3):
@@ -201,12 +203,13 @@ def consensus_field(
 ):  # fmt: skip
     """Signed distance at nodes by robust moving least squares, and how far scans disagree.
 
-    Returns (n,) f (NaN without support), (n,) robust standard deviation between scans (−1 where
-    one scan alone decides), (n,) scans that were heard, (n,) scans that were overruled.
+    Returns (n,) f (NaN without support), (n,) variance between scans less what their noise makes
+    (may be negative by chance; NaN where one scan alone decides), (n,) scans that were heard, (n,)
+    scans that were overruled.
     """
     n = len(nodes)
     field = np.full(n, np.nan)
-    spread = np.full(n, -1.0)
+    excess = np.full(n, np.nan)
     heard = np.zeros(n, np.int64)
     overruled = np.zeros(n, np.int64)
     limit = radius * radius
@@ -250,7 +253,6 @@ def consensus_field(
         for j in range(m):
             s = scan[near[j]]
             total[s] += weight[j]
-            square[s] += weight[j] * weight[j]
             value[s] += weight[j] * height[j]
             number[s] += 1
         said = np.empty(scans)
@@ -260,6 +262,14 @@ def consensus_field(
                 value[s] /= total[s]
                 said[who] = value[s]
                 who += 1
+        # variance of each scan's mean, from its own scatter: at edges more than noise
+        for j in range(m):
+            s = scan[near[j]]
+            off = height[j] - value[s]
+            square[s] += weight[j] * weight[j] * (off * off + sigma * sigma)
+        for s in range(scans):
+            if number[s] >= 3:
+                square[s] = np.sqrt(square[s]) / total[s]
         heard[k] = who
         banned = np.zeros(scans, np.bool_)
         if who >= 2:
@@ -271,7 +281,7 @@ def consensus_field(
             for s in range(scans):
                 if number[s] < 3:
                     continue
-                noise = sigma * np.sqrt(square[s]) / total[s]
+                noise = square[s]
                 bound = max(outlier_sigmas * max(scale, noise), outlier_mm)
                 if who >= 3 and abs(value[s] - middle) > bound:
                     banned[s] = True
@@ -286,9 +296,11 @@ def consensus_field(
                 variance = 0.0
                 for s in range(scans):
                     if number[s] >= 3 and not banned[s]:
-                        noise = sigma * np.sqrt(square[s]) / total[s]
-                        variance += (value[s] - mean) ** 2 - noise**2 * (kept - 1) / kept
-                spread[k] = np.sqrt(max(variance / (kept - 1), 0.0))
+                        noise = square[s]
+                        variance += (value[s] - mean) ** 2 - NOISE_FACTOR * noise**2 * (
+                            kept - 1
+                        ) / kept
+                excess[k] = variance / (kept - 1)
         # together: robust implicit moving least squares, which keeps edges (Öztireli 2009)
         f = 0.0
         gx = gy = gz = 0.0
@@ -318,4 +330,4 @@ def consensus_field(
             norm = max(np.sqrt(ax * ax + ay * ay + az * az), 1e-12)
             gx, gy, gz = ax / norm, ay / norm, az / norm
         field[k] = f
-    return field, spread, heard, overruled
+    return field, excess, heard, overruled

@@ -213,4 +213,4 @@ def _notes(scans: Sequence[Scan], placed: Placed, fused: Fused, used: int) -> tu
 
 
 def _sha256(scan: Scan) -> str:
-    return hashlib.sha256(np.ascontiguousarray(scan.points_mm)).hexdigest()
+    return hashlib.sha256(np.ascontiguousarray(scan.points_mm).tobytes()).hexdigest()

@@ -34,7 +34,8 @@ POISSON_DEPTH, POISSON_POINTS = 8, 150_000
 SURE = 0.97  # share of a component's neighbours that must agree about its side
 DUST_RATIO = 1e-3  # closed pieces smaller than this share of the whole are clutter
 SPREAD_CELLS = 5  # nodes along the edge of a cell of the stored spread
-SPREAD_QUANTILE = 0.9
+LEAST_NODES = 8  # that a cell's spread is pooled from
+LEAST_SPREAD_MM = 0.01  # below this chance cannot be told from disagreement
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,7 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None 
     edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / 400.0)
     low, shape, nodes, index = _band(points, edge, radius_mm, behind)
     cells = Cells.of(points, radius_mm)
-    field, spread, heard, overruled = kernels.consensus_field(
+    field, excess, heard, overruled = kernels.consensus_field(
         nodes, np.ascontiguousarray(points[cells.order]),
         np.ascontiguousarray(normals[cells.order]), np.ascontiguousarray(scan[cells.order]),
         cloud.scans, cells.low_mm, cells.cell_mm, cells.shape, cells.start, radius_mm,
@@ -137,11 +138,11 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None 
     _fill(grid, seen, low, edge, (points, normals), behind)
     mesh = _surface(grid, low, edge)
     close = np.isfinite(field) & (np.abs(field) < edge)
-    noise = spread[close & (spread >= 0)] / np.sqrt(np.maximum(heard[close & (spread >= 0)], 1))
+    spread = _spread(excess, close, index, low, edge, shape) if cloud.scans > 1 else None
     return Fused(
         mesh=mesh,
-        spread=_spread(spread, close, index, low, edge, shape) if cloud.scans > 1 else None,
-        standard_error_mm=float(np.quantile(noise, 0.99)) if len(noise) else cloud.sigma_mm,
+        spread=spread,
+        standard_error_mm=_standard_error(cloud, spread, radius_mm),
         unseen_ratio=_unseen(mesh, seen, low, edge),
         single_ratio=float((heard[close] == 1).mean()) if close.any() else 1.0,
         overruled_ratio=float((overruled[close] > 0).mean()) if close.any() else 0.0,
@@ -312,26 +313,36 @@ def _surface(
 
 
 def _spread(
-    spread: Float[np.ndarray, " k"],
+    excess: Float[np.ndarray, " k"],
     close: Bool[np.ndarray, " k"],
     index: Int[np.ndarray, "k 3"],
     low: Float[np.ndarray, " 3"],
     edge: float,
     shape: Int[np.ndarray, " 3"],
 ) -> Spread:
-    """A high quantile of the disagreement in each coarse cell, and in its neighbours."""
-    used = close & (spread > 0)
+    """Variance between scans pooled over coarse cells: chance averages out, disagreement stays."""
+    used = close & np.isfinite(excess)
     coarse = index[used] // SPREAD_CELLS
     size = shape // SPREAD_CELLS + 1
     key = (coarse[:, 0] * size[1] + coarse[:, 1]) * size[2] + coarse[:, 2]
-    order = np.lexsort((spread[used], key))
-    ranked, values = key[order], spread[used][order]
-    places, first, count = np.unique(ranked, return_index=True, return_counts=True)
-    found = np.zeros(int(np.prod(size)), dtype=np.float32)
-    pick = first + np.minimum((SPREAD_QUANTILE * count).astype(np.int64), count - 1)
-    found[places] = values[pick]
+    cells = int(np.prod(size))
+    count = np.bincount(key, minlength=cells)
+    pooled = np.bincount(key, weights=excess[used], minlength=cells) / np.maximum(count, 1)
+    pooled[count < LEAST_NODES] = 0.0
+    found = np.sqrt(np.maximum(pooled, 0.0)).astype(np.float32)
+    found[found < LEAST_SPREAD_MM] = 0.0
     grown = ndimage.maximum_filter(found.reshape(tuple(size)), size=3)
     return Spread(low - 0.5 * edge, SPREAD_CELLS * edge, grown)
+
+
+def _standard_error(cloud: Cloud, spread: Spread | None, radius_mm: float) -> float:
+    """How well the consensus is known at the 99th percentile: noise, and scans that differ."""
+    near = 0.36 * np.pi * (radius_mm / cloud.spacing_mm) ** 2
+    noise_mm = cloud.sigma_mm / np.sqrt(max(near, 1.0))
+    if spread is None or not (spread.values_mm > 0).any():
+        return float(noise_mm)
+    high = float(np.quantile(spread.values_mm[spread.values_mm > 0], 0.99))
+    return float(np.hypot(noise_mm, high / np.sqrt(cloud.scans)))
 
 
 def _unseen(

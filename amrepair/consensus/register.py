@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.coarse import cube_rotations
 from amrepair.align.refine import thin_out
+from amrepair.consensus.cloud import planes, spacing_of
 from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector
 from gcode.progress import Progress, silent
@@ -23,6 +24,9 @@ from gcode.progress import Progress, silent
 COARSE_POINTS, FINE_POINTS = 15_000, 12_000
 VOXEL_RATIOS = (0.012, 0.02)  # of the diagonal
 GOOD_OVERLAP, LEAST_OVERLAP = 0.6, 0.25
+# A point farther from the model than it lies overlaps by reach is above it, not beside it, where
+# this share of the way is along the normal; it counts this many times.
+ABOVE, CONTRADICTION = 0.8, 3.0
 ROUNDS = 12
 SHRINK = 0.6
 
@@ -126,21 +130,29 @@ def _coverage(points_mm: Float[np.ndarray, "n 3"], voxel_mm: float) -> int:
 def _propose(
     source_mm: Float[np.ndarray, "n 3"], model_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
 ) -> tuple[float, Float[np.ndarray, "4 4"]]:
-    """The best pose of a scan on the model, and the share of it that lies there."""
-    best_overlap, best_cost, best_pose = 0.0, np.inf, np.eye(4)
+    """The best pose of a scan on the model, and the share of it that lies there.
+
+    Overlap alone would lay one half of a part on the other. A point beside the model's rim says
+    nothing; one above or below its surface contradicts the pose.
+    """
+    best_overlap, best_score, best_pose = 0.0, -np.inf, np.eye(4)
     tree = cKDTree(model_mm)
     usual = float(np.median(tree.query(model_mm[:: max(1, len(model_mm) // 2000)], k=[2])[0]))
     reach_mm = 3.0 * usual
+    plane = planes(model_mm, spacing_of(model_mm))[0]
     target, target_tree = _prepared(model_mm, diagonal_mm)
     source, _ = _prepared(source_mm, diagonal_mm)
     for guess in _guesses(source_mm, model_mm, diagonal_mm):
         pose = _gicp(target, source, target_tree, guess, 0.02 * diagonal_mm)
-        distance = tree.query(_apply(pose, source_mm), workers=-1)[0]
+        moved = _apply(pose, source_mm)
+        distance, index = tree.query(moved, workers=-1)
+        height = np.abs(((moved - model_mm[index]) * plane[index]).sum(axis=1))
         overlap = float((distance < reach_mm).mean())
-        cost = float(np.minimum(distance, 3 * reach_mm).mean())
-        if cost < best_cost:
-            best_overlap, best_cost, best_pose = overlap, cost, pose
-        if best_overlap > 0.97:
+        against = (distance > reach_mm) & (height > ABOVE * distance)
+        score = overlap - CONTRADICTION * float((against & (distance < 0.1 * diagonal_mm)).mean())
+        if score > best_score:
+            best_overlap, best_score, best_pose = overlap, score, pose
+        if best_score > 0.97:
             break
     return best_overlap, best_pose
 
@@ -227,7 +239,7 @@ def _together(
     """All poses but the first, refined against all other scans in turn, point to plane."""
     found = [np.array(pose) for pose in poses]
     sample = [rng.permutation(len(p.points_mm))[:FINE_POINTS] for p in pieces]
-    noise_mm = max(max(p.sigma_mm for p in pieces), 1e-3)
+    noise_mm = max(1e-3, *(p.sigma_mm for p in pieces))
     scale_mm = max(10.0 * noise_mm, 0.5 * max(p.spacing_mm for p in pieces))
     rmse_mm = 0.0
     for _ in range(ROUNDS):
