@@ -19,7 +19,8 @@ from scipy.spatial import cKDTree
 from amrepair.align import align
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
-from amrepair.errors import AlignmentError, InputError
+from amrepair.consensus import fit_from_scans
+from amrepair.errors import AlignmentError
 from amrepair.scans.scan import Scan
 from amrepair.template import (
     LearnedSdf,
@@ -62,24 +63,30 @@ def class_template(
 ) -> LearnedSdf | NetworkSdf:
     """The class's template; fitted once for each seed, then read from the cache.
 
-    Raises
-    ------
-    InputError
-        If the class has no normal mesh.
+    A class without a normal mesh gets the consensus of its training clouds.
     """
     words = "" if recipe == "fast" else hashlib.sha256(repr(paper).encode()).hexdigest()[:8]
     path = cache / f"{data.name}-{recipe}{words}-{seed}.safetensors"
     if path.is_file():
         return load_template(path)
+    template: LearnedSdf | NetworkSdf
     if data.mesh is None:
-        raise InputError(
-            f"the class {data.name} has no normal mesh; templates from scans alone are not there "
-            "yet, choose a baseline"
-        )
-    template = fit_template(data.mesh, recipe=recipe, paper=paper, seed=seed)
+        template = _from_clouds(data, seed)
+        if recipe != "fast":
+            template = fit_template(template.mesh, recipe=recipe, paper=paper, seed=seed)
+    else:
+        template = fit_template(data.mesh, recipe=recipe, paper=paper, seed=seed)
     cache.mkdir(parents=True, exist_ok=True)
     template.save(path)
     return template
+
+
+def _from_clouds(data: ClassInput, seed: int) -> LearnedSdf:
+    scans = [
+        Scan(cloud, data.sigma_mm, "scanner", source=f"{data.name}, training cloud {k}")
+        for k, cloud in enumerate(data.clouds_mm)
+    ]
+    return fit_from_scans(scans, seed=seed).template
 
 
 def _place(

@@ -21,12 +21,15 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector
 from gcode.progress import Progress, silent
 
-COARSE_POINTS, FINE_POINTS = 15_000, 12_000
+COARSE_POINTS, FINE_POINTS, SCORE_POINTS = 15_000, 12_000, 4_000
 VOXEL_RATIOS = (0.012, 0.02)  # of the diagonal
 GOOD_OVERLAP, LEAST_OVERLAP = 0.6, 0.25
 # A point farther from the model than it lies overlaps by reach is above it, not beside it, where
 # this share of the way is along the normal; it counts this many times.
-ABOVE, CONTRADICTION = 0.8, 3.0
+ABOVE, CONTRADICTION = 0.8, 4.0
+# More than this against each point that agrees, and the pose is wrong: a plate on its other half
+# has 0.5, that plate in its place 0.16 (its edges), scans of a whole part under 0.05.
+MOST_AGAINST = 0.3
 ROUNDS = 12
 SHRINK = 0.6
 
@@ -88,26 +91,31 @@ def place_all(
     root = int(np.argmax([_coverage(cloud, diagonal_mm / 100) for cloud in thin]))
     poses: dict[int, np.ndarray] = {root: np.eye(4)}
     waiting = [k for k in range(len(pieces)) if k != root]
-    for bar in (GOOD_OVERLAP, LEAST_OVERLAP):
-        moved = True
-        while moved and waiting:
-            moved = False
-            model = np.concatenate([_apply(poses[k], thin[k]) for k in poses])
-            for k in list(waiting):
-                progress("align", float(len(poses)), float(len(pieces)))
-                overlap, pose = _propose(thin[k], model, diagonal_mm)
-                if overlap >= bar:
-                    poses[k] = pose
-                    waiting.remove(k)
-                    moved = True
-                    if bar == LEAST_OVERLAP:
-                        break  # the model has grown: look again
+    proposed: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+    bar = GOOD_OVERLAP
+    while waiting:
+        model = np.concatenate([_apply(poses[k], thin[k]) for k in poses])
+        size, found = len(poses), []
+        for k in waiting:
+            progress("align", float(len(poses)), float(len(pieces)))
+            if (k, size) not in proposed:
+                proposed[k, size] = _propose(thin[k], model, diagonal_mm)
+            if proposed[k, size][0] >= bar:
+                found.append(k)
+        if bar < GOOD_OVERLAP:  # the best of the doubtful; then the model has grown: look again
+            found = sorted(found, key=lambda k: -proposed[k, size][0])[:1]
+        for k in found:
+            poses[k] = proposed[k, size][1]
+            waiting.remove(k)
+        if not found and bar == LEAST_OVERLAP:
+            break
+        bar = GOOD_OVERLAP if found else LEAST_OVERLAP
     if 2 * len(waiting) >= len(pieces):
         names = ", ".join(pieces[k].name for k in waiting)
         raise AlignmentError(
             f"{len(waiting)} of {len(pieces)} scans overlap the others by less than "
-            f"{LEAST_OVERLAP:.0%} in every pose that was tried ({names}); check that they show the "
-            "same part in the same unit, or scan with more overlap"
+            f"{LEAST_OVERLAP:.0%}, or contradict them, in every pose that was tried ({names}); "
+            "check that they show the same part in the same unit, or scan with more overlap"
         )
     which = sorted(poses)
     refined, rmse_mm = _together([pieces[k] for k in which], [poses[k] for k in which], rng)
@@ -139,22 +147,41 @@ def _propose(
     tree = cKDTree(model_mm)
     usual = float(np.median(tree.query(model_mm[:: max(1, len(model_mm) // 2000)], k=[2])[0]))
     reach_mm = 3.0 * usual
-    plane = planes(model_mm, spacing_of(model_mm))[0]
+    model_plane = planes(model_mm, spacing_of(model_mm))[0]
+    source_plane = planes(source_mm, spacing_of(source_mm))[0]
+    source_tree = cKDTree(source_mm)
     target, target_tree = _prepared(model_mm, diagonal_mm)
     source, _ = _prepared(source_mm, diagonal_mm)
+    thinner = len(source_mm) // SCORE_POINTS + 1
     for guess in _guesses(source_mm, model_mm, diagonal_mm):
         pose = _gicp(target, source, target_tree, guess, 0.02 * diagonal_mm)
-        moved = _apply(pose, source_mm)
-        distance, index = tree.query(moved, workers=-1)
-        height = np.abs(((moved - model_mm[index]) * plane[index]).sum(axis=1))
-        overlap = float((distance < reach_mm).mean())
-        against = (distance > reach_mm) & (height > ABOVE * distance)
-        score = overlap - CONTRADICTION * float((against & (distance < 0.1 * diagonal_mm)).mean())
+        moved = _apply(pose, source_mm[::thinner])
+        forth = tree.query(moved, workers=-1)
+        overlap = float((forth[0] < reach_mm).mean())
+        against = _above(moved, model_mm, model_plane, forth, reach_mm)
+        returned = _apply(np.linalg.inv(pose), model_mm[:: len(model_mm) // SCORE_POINTS + 1])
+        back = source_tree.query(returned, workers=-1)
+        against += _above(returned, source_mm, source_plane, back, reach_mm)
+        score = overlap - CONTRADICTION * against
         if score > best_score:
-            best_overlap, best_score, best_pose = overlap, score, pose
-        if best_score > 0.97:
+            agrees = against <= MOST_AGAINST * overlap
+            best_overlap, best_score, best_pose = overlap if agrees else 0.0, score, pose
+        if best_score > 0.95:
             break
     return best_overlap, best_pose
+
+
+def _above(
+    points_mm: Float[np.ndarray, "n 3"],
+    surface_mm: Float[np.ndarray, "m 3"],
+    plane: Float[np.ndarray, "m 3"],
+    nearest: tuple[np.ndarray, np.ndarray],
+    reach_mm: float,
+) -> float:
+    """Share of points that lie off the other surface, above or below it and not beside it."""
+    distance, index = nearest
+    height = np.abs(((points_mm - surface_mm[index]) * plane[index]).sum(axis=1))
+    return float(((distance > reach_mm) & (height > ABOVE * distance)).mean())
 
 
 def _guesses(

@@ -130,7 +130,8 @@ def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
     clouds[3][rim & (clouds[3][:, 2] > 7.5), 2] -= 0.15  # a dent, within reach of the fit
     fused = fuse(joined(clouds))
     assert fused.rejected > 100
-    assert fused_error(fused, part).max() < 0.3
+    assert np.quantile(fused_error(fused, part), 0.999) < 0.2
+    assert fused_error(fused, part).max() < 0.5  # specks at edges; the bulge has 1.5
     assert fused_error(fused, part).mean() < 0.015
     assert fused.overruled_ratio > 0
 
@@ -180,19 +181,29 @@ def test_what_no_scan_saw_is_closed_and_said(part: AnalyticTemplate) -> None:
     assert np.abs(MeshSdf.from_mesh(fused.mesh).distance(top)).max() < 0.05
 
 
-def test_overlapping_halves_make_a_whole(part: AnalyticTemplate) -> None:
-    halves = []
-    for s, (low, high) in enumerate(((-1.0, 26.0), (12.0, 41.0))):
-        cloud = points_of(part, 40_000, s)
-        halves.append(placed(cloud[(cloud[:, 0] > low) & (cloud[:, 0] < high)], s))
+def halves(part: AnalyticTemplate, first_mm: float, second_mm: float) -> list[Scan]:
+    """All that lies left of one plane, and all that lies right of another."""
+    found = []
+    for s, (low, high) in enumerate(((-1.0, first_mm), (second_mm, 41.0))):
+        cloud = points_of(part, 20_000, s)
+        found.append(placed(cloud[(cloud[:, 0] > low) & (cloud[:, 0] < high)], s))
+    return found
+
+
+def test_overlapping_partial_scans_find_each_other(part: AnalyticTemplate) -> None:
     rng = np.random.default_rng(0)
-    pieces = [_piece(scan, rng) for scan in halves]
-    found = place_all(pieces, rng)
-    assert found.left_out == ()
+    found = place_all([_piece(scan, rng) for scan in halves(part, 34.0, 5.0)], rng)
     turn, shift = pose(1)
     corners = np.array(part.bounds_mm)
     back = (corners @ turn.T + shift) @ found.poses[1][:3, :3].T + found.poses[1][:3, 3]
     assert np.abs(back - corners).max() < 0.1
+
+
+def test_a_plate_is_not_laid_on_its_other_half(part: AnalyticTemplate) -> None:
+    # regression: the pose of the largest overlap was taken, which turns one half onto the other
+    rng = np.random.default_rng(0)
+    with pytest.raises(AlignmentError, match="contradict"):
+        place_all([_piece(scan, rng) for scan in halves(part, 26.0, 12.0)], rng)
 
 
 def test_scans_of_different_parts_are_refused(part: AnalyticTemplate) -> None:
