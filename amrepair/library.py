@@ -77,9 +77,10 @@ def template_files(folder: Path) -> list[Path]:
         If there are none.
     """
     found: dict[str, Path] = {}
-    for path in sorted(folder.iterdir(), key=lambda p: (SUFFIXES + (p.suffix,)).index(p.suffix)):
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
-            found.setdefault(path.stem, path)
+    for suffix in SUFFIXES:
+        for path in sorted(folder.iterdir()):
+            if path.suffix.lower() == suffix and not path.name.startswith("."):
+                found.setdefault(path.stem, path)
     if not found:
         raise InputError(
             f"the folder {folder} holds no template ({', '.join(SUFFIXES)}); fit some with "

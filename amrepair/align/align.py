@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align.bed import bed_prior, level_on_bed
+from amrepair.align.checks import refuse_repeated
 from amrepair.align.coarse import proposals
 from amrepair.align.pam import PAPER, PamOptions, align_paper
 from amrepair.align.refine import Prior, Refined, refine, thin_out
@@ -78,6 +79,7 @@ def align(
         raise AlignmentError(
             f"the scan {scan.source} has {len(scan)} points; an alignment needs {LEAST_POINTS}"
         )
+    refuse_repeated(scan, LEAST_POINTS)
     rng = rng if rng is not None else np.random.default_rng(0)
     if method == "paper":
         _refuse_other_size(scan, template)

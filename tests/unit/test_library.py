@@ -84,7 +84,7 @@ def test_misfit_is_nothing_on_the_part_and_grows_off_it(parts: dict[str, MeshSdf
         Transform.identity("template", "scanner"), 0.0, 1.0, np.eye(6), (), "robust", 1
     )
     on = misfit(Scan(points, 0.03, "scanner"), part, stay)
-    off = misfit(Scan(points + (0, 0, 0.5), 0.03, "scanner"), part, stay)
+    off = misfit(Scan(points + np.array([0, 0, 0.5]), 0.03, "scanner"), part, stay)
     half = misfit(Scan(points[points[:, 2] > 3], 0.03, "scanner"), part, stay)
     assert on < 0.1  # the gaps between 20,000 points
     assert half < 0.25
