@@ -26,7 +26,7 @@ from amrepair.scans import Scan
 from amrepair.simulate.part_files import part_path
 from amrepair.template import MeshSdf, extract_mesh, load_mesh
 from amrepair.template.fit import fit_fast
-from amrepair.template.learned import LearnedSdf, Tables
+from amrepair.template.learned import Grid, LearnedSdf
 from amrepair.template.paper import PAPER, fit_paper
 from amrepair.template.port import Template
 
@@ -71,13 +71,13 @@ def fits(exact: MeshSdf, steps: int) -> dict[str, Template]:
     print("| template | s | 0 | " + " | ".join(f"±{o:g} mm" for o in OFFSETS_MM) + " |")
     print("|---" * (3 + len(OFFSETS_MM)) + "|")
     made: dict[str, Template] = {}
-    template, seconds = timed(lambda: fit_fast(exact, device="cpu"))
+    template, seconds = timed(lambda: fit_fast(exact))
     assert isinstance(template, LearnedSdf)
     made["fast"] = template
     accuracy("fast", template, exact, seconds)
-    t = template.tables
-    bare = Tables.bare(t.origin_mm, t.cell_mm, t.base, (1.0,), 2)
-    accuracy("its grid alone", replace(template, tables=bare), exact, float("nan"))
+    grid = template.grid
+    bare = Grid.bare(grid.origin_mm, grid.cell_mm, grid.base)
+    accuracy("its coarse grid alone", replace(template, grid=bare), exact, float("nan"))
     if steps:
         options = replace(PAPER, batch=8_192, rate=5e-4, epochs=steps // 2, dropout=0.0)
         network, seconds = timed(lambda: fit_paper(exact, options=options, device="cpu"))
@@ -135,7 +135,7 @@ def scans_of(exact: MeshSdf, count: int, points: int) -> list[Scan]:
 def from_scans(exact: MeshSdf, points: int) -> None:
     scans = scans_of(exact, 4, points)
     print(f"\nFrom 4 scans of {points:,} points, noise {1e3 * SIGMA_MM:.0f} µm, no mesh\n")
-    made, seconds = timed(lambda: fit_from_scans(scans, device="cpu"))
+    made, seconds = timed(lambda: fit_from_scans(scans))
     template, fused = made.template, made.fused.mesh  # type: ignore[attr-defined]
     on = np.abs(template.distance(surface_of(exact.mesh)[0]))
     print(f"- consensus: {seconds:.1f} s; field on the true surface {micrometres(on)} µm;")

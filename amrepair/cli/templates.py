@@ -38,7 +38,9 @@ def fit(
             "encoding=off an ablation, epochs=N shortens it. May be repeated."
         ),
     ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    device: Annotated[
+        str, typer.Option(help="Where the recipe paper trains: auto, cpu or cuda.")
+    ] = "auto",
     seed: SeedOption = 0,
 ) -> None:
     """Fit the signed distance field that scans are held against."""
@@ -56,7 +58,7 @@ def fit(
     template: LearnedSdf | NetworkSdf
     with bars.shown():
         if scans and recipe == "fast":
-            template = _from_scans(scans, meshes, device, seed, bars)
+            template = _from_scans(scans, meshes, seed, bars)
         else:
             template = fit_template(
                 meshes, recipe=recipe, paper=settings, device=device, seed=seed, progress=bars
@@ -67,9 +69,7 @@ def fit(
         console.errors.print(f"  {note}")
 
 
-def _from_scans(
-    scans: list[Path], meshes: list[Path], device: str, seed: int, bars: console.Bars
-) -> LearnedSdf:
+def _from_scans(scans: list[Path], meshes: list[Path], seed: int, bars: console.Bars) -> LearnedSdf:
     from amrepair.consensus import fit_from_scans
     from amrepair.scans import read_scan
     from amrepair.template import load_mesh
@@ -78,7 +78,7 @@ def _from_scans(
         raise InputError(f"a template has one nominal mesh, {len(meshes)} were given")
     clouds = [read_scan(path, frame="scanner") for path in scans]
     mesh = load_mesh(meshes[0]) if meshes else None
-    return fit_from_scans(clouds, mesh=mesh, device=device, seed=seed, progress=bars).template
+    return fit_from_scans(clouds, mesh=mesh, seed=seed, progress=bars).template
 
 
 @template_app.command("mesh")

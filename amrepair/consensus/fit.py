@@ -56,7 +56,6 @@ def fit_from_scans(
     scans: Sequence[Scan],
     *,
     mesh: trimesh.Trimesh | None = None,
-    device: str = "auto",
     seed: int = 0,
     progress: Progress = silent,
 ) -> ScanFit:
@@ -106,7 +105,6 @@ def fit_from_scans(
     }
     made = fit_fast(
         MeshSdf.from_mesh(closed),
-        device=device,
         seed=seed,
         metadata=metadata,
         progress=lambda stage, done, total: progress(stage, 0.5 + 0.5 * done / total, 1.0),

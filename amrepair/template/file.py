@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import trimesh
 
 FORMAT = "amrepair-template"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 HEAD = "amrepair"
 
 

@@ -46,6 +46,8 @@ def fit_template(
         A mesh or its file, mm; made watertight where that leaves the shape in no doubt.
     paper
         Settings of the recipe `paper`.
+    device
+        Where the recipe `paper` trains; the fast one needs no torch.
 
     Raises
     ------
@@ -68,7 +70,7 @@ def fit_template(
         return fit_paper(
             exact, options=paper, device=device, seed=seed, metadata=metadata, progress=progress
         )
-    return fit_fast(exact, device=device, seed=seed, metadata=metadata, progress=progress)
+    return fit_fast(exact, seed=seed, metadata=metadata, progress=progress)
 
 
 def made_from(closed: trimesh.Trimesh, recipe: str, seed: int) -> dict[str, str]:
@@ -104,7 +106,6 @@ def load_or_fit(
     source: Path | str | trimesh.Trimesh,
     *,
     cache_dir: Path | None = None,
-    device: str = "auto",
     seed: int = 0,
     progress: Progress = silent,
 ) -> LearnedSdf:
@@ -127,7 +128,6 @@ def load_or_fit(
             path.unlink(missing_ok=True)  # a crash while it was written, or another version
     template = fit_fast(
         MeshSdf.from_mesh(closed),
-        device=device,
         seed=seed,
         metadata=made_from(closed, "fast", seed),
         progress=progress,

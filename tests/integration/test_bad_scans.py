@@ -24,9 +24,9 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rough template: what is refused here does not depend on its details."""
     path = tmp_path_factory.mktemp("template") / "bracket.safetensors"
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("STEPS", 5), ("SAMPLES", 20_000), ("GRID_CELLS", 40)):
+        for name, value in (("SAMPLES", 20_000), ("GRID_CELLS", 40)):
             patch.setattr(f"amrepair.template.fit.{name}", value)
-        fit_template(PART, device="cpu").save(path)
+        fit_template(PART).save(path)
     return path
 
 

@@ -100,13 +100,9 @@ def test_scans_find_each_other(part: AnalyticTemplate) -> None:
         assert np.abs(back - corners).max() < 0.02  # σ over the root of 12,000, and its lever
 
 
-def test_a_template_from_scans_is_the_part(
-    part: AnalyticTemplate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("amrepair.template.fit.STEPS", 60)  # what is learned is tested elsewhere
-    monkeypatch.setattr("amrepair.template.fit.SAMPLES", 100_000)
+def test_a_template_from_scans_is_the_part(part: AnalyticTemplate, tmp_path: Path) -> None:
     scans = [placed(points_of(part, 30_000, s), s) for s in range(3)]
-    made = fit_from_scans(scans, device="cpu", seed=0)
+    made = fit_from_scans(scans, seed=0)
     truth, _ = sample_surface(part.body, 0.3, seed=9)
     error_mm = np.abs(made.template.distance(truth))
     assert error_mm.mean() < 0.015

@@ -80,8 +80,8 @@ def test_a_ball_is_learned(fitted: NetworkSdf, ball: MeshSdf) -> None:
     assert error_mm.mean() < 0.05  # 0.5 % of the radius after 380 steps
     assert np.quantile(error_mm, 0.99) < 2 * fitted.bias_mm
     away = np.asarray(points) * 1.05
-    assert fitted.distance(away).mean() == pytest.approx(0.5, abs=0.05)
-    assert fitted.distance(0.95 * np.asarray(points)).mean() == pytest.approx(-0.5, abs=0.05)
+    assert fitted.distance(away).mean() == pytest.approx(0.5, abs=0.1)
+    assert fitted.distance(0.95 * np.asarray(points)).mean() == pytest.approx(-0.5, abs=0.1)
 
 
 def test_far_points_are_outside_and_far(fitted: NetworkSdf) -> None:
