@@ -4,7 +4,7 @@ Run: python benchmarks/bench_pasdf.py [--align 10] [--views 10] [--parts NAME…
 [--normal 3] [--paper NAME=VALUE…] [--out DIR]. Alignment: scans of 200,000 points in random poses,
 noise 0.05 mm, a ball of 5 mm missing, the whole surface or what one sensor sees; success is an RMSE
 under 0.1 mm to the true pose. Detection: a synthetic set, `pasdf`, `pasdf-paper` (shortened) and
-`patchcore-fpfh+pam`, with the repair template's distances. `--align 0` or `--defects 0` skip a half.
+`patchcore-fpfh+pam`, with the repair template's distances. Zero of anything skips it.
 """
 
 from __future__ import annotations

@@ -156,7 +156,8 @@ def reach_mm(cloud: Cloud) -> float:
     The kernel (1 − d²/r²)⁴ over a plane has 0.36 of its points' weight (Σw)²/Σw².
     """
     wanted_mm = max(0.005, 0.05 * cloud.spacing_mm)
-    count = float(np.clip((cloud.sigma_mm / wanted_mm) ** 2 / 0.36, 16.0, 120.0))
+    least = max(24.0, 8.0 * cloud.scans)  # so that each scan alone has a word
+    count = float(np.clip((cloud.sigma_mm / wanted_mm) ** 2 / 0.36, least, 120.0))
     return float(np.sqrt(count / np.pi)) * cloud.spacing_mm
 
 
