@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint suite slow clean help
+.PHONY: demo test lint suite slow peers clean help
 
 help: ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -31,5 +31,9 @@ suite: $(STAMP)
 slow: $(STAMP) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
 
+peers: $(STAMP) ## print through and beside OctoPrint, Moonraker and Printrun, each in its own environment
+	$(BIN)/python tests/peers/environments.py
+	$(BIN)/python -m pytest -m peers tests/peers
+
 clean: ## remove the environment and what runs left behind
-	rm -rf $(VENV) out runs build dist
+	rm -rf $(VENV) .peers out runs build dist

@@ -66,7 +66,10 @@ def add_to(app: typer.Typer) -> None:
 def loop(
     job_file: Annotated[Path, typer.Argument(metavar="JOB", help="G-code of the whole job.")],
     template: TemplateOption,
-    port: Annotated[str, typer.Option(help="Device path of the printer.")],
+    port: Annotated[
+        str,
+        typer.Option(help="Device path, octoprint+http://HOST:PORT or moonraker+http://HOST:PORT."),
+    ],
     scanner: Annotated[str, typer.Option(help="watch:DIR: a folder that scans are dropped in.")],
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,

@@ -8,12 +8,13 @@ averages say so. Empty space counts only where a ray crossed it or scanned surfa
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
-from amrepair.deficit.heights import as_built_heights
+from amrepair.deficit.heights import as_built_heights, standing_heights
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.evidence import Evidence
@@ -98,7 +99,7 @@ def compute_deficit(
     printed_z_mm
         Height printed so far, build frame; None is the template's own top.
     cell_mm
-        Cell of the as-built height field.
+        Cell of what the scan alone says of heights.
 
     Raises
     ------
@@ -134,20 +135,22 @@ def compute_deficit(
         for found in solids.values()
     )
     unseen = anomaly.template_label == int(Label.UNSEEN)
+    seen = as_built_heights(
+        scan,
+        template,
+        evidence,
+        build_from_template=build_from_template,
+        printed_z_mm=printed_z_mm,
+        cell_mm=cell_mm,
+    )
+    expected: Any = template.solid()
     return Deficit(
         missing=missing,
         excess=excess,
         regions=tuple(sorted(regions, key=lambda r: (int(r.label), -r.volume_mm3))),
         tolerance_mm=tau_mm,
         unseen_area_mm2=_unseen_area(anomaly, int(unseen.sum())),
-        as_built=as_built_heights(
-            scan,
-            template,
-            evidence,
-            build_from_template=build_from_template,
-            printed_z_mm=printed_z_mm,
-            cell_mm=cell_mm,
-        ),
+        as_built=standing_heights(seen, expected.transform(matrix), missing, excess),
     )
 
 

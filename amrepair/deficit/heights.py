@@ -6,21 +6,32 @@ height and a margin, unless the scan shows no bed at all: then the bed around th
 
 from __future__ import annotations
 
+import math
+
+import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.detect.evidence import Evidence
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template.port import Template
-from gcode.surfaces import HeightField
+from gcode.surfaces import HeightField, raster_kernels
 
 UNSEEN_MARGIN_MM = 1.0
 # Around the part: more than a nozzle's cone, so that what stands beside it is in the field.
 AROUND_MM = 8.0
 # Points within this of a cell's top are one surface with its noise.
 TOP_BAND_MM = 0.3
+# An unseen patch smaller than this between seen ones is a gap of sampling, not a place to hide.
+GAP_MM2 = 1.0
+FINE_CELL_MM, MOST_CELLS = 0.1, 2_000_000
+# The scan may stand out this much before it overrules the solids: their tolerance, and noise.
+TRUST_MM = 0.3
+NOISE_MM = 0.1
+# Two layers: thinner material over a void is the solids' own rounding at its rim.
+FILM_MM = 0.4
 
 
 def as_built_heights(
@@ -42,7 +53,6 @@ def as_built_heights(
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
     solid_z = top_z + UNSEEN_MARGIN_MM
     z, seen = _tops(points, low[:2], cell_mm, (int(shape[0]), int(shape[1])))
-    z, seen = _close_gaps(z, seen)
     if not evidence.has_rays:
         # without rays nothing tells empty from unseen: beside the part the bed is taken as bare
         bare = ~seen & ~_footprint(template, build_from_template, low, cell_mm, z.shape)
@@ -50,12 +60,79 @@ def as_built_heights(
         known = seen | bare
     else:
         known = seen
+    z, closed = _close_gaps(z, known, cell_mm)
+    seen = seen | (closed & ~known)
+    known = closed
     return HeightField(
         origin_mm=low[:2].copy(),
         cell_mm=cell_mm,
         z_mm=np.where(known, np.maximum(z, 0.0), solid_z),
         seen=seen,
     )
+
+
+def standing_heights(
+    seen: HeightField,
+    expected: manifold3d.Manifold,
+    missing: manifold3d.Manifold,
+    excess: manifold3d.Manifold,
+) -> HeightField:
+    """The as-built field with sharp walls.
+
+    What was expected, less what is missing, with what is too much, gives heights on a fine grid.
+    They stand beside walls, where the scan saw nothing higher; elsewhere the scan itself decides.
+
+    Parameters
+    ----------
+    seen
+        Heights of the scan, cell by cell (`as_built_heights`).
+    expected, missing, excess
+        Solids, build frame.
+    """
+    box = seen.box_mm
+    area_mm2 = (box[2] - box[0]) * (box[3] - box[1])
+    cell_mm = max(FINE_CELL_MM, float(np.sqrt(area_mm2 / MOST_CELLS)))
+    ny, nx = (math.ceil((box[k + 2] - box[k]) / cell_mm - 1e-9) for k in (1, 0))
+    fine = HeightField(
+        np.array(box[:2]), cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool)
+    )
+    columns = [_columns(solid, fine) for solid in (expected, missing)]
+    z_mm = raster_kernels.column_rest(*columns[0], *columns[1], FILM_MM, 0.0).reshape(ny, nx)
+    if not excess.is_empty():
+        z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
+    x, y = fine.centres_mm()
+    cells = seen.cells_of(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    cells = np.clip(cells, 0, np.array(seen.shape) - 1)
+    at = (cells[:, 0].reshape(fine.shape), cells[:, 1].reshape(fine.shape))
+    # a cell of the scan is as high as the highest thing that touches it: true of floors, not
+    # beside walls, where the solids are the sharper of the two unless something else stands there
+    around = 2 * round(1.5 * seen.cell_mm / cell_mm) + 1
+    highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
+    by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
+    # where nothing is missing and the scan agrees, its noise would only raise what is highest
+    filled = (columns[1][0][1:] == columns[1][0][:-1]).reshape(ny, nx)
+    agrees = filled & (np.abs(seen.z_mm[at] - z_mm) < NOISE_MM)
+    known = seen.seen[at]
+    sharp = known & (by_wall | agrees)
+    return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known.copy())
+
+
+def _columns(
+    solid: manifold3d.Manifold, field: HeightField
+) -> tuple[Int[np.ndarray, " cells1"], Float[np.ndarray, " crossings"]]:
+    """Crossings of a solid with the field's columns: where each column's begin, and heights."""
+    mesh = solid.to_mesh64()
+    ny, nx = field.shape
+    offset, z, _ = raster_kernels.column_crossings(
+        np.asarray(mesh.vert_properties, np.float64)[:, :3].copy(),
+        np.asarray(mesh.tri_verts).astype(np.int64),
+        float(field.origin_mm[0]),
+        float(field.origin_mm[1]),
+        field.cell_mm,
+        nx,
+        ny,
+    )
+    return offset, z
 
 
 def _corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
@@ -86,13 +163,17 @@ def _tops(
 
 
 def _close_gaps(
-    z_mm: Float[np.ndarray, "ny nx"], seen: Bool[np.ndarray, "ny nx"]
+    z_mm: Float[np.ndarray, "ny nx"], seen: Bool[np.ndarray, "ny nx"], cell_mm: float
 ) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
-    """A cell that sampling left empty among seen ones takes its highest neighbour."""
-    around = ndimage.uniform_filter(seen.astype(float), 3) * 9
-    gap = ~seen & (around >= 4.5)
+    """A few cells that sampling left empty among seen ones take their highest neighbour."""
+    groups, count = ndimage.label(~seen, structure=np.ones((3, 3)))
+    if count == 0:
+        return z_mm, seen
+    size = np.bincount(groups.ravel(), minlength=count + 1)
+    small = (size <= max(1, int(GAP_MM2 / cell_mm**2)))[groups] & ~seen
     highest = ndimage.maximum_filter(np.where(seen, z_mm, -np.inf), 3)
-    return np.where(gap, highest, z_mm), seen | gap
+    by_group = ndimage.maximum(highest, groups, index=np.arange(count + 1))
+    return np.where(small, np.asarray(by_group)[groups], z_mm), seen | small
 
 
 def _footprint(

@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 from amrepair.detect.anomaly import AnomalyMap, Label
 from amrepair.detect.evidence import Evidence, gather
+from amrepair.detect.faces import PLANE_POINTS
 from amrepair.detect.normal_variation import forgiven
 from amrepair.detect.regions import find_regions
 from amrepair.detect.surfels import Surfels, make_surfels
@@ -115,7 +116,13 @@ def detect(
     )
     progress("detect", 1.0, 4.0)
     missing, excess = _label_surfels(forgiven(surfels, template), limit)
-    evidence = gather(scan, template, surfels, missing | excess)
+    evidence = gather(
+        scan,
+        template,
+        surfels,
+        missing | excess,
+        threshold_mm=float(limit.low_mm(np.array([PLANE_POINTS]))[0]),
+    )
     progress("detect", 2.0, 4.0)
     label = np.zeros(len(scan), np.int64)
     has_cell = surfels.of_point >= 0

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from amrepair.detect import surfel_kernels as kernels
+from amrepair.detect.faces import Faces, Patches, find_faces
 from amrepair.detect.rays import RangeImage, range_images
 from amrepair.detect.surfels import Surfels
 from amrepair.scans import Scan
@@ -26,8 +26,8 @@ NEIGHBOURS = 4
 STRIP_COSINE = 0.77
 # "Solid, as far as anybody knows": a clearance well below every threshold.
 SOLID_MM = -5.0
-# A sign vector needs this mean agreement with the template before file normals are believed.
-NORMAL_AGREEMENT = 0.5
+# The template's surface in patches of this size closes what stands there.
+PATCH_MM = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +44,8 @@ class Evidence:
         (s, 3) outward unit normals where `off`; zero elsewhere (the template's field serves).
     images
         Range images, one per sensor; empty where sensors are unknown.
+    faces
+        What the scan says around defects where no rays tell; None where there are, or no defect.
     """
 
     surfels: Surfels
@@ -51,6 +53,7 @@ class Evidence:
     normal: Float[np.ndarray, "s 3"]
     images: tuple[RangeImage, ...]
     tree: cKDTree
+    faces: Faces | None = None
 
     @property
     def has_rays(self) -> bool:
@@ -72,7 +75,10 @@ class Evidence:
                 best = np.maximum(best, seen)
                 least = np.maximum(least, cautious)
             return np.maximum(best, SOLID_MM), np.maximum(least, SOLID_MM)
-        near = self.surface_clearance(points_mm, f_mm)
+        if self.faces is not None:
+            near = self.faces.clearance(points_mm, f_mm)
+        else:
+            near = self.surface_clearance(points_mm, f_mm)
         return near, near
 
     def surface_clearance(
@@ -101,54 +107,43 @@ class Evidence:
         beside = self.off[index[:, 0]] & (
             sideways > 1.5 * s.cell_mm + SIDEWAYS_PER_HEIGHT * np.abs(height)
         )
-        best = np.where(beside, SOLID_MM, best)
-        return self._beyond_rims(points_mm, f_mm, distance[:, 0], self.off[index[:, 0]], best)
-
-    def _beyond_rims(
-        self,
-        points_mm: Float[np.ndarray, "n 3"],
-        f_mm: Float[np.ndarray, " n"],
-        distance_mm: Float[np.ndarray, " n"],
-        nearest_off: Bool[np.ndarray, " n"],
-        best_mm: Float[np.ndarray, " n"],
-    ) -> Float[np.ndarray, " n"]:
-        """Mend the answers beyond a convex rim, where a surfel on the template is nearest.
-
-        Material under a scanned face lies |f| below it. What lies farther from the nearest
-        surfel than that is not under it: the broken face that meets it at the rim decides.
-        """
-        s = self.surfels
-        off = np.flatnonzero(self.off)
-        ask = np.flatnonzero(
-            ~nearest_off & (f_mm < 0) & (distance_mm > 1.3 * np.abs(f_mm) + 1.5 * s.cell_mm)
-        )
-        if len(off) == 0 or len(ask) == 0:
-            return best_mm
-        reach, which = cKDTree(s.place_mm[off]).query(points_mm[ask], workers=2)
-        which = off[which]
-        height = ((points_mm[ask] - s.place_mm[which]) * self.normal[which]).sum(axis=1)
-        meets = reach <= distance_mm[ask] + 1.5 * s.cell_mm
-        mended = best_mm.copy()
-        mended[ask] = np.where(meets & (height > 0), height, best_mm[ask])
-        return mended
+        return np.where(beside, SOLID_MM, best)
 
 
 def gather(
-    scan: Scan, template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"]
+    scan: Scan,
+    template: Template,
+    surfels: Surfels,
+    off: Bool[np.ndarray, " s"],
+    *,
+    threshold_mm: float,
 ) -> Evidence:
     """Collect the evidence of a scan whose off-template surfels are known."""
     off = off | _strips(template, surfels, off)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
-    if len(which):
-        normal[which] = _outward(scan, template, surfels, off, which)
-    return Evidence(
-        surfels=surfels,
-        off=off,
-        normal=normal,
-        images=range_images(scan, spacing_mm=surfels.spacing_mm),
-        tree=cKDTree(surfels.place_mm, compact_nodes=False, balanced_tree=False),
-    )
+    images = range_images(scan, spacing_mm=surfels.spacing_mm)
+    tree = cKDTree(surfels.place_mm, compact_nodes=False, balanced_tree=False)
+    faces = None
+    if len(which) and scan.sensors_mm is not None and scan.sensor_index is not None:
+        to_sensor = scan.sensors_mm[scan.sensor_index] - scan.points_mm
+        normal[which] = _toward(surfels.planes(which), surfels.mean_of(to_sensor)[which])
+    elif len(which):
+        spacing_mm = max(PATCH_MM, surfels.spacing_mm)
+        places, normals = template.surface_points(spacing_mm)
+        patches = Patches(places, normals * spacing_mm**2)
+        faces = find_faces(scan, template, surfels, off, patches, threshold_mm=threshold_mm)
+        nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
+        normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
+    return Evidence(surfels, off, normal, images, tree, faces)
+
+
+def _toward(
+    planes: Float[np.ndarray, "q 3"], guide: Float[np.ndarray, "q 3"]
+) -> Float[np.ndarray, "q 3"]:
+    """Planes turned to the side of their guides."""
+    sign = np.where((planes * guide).sum(axis=1) < 0, -1.0, 1.0)
+    return np.asarray(planes * sign[:, None])
 
 
 def _strips(
@@ -171,84 +166,3 @@ def _strips(
         along = np.abs((gradient * surfels.planes(which)).sum(axis=1))
         strips[which] = (along < STRIP_COSINE) & (surfels.deviation_mm[which] < 0)
     return strips
-
-
-def _outward(
-    scan: Scan,
-    template: Template,
-    surfels: Surfels,
-    off: Bool[np.ndarray, " s"],
-    which: Int[np.ndarray, " q"],
-) -> Float[np.ndarray, "q 3"]:
-    """Outward normals of the surfels in `which`: by sensors, file, or looking about."""
-    planes = surfels.planes(which)
-    guide: Float[np.ndarray, "q 3"] | None = None
-    if scan.sensors_mm is not None and scan.sensor_index is not None:
-        to_sensor = scan.sensors_mm[scan.sensor_index] - scan.points_mm
-        guide = surfels.mean_of(to_sensor)[which]
-    elif scan.normals is not None:
-        guide = _file_normals(scan.normals, template, surfels, off, which)
-    if guide is None:
-        guide = _open_side(template, surfels, off, which, planes)
-    sign = np.where((planes * guide).sum(axis=1) < 0, -1.0, 1.0)
-    return planes * sign[:, None]
-
-
-def _file_normals(
-    normals: Float[np.ndarray, "n 3"],
-    template: Template,
-    surfels: Surfels,
-    off: Bool[np.ndarray, " s"],
-    which: Int[np.ndarray, " q"],
-) -> Float[np.ndarray, "q 3"] | None:
-    """The file's normals, turned outward as a whole; None where they contradict the template."""
-    mean = surfels.mean_of(normals)
-    on = np.flatnonzero(~off)[:: max(1, int((~off).sum()) // 5000)]
-    if len(on) == 0:
-        return mean[which]
-    expected = template.distance_and_gradient(surfels.place_mm[on])[1]
-    agreement = float(np.median((expected * mean[on]).sum(axis=1)))
-    if abs(agreement) < NORMAL_AGREEMENT:
-        return None
-    return mean[which] * np.sign(agreement)
-
-
-def _open_side(
-    template: Template,
-    surfels: Surfels,
-    off: Bool[np.ndarray, " s"],
-    which: Int[np.ndarray, " q"],
-    planes: Float[np.ndarray, "q 3"],
-) -> Float[np.ndarray, "q 3"]:
-    """Vectors toward the open side, by rays from each surfel to what the scan knows around it."""
-    cell_mm = surfels.cell_mm
-    low = template.bounds_mm[0] - 3 * cell_mm
-    shape = np.ceil((template.bounds_mm[1] - low) / cell_mm).astype(int) + 4
-    grid = np.full(tuple(shape), -1, np.int32)
-    index = np.floor((surfels.place_mm - low) / cell_mm).astype(int)
-    inside = ((index >= 0) & (index < shape)).all(axis=1)
-    # on-template surfels last, so that they win a shared cell: their side is known for sure
-    for chosen in (np.flatnonzero(inside & off), np.flatnonzero(inside & ~off)):
-        grid[tuple(index[chosen].T)] = chosen
-    outward = np.zeros((len(surfels), 3))
-    on = np.flatnonzero(inside & ~off)
-    outward[on] = template.distance_and_gradient(surfels.place_mm[on])[1]
-    votes = kernels.open_votes(
-        surfels.place_mm[which], planes, _directions(), grid, low, cell_mm, outward
-    )
-    spread = np.zeros((len(surfels), 3))
-    spread[which] = votes
-    for _ in range(3):  # a floor is decided as a whole, not cell by cell
-        spread = kernels.neighbour_sums(surfels.table, spread)
-        spread /= np.maximum(np.linalg.norm(spread, axis=1, keepdims=True), 1e-12)
-        spread[~off] = 0.0
-    return spread[which]
-
-
-def _directions() -> Float[np.ndarray, "k 3"]:
-    """64 directions spread evenly (Fibonacci sphere)."""
-    k = np.arange(64) + 0.5
-    z = 1 - 2 * k / 64
-    angle = np.pi * (1 + 5**0.5) * k
-    r = np.sqrt(1 - z**2)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)

@@ -7,10 +7,11 @@ only their lower faces can touch. What is laid on the way stands there for the m
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gcode.check import sweep_kernels as kernels
 from gcode.check.rules import Moves, Refusal
-from gcode.profiles import PrinterProfile
+from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
 from gcode.surfaces.heightfield import footprint_rows
 
@@ -19,6 +20,8 @@ TIP_SLACK_MM = 0.2
 # The head's body must clear what stands there, up to the noise of the height field.
 BODY_SLACK_MM = 0.1
 MAX_CELLS = 12_000_000  # of the field and all its slices: 96 MB; beyond that cells are joined
+# Slices of the head that reach farther than this are swept over cells of this size.
+WIDE_MM, WIDE_CELL_MM = 2.5, 0.2
 MOST_SAID = 20
 
 
@@ -35,30 +38,25 @@ def sweep(
     slices = [p for p in printer.envelope if p.z_from_mm <= tallest_mm - lowest_mm]
     if not slices:
         return [], np.inf
-    field = _coarse(as_built, max(1, MAX_CELLS // (len(slices) + 1)))
-    tables = [footprint_rows(part.polygon_mm, field.cell_mm) for part in slices]
-    rows = np.concatenate([np.stack(table, axis=1) for table in tables])
-    row_at = np.concatenate([[0], np.cumsum([len(table[0]) for table in tables])])
-    dilated = np.stack([field.max_within(part.polygon_mm) for part in slices])
     pushed = np.array(moves.pushed_mm3)
     length = np.linalg.norm(end - start, axis=1)
     width = np.clip(pushed / np.maximum(length, 1e-9) / 0.2, 0.0, 2 * printer.nozzle_diameter_mm)
+    worst = np.full(len(start), -np.inf)
+    which = np.zeros(len(start), dtype=np.int64)
+    reach = [float(np.abs(np.array(part.polygon_mm)).max()) for part in slices]
+    # what is wide is swept over joined cells, each as high as its highest: never too low
+    for wide in (False, True):
+        own = [k for k, mm in enumerate(reach) if (mm > WIDE_MM) == wide]
+        if not own:
+            continue
+        field = _coarse(
+            as_built, max(1, MAX_CELLS // (len(own) + 1)), WIDE_CELL_MM if wide else 0.0
+        )
+        depth, of_own = _swept(field, [slices[k] for k in own], start, end, pushed, width)
+        deeper = depth > worst
+        worst = np.where(deeper, depth, worst)
+        which = np.where(deeper, np.array(own)[of_own], which)
     tip = np.array([part.z_from_mm < 1e-9 for part in slices])
-    worst, which = kernels.sweep(
-        start,
-        end,
-        (pushed > 0).astype(np.int64),
-        0.5 * width,
-        field.z_mm.astype(np.float64).copy(),
-        field.origin_mm.astype(np.float64),
-        field.cell_mm,
-        np.array([part.z_from_mm for part in slices]),
-        np.arange(len(slices)),
-        dilated,
-        rows,
-        row_at,
-        np.where(tip, TIP_SLACK_MM, BODY_SLACK_MM),
-    )
     refusals = []
     for k in np.flatnonzero(worst > 0)[:MOST_SAID]:
         part = slices[int(which[k])]
@@ -76,16 +74,42 @@ def sweep(
     return refusals, float(-(body.max() + BODY_SLACK_MM)) if len(body) else np.inf
 
 
-def _coarse(field: HeightField, most: int) -> HeightField:
-    """The field with cells joined, each as high as its highest, so that it is small enough."""
-    ny, nx = field.shape
-    factor = int(np.ceil(np.sqrt(ny * nx / most)))
-    if factor <= 1:
-        return field
-    padded = np.full((-(-ny // factor) * factor, -(-nx // factor) * factor), -np.inf)
-    padded[:ny, :nx] = field.z_mm
-    blocks = padded.reshape(padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
-    z_mm = blocks.max(axis=(1, 3))
-    return HeightField(
-        field.origin_mm, field.cell_mm * factor, z_mm, np.ones(z_mm.shape, dtype=bool)
+def _swept(
+    field: HeightField,
+    slices: list[EnvelopeSlice],
+    start: Float[np.ndarray, "n 3"],
+    end: Float[np.ndarray, "n 3"],
+    pushed_mm3: Float[np.ndarray, " n"],
+    width_mm: Float[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Worst contact of every move with some slices, beyond what is allowed, and the slice."""
+    tables = [footprint_rows(part.polygon_mm, field.cell_mm) for part in slices]
+    rows = np.concatenate([np.stack(table, axis=1) for table in tables])
+    row_at = np.concatenate([[0], np.cumsum([len(table[0]) for table in tables])])
+    dilated = np.stack([field.max_within(part.polygon_mm) for part in slices])
+    tip = np.array([part.z_from_mm < 1e-9 for part in slices])
+    worst, which = kernels.sweep(
+        start,
+        end,
+        (pushed_mm3 > 0).astype(np.int64),
+        0.5 * width_mm,
+        field.z_mm.astype(np.float64).copy(),
+        field.origin_mm.astype(np.float64),
+        field.cell_mm,
+        np.array([part.z_from_mm for part in slices]),
+        np.arange(len(slices)),
+        dilated,
+        rows,
+        row_at,
+        np.where(tip, TIP_SLACK_MM, BODY_SLACK_MM),
     )
+    return np.asarray(worst), np.asarray(which)
+
+
+def _coarse(field: HeightField, most: int, least_cell_mm: float) -> HeightField:
+    """The field with cells joined, so that it is small enough and not finer than needed."""
+    ny, nx = field.shape
+    factor = max(
+        int(np.ceil(np.sqrt(ny * nx / most))), int(np.ceil(least_cell_mm / field.cell_mm - 1e-6))
+    )
+    return field.coarsened(factor)

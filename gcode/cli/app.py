@@ -11,12 +11,12 @@ import typer
 import gcode
 from gcode.check import check as check_program
 from gcode.check import find_refusals
-from gcode.cli import console
+from gcode.cli import console, importing
 from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
 from gcode.firmware import serve_forever
 from gcode.firmware.faults import parse_faults
-from gcode.hosts import connect
+from gcode.hosts import Printer, connect
 from gcode.moves import Program
 from gcode.profiles import (
     DEFAULT_MATERIAL,
@@ -60,6 +60,7 @@ app = typer.Typer(
 )
 profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
 app.add_typer(profiles_app, name="profiles")
+importing.add_to(profiles_app)
 
 
 def _version(asked: bool) -> None:
@@ -212,7 +213,13 @@ def estimate(
 @app.command("send")
 def send(
     file: FileArgument,
-    port: Annotated[str, typer.Option(help="Device path, or file:PATH.")],
+    port: Annotated[
+        str,
+        typer.Option(
+            help="Device path, octoprint+http://HOST:PORT, moonraker+http://HOST:PORT, file:PATH; "
+            "keys by OCTOPRINT_API_KEY, MOONRAKER_API_KEY."
+        ),
+    ],
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
     wire_log: Annotated[Path | None, typer.Option(help="Log of every byte, with times.")] = None,
@@ -238,7 +245,7 @@ def send(
             report = machine.print(checked, progress=bars)
             machine.finish_moves()
     except BaseException:
-        machine.abort()
+        _abort(machine)
         raise
     finally:
         machine.close()
@@ -317,6 +324,14 @@ def profiles_show(
         f"There is no profile '{profile}'; 'gcode profiles list' names them (for a file of your "
         "own, say --kind)."
     )
+
+
+def _abort(machine: Printer) -> None:
+    """End the job; the failure that led here stays the one that is reported."""
+    try:
+        machine.abort()
+    except GcodeError as error:
+        console.errors.print(f"gcode: the printer could not be made safe: {error}", markup=False)
 
 
 def _text(path: Path) -> str:

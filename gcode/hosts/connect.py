@@ -7,8 +7,12 @@ from pathlib import Path
 from gcode.errors import InputError
 from gcode.hosts.file import FilePrinter
 from gcode.hosts.journal import Journal
+from gcode.hosts.moonraker import MoonrakerPrinter
+from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.port import Printer
+from gcode.hosts.secret import find_key
 from gcode.hosts.serial import SerialPrinter
+from gcode.hosts.web import Address
 
 
 def connect(
@@ -24,20 +28,23 @@ def connect(
     Parameters
     ----------
     port
-        A device path, `octoprint+http://…`, `moonraker+http://…` or `file:PATH`.
+        A device path, `octoprint+http://…`, `moonraker+http://…` or `file:PATH`. The servers'
+        API keys come from the environment or the keys file (`secret`), never with the name.
 
     Raises
     ------
     InputError
-        If the name is none of these.
+        If the name is none of these, or carries a secret.
     """
     if port.startswith("file:"):
         return FilePrinter(Path(port.removeprefix("file:")))
     if port.startswith(("octoprint+", "moonraker+")):
-        raise InputError(
-            f"{port!r} needs the OctoPrint or Moonraker adapter, which this version does not have "
-            f"yet; use the printer's device path or file:PATH."
-        )
+        if journal is not None:
+            raise InputError(
+                f"A journal belongs to a serial port; {port.partition('+')[0]} keeps its own "
+                f"state: leave --journal out."
+            )
+        return _web_printer(Address.parse(port), wire_log)
     if "://" in port:
         raise InputError(
             f"{port!r} names no kind of printer; write a device path, octoprint+http://…, "
@@ -50,3 +57,10 @@ def connect(
         wire_log=wire_log,
         journal=Journal(journal) if journal is not None else None,
     )
+
+
+def _web_printer(address: Address, wire_log: Path | None) -> Printer:
+    key = find_key(address.kind, address.spec)
+    if address.kind == "octoprint":
+        return OctoPrintPrinter(address, key, wire_log=wire_log)
+    return MoonrakerPrinter(address, key, wire_log=wire_log)

@@ -51,6 +51,11 @@ def load_process(id_or_path: str | Path) -> ProcessProfile:
     return _load(ProcessProfile, "processes", id_or_path)
 
 
+def content_of(kind: Kind, id_or_path: str | Path) -> dict[str, Any]:
+    """Return a profile's content with everything it inherits, before validation."""
+    return _resolve(kind, _find(kind, id_or_path).resolve(), ())
+
+
 def _id_of(path: Path) -> str:
     return path.name.removesuffix(".toml")
 

@@ -31,6 +31,7 @@ from gcode.protocol.events import (
     CommandFailed,
     Event,
     Greeted,
+    LineError,
     LinkLost,
     Ok,
     PrinterReset,
@@ -337,7 +338,12 @@ class Link:
             self._listen_anew(now_s, self._silence_s())
         elif isinstance(reply, Waiting):
             self._events.append(reply)
-            self._doubt(now_s)  # it has nothing to do, yet owes us an ok
+            # It has nothing to do, yet owes us an ok; one that is under way gets a moment.
+            self._doubt(now_s, self.timing.resend_grace_s)
+        elif isinstance(reply, LineError):
+            self._events.append(reply)
+            # Some ask for no resend (OctoPrint#2226); the others' request follows at once.
+            self._doubt(now_s, self.timing.resend_grace_s)
         elif isinstance(reply, PrinterReset):
             self._events.append(reply)
             self._on_reset(reply, now_s)
@@ -547,10 +553,11 @@ class Link:
         self._probing_since_s = None
         self._deadline_s = now_s + silence_s
 
-    def _doubt(self, now_s: float) -> None:
+    def _doubt(self, now_s: float, after_s: float | None = None) -> None:
         """Something is odd: wait only shortly before asking again."""
         if self.state in (State.WAITING, State.PROBING):
-            self._deadline_s = min(self._deadline_s, now_s + self.timing.doubt_s)
+            wait_s = self.timing.doubt_s if after_s is None else after_s
+            self._deadline_s = min(self._deadline_s, now_s + wait_s)
 
     # ------------------------------------------------------------------ small parts
 

@@ -54,12 +54,14 @@ MOST_THICK_NOZZLES = 0.8
 # The floor was measured, the deficit computed from it: they agree within this.
 AGREE_MM = 0.04
 # A gap of more than this share of the thickest bead is not filled from above.
-DEEP_RATIO = 1.7
-HOLD_MM = 0.6  # how far a bead may hang over a hole beside what holds it
+DEEP_RATIO = 1.3
+HOLD_MM = 0.4  # how far a bead may hang over a hole beside what holds it
 STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4
 LEAST_SECTION_MM2 = 0.004
-SPREAD_NOZZLES = 1.6  # from a bead's centre, as far as plastic is pressed sideways
+SPREAD_NOZZLES = 0.95  # from a bead's centre, as far as plastic is pressed sideways
+# Centre lines keep off the rim of where the tip may go: contours of cells are not exact.
+DRAWN_IN_CELLS = 0.75
 ROUNDING_MM = 2e-3  # more than the text's last digit
 NEAR_MM = 1.0  # a travel as short as this needs no lift
 CLEAR_MM = 0.5  # of the tip over everything on a travel
@@ -201,7 +203,10 @@ class _Model:
         window = (x0 - 20.0, y0 - 20.0, x1 + 20.0, y1 + 20.0)
         # the lowest pass lies at most one thick bead above the deficit's floor
         self.reach = Reach(
-            as_built.crop(window), setup.printer, lowest_tip_mm=max(0.0, float(self.box[2]))
+            as_built,
+            setup.printer,
+            lowest_tip_mm=max(0.0, float(self.box[2])),
+            window_mm=window,
         )
         self.field = as_built
 
@@ -301,7 +306,9 @@ def _plan_pass(
     if not thick.any():
         return None
     reach = model.reach.at(z_mm)
-    centres = _contour((thick > 0) & model.free_at(reach), model)
+    centres = offset(
+        _contour((thick > 0) & model.free_at(reach), model), -DRAWN_IN_CELLS * model.cell_mm
+    )
     if centres.is_empty():
         return None
     wanted_region = _contour(thick > 0, model)
@@ -334,19 +341,25 @@ def _due(
     Where it is too deep already (the nozzle could not get down there), a layer is drawn over it
     as far as a bead holds on to what stands beside it; what lies under it is lost, and said.
     """
-    wanted = model.wanted_below(z_mm) - model.laid_mm - model.sunk_mm
+    below = model.wanted_below(z_mm)
+    wanted = below - model.laid_mm - model.sunk_mm
+    # a hole that the nozzle could not get into ends below: nothing is laid over what is above it
+    wanted = np.where(below - model.wanted_below(z_mm - most_mm) > ROUNDING_MM, wanted, 0.0)
     gap = z_mm - model.surface_mm
     thick = np.clip(np.minimum(gap, wanted + AGREE_MM), 0.0, None)
     last = model.top_mm <= z_mm + 1e-6
     due = (following_mm - model.surface_mm > most_mm) | last
     active = due & (wanted > LEAST_THICK_MM / 2) & (thick >= LEAST_THICK_MM)
-    deep = active & (thick > DEEP_RATIO * most_mm)
+    # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
+    active &= model.top_mm > z_mm - 0.5 * layer_mm
+    deep = active & (gap > DEEP_RATIO * most_mm)
     if deep.any():
         held = ndimage.binary_dilation(
             ((active & ~deep) | (gap < most_mm)), iterations=round(HOLD_MM / model.cell_mm)
         )
-        model.sunk_mm = np.where(deep & held, model.sunk_mm + thick - layer_mm, model.sunk_mm)
-        thick = np.where(deep & held, layer_mm, thick)
+        lidded = np.minimum(thick, layer_mm)
+        model.sunk_mm = np.where(deep & held, model.sunk_mm + thick - lidded, model.sunk_mm)
+        thick = np.where(deep & held, lidded, thick)
         active &= ~deep | held
     return np.where(active, thick, 0.0)
 
@@ -361,7 +374,8 @@ def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: _Model) -> l
     t = (step / count[owner])[:, None]
     points = np.concatenate([xy[owner] + (xy[owner + 1] - xy[owner]) * t, xy[-1:]])
     ok = np.ones(len(points) - 1, dtype=bool)
-    for share in np.linspace(0.0, 1.0, 6):  # closer than the checker's own steps
+    closer = 2 + int(np.ceil(3 * STEP_MM / model.reach.field.cell_mm))
+    for share in np.linspace(0.0, 1.0, closer):  # than the checker's own steps of half a cell
         at = points[:-1] + (points[1:] - points[:-1]) * share
         ok &= _surely_free(at, reach, model)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
@@ -562,7 +576,8 @@ def _emit(pen: Pen, one: _Pass, model: _Model, setup: PrintSetup) -> float:
         target = np.array([*chain.xy_mm[0], one.z_mm])
         gap = target - pen.position_mm
         near = abs(gap[2]) < 1e-6 and float(np.hypot(gap[0], gap[1])) < NEAR_MM
-        way = pen.position_mm[:2] + np.linspace(0.0, 1.0, 12)[:, None] * gap[:2]
+        samples = 2 + int(np.ceil(3 * NEAR_MM / model.reach.field.cell_mm))
+        way = pen.position_mm[:2] + np.linspace(0.0, 1.0, samples)[:, None] * gap[:2]
         if near and _surely_free(way, one.reach, model).all():
             pen.move_to(target)
         else:

@@ -5,6 +5,7 @@ A column is out of reach at a height where any slice of the envelope, placed the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +14,12 @@ from jaxtyping import Bool, Float
 from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
 
-# The flat may press this deep into the plastic beside it: a layer less than a contact that
-# moves a part; with the noise of a scan it stays under the checker's limit.
-TIP_PRESS_MM = 0.15
-BODY_CLEARANCE_MM = 0.1
+# The flat may press this deep into the plastic beside it: half a layer; with what a scan gets
+# wrong it stays under the checker's limit.
+TIP_PRESS_MM = 0.1
+BODY_CLEARANCE_MM = 0.0
+# Slices that reach farther than this are looked at in cells of this size.
+WIDE_MM, WIDE_CELL_MM = 2.5, 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +35,27 @@ class Obstacle:
         return self.part.z_from_mm < 1e-9
 
 
+def _inner(wide: HeightField, field: HeightField) -> tuple[float, float, float, float]:
+    """The box of the joined cells, drawn in so that rounding picks no further cell."""
+    x0, y0, x1, y1 = wide.box_mm
+    little = 0.25 * field.cell_mm
+    return (x0 + little, y0 + little, x1 - little, y1 - little)
+
+
+def _least_tip(
+    part: EnvelopeSlice, field: HeightField, wide: HeightField, factor: int
+) -> Float[np.ndarray, "ny nx"]:
+    """How high the tip must at least be by column; what is wide is looked at in joined cells."""
+    if max(abs(v) for corner in part.polygon_mm for v in corner) <= WIDE_MM:
+        under = field.max_within(part.polygon_mm)
+    else:
+        joined = wide.max_within(part.polygon_mm)
+        ny, nx = field.shape
+        under = np.repeat(np.repeat(joined, factor, axis=0), factor, axis=1)[:ny, :nx]
+    give_mm = -TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_CLEARANCE_MM
+    return np.asarray(under - part.z_from_mm + give_mm)
+
+
 class Reach:
     """Answers where the tip may go.
 
@@ -41,21 +65,30 @@ class Reach:
         What stands there; its grid is the answers' grid.
     lowest_tip_mm
         The tip is never asked about below this height.
+    window_mm
+        (x_min, y_min, x_max, y_max) where the tip is asked about, and what stands around it;
+        None is all of the field.
     """
 
     def __init__(
-        self, field: HeightField, printer: PrinterProfile, *, lowest_tip_mm: float = 0.0
+        self,
+        field: HeightField,
+        printer: PrinterProfile,
+        *,
+        lowest_tip_mm: float = 0.0,
+        window_mm: tuple[float, float, float, float] | None = None,
     ) -> None:
+        factor = max(1, math.ceil(WIDE_CELL_MM / field.cell_mm - 1e-6))
+        wide = field.coarsened(factor)
+        if window_mm is not None:
+            # along the joined cells, which are those of the whole field
+            wide = wide.crop(window_mm)
+            field = field.crop(_inner(wide, field))
         self.field = field
         # a slice that stays above everything when the tip is lowest cannot touch
         high_mm = field.top_mm - lowest_tip_mm + BODY_CLEARANCE_MM
         self.obstacles = tuple(
-            Obstacle(
-                part,
-                field.max_within(part.polygon_mm)
-                - part.z_from_mm
-                + (-TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_CLEARANCE_MM),
-            )
+            Obstacle(part, _least_tip(part, field, wide, factor))
             for part in printer.envelope
             if part.z_from_mm <= high_mm
         )

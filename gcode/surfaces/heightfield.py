@@ -156,6 +156,23 @@ class HeightField:
             seen=self.seen[y0:y1, x0:x1].copy(),
         )
 
+    def coarsened(self, factor: int) -> HeightField:
+        """Cells joined by `factor` each way, each as high as its highest; seen if all were."""
+        if factor <= 1:
+            return self
+        ny, nx = self.shape
+        rows, columns = -(-ny // factor), -(-nx // factor)
+        z_mm = np.full((rows * factor, columns * factor), -np.inf)
+        seen = np.ones(z_mm.shape, dtype=bool)
+        z_mm[:ny, :nx], seen[:ny, :nx] = self.z_mm, self.seen
+        blocks = (rows, factor, columns, factor)
+        return HeightField(
+            self.origin_mm,
+            self.cell_mm * factor,
+            z_mm.reshape(blocks).max(axis=(1, 3)),
+            np.asarray(seen.reshape(blocks).all(axis=(1, 3))),
+        )
+
     def raised(self, z_mm: Float[np.ndarray, "ny nx"]) -> HeightField:
         """The same grid with heights max(z, own)."""
         return HeightField(self.origin_mm, self.cell_mm, np.maximum(self.z_mm, z_mm), self.seen)

@@ -149,3 +149,36 @@ def dilate_rows(z: Any, row_dy: Any, row_low: Any, row_high: Any) -> Any:
             for ix in range(nx):
                 out[iy, ix] = max(out[iy, ix], line[ix])
     return out
+
+
+@njit(cache=True, nogil=True)
+def column_rest(
+    offset: Any, z: Any, gone_offset: Any, gone_z: Any, film: float, empty: float
+) -> Any:
+    """Highest crossing of each column after a second solid is taken from the first.
+
+    Both are given by their crossings (`column_crossings`). What is left thinner than `film` goes
+    with what was taken; `empty` where nothing stays.
+    """
+    n = offset.shape[0] - 1
+    top = np.full(n, empty)
+    for i in range(n):
+        stands = np.sort(z[offset[i] : offset[i + 1]])
+        gone = np.sort(gone_z[gone_offset[i] : gone_offset[i + 1]])
+        done = False
+        for k in range(len(stands) - 1, 0, -2):
+            high, low = stands[k], stands[k - 1]
+            touched = False
+            for g in range(len(gone) - 1, 0, -2):
+                if gone[g - 1] >= high or gone[g] <= low:
+                    continue
+                touched = True
+                if high - gone[g] > film:
+                    break
+                high = gone[g - 1]
+            if not touched or high - low > film:
+                top[i] = high
+                done = True
+            if done:
+                break
+    return top

@@ -1,0 +1,392 @@
+"""Broken faces: what a scan without rays says of the space around what left the template.
+
+Around a defect every point of the scan is looked at for itself: on the template's own surface, or
+on a broken face with a plane of its own. With the template's surface where it was seen, they close
+what stands there; the winding number then says which side a point of space is on, and the nearest
+face how far. Nothing is labelled here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from amrepair.detect.surfels import Surfels
+from amrepair.detect.winding import Shell
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+
+# The scan is looked at point by point within this of what lies off the template.
+AROUND_MM = 1.5
+# Points of one plane: at the spacing s of the scan a disc of about 2 s.
+PLANE_POINTS = 16
+PLANE_ROUNDS = 4
+LONE_RATIO = 0.2  # of its neighbours must be broken, too
+NEIGHBOURS = 6
+# Planes more than 40° off the template's own slope are another surface, if they lie below it.
+STRIP_COSINE, STRIP_MM = 0.77, 0.03
+# The template's surface is there where a point of the scan lies this near (in spacings).
+PRESENT_SPACINGS = 1.6
+# Samples on one side only: a patch beside a rim (0 amid even samples, 1 far outside).
+SURROUND_POINTS, LOPSIDED = 8, 0.6
+# A face answers for what lies over it: sideways within a spacing and this share of the height.
+BESIDE_SPACINGS, BESIDE_PER_HEIGHT = 2.0, 0.5
+NEAR_SPACINGS = 3.0
+# Nearer to ½ than this the winding number does not say on which side of a surface a point is.
+SURE_WINDING = 0.05
+PROBE_MM = 0.5
+OPEN_WINDING = 0.3
+MOST_TURNS = 12
+# Rooms that the scan's surface separates: voxels, the space around the faces, their number.
+VOXEL_MM, ROOM_MM, MOST_VOXELS = 0.3, 3.0, 600_000
+UNDER_MM = 0.8
+# A room is what its many seeds say if the others are fewer than this share.
+LEAK_RATIO = 0.02
+# A sign vector needs this mean agreement with the template before file normals are believed.
+NORMAL_AGREEMENT = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Faces:
+    """The scanned surface around defects, template frame.
+
+    Attributes
+    ----------
+    place_mm, deviation_mm
+        (k, 3) and (k,) places and the template's distance there; around defects moved onto the
+        plane through their neighbours, elsewhere the surfels.
+    off
+        (k,) on a broken face.
+    normal
+        (k, 3) outward unit normals where `off`, else zero.
+    spacing_mm
+        Of the scan.
+    shell
+        All that is known to stand there as one closed surface.
+    """
+
+    place_mm: Float[np.ndarray, "k 3"]
+    deviation_mm: Float[np.ndarray, " k"]
+    off: Bool[np.ndarray, " k"]
+    normal: Float[np.ndarray, "k 3"]
+    spacing_mm: float
+    tree: cKDTree
+    shell: Shell
+
+    def clearance(
+        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Signed distance to what stands there, positive outside.
+
+        A place on the template answers f(x) − f(place): exact on curves and edges. One on a broken
+        face answers with its plane. Where neither lies over the point, the winding number says the
+        side and the nearest place how far.
+        """
+        k = min(NEIGHBOURS, len(self.place_mm))
+        distance, index = self.tree.query(points_mm, k=k, workers=2)
+        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+        offset = points_mm[:, None, :] - self.place_mm[index]
+        plane = (offset * self.normal[index]).sum(axis=2)
+        field = f_mm[:, None] - self.deviation_mm[index]
+        value = np.where(self.off[index], plane, field)
+        weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * self.spacing_mm) ** 2)
+        best = (weight * value).sum(axis=1) / weight.sum(axis=1)
+        height = np.abs(value[:, 0])
+        sideways = np.sqrt(np.maximum(distance[:, 0] ** 2 - height**2, 0.0))
+        s = self.spacing_mm
+        far = (distance[:, 0] > NEAR_SPACINGS * s) | (
+            sideways > BESIDE_SPACINGS * s + BESIDE_PER_HEIGHT * height
+        )
+        ask = np.flatnonzero(far | (distance[:, 0] > s))
+        if len(ask):
+            inside = self.shell.winding(points_mm[ask])
+            contrary = np.where(
+                best[ask] < 0, inside < 0.5 - SURE_WINDING, inside > 0.5 + SURE_WINDING
+            )
+            decided = far[ask] | contrary
+            sign = np.where(inside[decided] < 0.5, 1.0, -1.0)
+            best[ask[decided]] = sign * distance[ask[decided], 0]
+        return np.asarray(best)
+
+
+@dataclass(frozen=True, slots=True)
+class Patches:
+    """The template's surface: (m, 3) places, and outward normals times area."""
+
+    place_mm: Float[np.ndarray, "m 3"]
+    vector_mm2: Float[np.ndarray, "m 3"]
+
+
+def find_faces(
+    scan: Scan,
+    template: Template,
+    surfels: Surfels,
+    off: Bool[np.ndarray, " s"],
+    patches: Patches,
+    *,
+    threshold_mm: float,
+) -> Faces:
+    """Look at the scan around the surfels in `off` and close what stands there.
+
+    Parameters
+    ----------
+    threshold_mm
+        Deviation from the template that is more than noise for a mean of `PLANE_POINTS` points.
+    """
+    kept = surfels.of_point >= 0
+    near_cell = _around(scan.points_mm[kept], surfels, off, patches)
+    chosen = np.flatnonzero(kept)[near_cell[surfels.of_point[kept]]]
+    points = scan.points_mm[chosen]
+    place, plane, area, neighbours = _planes(
+        points, spacing_mm=surfels.spacing_mm, sigma_mm=max(scan.sigma_mm, surfels.spread_mm)
+    )
+    deviation, gradient = template.distance_and_gradient(place)
+    gradient = _unit(gradient)
+    along = np.abs((gradient * plane).sum(axis=1))
+    broken = np.abs(deviation) > threshold_mm
+    broken |= (along < STRIP_COSINE) & (deviation < -STRIP_MM)
+    # a lone point among others is noise
+    broken &= broken[neighbours].mean(axis=1) > LONE_RATIO
+    rest = np.flatnonzero(~near_cell)
+    places = np.concatenate([place, surfels.place_mm[rest]])
+    is_off = np.concatenate([broken, np.zeros(len(rest), bool)])
+    tree = cKDTree(places, compact_nodes=False, balanced_tree=False)
+    spacing_mm = float(np.sqrt(np.median(area)))
+    reach = np.full(len(places), PRESENT_SPACINGS * spacing_mm)
+    reach[len(place) :] = 1.8 * surfels.cell_mm
+    present = _present(patches, places, is_off, tree, reach)
+    which = np.flatnonzero(broken)
+    given = None
+    if scan.normals is not None:
+        given = _given(scan.normals[chosen], gradient, ~broken)
+    if given is not None:
+        flip = (plane[which] * given[which]).sum(axis=1) < 0
+        outward = np.where(flip[:, None], -plane[which], plane[which])
+    else:
+        side = _open_side(
+            template, scan.points_mm[kept], place[which], plane[which], patches, present
+        )
+        outward = _turned(place, which, plane, area, neighbours, patches, present, spacing_mm, side)
+    normal = np.zeros((len(places), 3))
+    normal[which] = outward
+    deviations = np.concatenate([deviation, surfels.deviation_mm[rest]])
+    vectors = outward * area[which, None]
+
+    def faces_with(keep: Bool[np.ndarray, " m"]) -> Faces:
+        shell = Shell.of(
+            np.concatenate([patches.place_mm[keep], place[which]]),
+            np.concatenate([patches.vector_mm2[keep], vectors]),
+        )
+        return Faces(places, deviations, is_off, normal, spacing_mm, tree, shell)
+
+    return faces_with(_standing(faces_with, template, patches, present))
+
+
+def _around(
+    points_mm: Float[np.ndarray, "n 3"],
+    surfels: Surfels,
+    off: Bool[np.ndarray, " s"],
+    patches: Patches,
+) -> Bool[np.ndarray, " s"]:
+    """Surfels near what lies off the template, or near template that no point lies on."""
+    reach_mm = PRESENT_SPACINGS * surfels.spacing_mm
+    raw = cKDTree(points_mm, compact_nodes=False, balanced_tree=False)
+    gap = np.isinf(raw.query(patches.place_mm, distance_upper_bound=reach_mm, workers=2)[0])
+    lost = np.concatenate([surfels.place_mm[off], patches.place_mm[gap]])
+    distance = cKDTree(lost).query(surfels.place_mm, distance_upper_bound=AROUND_MM, workers=2)[0]
+    return np.asarray(np.isfinite(distance))
+
+
+def _present(
+    patches: Patches,
+    places_mm: Float[np.ndarray, "k 3"],
+    off: Bool[np.ndarray, " k"],
+    tree: cKDTree,
+    reach_mm: Float[np.ndarray, " k"],
+) -> Bool[np.ndarray, " m"]:
+    """Patches of the template's surface amid scanned surface, not beside its rim."""
+    k = min(SURROUND_POINTS, len(places_mm))
+    distance, index = tree.query(patches.place_mm, k=k, workers=2)
+    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+    offset = places_mm[index] - patches.place_mm[:, None, :]
+    normal = _unit(patches.vector_mm2)
+    offset -= np.einsum("mki,mi->mk", offset, normal)[:, :, None] * normal[:, None, :]
+    sideways = np.linalg.norm(offset, axis=2).mean(axis=1)
+    lopsided = np.linalg.norm(offset.mean(axis=1), axis=1) / np.maximum(sideways, 1e-9)
+    near = distance[:, 0] / reach_mm[index[:, 0]]
+    near = (near < 0.4) | ((near < 1.0) & (lopsided < LOPSIDED))
+    return np.asarray(near & (off[index].mean(axis=1) < 0.5))
+
+
+def _standing(
+    faces_with: object, template: Template, patches: Patches, present: Bool[np.ndarray, " m"]
+) -> Bool[np.ndarray, " m"]:
+    """Patches of the template that stand: those seen, and those that nothing speaks against.
+
+    A hole in the scan is missing where broken faces close it from within (winding number 0 just
+    inside the template's surface), covered where they close it from outside (1), and unseen where
+    nothing does (½): then the template's own surface is taken to stand there.
+    """
+    holes = np.flatnonzero(~present)
+    probes = patches.place_mm[holes] - PROBE_MM * _unit(patches.vector_mm2[holes])
+    f_mm = template.distance(probes)
+    keep = present
+    for _ in range(2):  # what is unseen elsewhere pulls on the first answer
+        faces: Faces = faces_with(keep)  # type: ignore[operator]
+        inside = faces.shell.winding(probes)
+        unseen = faces.clearance(probes, f_mm) <= 0
+        unseen &= (inside > OPEN_WINDING) & (inside < 1 - OPEN_WINDING / 2)
+        keep = present.copy()
+        keep[holes[unseen]] = True
+    return keep
+
+
+def _planes(
+    points_mm: Float[np.ndarray, "n 3"], *, spacing_mm: float, sigma_mm: float
+) -> tuple[
+    Float[np.ndarray, "n 3"],
+    Float[np.ndarray, "n 3"],
+    Float[np.ndarray, " n"],
+    Int[np.ndarray, "n k"],
+]:
+    """Points moved onto the planes through their neighbours, those planes' normals, and areas."""
+    k = min(PLANE_POINTS, len(points_mm))
+    distance, index = cKDTree(points_mm).query(points_mm, k=k, workers=2)
+    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+    around = points_mm[index]
+    weight = np.ones(index.shape)
+    spread_mm = spacing_mm
+    for _ in range(PLANE_ROUNDS):
+        total = weight.sum(axis=1)
+        mean = np.einsum("nk,nki->ni", weight, around) / total[:, None]
+        centred = around - mean[:, None, :]
+        second = np.einsum("nk,nki,nkj->nij", weight, centred, centred)
+        normal = np.linalg.eigh(second)[1][:, :, 0]
+        # at an edge one of the two planes wins: what lies far from it counts less and less
+        height = np.einsum("nki,ni->nk", centred, normal)
+        height -= np.einsum("ni,ni->n", points_mm - mean, normal)[:, None]
+        spread_mm = max(spread_mm / 2, 2 * sigma_mm)
+        weight = np.exp(-((height / spread_mm) ** 2)) + 1e-6
+    above = np.einsum("ni,ni->n", points_mm - mean, normal)
+    area = np.pi * distance[:, -1] ** 2 / max(k - 1, 1)
+    return points_mm - above[:, None] * normal, np.ascontiguousarray(normal), area, index
+
+
+def _given(
+    normals: Float[np.ndarray, "n 3"],
+    gradient: Float[np.ndarray, "n 3"],
+    on: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"] | None:
+    """The file's normals, turned outward as a whole; None where they contradict the template."""
+    if not on.any():
+        return normals
+    agreement = float(np.median((gradient[on] * normals[on]).sum(axis=1)))
+    if abs(agreement) < NORMAL_AGREEMENT:
+        return None
+    return np.asarray(normals * np.sign(agreement))
+
+
+def _turned(
+    place_mm: Float[np.ndarray, "n 3"],
+    which: Int[np.ndarray, " q"],
+    plane: Float[np.ndarray, "n 3"],
+    area_mm2: Float[np.ndarray, " n"],
+    neighbours: Int[np.ndarray, "n k"],
+    patches: Patches,
+    present: Bool[np.ndarray, " m"],
+    spacing_mm: float,
+    side: Float[np.ndarray, " q"],
+) -> Float[np.ndarray, "q 3"]:
+    """Planes of the broken faces turned to the side known to be open, or down the winding number.
+
+    First the winding number of the template's surface where it is present, and of the faces whose
+    side is known: it falls toward the hole. Then with all faces, until none turns any more.
+    """
+    normal, place = np.where(side[:, None] < 0, -1.0, 1.0) * plane[which], place_mm[which]
+    sure = side != 0
+    known = np.concatenate([patches.place_mm[present], place[sure]])
+    known_vector = np.concatenate(
+        [patches.vector_mm2[present], normal[sure] * area_mm2[which[sure], None]]
+    )
+    shell = Shell.of(known, known_vector)
+    place, open_normal = place[~sure], normal[~sure]
+    which_open, area_open = which[~sure], area_mm2[which[~sure], None]
+    step_mm = 2.0 * spacing_mm
+    falls = np.zeros_like(place_mm)
+    falls[which[sure]] = normal[sure]
+    for turn in range(MOST_TURNS if len(place) else 0):
+        ahead, behind = place + step_mm * open_normal, place - step_mm * open_normal
+        drop = shell.winding(behind) - shell.winding(ahead)
+        falls[which_open] = drop[:, None] * open_normal
+        # a face is decided as a whole, not point by point
+        vote = (falls[neighbours[which_open]].sum(axis=1) * open_normal).sum(axis=1)
+        if turn and (vote >= 0).all():
+            break
+        open_normal = np.where(vote[:, None] < 0, -open_normal, open_normal)
+        shell = Shell.of(
+            np.concatenate([known, place]),
+            np.concatenate([known_vector, open_normal * area_open]),
+        )
+    normal[~sure] = open_normal
+    return np.asarray(normal)
+
+
+def _open_side(
+    template: Template,
+    points_mm: Float[np.ndarray, "n 3"],
+    face_mm: Float[np.ndarray, "q 3"],
+    plane: Float[np.ndarray, "q 3"],
+    patches: Patches,
+    present: Bool[np.ndarray, " m"],
+) -> Float[np.ndarray, " q"]:
+    """Positive where space ahead of a face's plane is open, negative behind, 0 unknown.
+
+    Space is cut into what scanned surface separates. What holds a corner of the outside is empty,
+    what lies just under the template's present surface is solid; both: the scan leaks, unknown.
+    """
+    if len(face_mm) == 0:
+        return np.zeros(0)
+    low, high = face_mm.min(axis=0) - ROOM_MM, face_mm.max(axis=0) + ROOM_MM
+    voxel_mm = max(VOXEL_MM, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
+    shape = np.ceil((high - low) / voxel_mm).astype(np.int64)
+
+    def cells(
+        points_mm: Float[np.ndarray, "p 3"],
+    ) -> tuple[Int[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
+        index = np.floor((points_mm - low) / voxel_mm).astype(np.int64)
+        return index, np.asarray(((index >= 0) & (index < shape)).all(axis=1))
+
+    wall = np.zeros(tuple(shape), bool)
+    for points in (points_mm, patches.place_mm[present]):
+        index, ok = cells(points)
+        wall[tuple(index[ok].T)] = True
+    wall = ndimage.binary_dilation(wall)  # a sheet of points has gaps of chance
+    rooms, count = ndimage.label(~wall)
+    edge = np.ones(tuple(shape), bool)
+    edge[1:-1, 1:-1, 1:-1] = False
+    edge_index = np.argwhere(edge & ~wall)
+    centres = low + (edge_index + 0.5) * voxel_mm
+    outside = edge_index[template.distance(centres) > voxel_mm]
+    under = patches.place_mm[present] - UNDER_MM * _unit(patches.vector_mm2[present])
+    index, ok = cells(under)
+    inside = index[ok][template.distance(under[ok]) < -0.8 * UNDER_MM]
+    empties = np.bincount(rooms[tuple(outside.T)], minlength=count + 1)
+    solids = np.bincount(rooms[tuple(inside.T)], minlength=count + 1)
+    value = np.zeros(count + 1)
+    value[(empties > 0) & (solids < LEAK_RATIO * empties)] = 1.0
+    value[(solids > 0) & (empties < LEAK_RATIO * solids)] = -1.0
+    value[0] = 0.0
+    side = np.zeros(len(face_mm))
+    for step in (2.5, 3.5):
+        for sign in (-1.0, 1.0):
+            index, ok = cells(face_mm + sign * step * voxel_mm * plane)
+            side[ok] += sign * value[rooms[tuple(index[ok].T)]]
+    return side
+
+
+def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))

@@ -1,0 +1,91 @@
+"""`gcode profiles import`: another program's profile as one of ours."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gcode.cli import console
+from gcode.errors import InputError
+from gcode.profiles.importers import ImportedFile, file_name, import_profiles, to_toml
+
+SHOWN = 60
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("import")(import_)
+
+
+def import_(
+    file: Annotated[
+        Path, typer.Argument(help="PrusaSlicer .ini, OrcaSlicer .json, Klipper printer.cfg.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the TOML files.")] = Path(),
+    preset: Annotated[
+        str | None, typer.Option(help="Preset of a PrusaSlicer bundle: printer:NAME, …")
+    ] = None,
+    inherits: Annotated[
+        str | None, typer.Option(help="Shipped profile for what the source does not know.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
+    ] = False,
+) -> None:
+    """Import a profile: every key is mapped, or listed with the reason."""
+    found = import_profiles(file, preset=preset, inherits=inherits)
+    folders = len(found.profiles) > 1
+    paths = []
+    for made in found.profiles:
+        paths.append((out / made.kind if folders else out) / file_name(made))
+        if paths[-1].exists():
+            raise InputError(f"{paths[-1]} is there already; remove it, or name another --out.")
+    for made, path in zip(found.profiles, paths, strict=True):
+        text = to_toml(made, found.source)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{path.parent} cannot be made ({error.strerror}).") from error
+        console.write_whole(path, partial(Path.write_text, data=text, encoding="utf-8"))
+    if as_json:
+        console.show_json(_result(found, paths))
+    else:
+        _show(found, paths)
+
+
+def _result(found: ImportedFile, paths: list[Path]) -> dict[str, Any]:
+    return {
+        "profiles": [
+            {
+                "path": str(path),
+                "kind": made.kind,
+                "inherits": made.inherits,
+                "mapped": [
+                    {"source_key": m.source_key, "key": m.key, "value": m.value}
+                    for m in made.mapped
+                ],
+            }
+            for made, path in zip(found.profiles, paths, strict=True)
+        ],
+        "not_mapped": [
+            {"source_key": row.source_key, "value": row.source_value, "reason": row.reason}
+            for row in found.left
+        ],
+        "notes": list(found.notes),
+    }
+
+
+def _show(found: ImportedFile, paths: list[Path]) -> None:
+    for made, path in zip(found.profiles, paths, strict=True):
+        console.out.print(
+            f"{path}: {len(made.mapped)} keys, the rest from {made.inherits}.", markup=False
+        )
+    for note in found.notes:
+        console.out.print(f"note: {note}.", markup=False)
+    console.out.print(f"{len(found.left)} keys are not mapped:")
+    for row in found.left:
+        value = " ".join(row.source_value.split())[:SHOWN]
+        console.out.print(f"  {row.source_key} = {value}: {row.reason}", markup=False)

@@ -1,0 +1,381 @@
+"""A printer behind a Moonraker server and Klipper: JSON-RPC over the websocket, HTTP for files.
+
+Klipper reads the file itself and prints on by itself when we are gone. This adapter uploads a
+program, has it printed, and tells truthfully how that ended. Parking in a pause is left to the
+printer's own PAUSE macro. The emergency stop goes by HTTP, past every queue (a script would wait
+its turn).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from gcode.errors import LinkError, LocalProtocolError, PortBusyError, PrinterError
+from gcode.hosts.lock import PortLock
+from gcode.hosts.moonraker_session import MoonrakerSession
+from gcode.hosts.port import (
+    Capabilities,
+    LinkLostError,
+    PrintableProgram,
+    PrintReport,
+    Temperatures,
+)
+from gcode.hosts.proof import require_checked
+from gcode.hosts.secret import ApiKey
+from gcode.hosts.upload import JobFile
+from gcode.hosts.web import (
+    LIFT_COMMANDS,
+    Address,
+    WebLog,
+    WebTiming,
+    heaters_word,
+    sentence,
+)
+from gcode.progress import Progress, silent
+
+LOOK_EVERY = 5
+"""Waits without an end after which the job is asked for, in case that its news did not come."""
+
+
+class MoonrakerPrinter:
+    """A printer that Klipper drives, reached through Moonraker.
+
+    Parameters
+    ----------
+    address
+        The server.
+    key
+        API key; none where the server trusts this machine.
+    wire_log
+        File for requests and news, with times; it never holds the key.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        key: ApiKey,
+        *,
+        wire_log: Path | None = None,
+        timing: WebTiming | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.address = address
+        self._key = key
+        self._timing = timing or WebTiming()
+        self._clock = clock
+        self._wire_log = wire_log
+        self._log: WebLog | None = None
+        self._lock = PortLock(address.spec)
+        self._tried_safety = False
+        self._open: MoonrakerSession | None = None
+        self._aborted = False
+
+    def __enter__(self) -> MoonrakerPrinter:
+        self.connect()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if error is not None and not self._tried_safety:
+                self._make_safe(error)
+        finally:
+            self.close()
+
+    # ------------------------------------------------------------------ connection
+
+    def connect(self) -> None:
+        """Open the websocket; refuse a printer that is not ready or prints already."""
+        if self._open is not None:
+            return
+        self._lock.acquire()
+        try:
+            self._log = WebLog(self._wire_log) if self._wire_log else None
+            self._open = MoonrakerSession(
+                self.address, self._key, self._timing, self._clock, self._log
+            )
+            self._refuse_unless_ready()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the server; a print under way goes on there."""
+        if self._open is not None:
+            self._open.close()
+            self._open = None
+        self._lock.release()
+        if self._log is not None:
+            self._log.close()
+            self._log = None
+
+    @property
+    def _session(self) -> MoonrakerSession:
+        if self._open is None:
+            raise LocalProtocolError("The printer is not connected; call connect() first.")
+        return self._open
+
+    def _refuse_unless_ready(self) -> None:
+        self._session.look()
+        state = self._session.state
+        if state.stopped:
+            raise PrinterError(
+                f"Klipper behind {self.address.name} has stopped ({_line(state.klippy_message)}); "
+                f"mend the cause and run FIRMWARE_RESTART."
+            )
+        if state.busy:
+            raise PortBusyError(
+                f"{self.address.name} is printing {state.print_file!r} already; wait for it, or "
+                f"cancel it there."
+            )
+
+    # ------------------------------------------------------------------ questions
+
+    def capabilities(self) -> Capabilities:
+        """Return Klipper's version, and what its configuration lets us use."""
+        info = self._session.call("printer.info")
+        version = info.get("software_version", "") if isinstance(info, dict) else ""
+        found = self._session.call("printer.objects.list")
+        objects = found.get("objects", ()) if isinstance(found, dict) else ()
+        caps = {name.upper(): name in objects for name in ("virtual_sdcard", "pause_resume")}
+        return Capabilities(f"Klipper {version}".strip(), {**caps, "EMERGENCY_STOP": True})
+
+    def temperatures(self) -> Temperatures:
+        """Ask for temperatures."""
+        wanted: dict[str, list[str] | None] = {
+            "extruder": ["temperature", "target"],
+            "heater_bed": ["temperature", "target"],
+        }
+        status = self._session.query(wanted)
+        hotend, bed = status.get("extruder", {}), status.get("heater_bed", {})
+        if "temperature" not in hotend:
+            raise LinkError(f"{self.address.name} reports no [extruder]; check printer.cfg.")
+        return Temperatures(
+            float(hotend["temperature"]),
+            float(hotend.get("target") or 0.0),
+            float(bed["temperature"]) if "temperature" in bed else None,
+            float(bed.get("target") or 0.0) if "temperature" in bed else None,
+        )
+
+    def position_mm(self) -> tuple[float, float, float]:
+        """Ask for the logical position."""
+        place = self._session.query({"gcode_move": ["gcode_position"]}).get("gcode_move", {})
+        x_mm, y_mm, z_mm = (float(value) for value in place["gcode_position"][:3])
+        return x_mm, y_mm, z_mm
+
+    def finish_moves(self) -> None:
+        """Return when every buffered move has been made (M400)."""
+        self.command("M400")
+
+    def command(self, text: str) -> None:
+        """Run a script of the host's own; return when Klipper has carried it out."""
+        self._session.call("printer.gcode.script", {"script": text}, limit_s=None)
+
+    # ------------------------------------------------------------------ printing
+
+    def print(
+        self,
+        checked: PrintableProgram,
+        *,
+        lines: range | None = None,
+        progress: Progress = silent,
+    ) -> PrintReport:
+        """Upload a program or a part of it, have it printed, return when it is done."""
+        require_checked(checked)
+        start_s, self._tried_safety = self._clock(), False
+        self._refuse_unless_ready()
+        job = JobFile.of(checked, lines)
+        self._upload(job)
+        self._aborted = False
+        self._start(job)
+        try:
+            ok = self._follow(job, progress)
+        except BaseException as error:  # an interrupt, too: the server would print on by itself
+            self._make_safe(error)
+            raise
+        if ok:
+            progress("printing", 1.0, 1.0)
+        self._session.request("DELETE", f"/server/files/gcodes/{job.name}")
+        # Klipper carries out every line that it has taken, so the position is a lower bound.
+        next_line = job.end if ok else job.line_at(self._session.state.file_position)
+        done = range(job.first, next_line)
+        return PrintReport(
+            ok=ok,
+            lines_acked=sum(
+                bool(row.partition(";")[0].strip()) for row in checked.lines(done.start, done.stop)
+            ),
+            resends=0,
+            stalls=0,
+            spare_oks=0,
+            bytes_sent=len(job.data),
+            seconds=self._clock() - start_s,
+            next_line=next_line,
+            round_trip_s=(0.0, 0.0, 0.0),
+            warnings=() if ok else (f"{self.address.name} cancelled the print",),
+        )
+
+    def _upload(self, job: JobFile) -> None:
+        """Put the file on the server, which compares its checksum."""
+        answer = self._session.request(
+            "POST",
+            "/server/files/upload",
+            files={"file": (job.name, job.data)},
+            data={"root": "gcodes", "checksum": job.sha256},
+            timeout_s=self._timing.upload_s,
+        )
+        if answer.status_code != 201:
+            raise LinkError(
+                f"{self.address.name} does not take the file ({sentence(answer)}); is its disk "
+                f"full?"
+            )
+
+    def _start(self, job: JobFile) -> None:
+        with self._session.news:
+            self._session.state.follow(job.name)
+        try:
+            self._session.call("printer.print.start", {"filename": job.name}, limit_s=None)
+        except PrinterError:
+            raise
+        except LinkError as error:
+            if not self._began(job):
+                raise self._lost(job, f"whether it began is not known: {error}") from error
+
+    def _began(self, job: JobFile) -> bool:
+        """Whether a print whose start was not confirmed is under way after all."""
+        try:
+            self._look(job)
+        except LinkLostError:
+            return False
+        return True
+
+    def _follow(self, job: JobFile, progress: Progress) -> bool:
+        """Wait for the print's end; False if it was cancelled."""
+        session, state = self._session, self._session.state
+        self._look(job)
+        looked_s = self._clock()
+        while True:
+            with session.news:
+                session.news.wait_for(
+                    lambda: state.ended or state.moved or state.stale or not session.listening,
+                    self._timing.poll_s,
+                )
+                state.moved = False
+                ended, fresh = state.ended, session.listening and not state.stale
+            progress("printing", float(state.file_position), float(len(job.data)))
+            if ended:
+                return self._outcome(job)
+            if fresh and self._clock() - looked_s < LOOK_EVERY * self._timing.poll_s:
+                continue
+            self._look(job)
+            looked_s = self._clock()
+
+    def _outcome(self, job: JobFile) -> bool:
+        state = self._session.state
+        if state.outcome in {"complete", "cancelled"}:
+            return state.outcome == "complete"
+        why = state.klippy_message if state.stopped else state.message
+        raise PrinterError(
+            f"{self.address.name} reports a fault: {_line(why)}; {self._uncertain(job)}."
+        )
+
+    def _look(self, job: JobFile) -> None:
+        """Ask what became of the print.
+
+        A server that went away lets Klipper print on, and gets time to come back; a Klipper that
+        restarted has forgotten the print.
+        """
+        state, until_s = self._session.state, self._clock() + self._timing.lost_s
+        while True:
+            try:
+                self._session.look()
+                break
+            except LinkError as error:
+                if self._clock() > until_s:
+                    raise self._lost(job, f"{error} It may be printing on by itself") from error
+            with self._session.news:
+                self._session.news.wait(self._timing.poll_s)
+        if state.printing_ours:
+            return
+        if self._aborted:  # a cancel macro may reset the file
+            state.outcome = "cancelled"
+            return
+        raise self._lost(
+            job, f"Klipper no longer knows the file (its state is {state.print_state!r})"
+        )
+
+    def _uncertain(self, job: JobFile) -> str:
+        taken = job.line_at(self._session.state.file_position)
+        return (
+            f"lines {job.first + 1} to {job.end} are uncertain (Klipper had taken up to line "
+            f"{taken} into its queue)"
+        )
+
+    def _lost(self, job: JobFile, why: str) -> LinkLostError:
+        return LinkLostError(
+            f"The print on {self.address.name} is lost: {why}; {self._uncertain(job)}.",
+            job.first - 1,
+            job.end - 1,
+        )
+
+    # ------------------------------------------------------------------ pause, abort, stop
+
+    def pause(self) -> None:
+        """Have Klipper pause, which parks the nozzle if its PAUSE macro does."""
+        self._session.call("printer.print.pause", limit_s=None)
+
+    def resume(self) -> None:
+        """Have Klipper go on."""
+        self._session.call("printer.print.resume", limit_s=None)
+
+    def abort(self) -> None:
+        """Cancel the print, heaters off, nozzle lifted where homed; harmless unconnected."""
+        if self._open is None:
+            return
+        session = self._session
+        session.look()
+        if session.state.stopped:
+            return  # a Klipper that shut down has switched everything off
+        if session.state.busy:
+            self._aborted = True
+            session.call("printer.print.cancel", limit_s=None)
+        self.heaters_off()
+        homed = session.query({"toolhead": ["homed_axes"]}).get("toolhead", {})
+        if "z" in str(homed.get("homed_axes", "")):
+            self.command("\n".join(LIFT_COMMANDS))
+
+    def emergency_stop(self) -> None:
+        """Stop Klipper now, by its own endpoint; FIRMWARE_RESTART it afterwards."""
+        answer = self._session.request("POST", "/printer/emergency_stop")
+        if answer.status_code != 200:
+            raise LinkError(
+                f"{self.address.name} refuses the emergency stop ({sentence(answer)}): switch the "
+                f"printer off."
+            )
+
+    def heaters_off(self) -> None:
+        """Switch every heater and the fan off."""
+        self.command("TURN_OFF_HEATERS\nM107")
+
+    def _make_safe(self, error: BaseException) -> None:
+        """Make safe what can be reached, and add to the error how that went."""
+        try:
+            self.abort()
+            word = heaters_word(self.temperatures)
+        except (LinkError, LocalProtocolError) as second:
+            word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
+        self._tried_safety = True
+        if isinstance(error, LinkError):
+            error.args = (f"{error.args[0]} {word}", *error.args[1:])
+        else:
+            error.add_note(word)
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split()).rstrip(".")[:200] or "no reason given"

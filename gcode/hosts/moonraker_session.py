@@ -1,0 +1,178 @@
+"""Speaks JSON-RPC with one Moonraker server over its websocket; knows nothing of jobs."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+
+import gcode
+from gcode.errors import LinkError, PrinterError
+from gcode.hosts.moonraker_state import SUBSCRIPTION, KlippyState
+from gcode.hosts.secret import ApiKey
+from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, refused_key
+
+_MESSAGE = re.compile(r"""['"]message['"]:\s*(['"])(.*?)\1\s*[,}]""", re.DOTALL)
+
+
+class MoonrakerSession:
+    """One websocket, its calls and its news.
+
+    Attributes
+    ----------
+    news
+        Notified whenever `state` may have changed; hold it to read several fields at once.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        key: ApiKey,
+        timing: WebTiming,
+        clock: Callable[[], float],
+        log: WebLog | None,
+    ) -> None:
+        self.address = address
+        self.state = KlippyState()
+        self.news = threading.Condition()
+        self._key = key
+        self._timing = timing
+        self._clock = clock
+        self._log = log
+        self._numbers = itertools.count(1)
+        self._client = WebClient(address, key, timing, log)
+        self._socket: PushSocket | None = None
+
+    def close(self) -> None:
+        """Hang up."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        self._client.close()
+
+    @property
+    def listening(self) -> bool:
+        """Whether news can reach us."""
+        return self._socket is not None and self._socket.alive
+
+    def request(self, method: str, path: str, **kwargs: Any) -> httpx.Response:
+        """Send an HTTP request once; see `WebClient.request`."""
+        return self._client.request(method, path, **kwargs)
+
+    def listen(self) -> None:
+        """Open the websocket and say who we are."""
+        self._client.get("/server/info")  # tells an unreachable server from a refused key
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = PushSocket(
+            self.address,
+            "/websocket",
+            headers=self._key.headers,
+            timing=self._timing,
+            on_message=self._on_message,
+            on_closed=self._on_closed,
+        )
+        who = {"client_name": "gcode", "version": gcode.__version__, "type": "other", "url": "-"}
+        if self._key.value:
+            who["api_key"] = self._key.value
+        self.call("server.connection.identify", who)
+
+    def _on_message(self, message: Any) -> None:
+        if self._log is not None and isinstance(message, dict):
+            shown = {k: v for k, v in message.items() if k != "jsonrpc"}
+            self._log.add(b"<", json.dumps(shown)[:500])
+        with self.news:
+            self.state.take(message)
+            self.news.notify_all()
+
+    def _on_closed(self) -> None:
+        with self.news:
+            self.news.notify_all()
+
+    def call(
+        self, method: str, params: dict[str, Any] | None = None, *, limit_s: float | None = 0.0
+    ) -> Any:
+        """Call a method and return its result.
+
+        Parameters
+        ----------
+        limit_s
+            0 the usual time; None as long as the socket lives: scripts take as long as their
+            moves (Moonraker#437).
+
+        Raises
+        ------
+        LinkError
+            If no answer comes.
+        PrinterError
+            If Klipper refuses.
+        """
+        limit_s = self._timing.request_s if limit_s == 0.0 else limit_s
+        number, socket = next(self._numbers), self._socket
+        if socket is None or not socket.alive:
+            raise LinkError(f"The websocket of {self.address.name} is closed.")
+        if self._log is not None and method != "server.connection.identify":
+            self._log.add(b">", f"{number} {method} {json.dumps(params or {})}"[:500])
+        socket.send({"jsonrpc": "2.0", "method": method, "params": params or {}, "id": number})
+        with self.news:
+            answers = self.state.answers
+            self.news.wait_for(lambda: number in answers or not socket.alive, limit_s)
+            answer = answers.pop(number, None)
+        if answer is None:
+            why = "has closed the websocket" if not socket.alive else f"is silent for {limit_s:g} s"
+            raise LinkError(
+                f"{self.address.name} {why} while {method} was under way; whether it was carried "
+                f"out is not known."
+            )
+        if "error" in answer:
+            raise self._refusal(method, answer["error"])
+        return answer.get("result")
+
+    def _refusal(self, method: str, error: object) -> LinkError:
+        code = error.get("code") if isinstance(error, dict) else None
+        text = str(error.get("message", error) if isinstance(error, dict) else error)
+        if code in {401, 403, -32602} and "nauthorized" in text:
+            return refused_key(self.address, self._key)
+        if match := _MESSAGE.search(text):  # Klipper's error object, printed
+            text = match.group(2)
+        text = " ".join(text.split()).rstrip(".")[:300]
+        if code == 503:
+            return LinkError(f"{self.address.name} has no Klipper behind it ({text}); start it.")
+        return PrinterError(f"{self.address.name} refuses {method}: {text}.")
+
+    def query(self, objects: dict[str, list[str] | None]) -> dict[str, dict[str, Any]]:
+        """Return objects of Klipper; those that the printer lacks are left out."""
+        found = self.call("printer.objects.query", {"objects": objects})
+        status = found.get("status") if isinstance(found, dict) else None
+        if not isinstance(status, dict):
+            raise LinkError(f"{self.address.name} answers a query without a status.")
+        return {name: value for name, value in status.items() if isinstance(value, dict)}
+
+    def look(self) -> None:
+        """Ask for Klipper's state, listening and subscribing anew.
+
+        Raises
+        ------
+        LinkError
+            If there is no Klipper to be asked, or not yet.
+        """
+        if not self.listening:
+            self.listen()
+        info = self.call("server.info")
+        klippy = str(info.get("klippy_state", "")) if isinstance(info, dict) else ""
+        with self.news:
+            self.state.klippy, self.state.stale = klippy, False
+        if klippy in {"disconnected", "startup", ""}:
+            raise LinkError(
+                f"Klipper behind {self.address.name} is not ready (it is {klippy or 'silent'}); "
+                f"start it, or see its log."
+            )
+        found = self.call("printer.objects.subscribe", {"objects": SUBSCRIPTION})
+        with self.news:
+            if isinstance(found, dict) and isinstance(found.get("status"), dict):
+                self.state.take_status(found["status"])

@@ -1,0 +1,108 @@
+"""What Moonraker's news say of Klipper and of the one print that is followed; no I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+ENDS = ("complete", "cancelled", "error")
+STOPPED = ("shutdown", "error")
+SUBSCRIPTION: dict[str, list[str] | None] = {
+    "webhooks": ["state", "state_message"],
+    "print_stats": ["state", "filename", "message"],
+    "virtual_sdcard": ["file_position"],
+}
+_KLIPPY_NEWS = {
+    "notify_klippy_ready": "ready",
+    "notify_klippy_shutdown": "shutdown",
+    "notify_klippy_disconnected": "disconnected",
+}
+
+
+@dataclass(slots=True)
+class KlippyState:
+    """State as told by subscription.
+
+    Attributes
+    ----------
+    klippy
+        ready, startup, shutdown, error or disconnected.
+    stale
+        Klipper came back: what we knew of its objects is void until asked anew.
+    outcome
+        How the followed print ended: one of `ENDS`.
+    file_position
+        Bytes of the followed file that Klipper has taken into its queue.
+    """
+
+    klippy: str = ""
+    klippy_message: str = ""
+    print_state: str = ""
+    print_file: str = ""
+    message: str = ""
+    file: str = ""
+    file_position: int = 0
+    moved: bool = False
+    stale: bool = False
+    outcome: str = ""
+    answers: dict[int, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether Klipper has stopped with a fault."""
+        return self.klippy in STOPPED
+
+    @property
+    def ended(self) -> bool:
+        """Whether the followed print is over, or Klipper with it."""
+        return bool(self.outcome) or self.stopped
+
+    @property
+    def busy(self) -> bool:
+        """Whether Klipper prints a file."""
+        return self.print_state in {"printing", "paused"}
+
+    def follow(self, file: str) -> None:
+        """Follow the print of a file from now on."""
+        self.file, self.file_position, self.outcome, self.moved = file, 0, "", False
+
+    def take(self, message: object) -> None:
+        """Take one message; what is not understood is left alone."""
+        if not isinstance(message, dict):
+            return
+        method = message.get("method")
+        if isinstance(number := message.get("id"), int):
+            self.answers[number] = message
+        elif isinstance(method, str) and method in _KLIPPY_NEWS:
+            self.klippy = _KLIPPY_NEWS[method]
+            self.stale = True
+        elif method == "notify_status_update":
+            parameters = message.get("params")
+            if isinstance(parameters, list) and parameters and isinstance(parameters[0], dict):
+                self.take_status(parameters[0])
+
+    def take_status(self, status: dict[str, Any]) -> None:
+        """Take objects of Klipper, whole or what changed of them."""
+        hooks, stats = _object(status, "webhooks"), _object(status, "print_stats")
+        self.klippy = str(hooks.get("state", self.klippy))
+        self.klippy_message = str(hooks.get("state_message", self.klippy_message))
+        self.print_file = str(stats.get("filename", self.print_file))
+        self.print_state = str(stats.get("state", self.print_state))
+        self.message = str(stats.get("message", self.message))
+        if not self.file or self.print_file != self.file:
+            return
+        if self.print_state in ENDS and not self.outcome:
+            self.outcome = self.print_state
+        position = _object(status, "virtual_sdcard").get("file_position")
+        if isinstance(position, int) and position > self.file_position:  # 0 again once it ended
+            self.file_position, self.moved = position, True
+
+    @property
+    def printing_ours(self) -> bool:
+        """Whether the followed print is under way or known to have ended."""
+        return self.ended or (self.print_file == self.file and self.busy)
+
+
+def _object(status: dict[str, Any], name: str) -> dict[str, Any]:
+    found = status.get(name)
+    return found if isinstance(found, dict) else {}

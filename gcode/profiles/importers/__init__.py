@@ -1,0 +1,223 @@
+"""Other programs' profiles, read only: PrusaSlicer `.ini`, OrcaSlicer JSON, Klipper `printer.cfg`.
+
+What the source does not know (the tool head's envelope, where to park and prime) is inherited from
+a shipped profile and said; every key of the source is mapped or listed with the reason. Nothing is
+written here but what the schema accepts.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from gcode.errors import InputError, ProfileError
+from gcode.profiles.importers.klipper import KLIPPER, finish, read_klipper
+from gcode.profiles.importers.rules import Imported, Left, Mapped, Rule, Source, apply
+from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
+from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
+from gcode.profiles.store import Kind, content_of, list_profiles
+
+__all__ = ["Imported", "ImportedFile", "Left", "Mapped", "import_profiles", "to_toml"]
+
+_MODELS: dict[Kind, type[PrinterProfile | MaterialProfile | ProcessProfile]] = {
+    "printers": PrinterProfile,
+    "materials": MaterialProfile,
+    "processes": ProcessProfile,
+}
+_MARKS = {
+    "prusa_mk3s": "MK3",
+    "prusa_mk4": "MK4",
+    "prusa_mini": "MINI",
+    "ender_3": "ENDER3",
+    "creality_k1": "CREALITYK1",
+    "voron_2_4": "VORON2.4",
+}
+"""Shipped machines, by what their names hold once spaces and dashes are left out."""
+_GENERIC = {
+    "marlin": "generic_marlin",
+    "klipper": "generic_klipper",
+    "reprap": "generic_reprap",
+    "prusa": "prusa_mk3s",
+}
+ASK_FOR = (
+    "bed_size_mm",
+    "max_z_mm",
+    "max_hotend_c",
+    "max_bed_c",
+    "envelope",
+    "park_mm",
+    "prime_mm",
+    "start_gcode",
+    "end_gcode",
+)
+"""Keys of a printer that are another machine's until somebody measures or writes them."""
+EDGE_MM = 5.0
+"""How far from the bed's edge an inherited place is kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedFile:
+    """What one file came to.
+
+    Attributes
+    ----------
+    left
+        Keys without a place here, with reasons.
+    notes
+        What to look at before printing.
+    """
+
+    source: str
+    profiles: tuple[Imported, ...]
+    left: tuple[Left, ...]
+    notes: tuple[str, ...]
+
+
+def import_profiles(
+    path: Path, *, preset: str | None = None, inherits: str | None = None
+) -> ImportedFile:
+    """Read another program's profile.
+
+    Parameters
+    ----------
+    preset
+        Which preset of a PrusaSlicer bundle, as `print:NAME`.
+    inherits
+        Shipped profile to take from what the source does not know; chosen by dialect, model or
+        filament where left out.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is none of the three kinds.
+    ProfileError
+        If a value is outside what our profiles allow.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read as text ({error}).") from error
+    rules, source = _read(path, text, preset)
+    if inherits is not None and len(source.kinds) > 1:
+        raise InputError(
+            f"{path} holds {', '.join(source.kinds)}; --inherits can only be given for one."
+        )
+    parents = {kind: inherits or _parent(kind, source, rules) for kind in source.kinds}
+    made, left = apply(source, rules, parents)
+    if rules is KLIPPER:
+        left = finish(made[0], left, source)
+    notes: list[str] = []
+    for profile in made:
+        notes += _settle(profile)
+        _validate(path, profile)
+    return ImportedFile(str(path), made, left, tuple(notes))
+
+
+def _read(path: Path, text: str, preset: str | None) -> tuple[dict[str, Rule], Source]:
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return ORCA, read_orca(path, text)
+    if suffix == ".cfg":
+        return KLIPPER, read_klipper(path, text)
+    if suffix == ".ini":
+        return PRUSA, read_prusa(path, text, preset)
+    raise InputError(
+        f"{path}: its ending is {suffix or 'missing'}; give a PrusaSlicer .ini, an OrcaSlicer "
+        f".json or a Klipper printer.cfg."
+    )
+
+
+def _parent(kind: Kind, source: Source, rules: dict[str, Rule]) -> str:
+    if kind == "processes":
+        return "standard_0.20"
+    if kind == "materials":
+        named = source.values.get("filament_type", "").split(",")[0].split(";")[0].strip().lower()
+        return named if named in list_profiles("materials") else "pla"
+    if rules is KLIPPER:
+        return _GENERIC["klipper"]
+    model = f"{source.values.get('printer_model', '')} {source.name}".upper()
+    model = re.sub(r"[\s_-]", "", model)
+    for profile, mark in _MARKS.items():
+        if mark in model:
+            return profile
+    flavour = source.values.get("gcode_flavor", "marlin")
+    dialect = "reprap" if flavour == "reprapfirmware" else flavour
+    return _GENERIC.get(dialect, _GENERIC["marlin"])
+
+
+def _settle(made: Imported) -> list[str]:
+    """Complete tables, keep inherited places on the bed; say what is not the machine's own."""
+    above = content_of(made.kind, made.inherits)
+    for key, value in made.values.items():
+        if isinstance(value, dict) and isinstance(above.get(key), dict):
+            made.values[key] = {**above[key], **value}
+    if made.kind != "printers":
+        return []
+    if above["dialect"] == "prusa" and made.values.get("dialect") == "marlin":
+        made.values["dialect"] = "prusa"  # PrusaSlicer calls Prusa's firmware Marlin
+    merged = {**above, **made.values}
+    notes = []
+    size_mm, top_mm = merged["bed_size_mm"], merged["max_z_mm"]
+    for key in ("park_mm", "prime_mm"):
+        x_mm, y_mm, z_mm = merged[key]
+        kept = [min(x_mm, size_mm[0] - EDGE_MM), min(y_mm, size_mm[1] - EDGE_MM), min(z_mm, top_mm)]
+        if kept != list(merged[key]):
+            made.values[key] = kept
+            notes.append(f"{key} of {made.inherits} was moved onto this bed: {kept}")
+    foreign = [key for key in ASK_FOR if key not in made.values]
+    notes.append(
+        f"{', '.join(foreign)}: taken from {made.inherits}; measure the tool head and correct them "
+        f"before printing on a part"
+    )
+    return notes
+
+
+def _validate(path: Path, made: Imported) -> None:
+    content = {**content_of(made.kind, made.inherits), **made.values, "id": "x", "name": made.name}
+    try:
+        _MODELS[made.kind].model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        origin = next((m for m in made.mapped if key.startswith(m.key.split(".")[0])), None)
+        theirs = f" (from {origin.source_key!r} = {origin.source_value!r})" if origin else ""
+        raise ProfileError(
+            f"{path}: key '{key}' = {first['input']!r}{theirs} is out of range: {first['msg']}; "
+            f"correct it in the source."
+        ) from error
+
+
+def file_name(made: Imported) -> str:
+    """Return the file name, and so the ID, of an imported profile."""
+    slug = re.sub(r"[^a-z0-9.]+", "_", made.name.lower()).strip("_.")
+    return f"{slug or 'imported'}.toml"
+
+
+def to_toml(made: Imported, source: str) -> str:
+    """Return the profile as TOML, every value with the key it came from."""
+    came_from: dict[str, str] = {}
+    for mapped in made.mapped:
+        key = mapped.key.split(".")[0]
+        came_from[key] = ", ".join(filter(None, (came_from.get(key), mapped.source_key)))
+    plain = [f"# Imported from {Path(source).name}.", f"inherits = {_value(made.inherits)}"]
+    plain.append(f"name = {_value(made.name)}")
+    came_from.pop("name", None)
+    tables = []
+    for key, value in made.values.items():
+        origin = f" # {came_from[key]}" if key in came_from else ""
+        if isinstance(value, dict):
+            rows = [f"{inner} = {_value(number)}" for inner, number in value.items()]
+            tables += ["", f"[{key}]{origin}", *rows]
+        else:
+            plain.append(f"{key} = {_value(value)}{origin}")
+    return "\n".join([*plain, *tables, ""])
+
+
+def _value(value: Any) -> str:
+    """TOML of text, numbers and lists is JSON's, but for DEL."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

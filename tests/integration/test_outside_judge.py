@@ -1,0 +1,123 @@
+"""Offline repairs under the outside judge: scan in, G-code out, beads laid by somebody else.
+
+A part of our own with a hole, a thin wall and a boss; pieces of known volume are taken away; the
+scan is a bare cloud (0.2 mm, 0.04 mm noise, no normals, no sensors), its pose known.
+"""
+
+from __future__ import annotations
+
+import manifold3d
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.frames import Transform
+from amrepair.repair import Site, plan_repair
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf
+from gcode.profiles import load_setup
+from gcode.slicing.layers import LayerGrid
+from tests.judge import judge
+
+NOISE_MM, SPACING_MM = 0.04, 0.2
+ON_BED_MM = np.array([95.0, 85.0, 0.0])
+Solid = manifold3d.Manifold
+
+
+def _box(size: tuple[float, float, float], at: tuple[float, float, float]) -> Solid:
+    return Solid.cube(size).translate(at)
+
+
+def _part() -> Solid:
+    whole = _box((60.0, 40.0, 8.0), (0.0, 0.0, 0.0))
+    whole += _box((50.0, 1.2, 6.0), (5.0, 30.0, 8.0))
+    whole += _box((20.0, 14.0, 4.0), (6.0, 6.0, 8.0))
+    return whole - Solid.cylinder(20.0, 3.0, 3.0, 64).translate((48.0, 12.0, -1.0))
+
+
+# what cuts the piece off, and the share of it that must get filled of what the judge reaches
+TOOLS = {
+    "notch": (_box((14.0, 12.0, 10.0), (34.0, -1.0, 5.8)), 0.88),
+    "corner": (_box((16.0, 14.0, 10.0), (48.0, -4.0, 6.0)), 0.92),
+    "wall gap": (_box((16.0, 4.0, 6.0), (22.0, 29.0, 12.0)), 0.88),
+    "boss": (_box((22.0, 8.0, 9.0), (5.0, 5.0, 10.6)), 0.92),
+    "worn edge": (
+        _box((60.0, 10.0, 0.1), (0.0, 0.0, 0.0))
+        .rotate((-20.0, 0.0, 0.0))
+        .translate((0.0, -6.0, 8.6)),
+        0.85,
+    ),
+}
+
+
+def _mesh(solid: Solid) -> trimesh.Trimesh:
+    mesh = solid.to_mesh64()
+    return trimesh.Trimesh(
+        np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts).astype(int), process=False
+    )
+
+
+def _scan(solid: Solid, seed: int) -> Scan:
+    mesh = _mesh(solid)
+    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / SPACING_MM**2), seed=seed)
+    noise = np.random.default_rng(seed).normal(scale=NOISE_MM, size=points.shape)
+    return Scan(np.asarray(points) + noise, NOISE_MM, "build")
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
+    tool, least_filled = TOOLS[name]
+    # from above: whatever stood over the piece is gone with it
+    tool = Solid.batch_hull([tool, tool.translate((0.0, 0.0, 30.0))])
+    part = _part()
+    template = MeshSdf.from_mesh(_mesh(part))
+    on_bed = tuple(ON_BED_MM)
+    piece = part.translate(on_bed) ^ tool.translate(on_bed)
+    rest = part.translate(on_bed) - piece
+    setup = load_setup()
+    placed = Transform.from_rotation_translation(
+        "build", "template", rotation=np.eye(3), translation_mm=ON_BED_MM
+    )
+    site = Site(template, setup, LayerGrid.from_setup(setup), build_from_template=placed)
+    plan = plan_repair(_scan(rest, 1), site, title=name, guess=placed.inverse())
+    assert plan.checked is not None
+    assert plan.patch is not None
+    # the deficit, against the truth
+    assert plan.deficit.missing_mm3 == pytest.approx(piece.volume(), rel=0.05)
+    verdict = judge(
+        plan.checked.program.text,
+        _mesh(rest),
+        _mesh(part.translate(on_bed)),
+        np.asarray(piece.bounding_box()).reshape(2, 3),
+    )
+    assert verdict.filled_ratio >= least_filled
+    assert verdict.outside_ratio <= 0.05
+    assert verdict.in_air_mm3 <= 0.005 * verdict.laid_mm3 + 0.1
+    assert verdict.widest_mm <= 2 * setup.printer.nozzle_diameter_mm + 1e-9
+    assert verdict.deepest_contact_mm <= 0.2
+    declared = sum(r.volume_mm3 * r.reachable_ratio for r in plan.patch.regions)
+    assert declared / plan.deficit.missing_mm3 == pytest.approx(verdict.reachable_ratio, abs=0.07)
+
+
+def test_the_judge_sees_a_bead_that_is_laid_beside_the_part() -> None:
+    """The judge itself: a bead in the right place fills, one beside it is outside."""
+    stands, wanted = (
+        _box((20.0, 20.0, 2.0), (50.0, 50.0, 0.0)),
+        _box((20.0, 20.0, 2.2), (50.0, 50.0, 0.0)),
+    )
+    box = np.array([[50.0, 50.0, 2.0], [70.0, 70.0, 2.2]])
+    filament_mm = 10.0 * 0.45 * 0.2 / (np.pi / 4 * 1.75**2)
+    for x, outside in ((60.0, 0.0), (71.8, 1.0)):
+        text = f"M83\nG1 Z2.2\nG1 X{x} Y55\nG1 Y65 E{filament_mm:.5f}\n"
+        verdict = judge(text, _mesh(stands), _mesh(wanted), box)
+        assert verdict.outside_ratio == pytest.approx(outside, abs=0.02)
+        assert verdict.laid_mm3 == pytest.approx(0.9, rel=0.05)
+        assert verdict.filled_mm3 == pytest.approx(0.9 * (1 - outside), abs=0.05)
+
+
+def test_the_judge_sees_the_head_run_into_a_wall() -> None:
+    stands = _box((20.0, 20.0, 2.0), (50.0, 50.0, 0.0)) + _box((2.0, 20.0, 9.0), (68.0, 50.0, 0.0))
+    box = np.array([[50.0, 50.0, 2.0], [60.0, 70.0, 2.2]])
+    near, far = "G1 Z2.2\nG1 X66.5 Y55\nG1 Y65\n", "G1 Z2.2\nG1 X30 Y55\nG1 Y65\n"
+    assert judge(near, _mesh(stands), _mesh(stands), box).deepest_contact_mm > 1.0
+    assert judge(far, _mesh(stands), _mesh(stands), box).deepest_contact_mm < 0.2

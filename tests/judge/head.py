@@ -1,0 +1,95 @@
+"""The judge's own tool head: discs and boxes at heights over the tip, and where it can go."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy import ndimage
+
+
+@dataclass(frozen=True)
+class HeadSlice:
+    """What the head covers from a height over the tip upward: a disc, or a box around the bore."""
+
+    above_mm: float
+    radius_mm: float = 0.0
+    box_mm: tuple[float, float, float, float] | None = None
+
+
+# An E3D V6 nozzle of 0.4 mm (1 mm flat, cone, 7 mm hexagon across the corners), its block, and the
+# fan duct of a Prusa MK3S, off the published drawings.
+MK3S_HEAD = (
+    HeadSlice(0.0, radius_mm=0.5),
+    HeadSlice(0.8, radius_mm=1.6),
+    HeadSlice(2.0, radius_mm=4.2),
+    HeadSlice(4.5, box_mm=(-9.0, -18.0, 14.0, 9.0)),
+    HeadSlice(6.0, box_mm=(-24.0, -32.0, 24.0, 22.0)),
+)
+
+
+def grown(
+    tops_mm: np.ndarray, cell_mm: float, part: HeadSlice, window: tuple[slice, slice]
+) -> np.ndarray:
+    """Highest thing under a slice of the head, by the column that the bore is over."""
+    if part.box_mm is not None:
+        x0, y0, x1, y1 = (v / cell_mm for v in part.box_mm)
+        size = (int(x1 - x0) | 1, int(y1 - y0) | 1)
+        middle = (round((x0 + x1) / 2), round((y0 + y1) / 2))
+        wide = ndimage.maximum_filter(tops_mm, size, mode="constant")
+        return ndimage.shift(wide, (-middle[0], -middle[1]), order=0, cval=0.0)[window]
+    n = int(np.ceil(part.radius_mm / cell_mm))
+    i, j = np.mgrid[-n : n + 1, -n : n + 1]
+    under = np.argwhere(np.hypot(i, j) * cell_mm < part.radius_mm) - n
+    corner = np.array([window[0].start, window[1].start])
+    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
+    return _highest_under(tops_mm, under, corner, shape)
+
+
+@njit(cache=True)
+def _highest_under(tops, under, corner, shape):  # type: ignore[no-untyped-def]
+    out = np.zeros(shape)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            for u in range(len(under)):
+                a, b = i + corner[0] + under[u, 0], j + corner[1] + under[u, 1]
+                if 0 <= a < tops.shape[0] and 0 <= b < tops.shape[1]:
+                    out[i, j] = max(out[i, j], tops[a, b])
+    return out
+
+
+def reachable(
+    missing: np.ndarray,
+    stands: np.ndarray,
+    low_z_mm: float,
+    size_z_mm: float,
+    tops_mm: np.ndarray,
+    window: tuple[slice, slice],
+    cell_mm: float,
+    head: tuple[HeadSlice, ...],
+    *,
+    bead_mm: float,
+    layer_mm: float,
+    allowed_mm: float,
+) -> np.ndarray:
+    """Missing voxels that a bead gets to: half its width from a free tip, and not over air.
+
+    A layer down, what stands or is filled must lie within a bead's width.
+    """
+    reach = np.zeros(missing.shape, bool)
+    least_mm = np.max(
+        [grown(tops_mm, cell_mm, part, window) - part.above_mm for part in head], axis=0
+    )
+    below = max(1, round(layer_mm / size_z_mm))
+    for k in range(missing.shape[2]):
+        if not missing[:, :, k].any():
+            continue
+        tip_mm = low_z_mm + (k + 1) * size_z_mm + 0.5 * layer_mm  # a bead lies below its tip
+        free = tip_mm >= least_mm - allowed_mm
+        near = ndimage.distance_transform_edt(~free) * cell_mm <= 0.5 * bead_mm
+        if low_z_mm + (k - below) * size_z_mm > 0 and k >= below:
+            floor = stands[:, :, k - below] | reach[:, :, k - below]
+            near &= ndimage.distance_transform_edt(~floor) * cell_mm <= bead_mm
+        reach[:, :, k] = missing[:, :, k] & near
+    return reach
