@@ -11,9 +11,9 @@ from __future__ import annotations
 import manifold3d as m3
 import numpy as np
 from _shared import mesh_of, out_folder, scan_of
-from amrepair.consensus import fit_from_scans
 
 import amrepair
+from amrepair.consensus import fit_from_scans
 from amrepair.frames import rotation_from_vector
 from amrepair.template import MeshSdf, extract_mesh
 

@@ -9,7 +9,9 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align.bed import bed_prior, level_on_bed
+from amrepair.align.checks import refuse_repeated
 from amrepair.align.coarse import proposals
+from amrepair.align.pam import PAPER, PamOptions, align_paper
 from amrepair.align.refine import Prior, Refined, refine, thin_out
 from amrepair.align.registration import Registration
 from amrepair.errors import AlignmentError, InputError
@@ -18,7 +20,7 @@ from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
-METHODS = ("robust",)
+METHODS = ("robust", "paper")
 FINE_POINTS, COARSE_POINTS = 15_000, 1_500
 LEAST_POINTS = 50
 # A guess from a calibration is good to this; what is farther is not the part that was meant.
@@ -45,6 +47,7 @@ def align(
     guess: Transform | None = None,
     bound_mm: float = BOUND_MM,
     bound_deg: float = BOUND_DEG,
+    pam_options: PamOptions = PAPER,
     rng: np.random.Generator | None = None,
     progress: Progress = silent,
 ) -> Registration:
@@ -58,6 +61,8 @@ def align(
         Template from the scan's frame, good to the bounds; only refinement runs then.
     bound_mm, bound_deg
         How far the result may lie from the guess.
+    pam_options
+        Of the method `paper`: the code's variants and the ablations.
     rng
         Chooses the points that are looked at; a fixed seed by default.
 
@@ -85,7 +90,13 @@ def align(
         raise AlignmentError(
             f"the scan {scan.source} has {len(scan)} points; an alignment needs {LEAST_POINTS}"
         )
+    refuse_repeated(scan, LEAST_POINTS)
     rng = rng if rng is not None else np.random.default_rng(0)
+    if method == "paper":
+        _refuse_other_size(scan, template)
+        return align_paper(
+            scan, template, options=pam_options, guess=guess, rng=rng, progress=progress
+        )
     sigma_mm = float(np.hypot(max(scan.sigma_mm, 1e-3), NOISE_FLOOR_MM))
     progress("align", 0.0, 1.0)
     if guess is not None:

@@ -24,6 +24,7 @@ from amrepair.bench.dataset import BenchClass, Format, Sample
 from amrepair.bench.method import Model, class_input
 from amrepair.bench.metrics import Detection, detection
 from amrepair.bench.registry import make_method
+from amrepair.template.paper import PaperOptions
 from gcode.progress import Progress, silent
 
 # Median residual of the normal points after alignment, over the noise: flat parts of a well
@@ -41,8 +42,8 @@ class Row:
         Over the class's samples, and over all their points together; 0…1.
     seconds_per_sample, fit_seconds
         Alignment and scoring of one sample on average; fitting.
-    cd, emd, cd_squared
-        Repair template against normal shape, in units of its radius.
+    cd, emd, cd_squared, to_surface, from_surface
+        Repair template against normal shape, in units of its radius (`CloudDistance`).
     failed_alignments, badly_aligned
         Samples that raised; samples whose normal points lie off the normal surface.
     """
@@ -59,6 +60,8 @@ class Row:
     cd: float | None
     emd: float | None
     cd_squared: float | None
+    to_surface: float | None
+    from_surface: float | None
     samples: int
     points: int
     failed_alignments: int
@@ -75,6 +78,7 @@ class Cell:
     seed: int
     out: Path
     checkpoint: Path | None = None
+    paper: PaperOptions | None = None
 
     @property
     def folder(self) -> Path:
@@ -125,7 +129,7 @@ def run_cell(
     if left or not fit_path.is_file():
         started = clock()
         data = class_input(cell.one, cell.format)
-        method = make_method(cell.method, checkpoint=cell.checkpoint)
+        method = make_method(cell.method, checkpoint=cell.checkpoint, paper=cell.paper)
         model = method.fit(data, seed=cell.seed, cache=cell.out / "partial" / "templates")
         _write_fit(fit_path, model, clock() - started, data.sigma_mm)
         for i, sample in enumerate(left):
@@ -157,6 +161,8 @@ def _write_fit(path: Path, model: Model, seconds: float, sigma_mm: float) -> Non
         "cd": None if distance is None else distance.chamfer,
         "emd": None if distance is None else distance.emd,
         "cd_squared": None if distance is None else distance.chamfer_squared,
+        "to_surface": None if distance is None else distance.to_surface,
+        "from_surface": None if distance is None else distance.from_surface,
     }
     if not path.is_file():  # a resumed run keeps the first fit's time
         write_whole(path, json.dumps(said).encode())
@@ -220,6 +226,8 @@ def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
         cd=fit["cd"],
         emd=fit["emd"],
         cd_squared=fit["cd_squared"],
+        to_surface=fit["to_surface"],
+        from_surface=fit["from_surface"],
         samples=len(kept),
         points=len(labels),
         failed_alignments=failed,

@@ -6,9 +6,11 @@ taking its size: noise falls with the root of their number, a defect's offset do
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -17,11 +19,23 @@ from scipy.spatial import cKDTree
 from amrepair.align import align
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
-from amrepair.errors import AlignmentError, InputError
+from amrepair.consensus import fit_from_scans
+from amrepair.errors import AlignmentError
 from amrepair.scans.scan import Scan
-from amrepair.template import LearnedSdf, extract_mesh, fit_template
+from amrepair.template import (
+    LearnedSdf,
+    MeshSdf,
+    NetworkSdf,
+    extract_mesh,
+    fit_template,
+    load_template,
+)
+from amrepair.template.paper import PAPER, PaperOptions
 from amrepair.template.port import Template
 from amrepair.template.surface import sample_surface
+
+if TYPE_CHECKING:
+    import trimesh
 
 _log = logging.getLogger(__name__)
 
@@ -35,30 +49,44 @@ MIN_TOP = 12
 # Farther out than this share of the part nothing more is learned: clutter must not set the score.
 MAX_OFFSET_RATIO = 0.15
 REPAIR_POINTS = 16_384
-SURFACE_SPACING_MM = 0.5  # voxel of the extracted surface: about 16,000 points on 100 mm
+SURFACE_SPACING_MM = 0.5  # voxel of the extracted surface
 RETRIES = 3
 
 
-def class_template(data: ClassInput, seed: int, cache: Path) -> LearnedSdf:
+def class_template(
+    data: ClassInput,
+    seed: int,
+    cache: Path,
+    *,
+    recipe: str = "fast",
+    paper: PaperOptions = PAPER,
+) -> LearnedSdf | NetworkSdf:
     """The class's template; fitted once for each seed, then read from the cache.
 
-    Raises
-    ------
-    InputError
-        If the class has no normal mesh.
+    A class without a normal mesh gets the consensus of its training clouds.
     """
-    path = cache / f"{data.name}-fast-{seed}.safetensors"
+    words = "" if recipe == "fast" else hashlib.sha256(repr(paper).encode()).hexdigest()[:8]
+    path = cache / f"{data.name}-{recipe}{words}-{seed}.safetensors"
     if path.is_file():
-        return LearnedSdf.load(path)
+        return load_template(path)
+    template: LearnedSdf | NetworkSdf
     if data.mesh is None:
-        raise InputError(
-            f"the class {data.name} has no normal mesh; templates from scans alone are not there "
-            "yet, choose a baseline"
-        )
-    template = fit_template(data.mesh, seed=seed)
+        template = _from_clouds(data, seed)
+        if recipe != "fast":
+            template = fit_template(template.mesh, recipe=recipe, paper=paper, seed=seed)
+    else:
+        template = fit_template(data.mesh, recipe=recipe, paper=paper, seed=seed)
     cache.mkdir(parents=True, exist_ok=True)
     template.save(path)
     return template
+
+
+def _from_clouds(data: ClassInput, seed: int) -> LearnedSdf:
+    scans = [
+        Scan(cloud, data.sigma_mm, "scanner", source=f"{data.name}, training cloud {k}")
+        for k, cloud in enumerate(data.clouds_mm)
+    ]
+    return fit_from_scans(scans, seed=seed).template
 
 
 def _place(
@@ -85,17 +113,36 @@ def _place(
 def repair_distance(
     template: Template, data: ClassInput, rng: np.random.Generator
 ) -> CloudDistance | None:
-    """Cloud of the template's zero level against the normal shape, in units of its radius."""
+    """The template's zero level against the normal shape, in units of its radius.
+
+    References
+    ----------
+    PASDF, section 3.4: marching cubes, then points sampled from the mesh; eq. (7).
+    """
     if data.mesh is None:
         return None
-    made = np.asarray(extract_mesh(template, SURFACE_SPACING_MM).vertices, dtype=np.float64)
-    truth = sample_surface(
-        np.asarray(data.mesh.vertices), np.asarray(data.mesh.faces), count=REPAIR_POINTS
-    )[0]
-    radius_mm = float(np.linalg.norm(truth - truth.mean(axis=0), axis=1).max())
-    pick = [c[np.sort(rng.permutation(len(c))[:REPAIR_POINTS])] / radius_mm for c in (made, truth)]
-    count = min(len(pick[0]), len(pick[1]))
-    return cloud_distance(pick[0][:count], pick[1][:count], rng=rng)
+    made = extract_mesh(template, SURFACE_SPACING_MM)
+    first, second = (
+        sample_surface(
+            np.asarray(mesh.vertices),
+            np.asarray(mesh.faces),
+            count=REPAIR_POINTS,
+            offset=float(rng.random()),
+        )[0]
+        for mesh in (made, data.mesh)
+    )
+    radius_mm = float(np.linalg.norm(second - second.mean(axis=0), axis=1).max())
+    found = cloud_distance(first / radius_mm, second / radius_mm, rng=rng)
+    made.metadata["notes"] = ()  # closed as marching cubes leaves it: only distances are asked
+    return replace(
+        found,
+        to_surface=_mean_distance(data.mesh, first) / radius_mm,
+        from_surface=_mean_distance(made, second) / radius_mm,
+    )
+
+
+def _mean_distance(mesh: trimesh.Trimesh, points_mm: Float[np.ndarray, "n 3"]) -> float:
+    return float(MeshSdf.from_mesh(mesh).unsigned_distance(points_mm).mean())
 
 
 def smoothed_score(

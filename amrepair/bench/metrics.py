@@ -113,11 +113,16 @@ class CloudDistance:
         The same with squared distances, as PASDF's eq. (7) has it.
     emd
         Mean distance under the best bijection of equally many points.
+    to_surface, from_surface
+        Mean distance of the first's points to the second's surface, and back; None where they are
+        clouds without one.
     """
 
     chamfer: float
     chamfer_squared: float
     emd: float
+    to_surface: float | None = None
+    from_surface: float | None = None
 
 
 def cloud_distance(

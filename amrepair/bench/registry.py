@@ -17,9 +17,11 @@ from amrepair.bench.baselines import (
 from amrepair.bench.dataset import Format
 from amrepair.bench.method import Method
 from amrepair.errors import InputError
+from amrepair.template.paper import PaperOptions
 
 PAM = "+pam"
-OWN = ("pasdf", "pasdf-paper")
+PAPER_METHOD = "pasdf-paper"
+OWN = ("pasdf", PAPER_METHOD)
 BASELINES = ("btf-raw", "btf-fpfh", "patchcore-fpfh", "patchcore-fpfh-raw")
 PRETRAINED = ("patchcore-pointmae", "patchcore-pointbert")  # with a checkpoint of the user's
 METHODS = (
@@ -72,13 +74,17 @@ PUBLISHED: dict[Format, dict[str, tuple[float | None, float | None]]] = {
 PUBLISHED_REPAIR = {Format.REAL3D: (0.0203, 0.0110), Format.SHAPENET: (0.0445, 0.0228)}
 
 
-def make_method(name: str, *, checkpoint: Path | None = None) -> Method:
+def make_method(
+    name: str, *, checkpoint: Path | None = None, paper: PaperOptions | None = None
+) -> Method:
     """A method by its name on the command line.
 
     Parameters
     ----------
     checkpoint
         Weights, for the methods that need them.
+    paper
+        Recipe of `pasdf-paper`; None takes the benchmark's shortened one.
 
     Raises
     ------
@@ -92,13 +98,12 @@ def make_method(name: str, *, checkpoint: Path | None = None) -> Method:
         from amrepair.bench.house import FieldMethod
 
         return FieldMethod()
-    if name in OWN or pam:
-        raise InputError(
-            f"the method '{name}' needs the published recipe and alignment (PAM), which this "
-            "version does not have yet; choose pasdf, or a baseline without +pam"
-        )
+    from amrepair.bench.paper import BENCH_PAPER, PaperMethod, make_pam_aligner
+
+    if name == PAPER_METHOD:
+        return PaperMethod(paper or BENCH_PAPER)
     features = _extractors(base, pam=pam, checkpoint=checkpoint)
-    return BankMethod(features, base.startswith("patchcore"))
+    return BankMethod(features, base.startswith("patchcore"), make_pam_aligner if pam else None)
 
 
 def _extractors(base: str, *, pam: bool, checkpoint: Path | None) -> tuple[Extractor, ...]:

@@ -18,20 +18,22 @@ import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from amrepair.bench.cells import Cell, Row, run_cell, write_whole
 from amrepair.bench.dataset import BenchData, open_dataset
-from amrepair.bench.registry import METHODS, make_method
+from amrepair.bench.paper import BENCH_PAPER
+from amrepair.bench.registry import METHODS, PAPER_METHOD, make_method
 from amrepair.bench.synth import MANIFEST
 from amrepair.bench.tables import as_csv, as_json, as_markdown
 from amrepair.errors import InputError
+from amrepair.template.paper import PaperOptions
 from gcode.progress import Progress, silent
 
 DEFAULT_SEEDS = (0, 1, 2)
 # Raised when scores of the same name would come out differently: old cells are then refused.
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,7 @@ def run_bench(
     seeds: Sequence[int] = DEFAULT_SEEDS,
     classes: Sequence[str] | None = None,
     checkpoint: Path | None = None,
+    paper: PaperOptions = BENCH_PAPER,
     progress: Progress = silent,
 ) -> BenchReport:
     """Compare methods on a data set.
@@ -84,6 +87,8 @@ def run_bench(
         Only these; None takes all.
     checkpoint
         Pretrained weights, for the methods that need them.
+    paper
+        Recipe of `pasdf-paper`; by default a shortened one.
 
     Raises
     ------
@@ -98,12 +103,12 @@ def run_bench(
         )
     names = list(dict.fromkeys(methods))
     for name in names:
-        make_method(name, checkpoint=checkpoint)
+        make_method(name, checkpoint=checkpoint, paper=paper)
     chosen = _choose(data, classes)
     out = Path(out)
-    _claim(out, data)
+    _claim(out, data, paper if PAPER_METHOD in names else None)
     cells = [
-        Cell(method, one, data.format, seed, out, checkpoint)
+        Cell(method, one, data.format, seed, out, checkpoint, paper)
         for one in chosen.classes
         for method in names
         for seed in dict.fromkeys(seeds)
@@ -111,7 +116,7 @@ def run_bench(
     rows: list[Row] = []
     for row in _work(cells, jobs, progress):
         rows.append(row)
-        report = _write(out, chosen, rows, len(cells))
+        report = _write(out, chosen, rows, len(cells), paper)
         progress("bench", float(len(rows)), float(len(cells)))
     shutil.rmtree(out / "partial", ignore_errors=True)
     return report
@@ -127,23 +132,35 @@ def _choose(data: BenchData, classes: Sequence[str] | None) -> BenchData:
     return BenchData(data.format, data.root, tuple(known[name] for name in sorted(set(classes))))
 
 
-def _claim(out: Path, data: BenchData) -> None:
+def _claim(out: Path, data: BenchData, paper: PaperOptions | None) -> None:
     """Mark the folder as this data set's, or refuse it."""
     listing = hashlib.sha256()
     for one in data.classes:
         for path in (*one.train, *(sample.cloud_path for sample in one.test)):
             listing.update(f"{one.name}/{path.name}:{path.stat().st_size}\n".encode())
-    said = {"format": str(data.format), "files": listing.hexdigest(), "layout": LAYOUT_VERSION}
+    said: dict[str, object] = {
+        "format": str(data.format),
+        "files": listing.hexdigest(),
+        "layout": LAYOUT_VERSION,
+    }
     path = out / "run.json"
     if path.is_file():
         try:
             found = json.loads(path.read_text())
         except ValueError:
             found = None
+        recipe = found.pop("paper", None) if isinstance(found, dict) else None
         if found != said:
             raise InputError(
                 f"{out} holds results of another data set or version; choose another --out"
             )
+        if paper is not None and recipe is not None and recipe != asdict(paper):
+            raise InputError(
+                f"{out} holds results of {PAPER_METHOD} by another recipe; choose another --out"
+            )
+        said["paper"] = recipe
+    if paper is not None:
+        said["paper"] = asdict(paper)
     write_whole(path, json.dumps(said).encode())
 
 
@@ -176,16 +193,18 @@ def _limit_threads(count: int) -> None:
     os.environ["OMP_NUM_THREADS"] = str(count)
 
 
-def _write(out: Path, data: BenchData, rows: Sequence[Row], cells: int) -> BenchReport:
+def _write(
+    out: Path, data: BenchData, rows: Sequence[Row], cells: int, paper: PaperOptions
+) -> BenchReport:
     ordered = sorted(rows, key=lambda r: (METHODS.index(r.method), r.class_name, r.seed))
     synthetic = (data.root / MANIFEST).is_file()
     report = BenchReport(
         tuple(ordered), out / "results.json", out / "results.csv", out / "results.md"
     )
     complete = len(rows) == cells
-    said = as_json(ordered, data.format, synthetic=synthetic, complete=complete)
+    said = as_json(ordered, data.format, synthetic=synthetic, complete=complete, paper=paper)
     write_whole(report.json_path, said.encode())
     write_whole(report.csv_path, as_csv(ordered).encode())
-    table = as_markdown(ordered, data.format, synthetic=synthetic, complete=complete)
+    table = as_markdown(ordered, data.format, synthetic=synthetic, complete=complete, paper=paper)
     write_whole(report.markdown_path, table.encode())
     return report

@@ -18,10 +18,20 @@ import numpy as np
 from amrepair.bench.cells import Row
 from amrepair.bench.dataset import Format
 from amrepair.bench.metrics import mean_and_spread
-from amrepair.bench.registry import PUBLISHED, PUBLISHED_REPAIR
+from amrepair.bench.registry import PAPER_METHOD, PUBLISHED, PUBLISHED_REPAIR
+from amrepair.template.paper import PAPER, PaperOptions
 
 AREAS = ("o_auroc", "p_auroc", "o_aupr", "p_aupr")
-FIGURES = (*AREAS, "seconds_per_sample", "fit_seconds", "cd", "emd", "cd_squared")
+FIGURES = (
+    *AREAS,
+    "seconds_per_sample",
+    "fit_seconds",
+    "cd",
+    "emd",
+    "cd_squared",
+    "to_surface",
+    "from_surface",
+)
 
 
 def _value(row: Row, figure: str) -> float:
@@ -51,7 +61,25 @@ def _null(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def as_json(rows: Sequence[Row], format: Format, *, synthetic: bool, complete: bool) -> str:
+def recipe_note(paper: PaperOptions) -> str:
+    """One sentence: where the recipe that ran differs from the published one."""
+    was, now = asdict(PAPER), asdict(paper)
+    changes = [
+        f"{name} {now[name]} instead of {was[name]}" for name in was if now[name] != was[name]
+    ]
+    if not changes:
+        return f"{PAPER_METHOD}: the published recipe, unchanged."
+    return f"{PAPER_METHOD}: the published recipe with {', '.join(changes)}."
+
+
+def as_json(
+    rows: Sequence[Row],
+    format: Format,
+    *,
+    synthetic: bool,
+    complete: bool,
+    paper: PaperOptions = PAPER,
+) -> str:
     """One object: rows by method, class and seed; means with spread; published figures."""
     means = []
     for method in _methods(rows):
@@ -76,6 +104,7 @@ def as_json(rows: Sequence[Row], format: Format, *, synthetic: bool, complete: b
         "synthetic": synthetic,
         "complete": complete,
         "seeds": sorted({row.seed for row in rows}),
+        "paper_recipe": asdict(paper) if PAPER_METHOD in _methods(rows) else None,
         "rows": [_renamed(row) for row in rows],
         "means": means,
         "published": {
@@ -128,7 +157,14 @@ def _published(format: Format, method: str) -> str:
     return " / ".join("–" if value is None else f"{value:.1f}" for value in pair)
 
 
-def as_markdown(rows: Sequence[Row], format: Format, *, synthetic: bool, complete: bool) -> str:
+def as_markdown(
+    rows: Sequence[Row],
+    format: Format,
+    *,
+    synthetic: bool,
+    complete: bool,
+    paper: PaperOptions = PAPER,
+) -> str:
     """Means over classes with the spread over seeds, then every class."""
     seeds = sorted({row.seed for row in rows})
     classes = sorted({row.class_name for row in rows})
@@ -144,9 +180,9 @@ def as_markdown(rows: Sequence[Row], format: Format, *, synthetic: bool, complet
             else " as printed in PASDF (arXiv 2505.24431)."
         ),
         "",
-        "| method | O-AUROC | P-AUROC | O-AUPR | P-AUPR | s/sample | CD | EMD | badly aligned "
-        "| published |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| method | O-AUROC | P-AUROC | O-AUPR | P-AUPR | s/sample | CD | EMD | to surface "
+        "| from surface | badly aligned | published |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for method in _methods(rows):
         found = summary(rows, method)
@@ -158,16 +194,26 @@ def as_markdown(rows: Sequence[Row], format: Format, *, synthetic: bool, complet
             _plain(found["seconds_per_sample"][0], 3),
             _plain(found["cd"][0], 4),
             _plain(found["emd"][0], 4),
+            _plain(found["to_surface"][0], 6),
+            _plain(found["from_surface"][0], 6),
             "–" if bad is None else f"{bad} of {sum(row.samples for row in own)}",
             _published(format, method),
         ]
         lines.append("| " + " | ".join(cells) + " |")
     others = [name for name in PUBLISHED[format] if name not in _methods(rows)]
     lines += [
-        f"| {name} (not run) " + "| – " * 8 + f"| {_published(format, name)} |" for name in others
+        f"| {name} (not run) " + "| – " * 10 + f"| {_published(format, name)} |" for name in others
     ]
     cd, emd = PUBLISHED_REPAIR[format]
     lines += ["", f"Published CD / EMD of the repair template: {cd} / {emd}.", ""]
+    lines += [
+        "CD and EMD of two samples of the same surface are not 0: at 16,000 points they sit on "
+        "their sampling floor. To surface and from surface are mean distances of the repair "
+        "template's points to the normal surface and back; all four in units of its radius.",
+        "",
+    ]
+    if PAPER_METHOD in _methods(rows):
+        lines += [recipe_note(paper), ""]
     lines += ["## By class (O-AUROC / P-AUROC, mean over seeds)", ""]
     lines.append("| class | " + " | ".join(_methods(rows)) + " |")
     lines.append("|---" * (len(_methods(rows)) + 1) + "|")

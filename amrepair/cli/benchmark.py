@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from amrepair.cli.options import SeedOption
+from amrepair.cli.options import SeedOption, with_settings
 from gcode.cli import console
 
 FormatOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or real3d-ad.")]
@@ -41,10 +41,20 @@ def bench(
     checkpoint: Annotated[
         Path | None, typer.Option(help="Pretrained weights, for the methods that need them.")
     ] = None,
+    paper: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Setting of pasdf-paper's recipe, name=value; variant=paper is the published "
+            "schedule, more than an hour a class. May be repeated."
+        ),
+    ] = None,
 ) -> None:
     """Compare methods on a data set."""
+    from amrepair.bench.paper import BENCH_PAPER
     from amrepair.bench.runner import run_bench
+    from amrepair.template.paper import VARIANTS
 
+    recipe = with_settings({"bench": BENCH_PAPER, **VARIANTS}, paper, "--paper")
     bars = console.Bars()
     with bars.shown():
         report = run_bench(
@@ -54,6 +64,7 @@ def bench(
             out=out,
             jobs=jobs,
             checkpoint=checkpoint,
+            paper=recipe,
             progress=bars,
         )
     console.out.print(f"Results: {report.markdown_path}")

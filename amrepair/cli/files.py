@@ -10,7 +10,28 @@ from amrepair.template import open_template
 from amrepair.template.mesh_file import SUFFIXES
 from gcode.cli.console import write_whole
 
-__all__ = ["open_template", "write_mesh"]
+__all__ = ["open_template", "sort_inputs", "write_mesh"]
+
+
+def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Meshes and scans among a template's inputs; a PLY without faces is a scan."""
+    meshes: list[Path] = []
+    scans: list[Path] = []
+    for path in paths:
+        suffix = path.suffix.lower()
+        is_mesh = suffix in SUFFIXES and not (suffix == ".ply" and _is_cloud(path))
+        (meshes if is_mesh else scans).append(path)
+    return meshes, scans
+
+
+def _is_cloud(path: Path) -> bool:
+    """Whether a PLY's header tells of no faces."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        head = stream.read(4096).split(b"end_header")[0]
+    words = [line.split() for line in head.splitlines() if line.startswith(b"element face")]
+    return not any(len(word) == 3 and word[2] != b"0" for word in words)
 
 
 def write_mesh(mesh: Any, path: Path) -> None:

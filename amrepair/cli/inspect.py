@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,17 +10,22 @@ import numpy as np
 import typer
 
 from amrepair.cli.files import open_template
-from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors
+from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors, with_settings
+from amrepair.errors import InputError
+from amrepair.library import Recognition
 from amrepair.repair import Stopwatch
 from amrepair.report.collect import rounded
 from amrepair.report.folder import RunFolder
-from amrepair.scans import read_scan, write_ply
+from amrepair.scans import Scan, read_scan, write_ply
 from gcode.cli import console
 
 _COLOURS = np.array([[180, 180, 180], [0, 90, 200], [220, 120, 0]])  # ok, missing, excess
 
 TemplateOption = Annotated[
-    Path, typer.Option("--template", help="Template file, or the part's mesh.")
+    Path,
+    typer.Option(
+        "--template", help="Template file, or the part's mesh, or a folder of them to choose from."
+    ),
 ]
 
 
@@ -48,22 +54,42 @@ def align(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="The scan in the template's frame (.ply).")
     ] = None,
-    method: Annotated[str, typer.Option(help="robust, or paper.")] = "robust",
+    method: Annotated[str, typer.Option(help="robust, or paper (PAM).")] = "robust",
+    pam: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Setting of the method paper, name=value; variant=code is the released code, "
+            "ransac=off, icp=off or iterate=off an ablation. May be repeated."
+        ),
+    ] = None,
     sensor_at: SensorOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Find where a scan lies in its template."""
     from amrepair.align import align as align_scan
+    from amrepair.align.pam import VARIANTS
 
+    if pam and method != "paper":
+        raise InputError(f"--pam belongs to --method paper, the method is {method}")
+    settings = with_settings(VARIANTS, pam, "--pam")
     watch, bars = Stopwatch(), console.Bars()
     cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
     with bars.shown():
-        field = open_template(template, progress=bars)
-        with watch("align"):
-            found = align_scan(
-                cloud, field, method=method, rng=np.random.default_rng(seed), progress=bars
-            )
+        if template.is_dir():
+            known = from_library(cloud, template, method, seed, watch, bars)
+            found, chosen = known.registration, chosen_part(known)
+        else:
+            field, chosen = open_template(template, progress=bars), {}
+            with watch("align"):
+                found = align_scan(
+                    cloud,
+                    field,
+                    method=method,
+                    pam_options=settings,
+                    rng=np.random.default_rng(seed),
+                    progress=bars,
+                )
     if output is not None:
         moved = cloud.moved(found.template_from_scan)
         console.write_whole(output, lambda path: write_ply(moved, path))
@@ -76,15 +102,38 @@ def align(
         "method": found.method,
         "iterations": found.iterations,
         "seconds": round(watch.seconds["align"], 3),
+        **chosen,
     }
     if as_json:
         console.show_json(result)
         return
+    if chosen:
+        console.out.print(f"Part: {chosen['template']}, confidence {chosen['confidence']:.2f}.")
     console.out.print(
         f"Aligned: {found.rmse_mm:.3f} mm rms over {found.inlier_ratio:.1%} of the points, "
         f"{len(found.symmetric_alternatives)} other poses fit as well."
     )
     console.out.print(np.array2string(found.template_from_scan.matrix, precision=6))
+
+
+def from_library(
+    cloud: Scan, folder: Path, method: str, seed: int, watch: Stopwatch, bars: console.Bars
+) -> Recognition:
+    """The part of a folder that a scan shows, aligned."""
+    from amrepair.library import recognise, template_files
+
+    parts = [(path.stem, partial(open_template, path)) for path in template_files(folder)]
+    with watch("align"):
+        return recognise(cloud, parts, method=method, seed=seed, progress=bars)
+
+
+def chosen_part(known: Recognition) -> dict[str, Any]:
+    """What results say of a choice."""
+    return {
+        "template": known.name,
+        "confidence": round(known.confidence, 4),
+        "candidates": {c.name: round(c.misfit_ratio, 4) for c in known.candidates},
+    }
 
 
 def detect(
@@ -103,9 +152,14 @@ def detect(
     cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
     folder = RunFolder(out)
     with bars.shown():
-        field = open_template(template, progress=bars)
-        with watch("align"):
-            found = align_scan(cloud, field, rng=np.random.default_rng(seed), progress=bars)
+        chosen: dict[str, Any] = {}
+        if template.is_dir():
+            known = from_library(cloud, template, "robust", seed, watch, bars)
+            field, found, chosen = known.template, known.registration, chosen_part(known)
+        else:
+            field = open_template(template, progress=bars)
+            with watch("align"):
+                found = align_scan(cloud, field, rng=np.random.default_rng(seed), progress=bars)
         with watch("detect"):
             anomaly = detect_defects(cloud.moved(found.template_from_scan), field, progress=bars)
     console.write_whole(
@@ -147,12 +201,15 @@ def detect(
         "template_from_scan": found.template_from_scan.matrix.tolist(),
         "rmse_mm": found.rmse_mm,
         "seconds": {stage: round(spent, 3) for stage, spent in watch.seconds.items()},
+        **chosen,
     }
     result = dict(rounded(result))
     folder.write_json("result.json", result)
     if as_json:
         console.show_json(result)
         return
+    if chosen:
+        console.out.print(f"Part: {chosen['template']}, confidence {chosen['confidence']:.2f}.")
     console.out.print(
         f"{len(anomaly.regions)} regions beyond {anomaly.threshold_mm:.3f} mm "
         f"({anomaly.threshold_source}); object score {anomaly.object_score:.3f} mm."

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
@@ -14,6 +16,9 @@ from amrepair.simulate.run import scale_to_fit
 from amrepair.template import load_mesh
 from gcode.cli import console
 from gcode.profiles import PrintSetup
+
+Options = TypeVar("Options")
+_SWITCH = {"true": True, "on": True, "yes": True, "false": False, "off": False, "no": False}
 
 PrinterOption = Annotated[
     str,
@@ -109,3 +114,49 @@ def sensors(texts: list[str] | None) -> np.ndarray | None:
     if not texts:
         return None
     return np.stack([numbers(text, 3, "--sensor-at") for text in texts])
+
+
+def with_settings(
+    variants: dict[str, Options], texts: Sequence[str] | None, option: str
+) -> Options:
+    """A recipe's options, changed by `name=value` words; `variant=name` chooses where to start.
+
+    Raises
+    ------
+    InputError
+        If a word is no assignment, its name is unknown, or its value is of another kind.
+    """
+    words = []
+    base = next(iter(variants.values()))
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InputError(f"{option} is {text!r}; write name=value")
+        if name == "variant":
+            if value not in variants:
+                raise InputError(
+                    f"{option}: the variant {value!r} is unknown; choose {', '.join(variants)}"
+                )
+            base = variants[value]
+        else:
+            words.append((name, value))
+    known = {field.name: getattr(base, field.name) for field in fields(base)}  # type: ignore[arg-type]
+    changes = {}
+    for name, value in words:
+        if name not in known:
+            raise InputError(f"{option}: there is no setting {name!r}; choose {', '.join(known)}")
+        changes[name] = _value(value, known[name], f"{option} {name}")
+    return replace(base, **changes)  # type: ignore[type-var]
+
+
+def _value(text: str, like: object, what: str) -> object:
+    """A word as the kind of value that `like` is."""
+    if isinstance(like, str):
+        return text
+    try:
+        if isinstance(like, bool):
+            return _SWITCH[text.lower()]
+        return int(text) if isinstance(like, int) else float(text)
+    except (KeyError, ValueError) as error:
+        kind = {bool: "on or off", int: "a whole number", float: "a number"}[type(like)]
+        raise InputError(f"{what} is {text!r}; give {kind}") from error

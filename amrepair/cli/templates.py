@@ -7,8 +7,10 @@ from typing import Annotated
 
 import typer
 
-from amrepair.cli.files import open_template, write_mesh
-from amrepair.cli.options import SeedOption
+from amrepair.cli.files import open_template, sort_inputs, write_mesh
+from amrepair.cli.options import SeedOption, with_settings
+from amrepair.errors import InputError
+from amrepair.template import LearnedSdf, NetworkSdf
 from gcode.cli import console
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
@@ -29,22 +31,60 @@ def add_to(app: typer.Typer) -> None:
 def fit(
     inputs: Annotated[
         list[Path],
-        typer.Argument(help="A mesh of the part as it should be, mm."),
+        typer.Argument(
+            help="A mesh of the part as it should be, or normal scans of it, or both; mm."
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Template file (.safetensors).")],
     recipe: Annotated[str, typer.Option(help="fast, or paper for the published network.")] = "fast",
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    paper: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Setting of the recipe paper, name=value; variant=code is the released code, "
+            "encoding=off an ablation, epochs=N shortens it. May be repeated."
+        ),
+    ] = None,
+    device: Annotated[
+        str, typer.Option(help="Where the recipe paper trains: auto, cpu or cuda.")
+    ] = "auto",
     seed: SeedOption = 0,
 ) -> None:
     """Fit the signed distance field that scans are held against."""
     from amrepair.template import fit_template
+    from amrepair.template.paper import VARIANTS
 
+    if paper and recipe != "paper":
+        raise InputError(f"--paper belongs to --recipe paper, the recipe is {recipe}")
+    settings = with_settings(VARIANTS, paper, "--paper")
     console.writable(output)
     bars = console.Bars()
+    meshes, scans = sort_inputs(inputs)
+    if scans and recipe == "paper" and not meshes:
+        raise InputError("the recipe paper needs a mesh; fit the scans with --recipe fast")
+    template: LearnedSdf | NetworkSdf
     with bars.shown():
-        template = fit_template(inputs, recipe=recipe, device=device, seed=seed, progress=bars)
+        if scans and recipe == "fast":
+            template = _from_scans(scans, meshes, seed, bars)
+        else:
+            template = fit_template(
+                meshes, recipe=recipe, paper=settings, device=device, seed=seed, progress=bars
+            )
     template.save(output)
     console.errors.print(f"{output}: surface good to {template.bias_mm:.3f} mm (99 %)")
+    for note in filter(None, template.metadata.get("notes", "").split("; ")):
+        console.errors.print(f"  {note}")
+
+
+def _from_scans(scans: list[Path], meshes: list[Path], seed: int, bars: console.Bars) -> LearnedSdf:
+    from amrepair.consensus import fit_from_scans
+    from amrepair.scans import read_scan
+    from amrepair.template import load_mesh
+
+    if len(meshes) > 1:
+        raise InputError(f"a template has one nominal mesh, {len(meshes)} were given")
+    clouds = [read_scan(path, frame="scanner") for path in scans]
+    mesh = load_mesh(meshes[0]) if meshes else None
+    return fit_from_scans(clouds, mesh=mesh, seed=seed, progress=bars).template
 
 
 @template_app.command(

@@ -16,6 +16,7 @@ from scipy.stats import norm
 from amrepair.detect.anomaly import AnomalyMap, Label
 from amrepair.detect.evidence import Evidence, gather
 from amrepair.detect.faces import PLANE_POINTS
+from amrepair.detect.normal_variation import forgiven
 from amrepair.detect.regions import find_regions
 from amrepair.detect.surfels import Surfels, make_surfels
 from amrepair.errors import InputError
@@ -125,7 +126,7 @@ def detect(
         scan, template, surfels, threshold_mm, allowance_mm, registration_sigma_mm, false_alarms
     )
     progress("detect", 1.0, 4.0)
-    missing, excess = _label_surfels(surfels, limit)
+    missing, excess = _label_surfels(forgiven(surfels, template), limit)
     evidence = gather(
         scan,
         template,

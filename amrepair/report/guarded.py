@@ -130,11 +130,11 @@ def _guarded(guard: Guard) -> Iterator[list[bool]]:
         done.append(True)
         return original(*args, process_request=_judged(guard, process_request), **options)
 
-    serving.serve = serve
+    serving.serve = serve  # type: ignore[misc, assignment]
     try:
         yield done
     finally:
-        serving.serve = original
+        serving.serve = original  # type: ignore[misc]
 
 
 def _judged(guard: Guard, inner: Callable[..., Any] | None) -> Callable[..., Any]:

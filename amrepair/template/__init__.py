@@ -1,16 +1,22 @@
 """Templates: the part as it should be, as a signed distance field.
 
-Learned (`LearnedSdf`), exact (`MeshSdf`), planned from the job's beads (`PlannedSdf`); a layer's
-cut of any of them. It does not know scans' poses, nor what is done about a difference. torch is
-imported only while fitting.
+Learned (`LearnedSdf`), learned as in the paper (`NetworkSdf`), exact (`MeshSdf`), planned from the
+job's beads (`PlannedSdf`); a layer's cut of any of them. It does not know scans' poses, nor what is
+done about a difference. torch is imported only while fitting, and by `NetworkSdf`.
 """
 
 from amrepair.template.cut import CutTemplate
 from amrepair.template.extract import extract_mesh
-from amrepair.template.fitting import default_cache_dir, fit_template, load_or_fit
+from amrepair.template.fitting import (
+    default_cache_dir,
+    fit_template,
+    load_or_fit,
+    load_template,
+)
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh
 from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.network import NetworkSdf
 from amrepair.template.opening import open_template
 from amrepair.template.planned import PlannedSdf
 from amrepair.template.port import Template
@@ -19,6 +25,7 @@ __all__ = [
     "CutTemplate",
     "LearnedSdf",
     "MeshSdf",
+    "NetworkSdf",
     "PlannedSdf",
     "Template",
     "default_cache_dir",
@@ -26,5 +33,6 @@ __all__ = [
     "fit_template",
     "load_mesh",
     "load_or_fit",
+    "load_template",
     "open_template",
 ]

@@ -67,6 +67,11 @@ class CutTemplate:
         gradient = np.where(cut[:, None], np.array([0.0, 0.0, 1.0]), gradient)
         return np.maximum(distance, above), gradient
 
+    def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) that of the whole: standard deviation between normal parts, where it is known."""
+        spread = getattr(self.whole, "spread_mm", None)
+        return np.zeros(len(points_mm)) if spread is None else np.asarray(spread(points_mm))
+
     def below_z(self, z_mm: float) -> Template:
         """The lower of the two cuts."""
         return CutTemplate(self.whole, min(z_mm, self.z_mm))

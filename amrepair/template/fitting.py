@@ -13,32 +13,41 @@ import numpy as np
 
 import amrepair
 from amrepair.errors import TemplateError
+from amrepair.template.file import FORMAT_VERSION, read_template
 from amrepair.template.fit import fit_fast
-from amrepair.template.learned import FORMAT_VERSION, LearnedSdf
+from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh, require_mesh
 from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.network import KIND as NETWORK
+from amrepair.template.network import NetworkSdf
+from amrepair.template.paper import PAPER, PaperOptions, fit_paper
 from gcode.progress import Progress, silent
 
 if TYPE_CHECKING:
     import trimesh
 
-RECIPES = ("fast",)
+RECIPES = ("fast", "paper")
 
 
 def fit_template(
     source: Path | str | trimesh.Trimesh | Sequence[Path],
     *,
     recipe: str = "fast",
+    paper: PaperOptions = PAPER,
     device: str = "auto",
     seed: int = 0,
     progress: Progress = silent,
-) -> LearnedSdf:
+) -> LearnedSdf | NetworkSdf:
     """Fit a template to a part.
 
     Parameters
     ----------
     source
         A mesh or its file, mm; made watertight where that leaves the shape in no doubt.
+    paper
+        Settings of the recipe `paper`.
+    device
+        Where the recipe `paper` trains; the fast one needs no torch.
 
     Raises
     ------
@@ -64,28 +73,52 @@ def fit_template(
         source = source[0]
     mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
     closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
-    metadata = {
+    metadata = made_from(closed, recipe, seed)
+    exact = MeshSdf.from_mesh(closed)
+    if recipe == "paper":
+        return fit_paper(
+            exact, options=paper, device=device, seed=seed, metadata=metadata, progress=progress
+        )
+    return fit_fast(exact, seed=seed, metadata=metadata, progress=progress)
+
+
+def made_from(closed: trimesh.Trimesh, recipe: str, seed: int) -> dict[str, str]:
+    """What a template's file says of how it was made."""
+    return {
         "recipe": recipe,
         "seed": str(seed),
         "part_sha256": mesh_sha256(closed),
         "version": amrepair.__version__,
         "notes": "; ".join(closed.metadata.get("notes", ())),
     }
-    return fit_fast(
-        MeshSdf.from_mesh(closed), device=device, seed=seed, metadata=metadata, progress=progress
-    )
+
+
+def load_template(path: Path) -> LearnedSdf | NetworkSdf:
+    """Open a template's file, whatever its recipe.
+
+    Raises
+    ------
+    TemplateError
+        If it is missing, truncated, or no template of ours.
+    """
+    path = Path(path)
+    arrays, head = read_template(path)
+    try:
+        if head.get("kind") == NETWORK:
+            return NetworkSdf.unpacked(path, arrays, head)
+        return LearnedSdf.unpacked(path, arrays, head)
+    except (KeyError, TypeError, ValueError) as error:
+        raise TemplateError(f"the template {path} is damaged ({error}); fit it again") from error
 
 
 def load_or_fit(
     source: Path | str | trimesh.Trimesh,
     *,
     cache_dir: Path | None = None,
-    recipe: str = "fast",
-    device: str = "auto",
     seed: int = 0,
     progress: Progress = silent,
 ) -> LearnedSdf:
-    """The template of a part: from the cache, keyed by the part's hash, or fitted and kept there.
+    """The fast template of a part: from the cache, keyed by its hash, or fitted and kept there.
 
     Parameters
     ----------
@@ -95,14 +128,19 @@ def load_or_fit(
     mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
     closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
     folder = cache_dir or default_cache_dir()
-    key = json.dumps([mesh_sha256(closed), recipe, seed, FORMAT_VERSION, amrepair.__version__])
+    key = json.dumps([mesh_sha256(closed), "fast", seed, FORMAT_VERSION, amrepair.__version__])
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.safetensors"
     if path.is_file():
         try:
             return LearnedSdf.load(path)
         except TemplateError:
             path.unlink(missing_ok=True)  # a crash while it was written, or another version
-    template = fit_template(closed, recipe=recipe, device=device, seed=seed, progress=progress)
+    template = fit_fast(
+        MeshSdf.from_mesh(closed),
+        seed=seed,
+        metadata=made_from(closed, "fast", seed),
+        progress=progress,
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         template.save(path)

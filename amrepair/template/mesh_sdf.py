@@ -16,11 +16,7 @@ from amrepair.device import open3d
 from amrepair.template.cut import CutTemplate
 from amrepair.template.mesh_file import as_manifold, require_mesh
 from amrepair.template.port import Template
-from amrepair.template.surface import (
-    count_for_spacing,
-    sample_surface,
-    triangle_areas_normals,
-)
+from amrepair.template.surface import mesh_points
 
 if TYPE_CHECKING:
     import trimesh
@@ -125,12 +121,7 @@ class MeshSdf:
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
         """(m, 3) points on the mesh, each for spacing² of area, and (m, 3) face normals."""
-        vertices, faces = np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces)
-        areas, _ = triangle_areas_normals(vertices, faces)
-        points, normals, _ = sample_surface(
-            vertices, faces, count=count_for_spacing(areas, spacing_mm)
-        )
-        return points, normals
+        return mesh_points(self.mesh, spacing_mm)
 
     def solid(self) -> Any:
         """The mesh itself as a `manifold3d.Manifold`."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from amrepair.errors import InputError
-from amrepair.template.fitting import load_or_fit
-from amrepair.template.learned import LearnedSdf
+from amrepair.template.fitting import load_or_fit, load_template
 from amrepair.template.mesh_file import SUFFIXES
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -33,7 +32,7 @@ def open_template(path: Path, *, progress: Progress = silent) -> Template:
     """
     suffix = path.suffix.lower()
     if suffix == TEMPLATE_SUFFIX:
-        return LearnedSdf.load(path)
+        return load_template(path)
     if suffix in SUFFIXES:
         return load_or_fit(path, progress=progress)
     raise InputError(

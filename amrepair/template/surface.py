@@ -5,8 +5,13 @@ It samples; it does not know where the mesh came from.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Float, Int
+
+if TYPE_CHECKING:
+    import trimesh
 
 # R2 low-discrepancy sequence (Roberts 2018): powers of the plastic number's inverse.
 _PLASTIC = 1.32471795724474602596
@@ -60,3 +65,13 @@ def sample_surface(
 def count_for_spacing(areas_mm2: Float[np.ndarray, " f"], spacing_mm: float) -> int:
     """How many points stand about `spacing_mm` apart on that area."""
     return max(1, int(np.ceil(float(areas_mm2.sum()) / spacing_mm**2)))
+
+
+def mesh_points(
+    mesh: trimesh.Trimesh, spacing_mm: float
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+    """(m, 3) points of a mesh, each for spacing² of its area, and (m, 3) face normals."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    areas, _ = triangle_areas_normals(vertices, faces)
+    points, normals, _ = sample_surface(vertices, faces, count=count_for_spacing(areas, spacing_mm))
+    return points, normals

@@ -19,7 +19,8 @@ from urllib.parse import urlsplit
 
 import httpx
 from websockets.exceptions import WebSocketException
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 from gcode.errors import InputError, LinkError
 from gcode.hosts.port import Temperatures
@@ -228,7 +229,7 @@ class PushSocket:
         self.alive = True
         self._stack = contextlib.ExitStack()
         try:
-            self._socket: ClientConnection = self._stack.enter_context(
+            self._socket: Connection = self._stack.enter_context(
                 connect(
                     address.socket_url(path),
                     additional_headers=dict(headers),

@@ -1,0 +1,214 @@
+"""`fit_from_scans`: a template from normal scans, with or without the part's mesh."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+import amrepair
+from amrepair.align import align
+from amrepair.consensus.cloud import outward, planes, spacing_of
+from amrepair.consensus.fuse import Cloud, Fused, fuse
+from amrepair.consensus.register import Piece, Placed, place_all
+from amrepair.errors import AlignmentError, InputError
+from amrepair.scans import Scan
+from amrepair.template import LearnedSdf, MeshSdf
+from amrepair.template.fit import fit_fast
+from amrepair.template.learned import Tolerance
+from gcode.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import trimesh
+
+LEAST_POINTS = 2_000
+MAX_POINTS = 400_000  # of one scan; more add time, not accuracy
+SIZE_JUMP = 3.0  # scans of one part in one unit differ by less
+
+
+@dataclass(frozen=True, slots=True)
+class ScanFit:
+    """A template from scans, and what went into it.
+
+    Attributes
+    ----------
+    poses
+        (4, 4) template from scan, None for scans that were left out.
+    notes
+        Sentences for the user.
+    """
+
+    template: LearnedSdf
+    fused: Fused
+    poses: tuple[Float[np.ndarray, "4 4"] | None, ...]
+    sigma_mm: float
+    rmse_mm: float
+    notes: tuple[str, ...]
+
+
+def fit_from_scans(
+    scans: Sequence[Scan],
+    *,
+    mesh: trimesh.Trimesh | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> ScanFit:
+    """Fit a template to normal scans of one part.
+
+    Parameters
+    ----------
+    scans
+        Noisy, overlapping, partial, each in a frame of its own; the template's frame is the first
+        scan's (of those that could be placed), or the mesh's.
+    mesh
+        The nominal shape: scans are aligned to it, and it stands where no scan looked.
+
+    Raises
+    ------
+    InputError
+        If there are too few points, or the scans' sizes tell of different units.
+    AlignmentError
+        If most scans do not fit each other, or none fits the mesh.
+    TemplateError
+        If they enclose no solid.
+    """
+    _refuse(scans)
+    rng = np.random.default_rng(seed)
+    pieces = []
+    for k, scan in enumerate(scans):
+        progress("fit", 0.1 * k / len(scans), 1.0)
+        pieces.append(_piece(scan, rng))
+    nominal = None if mesh is None else MeshSdf.from_mesh(mesh)
+    if nominal is None:
+        placed = place_all(pieces, rng) if len(pieces) > 1 else Placed((0,), (np.eye(4),), 0.0, ())
+    else:
+        placed = _on_mesh(scans, nominal, rng)
+    progress("fit", 0.35, 1.0)
+    cloud = _joined([pieces[k] for k in placed.which], [scans[k] for k in placed.which], placed)
+    fused = fuse(cloud, behind=nominal)
+    progress("fit", 0.5, 1.0)
+    notes = _notes(scans, placed, fused, len(placed.which))
+    closed = fused.mesh
+    closed.metadata["notes"] = notes
+    metadata = {
+        "recipe": "fast",
+        "seed": str(seed),
+        "version": amrepair.__version__,
+        "notes": "; ".join(notes),
+        "scans": json.dumps([{"source": s.source, "sha256": _sha256(s)} for s in scans]),
+    }
+    made = fit_fast(
+        MeshSdf.from_mesh(closed),
+        seed=seed,
+        metadata=metadata,
+        progress=lambda stage, done, total: progress(stage, 0.5 + 0.5 * done / total, 1.0),
+    )
+    spread = fused.spread
+    template = replace(
+        made,
+        bias_mm=float(np.hypot(made.bias_mm, 2.0 * fused.standard_error_mm)),
+        tolerance=None
+        if spread is None
+        else Tolerance(spread.origin_mm, spread.cell_mm, spread.values_mm),
+    )
+    poses: list[np.ndarray | None] = [None] * len(scans)
+    for k, pose in zip(placed.which, placed.poses, strict=True):
+        poses[k] = pose
+    return ScanFit(template, fused, tuple(poses), cloud.sigma_mm, placed.rmse_mm, notes)
+
+
+def _refuse(scans: Sequence[Scan]) -> None:
+    if not scans:
+        raise InputError("a template from scans needs at least one scan; none was given")
+    for scan in scans:
+        if len(scan) < LEAST_POINTS:
+            raise InputError(
+                f"the scan {scan.source} has {len(scan)} points; a template needs at least "
+                f"{LEAST_POINTS:,} of each scan"
+            )
+    sizes = [float(np.linalg.norm(np.ptp(scan.points_mm, axis=0))) for scan in scans]
+    usual = float(np.median(sizes))
+    for scan, size in zip(scans, sizes, strict=True):
+        if not usual / SIZE_JUMP < size < usual * SIZE_JUMP:
+            hint = " (metres for millimetres?)" if size < usual / 100 else ""
+            raise InputError(
+                f"the scan {scan.source} is {size:.3g} mm across, the scans' median is "
+                f"{usual:.3g} mm: they cannot be the same part in the same unit{hint}; convert "
+                "or remove it"
+            )
+
+
+def _piece(scan: Scan, rng: np.random.Generator) -> Piece:
+    points = scan.points_mm
+    if len(points) > MAX_POINTS:
+        points = points[np.sort(rng.permutation(len(points))[:MAX_POINTS])]
+    distinct = np.unique(points, axis=0)
+    if len(distinct) < LEAST_POINTS:
+        raise InputError(
+            f"the scan {scan.source} has only {len(distinct)} different points among "
+            f"{len(points)}; check the export"
+        )
+    spacing_mm = spacing_of(distinct)
+    normals, sigma_mm = planes(distinct, spacing_mm)
+    return Piece(scan.source, distinct, normals, spacing_mm, sigma_mm, cKDTree(distinct))
+
+
+def _on_mesh(scans: Sequence[Scan], nominal: MeshSdf, rng: np.random.Generator) -> Placed:
+    """Each scan on the nominal shape; those that do not fit it are left out."""
+    which, poses, squares, left_out, reasons = [], [], [], [], []
+    for k, scan in enumerate(scans):
+        try:
+            found = align(scan, nominal, rng=rng)
+        except AlignmentError as error:
+            left_out.append(k)
+            reasons.append(str(error))
+            continue
+        which.append(k)
+        poses.append(np.array(found.template_from_scan.matrix))
+        squares.append(found.rmse_mm**2)
+    if 2 * len(left_out) >= len(scans):
+        raise AlignmentError(
+            f"{len(left_out)} of {len(scans)} scans do not fit the mesh: {reasons[0]}"
+        )
+    return Placed(tuple(which), tuple(poses), float(np.sqrt(np.mean(squares))), tuple(left_out))
+
+
+def _joined(pieces: Sequence[Piece], scans: Sequence[Scan], placed: Placed) -> Cloud:
+    """All placed points with outward normals."""
+    points = np.concatenate(
+        [p.points_mm @ m[:3, :3].T + m[:3, 3] for p, m in zip(pieces, placed.poses, strict=True)]
+    )
+    normals = np.concatenate(
+        [p.normals @ m[:3, :3].T for p, m in zip(pieces, placed.poses, strict=True)]
+    )
+    scan = np.repeat(np.arange(len(pieces)), [len(p.points_mm) for p in pieces])
+    spacing_mm = float(1.0 / np.sqrt(sum(1.0 / p.spacing_mm**2 for p in pieces)))
+    # where the scans overlap little, the joint cloud is no denser than one of them
+    spacing_mm = max(spacing_mm, spacing_of(points))
+    sigma_mm = max(p.sigma_mm for p in pieces)
+    return Cloud(points, outward(points, normals, spacing_mm), scan, len(pieces), spacing_mm,
+                 sigma_mm)  # fmt: skip
+
+
+def _notes(scans: Sequence[Scan], placed: Placed, fused: Fused, used: int) -> tuple[str, ...]:
+    notes = [f"consensus of {used} of {len(scans)} scans"]
+    notes += [
+        f"{scans[k].source} fits none of the others and was left out" for k in placed.left_out
+    ]
+    if fused.unseen_ratio > 0.002:
+        notes.append(f"{fused.unseen_ratio:.1%} of the surface was seen by no scan and is a guess")
+    if used > 1 and fused.single_ratio > 0.05:
+        notes.append(f"{fused.single_ratio:.0%} of the surface was seen by one scan only")
+    if fused.rejected:
+        notes.append(f"{fused.rejected} points contradicted by other scans were left out")
+    return tuple(notes)
+
+
+def _sha256(scan: Scan) -> str:
+    return hashlib.sha256(np.ascontiguousarray(scan.points_mm).tobytes()).hexdigest()

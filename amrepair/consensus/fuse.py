@@ -1,0 +1,359 @@
+"""Placed scans to one surface: what most of them say, and how far they disagree.
+
+Outliers go in two steps: points that other scans contradict (they see surface above or below, and
+none here), then, at each node of the grid, scans that differ from the median of all. The surface
+where nobody looked is closed by a Poisson surface (Kazhdan and Hoppe 2013), or by the given mesh.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from amrepair.consensus import consensus_kernels as kernels
+from amrepair.consensus.cloud import Cells
+from amrepair.device import open3d
+from amrepair.errors import TemplateError
+from amrepair.template.mesh_file import as_manifold, is_valid, manifold_arrays
+from amrepair.template.mesh_sdf import MeshSdf
+
+if TYPE_CHECKING:
+    import trimesh
+
+LEAST_POINTS = 6  # in reach of a node, or it has no support
+ROUNDS = 3  # of the robust fit
+OUTLIER_SIGMAS, OUTLIER_MM = 5.0, 0.02
+FAR_SPACINGS = 24.0  # how far along the normal another scan's surface contradicts a point
+FACING = 0.3
+MAX_NODES = 60_000_000
+POISSON_DEPTH, POISSON_POINTS = 8, 150_000
+SURE = 0.97  # share of a component's neighbours that must agree about its side
+DUST_RATIO = 1e-3  # closed pieces smaller than this share of the whole are clutter
+SPREAD_CELLS = 5  # nodes along the edge of a cell of the stored spread
+LEAST_NODES = 8  # that a cell's spread is pooled from
+LEAST_SPREAD_MM = 0.01  # below this chance cannot be told from disagreement
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """Placed points of all scans, common frame.
+
+    Attributes
+    ----------
+    normals
+        (n, 3) outward.
+    scan
+        (n,) which scan each point is of.
+    scans
+        How many there are.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    scan: Int[np.ndarray, " n"]
+    scans: int
+    spacing_mm: float
+    sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Where the scans disagree.
+
+    Attributes
+    ----------
+    values_mm
+        (x, y, z) standard deviation between scans near the surface, 0 elsewhere.
+    """
+
+    origin_mm: Float[np.ndarray, " 3"]
+    cell_mm: float
+    values_mm: Float[np.ndarray, "x y z"]
+
+
+@dataclass(frozen=True, slots=True)
+class Fused:
+    """The consensus.
+
+    Attributes
+    ----------
+    mesh
+        Closed.
+    spread
+        None where one scan alone was given.
+    standard_error_mm
+        99th percentile over the surface of the consensus's own uncertainty.
+    unseen_ratio, single_ratio, overruled_ratio
+        Shares of the surface that no scan, or one alone, saw, and where a scan was overruled.
+    rejected
+        Points that other scans contradict.
+    """
+
+    mesh: trimesh.Trimesh
+    spread: Spread | None
+    standard_error_mm: float
+    unseen_ratio: float
+    single_ratio: float
+    overruled_ratio: float
+    rejected: int
+
+
+def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None = None) -> Fused:
+    """Fuse placed scans.
+
+    Parameters
+    ----------
+    voxel_mm
+        Edge of the grid; None follows the points.
+    behind
+        The nominal shape, for what no scan saw; None closes it smoothly.
+
+    Raises
+    ------
+    TemplateError
+        If the points make no closed surface, or the grid would be too large.
+    """
+    keep = ~_contradicted(cloud)
+    rejected = int((~keep).sum())
+    points, normals, scan = cloud.points_mm[keep], cloud.normals[keep], cloud.scan[keep]
+    radius_mm = reach_mm(cloud)
+    edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / 400.0)
+    low, shape, nodes, index = _band(points, edge, radius_mm, behind)
+    cells = Cells.of(points, radius_mm)
+    field, excess, heard, overruled = kernels.consensus_field(
+        nodes, np.ascontiguousarray(points[cells.order]),
+        np.ascontiguousarray(normals[cells.order]), np.ascontiguousarray(scan[cells.order]),
+        cloud.scans, cells.low_mm, cells.cell_mm, cells.shape, cells.start, radius_mm,
+        max(cloud.sigma_mm, 1e-4), ROUNDS, LEAST_POINTS, OUTLIER_SIGMAS, OUTLIER_MM,
+    )  # fmt: skip
+    # a plane fitted to points far below says little about a node high above them
+    field[np.abs(field) > 1.01 * radius_mm] = np.nan
+    grid = np.full(tuple(shape), np.nan, dtype=np.float32)
+    grid[tuple(index.T)] = field
+    seen = np.isfinite(grid)
+    _fill(grid, seen, low, edge, (points, normals), behind)
+    mesh = _surface(grid, low, edge)
+    close = np.isfinite(field) & (np.abs(field) < edge)
+    spread = _spread(excess, close, index, low, edge, shape) if cloud.scans > 1 else None
+    return Fused(
+        mesh=mesh,
+        spread=spread,
+        standard_error_mm=_standard_error(cloud, spread, radius_mm),
+        unseen_ratio=_unseen(mesh, seen, low, edge),
+        single_ratio=float((heard[close] == 1).mean()) if close.any() else 1.0,
+        overruled_ratio=float((overruled[close] > 0).mean()) if close.any() else 0.0,
+        rejected=rejected,
+    )
+
+
+def reach_mm(cloud: Cloud) -> float:
+    """Radius of a fit: enough points to bring the noise to 5 µm, or to a twentieth of the spacing.
+
+    The kernel (1 − d²/r²)⁴ over a plane has 0.36 of its points' weight (Σw)²/Σw².
+    """
+    wanted_mm = max(0.005, 0.05 * cloud.spacing_mm)
+    least = max(24.0, 8.0 * cloud.scans)  # so that each scan alone has a word
+    count = float(np.clip((cloud.sigma_mm / wanted_mm) ** 2 / 0.36, least, 120.0))
+    return float(np.sqrt(count / np.pi)) * cloud.spacing_mm
+
+
+def _contradicted(cloud: Cloud) -> Bool[np.ndarray, " n"]:
+    """(n,) points in cells that hold next to nothing, or that most other scans contradict."""
+    cell_mm = 2.2 * cloud.spacing_mm * np.sqrt(cloud.scans)
+    low = cloud.points_mm.min(axis=0) - 2 * cell_mm
+    index = np.floor((cloud.points_mm - low) / cell_mm).astype(np.int64)
+    shape = index.max(axis=0) + 3
+    flat = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+    key = cloud.scan * int(np.prod(shape)) + flat
+    places, surfel = np.unique(key, return_inverse=True)
+    count = np.bincount(surfel)
+
+    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "s 3"]:
+        sums = [np.bincount(surfel, weights=values[:, a]) / count for a in range(3)]
+        return np.ascontiguousarray(np.stack(sums, axis=1))
+
+    place, normal = mean(cloud.points_mm), mean(cloud.normals)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    table = np.full((cloud.scans, *shape), -1, dtype=np.int32)
+    table.reshape(-1)[places] = np.arange(len(places))
+    whose = places // int(np.prod(shape))
+    near_mm = max(0.7 * reach_mm(cloud), 5.0 * cloud.sigma_mm)
+    far_mm = max(FAR_SPACINGS * cloud.spacing_mm, 6.0 * near_mm)
+    support, conflict, _ = kernels.columns(
+        place, normal, whose, table, low, cell_mm, near_mm, far_mm, FACING
+    )
+    against = conflict > support + 1
+    if cloud.scans == 2:  # one word against one: the first scan's stands
+        against = (conflict > 0) & (support == 0) & (whose == 1)
+    around = ndimage.uniform_filter(
+        np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.float32), 3
+    ).reshape(-1)
+    lonely = (27.0 * around[places % int(np.prod(shape))] < LEAST_POINTS) & (support == 0)
+    return (against | lonely)[surfel]
+
+
+def _band(
+    points_mm: Float[np.ndarray, "n 3"], edge: float, radius_mm: float, behind: MeshSdf | None
+) -> tuple[
+    Float[np.ndarray, " 3"], Int[np.ndarray, " 3"], Float[np.ndarray, "k 3"], Int[np.ndarray, "k 3"]
+]:
+    """Grid and its nodes near the points."""
+    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
+    if behind is not None:
+        low = np.minimum(low, behind.bounds_mm[0])
+        high = np.maximum(high, behind.bounds_mm[1])
+    low = low - 4 * edge - radius_mm
+    shape = np.ceil((high + 4 * edge + radius_mm - low) / edge).astype(np.int64) + 1
+    if float(np.prod(shape.astype(np.float64))) > MAX_NODES:
+        raise TemplateError(
+            f"a grid of {edge:.3g} mm over these scans has {np.prod(shape):,} nodes, the limit is "
+            f"{MAX_NODES:,}; remove far clutter from the scans, or give a larger voxel"
+        )
+    occupied = np.zeros(tuple(shape), dtype=bool)
+    occupied[tuple(np.rint((points_mm - low) / edge).astype(np.int64).T)] = True
+    around = ndimage.generate_binary_structure(3, 1)
+    near = ndimage.binary_dilation(occupied, around, iterations=2)
+    index = np.argwhere(near)
+    return low, shape, low + edge * index, index
+
+
+def _fill(
+    grid: Float[np.ndarray, "x y z"],
+    seen: Bool[np.ndarray, "x y z"],
+    low: Float[np.ndarray, " 3"],
+    edge: float,
+    oriented: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
+    behind: MeshSdf | None,
+) -> None:
+    """Give the nodes without support a side: of their neighbours, or of the surface behind."""
+    parts, count = ndimage.label(~seen)
+    positive = np.zeros(count + 1)
+    touching = np.zeros(count + 1)
+    for axis in range(3):
+        for way in (0, 1):
+            here = [slice(None)] * 3
+            there = [slice(None)] * 3
+            here[axis] = slice(0, -1) if way else slice(1, None)
+            there[axis] = slice(1, None) if way else slice(0, -1)
+            mask = ~seen[tuple(here)] & seen[tuple(there)]
+            labels = parts[tuple(here)][mask]
+            touching += np.bincount(labels, minlength=count + 1)
+            sides = grid[tuple(there)][mask] > 0
+            positive += np.bincount(labels, weights=sides, minlength=count + 1)
+    share = positive / np.maximum(touching, 1)
+    outer = parts[0, 0, 0]
+    clear = (share >= SURE) | (share <= 1 - SURE) | (touching < 30)
+    side = np.where(share > 0.5, edge, -edge).astype(np.float32)
+    side[outer] = edge
+    grid[~seen] = side[parts[~seen]]
+    is_leaking = share[outer] < SURE and touching[outer] > 0
+    doubtful = [k for k in range(1, count + 1) if not clear[k] and k != outer]
+    if behind is None and not is_leaking and not doubtful:
+        return
+    asked = np.isin(parts, [outer, *doubtful]) & ~seen if behind is None else ~seen
+    closing = behind if behind is not None else _poisson(*oriented)
+    where = np.argwhere(asked)
+    grid[asked] = closing.distance(low + edge * where).astype(np.float32)
+
+
+def _poisson(points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> MeshSdf:
+    """A closed surface through oriented points."""
+    import trimesh
+
+    o3d = open3d()
+    step = max(1, len(points_mm) // POISSON_POINTS)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_mm[::step]))
+    cloud.normals = o3d.utility.Vector3dVector(normals[::step])
+    mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        cloud, depth=POISSON_DEPTH, scale=1.2, linear_fit=False
+    )[0]
+    made = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), process=False)
+    made.metadata["notes"] = ()  # only its distance is asked, and its sides by ray counts
+    if len(made.faces) == 0:
+        raise TemplateError("the scans leave the part too open to be closed; scan all sides of it")
+    return MeshSdf.from_mesh(made)
+
+
+def _surface(
+    grid: Float[np.ndarray, "x y z"], low: Float[np.ndarray, " 3"], edge: float
+) -> trimesh.Trimesh:
+    """Marching cubes, without dust; a valid solid."""
+    import manifold3d as m3
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    # the rim of the grid is outside: what reaches it is closed there
+    for axis in range(3):
+        for face in (0, -1):
+            rim = [slice(None)] * 3
+            rim[axis] = face  # type: ignore[call-overload]
+            grid[tuple(rim)] = np.maximum(grid[tuple(rim)], edge)
+    if not grid.min() < 0:
+        raise TemplateError("the scans enclose nothing; scan all sides of the part")
+    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+        grid, 0.0, spacing=(edge,) * 3
+    )
+    solid = as_manifold(np.asarray(vertices, dtype=np.float64) + low, np.asarray(faces))
+    if not is_valid(solid):
+        raise TemplateError("the fused surface is no valid solid; scan the part more evenly")
+    if solid.volume() < 0:
+        whole, turned = manifold_arrays(solid)
+        solid = as_manifold(whole, turned[:, ::-1])
+    pieces = solid.decompose()
+    largest = max(abs(piece.volume()) for piece in pieces)
+    kept = [piece for piece in pieces if abs(piece.volume()) >= DUST_RATIO * largest]
+    solid = m3.Manifold.compose(kept) if len(kept) < len(pieces) else solid
+    vertices, faces = manifold_arrays(solid)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.metadata["notes"] = ()
+    return mesh
+
+
+def _spread(
+    excess: Float[np.ndarray, " k"],
+    close: Bool[np.ndarray, " k"],
+    index: Int[np.ndarray, "k 3"],
+    low: Float[np.ndarray, " 3"],
+    edge: float,
+    shape: Int[np.ndarray, " 3"],
+) -> Spread:
+    """Variance between scans pooled over coarse cells: chance averages out, disagreement stays."""
+    used = close & np.isfinite(excess)
+    coarse = index[used] // SPREAD_CELLS
+    size = shape // SPREAD_CELLS + 1
+    key = (coarse[:, 0] * size[1] + coarse[:, 1]) * size[2] + coarse[:, 2]
+    cells = int(np.prod(size))
+    count = np.bincount(key, minlength=cells)
+    pooled = np.bincount(key, weights=excess[used], minlength=cells) / np.maximum(count, 1)
+    pooled[count < LEAST_NODES] = 0.0
+    found = np.sqrt(np.maximum(pooled, 0.0)).astype(np.float32)
+    found[found < LEAST_SPREAD_MM] = 0.0
+    grown = ndimage.maximum_filter(found.reshape(tuple(size)), size=3)
+    return Spread(low - 0.5 * edge, SPREAD_CELLS * edge, grown)
+
+
+def _standard_error(cloud: Cloud, spread: Spread | None, radius_mm: float) -> float:
+    """How well the consensus is known at the 99th percentile: noise, and scans that differ."""
+    near = 0.36 * np.pi * (radius_mm / cloud.spacing_mm) ** 2
+    noise_mm = cloud.sigma_mm / np.sqrt(max(near, 1.0))
+    if spread is None or not (spread.values_mm > 0).any():
+        return float(noise_mm)
+    high = float(np.quantile(spread.values_mm[spread.values_mm > 0], 0.99))
+    return float(np.hypot(noise_mm, high / np.sqrt(cloud.scans)))
+
+
+def _unseen(
+    mesh: trimesh.Trimesh,
+    seen: Bool[np.ndarray, "x y z"],
+    low: Float[np.ndarray, " 3"],
+    edge: float,
+) -> float:
+    """Share of the surface's area in cells where no scan had support."""
+    index = np.rint((np.asarray(mesh.triangles_center) - low) / edge).astype(np.int64)
+    index = np.clip(index, 0, np.array(seen.shape) - 1)
+    area = np.asarray(mesh.area_faces)
+    return float(area[~seen[tuple(index.T)]].sum() / area.sum())

@@ -1,0 +1,323 @@
+"""Scans onto each other, without a template: features propose, point to plane disposes.
+
+KISS-Matcher (H. Lim et al., ICRA 2025) and GICP (K. Koide, small_gicp, 2024) place each scan on
+what is placed already; then all poses are refined together. What cannot be placed is left out and
+named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from amrepair.align.coarse import cube_rotations
+from amrepair.align.refine import thin_out
+from amrepair.consensus.cloud import planes, spacing_of
+from amrepair.errors import AlignmentError
+from amrepair.frames import rotation_from_vector
+from gcode.progress import Progress, silent
+
+COARSE_POINTS, FINE_POINTS, SCORE_POINTS = 15_000, 12_000, 4_000
+VOXEL_RATIOS = (0.012, 0.02)  # of the diagonal
+GOOD_OVERLAP, LEAST_OVERLAP = 0.6, 0.25
+# A point farther from the model than it lies overlaps by reach is above it, not beside it, where
+# this share of the way is along the normal; it counts this many times.
+ABOVE, CONTRADICTION = 0.8, 4.0
+# More than this against each point that agrees, and the pose is wrong: a plate on its other half
+# has 0.5, that plate in its place 0.16 (its edges), scans of a whole part under 0.05.
+MOST_AGAINST = 0.3
+ROUNDS = 12
+SHRINK = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A scan as registration needs it, in its own frame.
+
+    Attributes
+    ----------
+    normals
+        (n, 3) unit normals of either sign.
+    tree
+        Of the points.
+    """
+
+    name: str
+    points_mm: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    spacing_mm: float
+    sigma_mm: float
+    tree: cKDTree
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Scans in the frame of the first of them that could be placed.
+
+    Attributes
+    ----------
+    which
+        Numbers of the scans that were placed.
+    poses
+        (4, 4) common frame from each of those scans.
+    rmse_mm
+        Point-to-plane, over what overlaps.
+    left_out
+        Numbers of the scans that fit nowhere.
+    """
+
+    which: tuple[int, ...]
+    poses: tuple[Float[np.ndarray, "4 4"], ...]
+    rmse_mm: float
+    left_out: tuple[int, ...]
+
+
+def place_all(
+    pieces: Sequence[Piece], rng: np.random.Generator, progress: Progress = silent
+) -> Placed:
+    """Bring scans of one part into one frame.
+
+    Raises
+    ------
+    AlignmentError
+        If most of them do not fit each other.
+    """
+    thin = [thin_out(piece.points_mm, COARSE_POINTS, rng) for piece in pieces]
+    diagonal_mm = max(float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in thin)
+    root = int(np.argmax([_coverage(cloud, diagonal_mm / 100) for cloud in thin]))
+    poses: dict[int, np.ndarray] = {root: np.eye(4)}
+    waiting = [k for k in range(len(pieces)) if k != root]
+    proposed: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+    bar = GOOD_OVERLAP
+    while waiting:
+        model = np.concatenate([_apply(poses[k], thin[k]) for k in poses])
+        size, found = len(poses), []
+        for k in waiting:
+            progress("align", float(len(poses)), float(len(pieces)))
+            if (k, size) not in proposed:
+                proposed[k, size] = _propose(thin[k], model, diagonal_mm)
+            if proposed[k, size][0] >= bar:
+                found.append(k)
+        if bar < GOOD_OVERLAP:  # the best of the doubtful; then the model has grown: look again
+            found = sorted(found, key=lambda k: -proposed[k, size][0])[:1]
+        for k in found:
+            poses[k] = proposed[k, size][1]
+            waiting.remove(k)
+        if not found and bar == LEAST_OVERLAP:
+            break
+        bar = GOOD_OVERLAP if found else LEAST_OVERLAP
+    if 2 * len(waiting) >= len(pieces):
+        names = ", ".join(pieces[k].name for k in waiting)
+        raise AlignmentError(
+            f"{len(waiting)} of {len(pieces)} scans overlap the others by less than "
+            f"{LEAST_OVERLAP:.0%}, or contradict them, in every pose that was tried ({names}); "
+            "check that they show the same part in the same unit, or scan with more overlap"
+        )
+    which = sorted(poses)
+    refined, rmse_mm = _together([pieces[k] for k in which], [poses[k] for k in which], rng)
+    home = np.linalg.inv(refined[0])
+    return Placed(
+        tuple(which), tuple(home @ pose for pose in refined), rmse_mm, tuple(sorted(waiting))
+    )
+
+
+def _apply(
+    pose: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _coverage(points_mm: Float[np.ndarray, "n 3"], voxel_mm: float) -> int:
+    return len(np.unique(np.floor(points_mm / voxel_mm).astype(np.int64), axis=0))
+
+
+def _propose(
+    source_mm: Float[np.ndarray, "n 3"], model_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
+) -> tuple[float, Float[np.ndarray, "4 4"]]:
+    """The best pose of a scan on the model, and the share of it that lies there.
+
+    Overlap alone would lay one half of a part on the other. A point beside the model's rim says
+    nothing; one above or below its surface contradicts the pose.
+    """
+    best_overlap, best_score, best_pose = 0.0, -np.inf, np.eye(4)
+    tree = cKDTree(model_mm)
+    usual = float(np.median(tree.query(model_mm[:: max(1, len(model_mm) // 2000)], k=[2])[0]))
+    reach_mm = 3.0 * usual
+    model_plane = planes(model_mm, spacing_of(model_mm))[0]
+    source_plane = planes(source_mm, spacing_of(source_mm))[0]
+    source_tree = cKDTree(source_mm)
+    target, target_tree = _prepared(model_mm, diagonal_mm)
+    source, _ = _prepared(source_mm, diagonal_mm)
+    thinner = len(source_mm) // SCORE_POINTS + 1
+    for guess in _guesses(source_mm, model_mm, diagonal_mm):
+        pose = _gicp(target, source, target_tree, guess, 0.02 * diagonal_mm)
+        moved = _apply(pose, source_mm[::thinner])
+        forth = tree.query(moved, workers=-1)
+        overlap = float((forth[0] < reach_mm).mean())
+        against = _above(moved, model_mm, model_plane, forth, reach_mm)
+        returned = _apply(np.linalg.inv(pose), model_mm[:: len(model_mm) // SCORE_POINTS + 1])
+        back = source_tree.query(returned, workers=-1)
+        against += _above(returned, source_mm, source_plane, back, reach_mm)
+        score = overlap - CONTRADICTION * against
+        if score > best_score:
+            agrees = against <= MOST_AGAINST * overlap
+            best_overlap, best_score, best_pose = overlap if agrees else 0.0, score, pose
+        if best_score > 0.95:
+            break
+    return best_overlap, best_pose
+
+
+def _above(
+    points_mm: Float[np.ndarray, "n 3"],
+    surface_mm: Float[np.ndarray, "m 3"],
+    plane: Float[np.ndarray, "m 3"],
+    nearest: tuple[np.ndarray, np.ndarray],
+    reach_mm: float,
+) -> float:
+    """Share of points that lie off the other surface, above or below it and not beside it."""
+    distance, index = nearest
+    height = np.abs(((points_mm - surface_mm[index]) * plane[index]).sum(axis=1))
+    return float(((distance > reach_mm) & (height > ABOVE * distance)).mean())
+
+
+def _guesses(
+    source_mm: Float[np.ndarray, "n 3"], model_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Feature matches at two voxels; then the 24 ways to lay the principal axes on each other."""
+    found = []
+    for ratio in VOXEL_RATIOS:
+        pose = _features(source_mm, model_mm, ratio * diagonal_mm)
+        if pose is not None:
+            found.append(pose)
+    (source_axes, source), (target_axes, target) = _axes(source_mm), _axes(model_mm)
+    for turn in cube_rotations():
+        rotation = target_axes @ turn @ source_axes.T
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, target - rotation @ source
+        found.append(pose)
+    return found
+
+
+def _features(
+    source_mm: Float[np.ndarray, "n 3"], model_mm: Float[np.ndarray, "m 3"], voxel_mm: float
+) -> Float[np.ndarray, "4 4"] | None:
+    import kiss_matcher
+
+    # about their own centres: the matcher computes in single precision
+    source, target = source_mm.mean(axis=0), model_mm.mean(axis=0)
+    matcher = kiss_matcher.KISSMatcher(
+        kiss_matcher.KISSMatcherConfig(voxel_size=voxel_mm, enable_noise_bound_clamping=False)
+    )
+    answer = matcher.estimate(
+        (source_mm - source).astype(np.float32), (model_mm - target).astype(np.float32)
+    )
+    rotation = np.asarray(answer.rotation, dtype=np.float64)
+    if not answer.valid or not np.isfinite(rotation).all():
+        return None
+    u, _, vt = np.linalg.svd(rotation)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = target + np.asarray(answer.translation).reshape(3) - rotation @ source
+    return pose
+
+
+def _axes(
+    points_mm: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+    centre = points_mm.mean(axis=0)
+    axes = np.linalg.eigh(np.cov((points_mm - centre).T))[1]
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1.0
+    local = (points_mm - centre) @ axes
+    return axes, centre + axes @ (0.5 * (local.min(axis=0) + local.max(axis=0)))
+
+
+def _prepared(points_mm: Float[np.ndarray, "n 3"], diagonal_mm: float) -> tuple[object, object]:
+    import small_gicp
+
+    return small_gicp.preprocess_points(
+        np.ascontiguousarray(points_mm), downsampling_resolution=0.006 * diagonal_mm
+    )
+
+
+def _gicp(
+    target: object,
+    source: object,
+    tree: object,
+    guess: Float[np.ndarray, "4 4"],
+    reach_mm: float,
+) -> Float[np.ndarray, "4 4"]:
+    import small_gicp
+
+    answer = small_gicp.align(
+        target, source, tree, init_T_target_source=guess, max_correspondence_distance=reach_mm
+    )
+    return np.array(answer.T_target_source)
+
+
+def _together(
+    pieces: Sequence[Piece], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
+) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
+    """All poses but the first, refined against all other scans in turn, point to plane."""
+    found = [np.array(pose) for pose in poses]
+    sample = [rng.permutation(len(p.points_mm))[:FINE_POINTS] for p in pieces]
+    noise_mm = max(1e-3, *(p.sigma_mm for p in pieces))
+    scale_mm = max(10.0 * noise_mm, 0.5 * max(p.spacing_mm for p in pieces))
+    rmse_mm = 0.0
+    for _ in range(ROUNDS):
+        moved_mm, squares, weights = 0.0, 0.0, 0.0
+        for k in range(1, len(pieces)):
+            points, normal, height = _pairs(pieces, found, k, sample[k])
+            if len(points) < 100:
+                continue
+            weight = (scale_mm**2 / (height**2 + scale_mm**2)) ** 2
+            centre = points.mean(axis=0)
+            jacobian = np.concatenate([np.cross(points - centre, normal), normal], axis=1)
+            weighted = jacobian * weight[:, None]
+            damping = 1e-9 * np.trace(weighted.T @ jacobian) * np.eye(6)
+            step = -np.linalg.solve(weighted.T @ jacobian + damping, weighted.T @ height)
+            turn = np.eye(4)
+            turn[:3, :3] = rotation_from_vector(step[:3])
+            turn[:3, 3] = centre + step[3:] - turn[:3, :3] @ centre
+            found[k] = turn @ found[k]
+            reach = float(np.linalg.norm(points - centre, axis=1).max())
+            moved_mm = max(
+                moved_mm, float(np.linalg.norm(step[3:]) + reach * np.linalg.norm(step[:3]))
+            )
+            squares += float((weight * height**2).sum())
+            weights += float(weight.sum())
+        rmse_mm = float(np.sqrt(squares / max(weights, 1e-12)))
+        if moved_mm < 2e-4 and scale_mm <= 4.0 * noise_mm:
+            break
+        scale_mm = max(4.0 * noise_mm, SHRINK * scale_mm)
+    return found, rmse_mm
+
+
+def _pairs(
+    pieces: Sequence[Piece],
+    poses: Sequence[Float[np.ndarray, "4 4"]],
+    k: int,
+    sample: np.ndarray,
+) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
+    """Points of a scan, and normals and heights over the planes of the other scans."""
+    own = _apply(poses[k], pieces[k].points_mm[sample])
+    points, normals, heights = [], [], []
+    for r, piece in enumerate(pieces):
+        if r == k:
+            continue
+        local = _apply(np.linalg.inv(poses[r]), own)
+        distance, index = piece.tree.query(
+            local, distance_upper_bound=4.0 * piece.spacing_mm, workers=-1
+        )
+        near = np.isfinite(distance)
+        normal = piece.normals[index[near]]
+        height = ((local[near] - piece.points_mm[index[near]]) * normal).sum(axis=1)
+        points.append(own[near])
+        normals.append(normal @ poses[r][:3, :3].T)
+        heights.append(height)
+    return np.concatenate(points), np.concatenate(normals), np.concatenate(heights)

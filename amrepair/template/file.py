@@ -1,0 +1,121 @@
+"""The template's file: safetensors with JSON metadata, written whole or not at all; never pickle.
+
+It knows arrays and a head; what they mean is the business of the classes that are kept in it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amrepair.errors import TemplateError
+
+if TYPE_CHECKING:
+    import trimesh
+
+FORMAT = "amrepair-template"
+FORMAT_VERSION = 2
+HEAD = "amrepair"
+
+
+def write_template(path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]) -> None:
+    """Write arrays and head.
+
+    Raises
+    ------
+    TemplateError
+        If the file cannot be written.
+    """
+    from safetensors.numpy import save
+
+    said = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "units": "mm",
+        "frame": "template",
+        **head,
+    }
+    data = save(
+        {name: np.ascontiguousarray(array) for name, array in arrays.items()},
+        metadata={HEAD: json.dumps(said)},
+    )
+    temporary = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    except OSError as error:
+        raise TemplateError(f"the template {path} cannot be written ({error.strerror})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_template(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and head of a file that is really ours.
+
+    Raises
+    ------
+    TemplateError
+        If it is missing, truncated, foreign or of another version.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise TemplateError(f"the template {path} does not exist or is not a file")
+    try:
+        with safe_open(path, framework="np") as file:
+            head = json.loads((file.metadata() or {}).get(HEAD, "null"))
+            if not isinstance(head, dict) or head.get("format") != FORMAT:
+                raise TemplateError(
+                    f"{path} is a safetensors file, but no template of ours; fit one with "
+                    "'amrepair template fit'"
+                )
+            if head.get("format_version") != FORMAT_VERSION:
+                raise TemplateError(
+                    f"{path} is a template of another version ({head.get('format_version')}, this "
+                    f"one reads {FORMAT_VERSION}); fit it again"
+                )
+            return {name: file.get_tensor(name) for name in file.keys()}, head  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as error:
+        raise TemplateError(
+            f"the template {path} is truncated or no template ({error}); fit it again"
+        ) from error
+
+
+def require_kind(path: Path, found: object, wanted: str) -> None:
+    """Refuse a template of another kind.
+
+    Raises
+    ------
+    TemplateError
+        If the kinds differ.
+    """
+    if found != wanted:
+        raise TemplateError(
+            f"{path} holds a template of the kind '{found}', not '{wanted}'; open it with "
+            "load_template, or fit it again"
+        )
+
+
+# What a template's file says of how it was made.
+KNOWN_METADATA = (
+    "recipe", "seed", "part_sha256", "version", "notes", "settings", "steps", "scans",
+)  # fmt: skip
+
+
+def stored_mesh(path: Path, arrays: dict[str, np.ndarray]) -> trimesh.Trimesh:
+    """The closed mesh that a template's file carries."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(arrays["vertices_mm"], arrays["faces"], process=False)
+    mesh.metadata["notes"] = ()
+    mesh.metadata["source"] = str(path)
+    return mesh
+
+
+def stored_metadata(head: dict[str, Any]) -> dict[str, str]:
+    """How a template was made, as its file says."""
+    return {key: str(head[key]) for key in KNOWN_METADATA if key in head}

@@ -1,0 +1,92 @@
+"""Templates from scans and libraries of templates, as a user calls them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.frames import rotation_from_vector
+from amrepair.scans import Scan, write_ply
+from amrepair.template import LearnedSdf, MeshSdf, load_mesh, load_template
+
+pytestmark = pytest.mark.slow  # a minute of work, all of it in other processes
+
+ROOT = Path(__file__).parents[2]
+PARTS = ROOT / "examples" / "parts"
+
+
+def call(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    code = "from amrepair.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+        cwd=ROOT,
+    )
+
+
+def write_scan(path: Path, part: str, seed: int, turn: float) -> Path:
+    mesh = load_mesh(PARTS / f"{part}.stl")
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 30_000, seed=seed)[0])
+    points = points + np.random.default_rng(seed).normal(0, 0.03, points.shape)
+    rotation = rotation_from_vector(turn * np.array([0.3, -0.8, 0.5]))
+    write_ply(Scan(points @ rotation.T + 20 * turn, 0.03, "scanner"), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One part learned from scans, one from its mesh."""
+    folder = tmp_path_factory.mktemp("library")
+    scans = [write_scan(folder / f"{k}.ply", "bracket", k, 2.0 * k) for k in range(3)]
+    done = call("template", "fit", *scans, "-o", folder / "bracket.safetensors")
+    assert done.returncode == 0, done.stderr
+    assert "consensus of 3 of 3 scans" in done.stderr
+    for scan in scans:
+        scan.unlink()
+    done = call("template", "fit", PARTS / "pebble.stl", "-o", folder / "pebble.safetensors")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_template_from_scan_files_is_the_part(library: Path) -> None:
+    template = load_template(library / "bracket.safetensors")
+    assert isinstance(template, LearnedSdf)
+    assert template.tolerance is not None
+    # the template's frame is the first scan's, which was not turned
+    exact = MeshSdf.from_mesh(load_mesh(PARTS / "bracket.stl"))
+    points = np.asarray(trimesh.sample.sample_surface(exact.mesh, 30_000, seed=9)[0])
+    assert np.abs(template.distance(points)).mean() < 0.03
+
+
+def test_the_right_template_of_a_folder_is_taken(library: Path, tmp_path: Path) -> None:
+    scan = write_scan(tmp_path / "scan.ply", "bracket", 7, 1.0)
+    done = call("align", scan, "--template", library, "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["template"] == "bracket"
+    assert said["confidence"] > 0.5
+    assert set(said["candidates"]) == {"bracket", "pebble"}
+    assert said["rmse_mm"] < 0.1
+
+
+def test_the_published_alignment_on_the_command_line(library: Path, tmp_path: Path) -> None:
+    scan = write_scan(tmp_path / "scan.ply", "bracket", 8, 0.0)
+    template = library / "bracket.safetensors"
+    words = ["align", scan, "--template", template, "--json", "--method", "paper"]
+    done = call(*words, "--pam", "ransac=off", "--pam", "variant=code")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["method"] == "paper"
+    assert np.abs(np.array(said["template_from_scan"]) - np.eye(4)).max() < 0.5
+    done = call("align", scan, "--template", template, "--pam", "icp=off")
+    assert done.returncode == 2
+    assert "--pam belongs to --method paper" in done.stderr

@@ -1,0 +1,245 @@
+"""Templates from scans, against analytic truth: poses, surface, outliers, spread, gaps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.consensus import fit_from_scans
+from amrepair.consensus.cloud import outward, planes, spacing_of
+from amrepair.consensus.fit import _piece
+from amrepair.consensus.fuse import Cloud, Fused, fuse
+from amrepair.consensus.register import place_all
+from amrepair.detect.normal_variation import forgiven
+from amrepair.detect.surfels import make_surfels
+from amrepair.errors import AlignmentError, InputError, TemplateError
+from amrepair.frames import rotation_from_vector
+from amrepair.scans import Scan
+from amrepair.template import LearnedSdf, MeshSdf, load_template
+from tests.analytic import (
+    AnalyticTemplate,
+    box,
+    cylinder,
+    difference,
+    sample_surface,
+    to_trimesh,
+    union,
+)
+
+SIGMA_MM = 0.03
+
+
+@pytest.fixture(scope="module")
+def part() -> AnalyticTemplate:
+    """A plate with a tower and a through hole: no symmetry, every kind of edge."""
+    body = union(box((0, 0, 0), (40, 25, 8)), cylinder((30, 15, 4), 6, 14))
+    return difference(body, cylinder((10, 9, -1), 4, 12))
+
+
+def points_of(
+    part: AnalyticTemplate, count: int, seed: int, sigma_mm: float = SIGMA_MM
+) -> np.ndarray:
+    """About `count` points in the part's frame."""
+    spacing_mm = float(np.sqrt(part.body.surface_area() / count))
+    points, _ = sample_surface(part.body, spacing_mm, seed=seed)
+    return points + np.random.default_rng(seed).normal(0, sigma_mm, points.shape)
+
+
+def pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(100 + seed)
+    axis = rng.normal(size=3)
+    turn = rotation_from_vector(2.5 * axis / np.linalg.norm(axis)) if seed else np.eye(3)
+    return turn, rng.normal(size=3) * 50.0 * (seed > 0)
+
+
+def placed(points: np.ndarray, seed: int) -> Scan:
+    turn, shift = pose(seed)
+    return Scan(points @ turn.T + shift, 0.04, "scanner", source=f"scan{seed}")
+
+
+def joined(clouds: list[np.ndarray]) -> Cloud:
+    """Scans that stand in one frame already."""
+    spacing = [spacing_of(c) for c in clouds]
+    normals = np.concatenate([planes(c, s)[0] for c, s in zip(clouds, spacing, strict=True)])
+    points = np.concatenate(clouds)
+    together = spacing_of(points)
+    scan = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
+    return Cloud(points, outward(points, normals, together), scan, len(clouds), together, SIGMA_MM)
+
+
+def fused_error(fused: Fused, part: AnalyticTemplate, away: float = 0.0) -> np.ndarray:
+    """|distance to the true surface| on the fused one."""
+    points, _ = trimesh.sample.sample_surface(fused.mesh, 40_000, seed=3)
+    return np.abs(part.distance(np.asarray(points)))
+
+
+def test_noise_and_spacing_are_measured(part: AnalyticTemplate) -> None:
+    points = points_of(part, 40_000, 0)
+    spacing_mm = spacing_of(points)
+    # random points of density ρ: spacing is defined as 1 / sqrt(ρ)
+    assert spacing_mm == pytest.approx(np.sqrt(part.body.surface_area() / 40_000), rel=0.1)
+    assert planes(points, spacing_mm)[1] == pytest.approx(SIGMA_MM, rel=0.2)
+
+
+def test_normals_point_outwards_also_in_the_hole(part: AnalyticTemplate) -> None:
+    points = points_of(part, 60_000, 1)
+    spacing_mm = spacing_of(points)
+    normals = outward(points, planes(points, spacing_mm)[0], spacing_mm)
+    gradient = part.distance_and_gradient(points)[1]
+    agree = (normals * gradient).sum(axis=1)
+    assert (agree > 0).mean() > 0.995  # planes through an edge lie across it
+    hole = (np.linalg.norm(points[:, :2] - (10, 9), axis=1) < 4.2) & (points[:, 2] > 1)
+    hole &= points[:, 2] < 7
+    assert (agree[hole] > 0).mean() > 0.99
+
+
+def test_scans_find_each_other(part: AnalyticTemplate) -> None:
+    scans = [placed(points_of(part, 15_000, s), s) for s in range(3)]
+    rng = np.random.default_rng(0)
+    found = place_all([_piece(scan, rng) for scan in scans], rng)
+    assert found.which == (0, 1, 2)
+    corners = np.array(part.bounds_mm)
+    for s, matrix in enumerate(found.poses):
+        turn, shift = pose(s)
+        back = (corners @ turn.T + shift) @ matrix[:3, :3].T + matrix[:3, 3]
+        assert np.abs(back - corners).max() < 0.02  # σ over the root of 12,000, and its lever
+
+
+def test_a_template_from_scans_is_the_part(part: AnalyticTemplate, tmp_path: Path) -> None:
+    scans = [placed(points_of(part, 20_000, s), s) for s in range(2)]
+    made = fit_from_scans(scans, seed=0)
+    truth, _ = sample_surface(part.body, 0.3, seed=9)
+    error_mm = np.abs(made.template.distance(truth))
+    assert error_mm.mean() < 0.015
+    assert np.quantile(error_mm, 0.9) < 0.05  # the rest is edges, rounded by a fit's radius
+    assert made.sigma_mm == pytest.approx(SIGMA_MM, rel=0.25)
+    assert made.fused.unseen_ratio < 0.002
+    assert made.template.solid().volume() == pytest.approx(part.body.volume(), rel=0.003)
+    assert "2 of 2 scans" in made.template.metadata["notes"]
+    made.template.save(tmp_path / "t.safetensors")
+    again = load_template(tmp_path / "t.safetensors")
+    assert isinstance(again, LearnedSdf)
+    assert np.array_equal(again.spread_mm(truth), made.template.spread_mm(truth))
+
+
+def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
+    clouds = [points_of(part, 30_000, s) for s in range(4)]
+    spot = np.array([20.0, 20.0, 8.0])
+    near = np.linalg.norm(clouds[2] - spot, axis=1) < 3.0
+    clouds[2][near & (clouds[2][:, 2] > 7.5), 2] += 1.5  # a bulge
+    rim = np.linalg.norm(clouds[3] - (34, 3, 8), axis=1) < 3.0
+    clouds[3][rim & (clouds[3][:, 2] > 7.5), 2] -= 0.15  # a dent, within reach of the fit
+    fused = fuse(joined(clouds))
+    assert fused.rejected > 100
+    assert np.quantile(fused_error(fused, part), 0.999) < 0.2
+    assert fused_error(fused, part).max() < 0.5  # specks at edges; the bulge has 1.5
+    assert fused_error(fused, part).mean() < 0.015
+    assert fused.overruled_ratio > 0
+
+
+def test_where_normal_parts_differ_the_spread_says_so(part: AnalyticTemplate) -> None:
+    clouds = [points_of(part, 30_000, s) for s in range(4)]
+    for cloud, lift in zip(clouds, (-0.15, -0.05, 0.05, 0.15), strict=True):
+        top = (np.linalg.norm(cloud[:, :2] - (30, 15), axis=1) < 5.5) & (cloud[:, 2] > 17.5)
+        cloud[top, 2] += lift
+    fused = fuse(joined(clouds))
+    assert fused.spread is not None
+    from amrepair.template.learned import Tolerance
+
+    spread = Tolerance(fused.spread.origin_mm, fused.spread.cell_mm, fused.spread.values_mm)
+    truth_mm = float(np.std((-0.15, -0.05, 0.05, 0.15), ddof=1))
+    middle = np.array([[30.0, 15.0, 18.0]])
+    assert spread.at(middle)[0] == pytest.approx(truth_mm, rel=0.3)
+    flat = np.array([[20.0, 12.0, 0.0], [5.0, 20.0, 8.0], [20.0, 0.0, 4.0]])
+    assert spread.at(flat).max() < 0.02
+
+
+def test_detection_forgives_what_normal_parts_differ_by(part: AnalyticTemplate) -> None:
+    class Varying(AnalyticTemplate):
+        def spread_mm(self, points_mm: np.ndarray) -> np.ndarray:
+            return np.where(points_mm[:, 0] > 20, 0.1, 0.0)
+
+    points = points_of(part, 8_000, 2)
+    surfels = make_surfels(points, np.full(len(points), 0.35), np.ones(len(points), bool))
+    changed = forgiven(surfels, Varying(part.field, part.body))
+    right = surfels.place_mm[:, 0] > 20
+    assert changed.deviation_mm[right] == pytest.approx(0.05)  # 0.35 − 3 × 0.1
+    assert changed.deviation_mm[~right] == pytest.approx(0.35)
+    assert forgiven(surfels, part) is surfels
+
+
+def test_what_no_scan_saw_is_closed_and_said(part: AnalyticTemplate) -> None:
+    clouds = []
+    for s in range(2):
+        cloud = points_of(part, 30_000, s)
+        clouds.append(cloud[cloud[:, 2] > 1.0])  # stands on a table
+    fused = fuse(joined(clouds))
+    assert fused.mesh.is_volume
+    assert fused.unseen_ratio > 0.2
+    top = np.array([[20.0, 5.0, 8.0], [30.0, 15.0, 18.0]])
+    assert np.abs(MeshSdf.from_mesh(fused.mesh).distance(top)).max() < 0.05
+
+
+def test_with_a_mesh_the_unseen_is_the_mesh_and_the_seen_the_scans(part: AnalyticTemplate) -> None:
+    clouds = [points_of(part, 20_000, s) for s in range(2)]
+    for cloud in clouds:  # both parts came out 0.1 mm higher than drawn
+        cloud[(cloud[:, 2] > 17.5), 2] += 0.1
+    clouds = [cloud[cloud[:, 2] > 1.0] for cloud in clouds]
+    nominal = MeshSdf.from_mesh(to_trimesh(part.body))
+    fused = fuse(joined(clouds), behind=nominal)
+    made = MeshSdf.from_mesh(fused.mesh)
+    bottom = np.array([[x, y, 0.0] for x in (3.0, 20.0, 37.0) for y in (3.0, 12.0, 22.0)])
+    bottom = bottom[np.abs(part.distance(bottom)) < 1e-6]
+    assert np.abs(made.distance(bottom)).max() < 0.01
+    assert made.distance(np.array([[30.0, 15.0, 18.1]]))[0] == pytest.approx(0.0, abs=0.02)
+    assert fused.unseen_ratio > 0.2
+
+
+def halves(part: AnalyticTemplate, first_mm: float, second_mm: float) -> list[Scan]:
+    """All that lies left of one plane, and all that lies right of another."""
+    found = []
+    for s, (low, high) in enumerate(((-1.0, first_mm), (second_mm, 41.0))):
+        cloud = points_of(part, 20_000, s)
+        found.append(placed(cloud[(cloud[:, 0] > low) & (cloud[:, 0] < high)], s))
+    return found
+
+
+def test_overlapping_partial_scans_find_each_other(part: AnalyticTemplate) -> None:
+    rng = np.random.default_rng(0)
+    found = place_all([_piece(scan, rng) for scan in halves(part, 34.0, 5.0)], rng)
+    turn, shift = pose(1)
+    corners = np.array(part.bounds_mm)
+    back = (corners @ turn.T + shift) @ found.poses[1][:3, :3].T + found.poses[1][:3, 3]
+    assert np.abs(back - corners).max() < 0.1
+
+
+def test_a_plate_is_not_laid_on_its_other_half(part: AnalyticTemplate) -> None:
+    # regression: the pose of the largest overlap was taken, which turns one half onto the other
+    rng = np.random.default_rng(0)
+    with pytest.raises(AlignmentError, match="contradict"):
+        place_all([_piece(scan, rng) for scan in halves(part, 26.0, 12.0)], rng)
+
+
+def test_scans_of_different_parts_are_refused(part: AnalyticTemplate) -> None:
+    ball = np.random.default_rng(0).normal(size=(8_000, 3))
+    ball *= 22.0 / np.linalg.norm(ball, axis=1, keepdims=True)
+    scans = [placed(points_of(part, 8_000, 0), 0), Scan(ball, 0.04, "scanner", source="ball")]
+    with pytest.raises((AlignmentError, TemplateError), match="overlap"):
+        fit_from_scans(scans)
+
+
+def test_bad_scans_are_refused_in_words(part: AnalyticTemplate) -> None:
+    good = placed(points_of(part, 8_000, 0), 0)
+    with pytest.raises(InputError, match="at least one scan"):
+        fit_from_scans([])
+    with pytest.raises(InputError, match="needs at least 2,000"):
+        fit_from_scans([Scan(np.zeros((1, 3)), 0.04, "scanner")])
+    metres = Scan(good.points_mm * 1e-3, 0.04, "scanner", source="metres.ply")
+    with pytest.raises(InputError, match=r"metres\.ply .*\(metres for millimetres"):
+        fit_from_scans([good, placed(points_of(part, 8_000, 1), 1), metres])
+    repeated = Scan(np.repeat(good.points_mm[:50], 100, axis=0), 0.04, "scanner", source="same")
+    with pytest.raises(InputError, match="only 50 different points"):
+        fit_from_scans([repeated])
