@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
-from gcode.cli.app import app
+from gcode.cli.app import send
 from gcode.errors import JournalError, LinkError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import supervisor
@@ -212,8 +212,5 @@ def test_a_printer_that_refuses_us_is_not_ours_to_abort(
     job.write_text("G28\nG1 X10 Y10 Z5 F3000\n")
     monkeypatch.setattr("gcode.cli.app.connect", lambda *_, **__: machine)
     with pytest.raises(LinkError, match="another job"):
-        app(
-            ["send", str(job), "--port", "octoprint+http://nowhere", "--printer", "generic_marlin"],
-            standalone_mode=False,
-        )
+        send(job, port="octoprint+http://nowhere", printer="generic_marlin")
     assert machine.aborted == 0
