@@ -15,7 +15,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
-from gcode.errors import JournalError
+from gcode.cli.app import send
+from gcode.errors import JournalError, LinkError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import supervisor
 from gcode.hosts.journal import Journal
@@ -188,3 +189,28 @@ def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
         db.execute("CREATE TABLE job (id INTEGER)")
     with pytest.raises(JournalError, match="version 0"):
         Journal(path)
+
+
+class Occupied:
+    """A server whose printer prints for somebody else."""
+
+    def __init__(self) -> None:
+        self.aborted = 0
+
+    def connect(self) -> None:
+        raise LinkError("The printer prints another job.")
+
+    def abort(self) -> None:
+        self.aborted += 1
+
+
+def test_a_printer_that_refuses_us_is_not_ours_to_abort(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # regression: found in a merge; cancelling would have ended somebody else's print
+    job, machine = tmp_path / "job.gcode", Occupied()
+    job.write_text("G28\nG1 X10 Y10 Z5 F3000\n")
+    monkeypatch.setattr("gcode.cli.app.connect", lambda *_, **__: machine)
+    with pytest.raises(LinkError, match="another job"):
+        send(job, port="octoprint+http://nowhere", printer="generic_marlin")
+    assert machine.aborted == 0
