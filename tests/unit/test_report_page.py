@@ -257,8 +257,9 @@ def test_a_look_of_a_plan_carries_normals_and_outlines(example_files: Path) -> N
     assert shown.height_map is not None
     (outline,) = shown.height_map.outlines_mm
     low, high = outline.min(axis=0), outline.max(axis=0)
-    assert low == pytest.approx([123.0, 80.0], abs=0.4)
-    assert high == pytest.approx([130.0, 88.0], abs=0.4)
+    # what is missing is grown back by up to three times the tolerance's 0.2 mm at a rim
+    assert low == pytest.approx([123.0, 80.0], abs=0.6)
+    assert high == pytest.approx([130.0, 88.0], abs=0.6)
 
 
 def test_the_bed_beside_the_part_is_not_drawn_as_excess(example_files: Path) -> None:
