@@ -43,6 +43,8 @@ AS_BUILT_CELL_MM = 0.25
 # Deeper inside than this, beyond a calibration's error, infill is open (or something is missing:
 # that tells nothing of the pose, either).
 OPEN_INFILL_MM = 0.5
+# No sensor sees to the bottom of a deep cell of infill, and the nozzle has just been over it.
+OPEN_CELL_MARGIN_MM = 0.0
 # Two poses whose repairs share less than this are two different repairs.
 SAME_REPAIR_RATIO = 0.8
 
@@ -260,6 +262,7 @@ def plan_repair(
                 build_from_template=placed,
                 printed_z_mm=site.printed_z_mm,
                 cell_mm=AS_BUILT_CELL_MM,
+                unseen_margin_mm=OPEN_CELL_MARGIN_MM,
             )
             deficit = replace(deficit, as_built=standing)
         _refuse_ambiguity(scan, site, registration, deficit)

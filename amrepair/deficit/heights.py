@@ -42,8 +42,15 @@ def as_built_heights(
     build_from_template: Transform,
     printed_z_mm: float | None,
     cell_mm: float,
+    unseen_margin_mm: float = UNSEEN_MARGIN_MM,
 ) -> HeightField:
-    """Height field of the scan, build frame."""
+    """Height field of the scan, build frame.
+
+    Parameters
+    ----------
+    unseen_margin_mm
+        What nobody saw is solid up to the printed height and this much more.
+    """
     points = build_from_template.apply(scan.points_mm)
     corners = _corners(template.bounds_mm)
     box = build_from_template.apply(corners)
@@ -51,7 +58,7 @@ def as_built_heights(
     cell_mm = max(cell_mm, 1.2 * evidence.surfels.spacing_mm)
     shape = tuple(np.ceil((high[:2] - low[:2]) / cell_mm).astype(int)[::-1])
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
-    solid_z = top_z + UNSEEN_MARGIN_MM
+    solid_z = top_z + unseen_margin_mm
     z, seen = _tops(points, low[:2], cell_mm, (int(shape[0]), int(shape[1])))
     if not evidence.has_rays:
         # without rays nothing tells empty from unseen: beside the part the bed is taken as bare
