@@ -81,7 +81,13 @@ app = typer.Typer(
 )
 profiles_app = typer.Typer(help="Printer, material and process profiles.", no_args_is_help=True)
 app.add_typer(profiles_app, name="profiles")
-app.command("resume-at")(resume_at_command)
+app.command(
+    "resume-at",
+    epilog=console.examples(
+        "gcode resume-at job.gcode --layer 41 --printer prusa_mk3s -o rest.gcode",
+        "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
+    ),
+)(resume_at_command)
 importing.add_to(profiles_app)
 
 

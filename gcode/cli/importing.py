@@ -17,7 +17,13 @@ SHOWN = 60
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("import")(import_)
+    app.command(
+        "import",
+        epilog=console.examples(
+            "gcode profiles import printer.cfg --out mine",
+            "gcode profiles import PrusaSlicer_config_bundle.ini --preset printer:NAME",
+        ),
+    )(import_)
 
 
 def import_(
