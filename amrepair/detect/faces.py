@@ -8,13 +8,14 @@ face how far. Nothing is labelled here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from amrepair.detect.rooms import Rooms, find_rooms
 from amrepair.detect.surfels import Surfels
 from amrepair.detect.winding import Shell
 from amrepair.scans import Scan
@@ -41,11 +42,6 @@ SURE_WINDING = 0.05
 PROBE_MM = 0.5
 OPEN_WINDING = 0.3
 MOST_TURNS = 12
-# Rooms that the scan's surface separates: voxels, the space around the faces, their number.
-VOXEL_MM, ROOM_MM, MOST_VOXELS = 0.3, 3.0, 600_000
-UNDER_MM = 0.8
-# A room is what its many seeds say if the others are fewer than this share.
-LEAK_RATIO = 0.02
 # A sign vector needs this mean agreement with the template before file normals are believed.
 NORMAL_AGREEMENT = 0.5
 
@@ -160,6 +156,13 @@ def find_faces(
     reach[len(place) :] = 1.8 * surfels.cell_mm
     present = _present(patches, places, is_off, tree, reach)
     which = np.flatnonzero(broken)
+    rooms = find_rooms(
+        template,
+        scan.points_mm[kept],
+        place[which],
+        patches.place_mm[present],
+        _unit(patches.vector_mm2[present]),
+    )
     given = None
     if scan.normals is not None:
         given = _given(scan.normals[chosen], gradient, ~broken)
@@ -167,9 +170,7 @@ def find_faces(
         flip = (plane[which] * given[which]).sum(axis=1) < 0
         outward = np.where(flip[:, None], -plane[which], plane[which])
     else:
-        side = _open_side(
-            template, scan.points_mm[kept], place[which], plane[which], patches, present
-        )
+        side = rooms.open_side(place[which], plane[which])
         outward = _turned(place, which, plane, area, neighbours, patches, present, spacing_mm, side)
     normal = np.zeros((len(places), 3))
     normal[which] = outward
@@ -183,7 +184,7 @@ def find_faces(
         )
         return Faces(places, deviations, is_off, normal, spacing_mm, tree, shell)
 
-    return faces_with(_standing(faces_with, template, patches, present))
+    return faces_with(_standing(faces_with, template, patches, present, rooms))
 
 
 def _around(
@@ -223,24 +224,33 @@ def _present(
 
 
 def _standing(
-    faces_with: object, template: Template, patches: Patches, present: Bool[np.ndarray, " m"]
+    faces_with: Callable[[Bool[np.ndarray, " m"]], Faces],
+    template: Template,
+    patches: Patches,
+    present: Bool[np.ndarray, " m"],
+    rooms: Rooms,
 ) -> Bool[np.ndarray, " m"]:
     """Patches of the template that stand: those seen, and those that nothing speaks against.
 
-    A hole in the scan is missing where broken faces close it from within (winding number 0 just
-    inside the template's surface), covered where they close it from outside (1), and unseen where
-    nothing does (½): then the template's own surface is taken to stand there.
+    A hole in the scan is missing where just inside the template's surface there is a room that is
+    open to the outside and nothing else; a broken face that looks out at it; or a winding number
+    of 0, since broken faces close it from within. It is covered where they close it from outside
+    (1). Else it is unseen: then the template's own surface is taken to stand there.
     """
     holes = np.flatnonzero(~present)
     probes = patches.place_mm[holes] - PROBE_MM * _unit(patches.vector_mm2[holes])
     f_mm = template.distance(probes)
+    room = rooms.value_at(probes)
     keep = present
     for _ in range(2):  # what is unseen elsewhere pulls on the first answer
-        faces: Faces = faces_with(keep)  # type: ignore[operator]
+        faces = faces_with(keep)
         inside = faces.shell.winding(probes)
-        unseen = faces.clearance(probes, f_mm) <= 0
-        unseen &= (inside > OPEN_WINDING) & (inside < 1 - OPEN_WINDING / 2)
-        keep = present.copy()
+        distance, nearest = faces.tree.query(probes, workers=2)
+        faced = faces.off[nearest] & (distance < NEAR_SPACINGS * faces.spacing_mm)
+        faced &= faces.clearance(probes, f_mm) > 0
+        unseen = (inside > OPEN_WINDING) & (inside < 1 - OPEN_WINDING / 2) & ~faced & (room <= 0)
+        # a patch that stands closes the surface itself: only the others are asked again
+        keep = keep.copy()
         keep[holes[unseen]] = True
     return keep
 
@@ -333,59 +343,6 @@ def _turned(
         )
     normal[~sure] = open_normal
     return np.asarray(normal)
-
-
-def _open_side(
-    template: Template,
-    points_mm: Float[np.ndarray, "n 3"],
-    face_mm: Float[np.ndarray, "q 3"],
-    plane: Float[np.ndarray, "q 3"],
-    patches: Patches,
-    present: Bool[np.ndarray, " m"],
-) -> Float[np.ndarray, " q"]:
-    """Positive where space ahead of a face's plane is open, negative behind, 0 unknown.
-
-    Space is cut into what scanned surface separates. What holds a corner of the outside is empty,
-    what lies just under the template's present surface is solid; both: the scan leaks, unknown.
-    """
-    if len(face_mm) == 0:
-        return np.zeros(0)
-    low, high = face_mm.min(axis=0) - ROOM_MM, face_mm.max(axis=0) + ROOM_MM
-    voxel_mm = max(VOXEL_MM, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
-    shape = np.ceil((high - low) / voxel_mm).astype(np.int64)
-
-    def cells(
-        points_mm: Float[np.ndarray, "p 3"],
-    ) -> tuple[Int[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
-        index = np.floor((points_mm - low) / voxel_mm).astype(np.int64)
-        return index, np.asarray(((index >= 0) & (index < shape)).all(axis=1))
-
-    wall = np.zeros(tuple(shape), bool)
-    for points in (points_mm, patches.place_mm[present]):
-        index, ok = cells(points)
-        wall[tuple(index[ok].T)] = True
-    wall = ndimage.binary_dilation(wall)  # a sheet of points has gaps of chance
-    rooms, count = ndimage.label(~wall)
-    edge = np.ones(tuple(shape), bool)
-    edge[1:-1, 1:-1, 1:-1] = False
-    edge_index = np.argwhere(edge & ~wall)
-    centres = low + (edge_index + 0.5) * voxel_mm
-    outside = edge_index[template.distance(centres) > voxel_mm]
-    under = patches.place_mm[present] - UNDER_MM * _unit(patches.vector_mm2[present])
-    index, ok = cells(under)
-    inside = index[ok][template.distance(under[ok]) < -0.8 * UNDER_MM]
-    empties = np.bincount(rooms[tuple(outside.T)], minlength=count + 1)
-    solids = np.bincount(rooms[tuple(inside.T)], minlength=count + 1)
-    value = np.zeros(count + 1)
-    value[(empties > 0) & (solids < LEAK_RATIO * empties)] = 1.0
-    value[(solids > 0) & (empties < LEAK_RATIO * solids)] = -1.0
-    value[0] = 0.0
-    side = np.zeros(len(face_mm))
-    for step in (2.5, 3.5):
-        for sign in (-1.0, 1.0):
-            index, ok = cells(face_mm + sign * step * voxel_mm * plane)
-            side[ok] += sign * value[rooms[tuple(index[ok].T)]]
-    return side
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
