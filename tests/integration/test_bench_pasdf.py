@@ -26,7 +26,7 @@ KNOB, BRACKET = PARTS / "knob.stl", PARTS / "bracket.stl"
 
 
 def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
-    options = SynthOptions(train=2, normal=2, per_defect=1, points=6000)
+    options = SynthOptions(train=1, normal=2, per_defect=1, points=4000)
     data = synthesize([KNOB], tmp_path / "set", "anomaly-shapenet", 0, options=options)
     report = run_bench(
         data, format="anomaly-shapenet", methods=["pasdf"], out=tmp_path / "out", seeds=[0]

@@ -87,7 +87,7 @@ def test_an_end_needs_its_own_event(messages: list[Any]) -> None:
     for message in messages:
         state.take(message)
     ends = [
-        message["event"]["type"]
+        message["event"].get("type")
         for message in messages
         if isinstance(message, dict)
         and isinstance(message.get("event"), dict)

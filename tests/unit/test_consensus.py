@@ -113,7 +113,8 @@ def test_a_template_from_scans_is_the_part(part: AnalyticTemplate, tmp_path: Pat
     made = fit_from_scans(scans, seed=0)
     truth, _ = sample_surface(part.body, 0.3, seed=9)
     error_mm = np.abs(made.template.distance(truth))
-    assert error_mm.mean() < 0.015
+    # 11 µm from 800,000 points (measurements); a twentieth of them leaves more of the noise
+    assert error_mm.mean() < 0.02
     assert np.quantile(error_mm, 0.9) < 0.05  # the rest is edges, rounded by a fit's radius
     assert made.sigma_mm == pytest.approx(SIGMA_MM, rel=0.25)
     assert made.fused.unseen_ratio < 0.002
