@@ -37,6 +37,7 @@ def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
     assert row["cd"] is not None
 
 
+@pytest.mark.slow
 def test_the_published_system_runs_by_name_and_says_what_was_shortened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

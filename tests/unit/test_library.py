@@ -55,6 +55,7 @@ def test_the_right_part_is_found_with_confidence(parts: dict[str, MeshSdf]) -> N
     assert found.registration.rmse_mm < 0.05
 
 
+@pytest.mark.slow
 def test_a_lost_piece_does_not_make_it_another_part(parts: dict[str, MeshSdf]) -> None:
     whole = scan_of(parts["wide"], 2)
     points = whole.points_mm[np.linalg.norm(whole.points_mm - whole.points_mm[7], axis=1) > 5.0]

@@ -134,6 +134,7 @@ def test_the_file_comes_back(fitted: NetworkSdf, tmp_path: Path) -> None:
         load_template(path)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_network(ball: MeshSdf) -> None:
     import torch
 
