@@ -8,119 +8,31 @@ its turn).
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from pathlib import Path
-from types import TracebackType
-
-from gcode.errors import LinkError, LocalProtocolError, PortBusyError, PrinterError
-from gcode.hosts.lock import PortLock
+from gcode.errors import LinkError, PortBusyError, PrinterError
+from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker_session import MoonrakerSession
-from gcode.hosts.port import (
-    Capabilities,
-    LinkLostError,
-    PrintableProgram,
-    PrintReport,
-    Temperatures,
-)
-from gcode.hosts.proof import require_checked
-from gcode.hosts.secret import ApiKey
+from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
+from gcode.hosts.server import LOOK_EVERY, ServerPrinter
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import (
-    LIFT_COMMANDS,
-    Address,
-    WebLog,
-    WebTiming,
-    heaters_word,
-    sentence,
-)
-from gcode.progress import Progress, silent
-
-LOOK_EVERY = 5
-"""Waits without an end after which the job is asked for, in case that its news did not come."""
+from gcode.hosts.web import LIFT_COMMANDS, sentence
+from gcode.progress import Progress
 
 
-class MoonrakerPrinter:
-    """A printer that Klipper drives, reached through Moonraker.
+class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
+    """A printer that Klipper drives, reached through Moonraker; parameters of `ServerPrinter`."""
 
-    Parameters
-    ----------
-    address
-        The server.
-    key
-        API key; none where the server trusts this machine.
-    wire_log
-        File for requests and news, with times; it never holds the key.
-    """
-
-    def __init__(
-        self,
-        address: Address,
-        key: ApiKey,
-        *,
-        wire_log: Path | None = None,
-        timing: WebTiming | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.address = address
-        self._key = key
-        self._timing = timing or WebTiming()
-        self._clock = clock
-        self._wire_log = wire_log
-        self._log: WebLog | None = None
-        self._lock = PortLock(address.spec)
-        self._tried_safety = False
-        self._open: MoonrakerSession | None = None
-        self._aborted = False
+    files = "/server/files/gcodes"
+    _aborted = False
 
     def __enter__(self) -> MoonrakerPrinter:
         self.connect()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            if error is not None and not self._tried_safety:
-                self._make_safe(error)
-        finally:
-            self.close()
+    def _new_session(self) -> MoonrakerSession:
+        return MoonrakerSession(self.address, self._key, self._timing, self._clock, self._log)
 
-    # ------------------------------------------------------------------ connection
-
-    def connect(self) -> None:
-        """Open the websocket; refuse a printer that is not ready or prints already."""
-        if self._open is not None:
-            return
-        self._lock.acquire()
-        try:
-            self._log = WebLog(self._wire_log) if self._wire_log else None
-            self._open = MoonrakerSession(
-                self.address, self._key, self._timing, self._clock, self._log
-            )
-            self._refuse_unless_ready()
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Let go of the server; a print under way goes on there."""
-        if self._open is not None:
-            self._open.close()
-            self._open = None
-        self._lock.release()
-        if self._log is not None:
-            self._log.close()
-            self._log = None
-
-    @property
-    def _session(self) -> MoonrakerSession:
-        if self._open is None:
-            raise LocalProtocolError("The printer is not connected; call connect() first.")
-        return self._open
+    def _greet(self) -> None:
+        self._refuse_unless_ready()
 
     def _refuse_unless_ready(self) -> None:
         self._session.look()
@@ -180,47 +92,6 @@ class MoonrakerPrinter:
 
     # ------------------------------------------------------------------ printing
 
-    def print(
-        self,
-        checked: PrintableProgram,
-        *,
-        lines: range | None = None,
-        progress: Progress = silent,
-    ) -> PrintReport:
-        """Upload a program or a part of it, have it printed, return when it is done."""
-        require_checked(checked)
-        start_s, self._tried_safety = self._clock(), False
-        self._refuse_unless_ready()
-        job = JobFile.of(checked, lines)
-        self._upload(job)
-        self._aborted = False
-        self._start(job)
-        try:
-            ok = self._follow(job, progress)
-        except BaseException as error:  # an interrupt, too: the server would print on by itself
-            self._make_safe(error)
-            raise
-        if ok:
-            progress("printing", 1.0, 1.0)
-        self._session.request("DELETE", f"/server/files/gcodes/{job.name}")
-        # Klipper carries out every line that it has taken, so the position is a lower bound.
-        next_line = job.end if ok else job.line_at(self._session.state.file_position)
-        done = range(job.first, next_line)
-        return PrintReport(
-            ok=ok,
-            lines_acked=sum(
-                bool(row.partition(";")[0].strip()) for row in checked.lines(done.start, done.stop)
-            ),
-            resends=0,
-            stalls=0,
-            spare_oks=0,
-            bytes_sent=len(job.data),
-            seconds=self._clock() - start_s,
-            next_line=next_line,
-            round_trip_s=(0.0, 0.0, 0.0),
-            warnings=() if ok else (f"{self.address.name} cancelled the print",),
-        )
-
     def _upload(self, job: JobFile) -> None:
         """Put the file on the server, which compares its checksum."""
         answer = self._session.request(
@@ -237,6 +108,7 @@ class MoonrakerPrinter:
             )
 
     def _start(self, job: JobFile) -> None:
+        self._aborted = False
         with self._session.news:
             self._session.state.follow(job.name)
         try:
@@ -286,21 +158,9 @@ class MoonrakerPrinter:
         )
 
     def _look(self, job: JobFile) -> None:
-        """Ask what became of the print.
-
-        A server that went away lets Klipper print on, and gets time to come back; a Klipper that
-        restarted has forgotten the print.
-        """
-        state, until_s = self._session.state, self._clock() + self._timing.lost_s
-        while True:
-            try:
-                self._session.look()
-                break
-            except LinkError as error:
-                if self._clock() > until_s:
-                    raise self._lost(job, f"{error} It may be printing on by itself") from error
-            with self._session.news:
-                self._session.news.wait(self._timing.poll_s)
+        """Ask what became of the print; a Klipper that restarted has forgotten it."""
+        state = self._session.state
+        self._patiently(job, self._session.look)
         if state.printing_ours:
             return
         if self._aborted:  # a cancel macro may reset the file
@@ -317,12 +177,12 @@ class MoonrakerPrinter:
             f"{taken} into its queue)"
         )
 
-    def _lost(self, job: JobFile, why: str) -> LinkLostError:
-        return LinkLostError(
-            f"The print on {self.address.name} is lost: {why}; {self._uncertain(job)}.",
-            job.first - 1,
-            job.end - 1,
-        )
+    def _reached(
+        self, checked: PrintableProgram, job: JobFile, *, ok: bool
+    ) -> tuple[int, int, int]:
+        # Klipper carries out every line that it has taken, so the position is a lower bound.
+        next_line = job.end if ok else job.line_at(self._session.state.file_position)
+        return next_line, sum(1 for _ in commands_of(checked, job.first, next_line)), 0
 
     # ------------------------------------------------------------------ pause, abort, stop
 
@@ -362,19 +222,6 @@ class MoonrakerPrinter:
     def heaters_off(self) -> None:
         """Switch every heater and the fan off."""
         self.command("TURN_OFF_HEATERS\nM107")
-
-    def _make_safe(self, error: BaseException) -> None:
-        """Make safe what can be reached, and add to the error how that went."""
-        try:
-            self.abort()
-            word = heaters_word(self.temperatures)
-        except (LinkError, LocalProtocolError) as second:
-            word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
-        self._tried_safety = True
-        if isinstance(error, LinkError):
-            error.args = (f"{error.args[0]} {word}", *error.args[1:])
-        else:
-            error.add_note(word)
 
 
 def _line(text: str) -> str:

@@ -5,29 +5,21 @@ from __future__ import annotations
 import itertools
 import json
 import re
-import threading
 from collections.abc import Callable
 from typing import Any
-
-import httpx
 
 import gcode
 from gcode.errors import LinkError, PrinterError
 from gcode.hosts.moonraker_state import SUBSCRIPTION, KlippyState
 from gcode.hosts.secret import ApiKey
-from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, refused_key
+from gcode.hosts.server import ServerSession
+from gcode.hosts.web import Address, WebLog, WebTiming, refused_key
 
 _MESSAGE = re.compile(r"""['"]message['"]:\s*(['"])(.*?)\1\s*[,}]""", re.DOTALL)
 
 
-class MoonrakerSession:
-    """One websocket, its calls and its news.
-
-    Attributes
-    ----------
-    news
-        Notified whenever `state` may have changed; hold it to read several fields at once.
-    """
+class MoonrakerSession(ServerSession[KlippyState]):
+    """One websocket, its calls and its news."""
 
     def __init__(
         self,
@@ -37,62 +29,20 @@ class MoonrakerSession:
         clock: Callable[[], float],
         log: WebLog | None,
     ) -> None:
-        self.address = address
-        self.state = KlippyState()
-        self.news = threading.Condition()
-        self._key = key
-        self._timing = timing
-        self._clock = clock
-        self._log = log
+        super().__init__(address, key, timing, clock, log, KlippyState())
         self._numbers = itertools.count(1)
-        self._client = WebClient(address, key, timing, log)
-        self._socket: PushSocket | None = None
-
-    def close(self) -> None:
-        """Hang up."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-        self._client.close()
-
-    @property
-    def listening(self) -> bool:
-        """Whether news can reach us."""
-        return self._socket is not None and self._socket.alive
-
-    def request(self, method: str, path: str, **kwargs: Any) -> httpx.Response:
-        """Send an HTTP request once; see `WebClient.request`."""
-        return self._client.request(method, path, **kwargs)
 
     def listen(self) -> None:
         """Open the websocket and say who we are."""
         self._client.get("/server/info")  # tells an unreachable server from a refused key
-        if self._socket is not None:
-            self._socket.close()
-        self._socket = PushSocket(
-            self.address,
-            "/websocket",
-            headers=self._key.headers,
-            timing=self._timing,
-            on_message=self._on_message,
-            on_closed=self._on_closed,
-        )
+        self._open_socket("/websocket", dict(self._key.headers))
         who = {"client_name": "gcode", "version": gcode.__version__, "type": "other", "url": "-"}
         if self._key.value:
             who["api_key"] = self._key.value
         self.call("server.connection.identify", who)
 
-    def _on_message(self, message: Any) -> None:
-        if self._log is not None and isinstance(message, dict):
-            shown = {k: v for k, v in message.items() if k != "jsonrpc"}
-            self._log.add(b"<", json.dumps(shown)[:500])
-        with self.news:
-            self.state.take(message)
-            self.news.notify_all()
-
-    def _on_closed(self) -> None:
-        with self.news:
-            self.news.notify_all()
+    def _logged(self, message: dict[str, Any]) -> str:
+        return json.dumps({k: v for k, v in message.items() if k != "jsonrpc"})[:500]
 
     def call(
         self, method: str, params: dict[str, Any] | None = None, *, limit_s: float | None = 0.0

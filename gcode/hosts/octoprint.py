@@ -7,128 +7,42 @@ in a pause is left to the server's own pause script, which knows where its queue
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from pathlib import Path
-from types import TracebackType
-
-from gcode.errors import LinkError, LocalProtocolError, PortBusyError, PrinterError
-from gcode.hosts.lock import PortLock
+from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.octoprint_session import OctoPrintSession
-from gcode.hosts.port import (
-    Capabilities,
-    LinkLostError,
-    PrintableProgram,
-    PrintReport,
-    Temperatures,
-)
-from gcode.hosts.proof import require_checked
+from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
-from gcode.hosts.secret import ApiKey
+from gcode.hosts.server import LOOK_EVERY, ServerPrinter
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import (
-    LIFT_COMMANDS,
-    Address,
-    WebLog,
-    WebTiming,
-    heaters_word,
-    sentence,
-)
-from gcode.progress import Progress, silent
+from gcode.hosts.web import LIFT_COMMANDS, sentence
+from gcode.progress import Progress
 from gcode.protocol import events as ev
 
-_FILES = "/api/files/local"
-LOOK_EVERY = 5
-"""Waits without an end after which the job is asked for, in case that its news did not come."""
 
+class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
+    """A printer that an OctoPrint server drives; parameters of `ServerPrinter`.
 
-class OctoPrintPrinter:
-    """A printer that an OctoPrint server drives.
-
-    Parameters
-    ----------
-    address
-        The server.
-    key
-        API key of a user who may print, control and see the terminal.
-    wire_log
-        File for requests and news, with times; it never holds the key.
+    The key's owner must be allowed to print, to control and to see the terminal.
     """
 
-    def __init__(
-        self,
-        address: Address,
-        key: ApiKey,
-        *,
-        wire_log: Path | None = None,
-        timing: WebTiming | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.address = address
-        self._key = key
-        self._timing = timing or WebTiming()
-        self._clock = clock
-        self._wire_log = wire_log
-        self._log: WebLog | None = None
-        self._lock = PortLock(address.spec)
-        self._tried_safety = False
-        self._open: OctoPrintSession | None = None
-        self._capabilities: Capabilities | None = None
+    files = "/api/files/local"
+    _capabilities: Capabilities | None = None
+    _resends_before = 0
 
     def __enter__(self) -> OctoPrintPrinter:
         self.connect()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            if error is not None and not self._tried_safety:
-                self._make_safe(error)
-        finally:
-            self.close()
+    def _new_session(self) -> OctoPrintSession:
+        return OctoPrintSession(self.address, self._key, self._timing, self._clock, self._log)
 
-    # ------------------------------------------------------------------ connection
-
-    def connect(self) -> None:
-        """Reach the server, open its push socket, refuse a printer that is not ready."""
-        if self._open is not None:
-            return
-        self._lock.acquire()
-        try:
-            self._log = WebLog(self._wire_log) if self._wire_log else None
-            self._open = OctoPrintSession(
-                self.address, self._key, self._timing, self._clock, self._log
+    def _greet(self) -> None:
+        if "Moonraker" in str(self._session.get("/api/version").get("text")):
+            raise LinkError(
+                f"{self.address.base} is a Moonraker that answers as OctoPrint; write "
+                f"moonraker+{self.address.base}."
             )
-            if "Moonraker" in str(self._open.get("/api/version").get("text")):
-                raise LinkError(
-                    f"{self.address.base} is a Moonraker that answers as OctoPrint; write "
-                    f"moonraker+{self.address.base}."
-                )
-            self._refuse_unless_ready()
-            self._open.listen()
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Let go of the server; a print under way goes on there."""
-        if self._open is not None:
-            self._open.close()
-            self._open = None
-        self._lock.release()
-        if self._log is not None:
-            self._log.close()
-            self._log = None
-
-    @property
-    def _session(self) -> OctoPrintSession:
-        if self._open is None:
-            raise LocalProtocolError("The printer is not connected; call connect() first.")
-        return self._open
+        self._refuse_unless_ready()
+        self._session.listen()
 
     # ------------------------------------------------------------------ questions
 
@@ -196,53 +110,20 @@ class OctoPrintPrinter:
 
     # ------------------------------------------------------------------ printing
 
-    def print(
-        self,
-        checked: PrintableProgram,
-        *,
-        lines: range | None = None,
-        progress: Progress = silent,
-    ) -> PrintReport:
-        """Upload a program or a part of it, have it printed, return when it is done."""
-        require_checked(checked)
-        start_s, self._tried_safety = self._clock(), False
-        self._refuse_unless_ready()
-        job = JobFile.of(checked, lines)
-        self._upload(job)
-        resends = self._session.state.resends
-        self._start(job)
-        try:
-            ok = self._follow(job, progress)
-        except BaseException as error:  # an interrupt, too: the server would print on by itself
-            self._make_safe(error)
-            raise
-        if ok:
-            progress("printing", 1.0, 1.0)
-        self._session.request("DELETE", f"{_FILES}/{job.name}")  # 409 where it is held: harmless
-        return PrintReport(
-            ok=ok,
-            lines_acked=job.commands if ok else 0,
-            resends=max(0, self._session.state.resends - resends),
-            stalls=0,
-            spare_oks=0,
-            bytes_sent=len(job.data),
-            seconds=self._clock() - start_s,
-            next_line=job.end if ok else job.first,
-            round_trip_s=(0.0, 0.0, 0.0),
-            warnings=() if ok else (f"{self.address.name} cancelled the print",),
-        )
-
     def _upload(self, job: JobFile) -> None:
         """Put the file on the server and compare what lies there."""
         answer = self._session.request(
-            "POST", _FILES, files={"file": (job.name, job.data)}, timeout_s=self._timing.upload_s
+            "POST",
+            self.files,
+            files={"file": (job.name, job.data)},
+            timeout_s=self._timing.upload_s,
         )
         if answer.status_code != 201:
             raise LinkError(
                 f"{self.address.name} does not take the file ({sentence(answer)}); is its disk "
                 f"full?"
             )
-        there = self._session.get(f"{_FILES}/{job.name}")
+        there = self._session.get(f"{self.files}/{job.name}")
         size, digest = there.get("size"), there.get("hash")
         if size != len(job.data) or digest not in {None, job.sha1}:
             raise LinkError(
@@ -251,10 +132,11 @@ class OctoPrintPrinter:
             )
 
     def _start(self, job: JobFile) -> None:
+        self._resends_before = self._session.state.resends
         self._session.state.follow(job.name)
         try:
             answer = self._session.request(
-                "POST", f"{_FILES}/{job.name}", json={"command": "select", "print": True}
+                "POST", f"{self.files}/{job.name}", json={"command": "select", "print": True}
             )
         except LinkError as error:
             raise self._lost(job, f"whether it began is not known: {error}") from error
@@ -296,20 +178,8 @@ class OctoPrintPrinter:
         return outcome == "PrintDone"
 
     def _look(self, job: JobFile) -> None:
-        """Ask what became of the print, in case that its news did not reach us.
-
-        A server that went away prints on by itself, or has forgotten: it gets time to come back.
-        """
-        until_s = self._clock() + self._timing.lost_s
-        while True:
-            try:
-                known = self._session.look()
-                break
-            except LinkError as error:
-                if self._clock() > until_s:
-                    raise self._lost(job, f"{error} It may be printing on by itself") from error
-            with self._session.news:
-                self._session.news.wait(self._timing.poll_s)
+        """Ask what became of the print, in case that its news did not reach us."""
+        known = self._patiently(job, self._session.look)
         if not known:
             text = self._session.state.text
             raise self._lost(job, f"it no longer prints the file (its state is {text!r})")
@@ -321,12 +191,11 @@ class OctoPrintPrinter:
             f"{job.line_at(read) + 1})"
         )
 
-    def _lost(self, job: JobFile, why: str) -> LinkLostError:
-        return LinkLostError(
-            f"The print on {self.address.name} is lost: {why}; {self._uncertain(job)}.",
-            job.first - 1,
-            job.end - 1,
-        )
+    def _reached(
+        self, checked: PrintableProgram, job: JobFile, *, ok: bool
+    ) -> tuple[int, int, int]:
+        resends = max(0, self._session.state.resends - self._resends_before)
+        return (job.end, job.commands, resends) if ok else (job.first, 0, resends)
 
     # ------------------------------------------------------------------ pause, abort, stop
 
@@ -373,16 +242,3 @@ class OctoPrintPrinter:
     def heaters_off(self) -> None:
         """Switch hotend, bed and fan off, acknowledged."""
         self._session.ask(*SAFE_COMMANDS)
-
-    def _make_safe(self, error: BaseException) -> None:
-        """Make safe what can be reached, and add to the error how that went."""
-        try:
-            self.abort()
-            word = heaters_word(self.temperatures)
-        except (LinkError, LocalProtocolError) as second:
-            word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
-        self._tried_safety = True
-        if isinstance(error, LinkError):
-            error.args = (f"{error.args[0]} {word}", *error.args[1:])
-        else:
-            error.add_note(word)

@@ -17,7 +17,8 @@ import httpx
 from gcode.errors import LinkError
 from gcode.hosts.octoprint_state import ServerState, part_of
 from gcode.hosts.secret import ApiKey
-from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, json_object, sentence
+from gcode.hosts.server import ServerSession
+from gcode.hosts.web import Address, WebLog, WebTiming, json_object, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
@@ -25,14 +26,8 @@ _SENT = re.compile(r"Send: (?:N\d+ )?(.*?)(?:\*\d+)?")
 SUBSCRIPTION = {"state": {"logs": True, "messages": False}, "plugins": False, "events": True}
 
 
-class OctoPrintSession:
-    """One login to a server and the socket that its news come over.
-
-    Attributes
-    ----------
-    news
-        Notified whenever `state` may have changed; hold it to read several fields at once.
-    """
+class OctoPrintSession(ServerSession[ServerState]):
+    """One login to a server and the socket that its news come over."""
 
     def __init__(
         self,
@@ -42,31 +37,8 @@ class OctoPrintSession:
         clock: Callable[[], float],
         log: WebLog | None,
     ) -> None:
-        self.address = address
-        self.state = ServerState()
-        self.news = threading.Condition()
-        self._timing = timing
-        self._clock = clock
-        self._log = log
+        super().__init__(address, key, timing, clock, log, ServerState())
         self._asking = threading.Lock()
-        self._client = WebClient(address, key, timing, log)
-        self._socket: PushSocket | None = None
-
-    def close(self) -> None:
-        """Log out."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-        self._client.close()
-
-    @property
-    def listening(self) -> bool:
-        """Whether news can reach us."""
-        return self._socket is not None and self._socket.alive
-
-    def request(self, method: str, path: str, **kwargs: Any) -> httpx.Response:
-        """Send a request once; see `WebClient.request`."""
-        return self._client.request(method, path, **kwargs)
 
     def get(self, path: str) -> dict[str, Any]:
         """Return an answer's JSON object."""
@@ -81,19 +53,11 @@ class OctoPrintSession:
                 f"{self.address.name} grants no session to the API key ({sentence(answer)}); use "
                 f"a user's or an application's key."
             )
-        if self._socket is not None:
-            self._socket.close()
+        self._hang_up()
         self.state.connected = False
-        self._socket = PushSocket(
-            self.address,
-            "/sockjs/websocket",
-            headers={},
-            timing=self._timing,
-            on_message=self._on_message,
-            on_closed=self._on_closed,
-        )
-        self._socket.send({"auth": f"{user.get('name')}:{user['session']}"})
-        self._socket.send({"subscribe": SUBSCRIPTION})
+        socket = self._open_socket("/sockjs/websocket", {})
+        socket.send({"auth": f"{user.get('name')}:{user['session']}"})
+        socket.send({"subscribe": SUBSCRIPTION})
         with self.news:
             if not self.news.wait_for(lambda: self.state.connected, self._timing.request_s):
                 raise LinkError(
@@ -101,16 +65,8 @@ class OctoPrintSession:
                     f"between that does not pass websockets?"
                 )
 
-    def _on_message(self, message: Any) -> None:
-        if self._log is not None and isinstance(message, dict):
-            self._log.add(b"<", json.dumps(message.get("event", list(message))))
-        with self.news:
-            self.state.take(message)
-            self.news.notify_all()
-
-    def _on_closed(self) -> None:
-        with self.news:
-            self.news.notify_all()
+    def _logged(self, message: dict[str, Any]) -> str:
+        return json.dumps(message.get("event", list(message)))
 
     def status(self) -> dict[str, Any]:
         """Return `/api/printer`.

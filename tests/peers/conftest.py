@@ -13,5 +13,5 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
 @pytest.fixture(autouse=True)
 def _no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     """Programs of the link's own tests; the checker's refusals are not the subject here."""
-    for name in ("serial", "octoprint", "moonraker"):
+    for name in ("serial", "server"):
         monkeypatch.setattr(f"gcode.hosts.{name}.require_checked", lambda checked: None)

@@ -14,7 +14,7 @@ import pytest
 from link_helpers import moves, program
 from web_harness import Answer, Asked, FakeServer
 
-import gcode.hosts.moonraker as moonraker_host
+import gcode.hosts.server as server_host
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts import LinkLostError, PrintReport
 from gcode.hosts.moonraker import MoonrakerPrinter
@@ -130,7 +130,7 @@ def part_of(body: bytes) -> bytes:
 
 @pytest.fixture(autouse=True)
 def _no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(moonraker_host, "require_checked", lambda checked: None)
+    monkeypatch.setattr(server_host, "require_checked", lambda checked: None)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ import pytest
 from link_helpers import moves, program
 from web_harness import Answer, Asked, FakeServer
 
-import gcode.hosts.octoprint as octoprint_host
+import gcode.hosts.server as server_host
 from gcode.errors import InputError, LinkError, PortBusyError, PrinterError
 from gcode.hosts import LinkLostError, PrintReport, connect
 from gcode.hosts.octoprint import OctoPrintPrinter
@@ -157,7 +157,7 @@ class FakeOctoPrint:
 
 @pytest.fixture(autouse=True)
 def _no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(octoprint_host, "require_checked", lambda checked: None)
+    monkeypatch.setattr(server_host, "require_checked", lambda checked: None)
 
 
 @pytest.fixture

@@ -1,0 +1,324 @@
+"""What printers behind a print server have in common, whichever server it is.
+
+One session with its push socket and its news; one print: uploaded, started, followed, made safe
+where that goes wrong. How a server is asked, and what its news mean, is in `octoprint` and
+`moonraker`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+import httpx
+
+from gcode.errors import LinkError, LocalProtocolError
+from gcode.hosts.lock import PortLock
+from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, Temperatures
+from gcode.hosts.proof import require_checked
+from gcode.hosts.secret import ApiKey
+from gcode.hosts.upload import JobFile
+from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, heaters_word
+from gcode.progress import Progress, silent
+
+LOOK_EVERY = 5
+"""Waits without an end after which the job is asked for, in case that its news did not come."""
+
+
+@runtime_checkable
+class News(Protocol):
+    """What is known of a server, told by its messages."""
+
+    def take(self, message: Any) -> None:
+        """Take one message."""
+
+
+State = TypeVar("State", bound=News)
+Answer = TypeVar("Answer")
+
+
+class ServerSession(ABC, Generic[State]):
+    """One login to a server and the socket that its news come over.
+
+    Attributes
+    ----------
+    news
+        Notified whenever `state` may have changed; hold it to read several fields at once.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        key: ApiKey,
+        timing: WebTiming,
+        clock: Callable[[], float],
+        log: WebLog | None,
+        state: State,
+    ) -> None:
+        self.address = address
+        self.state = state
+        self.news = threading.Condition()
+        self._key = key
+        self._timing = timing
+        self._clock = clock
+        self._log = log
+        self._client = WebClient(address, key, timing, log)
+        self._socket: PushSocket | None = None
+
+    def close(self) -> None:
+        """Hang up."""
+        self._hang_up()
+        self._client.close()
+
+    @property
+    def listening(self) -> bool:
+        """Whether news can reach us."""
+        return self._socket is not None and self._socket.alive
+
+    def request(self, method: str, path: str, **kwargs: Any) -> httpx.Response:
+        """Send an HTTP request once; see `WebClient.request`."""
+        return self._client.request(method, path, **kwargs)
+
+    @abstractmethod
+    def listen(self) -> None:
+        """Open the push socket, anew where there was one."""
+
+    @abstractmethod
+    def _logged(self, message: dict[str, Any]) -> str:
+        """What the wire log shows of a message."""
+
+    def _open_socket(self, path: str, headers: dict[str, str]) -> PushSocket:
+        """A push socket in the place of the last one."""
+        self._hang_up()
+        self._socket = PushSocket(
+            self.address,
+            path,
+            headers=headers,
+            timing=self._timing,
+            on_message=self._on_message,
+            on_closed=self._on_closed,
+        )
+        return self._socket
+
+    def _hang_up(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _on_message(self, message: Any) -> None:
+        if self._log is not None and isinstance(message, dict):
+            self._log.add(b"<", self._logged(message))
+        with self.news:
+            self.state.take(message)
+            self.news.notify_all()
+
+    def _on_closed(self) -> None:
+        with self.news:
+            self.news.notify_all()
+
+
+Session = TypeVar("Session", bound=ServerSession[Any])
+
+
+class ServerPrinter(ABC, Generic[Session]):
+    """A printer that a server drives.
+
+    Parameters
+    ----------
+    address
+        The server.
+    key
+        API key; none where the server trusts this machine.
+    wire_log
+        File for requests and news, with times; it never holds the key.
+    """
+
+    files: str
+    """Path of the uploaded files on the server."""
+
+    def __init__(
+        self,
+        address: Address,
+        key: ApiKey,
+        *,
+        wire_log: Path | None = None,
+        timing: WebTiming | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.address = address
+        self._key = key
+        self._timing = timing or WebTiming()
+        self._clock = clock
+        self._wire_log = wire_log
+        self._log: WebLog | None = None
+        self._lock = PortLock(address.spec)
+        self._tried_safety = False
+        self._open: Session | None = None
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if error is not None and not self._tried_safety:
+                self._make_safe(error)
+        finally:
+            self.close()
+
+    # ------------------------------------------------------------------ connection
+
+    def connect(self) -> None:
+        """Reach the server, open its push socket, refuse a printer that is not ready."""
+        if self._open is not None:
+            return
+        self._lock.acquire()
+        try:
+            self._log = WebLog(self._wire_log) if self._wire_log else None
+            self._open = self._new_session()
+            self._greet()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the server; a print under way goes on there."""
+        if self._open is not None:
+            self._open.close()
+            self._open = None
+        self._lock.release()
+        if self._log is not None:
+            self._log.close()
+            self._log = None
+
+    @property
+    def _session(self) -> Session:
+        if self._open is None:
+            raise LocalProtocolError("The printer is not connected; call connect() first.")
+        return self._open
+
+    @abstractmethod
+    def _new_session(self) -> Session:
+        """A session, not yet listening."""
+
+    @abstractmethod
+    def _greet(self) -> None:
+        """See that it is the right server and its printer is ready, and listen."""
+
+    @abstractmethod
+    def _refuse_unless_ready(self) -> None:
+        """Raise where the printer cannot take a print."""
+
+    # ------------------------------------------------------------------ printing
+
+    def print(
+        self,
+        checked: PrintableProgram,
+        *,
+        lines: range | None = None,
+        progress: Progress = silent,
+    ) -> PrintReport:
+        """Upload a program or a part of it, have it printed, return when it is done."""
+        require_checked(checked)
+        start_s, self._tried_safety = self._clock(), False
+        self._refuse_unless_ready()
+        job = JobFile.of(checked, lines)
+        self._upload(job)
+        self._start(job)
+        try:
+            ok = self._follow(job, progress)
+        except BaseException as error:  # an interrupt, too: the server would print on by itself
+            self._make_safe(error)
+            raise
+        if ok:
+            progress("printing", 1.0, 1.0)
+        self._session.request("DELETE", f"{self.files}/{job.name}")  # refused if held: harmless
+        next_line, acked, resends = self._reached(checked, job, ok=ok)
+        return PrintReport(
+            ok=ok,
+            lines_acked=acked,
+            resends=resends,
+            stalls=0,
+            spare_oks=0,
+            bytes_sent=len(job.data),
+            seconds=self._clock() - start_s,
+            next_line=next_line,
+            round_trip_s=(0.0, 0.0, 0.0),
+            warnings=() if ok else (f"{self.address.name} cancelled the print",),
+        )
+
+    @abstractmethod
+    def _upload(self, job: JobFile) -> None:
+        """Put the file on the server, and have it compared."""
+
+    @abstractmethod
+    def _start(self, job: JobFile) -> None:
+        """Have the print begin."""
+
+    @abstractmethod
+    def _follow(self, job: JobFile, progress: Progress) -> bool:
+        """Wait for the print's end; False if it was cancelled."""
+
+    @abstractmethod
+    def _reached(
+        self, checked: PrintableProgram, job: JobFile, *, ok: bool
+    ) -> tuple[int, int, int]:
+        """After a print: the next line, lines acknowledged, resends."""
+
+    @abstractmethod
+    def _uncertain(self, job: JobFile) -> str:
+        """Which lines may have been carried out, in words."""
+
+    def _patiently(self, job: JobFile, ask: Callable[[], Answer]) -> Answer:
+        """Ask what became of the print; a server that went away gets time to come back.
+
+        Raises
+        ------
+        LinkLostError
+            If it does not: its printer may be printing on by itself.
+        """
+        until_s = self._clock() + self._timing.lost_s
+        while True:
+            try:
+                return ask()
+            except LinkError as error:
+                if self._clock() > until_s:
+                    raise self._lost(job, f"{error} It may be printing on by itself") from error
+            with self._session.news:
+                self._session.news.wait(self._timing.poll_s)
+
+    def _lost(self, job: JobFile, why: str) -> LinkLostError:
+        return LinkLostError(
+            f"The print on {self.address.name} is lost: {why}; {self._uncertain(job)}.",
+            job.first - 1,
+            job.end - 1,
+        )
+
+    # ------------------------------------------------------------------ safety
+
+    @abstractmethod
+    def temperatures(self) -> Temperatures:
+        """Ask for temperatures."""
+
+    @abstractmethod
+    def abort(self) -> None:
+        """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""
+
+    def _make_safe(self, error: BaseException) -> None:
+        """Make safe what can be reached, and add to the error how that went."""
+        try:
+            self.abort()
+            word = heaters_word(self.temperatures)
+        except (LinkError, LocalProtocolError) as second:
+            word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
+        self._tried_safety = True
+        if isinstance(error, LinkError):
+            error.args = (f"{error.args[0]} {word}", *error.args[1:])
+        else:
+            error.add_note(word)
