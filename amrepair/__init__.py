@@ -20,8 +20,9 @@ importing this package costs nothing. Each room (`amrepair.scans`, `amrepair.ali
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from gcode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from amrepair.align import align as align_scan
@@ -68,17 +69,4 @@ _HOMES = {
     "run_loop": ("amrepair.loop", "run_loop"),
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Load a name when it is first used (PEP 562)."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, attribute = _HOMES[name]
-    found = getattr(import_module(module), attribute)
-    globals()[name] = found
-    return found
-
-
-def __dir__() -> list[str]:
-    """What there is, loaded or not."""
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(globals(), _HOMES)

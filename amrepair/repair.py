@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
@@ -245,14 +245,7 @@ def plan_repair(
         moved = _in_view(whole, site)
         anomaly = detect(moved, expected, allowance_mm=site.allowance_mm, progress=progress)
     with watch("deficit"):
-        deficit = compute_deficit(
-            moved,
-            expected,
-            anomaly,
-            build_from_template=placed,
-            printed_z_mm=site.printed_z_mm,
-            progress=progress,
-        )
+        standing = None
         if site.planned is not None and anomaly.evidence is not None:
             # what stands there is all that was seen, the bottoms of open cells too
             standing = as_built_heights(
@@ -264,7 +257,15 @@ def plan_repair(
                 cell_mm=AS_BUILT_CELL_MM,
                 unseen_margin_mm=OPEN_CELL_MARGIN_MM,
             )
-            deficit = replace(deficit, as_built=standing)
+        deficit = compute_deficit(
+            moved,
+            expected,
+            anomaly,
+            build_from_template=placed,
+            printed_z_mm=site.printed_z_mm,
+            as_built=standing,
+            progress=progress,
+        )
         _refuse_ambiguity(scan, site, registration, deficit)
     layer_mm = site.setup.process.layer_height_mm
     fillable = _fillable(deficit)
@@ -376,15 +377,6 @@ def _start_of(interruption: ModalState | None) -> tuple[float, float, float] | N
         return None
     x, y, z = interruption.position_mm
     return (float(x), float(y), float(z))
-
-
-def solid_arrays(
-    solid: manifold3d.Manifold,
-) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
-    """(v, 3) vertices, mm, and (f, 3) faces of a solid."""
-    mesh = solid.to_mesh64()
-    vertices = np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3]
-    return vertices, np.asarray(mesh.tri_verts).astype(np.int64)
 
 
 def program_of(plan: RepairPlan) -> Program | None:

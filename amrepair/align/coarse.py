@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from amrepair.template.port import Template
 
-VOXEL_RATIOS = (0.012, 0.02)  # of the template's diagonal
+VOXEL_RATIOS = (0.012, 0.02)  # of the part's diagonal
 SURFACE_POINTS = 30_000
 
 
@@ -26,11 +26,18 @@ def proposals(
     diagonal_mm = float(np.linalg.norm(high - low))
     area_guess = diagonal_mm**2
     surface, _ = template.surface_points(max(np.sqrt(area_guess / SURFACE_POINTS), 1e-3))
+    yield from poses_between(points_mm, surface, diagonal_mm)
+
+
+def poses_between(
+    source_mm: Float[np.ndarray, "n 3"], target_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
+) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """Candidate poses (target from source) of two clouds: features' first, then the axes'."""
     for ratio in VOXEL_RATIOS:
-        found = _kiss(points_mm, surface, ratio * diagonal_mm)
+        found = _kiss(source_mm, target_mm, ratio * diagonal_mm)
         if found is not None:
             yield found
-    yield from _by_axes(points_mm, surface)
+    yield from _by_axes(source_mm, target_mm)
 
 
 def _kiss(

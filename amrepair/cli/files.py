@@ -10,7 +10,7 @@ from amrepair.template import open_template
 from amrepair.template.mesh_file import SUFFIXES
 from gcode.cli.console import write_whole
 
-__all__ = ["open_template", "sort_inputs", "write_mesh"]
+__all__ = ["is_cloud", "open_template", "sort_inputs", "write_mesh"]
 
 
 def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
@@ -18,15 +18,14 @@ def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     meshes: list[Path] = []
     scans: list[Path] = []
     for path in paths:
-        suffix = path.suffix.lower()
-        is_mesh = suffix in SUFFIXES and not (suffix == ".ply" and _is_cloud(path))
+        is_mesh = path.suffix.lower() in SUFFIXES and not is_cloud(path)
         (meshes if is_mesh else scans).append(path)
     return meshes, scans
 
 
-def _is_cloud(path: Path) -> bool:
-    """Whether a PLY's header tells of no faces."""
-    if not path.is_file():
+def is_cloud(path: Path) -> bool:
+    """Whether a file is a PLY whose header tells of no faces: a scan, not a mesh."""
+    if path.suffix.lower() != ".ply" or not path.is_file():
         return False
     with path.open("rb") as stream:
         head = stream.read(4096).split(b"end_header")[0]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from amrepair.cli.files import is_cloud
 from amrepair.errors import InputError
 from amrepair.loop import Look
 from amrepair.repair import RepairPlan
@@ -21,7 +22,7 @@ from amrepair.report.guarded import LOOPBACK
 from amrepair.report.operator import Operator
 from amrepair.scans import read_scan
 from amrepair.scans.files import SUFFIXES as SCAN_SUFFIXES
-from amrepair.template import LearnedSdf
+from amrepair.template import load_template
 from amrepair.template.mesh_file import SUFFIXES as MESH_SUFFIXES
 from amrepair.template.mesh_file import load_mesh
 from gcode.cli import console
@@ -101,8 +102,8 @@ def show_file(page: LiveView, path: Path) -> None:
         text = path.read_text(encoding="utf-8", errors="replace")
         page.show_job(read_job(text), name=path.name, grown=True)
     elif suffix == ".safetensors":
-        page.show_solid(path.name, LearnedSdf.load(path).solid(), PART)
-    elif suffix in MESH_SUFFIXES and not _is_cloud(path):
+        page.show_solid(path.name, load_template(path).solid(), PART)
+    elif suffix in MESH_SUFFIXES and not is_cloud(path):
         mesh = load_mesh(path)
         page.show_mesh(path.name, np.asarray(mesh.vertices), np.asarray(mesh.faces), PART)
     else:
@@ -115,15 +116,6 @@ def _refuse(path: Path) -> None:
         raise InputError(f"{path}: there is no such file")
     if path.suffix.lower() not in known:
         raise InputError(f"{path} cannot be shown; it is one of {', '.join(sorted(known))}")
-
-
-def _is_cloud(path: Path) -> bool:
-    """A PLY without faces is a scan."""
-    if path.suffix.lower() != ".ply":
-        return False
-    with path.open("rb") as file:
-        head = file.read(4096)
-    return b"element face" not in head or b"element face 0" in head
 
 
 def _until_interrupted() -> None:

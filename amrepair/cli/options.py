@@ -14,37 +14,27 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.simulate.run import scale_to_fit
 from amrepair.template import load_mesh
-from gcode.cli import console
+from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
 from gcode.profiles import PrintSetup
+
+__all__ = [
+    "JsonOption",
+    "MaterialOption",
+    "PrinterOption",
+    "ProcessOption",
+    "SeedOption",
+    "SensorOption",
+    "numbers",
+    "part_pose",
+    "scaled_mesh",
+    "sensors",
+    "with_settings",
+]
 
 Options = TypeVar("Options")
 _SWITCH = {"true": True, "on": True, "yes": True, "false": False, "off": False, "no": False}
 
-PrinterOption = Annotated[
-    str,
-    typer.Option(
-        help="Printer profile: an ID or a TOML file.",
-        autocompletion=console.profile_ids("printers"),
-    ),
-]
-MaterialOption = Annotated[
-    str,
-    typer.Option(
-        help="Material profile: an ID or a TOML file.",
-        autocompletion=console.profile_ids("materials"),
-    ),
-]
-ProcessOption = Annotated[
-    str,
-    typer.Option(
-        help="Process profile: an ID or a TOML file.",
-        autocompletion=console.profile_ids("processes"),
-    ),
-]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of everything that is drawn.")]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
-]
 
 
 def scaled_mesh(path: Path, scale: str, setup: PrintSetup) -> Any:

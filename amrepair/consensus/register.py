@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from amrepair.align.coarse import cube_rotations
+from amrepair.align.coarse import poses_between
 from amrepair.align.refine import thin_out
 from amrepair.consensus.cloud import planes, spacing_of
 from amrepair.errors import AlignmentError
@@ -22,7 +22,6 @@ from amrepair.frames import rotation_from_vector
 from gcode.progress import Progress, silent
 
 COARSE_POINTS, FINE_POINTS, SCORE_POINTS = 15_000, 12_000, 4_000
-VOXEL_RATIOS = (0.012, 0.02)  # of the diagonal
 GOOD_OVERLAP, LEAST_OVERLAP = 0.6, 0.25
 # A point farther from the model than it lies overlaps by reach is above it, not beside it, where
 # this share of the way is along the normal; it counts this many times.
@@ -153,7 +152,7 @@ def _propose(
     target, target_tree = _prepared(model_mm, diagonal_mm)
     source, _ = _prepared(source_mm, diagonal_mm)
     thinner = len(source_mm) // SCORE_POINTS + 1
-    for guess in _guesses(source_mm, model_mm, diagonal_mm):
+    for guess in poses_between(source_mm, model_mm, diagonal_mm):
         pose = _gicp(target, source, target_tree, guess, 0.02 * diagonal_mm)
         moved = _apply(pose, source_mm[::thinner])
         forth = tree.query(moved, workers=-1)
@@ -182,59 +181,6 @@ def _above(
     distance, index = nearest
     height = np.abs(((points_mm - surface_mm[index]) * plane[index]).sum(axis=1))
     return float(((distance > reach_mm) & (height > ABOVE * distance)).mean())
-
-
-def _guesses(
-    source_mm: Float[np.ndarray, "n 3"], model_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
-) -> list[Float[np.ndarray, "4 4"]]:
-    """Feature matches at two voxels; then the 24 ways to lay the principal axes on each other."""
-    found = []
-    for ratio in VOXEL_RATIOS:
-        pose = _features(source_mm, model_mm, ratio * diagonal_mm)
-        if pose is not None:
-            found.append(pose)
-    (source_axes, source), (target_axes, target) = _axes(source_mm), _axes(model_mm)
-    for turn in cube_rotations():
-        rotation = target_axes @ turn @ source_axes.T
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, target - rotation @ source
-        found.append(pose)
-    return found
-
-
-def _features(
-    source_mm: Float[np.ndarray, "n 3"], model_mm: Float[np.ndarray, "m 3"], voxel_mm: float
-) -> Float[np.ndarray, "4 4"] | None:
-    import kiss_matcher
-
-    # about their own centres: the matcher computes in single precision
-    source, target = source_mm.mean(axis=0), model_mm.mean(axis=0)
-    matcher = kiss_matcher.KISSMatcher(
-        kiss_matcher.KISSMatcherConfig(voxel_size=voxel_mm, enable_noise_bound_clamping=False)
-    )
-    answer = matcher.estimate(
-        (source_mm - source).astype(np.float32), (model_mm - target).astype(np.float32)
-    )
-    rotation = np.asarray(answer.rotation, dtype=np.float64)
-    if not answer.valid or not np.isfinite(rotation).all():
-        return None
-    u, _, vt = np.linalg.svd(rotation)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = target + np.asarray(answer.translation).reshape(3) - rotation @ source
-    return pose
-
-
-def _axes(
-    points_mm: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
-    centre = points_mm.mean(axis=0)
-    axes = np.linalg.eigh(np.cov((points_mm - centre).T))[1]
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1.0
-    local = (points_mm - centre) @ axes
-    return axes, centre + axes @ (0.5 * (local.min(axis=0) + local.max(axis=0)))
 
 
 def _prepared(points_mm: Float[np.ndarray, "n 3"], diagonal_mm: float) -> tuple[object, object]:

@@ -82,6 +82,7 @@ def compute_deficit(
     tolerance_mm: float | None = None,
     printed_z_mm: float | None = None,
     cell_mm: float = 0.25,
+    as_built: HeightField | None = None,
     progress: Progress = silent,
 ) -> Deficit:
     """Solids of what is missing and in excess.
@@ -100,6 +101,8 @@ def compute_deficit(
         Height printed so far, build frame; None is the template's own top.
     cell_mm
         Cell of what the scan alone says of heights.
+    as_built
+        What stands on the bed, where the caller knows; None has it made of scan and solids.
 
     Raises
     ------
@@ -135,22 +138,24 @@ def compute_deficit(
         for found in solids.values()
     )
     unseen = anomaly.template_label == int(Label.UNSEEN)
-    seen = as_built_heights(
-        scan,
-        template,
-        evidence,
-        build_from_template=build_from_template,
-        printed_z_mm=printed_z_mm,
-        cell_mm=cell_mm,
-    )
-    expected: Any = template.solid()
+    if as_built is None:
+        seen = as_built_heights(
+            scan,
+            template,
+            evidence,
+            build_from_template=build_from_template,
+            printed_z_mm=printed_z_mm,
+            cell_mm=cell_mm,
+        )
+        expected: Any = template.solid()
+        as_built = standing_heights(seen, expected.transform(matrix), missing, excess)
     return Deficit(
         missing=missing,
         excess=excess,
         regions=tuple(sorted(regions, key=lambda r: (int(r.label), -r.volume_mm3))),
         tolerance_mm=tau_mm,
         unseen_area_mm2=_unseen_area(anomaly, int(unseen.sum())),
-        as_built=standing_heights(seen, expected.transform(matrix), missing, excess),
+        as_built=as_built,
     )
 
 

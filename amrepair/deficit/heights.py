@@ -17,6 +17,7 @@ from amrepair.detect.evidence import Evidence
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template.port import Template
+from gcode.slicing.layers import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
 UNSEEN_MARGIN_MM = 1.0
@@ -128,11 +129,11 @@ def _columns(
     solid: manifold3d.Manifold, field: HeightField
 ) -> tuple[Int[np.ndarray, " cells1"], Float[np.ndarray, " crossings"]]:
     """Crossings of a solid with the field's columns: where each column's begin, and heights."""
-    mesh = solid.to_mesh64()
+    vertices, faces = mesh_of(solid)
     ny, nx = field.shape
     offset, z, _ = raster_kernels.column_crossings(
-        np.asarray(mesh.vert_properties, np.float64)[:, :3].copy(),
-        np.asarray(mesh.tri_verts).astype(np.int64),
+        vertices,
+        faces,
         float(field.origin_mm[0]),
         float(field.origin_mm[1]),
         field.cell_mm,

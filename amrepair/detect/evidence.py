@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from amrepair.detect.faces import Faces, Patches, find_faces
+from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
 from amrepair.detect.rays import RangeImage, range_images
 from amrepair.detect.surfels import Surfels
 from amrepair.scans import Scan
@@ -22,8 +22,6 @@ from amrepair.template.port import Template
 # sideways by one cell plus this many times the height.
 SIDEWAYS_PER_HEIGHT = 1.0
 NEIGHBOURS = 4
-# Planes more than 40° off the template's own slope are another surface.
-STRIP_COSINE = 0.77
 # "Solid, as far as anybody knows": a clearance well below every threshold.
 SOLID_MM = -5.0
 # The template's surface in patches of this size closes what stands there.
@@ -84,30 +82,26 @@ class Evidence:
     def surface_clearance(
         self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
-        """Signed distance to the scanned surface itself (no rays), positive outside.
-
-        A surfel on the template answers f(x) − f(surfel): exact on curves and edges. One off the
-        template answers with its own plane.
-        """
+        """Signed distance to the scanned surface itself (no rays), positive outside."""
         s = self.surfels
         if len(s) == 0:
             return np.full(len(points_mm), SOLID_MM)
-        k = min(NEIGHBOURS, len(s))
-        distance, index = self.tree.query(points_mm, k=k, workers=2)
-        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-        offset = points_mm[:, None, :] - s.place_mm[index]
-        plane = (offset * self.normal[index]).sum(axis=2)
-        field = f_mm[:, None] - s.deviation_mm[index]
-        value = np.where(self.off[index], plane, field)
-        weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / s.cell_mm**2)
-        best = (weight * value).sum(axis=1) / weight.sum(axis=1)
-        # beside, not above: the nearest plane does not reach there
-        height = plane[:, 0]
-        sideways = np.sqrt(np.maximum(distance[:, 0] ** 2 - height**2, 0.0))
-        beside = self.off[index[:, 0]] & (
-            sideways > 1.5 * s.cell_mm + SIDEWAYS_PER_HEIGHT * np.abs(height)
+        near = nearest_planes(
+            points_mm,
+            f_mm,
+            self.tree,
+            place_mm=s.place_mm,
+            deviation_mm=s.deviation_mm,
+            off=self.off,
+            normal=self.normal,
+            count=NEIGHBOURS,
+            blur_mm=s.cell_mm,
         )
-        return np.where(beside, SOLID_MM, best)
+        # beside, not above: the nearest plane does not reach there
+        beside = self.off[near.index] & (
+            near.sideways_mm > 1.5 * s.cell_mm + SIDEWAYS_PER_HEIGHT * near.height_mm
+        )
+        return np.where(beside, SOLID_MM, near.value_mm)
 
 
 def gather(

@@ -47,6 +47,58 @@ NORMAL_AGREEMENT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
+class NearestPlanes:
+    """What the places nearest to some points say of them.
+
+    Attributes
+    ----------
+    value_mm
+        (n,) signed distance to the surface through them, positive outside.
+    distance_mm, height_mm, sideways_mm
+        (n,) to the nearest place: in all, over its surface, along it.
+    index
+        (n,) the nearest place.
+    """
+
+    value_mm: Float[np.ndarray, " n"]
+    distance_mm: Float[np.ndarray, " n"]
+    height_mm: Float[np.ndarray, " n"]
+    sideways_mm: Float[np.ndarray, " n"]
+    index: Int[np.ndarray, " n"]
+
+
+def nearest_planes(
+    points_mm: Float[np.ndarray, "n 3"],
+    f_mm: Float[np.ndarray, " n"],
+    tree: cKDTree,
+    *,
+    place_mm: Float[np.ndarray, "k 3"],
+    deviation_mm: Float[np.ndarray, " k"],
+    off: Bool[np.ndarray, " k"],
+    normal: Float[np.ndarray, "k 3"],
+    count: int,
+    blur_mm: float,
+) -> NearestPlanes:
+    """Ask the nearest places of a surface on which side of it points lie.
+
+    A place on the template answers f(x) − f(place): exact on curves and edges. One off it answers
+    with its own plane. `blur_mm` says how fast farther ones count less.
+    """
+    k = min(count, len(place_mm))
+    distance, index = tree.query(points_mm, k=k, workers=2)
+    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+    offset = points_mm[:, None, :] - place_mm[index]
+    plane = (offset * normal[index]).sum(axis=2)
+    field = f_mm[:, None] - deviation_mm[index]
+    value = np.where(off[index], plane, field)
+    weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / blur_mm**2)
+    best = (weight * value).sum(axis=1) / weight.sum(axis=1)
+    height = np.abs(value[:, 0])
+    sideways = np.sqrt(np.maximum(distance[:, 0] ** 2 - height**2, 0.0))
+    return NearestPlanes(best, distance[:, 0].copy(), height, sideways, index[:, 0].copy())
+
+
+@dataclass(frozen=True, slots=True)
 class Faces:
     """The scanned surface around defects, template frame.
 
@@ -78,26 +130,26 @@ class Faces:
     ) -> Float[np.ndarray, " n"]:
         """Signed distance to what stands there, positive outside.
 
-        A place on the template answers f(x) − f(place): exact on curves and edges. One on a broken
-        face answers with its plane. Where neither lies over the point, the winding number says the
-        side and the nearest place how far.
+        The nearest places answer (`nearest_planes`). Where none lies over the point, the winding
+        number says the side and the nearest place how far.
         """
-        k = min(NEIGHBOURS, len(self.place_mm))
-        distance, index = self.tree.query(points_mm, k=k, workers=2)
-        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-        offset = points_mm[:, None, :] - self.place_mm[index]
-        plane = (offset * self.normal[index]).sum(axis=2)
-        field = f_mm[:, None] - self.deviation_mm[index]
-        value = np.where(self.off[index], plane, field)
-        weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * self.spacing_mm) ** 2)
-        best = (weight * value).sum(axis=1) / weight.sum(axis=1)
-        height = np.abs(value[:, 0])
-        sideways = np.sqrt(np.maximum(distance[:, 0] ** 2 - height**2, 0.0))
-        s = self.spacing_mm
-        far = (distance[:, 0] > NEAR_SPACINGS * s) | (
-            sideways > BESIDE_SPACINGS * s + BESIDE_PER_HEIGHT * height
+        near = nearest_planes(
+            points_mm,
+            f_mm,
+            self.tree,
+            place_mm=self.place_mm,
+            deviation_mm=self.deviation_mm,
+            off=self.off,
+            normal=self.normal,
+            count=NEIGHBOURS,
+            blur_mm=2 * self.spacing_mm,
         )
-        ask = np.flatnonzero(far | (distance[:, 0] > s))
+        best, distance = near.value_mm, near.distance_mm
+        s = self.spacing_mm
+        far = (distance > NEAR_SPACINGS * s) | (
+            near.sideways_mm > BESIDE_SPACINGS * s + BESIDE_PER_HEIGHT * near.height_mm
+        )
+        ask = np.flatnonzero(far | (distance > s))
         if len(ask):
             inside = self.shell.winding(points_mm[ask])
             contrary = np.where(
@@ -105,7 +157,7 @@ class Faces:
             )
             decided = far[ask] | contrary
             sign = np.where(inside[decided] < 0.5, 1.0, -1.0)
-            best[ask[decided]] = sign * distance[ask[decided], 0]
+            best[ask[decided]] = sign * distance[ask[decided]]
         return np.asarray(best)
 
 
@@ -247,7 +299,7 @@ def _standing(
         inside = faces.shell.winding(probes)
         distance, nearest = faces.tree.query(probes, workers=2)
         faced = faces.off[nearest] & (distance < NEAR_SPACINGS * faces.spacing_mm)
-        faced &= faces.clearance(probes, f_mm) > 0
+        faced[faced] = faces.clearance(probes[faced], f_mm[faced]) > 0
         unseen = (inside > OPEN_WINDING) & (inside < 1 - OPEN_WINDING / 2) & ~faced & (room <= 0)
         # a patch that stands closes the surface itself: only the others are asked again
         keep = keep.copy()

@@ -54,8 +54,9 @@ class Shell:
         code = code[order]
         place, vector = place_mm[order], np.ascontiguousarray(vector_mm2[order])
         weight = np.maximum(area[order], 1e-12)
-        child, centre, total, mass, radius, leaf = [], [], [], [], [], []
-        at, below_place, below_weight = 0, place, weight
+        child, centre, total, radius = [], [], [], []
+        leaf: list[Bool[np.ndarray, " n"]] = []
+        below_place, below_weight = place, weight
         below_vector, below_radius = vector, np.zeros(len(place))
         below_start = 0
         while len(code):
@@ -68,14 +69,12 @@ class Shell:
             centre.append(c)
             total.append(np.add.reduceat(below_vector, first, axis=0))
             radius.append(np.maximum.reduceat(far + below_radius, first))
-            leaf.append(np.full(len(first), at == 0))
-            mass.append(w)
+            leaf.append(np.full(len(first), len(leaf) == 0))
             # the next level joins these nodes
             below_start = sum(len(c) for c in centre[:-1])
             below_place, below_weight, below_vector = c, w, total[-1]
             below_radius = radius[-1]
             code = code[first] >> 3
-            at += 1
             if len(first) <= 8:
                 break
         if not centre:

@@ -17,7 +17,7 @@ from amrepair.detect import Label
 from amrepair.detect.detection import BED_BAND_MM
 from amrepair.loop import Look as LoopLook
 from amrepair.loop import LoopReport
-from amrepair.repair import RepairPlan, solid_arrays
+from amrepair.repair import RepairPlan
 from amrepair.report.data import (
     BeadPath,
     Counter,
@@ -28,6 +28,7 @@ from amrepair.report.data import (
     SolidMesh,
 )
 from gcode.profiles import PrintSetup
+from gcode.slicing.layers import mesh_of
 
 DIGITS = 6  # of every figure in a result: beyond what any scan can tell
 OUTLINE_MM = 0.05  # finer than a pixel of the drawing
@@ -267,7 +268,7 @@ def solid_mesh(solid: Any) -> SolidMesh | None:
     """Triangles of a solid; None where it is empty."""
     if solid.is_empty():
         return None
-    vertices, faces = solid_arrays(solid)
+    vertices, faces = mesh_of(solid)
     return SolidMesh(vertices, faces)
 
 

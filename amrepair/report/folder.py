@@ -12,8 +12,8 @@ import trimesh
 
 from amrepair.errors import InputError
 from amrepair.loop import Look
-from amrepair.repair import solid_arrays
 from amrepair.scans import write_ply
+from gcode.slicing.layers import mesh_of
 
 
 class RunFolder:
@@ -74,7 +74,7 @@ class RunFolder:
 
     def write_solid(self, name: str, solid: Any) -> Path:
         """Write a `manifold3d.Manifold` as binary STL."""
-        vertices, faces = solid_arrays(solid)
+        vertices, faces = mesh_of(solid)
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         return self._whole(name, lambda path: mesh.export(path, file_type="stl"))
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.loop import Look
-from amrepair.repair import RepairPlan, solid_arrays
+from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.collect import of_the_part
 from amrepair.report.operator import Operator, Verdict
@@ -19,6 +19,7 @@ from amrepair.report.text import duration, length, quantity
 from gcode.moves import Extrude, Toolpath
 from gcode.progress import Progress
 from gcode.reader import Job
+from gcode.slicing.layers import mesh_of
 
 # Blue is missing, grey agrees, orange is too much: as in the report, safe for the colour-blind.
 STOPS = np.array(
@@ -116,7 +117,7 @@ class LiveView:
         if solid.is_empty():
             self._remove(name)
             return
-        vertices, faces = solid_arrays(solid)
+        vertices, faces = mesh_of(solid)
         self.show_mesh(name, vertices, faces, colour, opacity=opacity)
 
     def show_mesh(

@@ -12,6 +12,13 @@ import gcode
 from gcode.check import check as check_program
 from gcode.check import find_refusals
 from gcode.cli import console, importing
+from gcode.cli.options import (
+    JsonOption,
+    MaterialOption,
+    PrinterOption,
+    ProcessOption,
+    program_text,
+)
 from gcode.cli.resuming import resume_at_command
 from gcode.errors import GcodeError, InputError
 from gcode.estimate import estimate as estimate_program
@@ -43,33 +50,9 @@ from gcode.writer import write
 AS_BUILT_CELL_MM = 0.2
 AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
 
-PrinterOption = Annotated[
-    str,
-    typer.Option(
-        help="Printer profile: an ID or a TOML file.",
-        autocompletion=console.profile_ids("printers"),
-    ),
-]
-MaterialOption = Annotated[
-    str,
-    typer.Option(
-        help="Material profile: an ID or a TOML file.",
-        autocompletion=console.profile_ids("materials"),
-    ),
-]
-ProcessOption = Annotated[
-    str,
-    typer.Option(
-        help="Process profile: an ID or a TOML file.",
-        autocompletion=console.profile_ids("processes"),
-    ),
-]
 AsBuiltOption = Annotated[
     Path | None,
     typer.Option(help="What stands on the bed: a mesh, or a height map (.npz, .tif, .npy)."),
-]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
 ]
 FileArgument = Annotated[Path, typer.Argument(help="G-code file.")]
 
@@ -192,7 +175,7 @@ def check(
 ) -> None:
     """Judge a program: limits, temperatures, sections, and the tool head against --as-built."""
     setup = load_setup(printer, material)
-    program = Program(_text(file), setup.printer.dialect)
+    program = Program(program_text(file), setup.printer.dialect)
     field = _as_built(as_built) if as_built is not None else None
     refusals = find_refusals(program, setup, as_built=field)
     if as_json:
@@ -241,7 +224,7 @@ def estimate(
     """Tell how long a program takes and what it uses; heating left out."""
     machine = load_printer(printer) if printer is not None else None
     dialect = machine.dialect if machine is not None else "marlin"
-    found = estimate_program(Program(_text(file), dialect), machine)
+    found = estimate_program(Program(program_text(file), dialect), machine)
     result = {
         "print_time_s": round(found.print_time_s, 1),
         "filament_mm": round(found.filament_mm, 2),
@@ -299,7 +282,9 @@ def send(
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
     setup = load_setup(printer, material)
     field = _as_built(as_built) if as_built is not None else None
-    checked = check_program(Program(_text(file), setup.printer.dialect), setup, as_built=field)
+    checked = check_program(
+        Program(program_text(file), setup.printer.dialect), setup, as_built=field
+    )
     machine = connect(
         port,
         dialect=setup.printer.dialect,
@@ -350,7 +335,7 @@ def emulate(
     accelerated: Annotated[bool, typer.Option(help="Let the printer's clock jump.")] = False,
 ) -> None:
     """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
-    script = parse_faults(_text(faults)) if faults is not None else None
+    script = parse_faults(program_text(faults)) if faults is not None else None
     machine = load_printer(printer)
     with tempfile.TemporaryDirectory(prefix="gcode-emulate-") as folder:
         serve_forever(
@@ -419,13 +404,6 @@ def _abort(machine: Printer) -> None:
         console.errors.print(f"gcode: the printer could not be made safe: {error}", markup=False)
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).") from error
-
-
 def _tell(report: PrintReport, *, as_json: bool) -> None:
     """What became of a print, with the counters of its link."""
     result = {
@@ -468,7 +446,7 @@ def _as_built(path: Path) -> HeightField:
 def _grid(job: Path | None, setup: Any) -> LayerGrid:
     if job is None:
         return LayerGrid.from_setup(setup)
-    read = read_job(Program(_text(job), setup.printer.dialect))
+    read = read_job(Program(program_text(job), setup.printer.dialect))
     return LayerGrid.from_tops(
         [layer.z_mm for layer in read.layers], layer_height_mm=setup.process.layer_height_mm
     )

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from gcode.cli import console
+from gcode.cli.options import JsonOption
 from gcode.errors import InputError
 from gcode.profiles.importers import ImportedFile, file_name, import_profiles, to_toml
 
@@ -37,9 +38,7 @@ def import_(
     inherits: Annotated[
         str | None, typer.Option(help="Shipped profile for what the source does not know.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
-    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Import a profile: every key is mapped, or listed with the reason."""
     found = import_profiles(file, preset=preset, inherits=inherits)

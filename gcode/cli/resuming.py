@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gcode.cli import console
+from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
 from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, load_setup
@@ -23,19 +24,13 @@ def resume_at_command(
     layer: Annotated[
         int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
     ] = None,
-    printer: Annotated[
-        str, typer.Option(help="Printer profile: an ID or a TOML file.")
-    ] = DEFAULT_PRINTER,
-    material: Annotated[
-        str, typer.Option(help="Material profile: an ID or a TOML file.")
-    ] = DEFAULT_MATERIAL,
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
     standing: Annotated[
         Path | None,
         typer.Option(help="Height map (.npz) to write: what must stand there, for --as-built."),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
-    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Make a checked job from a layer on: heated, primed, lowered onto the part, Z not homed."""
     console.writable(output)
@@ -44,12 +39,12 @@ def resume_at_command(
             raise InputError(f"{standing}: what stands there is written as .npz; rename it.")
         console.writable(standing)
     setup = load_setup(printer, material)
-    try:
-        text = job.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"{job} cannot be read ({error.strerror}).") from error
     made = resume_at(
-        Program(text, setup.printer.dialect), setup, z_mm=z_mm, layer=layer, title=job.name
+        Program(program_text(job), setup.printer.dialect),
+        setup,
+        z_mm=z_mm,
+        layer=layer,
+        title=job.name,
     )
     program = made.checked.program
     console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))

@@ -1,0 +1,34 @@
+"""Names at the top of a package that are loaded when first used (PEP 562)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+
+def lazy_names(
+    namespace: dict[str, Any], homes: Mapping[str, tuple[str, str]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """A package's `__getattr__` and `__dir__`.
+
+    Parameters
+    ----------
+    namespace
+        The package's `globals()`; a name that was used once stays there.
+    homes
+        Module and attribute of every name.
+    """
+
+    def getattr_(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {namespace['__name__']!r} has no attribute {name!r}")
+        module, attribute = homes[name]
+        found = getattr(import_module(module), attribute)
+        namespace[name] = found
+        return found
+
+    def dir_() -> list[str]:
+        return sorted({*namespace, *homes})
+
+    return getattr_, dir_
