@@ -28,11 +28,14 @@ TOP_BAND_MM = 0.3
 # An unseen patch smaller than this between seen ones is a gap of sampling, not a place to hide.
 GAP_MM2 = 1.0
 FINE_CELL_MM, MOST_CELLS = 0.1, 2_000_000
+# In cells of the scan: one that a wall's noise touches, and a gap beside it that took its height.
+BY_WALL_CELLS = 2.5
 # The scan may stand out this much before it overrules the solids: their tolerance, and noise.
 TRUST_MM = 0.3
 NOISE_MM = 0.1
 # Two layers: thinner material over a void is the solids' own rounding at its rim.
 FILM_MM = 0.4
+FIN_CELLS = 3
 
 
 def as_built_heights(
@@ -106,6 +109,10 @@ def standing_heights(
     )
     columns = [_columns(solid, fine) for solid in (expected, missing)]
     z_mm = raster_kernels.column_rest(*columns[0], *columns[1], FILM_MM, 0.0).reshape(ny, nx)
+    untouched = (columns[1][0][1:] == columns[1][0][:-1]).reshape(ny, nx)
+    # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
+    beside = ~ndimage.binary_erosion(untouched, np.ones((3, 3)), border_value=1)
+    z_mm = np.where(beside, ndimage.grey_opening(z_mm, FIN_CELLS), z_mm)
     if not excess.is_empty():
         z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
     x, y = fine.centres_mm()
@@ -114,14 +121,15 @@ def standing_heights(
     at = (cells[:, 0].reshape(fine.shape), cells[:, 1].reshape(fine.shape))
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
     # beside walls, where the solids are the sharper of the two unless something else stands there
-    around = 2 * round(1.5 * seen.cell_mm / cell_mm) + 1
+    around = 2 * math.ceil(BY_WALL_CELLS * seen.cell_mm / cell_mm) + 1
     highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
     by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
-    filled = (columns[1][0][1:] == columns[1][0][:-1]).reshape(ny, nx)
-    agrees = filled & (np.abs(seen.z_mm[at] - z_mm) < NOISE_MM)
+    agrees = untouched & (np.abs(seen.z_mm[at] - z_mm) < NOISE_MM)
+    # what is much lower was seen on another side: of this one no point fell into the cell
+    beneath = seen.z_mm[at] < z_mm - TRUST_MM
     known = seen.seen[at]
-    sharp = known & (by_wall | agrees)
+    sharp = known & (by_wall | agrees | beneath)
     return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known.copy())
 
 
@@ -191,8 +199,9 @@ def _footprint(
     cell_mm: float,
     shape: tuple[int, ...],
 ) -> Bool[np.ndarray, "ny nx"]:
-    """Cells that the template covers, from its surface points, holes filled cell by cell."""
-    surface, _ = template.surface_points(max(0.6, cell_mm))
+    """Cells that the template covers: its surface points, and what lies between them."""
+    apart_mm = max(0.6, cell_mm)
+    surface, _ = template.surface_points(apart_mm)
     xy = build_from_template.apply(surface)[:, :2]
     index = np.floor((xy - low_mm[:2]) / cell_mm).astype(np.int64)
     ok = ((index >= 0) & (index < (shape[1], shape[0]))).all(axis=1)

@@ -7,6 +7,7 @@ only their lower faces can touch. What is laid on the way stands there for the m
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,8 +23,9 @@ TIP_SLACK_MM = 0.2
 # The head's body must clear what stands there, up to the noise of the height field.
 BODY_SLACK_MM = 0.1
 MAX_CELLS = 12_000_000  # of the field and all its slices: 96 MB; beyond that cells are joined
-# Slices of the head that reach farther than this are swept over cells of this size.
+# What is laid is looked at in cells of this size by slices that reach farther than this.
 WIDE_MM, WIDE_CELL_MM = 2.5, 0.2
+EDGE_MM = 0.5  # of a window around moves
 MOST_SAID = 20
 
 
@@ -45,24 +47,18 @@ def sweep(
     width = np.clip(pushed / np.maximum(length, 1e-9) / 0.2, 0.0, 2 * printer.nozzle_diameter_mm)
     worst = np.full(len(start), -np.inf)
     which = np.zeros(len(start), dtype=np.int64)
-    # what stands there, or will
-    laid_mm = float(end[pushed > 0, 2].max()) if (pushed > 0).any() else 0.0
-    stands_mm = max(as_built.top_mm, laid_mm)
+    swept = _Swept(start, end, pushed, width)
     reach = [float(np.abs(np.array(part.polygon_mm)).max()) for part in slices]
-    # what is wide is swept over joined cells, each as high as its highest: never too low
-    for wide in (False, True):
-        own = [k for k, mm in enumerate(reach) if (mm > WIDE_MM) == wide]
-        if not own:
+    near = [k for k, mm in enumerate(reach) if mm <= WIDE_MM]
+    far = [k for k, mm in enumerate(reach) if mm > WIDE_MM]
+    for own, found in (
+        (near, swept.over(as_built, [slices[k] for k in near], grows=True)),
+        (far, swept.over(as_built, [slices[k] for k in far], grows=False)),
+        (far, swept.over_laid([slices[k] for k in far])),
+    ):
+        if found is None:
             continue
-        around_mm = max(reach[k] for k in own) + 2 * WIDE_CELL_MM
-        lowest_slice_mm = min(slices[k].z_from_mm for k in own)
-        low = np.minimum(start[:, 2], end[:, 2]) + lowest_slice_mm <= stands_mm
-        least_cell_mm = WIDE_CELL_MM if wide else 0.0
-        near = _where_low(as_built, start[low], end[low], around_mm, least_cell_mm)
-        if not near.z_mm.size:
-            continue
-        field = _coarse(near, max(1, MAX_CELLS // (len(own) + 1)), least_cell_mm)
-        depth, of_own = _swept(field, [slices[k] for k in own], start, end, pushed, width)
+        depth, of_own = found
         deeper = depth > worst
         worst = np.where(deeper, depth, worst)
         which = np.where(deeper, np.array(own)[of_own], which)
@@ -84,64 +80,101 @@ def sweep(
     return refusals, float(-(body.max() + BODY_SLACK_MM)) if len(body) else np.inf
 
 
-def _where_low(
-    field: HeightField,
-    start: Float[np.ndarray, "n 3"],
-    end: Float[np.ndarray, "n 3"],
-    around_mm: float,
-    least_cell_mm: float,
-) -> HeightField:
-    """The field around the moves that are low enough to touch something in it."""
-    x0, y0, x1, y1 = field.box_mm
-    low, high = np.minimum(start, end)[:, :2] - around_mm, np.maximum(start, end)[:, :2] + around_mm
-    over = ((high > (x0, y0)) & (low < (x1, y1))).all(axis=1)
-    if not over.any():
-        return field.crop((x0, y0, x0, y0))
-    a, b = low[over].min(axis=0), high[over].max(axis=0)
-    # begin on a joined cell of the whole field, so that joining gives the same cells
-    factor = max(1, math.ceil(least_cell_mm / field.cell_mm - 1e-6))
-    step_mm = factor * field.cell_mm
-    a = field.origin_mm + np.floor((a - field.origin_mm) / step_mm) * step_mm
-    little = 0.25 * field.cell_mm
-    return field.crop((float(a[0]) + little, float(a[1]) + little, float(b[0]), float(b[1])))
+@dataclass(frozen=True, slots=True)
+class _Swept:
+    """Moves: (n, 3) start and end, (n,) plastic and width."""
 
+    start_mm: Float[np.ndarray, "n 3"]
+    end_mm: Float[np.ndarray, "n 3"]
+    pushed_mm3: Float[np.ndarray, " n"]
+    width_mm: Float[np.ndarray, " n"]
 
-def _swept(
-    field: HeightField,
-    slices: list[EnvelopeSlice],
-    start: Float[np.ndarray, "n 3"],
-    end: Float[np.ndarray, "n 3"],
-    pushed_mm3: Float[np.ndarray, " n"],
-    width_mm: Float[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Worst contact of every move with some slices, beyond what is allowed, and the slice."""
-    tables = [footprint_rows(part.polygon_mm, field.cell_mm) for part in slices]
-    rows = np.concatenate([np.stack(table, axis=1) for table in tables])
-    row_at = np.concatenate([[0], np.cumsum([len(table[0]) for table in tables])])
-    dilated = np.stack([field.max_within(part.polygon_mm) for part in slices])
-    tip = np.array([part.z_from_mm < 1e-9 for part in slices])
-    worst, which = kernels.sweep(
-        start,
-        end,
-        (pushed_mm3 > 0).astype(np.int64),
-        0.5 * width_mm,
-        field.z_mm.astype(np.float64).copy(),
-        field.origin_mm.astype(np.float64),
-        field.cell_mm,
-        np.array([part.z_from_mm for part in slices]),
-        np.arange(len(slices)),
-        dilated,
-        rows,
-        row_at,
-        np.where(tip, TIP_SLACK_MM, BODY_SLACK_MM),
-    )
-    return np.asarray(worst), np.asarray(which)
+    @property
+    def low_mm(self) -> Float[np.ndarray, " n"]:
+        """The lower end of every move."""
+        return np.minimum(self.start_mm[:, 2], self.end_mm[:, 2])
 
+    def over(
+        self, field: HeightField, slices: list[EnvelopeSlice], *, grows: bool
+    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]] | None:
+        """Worst contact of every move, beyond what is allowed, and the slice.
 
-def _coarse(field: HeightField, most: int, least_cell_mm: float) -> HeightField:
-    """The field with cells joined, so that it is small enough and not finer than needed."""
-    ny, nx = field.shape
-    factor = max(
-        int(np.ceil(np.sqrt(ny * nx / most))), int(np.ceil(least_cell_mm / field.cell_mm - 1e-6))
-    )
-    return field.coarsened(factor)
+        With `grows`, what is laid stands there for the moves after it.
+        """
+        if not slices:
+            return None
+        laid = self.pushed_mm3 > 0
+        stands_mm = max(field.top_mm, float(self.end_mm[laid, 2].max()) if laid.any() else 0.0)
+        box_mm = self._box_below(stands_mm - min(part.z_from_mm for part in slices))
+        if box_mm is None:
+            return None
+        rows, columns = field.window(box_mm)
+        cells = (rows.stop - rows.start) * (columns.stop - columns.start)
+        factor = math.ceil(math.sqrt(cells * (len(slices) + 1) / MAX_CELLS))
+        field = field.coarsened(factor)
+        window, near = field.window(box_mm), field.crop(box_mm)
+        if not near.z_mm.size:
+            return None
+        dilated = np.stack([field.max_within(part.polygon_mm, window) for part in slices])
+        return self._run(near, slices, dilated, grows=grows)
+
+    def over_laid(
+        self, slices: list[EnvelopeSlice]
+    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]] | None:
+        """The same with what these moves laid themselves, in joined cells: never too low."""
+        laid = self.pushed_mm3 > 0
+        if not slices or not laid.any():
+            return None
+        # what is laid is hit only by what comes far enough below it afterwards
+        low_mm = self.low_mm
+        later_mm = np.minimum.accumulate(low_mm[::-1])[::-1]
+        drop_mm = float((self.end_mm[laid, 2] - later_mm[laid]).max())
+        slices = [part for part in slices if part.z_from_mm < drop_mm]
+        box_mm = self._box_below(float(self.end_mm[laid, 2].max()))
+        if not slices or box_mm is None:
+            return None
+        size_mm = np.array(box_mm[2:]) - np.array(box_mm[:2])
+        cell_mm = max(
+            WIDE_CELL_MM, math.sqrt(float(np.prod(size_mm)) * (len(slices) + 1) / MAX_CELLS)
+        )
+        nx, ny = (int(v) for v in np.ceil(size_mm / cell_mm) + 1)
+        nothing = np.full((ny, nx), -np.inf)
+        bare = HeightField(np.array(box_mm[:2]), cell_mm, nothing, np.ones((ny, nx), bool))
+        dilated = np.repeat(nothing[None], len(slices), axis=0)
+        return self._run(bare, slices, dilated, grows=True)
+
+    def _box_below(self, z_mm: float) -> tuple[float, float, float, float] | None:
+        """The box of the moves that come below a height."""
+        low = self.low_mm <= z_mm
+        if not low.any():
+            return None
+        both = np.concatenate([self.start_mm[low, :2], self.end_mm[low, :2]])
+        (x0, y0), (x1, y1) = both.min(axis=0).tolist(), both.max(axis=0).tolist()
+        return x0 - EDGE_MM, y0 - EDGE_MM, x1 + EDGE_MM, y1 + EDGE_MM
+
+    def _run(
+        self,
+        field: HeightField,
+        slices: list[EnvelopeSlice],
+        dilated: Float[np.ndarray, "_s _ny _nx"],
+        *,
+        grows: bool,
+    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+        tables = [footprint_rows(part.polygon_mm, field.cell_mm) for part in slices]
+        tip = np.array([part.z_from_mm < 1e-9 for part in slices])
+        worst, which = kernels.sweep(
+            self.start_mm,
+            self.end_mm,
+            ((self.pushed_mm3 > 0) & grows).astype(np.int64),
+            0.5 * self.width_mm,
+            field.z_mm.astype(np.float64).copy(),
+            field.origin_mm.astype(np.float64),
+            field.cell_mm,
+            np.array([part.z_from_mm for part in slices]),
+            np.arange(len(slices)),
+            dilated,
+            np.concatenate([np.stack(table, axis=1) for table in tables]),
+            np.concatenate([[0], np.cumsum([len(table[0]) for table in tables])]),
+            np.where(tip, TIP_SLACK_MM, BODY_SLACK_MM),
+        )
+        return np.asarray(worst), np.asarray(which)

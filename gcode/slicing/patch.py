@@ -217,7 +217,7 @@ class _Model:
         self.laid_mm = np.zeros(self.shape)
         self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
         self.lost: list[Unprintable] = []
-        window = (x0 - 20.0, y0 - 20.0, x1 + 20.0, y1 + 20.0)
+        window = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
         # the lowest pass lies at most one thick bead above the deficit's floor
         self.reach = Reach(
             as_built,

@@ -5,7 +5,6 @@ A column is out of reach at a height where any slice of the envelope, placed the
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +15,9 @@ from gcode.surfaces import HeightField
 
 # The flat may press this deep into the plastic beside it: half a layer; with what a scan gets
 # wrong it stays under the checker's limit.
-TIP_PRESS_MM = 0.1
-BODY_CLEARANCE_MM = 0.0
-# Slices that reach farther than this are looked at in cells of this size.
-WIDE_MM, WIDE_CELL_MM = 2.5, 0.2
+TIP_PRESS_MM = 0.06
+# The noise of the field: half of what the checker allows.
+BODY_PRESS_MM = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,25 +33,12 @@ class Obstacle:
         return self.part.z_from_mm < 1e-9
 
 
-def _inner(wide: HeightField, field: HeightField) -> tuple[float, float, float, float]:
-    """The box of the joined cells, drawn in so that rounding picks no further cell."""
-    x0, y0, x1, y1 = wide.box_mm
-    little = 0.25 * field.cell_mm
-    return (x0 + little, y0 + little, x1 - little, y1 - little)
-
-
-def _least_tip(
-    part: EnvelopeSlice, field: HeightField, wide: HeightField, factor: int
+def least_tip(
+    part: EnvelopeSlice, field: HeightField, window: tuple[slice, slice]
 ) -> Float[np.ndarray, "ny nx"]:
-    """How high the tip must at least be by column; what is wide is looked at in joined cells."""
-    if max(abs(v) for corner in part.polygon_mm for v in corner) <= WIDE_MM:
-        under = field.max_within(part.polygon_mm)
-    else:
-        joined = wide.max_within(part.polygon_mm)
-        ny, nx = field.shape
-        under = np.repeat(np.repeat(joined, factor, axis=0), factor, axis=1)[:ny, :nx]
-    give_mm = -TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_CLEARANCE_MM
-    return np.asarray(under - part.z_from_mm + give_mm)
+    """How high the tip must at least be, by column of the window, for a slice to clear all."""
+    press_mm = TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_PRESS_MM
+    return np.asarray(field.max_within(part.polygon_mm, window) - part.z_from_mm - press_mm)
 
 
 class Reach:
@@ -62,12 +47,11 @@ class Reach:
     Parameters
     ----------
     field
-        What stands there; its grid is the answers' grid.
+        What stands there; the answers are on its grid, within the window.
     lowest_tip_mm
         The tip is never asked about below this height.
     window_mm
-        (x_min, y_min, x_max, y_max) where the tip is asked about, and what stands around it;
-        None is all of the field.
+        (x_min, y_min, x_max, y_max) where the tip is asked about; None is all of the field.
     """
 
     def __init__(
@@ -78,20 +62,15 @@ class Reach:
         lowest_tip_mm: float = 0.0,
         window_mm: tuple[float, float, float, float] | None = None,
     ) -> None:
-        factor = max(1, math.ceil(WIDE_CELL_MM / field.cell_mm - 1e-6))
-        wide = field.coarsened(factor)
-        if window_mm is not None:
-            # along the joined cells, which are those of the whole field
-            wide = wide.crop(window_mm)
-            field = field.crop(_inner(wide, field))
-        self.field = field
+        window = field.window(window_mm or field.box_mm)
         # a slice that stays above everything when the tip is lowest cannot touch
-        high_mm = field.top_mm - lowest_tip_mm + BODY_CLEARANCE_MM
+        high_mm = field.top_mm - lowest_tip_mm
         self.obstacles = tuple(
-            Obstacle(part, _least_tip(part, field, wide, factor))
+            Obstacle(part, least_tip(part, field, window))
             for part in printer.envelope
             if part.z_from_mm <= high_mm
         )
+        self.field = field.crop(window_mm or field.box_mm)
 
     def at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the tip may be at this height."""

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import tifffile
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from gcode.errors import InputError
 from gcode.surfaces import raster_kernels as kernels
@@ -138,7 +139,11 @@ class HeightField:
             return 0.0
         return max(0.0, float(self.z_mm[around[:, 0], around[:, 1]].max()))
 
-    def max_within(self, polygon_mm: Sequence[tuple[float, float]]) -> Float[np.ndarray, "ny nx"]:
+    def max_within(
+        self,
+        polygon_mm: Sequence[tuple[float, float]],
+        window: tuple[slice, slice] | None = None,
+    ) -> Float[np.ndarray, "_my _mx"]:
         """Greatest height under a convex polygon placed with its origin on each cell's centre.
 
         Parameters
@@ -146,22 +151,43 @@ class HeightField:
         polygon_mm
             Convex outline relative to the cell's centre. Every cell that it touches counts, so
             the answer is never too low.
+        window
+            Rows and columns of the cells that are asked about; all by default.
         """
+        ny, nx = self.shape
+        rows, columns = window or (slice(0, ny), slice(0, nx))
         dy, low, high = footprint_rows(polygon_mm, self.cell_mm)
-        return kernels.dilate_rows(self.z_mm.astype(np.float64), dy, low, high)
+        box = len(dy) > 0 and (low == low[0]).all() and (high == high[0]).all()
+        if not box:
+            return kernels.dilate_rows(
+                self.z_mm.astype(np.float64), dy, low, high,
+                rows.start, rows.stop, columns.start, columns.stop,
+            )  # fmt: skip
+        wide = _greatest_of_next(
+            self.z_mm.astype(np.float64), columns.start + int(low[0]), columns.stop - columns.start,
+            int(high[0] - low[0]) + 1, axis=1,
+        )  # fmt: skip
+        return _greatest_of_next(
+            wide, rows.start + int(dy[0]), rows.stop - rows.start, len(dy), axis=0
+        )
 
-    def crop(self, box_mm: tuple[float, float, float, float]) -> HeightField:
-        """Cells that touch (x_min, y_min, x_max, y_max); empty if none does."""
+    def window(self, box_mm: tuple[float, float, float, float]) -> tuple[slice, slice]:
+        """Rows and columns of the cells that touch (x_min, y_min, x_max, y_max)."""
         ny, nx = self.shape
         low = np.floor((np.array(box_mm[:2]) - self.origin_mm) / self.cell_mm).astype(int)
         high = np.ceil((np.array(box_mm[2:]) - self.origin_mm) / self.cell_mm).astype(int)
-        x0, x1 = np.clip((low[0], high[0]), 0, nx)
-        y0, y1 = np.clip((low[1], high[1]), 0, ny)
+        x0, x1 = (int(v) for v in np.clip((low[0], high[0]), 0, nx))
+        y0, y1 = (int(v) for v in np.clip((low[1], high[1]), 0, ny))
+        return slice(y0, y1), slice(x0, x1)
+
+    def crop(self, box_mm: tuple[float, float, float, float]) -> HeightField:
+        """Cells that touch (x_min, y_min, x_max, y_max); empty if none does."""
+        rows, columns = self.window(box_mm)
         return HeightField(
-            origin_mm=self.origin_mm + np.array([x0, y0]) * self.cell_mm,
+            origin_mm=self.origin_mm + np.array([columns.start, rows.start]) * self.cell_mm,
             cell_mm=self.cell_mm,
-            z_mm=self.z_mm[y0:y1, x0:x1].copy(),
-            seen=self.seen[y0:y1, x0:x1].copy(),
+            z_mm=self.z_mm[rows, columns].copy(),
+            seen=self.seen[rows, columns].copy(),
         )
 
     def coarsened(self, factor: int) -> HeightField:
@@ -347,6 +373,27 @@ def footprint_rows(
             rows.append((dy, math.floor(min(xs) + 0.5), math.ceil(max(xs) - 0.5)))
     table = np.array(rows, np.int64).reshape(-1, 3)
     return table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy()
+
+
+def _greatest_of_next(
+    z_mm: Float[np.ndarray, "ny nx"], first: int, count: int, size: int, *, axis: int
+) -> Float[np.ndarray, "_my _mx"]:
+    """Greatest of cells [i, i + size) along an axis, for `count` cells i from `first` on."""
+    shape = list(z_mm.shape)
+    shape[axis] = count + size - 1
+    padded = np.full(shape, -np.inf)
+    low, high = max(first, 0), min(first + shape[axis], z_mm.shape[axis])
+    if low < high:
+        inside, source = [slice(None)] * 2, [slice(None)] * 2
+        inside[axis], source[axis] = slice(low - first, high - first), slice(low, high)
+        padded[tuple(inside)] = z_mm[tuple(source)]
+    # scipy centres its window: shifted so that it begins at each cell
+    greatest = ndimage.maximum_filter1d(
+        padded, size, axis=axis, mode="constant", cval=-np.inf, origin=-((size - 1) // 2)
+    )
+    kept = [slice(None)] * 2
+    kept[axis] = slice(0, count)
+    return np.asarray(greatest[tuple(kept)])
 
 
 def _read_heights(

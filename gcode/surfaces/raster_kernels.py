@@ -110,44 +110,48 @@ def column_top(offset: Any, z: Any, empty: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def running_max(row: Any, low: int, high: int, out: Any) -> None:
-    """out[i] = max(row[i+low : i+high+1]) by a monotone queue; cells outside count as −inf."""
+def running_max(row: Any, low: int, reach: int, out: Any) -> None:
+    """out[i] = max(row[i+low : i+low+reach+1]) by a monotone queue; outside counts as −inf."""
     n = row.shape[0]
     queue = np.empty(n + 1, np.int64)
     head = 0
     tail = 0
-    entered = max(0, low)
-    if low < 0:
-        entered = 0
-    for i in range(n):
-        last = min(n - 1, i + high)
+    entered = 0
+    for i in range(out.shape[0]):
+        last = min(n - 1, i + low + reach)
         while entered <= last:
             while tail > head and row[queue[tail - 1]] <= row[entered]:
                 tail -= 1
             queue[tail] = entered
             tail += 1
             entered += 1
-        first = i + low
-        while tail > head and queue[head] < first:
+        while tail > head and queue[head] < i + low:
             head += 1
         out[i] = row[queue[head]] if tail > head else -np.inf
 
 
 @njit(cache=True, nogil=True)
-def dilate_rows(z: Any, row_dy: Any, row_low: Any, row_high: Any) -> Any:
-    """Greatest height under a footprint given by rows of cell offsets [low, high] at dy."""
+def dilate_rows(
+    z: Any, row_dy: Any, row_low: Any, row_high: Any, y0: int, y1: int, x0: int, x1: int
+) -> Any:
+    """Greatest height under a footprint of rows [low, high] at dy, for cells [y0, y1) × [x0, x1).
+
+    Cells of the answer may lie outside the field; nothing stands there.
+    """
     ny, nx = z.shape
-    out = np.full((ny, nx), -np.inf)
-    line = np.empty(nx)
+    out = np.full((y1 - y0, x1 - x0), -np.inf)
+    line = np.empty(x1 - x0)
     for r in range(row_dy.shape[0]):
-        dy = row_dy[r]
-        for iy in range(ny):
-            source = iy + dy
-            if source < 0 or source >= ny:
+        low, high = row_low[r], row_high[r]
+        first = min(max(x0 + low, 0), nx)
+        last = max(min(x1 + high, nx), first)
+        for iy in range(y0, y1):
+            source = iy + row_dy[r]
+            if source < 0 or source >= ny or last == first:
                 continue
-            running_max(z[source], row_low[r], row_high[r], line)
-            for ix in range(nx):
-                out[iy, ix] = max(out[iy, ix], line[ix])
+            running_max(z[source, first:last], x0 + low - first, high - low, line)
+            for ix in range(x1 - x0):
+                out[iy - y0, ix] = max(out[iy - y0, ix], line[ix])
     return out
 
 

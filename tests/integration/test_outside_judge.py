@@ -73,7 +73,7 @@ def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
     template = MeshSdf.from_mesh(_mesh(part))
     on_bed = tuple(ON_BED_MM)
     piece = part.translate(on_bed) ^ tool.translate(on_bed)
-    rest = part.translate(on_bed) - piece
+    rest = part.translate(on_bed) - tool.translate(on_bed)
     setup = load_setup()
     placed = Transform.from_rotation_translation(
         "build", "template", rotation=np.eye(3), translation_mm=ON_BED_MM

@@ -10,6 +10,7 @@ import trimesh
 from numba import njit
 
 # Columns do not run through vertices of a model whose coordinates are round.
+FILM_MM = 0.02
 SHIFT_MM = (1.3e-5, 2.1e-5)
 
 
@@ -52,24 +53,46 @@ def column_tops(mesh: trimesh.Trimesh, box: Voxels) -> np.ndarray:
 
 @njit(cache=True)
 def _highest(triangles, origin, size, shape):
+    """Top of each column; films, which a boolean leaves on faces that coincide, are nothing."""
+    starts = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    heights = np.zeros(0)
+    for phase in range(2):
+        if phase == 1:
+            starts[1:] = np.cumsum(starts[1:])
+            heights = np.zeros(starts[-1])
+            cursor = starts[:-1].copy()
+        for t in range(len(triangles)):
+            a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            i0 = max(0, int(np.ceil((min(a[0], b[0], c[0]) - origin[0]) / size[0])))
+            i1 = min(shape[0] - 1, int(np.floor((max(a[0], b[0], c[0]) - origin[0]) / size[0])))
+            j0 = max(0, int(np.ceil((min(a[1], b[1], c[1]) - origin[1]) / size[1])))
+            j1 = min(shape[1] - 1, int(np.floor((max(a[1], b[1], c[1]) - origin[1]) / size[1])))
+            area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+            if area == 0.0:
+                continue
+            for i in range(i0, i1 + 1):
+                x = origin[0] + i * size[0]
+                for j in range(j0, j1 + 1):
+                    y = origin[1] + j * size[1]
+                    u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
+                    v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
+                    if u >= 0 and v >= 0 and u + v <= 1:
+                        k = i * shape[1] + j
+                        if phase == 0:
+                            starts[k + 1] += 1
+                        else:
+                            heights[cursor[k]] = u * a[2] + v * b[2] + (1 - u - v) * c[2]
+                            cursor[k] += 1
     tops = np.zeros(shape)
-    for t in range(len(triangles)):
-        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        i0 = max(0, int(np.ceil((min(a[0], b[0], c[0]) - origin[0]) / size[0])))
-        i1 = min(shape[0] - 1, int(np.floor((max(a[0], b[0], c[0]) - origin[0]) / size[0])))
-        j0 = max(0, int(np.ceil((min(a[1], b[1], c[1]) - origin[1]) / size[1])))
-        j1 = min(shape[1] - 1, int(np.floor((max(a[1], b[1], c[1]) - origin[1]) / size[1])))
-        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-        if area == 0.0:
-            continue
-        for i in range(i0, i1 + 1):
-            x = origin[0] + i * size[0]
-            for j in range(j0, j1 + 1):
-                y = origin[1] + j * size[1]
-                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
-                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
-                if u >= 0 and v >= 0 and u + v <= 1:
-                    tops[i, j] = max(tops[i, j], u * a[2] + v * b[2] + (1 - u - v) * c[2])
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            k = i * shape[1] + j
+            z = np.sort(heights[starts[k] : starts[k + 1]])
+            last = len(z) - 1
+            while last > 0 and z[last] - z[last - 1] < FILM_MM:
+                last -= 2
+            if last >= 0:
+                tops[i, j] = max(0.0, z[last])
     return tops
 
 
