@@ -35,7 +35,7 @@ TRUST_MM = 0.3
 NOISE_MM = 0.1
 # Two layers: thinner material over a void is the solids' own rounding at its rim.
 FILM_MM = 0.4
-FIN_CELLS = 3
+FIN_CELLS = 2
 
 
 def as_built_heights(

@@ -67,6 +67,8 @@ NEAR_MM = 1.0  # a travel as short as this needs no lift
 CLEAR_MM = 0.5  # of the tip over everything on a travel
 STANDALONE_LIFT_MM = 5.0
 NOT_LISTED_MM3 = 0.02
+COVERED = "covered by what stands above it"
+TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
 Box = tuple[float, float, float, float, float, float]
 
 
@@ -650,10 +652,13 @@ def _left_over(model: _Model) -> tuple[tuple[Unreachable, ...], tuple[PatchRegio
         share = min(max(share, 0.0), 1.0)
         volume_mm3 = float(piece.volume())
         regions.append(PatchRegion(volume_mm3, box, share))
-        if stuck_mm3 > NOT_LISTED_MM3:
-            unreachable.append(
-                Unreachable(volume_mm3 * (1.0 - share), box, _reason(model, cells, left[cells]))
-            )
+        if stuck_mm3 <= NOT_LISTED_MM3:
+            continue
+        reason = _reason(model, cells, left[cells])
+        if reason is None:
+            model.lost.append(Unprintable(volume_mm3 * (1.0 - share), box, TOO_SMALL))
+        else:
+            unreachable.append(Unreachable(volume_mm3 * (1.0 - share), box, reason))
     return tuple(unreachable), tuple(regions)
 
 
@@ -663,16 +668,18 @@ def _cells_of(model: _Model, box: Box) -> tuple[slice, slice]:
     return slice(max(low[1], 0), high[1] + 1), slice(max(low[0], 0), high[0] + 1)
 
 
-def _reason(model: _Model, cells: tuple[slice, slice], stuck: Float[np.ndarray, "a b"]) -> str:
-    """What keeps the nozzle from the column with most left."""
+def _reason(
+    model: _Model, cells: tuple[slice, slice], stuck: Float[np.ndarray, "a b"]
+) -> str | None:
+    """What keeps the nozzle from the column with most left; None if nothing does."""
     iy, ix = np.unravel_index(int(np.argmax(stuck)), stuck.shape)
     iy, ix = int(iy) + cells[0].start, int(ix) + cells[1].start
-    if model.floor_mm[iy, ix] > model.top_mm[iy, ix] + LEAST_THICK_MM:
-        return "covered by what stands above it"
     point = model.points_mm.reshape(*model.shape, 2)[iy, ix]
     field = model.reach.field
     row, column = (int(v) for v in field.cells_of(point[None])[0])
     ny, nx = field.shape
+    if model.floor_mm[iy, ix] > model.top_mm[iy, ix] + LEAST_THICK_MM:
+        return COVERED
     if not (0 <= row < ny and 0 <= column < nx):
-        return "covered by what stands above it"
+        return COVERED
     return model.reach.reason_at(row, column, float(model.top_mm[iy, ix]))

@@ -38,7 +38,8 @@ def least_tip(
 ) -> Float[np.ndarray, "ny nx"]:
     """How high the tip must at least be, by column of the window, for a slice to clear all."""
     press_mm = TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_PRESS_MM
-    return np.asarray(field.max_within(part.polygon_mm, window) - part.z_from_mm - press_mm)
+    under_mm = field.max_within(part.polygon_mm, window, anywhere=True)
+    return np.asarray(under_mm - part.z_from_mm - press_mm)
 
 
 class Reach:
@@ -89,13 +90,13 @@ class Reach:
         index = np.where(inside[:, None], index, 0)
         return np.asarray(~inside | np.asarray(free)[index[:, 0], index[:, 1]])
 
-    def reason_at(self, iy: int, ix: int, z_mm: float) -> str:
-        """What stands in the way at one column, or why nothing does."""
+    def reason_at(self, iy: int, ix: int, z_mm: float) -> str | None:
+        """What stands in the way of the tip at one column; None where nothing does."""
         worst, part = 0.0, None
         for obstacle in self.obstacles:
             depth = float(obstacle.least_tip_mm[iy, ix]) - z_mm
             if depth > worst:
                 worst, part = depth, obstacle.part
         if part is None:
-            return "covered by what stands above it"
+            return None
         return f"the {part.part} would touch what stands beside it by {worst:.1f} mm"
