@@ -129,8 +129,11 @@ def standing_heights(
     # what is much lower was seen on another side: of this one no point fell into the cell
     beneath = seen.z_mm[at] < z_mm - TRUST_MM
     known = seen.seen[at]
-    sharp = known & (by_wall | agrees | beneath)
-    return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known.copy())
+    # where something is missing it was seen to be; below it there is what was expected
+    sharp = np.where(known, by_wall | agrees | beneath, ~untouched)
+    return HeightField(
+        fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | ~untouched
+    )
 
 
 def _columns(
