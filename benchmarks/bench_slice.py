@@ -57,12 +57,6 @@ def peers(part: Path, out: Path) -> dict[str, list[str]]:
     return {name: [*line, str(part)] for name, line in lines.items() if shutil.which(name)}
 
 
-def laid_mm3(path: Path) -> float:
-    """Plastic in a file's beads."""
-    beads = read_job(path.read_text()).beads
-    return float(np.linalg.norm(beads.end_mm - beads.start_mm, axis=1) @ beads.section_mm2)
-
-
 def least_s(command: list[str], rounds: int) -> float:
     """Least of `rounds` runs."""
     spent = []
@@ -106,11 +100,11 @@ def main() -> None:
         ]
         ours += ["--process", str(process), "--printer", setup.printer.id]
         own_s = least_s(ours, args.rounds)
-        laid = laid_mm3(out)
+        laid = read_job(out.read_text()).beads.volume_mm3
         print(f"ours: {own_s:.1f} s, {laid / solid.volume():.4f} of the volume")
         for name, command in peers(placed, out).items():
             seconds = least_s(command, args.rounds)
-            theirs = laid_mm3(out)
+            theirs = read_job(out.read_text()).beads.volume_mm3
             print(
                 f"{name}: {seconds:.1f} s, ratio {seconds / own_s:.2f}, "
                 f"{theirs / solid.volume():.4f} of the volume"

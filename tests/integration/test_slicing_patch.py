@@ -184,3 +184,42 @@ def test_travels_clear_what_stands_there() -> None:
 def test_an_empty_deficit_is_refused() -> None:
     with pytest.raises(SliceError, match="empty"):
         plan_of(m3.Manifold())
+
+
+@pytest.mark.parametrize(
+    ("size_mm", "floor_mm"),
+    [
+        ((6.03, 0.3, 1.0), 2.0),  # CuraEngine drops this sliver without a word
+        ((4.0, 4.0, 4.0), 2.0),  # Slic3r loses layers at its ends
+        ((4.0, 4.0, 4.0), 2.075),  # between two layers: refused by one, put on the bed by another
+        ((0.54, 0.54, 0.54), 2.0),  # a speck, which PrusaSlicer refuses
+    ],
+    ids=["sliver", "chunk", "off the layers", "speck"],
+)
+def test_nothing_small_is_dropped_in_silence(
+    size_mm: tuple[float, float, float], floor_mm: float
+) -> None:
+    base = m3.Manifold.cube((20.0, 20.0, floor_mm)).translate((90.0, 90.0, 0.0))
+    chunk = m3.Manifold.cube(size_mm).translate((95.0, 98.0, floor_mm))
+    plan = slice_patch(
+        chunk,
+        SETUP,
+        as_built=HeightField.from_manifold(base, 0.1, margin_mm=30.0),
+        grid=LayerGrid.from_setup(SETUP),
+        standalone=True,
+    )
+    volume_mm3 = chunk.volume()
+    named_mm3 = sum(thing.volume_mm3 for thing in plan.unprintable)
+    if plan.beads_mm3 == 0:
+        assert named_mm3 == pytest.approx(volume_mm3, rel=0.03)
+        return
+    assert plan.beads_mm3 == pytest.approx(volume_mm3, rel=0.03)
+    laid = motion_of(plan.toolpath)
+    low, high = np.array(chunk.bounding_box()).reshape(2, 3)
+    points = np.concatenate([laid.start_mm, laid.end_mm])
+    assert (points[:, :2] >= low[:2]).all()
+    assert (points[:, :2] <= high[:2]).all()
+    tops = np.unique(points[:, 2].round(6))
+    assert tops[0] - floor_mm <= 0.32
+    assert tops[-1] == pytest.approx(high[2])
+    assert np.diff(tops).max(initial=0.0) <= 0.32 + 1e-9
