@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -21,10 +22,11 @@ from amrepair.cli.options import (
     sensors,
 )
 from amrepair.errors import InputError
-from amrepair.repair import Site, Stopwatch, plan_repair
+from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
 from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
 from amrepair.report.collect import plan_result
 from amrepair.scans import read_scan
+from amrepair.turning import Turn, turns_named, turns_of
 from gcode.cli import console
 from gcode.moves import Program
 from gcode.profiles import (
@@ -39,6 +41,8 @@ from gcode.slicing.layers import LayerGrid
 
 # A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
+# Less than this share out of reach is not worth turning the part over.
+WORTH_TURNING_RATIO = 0.05
 
 
 def add_to(app: typer.Typer) -> None:
@@ -82,6 +86,14 @@ def repair(
         Path | None, typer.Option(help="The job's G-code: repair layers lie on its layers.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
+    turn: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A way in which the part may be laid on the bed (x90, x180, x270, y90, y270, "
+            "z90, z180, z270, any); say it once for each. Where something is out of reach, the "
+            "best is suggested."
+        ),
+    ] = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -93,6 +105,7 @@ def repair(
             "--scan-frame unknown needs --part-pose X,Y,Z,RZ: an aligned shape does not say where "
             "the part stands on the bed"
         )
+    turns = turns_named(turn or [])
     for path in filter(None, (output, report)):
         console.writable(path)
     placed = part_pose(pose) if pose is not None else None
@@ -105,15 +118,20 @@ def repair(
         with watch("template"):
             field = open_template(template, progress=bars)
         guess = placed.inverse() if placed is not None and frame == "build" else None
+        site = Site(field, setup, grid, placed if frame == "scanner" else None)
         plan = plan_repair(
             cloud,
-            Site(field, setup, grid, placed if frame == "scanner" else None),
+            site,
             title=f"repair of {scan.name}",
             guess=guess,
             rng=np.random.default_rng(seed),
             watch=watch,
             progress=bars,
         )
+        ranked: tuple[Turn, ...] = ()
+        if turns and plan.unreachable_mm3 > WORTH_TURNING_RATIO * plan.deficit.missing_mm3:
+            with watch("turns"):
+                ranked = turns_of(plan, site, turns, progress=bars)
     program = plan.checked.program if plan.checked is not None else None
     if program is not None:
         text = program.text
@@ -126,6 +144,8 @@ def repair(
         seconds=seconds,
         setup=setup,
     )
+    if turns:
+        result["turns"] = [asdict(one) for one in ranked]
     within = plan_is_enough(plan)
     if report is not None:
         data = report_of_plan(
@@ -144,8 +164,25 @@ def repair(
             console.out.print(line)
         if program is not None:
             console.out.print(f"Repair: {output}")
+        for line in _suggestion(plan, ranked):
+            console.out.print(line)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:
+    """What a person reads of the turns that were tried."""
+    if not ranked:
+        return []
+    best = ranked[0]
+    now = 1.0 - plan.unreachable_mm3 / plan.deficit.missing_mm3
+    if best.reachable_ratio <= now + WORTH_TURNING_RATIO:
+        return [f"No allowed turn reaches clearly more than the {now:.0%} of now."]
+    how = "" if best.stands else "; it does not lie there by itself and needs a fixture"
+    return [
+        f"Turned by {best.name} the nozzle would reach {best.reachable_ratio:.0%} of what is "
+        f"missing ({now:.0%} as it stands){how}. Lay it so, scan it in the bed's frame, repair."
+    ]
 
 
 def _grid(job: Path | None, setup: PrintSetup) -> LayerGrid:

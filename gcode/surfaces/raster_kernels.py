@@ -167,6 +167,11 @@ def column_rest(
     n = offset.shape[0] - 1
     top = np.full(n, empty)
     for i in range(n):
+        if gone_offset[i] == gone_offset[i + 1]:
+            for j in range(offset[i], offset[i + 1]):
+                if z[j] > top[i] or j == offset[i]:
+                    top[i] = z[j]
+            continue
         stands = np.sort(z[offset[i] : offset[i + 1]])
         gone = np.sort(gone_z[gone_offset[i] : gone_offset[i + 1]])
         done = False

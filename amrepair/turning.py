@@ -1,0 +1,158 @@
+"""Other ways to lay a broken part on the bed, and how much of what is missing each lets through.
+
+What the nozzle cannot get to as the part stands is often open to it from another side. Nothing is
+turned here: the share is found by slicing the turned deficit onto what would stand there; the part
+is then laid so, scanned in the bed's frame and repaired like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+from shapely.geometry import MultiPoint, Point
+
+from amrepair.errors import InputError
+from amrepair.repair import RepairPlan, Site
+from gcode.profiles import PrintSetup
+from gcode.progress import Progress, silent
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import slice_patch
+from gcode.surfaces import HeightField
+
+# About the bed's axes, right-handed, degrees; a turn about Z changes what the head's duct meets.
+TURNS: dict[str, tuple[float, float, float]] = {
+    "x90": (90.0, 0.0, 0.0),
+    "x180": (180.0, 0.0, 0.0),
+    "x270": (270.0, 0.0, 0.0),
+    "y90": (0.0, 90.0, 0.0),
+    "y270": (0.0, 270.0, 0.0),
+    "z90": (0.0, 0.0, 90.0),
+    "z180": (0.0, 0.0, 180.0),
+    "z270": (0.0, 0.0, 270.0),
+}
+FIELD_CELL_MM = 0.2
+# Around the turned part: more than the head's block beside it.
+AROUND_MM = 30.0
+# The foot of what lies on the bed is looked at this far above it.
+FOOT_MM = 0.1
+# Nearer to the edge of its foot than this a nozzle's touch tips it over.
+TIPPING_MM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """A way to lay the part on the bed.
+
+    Attributes
+    ----------
+    name
+        A key of `TURNS`.
+    reachable_ratio
+        Share of what is missing that beads would fill; 0 where the part does not fit the printer.
+    stands
+        Whether it lies there by itself: its centre of mass is over its foot.
+    """
+
+    name: str
+    reachable_ratio: float
+    stands: bool
+
+
+def turns_named(words: Sequence[str]) -> tuple[str, ...]:
+    """Names of turns; `any` is all of them.
+
+    Raises
+    ------
+    InputError
+        If there is no such turn.
+    """
+    names: list[str] = []
+    for word in words:
+        if word != "any" and word not in TURNS:
+            raise InputError(f"--turn is {word!r}; it is one of any, {', '.join(TURNS)}")
+        names += list(TURNS) if word == "any" else [word]
+    return tuple(dict.fromkeys(names))
+
+
+def turns_of(
+    plan: RepairPlan, site: Site, names: Sequence[str], *, progress: Progress = silent
+) -> tuple[Turn, ...]:
+    """`rank_turns` of what a plan says is missing."""
+    if plan.deficit.missing.is_empty():
+        return ()
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    expected: manifold3d.Manifold = site.template.solid()
+    standing = expected.transform(placed.matrix[:3]) - plan.deficit.missing + plan.deficit.excess
+    return rank_turns(
+        plan.deficit.missing, standing, names, setup=site.setup, grid=site.grid, progress=progress
+    )
+
+
+def rank_turns(
+    missing: manifold3d.Manifold,
+    standing: manifold3d.Manifold,
+    names: Sequence[str],
+    *,
+    setup: PrintSetup,
+    grid: LayerGrid,
+    progress: Progress = silent,
+) -> tuple[Turn, ...]:
+    """What each turn would let the nozzle reach, best first; ties as named.
+
+    Parameters
+    ----------
+    missing, standing
+        Solids, build frame, mm.
+    names
+        Keys of `TURNS` that the user allows.
+    """
+    found = []
+    for k, name in enumerate(names):
+        found.append(_tried(name, missing, standing, setup, grid))
+        progress("try turns", float(k + 1), float(len(names)))
+    return tuple(sorted(found, key=lambda turn: -round(turn.reachable_ratio, 3)))
+
+
+def _tried(
+    name: str,
+    missing: manifold3d.Manifold,
+    standing: manifold3d.Manifold,
+    setup: PrintSetup,
+    grid: LayerGrid,
+) -> Turn:
+    """Slice the turned deficit onto the turned rest, in the middle of the bed."""
+    turn = TURNS[name]
+    printer = setup.printer
+    rest = standing.rotate(turn)
+    low, high = np.array(rest.bounding_box()).reshape(2, 3)
+    bed = np.array(printer.bed_size_mm)
+    size = high - low
+    if (size[:2] > bed).any() or size[2] > printer.max_z_mm:
+        return Turn(name, 0.0, stands=False)
+    move = (*(0.5 * bed - 0.5 * (low + high)[:2]), -low[2])
+    rest, wanted = rest.translate(move), missing.rotate(turn).translate(move)
+    patch = slice_patch(
+        wanted,
+        setup,
+        as_built=HeightField.from_manifold(rest, FIELD_CELL_MM, margin_mm=AROUND_MM),
+        grid=grid,
+        standalone=True,
+    )
+    return Turn(name, float(patch.reachable_mm3 / wanted.volume()), _stands(rest))
+
+
+def _stands(solid: manifold3d.Manifold) -> bool:
+    """Whether the centre of mass lies over the hull of the foot."""
+    foot = solid.slice(FOOT_MM)
+    if foot.is_empty():
+        return False
+    hull = MultiPoint(np.concatenate([np.asarray(c) for c in foot.to_polygons()])).convex_hull
+    mesh = solid.to_mesh64()
+    corners = np.asarray(mesh.vert_properties)[:, :3][np.asarray(mesh.tri_verts, dtype=np.int64)]
+    # signed tetrahedra from the origin
+    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    centre = (volume[:, None] * corners.sum(axis=1)).sum(axis=0) / (4.0 * volume.sum())
+    return bool(hull.buffer(-TIPPING_MM).contains(Point(float(centre[0]), float(centre[1]))))
