@@ -23,6 +23,7 @@ from gcode.hosts.port import Capabilities, LinkLostError, Temperatures
 from gcode.hosts.wirelog import WireLog
 from gcode.protocol import Link, LinkDialect, LinkTiming, checksum
 from gcode.protocol import events as ev
+from gcode.protocol.events import Acknowledged
 
 Answer = TypeVar("Answer")
 QUERY_TRIES = 3
@@ -31,8 +32,8 @@ QUERY_TRIES = 3
 class SerialConversation:
     """A printer that can be asked things; see `SerialPrinter` for the parameters.
 
-    Those who build on it are told of acknowledgements and of what else is said, by the methods
-    that begin with `_on`, `_before`, `_fault` and `_lost_error`.
+    Those who build on it are told of what it has no use for itself, by the methods that begin
+    with `_on`, `_before`, `_fault` and `_lost_error`.
     """
 
     def __init__(
@@ -71,9 +72,6 @@ class SerialConversation:
 
     def _before_own_command(self) -> None:
         """Take note that the next line on the wire is none of a program's."""
-
-    def _on_acknowledged(self, number: int) -> None:
-        """Take note that line `number` is acknowledged."""
 
     def _on_other_event(self, event: ev.Event) -> None:
         """Take note of an event that the conversation itself has no use for."""
@@ -263,10 +261,6 @@ class SerialConversation:
     # ------------------------------------------------------------------ the wire
 
     def _write(self, data: bytes) -> None:
-        self._write_raw(data)
-        self._bytes_sent += len(data)
-
-    def _write_raw(self, data: bytes) -> None:
         if self._log is not None:
             self._log.add(self._clock(), b">", data)
         try:
@@ -274,6 +268,7 @@ class SerialConversation:
             while written < len(data):
                 select.select([], [self._fd], [], 1.0)
                 written += os.write(self._fd, data[written:])
+            self._bytes_sent += written
         except OSError as error:
             self._lost(f"the port failed ({error})")
 
@@ -303,9 +298,7 @@ class SerialConversation:
         if output := link.take_output():
             self._write(output)
         for event in events:
-            if type(event) is ev.Acknowledged:
-                self._on_acknowledged(event.number)
-            else:
+            if type(event) is not Acknowledged:
                 self._on_event(event)
         if self._failure is not None:
             failure, self._failure = self._failure, None
@@ -318,9 +311,7 @@ class SerialConversation:
         raise self._lost_error(why)
 
     def _on_event(self, event: ev.Event) -> None:
-        if isinstance(event, ev.Acknowledged):
-            self._on_acknowledged(event.number)
-        elif isinstance(event, ev.TemperatureReport):
+        if isinstance(event, ev.TemperatureReport):
             self._temperatures = event
         elif isinstance(event, ev.PositionReport):
             self._position = event
