@@ -28,7 +28,7 @@ from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts.journal import Journal
 from gcode.protocol import Link, LinkTiming
 
-TURN_LINES = host.PROGRESS_EVERY_LINES
+TURN_LINES = host.BATCH_LINES
 _RESPONDER = """
 import os, re, sys
 fd = int(sys.argv[1])

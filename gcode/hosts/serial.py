@@ -6,6 +6,7 @@ may be sent and what an answer means is `protocol.Link`'s.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -18,7 +19,7 @@ from gcode.hosts.conversation import SerialConversation
 from gcode.hosts.jobbook import TEMPERATURE_EVERY_S, JobBook
 from gcode.hosts.journal import Journal
 from gcode.hosts.lock import PortLock
-from gcode.hosts.modes import commands_of, modes_after
+from gcode.hosts.modes import batches_of, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport
 from gcode.hosts.proof import require_checked
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
@@ -30,8 +31,8 @@ from gcode.protocol import LinkTiming
 from gcode.protocol import events as ev
 
 PAUSE_LIFT_MM = 5.0
-PROGRESS_EVERY_LINES = 500
-_END = (-1, "")
+BATCH_LINES = 500
+"""Lines made ready, and counted, at a time."""
 
 
 class SerialPrinter(SerialConversation):
@@ -91,7 +92,7 @@ class SerialPrinter(SerialConversation):
         self._attention = threading.Event()  # set with either of the two others
         self._abort_asked = threading.Event()
         self._printing = False
-        self._asked_s = float("-inf")
+        self._ask_s = -math.inf if journal is not None else math.inf  # temperatures, when next
         self.actions: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> SerialPrinter:
@@ -228,6 +229,10 @@ class SerialPrinter(SerialConversation):
             first_line=first,
         )
 
+    def _note_temperatures(self, now_s: float) -> None:
+        self._ask_s = now_s + TEMPERATURE_EVERY_S
+        self._ask("M105")
+
     def _carry_out(
         self, checked: PrintableProgram, first: int, end: int, progress: Progress
     ) -> bool:
@@ -240,37 +245,48 @@ class SerialPrinter(SerialConversation):
 
     def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
         """Send the lines; False if the job was aborted."""
-        link, clock, book, asked = self._link, self._clock, self._book, self._asked
-        commands = commands_of(checked, first, end)
-        index, command = next(commands, _END)
-        heard_s, trip_s = clock(), 0.0
-        while index >= 0:
+        total = float(end - first)
+        for indices, commands in batches_of(checked, first, end, BATCH_LINES):
+            if indices:
+                progress("printing", float(indices[0] - first), total)
+                if not self._send_batch(checked, indices, commands):
+                    return False
+        while not self._link.idle:
+            self._pump()
+        progress("printing", total, total)
+        return True
+
+    def _send_batch(
+        self, checked: PrintableProgram, indices: list[int], commands: list[str]
+    ) -> bool:
+        """Send some lines, each when there is room for it; False if the job was aborted."""
+        link, clock, before_line, asked = (
+            self._link,
+            self._clock,
+            self._book.before_line,
+            self._asked,
+        )
+        trips_s: list[float] = []
+        heard_s = clock()
+        if heard_s >= self._ask_s:
+            self._note_temperatures(heard_s)  # now, for lines made ready lose their numbers by it
+        for index, line, command in zip(indices, link.prepare(commands), commands, strict=True):
             if self._attention.is_set() and not self._attend(checked, index):
                 return False
-            if heard_s >= self._asked_s + TEMPERATURE_EVERY_S and self._journal is not None:
-                self._asked_s = heard_s
-                self._ask("M105")
-            book.before_line(index)
+            if heard_s >= self._ask_s:
+                self._note_temperatures(heard_s)
+            before_line(index)
             sent_s = clock()
-            self._write(link.send(command, sent_s))
-            # The printer is at work now: all that can be done meanwhile costs no time.
+            self._write(link.send(line, sent_s))
             if command[:4] in asked:
                 asked[command[:4]] += 1
-            if trip_s:
-                self._round_trips.add(trip_s)
-            if index % PROGRESS_EVERY_LINES == 0:
-                progress("printing", float(index - first), float(end - first))
-            index, command = next(commands, _END)
-            link.prepare(command)
-            while not link.ready:
-                self._pump()
+            if not link.ready:
+                self._pump_ok()
+                while not link.ready:
+                    self._pump()
             heard_s = clock()
-            trip_s = heard_s - sent_s
-        while not link.idle:
-            self._pump()
-        if trip_s:
-            self._round_trips.add(trip_s)
-        progress("printing", float(end - first), float(end - first))
+            trips_s.append(heard_s - sent_s)
+        self._round_trips.add(trips_s)
         return True
 
     # ------------------------------------------------------------------ pause, abort, stop

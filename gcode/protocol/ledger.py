@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections import deque
 
+from gcode.protocol.lines import WireLine
+
 HISTORY_LINES = 512
 """Lines kept for a resend; OctoPrint keeps 50, a window and false acknowledgements want more."""
 
@@ -45,10 +47,10 @@ class Ledger:
         """Whether a line that may take minutes is not acknowledged yet."""
         return self._last_slow > self.acked
 
-    def add(self, data: bytes, *, slow: bool) -> None:
+    def add(self, line: WireLine) -> None:
         """Note the next line, which goes on the wire for the first time."""
+        number, _, data, slow = line
         self._lines.append(data)
-        number = self.cursor
         self.last = number
         self.cursor = number + 1
         self.wire_bytes += len(data)

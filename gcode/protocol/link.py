@@ -18,7 +18,7 @@ What it does not do: judge G-code, know what a job is, retry by reopening, or sl
 
 from __future__ import annotations
 
-import contextlib
+from collections.abc import Sequence
 
 from gcode.errors import LocalProtocolError
 from gcode.protocol.belief import Belief, Verdict
@@ -45,7 +45,7 @@ from gcode.protocol.events import (
 )
 from gcode.protocol.inbox import Inbox
 from gcode.protocol.ledger import Ledger
-from gcode.protocol.lines import numbered, wire_line
+from gcode.protocol.lines import WireLine, numbered, wire_line, wire_lines
 from gcode.protocol.replies import parse_reply
 from gcode.protocol.timing import LinkTiming
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
@@ -84,7 +84,6 @@ class Link:
         self.probes = 0
         self.spare_oks = 0
         self._inbox = Inbox()
-        self._prepared = (-1, "", b"", False)  # number, command, bytes, slow
         self._out = bytearray()
         self._events: list[Event] = []
         self._hello_at_s = 0.0
@@ -157,17 +156,15 @@ class Link:
         number = self._ledger.last
         return b"\n" + numbered(number, b"M110 N%d" % number)
 
-    def prepare(self, command: str) -> None:
-        """Do now what `send` will need if `command` comes next: while the printer is busy.
+    def prepare(self, commands: Sequence[str]) -> list[str | WireLine]:
+        """Make what `send` takes out of the commands that come next, all at once.
 
-        It promises nothing: where another line comes first, `send` does it again; what the
-        dialect cannot carry is refused by `send`.
+        It promises nothing: where another line comes between, `send` numbers anew; what the
+        dialect cannot carry is refused when its turn comes.
         """
-        with contextlib.suppress(LocalProtocolError):
-            number = self._ledger.last + 1
-            self._prepared = (number, command, *wire_line(number, command, self.dialect))
+        return wire_lines(self._ledger.last + 1, commands, self.dialect)
 
-    def send(self, command: str, now_s: float) -> bytes:
+    def send(self, command: str | WireLine, now_s: float) -> bytes:
         """Give the next line its number and return the bytes to write.
 
         Raises
@@ -176,18 +173,22 @@ class Link:
             If the link is not `ready`, or the command cannot be carried by this dialect.
         """
         ledger = self._ledger
-        if not self.ready:
+        if self.state is not _IDLE and not self.ready:
             raise LocalProtocolError(
                 f"The link is {self.state.value} with {ledger.last - ledger.acked} lines under way "
                 f"of {self.window}; wait until it is ready."
             )
-        number, prepared, data, slow = self._prepared
-        if prepared != command or number != ledger.last + 1:
-            data, slow = wire_line(ledger.last + 1, command, self.dialect)
-        ledger.add(data, slow=slow)
-        self._go(_SENT)
+        number = ledger.last + 1
+        if isinstance(command, str):
+            line = wire_line(number, command, self.dialect)
+        elif command[0] == number:
+            line = command
+        else:
+            line = wire_line(number, command.command, self.dialect)
+        ledger.add(line)
+        self.state = TRANSITIONS[self.state][_SENT]
         self._listen_anew(now_s)
-        return data
+        return line[2]
 
     def take_output(self) -> bytes:
         """Return bytes that the link itself wants written (resends, probes), once."""
@@ -212,17 +213,33 @@ class Link:
         if self.idle:
             self._belief.confirm(self._ledger.last)
 
-    def receive(self, data: bytes, now_s: float) -> list[Event]:
-        """Take bytes from the printer and return what they mean; any bytes at all are fine."""
+    def receive_ok(self, data: bytes) -> bool:
+        """Take the answer that nearly every line gets: the beaten path of `receive`.
+
+        True where `data` is an `ok`, one line was under way and nothing is in doubt: the line is
+        acknowledged. False where it is anything else: nothing is taken, `receive` is to have it.
+        """
+        ledger = self._ledger
         if (
             data == b"ok\n"
             and self.state is _WAITING
+            and ledger.last - ledger.acked == 1
             and self._swallow_until_s < 0
             and self._inbox.empty
-        ):  # the beaten path
-            self._acknowledge(self._ledger.acked + 1, now_s)
-            events, self._events = self._events, []
-            return events
+        ):
+            ledger.acked = ledger.last
+            ledger.wire_bytes = 0
+            self._belief.progress()
+            self._probing_since_s = None
+            self.state = TRANSITIONS[_WAITING][_DRAINED]
+            self._deadline_s = NEVER_S
+            return True
+        return False
+
+    def receive(self, data: bytes, now_s: float) -> list[Event]:
+        """Take bytes from the printer and return what they mean; any bytes at all are fine."""
+        if self.receive_ok(data):
+            return [Acknowledged(self._ledger.acked)]
         for raw, readable in self._inbox.take(data):
             if readable:
                 self._reply(raw, now_s)
