@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
-from amrepair.cli.files import open_template
 from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.options import (
     JsonOption,
@@ -21,21 +19,12 @@ from amrepair.cli.options import (
     sensors,
 )
 from amrepair.errors import InputError
-from amrepair.repair import Site, Stopwatch, plan_repair
-from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
-from amrepair.report.collect import plan_result
-from amrepair.scans import read_scan
 from gcode.cli import console
-from gcode.moves import Program
-from gcode.profiles import (
-    DEFAULT_MATERIAL,
-    DEFAULT_PRINTER,
-    DEFAULT_PROCESS,
-    PrintSetup,
-    load_setup,
-)
-from gcode.reader import read_job
-from gcode.slicing.layers import LayerGrid
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+
+if TYPE_CHECKING:
+    from gcode.profiles import PrintSetup
+    from gcode.slicing.layers import LayerGrid
 
 # A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
@@ -86,6 +75,15 @@ def repair(
     as_json: JsonOption = False,
 ) -> None:
     """Make the G-code that prints only what is missing on a finished part."""
+    import numpy as np
+
+    from amrepair.repair import Site, Stopwatch, plan_repair
+    from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
+    from amrepair.report.collect import plan_result
+    from amrepair.scans import read_scan
+    from amrepair.template import open_template
+    from gcode.profiles import load_setup
+
     if scan_frame not in FRAMES:
         raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
     if scan_frame == "unknown" and pose is None:
@@ -150,6 +148,10 @@ def repair(
 
 def _grid(job: Path | None, setup: PrintSetup) -> LayerGrid:
     """Layers of the job, or of the process profile."""
+    from gcode.moves import Program
+    from gcode.reader import read_job
+    from gcode.slicing.layers import LayerGrid
+
     if job is None:
         return LayerGrid.from_setup(setup)
     try:
