@@ -98,7 +98,7 @@ def loop(
     from amrepair.template import open_template
     from gcode.check import check
     from gcode.hosts import connect
-    from gcode.hosts.journal import default_path, is_device
+    from gcode.hosts.journal import default_path
     from gcode.profiles import load_setup
 
     if approve not in APPROVALS:
@@ -120,7 +120,7 @@ def loop(
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=folder.file("wire.log"),
-        journal=default_path(port) if is_device(port) else None,
+        journal=default_path(port),
     )
     ask = approve == "ask"
     with live_view(

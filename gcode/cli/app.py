@@ -278,7 +278,7 @@ def send(
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
     from gcode.check import check as check_program
     from gcode.hosts import connect
-    from gcode.hosts.journal import default_path, is_device
+    from gcode.hosts.journal import default_path
     from gcode.hosts.resume import resume as resume_job
     from gcode.hosts.serial import SerialPrinter
     from gcode.moves import Program
@@ -294,7 +294,7 @@ def send(
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=wire_log,
-        journal=journal or (default_path(port) if is_device(port) else None),
+        journal=journal or default_path(port),
     )
     if resume and not isinstance(machine, SerialPrinter):
         raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")
