@@ -19,8 +19,6 @@ HEAVY = frozenset(
 )
 PROGRAM = "G28\nG90\nM83\nM104 S200\nM109 S200\nG1 X10 Y10 Z0.2 F3000\nG1 X20 E0.5\nM104 S0\n"
 SHOW = "import atexit, sys; atexit.register(lambda: print('', *sys.modules, file=sys.stderr))"
-    "import atexit, sys; atexit.register(lambda: sys.stderr.write('\\n' + ' '.join(sys.modules)))"
-)
 
 
 def loaded_by(words: str, folder: Path) -> set[str]:
