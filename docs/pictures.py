@@ -115,6 +115,14 @@ def _store(image: Image.Image, path: Path) -> None:
     image.resize(SIZE_PX, Image.Resampling.LANCZOS).save(path, quality=80, method=6)
 
 
+def _lit(scan: amrepair.Scan) -> np.ndarray:
+    """Grey by the light that falls on a scan's points."""
+    if scan.normals is None:
+        return np.tile(np.array(GREY), (len(scan.points_mm), 1))
+    light = 0.7 + 0.4 * np.clip(scan.normals @ LIGHT, -1.0, 1.0)
+    return np.clip(light[:, None] * np.array(GREY), 0, 255).astype(int)
+
+
 def _beads(path: Path) -> Any:
     return gcode.read_job(gcode.Program(path.read_text(encoding="utf-8"), "prusa")).beads
 
@@ -122,9 +130,10 @@ def _beads(path: Path) -> Any:
 def offline_repair(out: Path, image: Path) -> None:
     """The scan, and the beads in the place of what is missing."""
     painter = Painter(215.0)
-    painter.points(amrepair.read_scan(out / "scan.ply", frame="build").points_mm, GREY)
+    scan = amrepair.read_scan(out / "scan.ply", frame="build")
+    painter.points(scan.points_mm, _lit(scan))
     beads = _beads(out / "repair.gcode")
-    lowest = float(amrepair.read_scan(out / "scan.ply", frame="build").points_mm[:, 2].max()) - 6.0
+    lowest = float(scan.points_mm[:, 2].max()) - 6.0
     painter.beads(beads, beads.start_mm[:, 2] > lowest, GREEN)
     painter.save(image)
 
@@ -146,12 +155,13 @@ def template_from_scans(out: Path, image: Path) -> None:
 def run_in_simulation(out: Path, image: Path) -> None:
     """A look: the scan by its deviation is grey, the deficit blue, the repair's beads green."""
     painter = Painter(28.0, 48.0)
-    scan = amrepair.read_scan(out / "scan-1.ply", frame="build").points_mm
+    looked = amrepair.read_scan(out / "scan-1.ply", frame="build")
+    scan = looked.points_mm
     deficits = sorted(out.glob("deficit-1*.stl"))
     solid = trimesh.load_mesh(deficits[0])
     low, high = solid.bounds
     near = ((scan > low - 12.0) & (scan < high + 12.0)).all(axis=1)
-    painter.points(scan[near], GREY)
+    painter.points(scan[near], _lit(looked)[near])
     painter.mesh(solid, BLUE)
     beads = _beads(out / "repair-1.gcode")
     inside = ((beads.start_mm > low - 0.6) & (beads.start_mm < high + 0.6)).all(axis=1)
@@ -209,7 +219,7 @@ def benchmark(out: Path, image: Path) -> None:
 
 
 def _around(lines: Sequence[str], wanted: re.Pattern[str], count: int) -> list[str]:
-    index = next((i for i, line in enumerate(lines) if wanted.search(line)), 0)
+    index = max((i for i, line in enumerate(lines) if wanted.search(line)), default=0)
     first = max(0, index - count // 2)
     return list(lines[first : first + count])
 
