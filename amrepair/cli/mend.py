@@ -36,7 +36,7 @@ def add_to(app: typer.Typer) -> None:
         "repair",
         epilog=console.examples(
             "amrepair repair scan.ply --template part.safetensors -o repair.gcode "
-            "--report report.html",
+            "--standing standing.npz --report report.html",
             "amrepair repair scan.ply --template part.stl -o repair.gcode "
             "--scan-frame unknown --part-pose 100,80,0,90",
             "amrepair repair scan.ply --template part.stl -o repair.gcode --printer ender_3 "
@@ -70,6 +70,13 @@ def repair(
     job: Annotated[
         Path | None, typer.Option(help="The job's G-code: repair layers lie on its layers.")
     ] = None,
+    standing: Annotated[
+        Path | None,
+        typer.Option(
+            help="Height map (.npz) to write: what stands there, for --as-built of gcode check "
+            "and gcode send."
+        ),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
@@ -91,7 +98,9 @@ def repair(
             "--scan-frame unknown needs --part-pose X,Y,Z,RZ: an aligned shape does not say where "
             "the part stands on the bed"
         )
-    for path in filter(None, (output, report)):
+    if standing is not None and standing.suffix != ".npz":
+        raise InputError(f"{standing}: what stands there is written as .npz; rename it")
+    for path in filter(None, (output, report, standing)):
         console.writable(path)
     placed = part_pose(pose) if pose is not None else None
     setup = load_setup(printer, material, process)
@@ -116,6 +125,8 @@ def repair(
     if program is not None:
         text = program.text
         console.write_whole(output, lambda path: path.write_text(text, encoding="utf-8"))
+    if standing is not None:
+        console.write_whole(standing, plan.deficit.as_built.write)
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     result = plan_result(
         plan,
