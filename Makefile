@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := $(VENV)/.extras
 
-.PHONY: demo test lint suite slow docs peers clean help
+.PHONY: demo test lint suite slow chromium docs pictures peers clean help
 
 help: ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -36,12 +36,19 @@ suite: $(EXTRAS)
 slow: $(EXTRAS) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
 
+chromium: $(EXTRAS) ## report and live view as a person sees and drives them
+	$(BIN)/python -c "import sys; from tests.integration.browser import why_not; sys.exit(why_not())"
+	$(BIN)/python -m pytest -m slow tests/integration/test_report_in_browser.py tests/integration/test_live_view_in_browser.py
+
 peers: $(EXTRAS) ## print through and beside OctoPrint, Moonraker and Printrun, each in its own environment
 	$(BIN)/python tests/peers/environments.py
 	$(BIN)/python -m pytest -m peers tests/peers
 
 docs: $(EXTRAS) ## the documentation, into out/site; nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+pictures: $(EXTRAS) ## run the examples and draw the documentation's pictures of them anew
+	$(BIN)/python docs/pictures.py
 
 clean: ## remove the environment and what runs left behind
 	rm -rf $(VENV) .peers out runs build dist

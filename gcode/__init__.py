@@ -20,6 +20,7 @@ The names below are loaded when first used, so that importing this package costs
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 from gcode.lazy import lazy_names
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
     from gcode.writer import write as write_program
 
 __version__ = "0.1.0"
+
+# numba says so once where the system's TBB is old, and takes another way: nothing for a user to do.
+warnings.filterwarnings("ignore", message=".*The TBB threading layer")
 
 __all__ = [
     "CheckedProgram",

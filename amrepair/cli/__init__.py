@@ -14,11 +14,12 @@ def main() -> None:
     """Entry point; where a library is missing, it says which and how to mend it."""
     try:
         from amrepair.cli.app import main as run
+
+        run()
     except ImportError as error:
         sys.stderr.write(f"amrepair: a library that it needs cannot be loaded: {error}\n")
         _say_what_is_wrong()
         sys.exit(2)
-    run()
 
 
 def _say_what_is_wrong() -> None:

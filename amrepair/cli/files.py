@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from amrepair.errors import InputError
-from amrepair.template import open_template
-from amrepair.template.mesh_file import SUFFIXES
 from gcode.cli.console import write_whole
-
-__all__ = ["is_cloud", "open_template", "sort_inputs", "write_mesh"]
 
 
 def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     """Meshes and scans among a template's inputs; a PLY without faces is a scan."""
+    from amrepair.template.mesh_file import SUFFIXES
+
     meshes: list[Path] = []
     scans: list[Path] = []
     for path in paths:
@@ -41,6 +39,8 @@ def write_mesh(mesh: Any, path: Path) -> None:
     InputError
         If the ending is none of a mesh.
     """
+    from amrepair.template.mesh_file import SUFFIXES
+
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a mesh is written as one of {', '.join(SUFFIXES)}")
     write_whole(path, mesh.export)

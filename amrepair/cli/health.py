@@ -8,7 +8,6 @@ from typing import Any
 
 import typer
 
-import amrepair
 from amrepair.cli.options import JsonOption
 from amrepair.doctor import Finding, State, examine
 from gcode.cli import console
@@ -52,6 +51,8 @@ def _say(finding: Finding) -> None:
 
 
 def _result(findings: tuple[Finding, ...], healthy: bool) -> dict[str, Any]:
+    import amrepair
+
     return {
         "ok": healthy,
         "checks": [

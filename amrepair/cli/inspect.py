@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
-from amrepair.cli.files import open_template
 from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors, with_settings
 from amrepair.errors import InputError
-from amrepair.library import Recognition
-from amrepair.repair import Stopwatch
-from amrepair.report.collect import rounded
-from amrepair.report.folder import RunFolder
-from amrepair.scans import Scan, read_scan, write_ply
 from gcode.cli import console
 
-_COLOURS = np.array([[180, 180, 180], [0, 90, 200], [220, 120, 0]])  # ok, missing, excess
+if TYPE_CHECKING:
+    from amrepair.library import Recognition
+    from amrepair.repair import Stopwatch
+    from amrepair.scans import Scan
+
+_COLOURS = ((180, 180, 180), (0, 90, 200), (220, 120, 0))  # ok, missing, excess
 
 TemplateOption = Annotated[
     Path,
@@ -67,8 +65,13 @@ def align(
     as_json: JsonOption = False,
 ) -> None:
     """Find where a scan lies in its template."""
+    import numpy as np
+
     from amrepair.align import align as align_scan
     from amrepair.align.pam import VARIANTS
+    from amrepair.repair import Stopwatch
+    from amrepair.scans import read_scan, write_ply
+    from amrepair.template import open_template
 
     if pam and method != "paper":
         raise InputError(f"--pam belongs to --method paper, the method is {method}")
@@ -121,6 +124,7 @@ def from_library(
 ) -> Recognition:
     """The part of a folder that a scan shows, aligned."""
     from amrepair.library import recognise, template_files
+    from amrepair.template import open_template
 
     parts = [(path.stem, partial(open_template, path)) for path in template_files(folder)]
     with watch("align"):
@@ -145,8 +149,15 @@ def detect(
     as_json: JsonOption = False,
 ) -> None:
     """Align a scan and say what is missing and what is too much."""
+    import numpy as np
+
     from amrepair.align import align as align_scan
     from amrepair.detect import detect as detect_defects
+    from amrepair.repair import Stopwatch
+    from amrepair.report.collect import rounded
+    from amrepair.report.folder import RunFolder
+    from amrepair.scans import read_scan, write_ply
+    from amrepair.template import open_template
 
     watch, bars = Stopwatch(), console.Bars()
     cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
@@ -179,7 +190,7 @@ def detect(
         lambda path: write_ply(
             cloud,
             path,
-            colours=_COLOURS[anomaly.label],
+            colours=np.array(_COLOURS)[anomaly.label],
             scalars={"deviation": anomaly.deviation_mm, "label": anomaly.label},
         ),
     )

@@ -11,23 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from amrepair.cli.files import is_cloud
 from amrepair.errors import InputError
-from amrepair.loop import Look
-from amrepair.repair import RepairPlan
 from amrepair.report.guarded import LOOPBACK
-from amrepair.report.operator import Operator
-from amrepair.scans import read_scan
-from amrepair.scans.files import SUFFIXES as SCAN_SUFFIXES
-from amrepair.template import load_template
-from amrepair.template.mesh_file import SUFFIXES as MESH_SUFFIXES
-from amrepair.template.mesh_file import load_mesh
 from gcode.cli import console
 from gcode.progress import Progress
-from gcode.reader import Job, read_job
+
+if TYPE_CHECKING:
+    from amrepair.loop import Look
+    from amrepair.repair import RepairPlan
+    from amrepair.report.operator import Operator
+    from gcode.reader import Job
 
 if TYPE_CHECKING:
     from amrepair.report.live import LiveView
@@ -94,7 +90,14 @@ def show_file(page: LiveView, path: Path) -> None:
     InputError
         If it is none that can be shown.
     """
+    import numpy as np
+
     from amrepair.report.live import PART
+    from amrepair.scans import read_scan
+    from amrepair.template import load_template
+    from amrepair.template.mesh_file import SUFFIXES as MESH_SUFFIXES
+    from amrepair.template.mesh_file import load_mesh
+    from gcode.reader import read_job
 
     _refuse(path)
     suffix = path.suffix.lower()
@@ -111,6 +114,9 @@ def show_file(page: LiveView, path: Path) -> None:
 
 
 def _refuse(path: Path) -> None:
+    from amrepair.scans.files import SUFFIXES as SCAN_SUFFIXES
+    from amrepair.template.mesh_file import SUFFIXES as MESH_SUFFIXES
+
     known = JOB_SUFFIXES | {".safetensors"} | set(MESH_SUFFIXES) | SCAN_SUFFIXES
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
@@ -193,6 +199,8 @@ def live_view(
     asked: bool, *, ask: bool, title: str, host: str, port: int, token: str | None
 ) -> Iterator[NoView | ShownRun]:
     """A page with buttons for a run, or nothing where nobody asked for one."""
+    from amrepair.report.operator import Operator
+
     if not asked:
         yield NoView()
         return

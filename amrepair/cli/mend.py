@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
-from amrepair.cli.files import open_template
 from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.options import (
     JsonOption,
@@ -22,22 +20,14 @@ from amrepair.cli.options import (
     sensors,
 )
 from amrepair.errors import InputError
-from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
-from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
-from amrepair.report.collect import plan_result
-from amrepair.scans import read_scan
-from amrepair.turning import Turn, turns_named, turns_of
 from gcode.cli import console
-from gcode.moves import Program
-from gcode.profiles import (
-    DEFAULT_MATERIAL,
-    DEFAULT_PRINTER,
-    DEFAULT_PROCESS,
-    PrintSetup,
-    load_setup,
-)
-from gcode.reader import read_job
-from gcode.slicing.layers import LayerGrid
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+
+if TYPE_CHECKING:
+    from amrepair.repair import RepairPlan
+    from amrepair.turning import Turn
+    from gcode.profiles import PrintSetup
+    from gcode.slicing.layers import LayerGrid
 
 # A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
@@ -51,7 +41,7 @@ def add_to(app: typer.Typer) -> None:
         "repair",
         epilog=console.examples(
             "amrepair repair scan.ply --template part.safetensors -o repair.gcode "
-            "--report report.html",
+            "--standing standing.npz --report report.html",
             "amrepair repair scan.ply --template part.stl -o repair.gcode "
             "--scan-frame unknown --part-pose 100,80,0,90",
             "amrepair repair scan.ply --template part.stl -o repair.gcode --printer ender_3 "
@@ -85,6 +75,13 @@ def repair(
     job: Annotated[
         Path | None, typer.Option(help="The job's G-code: repair layers lie on its layers.")
     ] = None,
+    standing: Annotated[
+        Path | None,
+        typer.Option(
+            help="Height map (.npz) to write: what stands there, for --as-built of gcode check "
+            "and gcode send."
+        ),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
     turn: Annotated[
         list[str] | None,
@@ -98,6 +95,16 @@ def repair(
     as_json: JsonOption = False,
 ) -> None:
     """Make the G-code that prints only what is missing on a finished part."""
+    import numpy as np
+
+    from amrepair.repair import Site, Stopwatch, plan_repair
+    from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
+    from amrepair.report.collect import plan_result
+    from amrepair.scans import read_scan
+    from amrepair.template import open_template
+    from amrepair.turning import turns_named, turns_of
+    from gcode.profiles import load_setup
+
     if scan_frame not in FRAMES:
         raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
     if scan_frame == "unknown" and pose is None:
@@ -106,7 +113,9 @@ def repair(
             "the part stands on the bed"
         )
     turns = turns_named(turn or [])
-    for path in filter(None, (output, report)):
+    if standing is not None and standing.suffix != ".npz":
+        raise InputError(f"{standing}: what stands there is written as .npz; rename it")
+    for path in filter(None, (output, report, standing)):
         console.writable(path)
     placed = part_pose(pose) if pose is not None else None
     setup = load_setup(printer, material, process)
@@ -136,6 +145,8 @@ def repair(
     if program is not None:
         text = program.text
         console.write_whole(output, lambda path: path.write_text(text, encoding="utf-8"))
+    if standing is not None:
+        console.write_whole(standing, plan.deficit.as_built.write)
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     result = plan_result(
         plan,
@@ -187,6 +198,10 @@ def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:
 
 def _grid(job: Path | None, setup: PrintSetup) -> LayerGrid:
     """Layers of the job, or of the process profile."""
+    from gcode.moves import Program
+    from gcode.reader import read_job
+    from gcode.slicing.layers import LayerGrid
+
     if job is None:
         return LayerGrid.from_setup(setup)
     try:

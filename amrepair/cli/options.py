@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import numpy as np
 import typer
 
 from amrepair.errors import InputError
-from amrepair.frames import Transform
-from amrepair.simulate.run import scale_to_fit
-from amrepair.template import load_mesh
 from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
-from gcode.profiles import PrintSetup
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from amrepair.frames import Transform
+    from gcode.profiles import PrintSetup
 
 __all__ = [
     "JsonOption",
@@ -45,6 +46,11 @@ def scaled_mesh(path: Path, scale: str, setup: PrintSetup) -> Any:
     InputError
         If the file is no solid, or the factor is none.
     """
+    import numpy as np
+
+    from amrepair.simulate.run import scale_to_fit
+    from amrepair.template import load_mesh
+
     mesh = load_mesh(path)
     if scale == "fit":
         factor = scale_to_fit(np.asarray(mesh.bounds, dtype=np.float64), setup)
@@ -68,6 +74,8 @@ def numbers(text: str, count: int, option: str) -> np.ndarray:
     InputError
         If they are not `count` finite numbers.
     """
+    import numpy as np
+
     try:
         values = np.array([float(word) for word in text.split(",")])
     except ValueError:
@@ -79,6 +87,10 @@ def numbers(text: str, count: int, option: str) -> np.ndarray:
 
 def part_pose(text: str) -> Transform:
     """`X,Y,Z,RZ`: where the part's origin stands on the bed, and its turn about Z, degrees."""
+    import numpy as np
+
+    from amrepair.frames import Transform
+
     x, y, z, turn_deg = numbers(text, 4, "--part-pose")
     c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
     return Transform.from_rotation_translation(
@@ -101,6 +113,8 @@ SensorOption = Annotated[
 
 def sensors(texts: list[str] | None) -> np.ndarray | None:
     """(k, 3) sensor positions of the option; None where it was not given."""
+    import numpy as np
+
     if not texts:
         return None
     return np.stack([numbers(text, 3, "--sensor-at") for text in texts])

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
-from amrepair.cli.files import open_template
 from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.live import (
     VIEW_PORT,
@@ -27,30 +25,18 @@ from amrepair.cli.options import (
     SeedOption,
 )
 from amrepair.errors import InputError
-from amrepair.frames import Transform
-from amrepair.loop import Stop, locate_part, plan_stops, run_loop
-from amrepair.repair import RepairPlan, Site, Stopwatch
-from amrepair.report import report_of_loop, summary_of_result, write_report
-from amrepair.report.collect import loop_result
-from amrepair.report.folder import RunFolder
 from amrepair.report.guarded import LOOPBACK
-from amrepair.scans import Scanner, WatchedFolderScanner
-from amrepair.template import PlannedSdf
-from amrepair.template.port import Template
-from gcode.check import check
 from gcode.cli import console
-from gcode.hosts import connect
-from gcode.hosts.journal import default_path, is_device
-from gcode.moves import Program
-from gcode.profiles import (
-    DEFAULT_MATERIAL,
-    DEFAULT_PRINTER,
-    DEFAULT_PROCESS,
-    PrintSetup,
-    load_setup,
-)
-from gcode.reader import Job, read_job
-from gcode.slicing.layers import LayerGrid
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+
+if TYPE_CHECKING:
+    from amrepair.frames import Transform
+    from amrepair.loop import Stop
+    from amrepair.repair import RepairPlan, Site
+    from amrepair.scans import Scanner
+    from amrepair.template.port import Template
+    from gcode.profiles import PrintSetup
+    from gcode.reader import Job
 
 APPROVALS = ("ask", "auto")
 
@@ -102,6 +88,19 @@ def loop(
     as_json: JsonOption = False,
 ) -> None:
     """Print a job; at chosen layers and at the end scan, repair what is missing, go on."""
+    import numpy as np
+
+    from amrepair.loop import locate_part, plan_stops, run_loop
+    from amrepair.repair import Stopwatch
+    from amrepair.report import report_of_loop, summary_of_result, write_report
+    from amrepair.report.collect import loop_result
+    from amrepair.report.folder import RunFolder
+    from amrepair.template import open_template
+    from gcode.check import check
+    from gcode.hosts import connect
+    from gcode.hosts.journal import default_path
+    from gcode.profiles import load_setup
+
     if approve not in APPROVALS:
         raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
     setup = load_setup(printer, material, process)
@@ -121,7 +120,7 @@ def loop(
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=folder.file("wire.log"),
-        journal=default_path(port) if is_device(port) else None,
+        journal=default_path(port),
     )
     ask = approve == "ask"
     with live_view(
@@ -175,6 +174,9 @@ def loop(
 
 
 def _job(path: Path, setup: PrintSetup) -> Job:
+    from gcode.moves import Program
+    from gcode.reader import read_job
+
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -187,6 +189,11 @@ def _job(path: Path, setup: PrintSetup) -> Job:
 
 
 def _scanner(spec: str, calibration: Path | None, timeout_s: float) -> Scanner:
+    import numpy as np
+
+    from amrepair.frames import Transform
+    from amrepair.scans import WatchedFolderScanner
+
     if not spec.startswith("watch:"):
         raise InputError(
             f"--scanner is {spec!r}; give watch:DIR (a simulated scanner belongs to "
@@ -216,6 +223,12 @@ def _placed_solid(template: Template, placed: Transform) -> Any:
 
 def _site(job: Job, stop: Stop, template: Template, placed: Transform, setup: PrintSetup) -> Site:
     """The finished part by its template; a layer by the beads that the job planned."""
+    import numpy as np
+
+    from amrepair.repair import Site
+    from amrepair.template import PlannedSdf
+    from gcode.slicing.layers import LayerGrid
+
     grid = LayerGrid.from_tops(
         [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
     )

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
-from rich.table import Table
 
 from amrepair.cli.live import (
     VIEW_PORT,
@@ -25,22 +23,14 @@ from amrepair.cli.options import (
     SeedOption,
     scaled_mesh,
 )
-from amrepair.repair import Stopwatch
-from amrepair.report import (
-    ReportData,
-    TemperatureSeries,
-    report_of_loop,
-    summary_of_result,
-    write_report,
-)
-from amrepair.report.collect import loop_result, rounded
-from amrepair.report.folder import RunFolder
 from amrepair.report.guarded import LOOPBACK
-from amrepair.simulate.defects import DefectKind, parse_defect
-from amrepair.simulate.part_files import bracket_path
-from amrepair.simulate.run import SimulatedRun, place_on_bed, prepare_run, simulate_run
 from gcode.cli import console
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, load_setup
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+
+if TYPE_CHECKING:
+    from amrepair.report import ReportData
+    from amrepair.report.folder import RunFolder
+    from amrepair.simulate.run import SimulatedRun
 
 DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
 
@@ -91,6 +81,16 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Print a part on an emulated printer, break it, find what is missing and print only that."""
+    import numpy as np
+
+    from amrepair.repair import Stopwatch
+    from amrepair.report import write_report
+    from amrepair.report.folder import RunFolder
+    from amrepair.simulate.defects import DefectKind, parse_defect
+    from amrepair.simulate.part_files import bracket_path
+    from amrepair.simulate.run import place_on_bed, prepare_run, simulate_run
+    from gcode.profiles import load_setup
+
     watch, bars = Stopwatch(), console.Bars()
     defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
     defects = [d for d in defects if d.kind is not DefectKind.NONE]
@@ -138,6 +138,8 @@ def simulate(
 def _result(
     run: SimulatedRun, folder: RunFolder, seed: int, seconds: dict[str, float]
 ) -> dict[str, Any]:
+    from amrepair.report.collect import loop_result, rounded
+
     printed = [look for look in run.report.looks if look.printed]
     last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
     result = loop_result(
@@ -176,6 +178,8 @@ def _result(
 
 
 def _report_data(run: SimulatedRun, path: Path, result: dict[str, Any]) -> ReportData:
+    from amrepair.report import TemperatureSeries, report_of_loop
+
     prepared = run.prepared
     clock, hotend, bed = run.temperatures.T
     return report_of_loop(
@@ -196,6 +200,10 @@ def _report_data(run: SimulatedRun, path: Path, result: dict[str, Any]) -> Repor
 
 
 def _say(run: SimulatedRun, result: dict[str, Any], folder: RunFolder, within: bool) -> None:
+    from rich.table import Table
+
+    from amrepair.report import summary_of_result
+
     table = Table(title=None, show_edge=False, pad_edge=False)
     for name in ("defect", "stop", "missing mm³", "filled mm³", "ratio"):
         table.add_column(name, justify="left" if name in {"defect", "stop"} else "right")

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from amrepair.cli.files import open_template, sort_inputs, write_mesh
+from amrepair.cli.files import sort_inputs, write_mesh
 from amrepair.cli.options import SeedOption, with_settings
 from amrepair.errors import InputError
-from amrepair.template import LearnedSdf, NetworkSdf
 from gcode.cli import console
+
+if TYPE_CHECKING:
+    from amrepair.template import LearnedSdf, NetworkSdf
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
 
@@ -104,7 +106,7 @@ def mesh(
     ] = None,
 ) -> None:
     """Extract the template's surface as a closed mesh."""
-    from amrepair.template import extract_mesh
+    from amrepair.template import extract_mesh, open_template
 
     console.writable(output)
     bars = console.Bars()

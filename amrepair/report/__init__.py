@@ -1,22 +1,29 @@
 """Report: what people see of a run. It reads results and never changes them."""
 
-from amrepair.report.assemble import plan_is_enough, report_of_loop, report_of_plan
-from amrepair.report.data import (
-    BeadPath,
-    Counter,
-    Decision,
-    Figures,
-    HeightMap,
-    Look,
-    Outcome,
-    RegionRow,
-    ReportData,
-    SolidMesh,
-    TemperatureSeries,
-    regions_from_result,
-)
-from amrepair.report.document import render_report, write_report
-from amrepair.report.text import outcome_of, summary, summary_of, summary_of_result
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gcode.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from amrepair.report.assemble import plan_is_enough, report_of_loop, report_of_plan
+    from amrepair.report.data import (
+        BeadPath,
+        Counter,
+        Decision,
+        Figures,
+        HeightMap,
+        Look,
+        Outcome,
+        RegionRow,
+        ReportData,
+        SolidMesh,
+        TemperatureSeries,
+        regions_from_result,
+    )
+    from amrepair.report.document import render_report, write_report
+    from amrepair.report.text import outcome_of, summary, summary_of, summary_of_result
 
 __all__ = [
     "BeadPath",
@@ -41,3 +48,29 @@ __all__ = [
     "summary_of_result",
     "write_report",
 ]
+
+_HOMES = {
+    "BeadPath": ("amrepair.report.data", "BeadPath"),
+    "Counter": ("amrepair.report.data", "Counter"),
+    "Decision": ("amrepair.report.data", "Decision"),
+    "Figures": ("amrepair.report.data", "Figures"),
+    "HeightMap": ("amrepair.report.data", "HeightMap"),
+    "Look": ("amrepair.report.data", "Look"),
+    "Outcome": ("amrepair.report.data", "Outcome"),
+    "RegionRow": ("amrepair.report.data", "RegionRow"),
+    "ReportData": ("amrepair.report.data", "ReportData"),
+    "SolidMesh": ("amrepair.report.data", "SolidMesh"),
+    "TemperatureSeries": ("amrepair.report.data", "TemperatureSeries"),
+    "outcome_of": ("amrepair.report.text", "outcome_of"),
+    "plan_is_enough": ("amrepair.report.assemble", "plan_is_enough"),
+    "regions_from_result": ("amrepair.report.data", "regions_from_result"),
+    "render_report": ("amrepair.report.document", "render_report"),
+    "report_of_loop": ("amrepair.report.assemble", "report_of_loop"),
+    "report_of_plan": ("amrepair.report.assemble", "report_of_plan"),
+    "summary": ("amrepair.report.text", "summary"),
+    "summary_of": ("amrepair.report.text", "summary_of"),
+    "summary_of_result": ("amrepair.report.text", "summary_of_result"),
+    "write_report": ("amrepair.report.document", "write_report"),
+}
+
+__getattr__, __dir__ = lazy_names(globals(), _HOMES)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-import gcode
-from gcode.check import check as check_program
-from gcode.check import find_refusals
 from gcode.cli import console, importing
 from gcode.cli.options import (
     JsonOption,
@@ -21,31 +18,12 @@ from gcode.cli.options import (
 )
 from gcode.cli.resuming import resume_at_command
 from gcode.errors import GcodeError, InputError
-from gcode.estimate import estimate as estimate_program
-from gcode.firmware import serve_forever
-from gcode.firmware.faults import parse_faults
-from gcode.hosts import Printer, PrintReport, connect
-from gcode.hosts.journal import default_path, is_device
-from gcode.hosts.resume import resume as resume_job
-from gcode.hosts.serial import SerialPrinter
-from gcode.moves import Program
-from gcode.profiles import (
-    DEFAULT_MATERIAL,
-    DEFAULT_PRINTER,
-    DEFAULT_PROCESS,
-    list_profiles,
-    load_material,
-    load_printer,
-    load_process,
-    load_setup,
-)
-from gcode.reader import read_job
-from gcode.slicing.job import slice_part
-from gcode.slicing.layers import LayerGrid
-from gcode.slicing.patch import slice_patch
-from gcode.solids import SUFFIXES, read_solid
-from gcode.surfaces import HeightField
-from gcode.writer import write
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, list_profiles
+
+if TYPE_CHECKING:
+    from gcode.hosts import Printer, PrintReport
+    from gcode.slicing.layers import LayerGrid
+    from gcode.surfaces import HeightField
 
 AS_BUILT_CELL_MM = 0.2
 AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
@@ -75,6 +53,8 @@ importing.add_to(profiles_app)
 
 
 def _version(asked: bool) -> bool:
+    import gcode
+
     if asked:
         console.out.print(f"gcode {gcode.__version__}")
         raise typer.Exit
@@ -111,6 +91,14 @@ def slice_solid(
     as_json: JsonOption = False,
 ) -> None:
     """Slice a solid: a whole job, or with --as-built a patch on top of what stands there."""
+    from gcode.check import check as check_program
+    from gcode.estimate import estimate as estimate_program
+    from gcode.profiles import load_setup
+    from gcode.slicing.job import slice_part
+    from gcode.slicing.patch import slice_patch
+    from gcode.solids import read_solid
+    from gcode.writer import write
+
     console.writable(output)
     setup = load_setup(printer, material, process)
     shape = read_solid(solid)
@@ -174,6 +162,10 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Judge a program: limits, temperatures, sections, and the tool head against --as-built."""
+    from gcode.check import find_refusals
+    from gcode.moves import Program
+    from gcode.profiles import load_setup
+
     setup = load_setup(printer, material)
     program = Program(program_text(file), setup.printer.dialect)
     field = _as_built(as_built) if as_built is not None else None
@@ -222,6 +214,10 @@ def estimate(
     as_json: JsonOption = False,
 ) -> None:
     """Tell how long a program takes and what it uses; heating left out."""
+    from gcode.estimate import estimate as estimate_program
+    from gcode.moves import Program
+    from gcode.profiles import load_printer
+
     machine = load_printer(printer) if printer is not None else None
     dialect = machine.dialect if machine is not None else "marlin"
     found = estimate_program(Program(program_text(file), dialect), machine)
@@ -280,6 +276,14 @@ def send(
     as_json: JsonOption = False,
 ) -> None:
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
+    from gcode.check import check as check_program
+    from gcode.hosts import connect
+    from gcode.hosts.journal import default_path
+    from gcode.hosts.resume import resume as resume_job
+    from gcode.hosts.serial import SerialPrinter
+    from gcode.moves import Program
+    from gcode.profiles import load_setup
+
     setup = load_setup(printer, material)
     field = _as_built(as_built) if as_built is not None else None
     checked = check_program(
@@ -290,7 +294,7 @@ def send(
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
         wire_log=wire_log,
-        journal=journal or (default_path(port) if is_device(port) else None),
+        journal=journal or default_path(port),
     )
     if resume and not isinstance(machine, SerialPrinter):
         raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")
@@ -335,6 +339,10 @@ def emulate(
     accelerated: Annotated[bool, typer.Option(help="Let the printer's clock jump.")] = False,
 ) -> None:
     """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
+    from gcode.firmware import serve_forever
+    from gcode.firmware.faults import parse_faults
+    from gcode.profiles import load_printer
+
     script = parse_faults(program_text(faults)) if faults is not None else None
     machine = load_printer(printer)
     with tempfile.TemporaryDirectory(prefix="gcode-emulate-") as folder:
@@ -379,6 +387,8 @@ def profiles_show(
     ] = "",
 ) -> None:
     """Show a profile with everything it inherits, as JSON."""
+    from gcode.profiles import load_material, load_printer, load_process
+
     loaders: dict[str, Any] = {
         "printers": load_printer,
         "materials": load_material,
@@ -435,6 +445,9 @@ def _tell(report: PrintReport, *, as_json: bool) -> None:
 
 def _as_built(path: Path) -> HeightField:
     """A height field from a height map, or from a mesh with room around it."""
+    from gcode.solids import SUFFIXES, read_solid
+    from gcode.surfaces import HeightField
+
     if path.suffix.lower() not in SUFFIXES:
         if not path.is_file():
             raise InputError(f"{path}: there is no such file.")
@@ -444,6 +457,10 @@ def _as_built(path: Path) -> HeightField:
 
 
 def _grid(job: Path | None, setup: Any) -> LayerGrid:
+    from gcode.moves import Program
+    from gcode.reader import read_job
+    from gcode.slicing.layers import LayerGrid
+
     if job is None:
         return LayerGrid.from_setup(setup)
     read = read_job(Program(program_text(job), setup.printer.dialect))

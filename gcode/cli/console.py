@@ -17,8 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from gcode.errors import InputError
-from gcode.profiles import list_profiles
-from gcode.profiles.store import Kind
+from gcode.profiles.names import Kind, list_profiles
 
 NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130

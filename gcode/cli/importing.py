@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gcode.cli import console
 from gcode.cli.options import JsonOption
 from gcode.errors import InputError
-from gcode.profiles.importers import ImportedFile, file_name, import_profiles, to_toml
+
+if TYPE_CHECKING:
+    from gcode.profiles.importers import ImportedFile
 
 SHOWN = 60
 
@@ -41,6 +43,8 @@ def import_(
     as_json: JsonOption = False,
 ) -> None:
     """Import a profile: every key is mapped, or listed with the reason."""
+    from gcode.profiles.importers import file_name, import_profiles, to_toml
+
     found = import_profiles(file, preset=preset, inherits=inherits)
     folders = len(found.profiles) > 1
     paths = []

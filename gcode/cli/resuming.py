@@ -10,9 +10,7 @@ import typer
 from gcode.cli import console
 from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
 from gcode.errors import InputError
-from gcode.moves import Program
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, load_setup
-from gcode.resumption import resume_at
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
 
 
 def resume_at_command(
@@ -33,6 +31,10 @@ def resume_at_command(
     as_json: JsonOption = False,
 ) -> None:
     """Make a checked job from a layer on: heated, primed, lowered onto the part, Z not homed."""
+    from gcode.moves import Program
+    from gcode.profiles import load_setup
+    from gcode.resumption import resume_at
+
     console.writable(output)
     if standing is not None:
         if standing.suffix != ".npz":

@@ -7,12 +7,8 @@ from pathlib import Path
 from gcode.errors import InputError
 from gcode.hosts.file import FilePrinter
 from gcode.hosts.journal import Journal
-from gcode.hosts.moonraker import MoonrakerPrinter
-from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.port import Printer
-from gcode.hosts.secret import find_key
 from gcode.hosts.serial import SerialPrinter
-from gcode.hosts.web import Address
 
 
 def connect(
@@ -55,7 +51,7 @@ def connect(
                 f"A journal belongs to a serial port; {port.partition('+')[0]} keeps its own "
                 f"state: leave --journal out."
             )
-        return _web_printer(Address.parse(port), wire_log)
+        return _web_printer(port, wire_log)
     if "://" in port:
         raise InputError(
             f"{port!r} names no kind of printer; write a device path, octoprint+http://…, "
@@ -70,8 +66,17 @@ def connect(
     )
 
 
-def _web_printer(address: Address, wire_log: Path | None) -> Printer:
+def _web_printer(port: str, wire_log: Path | None) -> Printer:
+    # loaded here: a printer on a cable needs none of the web's libraries
+    from gcode.hosts.secret import find_key
+    from gcode.hosts.web import Address
+
+    address = Address.parse(port)
     key = find_key(address.kind, address.spec)
     if address.kind == "octoprint":
+        from gcode.hosts.octoprint import OctoPrintPrinter
+
         return OctoPrintPrinter(address, key, wire_log=wire_log)
+    from gcode.hosts.moonraker import MoonrakerPrinter
+
     return MoonrakerPrinter(address, key, wire_log=wire_log)

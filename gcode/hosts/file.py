@@ -91,7 +91,7 @@ class FilePrinter:
         progress("writing", 1.0, 1.0)
         next_line = checked.program.text.count("\n") if lines is None else end
         seconds = self._clock() - start_s
-        return PrintReport(True, written, 0, 0, 0, size, seconds, next_line, (0.0, 0.0, 0.0))
+        return PrintReport(True, written, 0, 0, 0, size, seconds, next_line, (0.0, 0.0, 0.0), first)
 
     def finish_moves(self) -> None:
         """Nothing moves."""

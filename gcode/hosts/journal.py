@@ -72,13 +72,13 @@ CREATE TABLE IF NOT EXISTS temperature (
 """
 
 
-def is_device(port: str) -> bool:
-    """Whether a port's name is a device path: a server or a file keeps no journal here."""
-    return "://" not in port and not port.startswith("file:")
+def default_path(port: str) -> Path | None:
+    """Where a port's journal is kept unless told otherwise: one a printer, in the user's state.
 
-
-def default_path(port: str) -> Path:
-    """Where a port's journal is kept unless told otherwise: one a printer, in the user's state."""
+    None for a server or a file, which keep no journal here.
+    """
+    if "://" in port or port.startswith("file:"):
+        return None
     folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     return folder / "gcode" / f"{hashlib.sha256(port.encode()).hexdigest()[:16]}.sqlite"
 

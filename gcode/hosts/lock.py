@@ -3,6 +3,12 @@
 `flock` on a file named after the port's device; the kernel drops it when the last process that
 holds the descriptor ends, however it ends. The supervisor of `safety` inherits the descriptor,
 so that nobody takes the printer between a sender's death and the heaters being switched off.
+
+Who is done removes the file while still holding the lock on it. Whoever opened it before that gets
+the lock of a file without a name, which keeps nobody out; so a lock counts only if the file of that
+name is the one that was locked, and is tried for again otherwise. A killed sender leaves its file,
+one a printer, for the next. It lies in the temporary folder because that is shared by all users of
+the machine, as the printer is.
 """
 
 from __future__ import annotations
@@ -16,7 +22,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from gcode.errors import PortBusyError
+from gcode.errors import LinkError, PortBusyError
 
 ORPHAN_S = 8.0
 """How long to wait for a dead sender's supervisor to finish."""
@@ -44,34 +50,56 @@ class PortLock:
         ------
         PortBusyError
             If a living sender holds it, or a dead one's supervisor does not finish.
+        LinkError
+            If the lock's file cannot be used.
         """
-        fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         until_s = clock() + ORPHAN_S
         while True:
+            fd = self._open()
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
             except OSError:
                 owner = _owner(fd)
+                os.close(fd)
                 if clock() >= until_s or (owner is not None and _alive(owner)):
-                    os.close(fd)
                     who = f"process {owner}" if owner is not None else "another process"
                     raise PortBusyError(
                         f"{self._port} is held by {who}; one printer takes one sender: end it "
                         f"or choose another port."
                     ) from None
                 sleep(0.02)
+                continue
+            if self._is_named(fd):
+                break
+            os.close(fd)  # its last holder has removed it: try for the file that has the name now
         os.ftruncate(fd, 0)
         os.pwrite(fd, str(os.getpid()).encode(), 0)
         self.fd = fd
 
     def release(self) -> None:
-        """Give the lock back."""
+        """Give the lock back, and leave nothing behind."""
         if self.fd is not None:
             with contextlib.suppress(OSError):
-                os.ftruncate(self.fd, 0)
+                if self._is_named(self.fd):
+                    self._path.unlink()
             os.close(self.fd)
             self.fd = None
+
+    def _open(self) -> int:
+        try:
+            return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise LinkError(
+                f"The lock of {self._port}, {self._path}, cannot be used ({error.strerror}); if "
+                f"another user left it and sends nothing, remove it."
+            ) from error
+
+    def _is_named(self, fd: int) -> bool:
+        """Whether the open file is the one that the path leads to."""
+        try:
+            return os.path.samestat(os.fstat(fd), self._path.stat())
+        except FileNotFoundError:
+            return False
 
 
 def _owner(fd: int) -> int | None:

@@ -42,6 +42,20 @@ class Modes:
         return tuple(commands)
 
 
+def batches_of(
+    checked: PrintableProgram, first: int, end: int, size: int
+) -> Iterator[tuple[list[int], list[str]]]:
+    """Lines to send and their numbers in the program, those of `size` lines at a time."""
+    for start in range(first, end, size):
+        lines = [
+            line.partition(";")[0].strip() for line in checked.lines(start, min(end, start + size))
+        ]
+        yield (
+            [start + offset for offset, line in enumerate(lines) if line],
+            [line for line in lines if line],
+        )
+
+
 def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
     """Lines to send with their numbers in the program; comments and empty lines left out."""
     step = 4096

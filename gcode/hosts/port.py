@@ -76,8 +76,8 @@ class PrintReport:
     seconds: float
     next_line: int
     round_trip_s: tuple[float, float, float]
+    first_line: int
     warnings: tuple[str, ...] = ()
-    first_line: int = 0
 
 
 class LinkLostError(LinkError):

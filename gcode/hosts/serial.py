@@ -6,7 +6,6 @@ may be sent and what an answer means is `protocol.Link`'s.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
@@ -17,9 +16,10 @@ from types import TracebackType
 
 from gcode.errors import JournalError, LinkError, LocalProtocolError, PrinterError
 from gcode.hosts.conversation import SerialConversation
+from gcode.hosts.jobbook import TEMPERATURE_EVERY_S, JobBook
 from gcode.hosts.journal import Journal
 from gcode.hosts.lock import PortLock
-from gcode.hosts.modes import commands_of, modes_after
+from gcode.hosts.modes import batches_of, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport
 from gcode.hosts.proof import require_checked
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
@@ -31,13 +31,8 @@ from gcode.protocol import LinkTiming
 from gcode.protocol import events as ev
 
 PAUSE_LIFT_MM = 5.0
-PROGRESS_EVERY_LINES = 500
-UNCOUNTED_STEP = 16
-"""Lines reserved by one commit where the printer counts none: few enough for its place to tell one
-from another, many enough for a slow disk not to hold up short moves."""
-TEMPERATURE_STEP_C = 2.0
-TEMPERATURE_EVERY_S = 10.0
-"""How often the journal hears of temperatures; a bed loses about a degree in that time."""
+BATCH_LINES = 500
+"""Lines made ready, and counted, at a time."""
 
 
 class SerialPrinter(SerialConversation):
@@ -90,17 +85,14 @@ class SerialPrinter(SerialConversation):
         self._guard = guard
         self._supervisor: Supervisor | None = None
         self._lock = PortLock(port)
-        self._sent_lines: deque[tuple[int, int]] = deque(maxlen=1024)
+        self._book = JobBook(self._link, journal, clock)
         self._round_trips = RoundTrips()
-        self._lines_acked = 0
-        self._executed_line = -1
         self._pause_asked = threading.Event()
         self._go_on = threading.Event()
+        self._attention = threading.Event()  # set with either of the two others
         self._abort_asked = threading.Event()
         self._printing = False
-        self._first_line = 0
-        self._reserved = 0  # end of the journal's open step; 0 if none is open
-        self._noted_s = self._asked_s = self._noted_bed_c = -math.inf
+        self._ask_s = -math.inf if journal is not None else math.inf  # temperatures, when next
         self.actions: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> SerialPrinter:
@@ -184,14 +176,7 @@ class SerialPrinter(SerialConversation):
         return self._journal
 
     def _before_own_command(self) -> None:
-        """Tell the journal that the next wire number is no program line's."""
-        if self._journal is not None and self._reserved:
-            line = self._last_sent_line(self._first_line) + 1
-            self._journal.reserve(line, self._next_number(), line, self._executed_line + 1)
-            self._reserved = 0
-
-    def _next_number(self) -> int | None:
-        return self._link.last_sent + 1 if self._link.dialect.verifies else None
+        self._book.before_own_command()
 
     # ------------------------------------------------------------------ printing
 
@@ -209,25 +194,19 @@ class SerialPrinter(SerialConversation):
         total = checked.program.text.count("\n") + 1
         first, end = (0, total) if lines is None else (lines.start, lines.stop)
         start_s = self._clock()
-        before = (self._lines_acked, self._link.resends, self._stalls, self._link.spare_oks)
-        before_bytes = self._bytes_sent
+        before = (self._link.resends, self._stalls, self._link.spare_oks, self._bytes_sent)
         self._round_trips = RoundTrips()
         self._warnings.clear()
         self._abort_asked.clear()
-        self._sent_lines.clear()
-        self._executed_line = first - 1
-        self._first_line, self._reserved = first, 0
+        self._book.open(first, end)
         self._printing = True
         try:
             with self._mutex:
                 whole = self._carry_out(checked, first, end, progress)
-                if whole and end >= total and self._journal is not None:
-                    self._journal.finish()
+                if whole and end >= total:
+                    self._book.finish()
         except (LinkError, LocalProtocolError):
-            if self._journal is not None:
-                sent = max(self._last_sent_line(first), self._executed_line)
-                with contextlib.suppress(JournalError):  # heaters come first
-                    self._journal.lost(self._executed_line + 1, sent + 1)
+            self._book.lost()
             self.make_safe()
             raise
         finally:
@@ -238,66 +217,77 @@ class SerialPrinter(SerialConversation):
             self.make_safe()
         return PrintReport(
             ok=whole,
-            lines_acked=self._lines_acked - before[0],
-            resends=self._link.resends - before[1],
-            stalls=self._stalls - before[2],
-            spare_oks=self._link.spare_oks - before[3],
-            bytes_sent=self._bytes_sent - before_bytes,
+            lines_acked=self._book.lines_acked,
+            resends=self._link.resends - before[0],
+            stalls=self._stalls - before[1],
+            spare_oks=self._link.spare_oks - before[2],
+            bytes_sent=self._bytes_sent - before[3],
             seconds=self._clock() - start_s,
-            next_line=end if whole else self._executed_line + 1,
+            next_line=end if whole else self._book.executed_line + 1,
             round_trip_s=self._round_trips.summary_s(),
             warnings=tuple(self._warnings),
             first_line=first,
         )
 
+    def _note_temperatures(self, now_s: float) -> None:
+        self._ask_s = now_s + TEMPERATURE_EVERY_S
+        self._ask("M105")
+
     def _carry_out(
         self, checked: PrintableProgram, first: int, end: int, progress: Progress
     ) -> bool:
         """Stream, and prove that all has arrived; False if the job was aborted."""
-        if self._journal is not None:
-            self._journal.begin(checked.program.sha256, self.port, first, end)
+        self._book.begin(checked, self.port)
         whole = self._stream(checked, first, end, progress)
         self._prove()
-        self._executed_line = self._last_sent_line(first)
-        if self._journal is not None:
-            self._journal.acknowledged(self._executed_line + 1)
+        self._book.proved()
         return whole
 
     def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
         """Send the lines; False if the job was aborted."""
-        link, clock, journal, trips = self._link, self._clock, self._journal, self._round_trips
-        asked = self._asked
-        for index, command in commands_of(checked, first, end):
-            if self._pause_asked.is_set() and not self._sit_out_pause(checked, index):
-                return False
-            if self._abort_asked.is_set():
-                return False
-            if journal is not None:
-                if clock() >= self._asked_s + TEMPERATURE_EVERY_S:
-                    self._asked_s = clock()
-                    self._ask("M105")
-                if index >= self._reserved or not self._reserved:
-                    step = journal.step_lines if link.dialect.verifies else UNCOUNTED_STEP
-                    self._reserved = min(index + step, end)
-                    acked = self._executed_line + 1
-                    journal.reserve(index, self._next_number(), self._reserved, acked)
-            sent_s = clock()
-            self._sent_lines.append((link.last_sent + 1, index))
-            if command[:4] in asked:
-                asked[command[:4]] += 1
-            self._write(link.send(command, sent_s))
-            while not link.ready:
-                self._pump()
-            trips.add(clock() - sent_s)
-            if index % PROGRESS_EVERY_LINES == 0:
-                progress("printing", float(index - first), float(end - first))
-        while not link.idle:
+        total = float(end - first)
+        for indices, commands in batches_of(checked, first, end, BATCH_LINES):
+            if indices:
+                progress("printing", float(indices[0] - first), total)
+                if not self._send_batch(checked, indices, commands):
+                    return False
+        while not self._link.idle:
             self._pump()
-        progress("printing", float(end - first), float(end - first))
+        progress("printing", total, total)
         return True
 
-    def _last_sent_line(self, first: int) -> int:
-        return self._sent_lines[-1][1] if self._sent_lines else first - 1
+    def _send_batch(
+        self, checked: PrintableProgram, indices: list[int], commands: list[str]
+    ) -> bool:
+        """Send some lines, each when there is room for it; False if the job was aborted."""
+        link, clock, before_line, asked = (
+            self._link,
+            self._clock,
+            self._book.before_line,
+            self._asked,
+        )
+        trips_s: list[float] = []
+        heard_s = clock()
+        if heard_s >= self._ask_s:
+            self._note_temperatures(heard_s)  # now, for lines made ready lose their numbers by it
+        for index, line, command in zip(indices, link.prepare(commands), commands, strict=True):
+            if self._attention.is_set() and not self._attend(checked, index):
+                return False
+            if heard_s >= self._ask_s:
+                self._note_temperatures(heard_s)
+            before_line(index)
+            sent_s = clock()
+            self._write(link.send(line, sent_s))
+            if command[:4] in asked:
+                asked[command[:4]] += 1
+            if not link.ready:
+                self._pump_ok()
+                while not link.ready:
+                    self._pump()
+            heard_s = clock()
+            trips_s.append(heard_s - sent_s)
+        self._round_trips.add(trips_s)
+        return True
 
     # ------------------------------------------------------------------ pause, abort, stop
 
@@ -305,6 +295,7 @@ class SerialPrinter(SerialConversation):
         """Stop after the line under way and lift the nozzle; harmless when paused already."""
         self._go_on.clear()
         self._pause_asked.set()
+        self._attention.set()
 
     def resume(self) -> None:
         """Go on after a pause."""
@@ -314,9 +305,17 @@ class SerialPrinter(SerialConversation):
     def abort(self) -> None:
         """End the job: nothing more is sent, heaters off, nozzle lifted."""
         self._abort_asked.set()
+        self._attention.set()
         self._go_on.set()
         if not self._printing:
             self.make_safe()
+
+    def _attend(self, checked: PrintableProgram, line: int) -> bool:
+        """Do what was asked for meanwhile; False on abort."""
+        self._attention.clear()
+        if self._pause_asked.is_set() and not self._sit_out_pause(checked, line):
+            return False
+        return not self._abort_asked.is_set()
 
     def _sit_out_pause(self, checked: PrintableProgram, line: int) -> bool:
         """Lift, wait, and restore position, modes, feed and extruder exactly; False on abort.
@@ -350,7 +349,7 @@ class SerialPrinter(SerialConversation):
 
     def emergency_stop(self) -> None:
         """Send M112, past every queue that the firmware lets it pass."""
-        self._write_raw(b"\nM112\n")
+        self._write(b"\nM112\n")
         self._link.give_up("an emergency stop was asked for")
 
     def heaters_off(self) -> None:
@@ -365,7 +364,7 @@ class SerialPrinter(SerialConversation):
         try:
             if self._link.ended or not self._link.idle:
                 data = b"\n" + b"".join(command.encode() + b"\n" for command in SAFE_COMMANDS)
-                self._write_raw(data)
+                self._write(data)
                 self._note("heaters told to switch off by unnumbered lines; nothing confirms it")
             else:
                 self._switch_off()
@@ -398,26 +397,13 @@ class SerialPrinter(SerialConversation):
         self._warnings.append(text)
         if self._log is not None:
             self._log.add(self._clock(), b"#", text.encode("ascii", "replace"))
-        if self._journal is not None:
-            with contextlib.suppress(JournalError):  # a full disk must not stop a safe exit
-                self._journal.note(text)
+        self._book.note(text)
 
     # ------------------------------------------------------------------ what is heard
 
-    def _on_acknowledged(self, number: int) -> None:
-        lines = self._sent_lines
-        if lines and lines[-1][0] == number:
-            self._executed_line = lines[-1][1]
-            self._lines_acked += 1
-        elif lines and lines[0][0] <= number < lines[-1][0]:
-            index = number - lines[-1][0] - 1
-            if -index <= len(lines):
-                self._executed_line = lines[index][1]
-            self._lines_acked += 1
-
     def _on_other_event(self, event: ev.Event) -> None:
         if isinstance(event, ev.TemperatureReport):
-            self._journal_temperatures(event)
+            self._book.temperature(event)
         elif isinstance(event, ev.HostAction):
             self.actions.append(event.action)
             if event.action.split()[0] in ("pause", "cancel"):
@@ -426,34 +412,21 @@ class SerialPrinter(SerialConversation):
     def _fault(self, text: str) -> Exception:
         return PrinterError(
             f"The printer reports a fault: {text}; the last program line known to be executed is "
-            f"{self._executed_line + 1}."
+            f"{self._book.executed_line + 1}."
         )
 
-    def _journal_temperatures(self, report: ev.TemperatureReport) -> None:
-        """Write temperatures down, some of the many that come while something heats."""
-        heaters = report.heaters
-        hotend, bed = heaters.get("T") or heaters.get("T0"), heaters.get("B")
-        if self._journal is None or hotend is None:
-            return
-        now_s = self._clock()
-        bed_c = bed.current_c if bed else None
-        change_c = abs((bed_c or 0.0) - self._noted_bed_c)
-        if now_s >= self._noted_s + TEMPERATURE_EVERY_S / 2 or change_c >= TEMPERATURE_STEP_C:
-            self._noted_s, self._noted_bed_c = now_s, bed_c or 0.0
-            self._journal.temperature(hotend.current_c, bed_c)
-
     def _lost_error(self, why: str) -> LinkLostError:
-        last_sent = max((line for _, line in self._sent_lines), default=self._executed_line)
+        executed, last_sent = self._book.executed_line, self._book.last_sent_line
         doubt = (
-            f"lines {self._executed_line + 2} to {last_sent + 1} are uncertain"
-            if last_sent > self._executed_line
+            f"lines {executed + 2} to {last_sent + 1} are uncertain"
+            if last_sent > executed
             else "no later line was sent"
         )
         return LinkLostError(
             f"The link to {self.port} is lost: {why}; program lines up to "
-            f"{self._executed_line + 1} are acknowledged, {doubt}; find out where the printer is "
+            f"{executed + 1} are acknowledged, {doubt}; find out where the printer is "
             f"before going on.",
-            self._executed_line,
+            executed,
             last_sent,
             why=why,
         )

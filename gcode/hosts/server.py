@@ -250,6 +250,7 @@ class ServerPrinter(ABC, Generic[Session]):
             seconds=self._clock() - start_s,
             next_line=next_line,
             round_trip_s=(0.0, 0.0, 0.0),
+            first_line=job.first,
             warnings=() if ok else (f"{self.address.name} cancelled the print",),
         )
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 _FIRST_S = 1e-6
 _STEP = math.log(1.05)
@@ -14,19 +17,20 @@ class RoundTrips:
     """A histogram of times on a logarithmic scale; percentiles are right to 5 %."""
 
     def __init__(self) -> None:
-        self._counts = [0] * _BUCKETS
+        self._counts = np.zeros(_BUCKETS, dtype=np.int64)
         self.count = 0
 
-    def add(self, seconds: float) -> None:
-        """Count one round trip."""
-        index = int(math.log(seconds / _FIRST_S) / _STEP) if seconds > _FIRST_S else 0
-        self._counts[index if index < _BUCKETS else _BUCKETS - 1] += 1
-        self.count += 1
+    def add(self, seconds: Sequence[float]) -> None:
+        """Count round trips."""
+        times_s = np.maximum(np.asarray(seconds, dtype=np.float64), _FIRST_S)
+        buckets = np.minimum((np.log(times_s / _FIRST_S) / _STEP).astype(np.intp), _BUCKETS - 1)
+        self._counts += np.bincount(buckets, minlength=_BUCKETS)
+        self.count += len(seconds)
 
     def percentile_s(self, percent: float) -> float:
         """Return the round trip that `percent` of all do not exceed; 0 without any."""
         wanted, seen = self.count * percent / 100.0, 0
-        for index, count in enumerate(self._counts):
+        for index, count in enumerate(self._counts.tolist()):
             seen += count
             if count and seen >= wanted:
                 return float(_FIRST_S * math.exp((index + 0.5) * _STEP))

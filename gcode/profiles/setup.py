@@ -7,15 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gcode.errors import ProfileError
+from gcode.profiles.names import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
-from gcode.profiles.store import (
-    DEFAULT_MATERIAL,
-    DEFAULT_PRINTER,
-    DEFAULT_PROCESS,
-    load_material,
-    load_printer,
-    load_process,
-)
+from gcode.profiles.store import load_material, load_printer, load_process
 
 _FIELD = re.compile(r"\{([a-z0-9_]+)\}")
 

@@ -10,30 +10,15 @@ import json
 import tomllib
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from gcode.errors import ProfileError
+from gcode.profiles.names import Kind, id_of, list_profiles, profile_dir
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
 
-Kind = Literal["printers", "materials", "processes"]
-DEFAULT_PRINTER = "prusa_mk3s"
-DEFAULT_MATERIAL = "pla"
-DEFAULT_PROCESS = "repair_0.20"
 _P = TypeVar("_P", PrinterProfile, MaterialProfile, ProcessProfile)
-
-
-def profile_dir() -> Path:
-    """The shipped profiles: package data when installed, the checkout's folder otherwise."""
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "profile_data"
-    return installed if installed.is_dir() else package.parent / "profiles"
-
-
-def list_profiles(kind: Kind) -> tuple[str, ...]:
-    """IDs of the shipped profiles of one kind, sorted."""
-    return tuple(sorted(_id_of(path) for path in (profile_dir() / kind).glob("*.toml")))
 
 
 def load_printer(id_or_path: str | Path) -> PrinterProfile:
@@ -54,10 +39,6 @@ def load_process(id_or_path: str | Path) -> ProcessProfile:
 def content_of(kind: Kind, id_or_path: str | Path) -> dict[str, Any]:
     """Return a profile's content with everything it inherits, before validation."""
     return _resolve(kind, _find(kind, id_or_path).resolve(), ())
-
-
-def _id_of(path: Path) -> str:
-    return path.name.removesuffix(".toml")
 
 
 def _find(kind: Kind, id_or_path: str | Path, beside: Path | None = None) -> Path:
@@ -123,7 +104,7 @@ def _resolve(kind: Kind, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
             base[key] = {**base[key], **value}
         else:
             base[key] = value
-    base["id"] = _id_of(path)
+    base["id"] = id_of(path)
     return base
 
 

@@ -4,10 +4,14 @@ No I/O, no clock, no threads (h11 is the model). `hosts` gives it a port and a c
 """
 
 from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
-from gcode.protocol.link import Link, LinkTiming, checksum, wire_text
+from gcode.protocol.ledger import HISTORY_LINES
+from gcode.protocol.lines import WireLine, checksum, wire_text
+from gcode.protocol.link import Link
+from gcode.protocol.timing import LinkTiming
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
 
 __all__ = [
+    "HISTORY_LINES",
     "LINK_DIALECTS",
     "TRANSITIONS",
     "Link",
@@ -15,6 +19,7 @@ __all__ = [
     "LinkTiming",
     "Signal",
     "State",
+    "WireLine",
     "checksum",
     "wire_text",
 ]

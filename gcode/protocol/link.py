@@ -18,13 +18,10 @@ What it does not do: judge G-code, know what a job is, retry by reopening, or sl
 
 from __future__ import annotations
 
-import re
-from collections import deque
-from dataclasses import dataclass
-from functools import reduce
-from operator import xor
+from collections.abc import Sequence
 
 from gcode.errors import LocalProtocolError
+from gcode.protocol.belief import Belief, Verdict
 from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
 from gcode.protocol.events import (
     Acknowledged,
@@ -46,62 +43,19 @@ from gcode.protocol.events import (
     Unrecognised,
     Waiting,
 )
+from gcode.protocol.inbox import Inbox
+from gcode.protocol.ledger import Ledger
+from gcode.protocol.lines import WireLine, numbered, wire_line, wire_lines
 from gcode.protocol.replies import parse_reply
+from gcode.protocol.timing import LinkTiming
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
 
-HISTORY_LINES = 512
-"""Lines kept for a resend; OctoPrint keeps 50, a window and false acknowledgements want more."""
+NEVER_S = float("inf")
 
-MAX_REPLY_BYTES = 4096
-"""A reply longer than this is noise, dropped up to its newline."""
-
-SLOW_COMMANDS = frozenset(
-    (
-        *("G4", "G28", "G29", "G30", "G33", "G34", "G76", "G80"),
-        *("M0", "M1", "M25", "M48", "M109", "M116", "M125", "M190", "M191", "M226", "M303"),
-        *("M400", "M569", "M600", "M601", "M701", "M702", "M860", "M861"),
-    )
-)
-"""Commands that may take minutes without an answer (OctoPrint's longRunningCommands and more)."""
-
-_MACRO = re.compile(r"[A-Za-z_]{2}")
-"""A command by name (Klipper) may be a whole script, and takes as long as its moves."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkTiming:
-    """How long the link waits, s.
-
-    Attributes
-    ----------
-    silence_s
-        An ordinary line unanswered for this long: send it again (OctoPrint waits 30 s and
-        then forces the *next* line, which loses one; a probe loses nothing).
-    slow_silence_s
-        The same for commands that take long.
-    resend_grace_s
-        How long after a resend request an `ok` may still belong to it.
-    doubt_s
-        Silence after something suspicious (a garbled reply, an ignored resend).
-    give_up_s
-        Unanswered probes for this long: the link is lost.
-    slow_give_up_s
-        The same while a slow command is under way.
-    """
-
-    silence_s: float = 8.0
-    slow_silence_s: float = 60.0
-    resend_grace_s: float = 0.1
-    doubt_s: float = 0.4
-    give_up_s: float = 60.0
-    slow_give_up_s: float = 1800.0
-    max_resends: int = 10
-    max_refused: int = 3
-
-
-def checksum(data: bytes) -> int:
-    """Exclusive or over `data`, the checksum of RepRap's protocol."""
-    return reduce(xor, data, 0)
+# Looked up once: Python 3.11 takes 0.1 µs to find a member of an enumeration, ten times a line.
+_GREETING, _IDLE, _WAITING = State.GREETING, State.IDLE, State.WAITING
+_REWINDING, _PROBING = State.REWINDING, State.PROBING
+_SENT, _ACKED, _DRAINED = Signal.SENT, Signal.ACKED, Signal.DRAINED
 
 
 class Link:
@@ -129,34 +83,20 @@ class Link:
         self.resends = 0
         self.probes = 0
         self.spare_oks = 0
-        self._history: deque[bytes] = deque(maxlen=HISTORY_LINES)
-        self._slow: deque[bool] = deque(maxlen=HISTORY_LINES)
-        self._inbox = bytearray()
-        self._skipping = False
+        self._inbox = Inbox()
         self._out = bytearray()
         self._events: list[Event] = []
         self._hello_at_s = 0.0
-        self._reset_numbers()
+        self._reset_numbers(0)
 
-    def _reset_numbers(self) -> None:
-        self._history.clear()
-        self._slow.clear()
-        self._last = 0  # highest number given to a line
-        self._acked = 0  # every line up to here is acknowledged
-        self._cursor = 1  # the next number to put on the wire
-        self._proven = 0  # received for certain: cannot be asked for again
-        self._wire_bytes = 0
-        self._stale: int | None = None  # a resend request for this number may be an echo
+    def _reset_numbers(self, number: int) -> None:
+        self._ledger = Ledger(number)
+        self._belief = Belief(self.timing, number)
         self._swallow_until_s = -1.0
         self._rewind_until_s = 0.0
         self._rewind_at_once = False
-        self._same_resends = 0
-        self._last_resend = -1
-        self._refused = 0
-        self._refused_at = 0
-        self._number_faults = 0
         self._heard_s = 0.0
-        self._deadline_s = float("inf")
+        self._deadline_s = NEVER_S
         self._probing_since_s: float | None = None
 
     # ------------------------------------------------------------------ what the caller asks
@@ -164,30 +104,31 @@ class Link:
     @property
     def last_sent(self) -> int:
         """Number of the last line given to `send`."""
-        return self._last
+        return self._ledger.last
 
     @property
     def last_acked(self) -> int:
         """Every line up to this number is acknowledged."""
-        return self._acked
+        return self._ledger.acked
 
     @property
     def ready(self) -> bool:
         """Whether `send` may be called now."""
-        if self.state is State.IDLE:
+        if self.state is _IDLE:
             return True
+        if self.window == 1 or self.state is not _WAITING:
+            return False
+        ledger = self._ledger
         return (
-            self.state is State.WAITING
-            and self.window > 1
-            and self._cursor == self._last + 1
-            and self._last - self._acked < self.window
-            and self._wire_bytes < self.dialect.rx_bytes
+            ledger.cursor == ledger.last + 1
+            and ledger.last - ledger.acked < self.window
+            and ledger.wire_bytes < self.dialect.rx_bytes
         )
 
     @property
     def idle(self) -> bool:
         """Whether every line sent is acknowledged and nothing is in doubt."""
-        return self.state is State.IDLE
+        return self.state is _IDLE
 
     @property
     def ended(self) -> bool:
@@ -200,9 +141,7 @@ class Link:
         With `number`, continue a numbering that is proved to have reached it.
         """
         self._go(Signal.HELLO)
-        self._reset_numbers()
-        self._last = self._acked = self._proven = number
-        self._cursor = number + 1
+        self._reset_numbers(number)
         self._inbox.clear()
         self._out.clear()
         self._probing_since_s = now_s
@@ -214,9 +153,18 @@ class Link:
         if not self.dialect.numbered:
             return b"\nM105\n"
         # The newline ends whatever half line a dead sender left in the printer's buffer.
-        return b"\n" + _numbered(self._last, f"M110 N{self._last}".encode())
+        number = self._ledger.last
+        return b"\n" + numbered(number, b"M110 N%d" % number)
 
-    def send(self, command: str, now_s: float) -> bytes:
+    def prepare(self, commands: Sequence[str]) -> list[str | WireLine]:
+        """Make what `send` takes out of the commands that come next, all at once.
+
+        It promises nothing: where another line comes between, `send` numbers anew; what the
+        dialect cannot carry is refused when its turn comes.
+        """
+        return wire_lines(self._ledger.last + 1, commands, self.dialect)
+
+    def send(self, command: str | WireLine, now_s: float) -> bytes:
         """Give the next line its number and return the bytes to write.
 
         Raises
@@ -224,35 +172,23 @@ class Link:
         LocalProtocolError
             If the link is not `ready`, or the command cannot be carried by this dialect.
         """
-        if not self.ready:
+        ledger = self._ledger
+        if self.state is not _IDLE and not self.ready:
             raise LocalProtocolError(
-                f"The link is {self.state.value} with {self._last - self._acked} lines under way "
+                f"The link is {self.state.value} with {ledger.last - ledger.acked} lines under way "
                 f"of {self.window}; wait until it is ready."
             )
-        text = wire_text(command)
-        number = self._last + 1
-        data = _numbered(number, text) if self.dialect.numbered else text + b"\n"
-        if len(data) > self.dialect.max_line_bytes:
-            if text[:4] in (b"M117", b"M118"):
-                spare = len(data) - self.dialect.max_line_bytes
-                text = text[:-spare].rstrip()
-                data = _numbered(number, text) if self.dialect.numbered else text + b"\n"
-            else:
-                raise LocalProtocolError(
-                    f"The line of {len(data)} bytes exceeds the {self.dialect.max_line_bytes} "
-                    f"that {self.dialect.name} takes before cutting it silently; shorten it: "
-                    f"{command[:60]!r}."
-                )
-        name = text.split(b" ", 1)[0].decode("ascii", "replace")
-        slow = name in SLOW_COMMANDS or _MACRO.match(name) is not None
-        self._history.append(data)
-        self._slow.append(slow)
-        self._last = number
-        self._cursor = number + 1
-        self._wire_bytes += len(data)
-        self._go(Signal.SENT)
-        self._listen_anew(now_s, self._silence_s())
-        return data
+        number = ledger.last + 1
+        if isinstance(command, str):
+            line = wire_line(number, command, self.dialect)
+        elif command[0] == number:
+            line = command
+        else:
+            line = wire_line(number, command.command, self.dialect)
+        ledger.add(line)
+        self.state = TRANSITIONS[self.state][_SENT]
+        self._listen_anew(now_s)
+        return line[2]
 
     def take_output(self) -> bytes:
         """Return bytes that the link itself wants written (resends, probes), once."""
@@ -264,11 +200,10 @@ class Link:
 
     def next_deadline_s(self) -> float:
         """When `tick` has something to do; infinity if never."""
-        if self.state is State.REWINDING:
-            return self._rewind_until_s
-        if self.state in (State.WAITING, State.PROBING, State.GREETING):
+        state = self.state
+        if state is _WAITING or state is _PROBING or state is _GREETING:
             return self._deadline_s
-        return float("inf")
+        return self._rewind_until_s if state is _REWINDING else NEVER_S
 
     def confirm(self) -> None:
         """Take note that the printer proved to have received every line sent so far.
@@ -276,40 +211,42 @@ class Link:
         For a caller who has seen an answer that only the last line can have caused.
         """
         if self.idle:
-            self._proven = self._last
-            self._refused = self._number_faults = 0
-            self._stale = None
+            self._belief.confirm(self._ledger.last)
+
+    def receive_ok(self, data: bytes) -> bool:
+        """Take the answer that nearly every line gets: the beaten path of `receive`.
+
+        True where `data` is an `ok`, one line was under way and nothing is in doubt: the line is
+        acknowledged. False where it is anything else: nothing is taken, `receive` is to have it.
+        """
+        ledger = self._ledger
+        if (
+            data == b"ok\n"
+            and self.state is _WAITING
+            and ledger.last - ledger.acked == 1
+            and self._swallow_until_s < 0
+            and self._inbox.empty
+        ):
+            ledger.acked = ledger.last
+            ledger.wire_bytes = 0
+            self._belief.progress()
+            self._probing_since_s = None
+            self.state = TRANSITIONS[_WAITING][_DRAINED]
+            self._deadline_s = NEVER_S
+            return True
+        return False
 
     def receive(self, data: bytes, now_s: float) -> list[Event]:
         """Take bytes from the printer and return what they mean; any bytes at all are fine."""
-        if (
-            data == b"ok\n"
-            and self.state is State.WAITING
-            and self._swallow_until_s < 0
-            and not self._inbox
-            and not self._skipping
-        ):  # the beaten path
-            self._acknowledge(self._acked + 1, now_s)
-            events, self._events = self._events, []
-            return events
-        self._inbox += data
-        if b"\n" in data:
-            *lines, rest = bytes(self._inbox).split(b"\n")
-            self._inbox = bytearray(rest)
-            for raw in lines:
-                if self._skipping:
-                    self._skipping = False
-                    continue
-                if len(raw) > MAX_REPLY_BYTES:
-                    self._events.append(Unrecognised(raw[:80]))
-                    self._doubt(now_s)
-                    continue
-                self._reply(raw.rstrip(b"\r"), now_s)
-        if len(self._inbox) > MAX_REPLY_BYTES:
-            self._events.append(Unrecognised(bytes(self._inbox[:80])))
-            self._inbox.clear()
-            self._skipping = True
-        if self.state is State.REWINDING and self._rewind_at_once:
+        if self.receive_ok(data):
+            return [Acknowledged(self._ledger.acked)]
+        for raw, readable in self._inbox.take(data):
+            if readable:
+                self._reply(raw, now_s)
+            else:
+                self._events.append(Unrecognised(raw))
+                self._doubt(now_s)
+        if self.state is _REWINDING and self._rewind_at_once:
             self._rewind(now_s)
         events, self._events = self._events, []
         return events
@@ -318,11 +255,11 @@ class Link:
         """Let time pass; call it no later than `next_deadline_s`."""
         if now_s < self.next_deadline_s():
             return []
-        if self.state is State.REWINDING:
+        if self.state is _REWINDING:
             self._rewind(now_s)
-        elif self.state is State.GREETING:
+        elif self.state is _GREETING:
             self._greet_again(now_s)
-        elif self.state in (State.WAITING, State.PROBING):
+        elif self.state in (_WAITING, _PROBING):
             self._silence(now_s)
         events, self._events = self._events, []
         return events
@@ -344,7 +281,7 @@ class Link:
             self._on_resend(reply.number, now_s)
         elif isinstance(reply, Busy):
             self._events.append(reply)
-            self._listen_anew(now_s, self._silence_s())
+            self._listen_anew(now_s)
         elif isinstance(reply, Waiting):
             self._events.append(reply)
             # It has nothing to do, yet owes us an ok; one that is under way gets a moment.
@@ -364,31 +301,31 @@ class Link:
             # A numbered line whose N was lost: taken for a command without number, checksum
             # and all, and answered with ok. It must be sent again.
             self._events.append(reply)
-            if self.state in (State.WAITING, State.PROBING):
-                self._on_resend(self._acked + 1, now_s)
+            if self.state in (_WAITING, _PROBING):
+                self._on_resend(self._ledger.acked + 1, now_s)
         elif isinstance(reply, Unrecognised):
             self._events.append(reply)
             self._doubt(now_s)
         else:
             self._events.append(reply)
-            if isinstance(reply, TemperatureReport) and self._slow_under_way():
-                self._listen_anew(now_s, self._silence_s())  # the reports of M109 and M190
+            if isinstance(reply, TemperatureReport) and self._ledger.slow_under_way:
+                self._listen_anew(now_s)  # the reports of M109 and M190
 
     def _on_ok(self, ok: Ok, now_s: float) -> None:
         self._events.extend(ok.more)  # type: ignore[arg-type]
-        if self.state is State.GREETING:
+        if self.state is _GREETING:
             self._go(Signal.GREETED)
             self._probing_since_s = None
             self._events.append(Greeted())
             return
-        if self.state is State.REWINDING:
+        if self.state is _REWINDING:
             # The ok that most firmwares send with a resend request (not all: Marlin 2.0.x).
             # With one line under way nothing else can come: go on at once.
-            if self._cursor - 1 - self._acked <= 1:
+            if self._ledger.cursor - 1 - self._ledger.acked <= 1:
                 self._rewind_at_once = True
             self._spare("belongs to a resend request")
             return
-        if self.state not in (State.WAITING, State.PROBING):
+        if self.state not in (_WAITING, _PROBING):
             self._spare("nothing was under way")
             return
         if now_s < self._swallow_until_s:
@@ -396,123 +333,86 @@ class Link:
             self._spare("belongs to a stale resend request")
             return
         self._swallow_until_s = -1.0
-        number = self._acked + 1
-        if ok.number is not None and self._number_faults <= self.timing.max_refused:
-            if ok.number <= self._acked:
-                self._number_faults += 1
-                self._spare(f"line {ok.number} was acknowledged before")
-                self._doubt(now_s)
-                return
-            if ok.number < self._cursor:
-                number = ok.number
-            else:
-                self._number_faults += 1  # ADVANCED_OK numbers can be wrong (Marlin#2952)
-        self._acknowledge(number, now_s)
+        number = self._belief.of_ok(ok.number, self._ledger)
+        if number is None:
+            self._spare(f"line {ok.number} was acknowledged before")
+            self._doubt(now_s)
+        else:
+            self._acknowledge(number, now_s)
 
     def _acknowledge(self, number: int, now_s: float) -> None:
-        if self.state is State.PROBING:
+        ledger, belief = self._ledger, self._belief
+        if self.state is _PROBING:
             # The line was sent twice; one copy earned this ok, the other may earn a request
             # for the next line, which must not be served.
-            self._stale = self._cursor
-        while self._acked < number:
-            self._acked += 1
-            self._wire_bytes -= len(self._history[self._acked - self._last - 1])
-        self._same_resends = 0
+            belief.stale = ledger.cursor
+        ledger.acknowledge(number)
+        belief.progress()
         self._probing_since_s = None
-        self._events.append(Acknowledged(self._acked))
-        if self._acked == self._last:
-            self._wire_bytes = 0
-            self._go(Signal.DRAINED)
-            self._deadline_s = float("inf")
+        self._events.append(Acknowledged(number))
+        if number == ledger.last:
+            self._go(_DRAINED)
+            self._deadline_s = NEVER_S
             return
-        self._go(Signal.ACKED)
-        self._transmit(now_s)
-        self._listen_anew(now_s, self._silence_s())
+        self._go(_ACKED)
+        self._transmit()
+        self._listen_anew(now_s)
 
     def _on_resend(self, number: int, now_s: float) -> None:
-        if not self.dialect.verifies or self.state not in (
-            State.IDLE,
-            State.WAITING,
-            State.REWINDING,
-            State.PROBING,
-        ):
+        if not self.dialect.verifies or Signal.RESEND not in TRANSITIONS[self.state]:
             self._events.append(ResendRequested(number, served=False))
-            if self.state is State.GREETING:
+            if self.state is _GREETING:
                 self._deadline_s = min(self._deadline_s, now_s + self.timing.resend_grace_s)
             elif not self.dialect.verifies and not self.ended:
                 self._lose(f"the printer asked for line {number}, which may be executed already")
             return
-        if self.state is not State.REWINDING and number == self._stale and number < self._cursor:
-            self._stale = None
-            self._swallow_until_s = now_s + self.timing.resend_grace_s
+        rewinding = self.state is _REWINDING
+        verdict, why = self._belief.of_resend(number, self._ledger, rewinding=rewinding)
+        if verdict is Verdict.SERVE:
+            self._serve(number, now_s)
+        elif verdict is Verdict.ECHO:
             self._events.append(ResendRequested(number, served=False))
+        else:
+            self._events.append(ResendRefused(number, why))
+        if verdict is Verdict.END:
+            self._lose(why)
+        elif verdict is not Verdict.SERVE:
+            # The request itself may be garbled: ask again before believing it.
+            self._swallow_until_s = now_s + self.timing.resend_grace_s
             self._doubt(now_s)
-            return
-        if (why := self._why_refused(number)) is not None:
-            self._refuse(number, why, now_s)
-            return
-        if number != self._last_resend:
-            self._same_resends = 0
-        if self.state is not State.REWINDING:  # a burst of requests counts once
-            self._same_resends += 1
-        self._last_resend = number
-        if self._same_resends > self.timing.max_resends:
-            self._lose(f"the printer asked for line {number} {self._same_resends} times in a row")
-            return
-        if number <= self._last:
+
+    def _serve(self, number: int, now_s: float) -> None:
+        """Make ready to send again from line `number`, once older answers are in."""
+        ledger = self._ledger
+        if number <= ledger.last:
             self.resends += 1
         self._events.append(ResendRequested(number, served=True))
-        if number - 1 > self._acked:
+        if number - 1 > ledger.acked:
             self._events.append(Acknowledged(number - 1))
-        self._acked = number - 1
-        self._cursor = max(self._cursor, number)
+        ledger.expect_again(number)
         self._rewind_until_s = now_s + self.timing.resend_grace_s
         self._rewind_at_once = False
         self._go(Signal.RESEND)
 
-    def _why_refused(self, number: int) -> str | None:
-        if number > self._last + 1:
-            return f"line {number} was never sent, the last is {self._last}"
-        if number <= self._proven:
-            return f"line {number} is proved to be received: the printer has lost its place"
-        if number <= self._last - len(self._history):
-            return f"line {number} is not in the last {len(self._history)} lines any more"
-        return None
-
-    def _refuse(self, number: int, why: str, now_s: float) -> None:
-        self._events.append(ResendRefused(number, why))
-        if self._acked - self._refused_at >= 2:
-            self._refused = 0  # it has made progress since: that one was noise
-        self._refused_at = self._acked
-        self._refused += 1
-        if self._refused >= self.timing.max_refused:
-            self._lose(why)
-        elif self.state is State.IDLE:
-            self._swallow_until_s = now_s + self.timing.resend_grace_s
-        else:
-            # The reply itself may be garbled: ask again before believing it.
-            self._swallow_until_s = now_s + self.timing.resend_grace_s
-            self._doubt(now_s)
-
     def _rewind(self, now_s: float) -> None:
         """Send again from the line asked for, now that all older answers are in."""
+        ledger = self._ledger
         self._rewind_at_once = False
-        self._cursor = self._acked + 1
         self._swallow_until_s = -1.0
-        self._wire_bytes = 0
-        if self._cursor > self._last:
-            self._stale = None
+        ledger.rewind()
+        if ledger.cursor > ledger.last:
+            self._belief.stale = None
             self._probing_since_s = None
-            self._go(Signal.DRAINED)
-            self._deadline_s = float("inf")
+            self._go(_DRAINED)
+            self._deadline_s = NEVER_S
             return
         self._go(Signal.REWOUND)
-        self._stale = self._cursor + 1
-        self._transmit(now_s)
-        self._listen_anew(now_s, self._silence_s())
+        self._belief.stale = ledger.cursor + 1
+        self._transmit()
+        self._listen_anew(now_s)
 
     def _on_reset(self, reset: PrinterReset, now_s: float) -> None:
-        if self.state is State.GREETING:
+        if self.state is _GREETING:
             self._go(Signal.RESET)
             self._deadline_s = min(self._deadline_s, now_s + self.timing.resend_grace_s)
         elif self.state not in (State.UNGREETED, State.LOST):
@@ -524,17 +424,17 @@ class Link:
         since_s = self._probing_since_s
         if since_s is None:
             since_s = self._probing_since_s = self._heard_s
-        slow = self._slow_under_way()
+        slow = self._ledger.slow_under_way
         limit_s = self.timing.slow_give_up_s if slow else self.timing.give_up_s
         if now_s - since_s >= limit_s:
-            self._lose(f"no answer to line {self._acked + 1} for {now_s - since_s:.1f} s")
+            self._lose(f"no answer to line {self._ledger.acked + 1} for {now_s - since_s:.1f} s")
             return
         if not self.dialect.verifies:
             # Nothing can be sent twice here: wait, and in the end stop.
             self._deadline_s = since_s + limit_s
             return
-        number = self._cursor - 1
-        self._out += self._line(number)
+        number = self._ledger.cursor - 1
+        self._out += self._ledger.data(number)
         self.probes += 1
         self._events.append(Probed(number))
         self._go(Signal.SILENCE)
@@ -546,40 +446,28 @@ class Link:
         else:
             self._out += self._hello_bytes(now_s)
 
-    def _slow_under_way(self) -> bool:
-        offset = self._acked - self._last
-        if offset == -1:
-            return self._slow[-1]  # one line under way: the beaten path
-        return any(self._slow[index] for index in range(offset, 0))
-
     def _silence_s(self) -> float:
-        if self._slow and self._slow_under_way():
-            return self.timing.slow_silence_s
-        return self.timing.silence_s
+        slow = self._ledger.slow_under_way
+        return self.timing.slow_silence_s if slow else self.timing.silence_s
 
-    def _listen_anew(self, now_s: float, silence_s: float) -> None:
+    def _listen_anew(self, now_s: float) -> None:
         self._heard_s = now_s
         self._probing_since_s = None
-        self._deadline_s = now_s + silence_s
+        self._deadline_s = now_s + self._silence_s()
 
     def _doubt(self, now_s: float, after_s: float | None = None) -> None:
         """Something is odd: wait only shortly before asking again."""
-        if self.state in (State.WAITING, State.PROBING):
+        if self.state in (_WAITING, _PROBING):
             wait_s = self.timing.doubt_s if after_s is None else after_s
             self._deadline_s = min(self._deadline_s, now_s + wait_s)
 
     # ------------------------------------------------------------------ small parts
 
-    def _transmit(self, now_s: float) -> None:
+    def _transmit(self) -> None:
         """Put lines that wait to be sent (again) on the wire, as far as the window allows."""
-        while self._cursor <= self._last and self._cursor - 1 - self._acked < self.window:
-            data = self._line(self._cursor)
-            self._out += data
-            self._wire_bytes += len(data)
-            self._cursor += 1
-
-    def _line(self, number: int) -> bytes:
-        return self._history[number - self._last - 1]
+        ledger = self._ledger
+        while ledger.cursor <= ledger.last and ledger.cursor - 1 - ledger.acked < self.window:
+            self._out += ledger.next_again()
 
     def _spare(self, why: str) -> None:
         self.spare_oks += 1
@@ -587,9 +475,9 @@ class Link:
 
     def _lose(self, why: str, signal: Signal = Signal.GIVE_UP) -> None:
         self._go(signal)
-        self._deadline_s = float("inf")
+        self._deadline_s = NEVER_S
         self._out.clear()
-        self._events.append(LinkLost(why, self._acked, self._last))
+        self._events.append(LinkLost(why, self._ledger.acked, self._ledger.last))
 
     def _go(self, signal: Signal) -> None:
         try:
@@ -598,28 +486,3 @@ class Link:
             raise LocalProtocolError(
                 f"{signal.value!r} is not possible while the link is {self.state.value}."
             ) from None
-
-
-def _numbered(number: int, text: bytes) -> bytes:
-    body = b"N%d %b" % (number, text)
-    return b"%b*%d\n" % (body, reduce(xor, body))
-
-
-def wire_text(command: str) -> bytes:
-    """Strip a G-code line to what goes on the wire: no comment, no space around, ASCII.
-
-    Raises
-    ------
-    LocalProtocolError
-        If nothing is left, if the command would end the line early, or if it renumbers lines.
-    """
-    text = command.partition(";")[0].strip()
-    if not text:
-        raise LocalProtocolError("An empty line or a comment is not sent; leave it out.")
-    if "\n" in text or "\r" in text:
-        raise LocalProtocolError(f"A command is one line; split it: {command[:60]!r}.")
-    if "M110" in text:
-        if text[:4] not in ("M117", "M118"):
-            raise LocalProtocolError(f"M110 renumbers lines and is the link's own: {text[:60]!r}.")
-        text = text.replace("M110", "M 110")  # Marlin finds M110 anywhere in a numbered line
-    return text.encode("ascii", "replace")

@@ -149,7 +149,8 @@ def chipped(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: Path) -> None:
     out, report = tmp_path / "repair.gcode", tmp_path / "report.html"
     words = ["repair", chipped["scan.xyz"], "--template", chipped["part.stl"], "-o", out]
-    words += ["--part-pose", "100,80,0,0", "--report", report, "--json"]
+    standing = tmp_path / "standing.npz"
+    words += ["--part-pose", "100,80,0,0", "--report", report, "--standing", standing, "--json"]
     done = call(*words)
     # 3: a strip beside the chip's cliff stays out of the nozzle's reach
     assert done.returncode in (0, 3), done.stderr
@@ -161,8 +162,14 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     homing = [line for line in text.splitlines() if line.startswith("G28")]
     assert homing == ["G28 X Y"]
     assert report.stat().st_size > 10_000
-    checked = call("check", out, "--json", program="gcode")
-    assert checked.returncode in (0, 2)  # without --as-built Z is not homed: it may say so
+    # regression: nothing wrote what --as-built needs, so nobody could check or send a repair
+    assert call("check", out, program="gcode").returncode == 2  # Z is not homed
+    checked = call("check", out, "--as-built", standing, program="gcode")
+    assert checked.returncode == 0, checked.stderr
+    copy = f"file:{tmp_path / 'sent.gcode'}"
+    sent = call("send", out, "--as-built", standing, "--port", copy, program="gcode")
+    assert sent.returncode == 0, sent.stderr
+    assert (tmp_path / "sent.gcode").read_text().rstrip() == text.rstrip()
     estimate = json.loads(call("estimate", out, "--json", program="gcode").stdout)
     assert estimate["filament_mm"] == pytest.approx(result["filament_mm"], rel=0.01)
     (x0, y0, _), (x1, y1, z1) = result["regions"][0]["box_mm"]

@@ -174,7 +174,7 @@ def test_the_nozzle_is_back_where_the_job_left_it_before_it_goes_on(
     class Recorder(FilePrinter):
         def print(self, checked: PrintableProgram, **_: object) -> PrintReport:
             sent.append(checked.program.text)
-            return PrintReport(True, 0, 0, 0, 0, 0, 0.0, 0, (0.0, 0.0, 0.0))
+            return PrintReport(True, 0, 0, 0, 0, 0, 0.0, 0, (0.0, 0.0, 0.0), 0)
 
     recorder = Recorder(tmp_path / "unused.gcode")
     parked = _park(recorder, run.setup, state)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from gcode.moves import Program
 from gcode.profiles import AxisLimits, EnvelopeSlice, PrinterProfile
@@ -47,8 +48,12 @@ class Unjudged:
 
     program: Program
 
+    @cached_property
+    def _lines(self) -> list[str]:
+        return self.program.text.split("\n")
+
     def lines(self, first: int, end: int) -> list[str]:
-        return self.program.text.split("\n")[first:end]
+        return self._lines[first:end]
 
 
 def program(lines: list[str]) -> Unjudged:

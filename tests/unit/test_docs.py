@@ -104,3 +104,11 @@ def test_it_builds_without_warnings_and_fetches_nothing(tmp_path: Path) -> None:
     reference = (tmp_path / "site" / "reference" / "amrepair.html").read_text(encoding="utf-8")
     assert "build_from_template" in reference  # taken from the docstrings
     assert "amrepair repair" in (tmp_path / "site" / "reference" / "commands.html").read_text()
+
+
+def test_every_example_has_its_picture_on_the_page() -> None:
+    page = (DOCS / "examples.md").read_text(encoding="utf-8")
+    for example in (ROOT / "examples").glob("[0-9]*.py"):
+        picture = DOCS / "images" / f"example-{example.name[:2]}.webp"
+        assert f"images/{picture.name}" in page, example.name
+        assert 1_000 < picture.stat().st_size < 150_000

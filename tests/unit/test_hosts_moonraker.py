@@ -153,7 +153,8 @@ def test_a_print_is_uploaded_whole_and_followed_to_its_end(fake: FakeMoonraker) 
     assert fake.uploads[0] == JOB.program.text.encode()
     assert fake.uploads[1].decode().split("\n") == [*moves(3), ""]
     assert (report.ok, report.lines_acked) == (True, 21)
-    assert (part.lines_acked, part.next_line) == (3, 6)
+    # regression: first_line was left out, and so 0
+    assert (part.lines_acked, part.first_line, part.next_line) == (3, 3, 6)
     assert told[-1] == 1.0
     assert fake.files == {}
 

@@ -192,7 +192,8 @@ def test_a_part_of_a_program_uploads_that_part(fake: FakeOctoPrint) -> None:
     with printer_at(fake) as printer:
         report = printer.print(JOB, lines=range(3, 6))
     assert seen[0].decode().split("\n") == [*moves(3), ""]
-    assert (report.lines_acked, report.next_line) == (3, 6)
+    # regression: first_line was left out, and so 0
+    assert (report.lines_acked, report.first_line, report.next_line) == (3, 3, 6)
 
 
 def test_questions_are_answered_from_the_terminal(fake: FakeOctoPrint) -> None:

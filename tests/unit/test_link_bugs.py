@@ -19,9 +19,8 @@ import gcode.hosts.serial as serial_host
 from gcode.errors import LocalProtocolError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts.serial import SerialPrinter
-from gcode.protocol import Link, State, checksum
+from gcode.protocol import HISTORY_LINES, Link, State, checksum
 from gcode.protocol import events as ev
-from gcode.protocol.link import HISTORY_LINES
 
 LINES = [f"G1 X{i} Y{i * 3 % 170} F6000" for i in range(60)]
 

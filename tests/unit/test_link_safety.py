@@ -210,7 +210,7 @@ def test_a_printer_that_refuses_us_is_not_ours_to_abort(
     # regression: found in a merge; cancelling would have ended somebody else's print
     job, machine = tmp_path / "job.gcode", Occupied()
     job.write_text("G28\nG1 X10 Y10 Z5 F3000\n")
-    monkeypatch.setattr("gcode.cli.app.connect", lambda *_, **__: machine)
+    monkeypatch.setattr("gcode.hosts.connect", lambda *_, **__: machine)
     with pytest.raises(LinkError, match="another job"):
         send(job, port="octoprint+http://nowhere", printer="generic_marlin")
     assert machine.aborted == 0

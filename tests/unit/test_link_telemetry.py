@@ -66,8 +66,8 @@ def test_noise_and_several_lines_make_one_row_each(tmp_path: Path) -> None:
 @given(st.lists(st.floats(2e-6, 200.0), min_size=1, max_size=300))
 def test_percentiles_are_right_to_five_percent(trips_s: list[float]) -> None:
     trips = RoundTrips()
-    for trip_s in trips_s:
-        trips.add(trip_s)
+    trips.add(trips_s[:100])
+    trips.add(trips_s[100:])
     for percent in (50.0, 95.0, 99.0):
         true_s = float(np.percentile(trips_s, percent, method="inverted_cdf"))
         assert trips.percentile_s(percent) == pytest.approx(true_s, rel=0.05)

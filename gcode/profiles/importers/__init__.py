@@ -19,8 +19,9 @@ from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.klipper import KLIPPER, finish, read_klipper
 from gcode.profiles.importers.rules import Imported, Left, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
+from gcode.profiles.names import Kind, list_profiles
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
-from gcode.profiles.store import Kind, content_of, list_profiles
+from gcode.profiles.store import content_of
 
 __all__ = ["Imported", "ImportedFile", "Left", "Mapped", "import_profiles", "to_toml"]
 

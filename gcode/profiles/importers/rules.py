@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from gcode.profiles.store import Kind
+from gcode.profiles.names import Kind
 
 _LENGTH = re.compile(r"[-+]?\d+(?:\.\d+)?")
 

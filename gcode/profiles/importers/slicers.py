@@ -25,7 +25,7 @@ from gcode.profiles.importers.rules import (
     share,
     whole,
 )
-from gcode.profiles.store import Kind
+from gcode.profiles.names import Kind
 
 _DIALECT = choice(
     marlin="marlin",

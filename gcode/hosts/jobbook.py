@@ -1,0 +1,144 @@
+"""Which program line went out under which number, and the journal that is written before it does.
+
+The order is the promise: `before_line` and `before_own_command` return when the journal holds
+what is about to happen, and only then may bytes be written. What is known to be executed is read
+from the link's own acknowledgements, which a resend request may take back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections import deque
+from collections.abc import Callable
+
+from gcode.errors import JournalError
+from gcode.hosts.journal import Journal
+from gcode.hosts.port import PrintableProgram
+from gcode.protocol import HISTORY_LINES, Link
+from gcode.protocol.events import TemperatureReport
+
+UNCOUNTED_STEP = 16
+"""Lines reserved by one commit where the printer counts none: few enough for its place to tell one
+from another, many enough for a slow disk not to hold up short moves."""
+TEMPERATURE_STEP_C = 2.0
+TEMPERATURE_EVERY_S = 10.0
+"""How often the journal hears of temperatures; a bed loses about a degree in that time."""
+
+
+class JobBook:
+    """The lines of one `print` call; without a journal nothing is written, all is known.
+
+    Attributes
+    ----------
+    lines_sent
+        Program lines sent; comments and empty lines never are.
+    """
+
+    def __init__(self, link: Link, journal: Journal | None, clock: Callable[[], float]) -> None:
+        self._link = link
+        self._journal = journal
+        self._clock = clock
+        self._sent: deque[tuple[int, int]] = deque(maxlen=2 * HISTORY_LINES)
+        self._first = self._end = 0
+        self._reserved = 0  # end of the journal's open step; 0 if none is open
+        self._noted_s = self._noted_bed_c = -math.inf
+        self.lines_sent = 0
+
+    def open(self, first: int, end: int) -> None:
+        """Turn to a new page: program lines [first, end)."""
+        self._sent.clear()
+        self._first, self._end = first, end
+        self._reserved = self.lines_sent = 0
+
+    def begin(self, checked: PrintableProgram, port: str) -> None:
+        """Write the job down."""
+        if self._journal is not None:
+            self._journal.begin(checked.program.sha256, port, self._first, self._end)
+
+    # ------------------------------------------------------------------ ahead of the wire
+
+    def before_line(self, index: int) -> None:
+        """Write down that program line `index` is sent next."""
+        if index >= self._reserved:
+            self._reserve(index)
+        self._sent.append((self._link.last_sent + 1, index))
+        self.lines_sent += 1
+
+    def _reserve(self, index: int) -> None:
+        if self._journal is None:
+            self._reserved = self._end
+            return
+        step = self._journal.step_lines if self._link.dialect.verifies else UNCOUNTED_STEP
+        reserved = min(index + step, self._end)
+        self._journal.reserve(index, self._next_number(), reserved, self.executed_line + 1)
+        self._reserved = reserved
+
+    def before_own_command(self) -> None:
+        """Write down that the next wire number is no program line's."""
+        if self._journal is not None and self._reserved:
+            line = self.last_sent_line + 1
+            self._journal.reserve(line, self._next_number(), line, self.executed_line + 1)
+            self._reserved = 0
+
+    def _next_number(self) -> int | None:
+        return self._link.last_sent + 1 if self._link.dialect.verifies else None
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def last_sent_line(self) -> int:
+        """The last program line sent; the one before the first if none was."""
+        return self._sent[-1][1] if self._sent else self._first - 1
+
+    @property
+    def executed_line(self) -> int:
+        """The last program line whose number is acknowledged."""
+        acked = self._link.last_acked
+        for number, index in reversed(self._sent):
+            if number <= acked:
+                return index
+        return self._first - 1
+
+    @property
+    def lines_acked(self) -> int:
+        """How many program lines are acknowledged."""
+        acked = self._link.last_acked
+        return self.lines_sent - sum(number > acked for number, _ in self._sent)
+
+    # ------------------------------------------------------------------ afterwards
+
+    def proved(self) -> None:
+        """Write down that every line sent has been received, proved by an answer."""
+        if self._journal is not None:
+            self._journal.acknowledged(self.executed_line + 1)
+
+    def finish(self) -> None:
+        """Write down that the whole program is done."""
+        if self._journal is not None:
+            self._journal.finish()
+
+    def lost(self) -> None:
+        """Write down what a lost link leaves uncertain; a full disk must not stop a safe exit."""
+        if self._journal is not None:
+            with contextlib.suppress(JournalError):
+                self._journal.lost(self.executed_line + 1, self.last_sent_line + 1)
+
+    def note(self, text: str) -> None:
+        """Write a remark down, if that is possible."""
+        if self._journal is not None:
+            with contextlib.suppress(JournalError):
+                self._journal.note(text)
+
+    def temperature(self, report: TemperatureReport) -> None:
+        """Write temperatures down, some of the many that come while something heats."""
+        heaters = report.heaters
+        hotend, bed = heaters.get("T") or heaters.get("T0"), heaters.get("B")
+        if self._journal is None or hotend is None:
+            return
+        now_s = self._clock()
+        bed_c = bed.current_c if bed else None
+        change_c = abs((bed_c or 0.0) - self._noted_bed_c)
+        if now_s >= self._noted_s + TEMPERATURE_EVERY_S / 2 or change_c >= TEMPERATURE_STEP_C:
+            self._noted_s, self._noted_bed_c = now_s, bed_c or 0.0
+            self._journal.temperature(hotend.current_c, bed_c)

@@ -1,0 +1,88 @@
+"""The journal is written before the wire, and an ok that a request takes back counts no more."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from link_helpers import moves, profile, program
+
+import gcode.hosts.serial as serial_host
+from gcode.firmware import EmulatedPrinterProcess
+from gcode.hosts.file import FilePrinter
+from gcode.hosts.jobbook import JobBook
+from gcode.hosts.journal import Journal
+from gcode.protocol import Link
+
+
+def test_no_line_goes_out_before_the_disk_says_that_it_may(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At every write another connection to the journal already sees line and number reserved."""
+    monkeypatch.setattr(serial_host, "require_checked", lambda checked: None)
+    path = tmp_path / "journal.sqlite"
+    lines = ["M302 S0", *moves(300)]
+    seen: list[int] = []
+    with (
+        EmulatedPrinterProcess(printer=profile()) as emulator,
+        serial_host.SerialPrinter(
+            emulator.port, journal=Journal(path, step_lines=64), supervise=False, guard=False
+        ) as printer,
+    ):
+        reader = sqlite3.connect(path)
+        write = printer._write
+
+        def watched(data: bytes) -> None:
+            match = re.match(rb"N(\d+) (.*)\*", data)
+            if match is not None and (text := match.group(2).decode()) in lines:
+                index = lines.index(text)
+                line, number, reserved = reader.execute(
+                    "SELECT line, number, reserved FROM step ORDER BY rowid DESC LIMIT 1"
+                ).fetchone()
+                assert line <= index < reserved
+                assert int(match.group(1)) == number + index - line
+                seen.append(index)
+            write(data)
+
+        monkeypatch.setattr(printer, "_write", watched)
+        report = printer.print(program(lines))
+        reader.close()
+    assert report.ok
+    assert seen == list(range(len(lines)))
+
+
+def test_an_ok_that_is_taken_back_is_not_called_executed() -> None:
+    # regression: a lost link named lines as acknowledged that the printer had asked for again
+    link = Link()
+    link.hello(0.0)
+    link.receive(b"ok\n", 0.0)
+    book = JobBook(link, None, lambda: 0.0)
+    book.open(10, 20)
+    for index in (10, 12, 13):
+        book.before_line(index)
+        link.send(f"G1 X{index}", 0.0)
+        link.receive(b"ok\n", 0.0)
+    assert (book.executed_line, book.last_sent_line, book.lines_acked) == (13, 13, 3)
+    link.receive(b"Error:checksum mismatch\nResend: 2\n", 1.0)  # an earlier ok was a spare one
+    assert (book.executed_line, book.last_sent_line, book.lines_acked) == (10, 13, 1)
+    link.give_up("the cable was pulled")
+    assert (book.executed_line, book.last_sent_line) == (10, 13)
+
+
+def test_before_the_first_line_nothing_is_executed() -> None:
+    book = JobBook(Link(), None, lambda: 0.0)
+    book.open(5, 9)
+    assert (book.executed_line, book.last_sent_line, book.lines_acked) == (4, 4, 0)
+
+
+def test_a_file_says_which_part_it_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # regression: every adapter but the serial one reported line 0 as its first
+    monkeypatch.setattr("gcode.hosts.file.require_checked", lambda checked: None)
+    with FilePrinter(tmp_path / "part.gcode") as printer:
+        report = printer.print(program(moves(9)), lines=range(3, 6))
+    assert (report.first_line, report.next_line, report.lines_acked) == (3, 6, 3)
