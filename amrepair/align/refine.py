@@ -139,23 +139,3 @@ def _vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
     """Axis-angle vector of a small rotation."""
     skew = 0.5 * (rotation - rotation.T)
     return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
-
-
-def thin_out(
-    points_mm: Float[np.ndarray, "n 3"], count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "m 3"]:
-    """About `count` points, evenly over space: one of each voxel, chosen by the generator."""
-    if len(points_mm) <= count:
-        return np.array(points_mm, dtype=np.float64)
-    shuffled = points_mm[rng.permutation(len(points_mm))]
-    low = shuffled.min(axis=0)
-    extent_mm = float((shuffled.max(axis=0) - low).max())
-    voxel_mm = max(extent_mm / 400.0, 1e-6)
-    for _ in range(40):
-        key = np.floor((shuffled - low) / voxel_mm).astype(np.int64)
-        flat = (key[:, 0] * 2_000_003 + key[:, 1]) * 2_000_003 + key[:, 2]
-        _, first = np.unique(flat, return_index=True)
-        if len(first) <= count:
-            return np.ascontiguousarray(shuffled[np.sort(first)])
-        voxel_mm *= 1.0 + 0.5 * min(1.0, np.sqrt(len(first) / count) - 1.0) + 0.02
-    return np.ascontiguousarray(shuffled[:count])
