@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from amrepair.align.coarse import by_features
 from amrepair.align.refine import Refined, refine
-from amrepair.align.search import CoarseField, Pose, search
+from amrepair.align.search import QUICK, THOROUGH, CoarseField, Effort, search
 from amrepair.align.thinning import thin_out
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
@@ -33,7 +33,8 @@ SAME_FIT, SAME_FIT_MM = 1.5, 0.005
 CLEAR_SIGMAS, CLEAR_MM = 4.0, 0.1
 CONTRADICTED_RATIO, CONTRADICTED_SIGMAS = 0.003, 4.0
 APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
-EXPLAINED = 0.7  # with fewer points on the part, features are asked too
+# With fewer points on the part the search is made thorough; then features are asked too.
+WELL_EXPLAINED, EXPLAINED = 0.85, 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,14 +94,17 @@ def pose_from_anywhere(
     clouds = _clouds(points_mm, template, sigma_mm, rng)
     field = CoarseField.of(template)
     progress("align", 0.1, 1.0)
-    starts = [pose.matrix for pose in _worth_refining(clouds, field, rng)]
-    progress("align", 0.5, 1.0)
-    found = _refined(starts, clouds, template)
+    found = _refined(_worth_refining(clouds, field, QUICK, rng), clouds, template)
+    if _explained(found[0][1], inlier_mm) < WELL_EXPLAINED:
+        progress("align", 0.3, 1.0)
+        starts = _worth_refining(clouds, field, THOROUGH, rng)
+        found = sorted(found + _refined(starts, clouds, template), key=_by_score)
     if _explained(found[0][1], inlier_mm) < EXPLAINED:
+        progress("align", 0.6, 1.0)
         surface = template.surface_points(np.sqrt(clouds.diagonal_mm**2 / FEATURE_POINTS))[0]
         extra = tuple(by_features(clouds.dense_mm, surface, clouds.diagonal_mm))
         if extra:
-            starts = [pose.matrix for pose in search(clouds.dense_mm, field, rng, extra)]
+            starts = [pose.matrix for pose in search(clouds.dense_mm, field, rng, only=extra)]
             found = sorted(found + _refined(starts, clouds, template), key=_by_score)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
@@ -137,13 +141,14 @@ def _clouds(
 def _worth_refining(
     clouds: _Clouds,
     field: CoarseField,
+    effort: Effort,
     rng: np.random.Generator,
-) -> list[Pose]:
-    poses = search(clouds.dense_mm, field, rng)
+) -> list[Float[np.ndarray, "4 4"]]:
+    poses = search(clouds.dense_mm, field, rng, effort=effort)
     limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
     fits = poses[0].score_mm <= 3.0 * clouds.sigma_mm + GOOD_CELLS * field.cell_mm
     most = MOST_REFINED if fits else MOST_DOUBTFUL
-    return [pose for pose in poses[:most] if pose.score_mm <= limit_mm]
+    return [pose.matrix for pose in poses[:most] if pose.score_mm <= limit_mm]
 
 
 def _by_score(one: tuple[float, Refined]) -> float:

@@ -17,7 +17,9 @@ from amrepair.template.port import Template
 
 SHRINK = 0.6  # of the loss's scale, from one iteration to the next
 STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
+STEP_SIGMAS = 0.01
 MAX_ITERATIONS = 60
+HASTE = 25  # iterations with whole steps
 INLIER_SIGMAS = 4.0
 
 
@@ -118,10 +120,12 @@ def refine(
         turn = float(np.linalg.norm(step[:3]))
         if turn > 0.2:  # a step this wide has left the linear range
             step *= 0.2 / turn
+        if iterations > HASTE:  # where it steps to and fro across an edge of the field
+            step *= 0.5
         rotation = rotation_from_vector(step[:3]) @ rotation
         place = place + step[3:]
         moved_mm = float(np.linalg.norm(step[3:])) + reach_mm * float(np.linalg.norm(step[:3]))
-        if scale <= end_scale_mm * (1 + 1e-9) and moved_mm < STEP_MM:
+        if scale <= end_scale_mm * (1 + 1e-9) and moved_mm < max(STEP_MM, STEP_SIGMAS * sigma_mm):
             converged = True
             break
         if moved_mm < 0.25 * scale:
