@@ -25,7 +25,7 @@ FEATURE_POINTS = 30_000  # of the template's surface
 # The coarse field rounds edges: a right pose may look worse than a wrong one by this factor.
 COARSE_FACTOR, MOST_REFINED, MOST_DOUBTFUL = 1.8, 40, 8
 GOOD_CELLS = 0.2  # what the coarse field is off by, at most, on a scan that fits
-FEW_FACTOR, FEW_ITERATIONS, MOST_FINISHED = 1.5, 30, 3
+FEW_FACTOR, FEW_ITERATIONS, DENSE_ITERATIONS, MOST_FINISHED = 1.5, 30, 120, 3
 # Another pose fits as well if its score is of the best one's size, and no more than a few points
 # lie on the part in the best pose and clearly off it in the other. Clearly: beyond the noise, and
 # beyond what prints of one part differ by.
@@ -108,6 +108,8 @@ def pose_from_anywhere(
             found = sorted(found + _refined(starts, clouds, template), key=_by_score)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
+    if not best.converged:
+        best = _finished(best, clouds, template, True)
     slid = _refined(_slides(best, clouds), clouds, template, finish=False)
     slid = [(score, _finished(moved, clouds, template, False)) for score, moved in slid]
     others: list[Float[np.ndarray, "4 4"]] = []
@@ -203,6 +205,7 @@ def _finished(rough: Refined, clouds: _Clouds, template: Template, move: bool) -
             start_scale_mm=scale_mm,
             end_scale_mm=scale_mm,
             sigma_mm=clouds.sigma_mm,
+            max_iterations=DENSE_ITERATIONS,
         )
     placed = clouds.dense_mm @ rough.matrix[:3, :3].T + rough.matrix[:3, 3]
     return Refined(

@@ -17,9 +17,9 @@ from amrepair.template.port import Template
 
 SHRINK = 0.6  # of the loss's scale, from one iteration to the next
 STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
-STEP_SIGMAS = 0.01
+STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
 MAX_ITERATIONS = 60
-HASTE = 25  # iterations with whole steps
+HASTE = 15  # iterations with whole steps
 INLIER_SIGMAS = 4.0
 
 
@@ -98,7 +98,7 @@ def refine(
     local = points_mm - centre
     scale, converged, hessian = start_scale_mm, False, np.zeros((6, 6))
     f = np.zeros(len(points_mm))
-    iterations = 0
+    iterations, last = 0, np.zeros(6)
     while iterations < max_iterations:
         iterations += 1
         turned = local @ rotation.T
@@ -120,8 +120,9 @@ def refine(
         turn = float(np.linalg.norm(step[:3]))
         if turn > 0.2:  # a step this wide has left the linear range
             step *= 0.2 / turn
-        if iterations > HASTE:  # where it steps to and fro across an edge of the field
-            step *= 0.5
+        if iterations > HASTE and float(step @ last) < 0.0:
+            step *= 0.5  # to and fro across an edge of the field
+        last = step
         rotation = rotation_from_vector(step[:3]) @ rotation
         place = place + step[3:]
         moved_mm = float(np.linalg.norm(step[3:])) + reach_mm * float(np.linalg.norm(step[:3]))

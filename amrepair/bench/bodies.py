@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 
 from amrepair.align.refine import refine
 from amrepair.align.thinning import thin_out
 from amrepair.template.port import Template
 
 LEAST_SHARE = 0.1  # of the points: a smaller piece never outweighs the other
-LEAST_EXPLAINED = 0.75  # of that piece, by its own pose
+LEAST_EXPLAINED = 0.6  # of that piece, by its own pose; the bent zone fits neither
+MOST_WRONG = 0.2  # of either piece, on the wrong side of the plane between them
 POINTS = 3_000
 CLEAR_SIGMAS, CLEAR_RATIO = 4.0, 0.002  # a point is off the surface; the ratio is of the diagonal
 FIRST_RATIO = 0.04  # scale of the second alignment's loss, of the diagonal
@@ -76,12 +76,24 @@ def _share(
     template: Template,
     poses: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]],
 ) -> float:
-    """Share of the template's surface that is nearest to points of the second piece."""
-    pieces = [
+    """Share of the template's surface on the second piece's side of the plane between the two.
+
+    A plane (Fisher's discriminant), not the nearest points: a view shows little of what it was not
+    made for. 0 where no plane parts them.
+    """
+    first, second = (
         cloud[which] @ matrix[:3, :3].T + matrix[:3, 3]
         for which, matrix in zip((~off, on_other), poses, strict=True)
-    ]
+    )
+    within = np.cov(first.T) + np.cov(second.T)
+    within += 1e-6 * np.trace(within) * np.eye(3)
+    across = np.linalg.solve(within, second.mean(axis=0) - first.mean(axis=0))
+    low, high = first @ across, second @ across
+    limits = np.quantile(np.concatenate([low, high]), np.linspace(0.02, 0.98, 97))
+    wrong = [0.5 * float((low > at).mean() + (high <= at).mean()) for at in limits]
+    best = int(np.argmin(wrong))
+    if wrong[best] > MOST_WRONG:
+        return 0.0
     diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
     surface = template.surface_points(SURFACE_RATIO * diagonal_mm)[0]
-    first, second = (np.asarray(cKDTree(piece).query(surface)[0]) for piece in pieces)
-    return float((second < first).mean())
+    return float((surface @ across > limits[best]).mean())
