@@ -28,6 +28,7 @@ NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
 INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
 INLIER_SIGMAS = 3.0
 SCALE_JUMP = 5.0  # sizes that differ by more are another unit
+SIZE_JUMP = 1.6  # sizes that differ by more are worth a word
 
 
 def align(
@@ -120,6 +121,7 @@ def align(
             f"within {inlier_mm:.2g} mm (at least {LEAST_INLIERS:.0%} are needed)"
             + ("" if found.converged else " and the refinement did not converge")
             + "; check part, unit and calibration"
+            + ("" if guess is not None else _other_size(scan, template))
         )
     return Registration(
         template_from_scan=Transform("template", scan.frame, found.matrix),
@@ -185,6 +187,15 @@ def _part_only(
     # a flat part seen from below has no other points: then all of the box count
     keep = near & above if (near & above).sum() >= LEAST_POINTS else near
     return points_mm[keep]
+
+
+def _other_size(scan: Scan, template: Template) -> str:
+    """What to add to a refusal, where the sizes differ much."""
+    size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
+    other = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    if 1.0 / SIZE_JUMP < size / max(other, 1e-12) < SIZE_JUMP:
+        return ""
+    return f" (the scan is {size:.3g} mm across, its template {other:.3g} mm)"
 
 
 def _refuse_other_size(scan: Scan, template: Template) -> None:
