@@ -23,7 +23,7 @@ from gcode.progress import Progress, silent
 DENSE_POINTS, FEW_POINTS = 15_000, 2_000
 FEATURE_POINTS = 30_000  # of the template's surface
 # The coarse field rounds edges: a right pose may look worse than a wrong one by this factor.
-COARSE_FACTOR, MOST_REFINED, MOST_DOUBTFUL = 1.8, 40, 8
+COARSE_FACTOR, MOST_REFINED, MOST_DOUBTFUL = 1.8, 40, 5
 GOOD_CELLS = 0.2  # what the coarse field is off by, at most, on a scan that fits
 FEW_FACTOR, FEW_ITERATIONS, DENSE_ITERATIONS, MOST_FINISHED = 1.5, 30, 120, 3
 # Another pose fits as well if its score is of the best one's size, and no more than a few points
@@ -35,6 +35,7 @@ CONTRADICTED_RATIO, CONTRADICTED_SIGMAS = 0.003, 4.0
 APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
 # With fewer points on the part the search is made thorough; then features are asked too.
 WELL_EXPLAINED, EXPLAINED = 0.85, 0.7
+PLAUSIBLE = 0.6  # a mean distance above this share of the cap is no fit that more points would mend
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +62,14 @@ class _Clouds:
     diagonal_mm: float
     sigma_mm: float
 
+    @property
+    def cap_mm(self) -> float:
+        """Farther off is as bad: ten times the noise, or a millimetre."""
+        return max(1.0, 10.0 * self.sigma_mm)
+
     def score(self, residual_mm: Float[np.ndarray, " k"]) -> float:
-        """Mean of |f|, each up to ten times the noise or a millimetre."""
-        return float(np.minimum(np.abs(residual_mm), max(1.0, 10.0 * self.sigma_mm)).mean())
+        """Mean of |f|, each up to the cap."""
+        return float(np.minimum(np.abs(residual_mm), self.cap_mm).mean())
 
     def apart(self, one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
         """Whether two poses move the scan's box to different places."""
@@ -108,7 +114,7 @@ def pose_from_anywhere(
             found = sorted(found + _refined(starts, clouds, template), key=_by_score)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
-    if not best.converged:
+    if not best.converged and best_score < PLAUSIBLE * clouds.cap_mm:
         best = _finished(best, clouds, template, True)
     slid = _refined(_slides(best, clouds), clouds, template, finish=False)
     slid = [(score, _finished(moved, clouds, template, False)) for score, moved in slid]
@@ -189,7 +195,8 @@ def _refined(
     for score, rough in found:
         if score > limit:
             break
-        moved = _finished(rough, clouds, template, len(finished) < MOST_FINISHED)
+        worth = len(finished) < MOST_FINISHED and score < PLAUSIBLE * clouds.cap_mm
+        moved = _finished(rough, clouds, template, worth)
         finished.append((clouds.score(moved.residual_mm), moved))
     return sorted(finished, key=_by_score)
 
