@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
+from amrepair.align.anywhere import pose_from_anywhere
 from amrepair.align.bed import bed_prior, level_on_bed
 from amrepair.align.checks import refuse_repeated
-from amrepair.align.coarse import proposals
 from amrepair.align.pam import PAPER, PamOptions, align_paper
-from amrepair.align.refine import Prior, Refined, refine, thin_out
+from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
+from amrepair.align.thinning import thin_out
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -21,22 +19,16 @@ from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
 METHODS = ("robust", "paper")
-FINE_POINTS, COARSE_POINTS = 15_000, 1_500
+FINE_POINTS = 15_000
 LEAST_POINTS = 50
 # A guess from a calibration is good to this; what is farther is not the part that was meant.
 BOUND_MM, BOUND_DEG = 3.0, 3.0
 LEAST_INLIERS = 0.5
 NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
 INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
-SAME_FIT = 1.15  # a pose within this factor of the best score fits as well
-APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
+INLIER_SIGMAS = 3.0
 SCALE_JUMP = 5.0  # sizes that differ by more are another unit
-
-
-@dataclass(frozen=True, slots=True)
-class _Candidate:
-    score: float
-    refined: Refined
+SIZE_JUMP = 1.6  # sizes that differ by more are worth a word
 
 
 def align(
@@ -98,6 +90,7 @@ def align(
             scan, template, options=pam_options, guess=guess, rng=rng, progress=progress
         )
     sigma_mm = float(np.hypot(max(scan.sigma_mm, 1e-3), NOISE_FLOOR_MM))
+    inlier_mm = max(INLIER_MM, INLIER_SIGMAS * sigma_mm)
     progress("align", 0.0, 1.0)
     if guess is not None:
         if guess.source != scan.frame:
@@ -108,17 +101,27 @@ def align(
         found = _from_guess(scan, template, guess, sigma_mm, bound_mm, bound_deg, rng)
         alternatives: tuple[Transform, ...] = ()
     else:
-        found, others = _from_anywhere(scan, template, sigma_mm, rng, progress)
-        alternatives = tuple(Transform("template", scan.frame, m) for m in others)
+        _refuse_other_size(scan, template)
+        answer = pose_from_anywhere(
+            scan.points_mm,
+            template,
+            sigma_mm=sigma_mm,
+            inlier_mm=inlier_mm,
+            rng=rng,
+            progress=progress,
+        )
+        found = answer.best
+        alternatives = tuple(Transform("template", scan.frame, m) for m in answer.others)
     progress("align", 1.0, 1.0)
-    inlier = np.abs(found.residual_mm) <= INLIER_MM
+    inlier = np.abs(found.residual_mm) <= inlier_mm
     ratio = float(inlier.mean())
     if not found.converged or ratio < LEAST_INLIERS:
         raise AlignmentError(
             f"the scan {scan.source} does not fit its template: {ratio:.0%} of its points lie "
-            f"within {INLIER_MM:g} mm (at least {LEAST_INLIERS:.0%} are needed)"
+            f"within {inlier_mm:.2g} mm (at least {LEAST_INLIERS:.0%} are needed)"
             + ("" if found.converged else " and the refinement did not converge")
             + "; check part, unit and calibration"
+            + ("" if guess is not None else _other_size(scan, template))
         )
     return Registration(
         template_from_scan=Transform("template", scan.frame, found.matrix),
@@ -186,95 +189,13 @@ def _part_only(
     return points_mm[keep]
 
 
-def _from_anywhere(
-    scan: Scan,
-    template: Template,
-    sigma_mm: float,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> tuple[Refined, list[Float[np.ndarray, "4 4"]]]:
-    """The best of many hypotheses, and those that fit as well."""
-    _refuse_other_size(scan, template)
-    dense = thin_out(scan.points_mm, FINE_POINTS, rng)
-    few = thin_out(dense, COARSE_POINTS, rng)
-    diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-    spacing_mm = max(diagonal_mm / 120.0, 0.3)
-    surface = thin_out(template.surface_points(spacing_mm)[0], 6_000, rng)
-    scale_mm = 0.03 * diagonal_mm
-    coarse: list[_Candidate] = []
-    for k, matrix in enumerate(proposals(dense, template)):
-        progress("align", 0.03 * k, 1.0)
-        moved = refine(
-            few,
-            template,
-            matrix,
-            start_scale_mm=scale_mm,
-            end_scale_mm=0.01 * diagonal_mm,
-            sigma_mm=sigma_mm,
-            max_iterations=25,
-        )
-        score = _score(moved.matrix, moved.residual_mm, dense, surface, 0.02 * diagonal_mm)
-        coarse.append(_Candidate(score, moved))
-    coarse.sort(key=lambda c: c.score)
-    fine: list[_Candidate] = []
-    for candidate in _distinct(coarse, diagonal_mm)[:6]:
-        if candidate.score > 2.5 * coarse[0].score + 1e-3:
-            break
-        moved = refine(
-            dense,
-            template,
-            candidate.refined.matrix,
-            start_scale_mm=0.01 * diagonal_mm,
-            end_scale_mm=max(0.1, 3.0 * sigma_mm),
-            sigma_mm=sigma_mm,
-        )
-        cap_mm = max(1.0, 10.0 * sigma_mm)
-        score = float(np.minimum(np.abs(moved.residual_mm), cap_mm).mean())
-        fine.append(_Candidate(score, moved))
-    fine.sort(key=lambda c: (not c.refined.converged, c.score))
-    best = fine[0]
-    others = [
-        c.refined.matrix
-        for c in _distinct(fine, diagonal_mm)[1:]
-        if c.refined.converged and c.score <= SAME_FIT * best.score
-    ]
-    return best.refined, others
-
-
-def _score(
-    matrix: Float[np.ndarray, "4 4"],
-    residual_mm: Float[np.ndarray, " n"],
-    points_mm: Float[np.ndarray, "m 3"],
-    surface_mm: Float[np.ndarray, "s 3"],
-    cap_mm: float,
-) -> float:
-    """Truncated mean distance, scan to template; and half a vote of the template to the scan."""
-    forward = float(np.minimum(np.abs(residual_mm), cap_mm).mean())
-    placed = points_mm @ matrix[:3, :3].T + matrix[:3, 3]
-    back = cKDTree(placed).query(surface_mm, distance_upper_bound=3.0 * cap_mm)[0]
-    # what one view does not see counts for little
-    missing = float(np.minimum(back, 3.0 * cap_mm).mean()) / 3.0
-    return forward + 0.2 * missing
-
-
-def _distinct(candidates: list[_Candidate], diagonal_mm: float) -> list[_Candidate]:
-    """Candidates without those that repeat an earlier one."""
-    kept: list[_Candidate] = []
-    for candidate in candidates:
-        m = candidate.refined.matrix
-        for other in kept:
-            away = m @ np.linalg.inv(other.refined.matrix)
-            corners = diagonal_mm * np.eye(3) * 0.5
-            # compare where the template's axes go, about the template's origin and the scan's
-            turn = np.linalg.norm((away[:3, :3] - np.eye(3)) @ corners, axis=0).max()
-            shift = np.linalg.norm(
-                m[:3, 3] - other.refined.matrix[:3, 3]
-            ) if turn < APART_RATIO * diagonal_mm else np.inf  # fmt: skip
-            if turn < APART_RATIO * diagonal_mm and shift < APART_RATIO * 2 * diagonal_mm:
-                break
-        else:
-            kept.append(candidate)
-    return kept
+def _other_size(scan: Scan, template: Template) -> str:
+    """What to add to a refusal, where the sizes differ much."""
+    size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
+    other = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    if 1.0 / SIZE_JUMP < size / max(other, 1e-12) < SIZE_JUMP:
+        return ""
+    return f" (the scan is {size:.3g} mm across, its template {other:.3g} mm)"
 
 
 def _refuse_other_size(scan: Scan, template: Template) -> None:

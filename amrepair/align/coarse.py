@@ -1,7 +1,7 @@
-"""Poses to start from, when nothing is known: features propose, the field disposes.
+"""Poses of two clouds on each other, from their features or their boxes.
 
 KISS-Matcher (H. Lim et al., ICRA 2025) on two voxel sizes, and the 24 ways to lay the principal
-axes on each other; each is refined on the field and scored there.
+axes on each other. It proposes; who asks must refine and score.
 """
 
 from __future__ import annotations
@@ -12,32 +12,25 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.template.port import Template
-
 VOXEL_RATIOS = (0.012, 0.02)  # of the part's diagonal
-SURFACE_POINTS = 30_000
-
-
-def proposals(
-    points_mm: Float[np.ndarray, "n 3"], template: Template
-) -> Iterator[Float[np.ndarray, "4 4"]]:
-    """Candidate poses (template from scan), features' first."""
-    low, high = template.bounds_mm
-    diagonal_mm = float(np.linalg.norm(high - low))
-    area_guess = diagonal_mm**2
-    surface, _ = template.surface_points(max(np.sqrt(area_guess / SURFACE_POINTS), 1e-3))
-    yield from poses_between(points_mm, surface, diagonal_mm)
 
 
 def poses_between(
     source_mm: Float[np.ndarray, "n 3"], target_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
 ) -> Iterator[Float[np.ndarray, "4 4"]]:
     """Candidate poses (target from source) of two clouds: features' first, then the axes'."""
+    yield from by_features(source_mm, target_mm, diagonal_mm)
+    yield from _by_axes(source_mm, target_mm)
+
+
+def by_features(
+    source_mm: Float[np.ndarray, "n 3"], target_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
+) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """Candidate poses by KISS-Matcher alone; none where it finds no match."""
     for ratio in VOXEL_RATIOS:
         found = _kiss(source_mm, target_mm, ratio * diagonal_mm)
         if found is not None:
             yield found
-    yield from _by_axes(source_mm, target_mm)
 
 
 def _kiss(

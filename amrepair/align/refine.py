@@ -17,7 +17,9 @@ from amrepair.template.port import Template
 
 SHRINK = 0.6  # of the loss's scale, from one iteration to the next
 STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
+STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
 MAX_ITERATIONS = 60
+HASTE = 15  # iterations with whole steps
 INLIER_SIGMAS = 4.0
 
 
@@ -96,7 +98,7 @@ def refine(
     local = points_mm - centre
     scale, converged, hessian = start_scale_mm, False, np.zeros((6, 6))
     f = np.zeros(len(points_mm))
-    iterations = 0
+    iterations, last = 0, np.zeros(6)
     while iterations < max_iterations:
         iterations += 1
         turned = local @ rotation.T
@@ -118,10 +120,13 @@ def refine(
         turn = float(np.linalg.norm(step[:3]))
         if turn > 0.2:  # a step this wide has left the linear range
             step *= 0.2 / turn
+        if iterations > HASTE and float(step @ last) < 0.0:
+            step *= 0.5  # to and fro across an edge of the field
+        last = step
         rotation = rotation_from_vector(step[:3]) @ rotation
         place = place + step[3:]
         moved_mm = float(np.linalg.norm(step[3:])) + reach_mm * float(np.linalg.norm(step[:3]))
-        if scale <= end_scale_mm * (1 + 1e-9) and moved_mm < STEP_MM:
+        if scale <= end_scale_mm * (1 + 1e-9) and moved_mm < max(STEP_MM, STEP_SIGMAS * sigma_mm):
             converged = True
             break
         if moved_mm < 0.25 * scale:
@@ -139,23 +144,3 @@ def _vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
     """Axis-angle vector of a small rotation."""
     skew = 0.5 * (rotation - rotation.T)
     return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
-
-
-def thin_out(
-    points_mm: Float[np.ndarray, "n 3"], count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "m 3"]:
-    """About `count` points, evenly over space: one of each voxel, chosen by the generator."""
-    if len(points_mm) <= count:
-        return np.array(points_mm, dtype=np.float64)
-    shuffled = points_mm[rng.permutation(len(points_mm))]
-    low = shuffled.min(axis=0)
-    extent_mm = float((shuffled.max(axis=0) - low).max())
-    voxel_mm = max(extent_mm / 400.0, 1e-6)
-    for _ in range(40):
-        key = np.floor((shuffled - low) / voxel_mm).astype(np.int64)
-        flat = (key[:, 0] * 2_000_003 + key[:, 1]) * 2_000_003 + key[:, 2]
-        _, first = np.unique(flat, return_index=True)
-        if len(first) <= count:
-            return np.ascontiguousarray(shuffled[np.sort(first)])
-        voxel_mm *= 1.0 + 0.5 * min(1.0, np.sqrt(len(first) / count) - 1.0) + 0.02
-    return np.ascontiguousarray(shuffled[:count])

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align import align
+from amrepair.bench.bodies import standing_pose
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.consensus import fit_from_scans
@@ -96,7 +97,10 @@ def _place(
     sigma_mm: float,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "n 3"]:
-    """Points in the template's frame; a failed alignment is tried again with other draws."""
+    """Points in the template's frame, the larger piece of a bent part in its place.
+
+    A failed alignment is tried again with other draws.
+    """
     scan = Scan(points_mm, sigma_mm, "scanner", source="sample")
     for attempt in range(RETRIES):
         try:
@@ -106,7 +110,10 @@ def _place(
                 raise
             _log.info("alignment failed (%s); trying again", error)
         else:
-            return np.asarray(found.template_from_scan.apply(points_mm))
+            matrix = standing_pose(
+                points_mm, template, found.template_from_scan.matrix, sigma_mm, rng
+            )
+            return points_mm @ matrix[:3, :3].T + matrix[:3, 3]
     raise AlignmentError("no alignment was tried")  # RETRIES is at least one
 
 
@@ -153,7 +160,7 @@ def smoothed_score(
     offset = np.clip(offset_mm, -limit_mm, limit_mm)
     tree = cKDTree(points_mm)
     wide = min(WIDE_NEIGHBOURS, len(points_mm))
-    index = tree.query(points_mm, k=[*range(1, wide + 1)])[1]
+    index = tree.query(points_mm, k=[*range(1, wide + 1)], workers=-1)[1]
     near = np.abs(offset[index[:, :NEAR_NEIGHBOURS]].mean(axis=1))
     return np.asarray(near + WIDE_WEIGHT * near[index].mean(axis=1))
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align.coarse import poses_between
-from amrepair.align.refine import thin_out
+from amrepair.align.thinning import thin_out
 from amrepair.consensus.cloud import planes, spacing_of
 from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector

@@ -1,0 +1,46 @@
+"""Fewer points, evenly over space."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.align.thinning_kernels import first_of_voxels
+
+MOST_LOOKED_AT = 200_000
+ROUNDS, CLOSE_ENOUGH = 12, 0.95
+
+
+def thin_out(
+    points_mm: Float[np.ndarray, "n 3"], count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "m 3"]:
+    """About `count` points, never more: one of each voxel, chosen by the generator."""
+    if len(points_mm) <= count:
+        return np.array(points_mm, dtype=np.float64)
+    order = rng.permutation(len(points_mm))[: max(MOST_LOOKED_AT, count)]
+    shuffled = np.ascontiguousarray(points_mm[order], dtype=np.float64)
+    low = shuffled.min(axis=0)
+    extent_mm = float((shuffled.max(axis=0) - low).max())
+    slots = np.empty(1 << int(np.ceil(np.log2(2 * count + 2))), dtype=np.int64)
+    chosen = np.empty(count, dtype=np.int64)
+    best = chosen[:0]
+    # between a voxel that leaves too many and one that leaves enough; voxels of a surface grow in
+    # number with the inverse square of their edge
+    small, large = extent_mm / 1e5, extent_mm
+    voxel_mm = max(extent_mm / np.sqrt(2.0 * count), 1e-9)
+    for _ in range(ROUNDS):
+        found = int(first_of_voxels(shuffled, low, voxel_mm, count, slots, chosen))
+        if found > count:
+            small = voxel_mm
+            voxel_mm = min(1.5 * voxel_mm, float(np.sqrt(small * large)))
+            continue
+        if found > len(best):
+            best = chosen[:found].copy()
+        if found >= CLOSE_ENOUGH * count:
+            break
+        large = voxel_mm
+        guess = voxel_mm * np.sqrt((found + 1) / count)
+        voxel_mm = float(guess if small < guess else np.sqrt(small * large))
+    if not len(best):
+        return shuffled[:count]
+    return np.ascontiguousarray(shuffled[np.sort(best)])

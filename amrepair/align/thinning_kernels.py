@@ -1,0 +1,43 @@
+# mypy: disable-error-code="no-untyped-def"
+"""The first point of each voxel; compiled."""
+
+from __future__ import annotations
+
+from numba import njit
+
+_FIRST, _SECOND, _THIRD = 73_856_093, 19_349_663, 83_492_791  # Teschner et al. 2003
+
+
+@njit(cache=True, nogil=True)
+def first_of_voxels(points, low, voxel, most, slots, chosen):
+    """How many voxels hold points, up to `most` + 1; their first points go to `chosen`.
+
+    `slots` is a table of a power of two, larger than `most`; numbers of points, −1 where free.
+    """
+    slots[:] = -1
+    mask = len(slots) - 1
+    found = 0
+    for i in range(len(points)):
+        x = int((points[i, 0] - low[0]) / voxel)
+        y = int((points[i, 1] - low[1]) / voxel)
+        z = int((points[i, 2] - low[2]) / voxel)
+        slot = ((x * _FIRST) ^ (y * _SECOND) ^ (z * _THIRD)) & mask
+        known = False
+        while slots[slot] >= 0:
+            other = chosen[slots[slot]]
+            if (
+                int((points[other, 0] - low[0]) / voxel) == x
+                and int((points[other, 1] - low[1]) / voxel) == y
+                and int((points[other, 2] - low[2]) / voxel) == z
+            ):
+                known = True
+                break
+            slot = (slot + 1) & mask
+        if known:
+            continue
+        if found == most:
+            return found + 1
+        slots[slot] = found
+        chosen[found] = i
+        found += 1
+    return found

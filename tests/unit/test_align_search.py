@@ -1,0 +1,119 @@
+"""The search from any pose: no gap between rotations, and honest about what fits as well."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from amrepair.align import Registration, align
+from amrepair.align.search import QUICK, spread_rotations
+from amrepair.align.thinning import thin_out
+from amrepair.bench.bodies import standing_pose
+from amrepair.errors import AlignmentError
+from amrepair.frames import rotation_from_vector
+from amrepair.scans import Scan
+from tests.analytic import AnalyticTemplate, box, cylinder, difference, sample_surface, union
+
+SIGMA_MM = 0.04
+Points = Float[np.ndarray, "n 3"]
+
+
+def notched() -> AnalyticTemplate:
+    """A plate that only a notch of 3 × 3 × 2 mm keeps from being symmetric."""
+    return difference(box((0, 0, 0), (40, 24, 8)), box((37, 21, 6), (41, 25, 9)))
+
+
+def aligned(
+    template: AnalyticTemplate, points: Points, seed: int = 0
+) -> tuple[Registration, float]:
+    """The answer for the points in a random pose, and how far it leaves them from their place."""
+    rng = np.random.default_rng(seed)
+    noisy = points + rng.normal(0, SIGMA_MM, points.shape)
+    moved = noisy @ spread_rotations(500)[int(rng.integers(500))].T + rng.normal(0, 60, 3)
+    found = align(Scan(moved, SIGMA_MM, "scanner", source="scan.ply"), template)
+    off = found.template_from_scan.apply(moved) - noisy
+    return found, float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def test_rotations_leave_no_gap() -> None:
+    turns = spread_rotations(1_200)
+    assert np.allclose(turns @ np.swapaxes(turns, 1, 2), np.eye(3), atol=1e-12)
+    asked = spread_rotations(7_001)[::7]
+    cosine = 0.5 * (np.einsum("aij,bij->ab", asked, turns).max(axis=1) - 1.0)
+    # the same share of SO(3) each would reach 14°; more than twice that is a gap
+    assert np.rad2deg(np.arccos(cosine.min())) < 28.0
+
+
+def test_thinning_is_even_and_never_more() -> None:
+    rng = np.random.default_rng(0)
+    flat = 50.0 * rng.uniform(0, 1, (40_000, 2)) ** 2  # far denser at one corner
+    points = np.column_stack([flat, np.zeros(len(flat))])
+    thin = thin_out(points, 1_000, rng)
+    assert 900 <= len(thin) <= 1_000
+    nearest = cKDTree(thin).query(thin, k=[2])[0]
+    assert np.quantile(nearest, 0.9) < 5 * np.quantile(nearest, 0.1)
+    given = {tuple(row) for row in points.tolist()}
+    assert all(tuple(row) in given for row in thin.tolist())
+    assert len(thin_out(points[:70], 1_000, rng)) == 70
+    assert len(thin_out(np.zeros((500, 3)), 100, rng)) <= 100
+
+
+def test_a_small_notch_decides_between_poses() -> None:
+    template = notched()
+    points = sample_surface(template.body, 0.6, seed=1)[0]
+    found, off_mm = aligned(template, points)
+    assert off_mm < 0.03
+    assert not found.symmetric_alternatives
+    # where no corner was seen all four poses fit, and are said to
+    corner = (np.abs(points - (20, 12, 4)) > (16, 8, 1)).all(axis=1)
+    found, _ = aligned(template, points[~corner])
+    assert len(found.symmetric_alternatives) == 3
+
+
+def test_a_turn_that_nothing_hinders_is_reported() -> None:
+    rod = cylinder((0, 0, 0), 8.0, 30.0)
+    found, _ = aligned(rod, sample_surface(rod.body, 0.7, seed=2)[0])
+    assert found.symmetric_alternatives
+    pin = union(rod, box((6, -2, 10), (13, 2, 16)))
+    found, off_mm = aligned(pin, sample_surface(pin.body, 0.7, seed=2)[0])
+    assert off_mm < 0.05
+    assert not found.symmetric_alternatives
+
+
+def test_clutter_does_not_mislead() -> None:
+    template = notched()
+    points = sample_surface(template.body, 0.6, seed=3)[0]
+    rng = np.random.default_rng(3)
+    noise = rng.uniform((-30, -30, -20), (70, 50, 30), (len(points) // 4, 3))
+    found, off_mm = aligned(template, np.concatenate([points, noise]), seed=3)
+    assert off_mm < 0.1
+    assert 0.7 < found.inlier_ratio < 0.9
+
+
+def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK)
+    monkeypatch.setattr("amrepair.align.anywhere.by_features", lambda *_: iter(()))
+    template = notched()
+    points = 10.0 * sample_surface(template.body, 1.5, seed=4)[0]  # centimetres taken for mm
+    with pytest.raises(AlignmentError, match=r"mm across, its template 47\.3 mm"):
+        aligned(template, points)
+
+
+@pytest.mark.parametrize("share_of_base", [1.0, 0.3])
+def test_the_larger_piece_of_a_bent_part_stands(share_of_base: float) -> None:
+    plate = difference(box((0, 0, 0), (60, 20, 4)), box((50, 12, -1), (61, 21, 5)))
+    points = sample_surface(plate.body, 0.4, seed=5)[0]
+    rng = np.random.default_rng(5)
+    bent = points[:, 0] > 40.0
+    hinge = np.array([40.0, 0.0, 0.0])
+    turn = rotation_from_vector(np.array([0.0, -np.deg2rad(8.0), 0.0]))
+    points[bent] = (points[bent] - hinge) @ turn.T + hinge
+    seen = bent | (rng.random(len(points)) < share_of_base)  # a view towards the bent end
+    points = points[seen] + rng.normal(0, SIGMA_MM, (int(seen.sum()), 3))
+    by_end = np.eye(4)  # as an alignment on the bent end has it
+    by_end[:3, :3], by_end[:3, 3] = turn.T, hinge - turn.T @ hinge
+    for start in (np.eye(4), by_end):
+        pose = standing_pose(points, plate, start, SIGMA_MM, np.random.default_rng(0))
+        assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.01
