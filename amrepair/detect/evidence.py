@@ -24,6 +24,9 @@ SIDEWAYS_PER_HEIGHT = 1.0
 NEIGHBOURS = 4
 # "Solid, as far as anybody knows": a clearance well below every threshold.
 SOLID_MM = -5.0
+# A pixel beside a silhouette, seen aslant, is off by no more than this many of its steps.
+SHARP_STEPS = 1.5
+SHARP_MM = 0.5
 # The template's surface in patches of this size closes what stands there.
 PATCH_MM = 0.4
 
@@ -72,12 +75,37 @@ class Evidence:
                 seen, cautious = image.clearance(points_mm)
                 best = np.maximum(best, seen)
                 least = np.maximum(least, cautious)
-            return np.maximum(best, SOLID_MM), np.maximum(least, SOLID_MM)
+            best = self._sharpened(points_mm, f_mm, np.maximum(best, SOLID_MM))
+            return best, np.maximum(least, SOLID_MM)
         if self.faces is not None:
             near = self.faces.clearance(points_mm, f_mm)
         else:
             near = self.surface_clearance(points_mm, f_mm)
         return near, near
+
+    def _sharpened(
+        self,
+        points_mm: Float[np.ndarray, "n 3"],
+        f_mm: Float[np.ndarray, " n"],
+        best_mm: Float[np.ndarray, " n"],
+    ) -> Float[np.ndarray, " n"]:
+        """What the rays say, as far as a pixel allows corrected by the scanned surface.
+
+        The emptiest of several noisy images lies too deep, and beside a silhouette every pixel is
+        a step of its own: means and planes over cells know better where the surface is, the rays
+        on which side of it a point lies.
+        """
+        step_mm = max(image.step_mm for image in self.images)
+        ask = np.flatnonzero(np.abs(best_mm) < SHARP_STEPS * step_mm + SHARP_MM)
+        if len(ask) == 0:
+            return best_mm
+        surface = self.surface_clearance(points_mm[ask], f_mm[ask])
+        limit_mm = SHARP_STEPS * step_mm
+        low, high = best_mm[ask] - limit_mm, best_mm[ask] + limit_mm
+        known = surface > SOLID_MM
+        sharp = best_mm.copy()
+        sharp[ask[known]] = np.clip(surface, low, high)[known]
+        return sharp
 
     def surface_clearance(
         self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
