@@ -70,13 +70,13 @@ def run_case(case: Case, process: str) -> dict[str, Any]:
     mesh = load_mesh(part_file(part))
     mesh.apply_scale(PARTS[part][1])
     setup = load_setup(process=process)
-    prepared = prepare_run(
-        load_or_fit(mesh), setup, [parse_defect(kind)], title=part, seed=seed
-    )
+    prepared = prepare_run(load_or_fit(mesh), setup, [parse_defect(kind)], title=part, seed=seed)
     run = simulate_run(prepared, max_iterations=MAX_ITERATIONS)
-    return {"part": part, "defect": kind, "seed": seed, "process": process} | figures(run) | {
-        "seconds": round(time.perf_counter() - began, 1)
-    }
+    return (
+        {"part": part, "defect": kind, "seed": seed, "process": process}
+        | figures(run)
+        | {"seconds": round(time.perf_counter() - began, 1)}
+    )
 
 
 def figures(run: SimulatedRun) -> dict[str, Any]:
@@ -88,7 +88,9 @@ def figures(run: SimulatedRun) -> dict[str, Any]:
     return {
         "missing_mm3": round(truth.missing_mm3, 2),
         "deficit_mm3": round(first.deficit.missing_mm3, 2),
-        "beads_mm3": round(sum(k.plan.patch.beads_mm3 for k in looks if k.printed and k.plan.patch), 2),
+        "beads_mm3": round(
+            sum(k.plan.patch.beads_mm3 for k in looks if k.printed and k.plan.patch), 2
+        ),
         "unreachable_mm3": round(first.unreachable_mm3, 2),
         "filled_ratio": round(truth.filled_mm3 / truth.missing_mm3, 4),
         "added_ratio": round(truth.added_mm3 / truth.missing_mm3, 4),

@@ -231,6 +231,7 @@ def simulate_run(
             scanner=SimulatedScanner(world, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model),
             take_motion=machine.take_motion,
             layer_height_mm=run.setup.process.layer_height_mm,
+            part=run.part,
             box_mm=(
                 box[0] - TRUTH_MARGIN_MM,
                 box[1] - TRUTH_MARGIN_MM,

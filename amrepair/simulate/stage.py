@@ -10,18 +10,18 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import manifold3d
 import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
 
 from amrepair.frames import Transform
 from amrepair.scans import Scan, ScanRequest
-from amrepair.simulate.columns import IntervalMap, Window
+from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
-
 
 # Beads of a repair spread, and crumble over a rim, no farther than this from the defect.
 AROUND_MM = 3.0
@@ -46,8 +46,8 @@ class DefectTruth:
     excess_mm3
         Volume that it added.
     added_mm3
-        Volume that repairs put where nothing should be: around the defect, beyond what stood out
-        before them.
+        Volume that repairs put where nothing should be: around the defect, where neither the
+        reference nor the part as designed has any, beyond what stood out before them.
     surface_ratio
         Share of the area over what was missing whose top is now within half a layer of the
         reference's, give or take a column sideways; 1 where nothing was missing.
@@ -93,6 +93,9 @@ class Stage:
         XY box (x_min, y_min, x_max, y_max) that truth is compared in.
     layer_height_mm
         Of the job: surfaces within half of it of the reference's are as they should be.
+    part
+        As designed, build frame: what a repair adds within it is not too much, even where the
+        reference's own beads left a gap.
     """
 
     def __init__(
@@ -104,6 +107,7 @@ class Stage:
         take_motion: Callable[[], MotionBatch],
         box_mm: tuple[float, float, float, float],
         layer_height_mm: float = 0.2,
+        part: manifold3d.Manifold | None = None,
     ) -> None:
         self.world = world
         self.reference = world.copy()
@@ -112,6 +116,16 @@ class Stage:
         self._take_motion = take_motion
         self._box_mm = box_mm
         self._layer_height_mm = layer_height_mm
+        self._design: IntervalMap | None = None
+        if part is not None:
+            ny, nx = world.columns.shape
+            design = Columns(
+                origin_mm=world.columns.origin_mm,
+                size_mm=((nx - 0.5) * world.cell_mm, (ny - 0.5) * world.cell_mm),
+                cell_mm=world.cell_mm,
+            )
+            design.unite(design.rasterise(part))
+            self._design = design.snapshot(self._window())
         self._wounds: list[_Wound] = []
         self._stops: list[str] = []
 
@@ -187,6 +201,8 @@ class Stage:
         window = self._window()
         standing, wanted = self.world.snapshot(window), self.reference.snapshot(window)
         extra = standing.minus(wanted)
+        if self._design is not None:
+            extra = extra.minus(self._design)
         even = _even(standing, wanted, 0.5 * self._layer_height_mm)
         around = np.array([[-1.0], [1.0]]) * AROUND_MM
         for wound in wounds:
