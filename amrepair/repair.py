@@ -17,8 +17,7 @@ from jaxtyping import Bool
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
-from amrepair.deficit import Deficit, as_built_heights, compute_deficit
-from amrepair.deficit.worth import MIN_REPAIR_MM3, worth_mending
+from amrepair.deficit import Deficit, as_built_heights, compute_deficit, worth
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
@@ -34,6 +33,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.writer import write
 
+MIN_REPAIR_MM3 = worth.MIN_REPAIR_MM3
 # Material standing out less than two layers is ploughed by the layers after it, or is a bump.
 EXCESS_LAYERS = 2.0
 # A planned template ends below; so near to its end its distances are not to be trusted.
@@ -161,7 +161,7 @@ class RepairPlan:
     def to_fill(self) -> tuple[Region, ...]:
         """Missing regions that are worth a repair: alone, or with those beside them."""
         missing = [region for region in self.deficit.regions if region.label is Label.MISSING]
-        keep = worth_mending([r.box_mm for r in missing], [r.volume_mm3 for r in missing])
+        keep = worth.worth_mending([r.box_mm for r in missing], [r.volume_mm3 for r in missing])
         return tuple(region for region, kept in zip(missing, keep, strict=True) if kept)
 
     @property
@@ -331,7 +331,10 @@ def _in_view(scan: Scan, site: Site) -> Scan:
     """What a planned template can judge: its own last millimetres; all of it otherwise."""
     if site.planned is None:
         return scan
-    low_mm = float(site.planned.bounds_mm[0, 2]) + PLANNED_EDGE_MM
+    low_mm = float(site.planned.bounds_mm[0, 2])
+    if low_mm < float(site.template.bounds_mm[0, 2]) + PLANNED_EDGE_MM:
+        return scan  # it reaches down to the bed: nothing was cut off
+    low_mm += PLANNED_EDGE_MM
     return _subset(scan, scan.points_mm[:, 2] > low_mm)
 
 
@@ -381,7 +384,7 @@ def _fillable(deficit: Deficit) -> manifold3d.Manifold:
     """The missing pieces that are worth a repair."""
     pieces = deficit.missing.decompose()
     boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
-    keep = worth_mending(boxes, [piece.volume() for piece in pieces])
+    keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces])
     pieces = [piece for piece, kept in zip(pieces, keep, strict=True) if kept]
     if not pieces:
         return manifold3d.Manifold()

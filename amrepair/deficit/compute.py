@@ -124,10 +124,18 @@ def compute_deficit(
     regions: list[Region] = []
     for label, found in solids.items():
         boxes = _boxes(anomaly, evidence, template, label)
+        finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
         for i, (low, high, depth) in enumerate(boxes):
             progress(f"deficit: {label.name.lower()}", float(i), float(len(boxes)))
             solid = _solid_in_box(
-                template, evidence, anomaly, label, low, high, depth_mm=depth, tau_mm=tau_mm
+                template,
+                evidence,
+                anomaly,
+                label,
+                low,
+                high,
+                depth_mm=min(depth, finest_mm),
+                tau_mm=tau_mm,
             )
             for piece in solid.decompose():
                 if piece.volume() >= CRUMB_MM3:
@@ -281,6 +289,10 @@ def _solid_in_box(
     beyond = -sign * cautious  # missing: how empty; excess: how solid
     limit_mm, thin_mm = _limits(anomaly, label, samples, f, tau_mm, depth_mm)
     core = (sign * f > limit_mm) & (beyond > limit_mm / 2)
+    if label is Label.MISSING and evidence.has_rays:
+        # a planned bead is thinner than 2 τ: nothing of it would be left of an eroded template,
+        # but rays that went through it count as well
+        core |= (sign * f > limit_mm / 4) & (beyond > limit_mm)
     nearest = evidence.tree.query(samples[near], workers=2)[1]
     by_label = np.zeros(len(samples), bool)
     by_label[near] = labels[nearest] == int(label)

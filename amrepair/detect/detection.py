@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
 from amrepair.detect.anomaly import AnomalyMap, Label
-from amrepair.detect.evidence import Evidence, gather
+from amrepair.detect.evidence import Evidence, gather, with_stubs
 from amrepair.detect.faces import PLANE_POINTS
 from amrepair.detect.normal_variation import forgiven
 from amrepair.detect.regions import find_regions
@@ -154,6 +154,8 @@ def detect(
     )
     surface_mm, normals = template.surface_points(max(SURFACE_SPACING_MM, surfels.spacing_mm))
     surface_label = _label_surface(surface_mm, normals, template, evidence, missing, limit)
+    gone_mm = surface_mm[surface_label == int(Label.MISSING)]
+    evidence = with_stubs(evidence, scan, gone_mm, missing | excess)
     progress("detect", 3.0, 4.0)
     score = np.abs(f_mm)
     kept_scores = score[keep]
@@ -316,4 +318,29 @@ def _label_surface(
         if not missing.any() and not evidence.has_rays:
             gone[:] = False
         label[open_[gone]] = int(Label.MISSING)
+    if evidence.has_rays:
+        label[_seen_through(surface_mm, normals, template, evidence, label, limit)] = int(
+            Label.MISSING
+        )
     return label
+
+
+def _seen_through(
+    surface_mm: Float[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "m 3"],
+    template: Template,
+    evidence: Evidence,
+    label: Int[np.ndarray, " m"],
+    limit: Threshold,
+) -> Int[np.ndarray, " k"]:
+    """Points that rays passed by more than noise can be, in whatever is thin.
+
+    A wall one bead wide that is gone leaves points of what stood below it, less than a
+    millimetre off and, in a wall so thin, within every limit; a layer over a cell leaves none.
+    """
+    here = np.flatnonzero(label != int(Label.MISSING))
+    depth_mm = float(limit.high_mm(np.array([27]))[0])
+    inside = surface_mm[here] - 0.5 * depth_mm * normals[here]
+    f_mm = template.distance(inside)
+    cautious = evidence.clearance(inside, f_mm)[1]
+    return here[(cautious > depth_mm) & (f_mm < -depth_mm / 4)]

@@ -71,7 +71,7 @@ def _lines_up_to_the_rim(
         beads = rectilinear(
             offset(region, -inset_mm), spacing_mm=spacing_mm, angle_rad=angle_rad, role=role
         )
-        return beads, sum(bead.area_mm2 for bead in beads)
+        return beads, float(sum(bead.area_mm2 for bead in beads))
 
     half_mm, nearer_mm = 0.5 * spacing_mm, overlap_ratio * spacing_mm
     laid, laid_mm2 = ending(half_mm)
