@@ -17,7 +17,7 @@ from jaxtyping import Bool
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
-from amrepair.deficit import Deficit, as_built_heights, compute_deficit
+from amrepair.deficit import Deficit, as_built_heights, compute_deficit, worth
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
@@ -33,8 +33,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.writer import write
 
-# A stop of the print, and heat beside the wound, must be worth it.
-MIN_REPAIR_MM3 = 2.0
+MIN_REPAIR_MM3 = worth.MIN_REPAIR_MM3
 # Material standing out less than two layers is ploughed by the layers after it, or is a bump.
 EXCESS_LAYERS = 2.0
 # A planned template ends below; so near to its end its distances are not to be trusted.
@@ -45,6 +44,8 @@ AS_BUILT_CELL_MM = 0.25
 OPEN_INFILL_MM = 0.5
 # No sensor sees to the bottom of a deep cell of infill, and the nozzle has just been over it.
 OPEN_CELL_MARGIN_MM = 0.0
+# A part stands upright where its Z is the bed's to 0.05 mm over 100 mm.
+LEVEL = 1e-7
 # Two poses whose repairs share less than this are two different repairs.
 SAME_REPAIR_RATIO = 0.8
 
@@ -158,12 +159,10 @@ class RepairPlan:
 
     @property
     def to_fill(self) -> tuple[Region, ...]:
-        """Missing regions that are worth a repair."""
-        return tuple(
-            region
-            for region in self.deficit.regions
-            if region.label is Label.MISSING and region.volume_mm3 >= MIN_REPAIR_MM3
-        )
+        """Missing regions that are worth a repair: alone, or with those beside them."""
+        missing = [region for region in self.deficit.regions if region.label is Label.MISSING]
+        keep = worth.worth_mending([r.box_mm for r in missing], [r.volume_mm3 for r in missing])
+        return tuple(region for region, kept in zip(missing, keep, strict=True) if kept)
 
     @property
     def too_much(self) -> tuple[Region, ...]:
@@ -243,7 +242,13 @@ def plan_repair(
         whole = scan.moved(registration.template_from_scan)
         expected = site.planned or site.template
         moved = _in_view(whole, site)
-        anomaly = detect(moved, expected, allowance_mm=site.allowance_mm, progress=progress)
+        anomaly = detect(
+            moved,
+            expected,
+            allowance_mm=site.allowance_mm,
+            top_z_mm=_top_of_layer(site),
+            progress=progress,
+        )
     with watch("deficit"):
         standing = None
         if site.planned is not None and anomaly.evidence is not None:
@@ -326,8 +331,19 @@ def _in_view(scan: Scan, site: Site) -> Scan:
     """What a planned template can judge: its own last millimetres; all of it otherwise."""
     if site.planned is None:
         return scan
-    low_mm = float(site.planned.bounds_mm[0, 2]) + PLANNED_EDGE_MM
+    low_mm = float(site.planned.bounds_mm[0, 2])
+    if low_mm < float(site.template.bounds_mm[0, 2]) + PLANNED_EDGE_MM:
+        return scan  # it reaches down to the bed: nothing was cut off
+    low_mm += PLANNED_EDGE_MM
     return _subset(scan, scan.points_mm[:, 2] > low_mm)
+
+
+def _top_of_layer(site: Site) -> float | None:
+    """Height of the layer just printed, template frame; None where none is, or it is tilted."""
+    placed = site.build_from_template
+    if placed is None or site.printed_z_mm is None or abs(placed.matrix[2, 2] - 1.0) > LEVEL:
+        return None
+    return site.printed_z_mm - float(placed.translation_mm[2])
 
 
 def _build_from_template(site: Site, scan: Scan, registration: Registration) -> Transform:
@@ -366,7 +382,10 @@ def _refuse_ambiguity(scan: Scan, site: Site, registration: Registration, defici
 
 def _fillable(deficit: Deficit) -> manifold3d.Manifold:
     """The missing pieces that are worth a repair."""
-    pieces = [piece for piece in deficit.missing.decompose() if piece.volume() >= MIN_REPAIR_MM3]
+    pieces = deficit.missing.decompose()
+    boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
+    keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces])
+    pieces = [piece for piece, kept in zip(pieces, keep, strict=True) if kept]
     if not pieces:
         return manifold3d.Manifold()
     return manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add)

@@ -57,7 +57,8 @@ def simulate(
         list[str] | None,
         typer.Option(
             "--defect",
-            help="TYPE[:key=value,…]: void, under_extrusion, chip, blob or none; may be repeated. "
+            help="TYPE[:key=value,…]: void, missing_beads, under_extrusion, chip, blob or none; "
+            "may be repeated. "
             f"Default: {', '.join(DEFAULT_DEFECTS)}.",
         ),
     ] = None,

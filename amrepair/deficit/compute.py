@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from amrepair.deficit.heights import as_built_heights, standing_heights
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.detect import AnomalyMap, Label, Region, detect
+from amrepair.detect.detection import ON_PLANE_MM
 from amrepair.detect.evidence import Evidence
 from amrepair.detect.regions import classify, group_points
 from amrepair.errors import DeficitError
@@ -28,6 +29,8 @@ from gcode.surfaces import HeightField
 
 # A corner of a cube of side τ lies √3 τ from the eroded template.
 GROW_FACTOR = 3**0.5
+# Under a layer's top, of the limit: what the surfel nearest to it is labelled for is missing.
+THIN_RATIO = 0.25
 # One bead of 0.45 × 0.2 mm as long as two nozzle widths: less cannot be placed.
 BEAD_MM3 = 0.08
 # Pieces below this share of a bead are what marching cubes makes of noise at a rim.
@@ -121,10 +124,18 @@ def compute_deficit(
     regions: list[Region] = []
     for label, found in solids.items():
         boxes = _boxes(anomaly, evidence, template, label)
+        finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
         for i, (low, high, depth) in enumerate(boxes):
             progress(f"deficit: {label.name.lower()}", float(i), float(len(boxes)))
             solid = _solid_in_box(
-                template, evidence, anomaly, label, low, high, depth_mm=depth, tau_mm=tau_mm
+                template,
+                evidence,
+                anomaly,
+                label,
+                low,
+                high,
+                depth_mm=min(depth, finest_mm),
+                tau_mm=tau_mm,
             )
             for piece in solid.decompose():
                 if piece.volume() >= CRUMB_MM3:
@@ -276,15 +287,41 @@ def _solid_in_box(
     # solid = both negative: inside the template and outside the as-built part (or the reverse)
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
     beyond = -sign * cautious  # missing: how empty; excess: how solid
-    core = (sign * f > tau_mm) & (beyond > tau_mm / 2)
+    limit_mm, thin_mm = _limits(anomaly, label, samples, f, tau_mm, depth_mm)
+    core = (sign * f > limit_mm) & (beyond > limit_mm / 2)
+    if label is Label.MISSING and evidence.has_rays:
+        # a planned bead is thinner than 2 τ: nothing of it would be left of an eroded template,
+        # but rays that went through it count as well
+        core |= (sign * f > limit_mm / 4) & (beyond > limit_mm)
     nearest = evidence.tree.query(samples[near], workers=2)[1]
     by_label = np.zeros(len(samples), bool)
     by_label[near] = labels[nearest] == int(label)
-    thin_mm = min(tau_mm, depth_mm / 2)
     core |= by_label & (sign * f > thin_mm) & (clip < 0)
     grow_mm = GROW_FACTOR * tau_mm + float(box.step_mm.max())
     reach = box.distance_to(core.reshape(box.shape)) - grow_mm
     return solid_from_field(box, np.maximum(clip.reshape(box.shape), np.minimum(reach, 10.0)))
+
+
+def _limits(
+    anomaly: AnomalyMap,
+    label: Label,
+    samples_mm: Float[np.ndarray, "v 3"],
+    f_mm: Float[np.ndarray, " v"],
+    tau_mm: float,
+    depth_mm: float,
+) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
+    """(v,) τ, and the depth from which on a label counts.
+
+    Under the plane of the layer just printed both are smaller: detection used a smaller limit,
+    and no wall is near whose noise could be taken for depth.
+    """
+    limit_mm = np.full(len(samples_mm), tau_mm)
+    thin_mm = np.full(len(samples_mm), min(tau_mm, depth_mm / 2))
+    if anomaly.top_z_mm is not None and label is Label.MISSING:
+        under = np.abs(f_mm - (samples_mm[:, 2] - anomaly.top_z_mm)) < ON_PLANE_MM
+        limit_mm[under] = min(tau_mm, anomaly.top_threshold_mm)
+        thin_mm[under] = np.minimum(thin_mm[under], THIN_RATIO * limit_mm[under])
+    return limit_mm, thin_mm
 
 
 def _region(

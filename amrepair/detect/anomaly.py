@@ -77,6 +77,9 @@ class AnomalyMap:
         The limit and how it was set.
     object_score
         Mean of the K highest scores.
+    top_z_mm, top_threshold_mm
+        The plane of the layer just printed, under which a smaller limit holds; None where there
+        is none.
     evidence, surfel_label
         What the labels rest on, for the deficit; None for a map read back from a file.
     """
@@ -93,3 +96,5 @@ class AnomalyMap:
     regions: tuple[Region, ...]
     evidence: Evidence | None = None
     surfel_label: Int[np.ndarray, " s"] | None = None
+    top_z_mm: float | None = None
+    top_threshold_mm: float = np.inf

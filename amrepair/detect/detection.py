@@ -7,14 +7,14 @@ is thinner than one point's noise, and hysteresis follows it to its rim.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
 from amrepair.detect.anomaly import AnomalyMap, Label
-from amrepair.detect.evidence import Evidence, gather
+from amrepair.detect.evidence import Evidence, gather, with_stubs
 from amrepair.detect.faces import PLANE_POINTS
 from amrepair.detect.normal_variation import forgiven
 from amrepair.detect.regions import find_regions
@@ -26,7 +26,11 @@ from gcode.progress import Progress, silent
 
 # Half a 0.2 mm layer: what section-at-mid-layer leaves on slopes and rounds off at tops.
 DEFAULT_ALLOWANCE_MM = 0.1
+# A layer's own top lies where the job's G-code puts it: a quarter of a layer is left to the beads.
+TOP_ALLOWANCE_MM = 0.05
 DEFAULT_REGISTRATION_SIGMA_MM = 0.03
+# The template's distance is the height under a plane: to rounding.
+ON_PLANE_MM = 1e-4
 FALSE_ALARMS_PER_SCAN = 1e-3
 # Excess farther out than this is not part of the print (clutter, the bed's rim).
 MAX_EXCESS_MM = 12.0
@@ -70,6 +74,7 @@ def detect(
     *,
     threshold_mm: float | None = None,
     allowance_mm: float = DEFAULT_ALLOWANCE_MM,
+    top_z_mm: float | None = None,
     registration_sigma_mm: float = DEFAULT_REGISTRATION_SIGMA_MM,
     false_alarms: float = FALSE_ALARMS_PER_SCAN,
     top_k: int = 1000,
@@ -85,6 +90,9 @@ def detect(
         Systematic part of the limit; None adds up allowance, registration and template bias.
     allowance_mm
         What the process may leave (staircase, top rounding): half a layer by default.
+    top_z_mm
+        Height of the layer just printed, where the template ends there: what is missing under
+        that plane is judged with `TOP_ALLOWANCE_MM`, since the job says exactly where it lies.
     registration_sigma_mm
         Standard deviation of the alignment at the surface.
     false_alarms
@@ -126,7 +134,10 @@ def detect(
         scan, template, surfels, threshold_mm, allowance_mm, registration_sigma_mm, false_alarms
     )
     progress("detect", 1.0, 4.0)
-    missing, excess = _label_surfels(forgiven(surfels, template), limit)
+    top_allowance_mm = min(allowance_mm, TOP_ALLOWANCE_MM)
+    top_limit = replace(limit, systematic_mm=limit.systematic_mm - allowance_mm + top_allowance_mm)
+    top = _under_plane(surfels, None if threshold_mm is not None else top_z_mm)
+    missing, excess = _label_surfels(forgiven(surfels, template), limit, top_limit, top)
     evidence = gather(
         scan,
         template,
@@ -143,6 +154,8 @@ def detect(
     )
     surface_mm, normals = template.surface_points(max(SURFACE_SPACING_MM, surfels.spacing_mm))
     surface_label = _label_surface(surface_mm, normals, template, evidence, missing, limit)
+    gone_mm = surface_mm[surface_label == int(Label.MISSING)]
+    evidence = with_stubs(evidence, scan, gone_mm, missing | excess)
     progress("detect", 3.0, 4.0)
     score = np.abs(f_mm)
     kept_scores = score[keep]
@@ -161,6 +174,8 @@ def detect(
         threshold_source=source,
         object_score=object_score,
         regions=regions,
+        top_z_mm=top_z_mm if threshold_mm is None else None,
+        top_threshold_mm=float(top_limit.high_mm(np.array([27]))[0]),
         evidence=evidence,
         surfel_label=np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0)),
     )
@@ -221,17 +236,31 @@ def _threshold(
     )
 
 
+def _under_plane(surfels: Surfels, top_z_mm: float | None) -> Bool[np.ndarray, " s"]:
+    """Surfels whose deviation is their height under the plane of the layer just printed."""
+    if top_z_mm is None:
+        return np.zeros(len(surfels), bool)
+    return np.abs(surfels.deviation_mm - (surfels.place_mm[:, 2] - top_z_mm)) < ON_PLANE_MM
+
+
 def _label_surfels(
-    surfels: Surfels, limit: Threshold
+    surfels: Surfels, limit: Threshold, top_limit: Threshold, top: Bool[np.ndarray, " s"]
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Missing and excess by two scales and hysteresis."""
+    """Missing and excess by two scales and hysteresis; missing under the top by its own limit."""
     labels = []
+    empty = surfels.table < 0
+    wide_top = top & (top[surfels.table] | empty).all(axis=1)
     for sign in (-1.0, 1.0):
+        own, own_wide = (top, wide_top) if sign < 0 else (np.zeros_like(top),) * 2
         cell = sign * surfels.deviation_mm
         wide = sign * surfels.wide_deviation_mm
-        core = (cell > limit.high_mm(surfels.count)) & (surfels.count >= 2)
-        core |= (wide > limit.high_mm(surfels.wide_count)) & (surfels.wide_count >= 6)
-        through = cell > limit.low_mm(surfels.count)
+        high = np.where(own, top_limit.high_mm(surfels.count), limit.high_mm(surfels.count))
+        count = surfels.wide_count
+        high_wide = np.where(own_wide, top_limit.high_mm(count), limit.high_mm(count))
+        low = np.where(own, top_limit.low_mm(surfels.count), limit.low_mm(surfels.count))
+        core = (cell > high) & (surfels.count >= 2)
+        core |= (wide > high_wide) & (count >= 6)
+        through = cell > low
         core &= through
         grown = surfels.grow(core, through)
         labels.append(_drop_specks(surfels, grown, core))
@@ -289,4 +318,29 @@ def _label_surface(
         if not missing.any() and not evidence.has_rays:
             gone[:] = False
         label[open_[gone]] = int(Label.MISSING)
+    if evidence.has_rays:
+        label[_seen_through(surface_mm, normals, template, evidence, label, limit)] = int(
+            Label.MISSING
+        )
     return label
+
+
+def _seen_through(
+    surface_mm: Float[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "m 3"],
+    template: Template,
+    evidence: Evidence,
+    label: Int[np.ndarray, " m"],
+    limit: Threshold,
+) -> Int[np.ndarray, " k"]:
+    """Points that rays passed by more than noise can be, in whatever is thin.
+
+    A wall one bead wide that is gone leaves points of what stood below it, less than a
+    millimetre off and, in a wall so thin, within every limit; a layer over a cell leaves none.
+    """
+    here = np.flatnonzero(label != int(Label.MISSING))
+    depth_mm = float(limit.high_mm(np.array([27]))[0])
+    inside = surface_mm[here] - 0.5 * depth_mm * normals[here]
+    f_mm = template.distance(inside)
+    cautious = evidence.clearance(inside, f_mm)[1]
+    return here[(cautious > depth_mm) & (f_mm < -depth_mm / 4)]

@@ -6,7 +6,7 @@ speaks the answer is "solid": unseen is never called missing. It labels nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,6 +24,12 @@ SIDEWAYS_PER_HEIGHT = 1.0
 NEIGHBOURS = 4
 # "Solid, as far as anybody knows": a clearance well below every threshold.
 SOLID_MM = -5.0
+# A pixel beside a silhouette, seen aslant, is off by no more than this many of its steps.
+SHARP_STEPS = 1.5
+SHARP_MM = 0.5
+# As far from template that is gone as a stub of it can be, and as deep inside as noise is not.
+STUB_CELLS = 2.5
+STUB_MM = 0.05
 # The template's surface in patches of this size closes what stands there.
 PATCH_MM = 0.4
 
@@ -72,12 +78,37 @@ class Evidence:
                 seen, cautious = image.clearance(points_mm)
                 best = np.maximum(best, seen)
                 least = np.maximum(least, cautious)
-            return np.maximum(best, SOLID_MM), np.maximum(least, SOLID_MM)
+            best = self._sharpened(points_mm, f_mm, np.maximum(best, SOLID_MM))
+            return best, np.maximum(least, SOLID_MM)
         if self.faces is not None:
             near = self.faces.clearance(points_mm, f_mm)
         else:
             near = self.surface_clearance(points_mm, f_mm)
         return near, near
+
+    def _sharpened(
+        self,
+        points_mm: Float[np.ndarray, "n 3"],
+        f_mm: Float[np.ndarray, " n"],
+        best_mm: Float[np.ndarray, " n"],
+    ) -> Float[np.ndarray, " n"]:
+        """What the rays say, as far as a pixel allows corrected by the scanned surface.
+
+        The emptiest of several noisy images lies too deep, and beside a silhouette every pixel is
+        a step of its own: means and planes over cells know better where the surface is, the rays
+        on which side of it a point lies.
+        """
+        step_mm = max(image.step_mm for image in self.images)
+        ask = np.flatnonzero(np.abs(best_mm) < SHARP_STEPS * step_mm + SHARP_MM)
+        if len(ask) == 0:
+            return best_mm
+        surface = self.surface_clearance(points_mm[ask], f_mm[ask])
+        limit_mm = SHARP_STEPS * step_mm
+        low, high = best_mm[ask] - limit_mm, best_mm[ask] + limit_mm
+        known = surface > SOLID_MM
+        sharp = best_mm.copy()
+        sharp[ask[known]] = np.clip(surface, low, high)[known]
+        return sharp
 
     def surface_clearance(
         self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
@@ -130,6 +161,35 @@ def gather(
         nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
         normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
     return Evidence(surfels, off, normal, images, tree, faces)
+
+
+def with_stubs(
+    evidence: Evidence,
+    scan: Scan,
+    gone_mm: Float[np.ndarray, "g 3"],
+    labelled: Bool[np.ndarray, " s"],
+) -> Evidence:
+    """The same evidence, knowing the tops of what is left of walls one bead wide.
+
+    Such a top lies inside the template, yet nearer to its side than any limit: where template
+    beside it is gone it is a surface of its own, and faces the sensors.
+    """
+    s = evidence.surfels
+    if len(gone_mm) == 0 or scan.sensors_mm is None or scan.sensor_index is None:
+        return evidence
+    reach_mm = STUB_CELLS * s.cell_mm
+    near = np.isfinite(
+        cKDTree(gone_mm).query(s.place_mm, distance_upper_bound=reach_mm, workers=2)[0]
+    )
+    which = np.flatnonzero(near & ~labelled & ~evidence.off & (s.deviation_mm < -STUB_MM))
+    if len(which) == 0:
+        return evidence
+    off, normal = evidence.off.copy(), evidence.normal.copy()
+    to_sensor = scan.sensors_mm[scan.sensor_index] - scan.points_mm
+    facing = s.mean_of(to_sensor)[which]
+    off[which] = True
+    normal[which] = facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    return replace(evidence, off=off, normal=normal)
 
 
 def _toward(

@@ -33,6 +33,8 @@ class RangeImage:
         Distance along the ray to what was seen (inf where nothing was); least of 3×3.
     cosine
         |cos| between ray and surface, per pixel.
+    step_mm
+        Edge of a pixel at the scan's median distance.
     """
 
     sensor_mm: Float[np.ndarray, " 3"]
@@ -43,6 +45,7 @@ class RangeImage:
     least_mm: Float[np.ndarray, "r c"]
     cosine: Float[np.ndarray, "r c"]
     blend_mm: float
+    step_mm: float
 
     def clearance(
         self, points_mm: Float[np.ndarray, "n 3"]
@@ -118,6 +121,7 @@ def _image(
         least_mm=kernels.least_of_nine(smooth),
         cosine=_incidence(smooth, low, pixel, blend_mm),
         blend_mm=blend_mm,
+        step_mm=step_mm,
     )
 
 

@@ -21,6 +21,7 @@ class DefectKind(StrEnum):
     """What can go wrong with a print."""
 
     VOID = "void"
+    MISSING_BEADS = "missing_beads"
     UNDER_EXTRUSION = "under_extrusion"
     CHIP = "chip"
     BLOB = "blob"
@@ -44,6 +45,12 @@ OPTIONS: dict[DefectKind, dict[str, Option]] = {
         "layers": Option(4.0, 1.0, 40.0, "layers not extruded"),
         "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
         "wall": Option(2.0, 0.0, 20.0, "mm to the part's wall"),
+    },
+    DefectKind.MISSING_BEADS: {
+        "beads": Option(4.0, 1.0, 40.0, "neighbouring lines skipped in every layer"),
+        "length": Option(12.0, 2.0, 100.0, "mm of each line skipped, at most"),
+        "layers": Option(2.0, 1.0, 40.0, "layers affected"),
+        "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
     },
     DefectKind.UNDER_EXTRUSION: {
         "flow": Option(0.5, 0.0, 0.95, "flow left, of 1"),

@@ -9,10 +9,11 @@ from collections.abc import Callable
 
 import manifold3d as m3
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from amrepair.errors import InputError
 from amrepair.simulate.defects import Defect, DefectKind, PlacedDefect
+from gcode.reader.job import Beads
 
 _SHRINK = tuple(0.85**k for k in range(9))  # down to a quarter of the size asked for
 _LEAST_ROOM_MM2 = 0.02
@@ -20,6 +21,8 @@ _TRIES = 60
 _CRUMB_MM3 = 0.05  # too small to be found, let alone printed
 _EVERYWHERE_MM = 1e9
 EVEN_RATIO = 0.97
+# Skipped lines: shorter ones are pieces of curves. Flow stops on the centre line and no wider.
+_LEAST_LINE_MM, _LINE_MM = 3.0, 0.05
 
 
 def place(
@@ -27,6 +30,8 @@ def place(
     part: m3.Manifold,
     tops_mm: Float[np.ndarray, " n"],
     rng: np.random.Generator,
+    *,
+    beads: Beads | None = None,
 ) -> PlacedDefect:
     """Find a place for a defect.
 
@@ -40,6 +45,8 @@ def place(
         (n,) heights of the layers' tops, rising.
     rng
         Chooses among the places.
+    beads
+        The job's beads, for defects that skip some of them.
 
     Raises
     ------
@@ -55,7 +62,10 @@ def place(
     if defect.kind is DefectKind.NONE:
         return PlacedDefect(defect.kind, (), np.zeros((0, 9)), None, None, np.zeros((2, 3)))
     for scale in _SHRINK:
-        placed = finders[defect.kind](defect, part, np.asarray(tops_mm), rng, scale)
+        if defect.kind is DefectKind.MISSING_BEADS:
+            placed = _missing_beads(defect, part, np.asarray(tops_mm), rng, scale, beads)
+        else:
+            placed = finders[defect.kind](defect, part, np.asarray(tops_mm), rng, scale)
         if placed is not None:
             return placed
     box = part.bounding_box()
@@ -185,6 +195,69 @@ def _under_extrusion(
         region = [*centre, 1.0, 0.0, half_mm, half_mm, low, high, flow]
         return PlacedDefect(defect.kind, tuple(layers), np.array([region]), None, None, box)
     return None
+
+
+def _missing_beads(
+    defect: Defect,
+    part: m3.Manifold,
+    tops_mm: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    scale: float,
+    beads: Beads | None,
+) -> PlacedDefect | None:
+    """Stretches of the job's own lines around one place that are not extruded."""
+    if beads is None:
+        raise InputError(f"the defect {defect} skips beads, but there is no job to skip them in")
+    count = max(1, round(defect.values["beads"] * scale))
+    for layers in _layer_ranges(defect, tops_mm, rng):
+        centre = random_point(_solid_through(part, layers, tops_mm), rng)
+        if centre is None:
+            continue
+        low, high = _z_range(layers, tops_mm)
+        z = beads.end_mm[:, 2]
+        regions = []
+        for layer in layers:
+            mine = np.flatnonzero((beads.layer == layer) & (z > low) & (z <= high))
+            found = _stretches(beads, mine, centre, count, 0.5 * defect.values["length"] * scale)
+            thick_mm = tops_mm[layer] - (tops_mm[layer - 1] if layer else 0.0)
+            z_low, z_high = tops_mm[layer] - 0.5 * thick_mm, tops_mm[layer] + 0.25 * thick_mm
+            regions += [[*row, _LINE_MM, z_low, z_high, 0.0] for row in found]
+        if len(regions) < count * len(layers):
+            continue
+        rows = np.array(regions)
+        reach = rows[:, 4:5] * np.abs(rows[:, 2:4]) + 0.5
+        bottom = tops_mm[layers[0] - 1] if layers[0] > 0 else 0.0
+        box = np.array(
+            [
+                [*(rows[:, :2] - reach).min(axis=0), bottom],
+                [*(rows[:, :2] + reach).max(axis=0), tops_mm[layers[-1]]],
+            ]
+        )
+        return PlacedDefect(defect.kind, tuple(layers), rows, None, None, box)
+    return None
+
+
+def _stretches(
+    beads: Beads,
+    mine: Int[np.ndarray, " k"],
+    centre: Float[np.ndarray, " 2"],
+    count: int,
+    half_mm: float,
+) -> list[list[float]]:
+    """x, y, cos, sin, half-length of the parts of the nearest long lines that lie by `centre`."""
+    start, end = beads.start_mm[mine, :2], beads.end_mm[mine, :2]
+    length = np.linalg.norm(end - start, axis=1)
+    long_ = length >= _LEAST_LINE_MM
+    start, end, length = start[long_], end[long_], length[long_]
+    along = (end - start) / length[:, None]
+    at = np.clip(((centre - start) * along).sum(axis=1), 0.0, length)
+    away = np.linalg.norm(start + at[:, None] * along - centre, axis=1)
+    found = []
+    for k in np.argsort(away, kind="stable")[:count]:
+        a, b = max(0.0, at[k] - half_mm), min(float(length[k]), at[k] + half_mm)
+        middle = start[k] + 0.5 * (a + b) * along[k]
+        found.append([*middle.tolist(), *along[k].tolist(), 0.5 * (b - a)])
+    return found
 
 
 def _even(part: m3.Manifold, layers: range, tops_mm: Float[np.ndarray, " n"]) -> bool:

@@ -174,7 +174,7 @@ def prepare_run(
         progress("check job", 1.0, 1.0)
     rng = np.random.default_rng([seed, 1])
     tops_mm = np.array(plan.grid.tops_mm)
-    placed = tuple(place(defect, part, tops_mm, rng) for defect in defects)
+    placed = tuple(place(defect, part, tops_mm, rng, beads=job.beads) for defect in defects)
     layers = [d.last_layer for d in placed if d.last_layer is not None and len(d.layers)]
     if not any(d.layers or d.removed or d.added for d in placed):
         layers = [len(job.layers) // 2]  # nothing will be wrong: look once on the way all the same
@@ -230,6 +230,8 @@ def simulate_run(
             defects=run.defects,
             scanner=SimulatedScanner(world, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model),
             take_motion=machine.take_motion,
+            layer_height_mm=run.setup.process.layer_height_mm,
+            part=run.part,
             box_mm=(
                 box[0] - TRUTH_MARGIN_MM,
                 box[1] - TRUTH_MARGIN_MM,

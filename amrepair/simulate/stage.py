@@ -10,13 +10,23 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import manifold3d
+import numpy as np
+from jaxtyping import Bool
+from scipy import ndimage
+
 from amrepair.frames import Transform
 from amrepair.scans import Scan, ScanRequest
-from amrepair.simulate.columns import IntervalMap, Window
+from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
+
+# Beads of a repair spread, and crumble over a rim, no farther than this from the defect.
+AROUND_MM = 3.0
+# A column lacks something where it lacks more than a bead's own roughness.
+LEAST_MISSING_MM = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +45,12 @@ class DefectTruth:
         Of that volume, what is solid after the last repair of that stop.
     excess_mm3
         Volume that it added.
+    added_mm3
+        Volume that repairs put where nothing should be: around the defect, where neither the
+        reference nor the part as designed has any, beyond what stood out before them.
+    surface_ratio
+        Share of the area over what was missing whose top is now within half a layer of the
+        reference's, give or take a column sideways; 1 where nothing was missing.
     """
 
     kind: str
@@ -42,6 +58,8 @@ class DefectTruth:
     missing_mm3: float
     filled_mm3: float
     excess_mm3: float
+    added_mm3: float = 0.0
+    surface_ratio: float = 1.0
 
 
 @dataclass(slots=True)
@@ -51,8 +69,11 @@ class _Wound:
     defect: PlacedDefect
     label: str
     missing: IntervalMap
+    standing_out: IntervalMap
     excess_mm3: float
     filled_mm3: float = 0.0
+    added_mm3: float = 0.0
+    surface_ratio: float = 1.0
 
 
 class Stage:
@@ -70,6 +91,11 @@ class Stage:
         Hands over what the printer did since it was last asked.
     box_mm
         XY box (x_min, y_min, x_max, y_max) that truth is compared in.
+    layer_height_mm
+        Of the job: surfaces within half of it of the reference's are as they should be.
+    part
+        As designed, build frame: what a repair adds within it is not too much, even where the
+        reference's own beads left a gap.
     """
 
     def __init__(
@@ -80,6 +106,8 @@ class Stage:
         scanner: SimulatedScanner,
         take_motion: Callable[[], MotionBatch],
         box_mm: tuple[float, float, float, float],
+        layer_height_mm: float = 0.2,
+        part: manifold3d.Manifold | None = None,
     ) -> None:
         self.world = world
         self.reference = world.copy()
@@ -87,6 +115,17 @@ class Stage:
         self._scanner = scanner
         self._take_motion = take_motion
         self._box_mm = box_mm
+        self._layer_height_mm = layer_height_mm
+        self._design: IntervalMap | None = None
+        if part is not None:
+            ny, nx = world.columns.shape
+            design = Columns(
+                origin_mm=world.columns.origin_mm,
+                size_mm=((nx - 0.5) * world.cell_mm, (ny - 0.5) * world.cell_mm),
+                cell_mm=world.cell_mm,
+            )
+            design.unite(design.rasterise(part))
+            self._design = design.snapshot(self._window())
         self._wounds: list[_Wound] = []
         self._stops: list[str] = []
 
@@ -105,6 +144,8 @@ class Stage:
                 missing_mm3=wound.missing.volume_mm3,
                 filled_mm3=wound.filled_mm3,
                 excess_mm3=wound.excess_mm3,
+                added_mm3=wound.added_mm3,
+                surface_ratio=wound.surface_ratio,
             )
             for wound in self._wounds
         )
@@ -150,15 +191,40 @@ class Stage:
             own = missing.clipped(defect.box_mm)
             missing = missing.minus(own)
             extra_mm3 = excess.clipped(defect.box_mm).volume_mm3
-            self._wounds.append(_Wound(defect, request.label, own, extra_mm3))
+            self._wounds.append(_Wound(defect, request.label, own, excess, extra_mm3))
 
     def _measure(self, label: str) -> None:
-        """How much of this stop's missing volume is solid now."""
-        standing = self.world.snapshot(self._window())
-        for wound in self._wounds:
-            if wound.label == label:
-                wound.filled_mm3 = wound.missing.common(standing).volume_mm3
+        """How much of this stop's missing volume is solid now, and how well it sits."""
+        wounds = [wound for wound in self._wounds if wound.label == label]
+        if not wounds:
+            return
+        window = self._window()
+        standing, wanted = self.world.snapshot(window), self.reference.snapshot(window)
+        extra = standing.minus(wanted)
+        if self._design is not None:
+            extra = extra.minus(self._design)
+        even = _even(standing, wanted, 0.5 * self._layer_height_mm)
+        around = np.array([[-1.0], [1.0]]) * AROUND_MM
+        for wound in wounds:
+            wound.filled_mm3 = wound.missing.common(standing).volume_mm3
+            added = extra.minus(wound.standing_out).clipped(wound.defect.box_mm + around)
+            wound.added_mm3 = added.volume_mm3
+            over = wound.missing.thickness_mm() > LEAST_MISSING_MM
+            wound.surface_ratio = float(even[over].mean()) if over.any() else 1.0
 
     def _window(self) -> Window:
         x0, y0, x1, y1 = self._box_mm
         return self.world.columns.box_window((x0, y0), (x1, y1))
+
+
+def _even(
+    standing: IntervalMap, wanted: IntervalMap, tolerance_mm: float
+) -> Bool[np.ndarray, "ny nx"]:
+    """Columns whose top is as high as the reference's within a tolerance up, down and sideways.
+
+    Sideways it is one column: at a wall, height says nothing.
+    """
+    top, should_mm = standing.top_mm(), wanted.top_mm()
+    low_mm = ndimage.minimum_filter(should_mm, 3) - tolerance_mm
+    high_mm = ndimage.maximum_filter(should_mm, 3) + tolerance_mm
+    return np.asarray((top >= low_mm) & (top <= high_mm))

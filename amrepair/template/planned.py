@@ -79,7 +79,7 @@ class PlannedSdf:
         low = np.minimum(start, end).min(axis=0) - [reach, reach, float(height.max())]
         high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
         # faces of voxels lie on the last layer's top
-        levels = int(np.ceil((top_mm - max(low[2], 0.0)) / voxel_mm - 1e-6))
+        levels = int(np.ceil((top_mm - low[2]) / voxel_mm - 1e-6))
         above = int(np.ceil(MARGIN_MM / voxel_mm))
         origin = np.array([low[0] - MARGIN_MM, low[1] - MARGIN_MM, top_mm - levels * voxel_mm])
         size = np.ceil((high[:2] + MARGIN_MM - origin[:2]) / voxel_mm).astype(int)

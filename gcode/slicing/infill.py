@@ -33,10 +33,14 @@ def solid_fill(
     least_mm: float,
     most_mm: float,
     pattern: Literal["rectilinear", "concentric"] = "rectilinear",
+    overlap_ratio: float = 0.0,
 ) -> tuple[list[Bead], float]:
     """Beads that fill `region`, and the area that none of them could serve.
 
-    What is narrower than about two lines is filled along its medial axis.
+    What is narrower than about two lines is filled along its medial axis. Lines end half a
+    spacing inside the region, or nearer to its rim by up to `overlap_ratio` spacings, as much as
+    brings the plastic that their round ends lack to where it lacks: more flow along the whole line
+    would pile it up in the middle.
     """
     area_mm2 = region.area()
     if area_mm2 <= 0:
@@ -46,9 +50,7 @@ def solid_fill(
     wide = offset(offset(region, -spacing_mm), spacing_mm)
     narrow = region - wide
     beads, lost_mm2 = _thin(narrow, least_mm=least_mm, most_mm=most_mm)
-    laid = rectilinear(
-        offset(wide, -0.5 * spacing_mm), spacing_mm=spacing_mm, angle_rad=angle_rad, role=role
-    )
+    laid = _lines_up_to_the_rim(wide, spacing_mm, angle_rad, role, overlap_ratio)
     if not laid and wide.area() > 0:
         more, lost = _thin(wide, least_mm=least_mm, most_mm=most_mm)
         return beads + more, lost_mm2 + lost
@@ -58,6 +60,28 @@ def solid_fill(
     applied = min(max(factor, FLOW_SPAN[0]), FLOW_SPAN[1])
     left_mm2 = max(0.0, weigh_mm2 - total_mm2 * applied)
     return beads + [bead.scaled(applied) for bead in laid], left_mm2
+
+
+def _lines_up_to_the_rim(
+    region: Any, spacing_mm: float, angle_rad: float, role: Role, overlap_ratio: float
+) -> list[Bead]:
+    """Lines that end so near to the rim that they carry the region's area, if they may."""
+
+    def ending(inset_mm: float) -> tuple[list[Bead], float]:
+        beads = rectilinear(
+            offset(region, -inset_mm), spacing_mm=spacing_mm, angle_rad=angle_rad, role=role
+        )
+        return beads, float(sum(bead.area_mm2 for bead in beads))
+
+    half_mm, nearer_mm = 0.5 * spacing_mm, overlap_ratio * spacing_mm
+    laid, laid_mm2 = ending(half_mm)
+    lacking_mm2 = region.area() - laid_mm2
+    if not laid or nearer_mm <= 0 or lacking_mm2 <= 0:
+        return laid
+    nearest, most_mm2 = ending(half_mm - nearer_mm)
+    if most_mm2 - laid_mm2 <= lacking_mm2:
+        return nearest
+    return ending(half_mm - nearer_mm * lacking_mm2 / (most_mm2 - laid_mm2))[0]
 
 
 def sparse_fill(

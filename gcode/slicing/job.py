@@ -30,6 +30,7 @@ from gcode.slicing.regions import SIMPLIFY_MM, flattened, offset, peel, pieces, 
 
 LEAST_NOZZLES = 0.5
 MOST_NOZZLES = 2.0
+INFILL_OVERLAP = 0.25  # of a spacing: PrusaSlicer's default overlap of infill and perimeters
 FLOW_CORRECTION = (0.85, 1.6)  # slab volume over section × height, outside of which flow is wrong
 SHORT_TRAVEL_MM = 1.5  # below this oozing costs less than a retraction
 NOT_LISTED_MM3 = 1e-3
@@ -201,6 +202,7 @@ def _plan_layer(section: Any, mask: Any | None, slab: Slab, setup: PrintSetup) -
             least_mm=least_mm,
             most_mm=most_mm,
             pattern="concentric" if process.infill_pattern == "concentric" else "rectilinear",
+            overlap_ratio=INFILL_OVERLAP,
         )
         layer.lost_mm2 += left
         if mask is not None:

@@ -119,6 +119,9 @@ def test_a_void_in_sparse_infill_is_mended_and_its_cells_are_left_open(template:
                    if look.printed and look.plan.patch)  # fmt: skip
     missing = sum(t.missing_mm3 for t in run.truth)
     assert laid_mm3 < 1.5 * missing + 2.0
+    # regression: a wall one bead wide reads no deeper than any limit; nothing came back
+    assert run.repaired_ratio is not None
+    assert run.repaired_ratio > 0.5
 
 
 def test_the_same_seed_gives_the_same_result(template: MeshSdf) -> None:

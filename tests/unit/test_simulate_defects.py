@@ -7,9 +7,19 @@ import numpy as np
 import pytest
 
 from amrepair.errors import InputError
-from amrepair.simulate.defects import DefectKind, parse_defect
+from amrepair.frames import Transform
+from amrepair.scans import ScanRequest
+from amrepair.simulate.defects import DefectKind, PlacedDefect, parse_defect
 from amrepair.simulate.part_files import bracket_path, part_path
 from amrepair.simulate.placement import place
+from amrepair.simulate.scanner import ScannerPose, SimulatedScanner
+from amrepair.simulate.stage import Stage
+from amrepair.simulate.world import World
+from gcode.firmware.motion import MotionBatch
+from gcode.profiles import load_setup
+from gcode.reader import read_job
+from gcode.slicing.job import plan_part
+from gcode.writer import write
 
 PARTS = {
     "block": m3.Manifold.cube((30, 30, 10)),
@@ -104,3 +114,64 @@ def test_bracket_is_found_and_other_names_are_refused() -> None:
     assert bracket_path().is_file()
     with pytest.raises(InputError, match="bracket"):
         part_path("teapot")
+
+
+def test_skipped_beads_lie_on_the_jobs_own_lines() -> None:
+    part = m3.Manifold.cube((30, 20, 4)).translate((60, 60, 0))
+    program = write(plan_part(part, load_setup()).toolpath, load_setup(), title="test")
+    job = read_job(program, filament_diameter_mm=1.75, dialect=program.dialect)
+    defect = parse_defect("missing_beads:beads=3,layers=2,layer=9")
+    beads = job.beads
+    placed = place(defect, part, tops(part), np.random.default_rng(1), beads=beads)
+    assert placed.layers == (8, 9)
+    assert len(placed.flow_regions) == 6
+    whole, broken = World((250.0, 210.0)), World((250.0, 210.0))
+    mine = beads.layer <= 9
+    length_mm = np.linalg.norm(beads.end_mm - beads.start_mm, axis=1)
+    motion = MotionBatch(
+        beads.start_mm[mine],
+        beads.end_mm[mine],
+        (length_mm * beads.section_mm2 / (np.pi / 4 * 1.75**2))[mine],
+        np.full(mine.sum(), 50.0),
+        np.arange(mine.sum()) * 1.0,
+    )
+    lost_mm3 = whole.deposit(motion) - broken.deposit(motion, [placed])
+    skipped_mm = 2 * placed.flow_regions[:, 4].sum()
+    # whole steps of 0.2 mm at either end, and the two neighbours' spacing
+    assert lost_mm3 == pytest.approx(skipped_mm * 0.407 * 0.2, rel=0.15)
+    with pytest.raises(InputError, match="no job"):
+        place(defect, part, tops(part), np.random.default_rng(1))
+
+
+def test_truth_says_how_even_a_repair_is_and_what_it_added() -> None:
+    world = World((60.0, 60.0))
+    block = m3.Manifold.cube((16, 16, 2)).translate((20, 20, 0))
+    hole = m3.Manifold.cube((4, 4, 1)).translate((26, 26, 1))
+    box = np.array([[26.0, 26, 1], [30, 30, 2]])
+    defect = PlacedDefect(DefectKind.CHIP, (), np.zeros((0, 9)), hole, None, box)
+    none = MotionBatch.concatenate([])
+    identity = Transform.identity("build", "scanner")
+    stage = Stage(
+        world,
+        defects=[defect],
+        scanner=SimulatedScanner(
+            world,
+            pose=ScannerPose(identity, identity),
+            sensors_mm=np.array([[30.0, 30.0, 200.0]]),
+            rng=np.random.default_rng(0),
+        ),
+        take_motion=lambda: none,
+        box_mm=(17.0, 17.0, 39.0, 39.0),
+    )
+    for one in (stage.world, stage.reference):
+        one.add(block)
+    request = ScanRequest("final", None, 2.0)
+    stage.scan(request)
+    assert stage.truth[0].surface_ratio < 0.3  # a column beside each wall is even sideways
+    world.add(m3.Manifold.cube((4, 3, 1.05)).translate((26, 26, 1)))  # 3/4 filled, 0.05 too high
+    stage.scan(request)
+    truth = stage.truth[0]
+    assert truth.missing_mm3 == pytest.approx(16.0)
+    assert truth.filled_mm3 == pytest.approx(12.0)
+    assert truth.added_mm3 == pytest.approx(12 * 0.05)
+    assert truth.surface_ratio == pytest.approx(3 / 4, abs=0.08)

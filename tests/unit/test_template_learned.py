@@ -139,6 +139,15 @@ def test_a_planned_plate_is_where_its_beads_are() -> None:
     assert plate.distance(np.array([[20.0, 8.0, 0.5]]))[0] == pytest.approx(2.0, abs=0.15)
 
 
+def test_a_part_drawn_below_its_own_zero_has_planned_beads_too() -> None:
+    # regression: the grid ended at z = 0 of the template's frame, wherever the part stood in it
+    start = np.array([[0.0, 0.0, -9.8], [0.0, 0.0, -9.6]])
+    end = start + np.array([10.0, 0.0, 0.0])
+    planned = PlannedSdf.from_beads(start, end, np.full(2, 0.09), np.full(2, 0.2))
+    assert planned.bounds_mm[:, 2] == pytest.approx([-10.0, -9.6])
+    assert planned.distance(np.array([[5.0, 0.0, -9.7]]))[0] < 0
+
+
 def test_an_open_groove_is_planned_to_be_open() -> None:
     groove = beads(gap=True)
     floor = np.array([[20.0, 20.0, 0.8]])

@@ -1,0 +1,48 @@
+"""What is worth a repair: pieces of a deficit weighed together where they are one defect."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from amrepair.deficit.compute import BEAD_MM3
+
+# A stop of the print, and heat beside the wound, must be worth it.
+MIN_REPAIR_MM3 = 2.0
+# What lies this near to a defect belongs to it.
+ONE_DEFECT_MM = 1.0
+
+
+def worth_mending(
+    boxes_mm: Sequence[Float[np.ndarray, "2 3"]], volumes_mm3: Sequence[float]
+) -> Bool[np.ndarray, " n"]:
+    """Pieces that belong to a defect of at least `MIN_REPAIR_MM3`.
+
+    Skipped beads that cross leave several pieces side by side: one defect. Crumbs below what a
+    bead fills join nothing.
+
+    Parameters
+    ----------
+    boxes_mm, volumes_mm3
+        Box and volume of each piece.
+
+    Returns
+    -------
+    numpy.ndarray
+        (n,) whether it is worth a repair.
+    """
+    volume = np.asarray(volumes_mm3, dtype=np.float64)
+    keep = np.zeros(len(volume), bool)
+    bead = np.flatnonzero(volume >= BEAD_MM3)
+    if len(bead) == 0:
+        return keep
+    box = np.stack([np.asarray(boxes_mm[int(k)]) for k in bead])
+    low, high = box[:, 0], box[:, 1] + ONE_DEFECT_MM
+    near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
+    groups, group = connected_components(csr_matrix(near), directed=False)
+    keep[bead] = np.bincount(group, weights=volume[bead], minlength=groups)[group] >= MIN_REPAIR_MM3
+    return keep

@@ -1,0 +1,163 @@
+"""False alarms: clean prints with noise in flow and scan must not be repaired.
+
+    AMREPAIR_DATA=… python benchmarks/bench_clean.py --every 5 --layers 100
+    python benchmarks/bench_clean.py --own bracket:standard_0.20 --every 10
+
+Every job is printed into the simulated world with wandering flow, scanned after every `--every`
+layers, and judged by its own planned beads, as the loop judges layers with sparse infill; a look
+that wants a repair is a false alarm. Lines of JSON in `--results`, one per job and call; a job goes
+on after the layers that it has there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amrepair.frames import Transform
+from amrepair.repair import Site, plan_repair
+from amrepair.scans import ScanRequest
+from amrepair.simulate.flow import noisy_flow
+from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
+from amrepair.simulate.world import World
+from amrepair.template import PlannedSdf, load_mesh
+from amrepair.template.mesh_file import as_manifold
+from gcode.firmware.motion import MotionBatch
+from gcode.moves import Program
+from gcode.profiles import PrintSetup, load_setup
+from gcode.reader import Job, read_job
+from gcode.slicing.job import plan_part
+from gcode.slicing.layers import LayerGrid
+from gcode.writer import write
+
+OURS = Path(__file__).parents[1] / "examples" / "parts"
+FILES = ("cura_slicer", "orca_slicer", "plant-sign", "screw", "prusaslicer-cube")
+HERE = Transform.identity("build", "template")
+FILAMENT_MM2 = float(np.pi / 4 * 1.75**2)
+
+
+def job_of(name: str, setup: PrintSetup) -> Job:
+    """A job of a real slicer, or `PART:PROCESS` sliced by us."""
+    if ":" in name:
+        part, process = name.split(":")
+        own = load_setup(process=process)
+        mesh = load_mesh(OURS / f"{part}.stl")
+        low, high = mesh.bounds
+        mesh.apply_translation(
+            [125 - (low[0] + high[0]) / 2, 105 - (low[1] + high[1]) / 2, -low[2]]
+        )
+        solid = as_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        program = write(plan_part(solid, own).toolpath, own, title=part)
+    else:
+        path = Path(os.environ["AMREPAIR_DATA"]) / "gcode" / f"{name}.gcode"
+        program = Program(path.read_text(errors="replace"), "marlin")
+    return read_job(program, filament_diameter_mm=1.75, dialect=program.dialect)
+
+
+def motion_of(job: Job, first: int, last: int) -> MotionBatch:
+    """Beads of layers [first, last], and a move away."""
+    beads = job.beads
+    mine = (beads.layer >= first) & (beads.layer <= last)
+    start, end = beads.start_mm[mine], beads.end_mm[mine]
+    length_mm = np.linalg.norm(end - start, axis=1)
+    away = np.array([[0.0, 0.0, float(end[-1, 2]) + 20.0]])
+    filament = np.append(length_mm * beads.section_mm2[mine] / FILAMENT_MM2, 0.0)
+    n = len(filament)
+    return MotionBatch(
+        np.concatenate([start, away]),
+        np.concatenate([end, away]),
+        filament,
+        np.full(n, 50.0),
+        np.arange(n) * 1.0,
+    )
+
+
+def site_of(job: Job, layer: int, setup: PrintSetup) -> Site:
+    """The planned beads after a layer, in the build frame."""
+    beads = job.beads
+    done = (beads.layer >= 0) & (beads.layer <= layer)
+    planned = PlannedSdf.from_beads(
+        beads.start_mm[done], beads.end_mm[done], beads.section_mm2[done], beads.height_mm[done]
+    )
+    tops = [one.z_mm for one in job.layers]
+    grid = LayerGrid.from_tops(tops, layer_height_mm=setup.process.layer_height_mm)
+    return Site(planned, setup, grid, HERE, tops[layer], planned=planned)
+
+
+def run_job(name: str, *, every: int, most: int, after: int, seed: int) -> dict[str, Any]:
+    """Print up to `most` layers beyond layer `after`, looking after every few."""
+    began = time.perf_counter()
+    setup = load_setup()
+    job = job_of(name, setup)
+    beads = job.beads
+    part = beads.layer >= 0
+    low, high = beads.start_mm[part].min(axis=0), beads.start_mm[part].max(axis=0)
+    world = World((float(max(high[0] + 20, 60)), float(max(high[1] + 20, 60))))
+    rng = np.random.default_rng([seed, len(name)])
+    centre = (float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2)
+    scanner = SimulatedScanner(
+        world,
+        pose=seeded_pose(rng, centre_mm=centre),
+        sensors_mm=default_sensors_mm(centre, distance_mm=max(300.0, 2 * float(high[2]) + 100)),
+        rng=rng,
+    )
+    last = min(len(job.layers) - 1, after + most)
+    alarms, looks, done = [], 0, -1
+    for layer in range(every - 1, last + 1, every):
+        world.deposit(noisy_flow(motion_of(job, done + 1, layer), rng))
+        done = layer
+        if layer <= after:
+            continue
+        site = site_of(job, layer, setup)
+        scan = scanner.scan(ScanRequest(f"layer-{layer:03d}", layer, job.layers[layer].z_mm))
+        plan = plan_repair(
+            scan,
+            site,
+            title="clean",
+            guess=HERE.inverse() @ scanner.build_from_scanner,
+            strict=False,
+        )
+        looks += 1
+        if plan.to_fill:
+            alarms.append([layer, round(sum(r.volume_mm3 for r in plan.to_fill), 2)])
+    return {
+        "job": name,
+        "layers": [after + 1, done],
+        "looks": looks,
+        "alarms": alarms,
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--jobs", nargs="*", default=list(FILES))
+    parser.add_argument("--own", nargs="*", default=[], metavar="PART:PROCESS")
+    parser.add_argument("--every", type=int, default=5)
+    parser.add_argument("--layers", type=int, default=100, help="of each job in this call")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, default=Path("out/clean.jsonl"))
+    args = parser.parse_args()
+    args.results.parent.mkdir(parents=True, exist_ok=True)
+    text = args.results.read_text() if args.results.is_file() else ""
+    rows = [json.loads(line) for line in text.splitlines()]
+    for name in [*args.jobs, *args.own]:
+        after = max((row["layers"][1] for row in rows if row["job"] == name), default=-1)
+        row = run_job(name, every=args.every, most=args.layers, after=after, seed=args.seed)
+        rows.append(row)
+        with args.results.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        print(json.dumps(row), flush=True)
+    layers = sum(row["layers"][1] - row["layers"][0] + 1 for row in rows)
+    looks = sum(row["looks"] for row in rows)
+    print(f"{layers} layers, {looks} looks, {sum(len(row['alarms']) for row in rows)} alarms")
+
+
+if __name__ == "__main__":
+    main()

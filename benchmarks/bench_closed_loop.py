@@ -1,0 +1,156 @@
+"""The closed loop's table: additive defects × parts × seeds, judged by the simulated world's truth.
+
+    AMREPAIR_DATA=… python benchmarks/bench_closed_loop.py --next 10   # run ten cases not yet run
+    python benchmarks/bench_closed_loop.py --case knob void 2          # run one
+    python benchmarks/bench_closed_loop.py --table                     # what there is so far
+
+Results are lines of JSON in `--results`, one per case, so the table can be made in pieces. Three
+parts are ours, three real (named by `AMREPAIR_DATA`); they are scaled so that a case takes seconds
+to a minute. Truth is the world against a reference printed by the same motion without the defect.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from amrepair.simulate.defects import parse_defect
+from amrepair.simulate.run import SimulatedRun, prepare_run, simulate_run
+from amrepair.template import load_mesh, load_or_fit
+from gcode.profiles import load_setup
+
+OURS = Path(__file__).parents[1] / "examples" / "parts"
+# name: file, factor
+PARTS: dict[str, tuple[str, float]] = {
+    "bracket": ("bracket.stl", 0.6),
+    "knob": ("knob.stl", 1.0),
+    "pebble": ("pebble.stl", 1.0),
+    "extruder-idler": ("prusa-extruder-idler.stl", 1.0),
+    "y-belt-idler": ("prusa-y-belt-idler.stl", 0.8),
+    "y-rod-holder": ("prusa-y-rod-holder.stl", 1.0),
+}
+DEFECTS = ("void", "missing_beads", "under_extrusion", "chip")
+SEEDS = (0, 1, 2)
+MAX_ITERATIONS = 2
+Case = tuple[str, str, int]
+
+
+def cases(parts: Sequence[str]) -> list[Case]:
+    """Every case, one seed of all before the next seed of any."""
+    return [(part, kind, seed) for seed in SEEDS for part in parts for kind in DEFECTS]
+
+
+def part_file(name: str) -> Path:
+    """Where a part lies.
+
+    Raises
+    ------
+    SystemExit
+        If it is a real part and nobody said where those are.
+    """
+    file = PARTS[name][0]
+    if (OURS / file).is_file():
+        return OURS / file
+    data = os.environ.get("AMREPAIR_DATA")
+    if not data:
+        raise SystemExit(f"{name} is a real part: set AMREPAIR_DATA, or leave it out with --parts")
+    return Path(data) / "parts" / file
+
+
+def run_case(case: Case, process: str) -> dict[str, Any]:
+    """Print, break and mend one part; what became of it."""
+    part, kind, seed = case
+    began = time.perf_counter()
+    mesh = load_mesh(part_file(part))
+    mesh.apply_scale(PARTS[part][1])
+    setup = load_setup(process=process)
+    prepared = prepare_run(load_or_fit(mesh), setup, [parse_defect(kind)], title=part, seed=seed)
+    run = simulate_run(prepared, max_iterations=MAX_ITERATIONS)
+    return (
+        {"part": part, "defect": kind, "seed": seed, "process": process}
+        | figures(run)
+        | {"seconds": round(time.perf_counter() - began, 1)}
+    )
+
+
+def figures(run: SimulatedRun) -> dict[str, Any]:
+    """What the table needs of one run with one defect."""
+    truth = run.truth[0]
+    looks = [look for look in run.report.looks if look.stop.label == truth.label]
+    elsewhere = [look for look in run.report.looks if look.stop.label != truth.label]
+    first = looks[0].plan
+    return {
+        "missing_mm3": round(truth.missing_mm3, 2),
+        "deficit_mm3": round(first.deficit.missing_mm3, 2),
+        "beads_mm3": round(
+            sum(k.plan.patch.beads_mm3 for k in looks if k.printed and k.plan.patch), 2
+        ),
+        "unreachable_mm3": round(first.unreachable_mm3, 2),
+        "filled_ratio": round(truth.filled_mm3 / truth.missing_mm3, 4),
+        "added_ratio": round(truth.added_mm3 / truth.missing_mm3, 4),
+        "surface_ratio": round(truth.surface_ratio, 4),
+        "iterations": sum(look.printed for look in looks),
+        "elsewhere": sum(look.printed for look in elsewhere),
+        "refused": first.refused,
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: by defect and in all."""
+    lines = [
+        "| defect | cases | filled, mean | worst | surface, mean | worst | added, mean | worst "
+        "| repairs, most |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for kind in (*DEFECTS, "all"):
+        mine = [row for row in rows if kind in {row["defect"], "all"}]
+        if not mine:
+            continue
+        values = {
+            key: [row[key] for row in mine]
+            for key in ("filled_ratio", "surface_ratio", "added_ratio", "iterations")
+        }
+        mean = {key: statistics.fmean(found) for key, found in values.items()}
+        lines.append(
+            f"| {kind} | {len(mine)} | {mean['filled_ratio']:.3f} | "
+            f"{min(values['filled_ratio']):.3f} | {mean['surface_ratio']:.3f} | "
+            f"{min(values['surface_ratio']):.3f} | {mean['added_ratio']:.3f} | "
+            f"{max(values['added_ratio']):.3f} | {max(values['iterations'])} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--next", type=int, default=0, help="how many cases not yet run")
+    parser.add_argument("--case", nargs=3, metavar=("PART", "DEFECT", "SEED"))
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--process", default="repair_0.20")
+    parser.add_argument("--results", type=Path, default=Path("out/closed-loop.jsonl"))
+    parser.add_argument("--table", action="store_true")
+    args = parser.parse_args()
+    args.results.parent.mkdir(parents=True, exist_ok=True)
+    text = args.results.read_text() if args.results.is_file() else ""
+    rows = [json.loads(line) for line in text.splitlines()]
+    done = {(row["part"], row["defect"], row["seed"]) for row in rows}
+    todo = [case for case in cases(args.parts) if case not in done][: args.next]
+    if args.case:
+        todo = [(args.case[0], args.case[1], int(args.case[2]))]
+    for case in todo:
+        row = run_case(case, args.process)
+        rows.append(row)
+        with args.results.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        print(json.dumps(row), flush=True)
+    if args.table:
+        print(table([row for row in rows if row["part"] in args.parts]))
+
+
+if __name__ == "__main__":
+    main()
