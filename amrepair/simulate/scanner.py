@@ -37,6 +37,12 @@ class ScannerModel:
         Half the height of the spot that a point averages over.
     bed_margin_mm
         How much of the bed around the part is measured.
+    dropout_ratio
+        Share of the points on square surface that do not come back; it grows as 1 / cos a, since
+        less light returns from a slope.
+    outlier_ratio, outlier_mm
+        Share of points that a shiny bead reflects from elsewhere, and the mean distance that they
+        are off along their rays, either way (Laplace: a few are far off).
     """
 
     sigma_mm: float = 0.03
@@ -44,6 +50,9 @@ class ScannerModel:
     max_incidence_rad: float = float(np.deg2rad(80.0))
     spot_half_height_mm: float = 0.2
     bed_margin_mm: float = 6.0
+    dropout_ratio: float = 0.0
+    outlier_ratio: float = 0.0
+    outlier_mm: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,4 +234,10 @@ class SimulatedScanner:
         keep = (cosine > np.cos(self.model.max_incidence_rad)) & ((kinds != BED) | near)
         noise_mm = self._rng.normal(size=len(points)) * self.model.sigma_mm
         spread = noise_mm / np.sqrt(np.maximum(cosine, 0.1))
+        if self.model.dropout_ratio > 0:
+            lost = self.model.dropout_ratio / np.maximum(cosine, 0.1)
+            keep &= self._rng.random(len(points)) >= lost
+        if self.model.outlier_ratio > 0:
+            shiny = self._rng.random(len(points)) < self.model.outlier_ratio
+            spread = spread + shiny * self._rng.laplace(0.0, self.model.outlier_mm, len(points))
         return (points + rays * spread[:, None])[keep]

@@ -117,3 +117,29 @@ def test_empty_bed_and_low_sensor_are_refused() -> None:
     world.add(m3.Manifold.cube((5, 5, 250)).translate((30, 30, 0)))
     with pytest.raises(ScannerError, match="higher"):
         scanner(world).scan(REQUEST)
+
+
+def test_dropouts_and_outliers_are_as_many_and_as_far_as_told() -> None:
+    world, _ = box_world(0.0)
+
+    def tops(model: ScannerModel) -> np.ndarray:
+        device = SimulatedScanner(
+            world,
+            pose=seeded_pose(np.random.default_rng(0), centre_mm=CENTRE),
+            sensors_mm=default_sensors_mm(CENTRE, oblique=0),
+            rng=np.random.default_rng(0),
+            model=model,
+        )
+        points = seen_in_build(device)
+        inside = (np.abs(points[:, :2] - (30.02, 30.05)) < (7.0, 5.0)).all(axis=1)
+        return points[inside, 2]
+
+    whole = tops(ScannerModel(sigma_mm=0.0, spacing_mm=0.15))
+    fewer = tops(ScannerModel(sigma_mm=0.0, spacing_mm=0.15, dropout_ratio=0.2))
+    # from above the surface is square; some 6,000 points, so the share is good to half a per cent
+    assert len(fewer) / len(whole) == pytest.approx(0.8, abs=0.02)
+    shiny = ScannerModel(sigma_mm=0.0, spacing_mm=0.15, outlier_ratio=0.1, outlier_mm=0.4)
+    off_mm = np.abs(tops(shiny) - 8.0)
+    far = off_mm[off_mm > 0.02]
+    assert len(far) / len(off_mm) == pytest.approx(0.1 * np.exp(-0.02 / 0.4), abs=0.015)
+    assert far.mean() == pytest.approx(0.42, abs=0.06)  # beyond 0.02 mm, 0.4 mm more on average
