@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from amrepair.cli.files import open_template
-from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.live import (
     VIEW_PORT,
     HostOption,
+    NoView,
     PortOption,
+    ShownRun,
     TokenOption,
     ViewOption,
     live_view,
@@ -26,18 +26,32 @@ from amrepair.cli.options import (
     ProcessOption,
     SeedOption,
 )
-from amrepair.errors import InputError
+from amrepair.errors import InputError, LoopError
 from amrepair.frames import Transform
-from amrepair.loop import Stop, locate_part, plan_stops, run_loop
-from amrepair.repair import RepairPlan, Site, Stopwatch
+from amrepair.loop import (
+    MAX_ITERATIONS,
+    Decision,
+    LoopReport,
+    Stop,
+    Tape,
+    locate_part,
+    plan_stops,
+    run_loop,
+)
+from amrepair.loop.calibrate import read_calibration
+from amrepair.loop.limits import Limits
+from amrepair.loop.pick_up import pick_up_serial
+from amrepair.loop.setting import Setting, forget, keep, open_run
+from amrepair.loop.sites import sites
+from amrepair.loop.tape import read_events
+from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.report import report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
 from amrepair.report.guarded import LOOPBACK
 from amrepair.scans import Scanner, WatchedFolderScanner
-from amrepair.template import PlannedSdf
 from amrepair.template.port import Template
-from gcode.check import check
+from gcode.check import CheckedProgram, check
 from gcode.cli import console
 from gcode.hosts import connect
 from gcode.hosts.journal import default_path, is_device
@@ -50,7 +64,6 @@ from gcode.profiles import (
     load_setup,
 )
 from gcode.reader import Job, read_job
-from gcode.slicing.layers import LayerGrid
 
 APPROVALS = ("ask", "auto")
 
@@ -66,22 +79,50 @@ def add_to(app: typer.Typer) -> None:
             "--scanner watch:scans --view",
             "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
             "--scanner watch:scans --approve auto --json",
+            "amrepair loop --resume out/loop",
         ),
     )(loop)
 
 
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """All that a run needs, new or gone on with."""
+
+    folder: RunFolder
+    setting: Setting
+    setup: PrintSetup
+    job: Job
+    checked: CheckedProgram
+    template: Template
+    stops: tuple[Stop, ...]
+    tape: Tape
+
+
 def loop(
-    job_file: Annotated[Path, typer.Argument(metavar="JOB", help="G-code of the whole job.")],
-    template: TemplateOption,
+    job_file: Annotated[
+        Path | None, typer.Argument(metavar="JOB", help="G-code of the whole job.")
+    ] = None,
+    template: Annotated[
+        Path | None,
+        typer.Option("--template", help="Fitted template, or a mesh that is fitted now."),
+    ] = None,
     port: Annotated[
-        str,
+        str | None,
         typer.Option(help="Device path, octoprint+http://HOST:PORT or moonraker+http://HOST:PORT."),
-    ],
-    scanner: Annotated[str, typer.Option(help="watch:DIR: a folder that scans are dropped in.")],
+    ] = None,
+    scanner: Annotated[
+        str | None, typer.Option(help="watch:DIR: a folder that scans are dropped in.")
+    ] = None,
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
     process: ProcessOption = DEFAULT_PROCESS,
-    approve: Annotated[str, typer.Option(help="ask before every repair, or auto.")] = "ask",
+    approve: Annotated[
+        str | None,
+        typer.Option(
+            help="ask before every repair (where left out), or auto: within the limits that the "
+            "process profile sets."
+        ),
+    ] = None,
     every: Annotated[
         int, typer.Option(min=0, help="Scan after every so many layers; 0: only at the end.")
     ] = 0,
@@ -90,10 +131,26 @@ def loop(
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="JSON file with build_from_scanner, 4×4; identity where left out."),
+        typer.Option(help="File that 'amrepair calibrate' wrote; identity where left out."),
     ] = None,
     scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
     out: Annotated[Path, typer.Option(help="Folder for result, scans, report.")] = Path("out/loop"),
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            "--resume",
+            metavar="RUN",
+            help="Go on with the run in this folder, which was killed or ended; JOB and all else "
+            "come from there.",
+        ),
+    ] = None,
+    pose_confirmed: Annotated[
+        bool,
+        typer.Option(
+            "--pose-confirmed",
+            help="With --resume: a scan has shown that the part stands where it stood.",
+        ),
+    ] = False,
     view: ViewOption = False,
     view_host: HostOption = LOOPBACK,
     view_port: PortOption = VIEW_PORT,
@@ -102,66 +159,175 @@ def loop(
     as_json: JsonOption = False,
 ) -> None:
     """Print a job; at chosen layers and at the end scan, repair what is missing, go on."""
-    if approve not in APPROVALS:
+    if approve not in (None, *APPROVALS):
         raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
-    setup = load_setup(printer, material, process)
     watch, bars = Stopwatch(), console.Bars()
-    eye = _scanner(scanner, calibration, scan_timeout_s)
+    if resume is not None:
+        if job_file is not None:
+            raise InputError("--resume takes the job from the run's folder; leave JOB out")
+        begun = _gone_on_with(resume, port, scanner, approve)
+    else:
+        begun = _new_run(
+            _given(job_file, "JOB"),
+            _given(template, "--template"),
+            out,
+            (printer, material, process),
+            [every, *(at_layer or [])],
+            calibration,
+            watch,
+            bars,
+            port=_given(port, "--port"),
+            scanner=_given(scanner, "--scanner"),
+            approve=approve or "ask",
+            scan_timeout_s=scan_timeout_s,
+            seed=seed,
+        )
+    ask = begun.setting.approve == "ask"
+    with live_view(
+        view, ask=ask, title=begun.setting.title, host=view_host, port=view_port, token=token
+    ) as page:
+        report = _print(
+            begun, page, watch, bars, view=view, going_on=resume is not None, pose=pose_confirmed
+        )
+    _tell(begun, report, watch, as_json=as_json)
+
+
+def _given(value: Any, name: str) -> Any:
+    if value is None:
+        raise InputError(f"{name} is missing; give it, or --resume RUN to go on with a run")
+    return value
+
+
+def _new_run(
+    job_file: Path,
+    template: Path,
+    out: Path,
+    ids: tuple[str, str, str],
+    layers: list[int],
+    calibration: Path | None,
+    watch: Stopwatch,
+    bars: console.Bars,
+    **said: Any,
+) -> _Begun:
+    """Read, check and write down what a run begins with."""
+    setup = load_setup(*ids)
+    pose = read_calibration(calibration)
+    _scanner(said["scanner"], pose, said["scan_timeout_s"])  # refused before any work
     folder = RunFolder(out)
+    before = read_events(out)
+    if before and before[-1].get("event") != "end":
+        raise InputError(
+            f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume {out}') "
+            "or name another folder with --out"
+        )
     job = _job(job_file, setup)
     checked = check(job.program, setup)
-    layers = [*range(every - 1, len(job.layers) - 1, every)] if every else []
-    stops = plan_stops(job, [*layers, *(at_layer or [])])
+    every, *at = layers
+    regular = [*range(every - 1, len(job.layers) - 1, every)] if every else []
+    stops = plan_stops(job, [*regular, *at])
     with watch("template"):
         field = open_template(template, progress=bars)
     with watch("locate"):
         placed = locate_part(job, field, layer_height_mm=setup.process.layer_height_mm)
+    setting = Setting.of(
+        setup, ids, stops=stops, build_from_template=placed, build_from_scanner=pose,
+        by_beads=True, max_iterations=MAX_ITERATIONS, limited=said["approve"] == "auto",
+        title=job_file.name, **said,
+    )  # fmt: skip
+    forget(out)
+    keep(out, setting, job.program.text, field)
+    return _Begun(folder, setting, setup, job, checked, field, stops, Tape(out))
+
+
+def _gone_on_with(
+    folder: Path, port: str | None, scanner: str | None, approve: str | None
+) -> _Begun:
+    """Open a run's folder; what is said now counts more than what was said then."""
+    run = open_run(folder)
+    changes: dict[str, Any] = {"port": port, "scanner": scanner, "approve": approve}
+    setting = replace(run.setting, **{k: v for k, v in changes.items() if v is not None})
+    if not setting.port:
+        raise InputError(f"the run in {folder} was simulated; there is no printer to go on with")
+    tape = Tape(folder)
+    tape.reopen()
+    checked = check(run.job.program, run.setup)
+    return _Begun(
+        RunFolder(folder), setting, run.setup, run.job, checked, run.template, run.stops, tape
+    )
+
+
+def _print(
+    begun: _Begun,
+    page: NoView | ShownRun,
+    watch: Stopwatch,
+    bars: console.Bars,
+    *,
+    view: bool,
+    going_on: bool,
+    pose: bool,
+) -> LoopReport:
+    """Connect and run the loop."""
+    setting, setup, ask = begun.setting, begun.setup, begun.setting.approve == "ask"
     machine = connect(
-        port,
+        setting.port,
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
-        wire_log=folder.file("wire.log"),
-        journal=default_path(port) if is_device(port) else None,
+        wire_log=begun.folder.file("wire.log"),
+        journal=default_path(setting.port) if is_device(setting.port) else None,
     )
-    ask = approve == "ask"
-    with live_view(
-        view, ask=ask, title=job_file.name, host=view_host, port=view_port, token=token
-    ) as page:
-        page.show_run(job, _placed_solid(field, placed))
+    pick_up = None
+    if going_on:
+        pick_up = pick_up_serial(
+            machine, release_c=setup.material.bed_release_c, pose_confirmed=pose
+        )
+    eye = _scanner(setting.scanner, setting.scanner_pose, setting.scan_timeout_s)
+    page.show_run(begun.job, _placed_solid(begun.template, setting.placed))
+    if not going_on:
         machine.connect()
-        page.drives(machine.pause, machine.resume)
-        try:
-            with bars.shown():
-                report = run_loop(
-                    job,
-                    checked,
-                    machine,
-                    eye,
-                    lambda stop: _site(job, stop, field, placed, setup),
-                    stops=stops,
-                    approve=(page.approve if view else _ask) if ask else lambda plan: True,
-                    record=page.recording(folder.record),
-                    rng=np.random.default_rng(seed),
-                    watch=watch,
-                    progress=page.watching(bars),
-                )
-        finally:
-            machine.close()
+    page.drives(machine.pause, machine.resume)
+    try:
+        with bars.shown():
+            return run_loop(
+                begun.job,
+                begun.checked,
+                machine,
+                eye,
+                sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads),
+                stops=begun.stops,
+                max_iterations=setting.max_iterations,
+                approve=(page.approve if view else _ask) if ask else lambda plan: True,
+                ask=(page.ask_to_go_on if view else _ask_to_go_on) if ask else None,
+                limits=Limits.of(setup.process) if setting.limited else None,
+                record=page.recording(begun.folder.record),
+                tape=begun.tape,
+                pick_up=pick_up,
+                seed=setting.seed,
+                watch=watch,
+                progress=page.watching(bars),
+            )
+    finally:
+        machine.close()
+        begun.tape.close()
+
+
+def _tell(begun: _Begun, report: LoopReport, watch: Stopwatch, *, as_json: bool) -> None:
+    """Result, report, exit code."""
+    folder, setting, setup = begun.folder, begun.setting, begun.setup
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     printed = [look for look in report.looks if look.printed]
     last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
     result = loop_result(
-        report, repaired_ratio=None, gcode=last, seed=seed, seconds=seconds, setup=setup
+        report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
     )
     folder.write_json("result.json", result)
     within = report.within_tolerance
     data = report_of_loop(
         report,
         result,
-        title=f"Run: {job_file.name}",
+        title=f"Run: {setting.title}",
         setup=setup,
-        about={"job": job_file.name},
-        expected=_placed_solid(field, placed),
+        about={"job": setting.title},
+        expected=_placed_solid(begun.template, setting.placed),
     )
     write_report(data, folder.file("report.html"))
     if as_json:
@@ -170,6 +336,13 @@ def loop(
         for line in summary_of_result(result, within_tolerance=within):
             console.out.print(line)
         console.out.print(f"Report: {folder.file('report.html')}")
+    if report.stopped:
+        console.errors.print(
+            f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
+            f"amrepair loop --resume {folder.path} --approve ask",
+            markup=False,
+        )
+        raise typer.Exit(LoopError.exit_code)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
 
@@ -186,24 +359,12 @@ def _job(path: Path, setup: PrintSetup) -> Job:
     )
 
 
-def _scanner(spec: str, calibration: Path | None, timeout_s: float) -> Scanner:
+def _scanner(spec: str, pose: Transform, timeout_s: float) -> Scanner:
     if not spec.startswith("watch:"):
         raise InputError(
             f"--scanner is {spec!r}; give watch:DIR (a simulated scanner belongs to "
             "'amrepair simulate')"
         )
-    pose = None
-    if calibration is not None:
-        try:
-            matrix = np.array(json.loads(calibration.read_text())["build_from_scanner"], float)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"the calibration {calibration} cannot be read ({error}); it is a JSON object with "
-                "build_from_scanner, a 4×4 matrix"
-            ) from error
-        if matrix.shape != (4, 4):
-            raise InputError(f"the calibration {calibration} holds {matrix.shape}, not 4×4")
-        pose = Transform("build", "scanner", matrix)
     folder = Path(spec.removeprefix("watch:"))
     return WatchedFolderScanner(folder, build_from_scanner=pose, timeout_s=timeout_s)
 
@@ -212,26 +373,6 @@ def _placed_solid(template: Template, placed: Transform) -> Any:
     """The part as it should be, where it stands."""
     solid: Any = template.solid()
     return solid.transform(placed.matrix[:3])
-
-
-def _site(job: Job, stop: Stop, template: Template, placed: Transform, setup: PrintSetup) -> Site:
-    """The finished part by its template; a layer by the beads that the job planned."""
-    grid = LayerGrid.from_tops(
-        [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
-    )
-    if stop.layer_index is None:
-        return Site(template, setup, grid, placed)
-    z_mm = float(placed.inverse().apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
-    beads = job.beads
-    done = (beads.line < stop.line) & (beads.layer >= 0)
-    template_from_build = placed.inverse()
-    planned = PlannedSdf.from_beads(
-        template_from_build.apply(beads.start_mm[done]),
-        template_from_build.apply(beads.end_mm[done]),
-        beads.section_mm2[done],
-        beads.height_mm[done],
-    )
-    return Site(template.below_z(z_mm), setup, grid, placed, stop.z_mm, planned=planned)
 
 
 def _ask(plan: RepairPlan) -> bool:
@@ -243,3 +384,16 @@ def _ask(plan: RepairPlan) -> bool:
         f"filament; the nozzle cannot reach {plan.unreachable_mm3:.1f} mm³."
     )
     return typer.confirm("Print it?", default=False, err=True)
+
+
+def _ask_to_go_on(decision: Decision) -> bool:
+    """Say why the run rests, and wait for a word."""
+    for verdict in decision.verdicts:
+        if verdict.action is decision.action:
+            one = verdict.finding
+            low, high = one.box_mm
+            console.errors.print(
+                f"{one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
+                f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}."
+            )
+    return typer.confirm("Go on all the same? (no ends the run)", default=False, err=True)

@@ -25,6 +25,10 @@ from amrepair.cli.options import (
     SeedOption,
     scaled_mesh,
 )
+from amrepair.errors import LoopError
+from amrepair.frames import Transform
+from amrepair.loop import Tape
+from amrepair.loop.setting import Setting, forget, keep
 from amrepair.repair import Stopwatch
 from amrepair.report import (
     ReportData,
@@ -38,7 +42,7 @@ from amrepair.report.folder import RunFolder
 from amrepair.report.guarded import LOOPBACK
 from amrepair.simulate.defects import DefectKind, parse_defect
 from amrepair.simulate.part_files import bracket_path
-from amrepair.simulate.run import SimulatedRun, place_on_bed, prepare_run, simulate_run
+from amrepair.simulate.run import PreparedRun, SimulatedRun, place_on_bed, prepare_run, simulate_run
 from gcode.cli import console
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, load_setup
 
@@ -97,6 +101,7 @@ def simulate(
     setup = load_setup(printer, material, process)
     path = part or bracket_path()
     mesh = scaled_mesh(path, scale, setup)
+    ids = (printer, material, process)
     place_on_bed(np.asarray(mesh.bounds, dtype=np.float64), setup)  # refused before any work
     folder = RunFolder(out)
     with bars.shown():
@@ -118,6 +123,7 @@ def simulate(
                 max_iterations=max_iterations,
                 approve=page.approve,
                 record=page.recording(folder.record),
+                begun=lambda pose: _recorded(prepared, folder, pose, ids, max_iterations),
                 watch=watch,
                 progress=page.watching(bars),
             )
@@ -127,12 +133,39 @@ def simulate(
     with watch("report"):
         write_report(_report_data(run, path, result), folder.file("report.html"))
     within = run.report.within_tolerance
+    if run.report.stopped:
+        console.errors.print(f"The run was ended: {run.report.stopped}.")
     if as_json:
         console.show_json(result)
     else:
         _say(run, result, folder, within)
+    if run.report.stopped:
+        raise typer.Exit(LoopError.exit_code)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def _recorded(
+    run: PreparedRun,
+    folder: RunFolder,
+    pose: Transform,
+    ids: tuple[str, str, str],
+    max_iterations: int,
+) -> Tape:
+    """Write down what the run begins with; the tape that it is recorded on."""
+    forget(folder.path)
+    setting = Setting.of(
+        run.setup,
+        ids,
+        stops=run.stops,
+        build_from_template=run.build_from_template,
+        build_from_scanner=pose,
+        by_beads=run.by_beads,
+        seed=run.seed,
+        max_iterations=max_iterations,
+    )
+    keep(folder.path, setting, run.checked.program.text, run.template)
+    return Tape(folder.path)
 
 
 def _result(
