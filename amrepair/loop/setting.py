@@ -13,17 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
-from amrepair.template import load_template
+from amrepair.template import MeshSdf, load_template
 from amrepair.template.port import Template
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, read_job
+from gcode.slicing.layers import mesh_of
 
-SETTING, JOB, TEMPLATE = "run.json", "job.gcode", "template.safetensors"
+SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
 VERSION = 1
 
 
@@ -135,9 +137,7 @@ def keep(folder: Path, setting: Setting, job_text: str, template: Template) -> N
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _put(folder / JOB, job_text)
-        save: Any = getattr(template, "save", None)
-        if save is not None:
-            save(folder / TEMPLATE)
+        _keep_template(folder, template)
         _put(
             folder / SETTING,
             json.dumps({"version": VERSION, **asdict(setting)}, indent=2, ensure_ascii=False)
@@ -178,7 +178,27 @@ def open_run(folder: Path) -> Recorded:
         dialect=setup.printer.dialect,
     )
     stops = plan_stops(job, setting.layers, final=setting.final)
-    return Recorded(setting, setup, job, load_template(folder / TEMPLATE), stops)
+    return Recorded(setting, setup, job, _kept_template(folder), stops)
+
+
+def _keep_template(folder: Path, template: Template) -> None:
+    """As its own file; an exact mesh, which has none, as its triangles."""
+    save: Any = getattr(template, "save", None)
+    (folder / MESH).unlink(missing_ok=True)
+    if save is not None:
+        save(folder / TEMPLATE)
+        return
+    vertices, faces = mesh_of(template.solid())
+    with (folder / MESH).open("wb") as file:
+        np.savez(file, vertices_mm=vertices, faces=faces)
+
+
+def _kept_template(folder: Path) -> Template:
+    if not (folder / MESH).is_file():
+        return load_template(folder / TEMPLATE)
+    with np.load(folder / MESH) as kept:
+        mesh = trimesh.Trimesh(kept["vertices_mm"], kept["faces"], process=False)
+    return MeshSdf.from_mesh(mesh)
 
 
 def forget(folder: Path) -> None:

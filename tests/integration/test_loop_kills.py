@@ -101,6 +101,7 @@ class Bench:
         """Kill once so many beads of what was sent as `kind` are executed."""
 
         def under_way() -> bool:
+            assert not (self.folder / "told").exists(), self.told()
             events = self.events()
             return bool(events) and events[-1].get("kind") == kind
 

@@ -84,7 +84,11 @@ class Dying(Tape):
 def loop(folder: str, port: str, go_on: bool = False, die_after: int = 0) -> int:
     """Run the loop of a folder, or go on with it; what went wrong is in `told`."""
     here = Path(folder)
-    run = open_run(here / "run")
+    try:
+        run = open_run(here / "run")
+    except BaseException:  # noqa: BLE001
+        (here / "told").write_text(traceback.format_exc())
+        return 5
     tape = Dying(here / "run", die_after)
     book = Journal(here / "journal.sqlite", step_lines=64)
     printer = SerialPrinter(port, journal=book, dialect="prusa", timing=QUICK)

@@ -104,7 +104,7 @@ def test_a_place_beside_the_layer_changes_nothing() -> None:
 
 def test_relative_coordinates_are_refused() -> None:
     own, other = ";LAYER_CHANGE\nG1 Z0.4 F600", "G91\n;LAYER_CHANGE\nG1 Z0.2 F600\nG90"
-    made = read_job(Program(job(absolute_e=False).program.text.replace(own, other), "marlin"))
+    made = read_job(Program(job(absolute_e=True).program.text.replace(own, other), "marlin"))
     assert not made.state_after(made.layers[1].first_line).absolute_xyz
     with pytest.raises(InputError, match="relative"):
         change_flow(made, SETUP, 1, box(0.1, 1.0))
