@@ -288,7 +288,7 @@ class _Run:
             progress=self._progress,
         )
         with self._watch("decide"):
-            plan = typed(plan, self._job, site, stop.line)
+            plan = typed(plan, self._job, site, stop.line, self._scanner.build_from_scanner)
             decision = self._decide(plan, site, stop, here, seen_twice=again)
         look = self._outcome(Look(number, stop, scan, plan, decision, printed=False), taped)
         self._looks.append(look)
