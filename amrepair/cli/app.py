@@ -9,6 +9,7 @@ import typer
 import amrepair
 from amrepair.cli import (
     benchmark,
+    calibration,
     health,
     inspect,
     live,
@@ -51,6 +52,7 @@ templates.add_to(app)
 inspect.add_to(app)
 mend.add_to(app)
 printing.add_to(app)
+calibration.add_to(app)
 replaying.add_to(app)
 benchmark.add_to(app)
 health.add_to(app)
