@@ -23,7 +23,8 @@ import trimesh
 from amrepair.errors import AmrepairError
 from amrepair.frames import Transform
 from amrepair.loop import plan_stops
-from amrepair.loop.kinds import last_beads, typed
+from amrepair.loop.kinds import typed
+from amrepair.loop.shapes import last_beads
 from amrepair.loop.sites import sites
 from amrepair.repair import plan_repair
 from amrepair.scans import Scan

@@ -171,9 +171,9 @@ SURE = 0.9
 """Confidence from which a run is ended without asking first."""
 DOUBTFUL = 0.25
 """Confidence below which another look is taken."""
-THIN_LAYERS = 0.6
+THIN_LAYERS = 0.75
 """A bead laid into less than this has no room under the nozzle."""
-ONE_LAYER = 1.5
+ONE_LAYER = 1.75
 """What is lower than this, noise and all, lies within one layer."""
 LEAST_LAYERS = 0.2
 """Less than this is within what a layer's beads differ by themselves."""

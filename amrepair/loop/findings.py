@@ -138,7 +138,7 @@ def findings(
                 type=region.type,
                 confidence=float(region.confidence),
                 volume_mm3=float(region.volume_mm3),
-                thickness_layers=float(region.depth_mm / plan.layer_height_mm),
+                thickness_layers=thickness_mm(region) / plan.layer_height_mm,
                 height_layers=float(height_mm(region) / plan.layer_height_mm),
                 reachable_ratio=reach,
                 cover=cover_of(job, layer_index, np.asarray(region.box_mm)),
@@ -158,7 +158,7 @@ def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int |
         type=region.type,
         confidence=1.0,
         volume_mm3=float(region.volume_mm3),
-        thickness_layers=float(region.depth_mm / layer_mm),
+        thickness_layers=thickness_mm(region) / layer_mm,
         height_layers=float(height_mm(region) / layer_mm),
         reachable_ratio=1.0,
         cover=cover_of(job, layer_index, np.asarray(region.box_mm)),
@@ -166,6 +166,11 @@ def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int |
         box_mm=_corners(region.box_mm),
     )
     return judge(finding).action
+
+
+def thickness_mm(region: Region) -> float:
+    """Mean thickness: the volume over half the surface, which is one side of a flat piece."""
+    return float(region.volume_mm3 / max(region.area_mm2, 1e-9))
 
 
 def height_mm(region: Region) -> float:

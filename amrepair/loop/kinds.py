@@ -19,6 +19,8 @@ from amrepair.detect import Label, Region
 from amrepair.detect.anomaly import DefectType
 from amrepair.frames import Transform
 from amrepair.loop.findings import matching
+from amrepair.loop.shapes import bead_way, last_beads, spread, tall_mm
+from amrepair.loop.shapes import chain as chain_of
 from amrepair.repair import RepairPlan, Site
 from gcode.reader import Job
 
@@ -26,24 +28,26 @@ from gcode.reader import Job
 MOVED_MM, MOVED_RAD = 0.8, float(np.deg2rad(1.5))
 # Between two groups of layers: as a share of the layer height, and of what the walls tell.
 SHIFT_LAYERS, SHIFT_SHARE = 1.0, 0.35
-LEAST_POINTS, MOST_POINTS = 120, 15_000
+LEAST_POINTS, MOST_POINTS = 120, 6_000
 # Walls are looked at off the bed and off the top's rim; the bed, off the part.
 LOW_WALL_MM, HIGH_WALL_MM, BESIDE_MM, TOP_BAND_MM = 0.8, 0.5, 1.5, 1.2
 BELOW_MM, RIM_MM = 0.7, 0.5
 # Of a layer's height: less than this is what a layer's beads differ by themselves.
 SHORT = 0.3
 # A surface that bends: range of its parabola, in layers; share of the deviation it explains.
-WARP_LAYERS, WARP_SHARE = 1.0, 0.45
+WARP_LAYERS, LIFTED_LAYERS, WARP_SHARE = 1.0, 0.6, 0.45
 # Of a layer's beads: too little or too much flow over at least this share is the layer's own.
 LAYER_SHARE = 0.55
 CLOG_SHARE = (0.12, 0.9)
 # Before a clog, of what it takes away after its beginning.
 BEFORE_CLOG = 0.4
-BEAD_STEP_MM = 0.6
 # Longer along the beads than across them by this much: beads were skipped.
 SKIPPED_ASPECT = 2.2
-STRING_ASPECT, STRING_WIDTH_MM, CHAIN_MM = 4.0, 2.2, 4.0
+STRING_ASPECT, STRING_WIDTH_MM = 4.0, 2.2
+STRING_TALL = 0.25
 ALONG_COSINE = 0.9
+# Mean depth, in layers: less than whole beads are missing where it is shallower.
+WHOLE_LAYERS = 0.7
 TOP_COSINE, WALL_COSINE = 0.8, 0.4
 
 
@@ -107,7 +111,9 @@ def typed(
     for region in plan.deficit.regions:
         there = _there(region.depth_mm, plan.deficit.tolerance_mm)
         rim = _at_rim(plan, site, np.asarray(region.box_mm))
-        kind = whole or _of_region(region, pieces[region.label], flow, job, line, at_rim=rim)
+        kind = whole or _of_region(
+            region, pieces[region.label], flow, job, line, at_rim=rim, layer_mm=layer_mm
+        )
         regions.append(
             replace(region, type=kind.type, confidence=min(kind.confidence, there)
                     if whole is None else kind.confidence)
@@ -136,7 +142,8 @@ def _surfaces(plan: RepairPlan, site: Site) -> tuple[_Surface, _Surface] | None:
     evidence = plan.anomaly.evidence
     if evidence is None or len(evidence.surfels) == 0:
         return None
-    points, deviation = plan.anomaly.points_mm, plan.anomaly.deviation_mm
+    every = max(1, len(plan.anomaly.points_mm) // (12 * MOST_POINTS))
+    points, deviation = plan.anomaly.points_mm[::every], plan.anomaly.deviation_mm[::every]
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     height = placed.apply(points)[:, 2]
     beside = np.flatnonzero((deviation > BESIDE_MM) & (np.abs(height) < 0.5))
@@ -160,9 +167,10 @@ def _surfaces(plan: RepairPlan, site: Site) -> tuple[_Surface, _Surface] | None:
 def _came_off(plan: RepairPlan, build_from_scanner: Transform) -> Kind | None:
     """Whether the part lies somewhere else than where the calibration and the job have it."""
     moved = plan.build_from_scan @ build_from_scanner.inverse()
-    centre = plan.build_from_scan.apply(
-        plan.registration.template_from_scan.inverse().apply(plan.scan.points_mm)
-    ).mean(axis=0, keepdims=True)
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    points = plan.scan.points_mm
+    some = points[:: max(1, len(points) // MOST_POINTS)]
+    centre = placed.apply(some).mean(axis=0, keepdims=True)
     off_mm = float(np.linalg.norm(moved.apply(centre) - centre))
     cosine = float(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0))
     turned_rad = float(np.arccos(cosine))
@@ -210,8 +218,10 @@ def _warped(top: _Surface, layer_mm: float) -> Kind | None:
     rim = np.hypot(x, y) > 1.0
     if not middle.any() or not rim.any():
         return None
-    lifted_mm = float(np.percentile(fitted[rim], 90) - fitted[middle].mean())
-    if lifted_mm > WARP_LAYERS * layer_mm and share > WARP_SHARE:
+    high_mm = float(np.percentile(fitted[rim], 90))
+    lifted_mm = high_mm - float(fitted[middle].mean())
+    up = high_mm > LIFTED_LAYERS * layer_mm  # what sinks in the middle is no curl
+    if up and lifted_mm > WARP_LAYERS * layer_mm and share > WARP_SHARE:
         sure = _sure(lifted_mm, WARP_LAYERS * layer_mm) * min(1.0, share / (1.5 * WARP_SHARE))
         return Kind(DefectType.WARP, sure)
     return None
@@ -250,20 +260,6 @@ def _flow(top: _Surface, job: Job, line: int, layer_mm: float) -> Kind | None:
     return None
 
 
-def last_beads(job: Job, line: int) -> Float[np.ndarray, "n 3"]:
-    """Places along the beads of the last layer before a line, as printed."""
-    beads = job.beads
-    done = beads.line < line
-    if not done.any() or beads.layer[done].max() < 0:
-        return np.zeros((0, 3))
-    pick = done & (beads.layer == beads.layer[done].max())
-    start, step = beads.start_mm[pick], beads.end_mm[pick] - beads.start_mm[pick]
-    count = np.maximum(1, np.ceil(np.linalg.norm(step, axis=1) / BEAD_STEP_MM).astype(np.int64))
-    owner = np.repeat(np.arange(len(count)), count)
-    along = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    return np.asarray(start[owner] + step[owner] * ((along + 0.5) / count[owner])[:, None])
-
-
 def _of_region(
     region: Region,
     pieces: list[manifold3d.Manifold],
@@ -272,45 +268,32 @@ def _of_region(
     line: int,
     *,
     at_rim: bool,
+    layer_mm: float,
 ) -> Kind:
     """The type of one region, its place and shape considered."""
     piece = matching(pieces, np.asarray(region.box_mm))
     if region.label is Label.EXCESS:
         if flow is not None and flow.type is DefectType.OVER_EXTRUSION:
             return flow
-        long_mm, wide_mm, _ = _spread(_chain(piece, pieces))
-        if long_mm > STRING_ASPECT * wide_mm and wide_mm < STRING_WIDTH_MM:
+        chain = chain_of(piece, pieces)
+        long_mm, wide_mm, _ = spread(chain)
+        lies = tall_mm(chain) < STRING_TALL * long_mm  # what climbs a wall is its seam
+        if lies and long_mm > STRING_ASPECT * wide_mm and wide_mm < STRING_WIDTH_MM:
             return Kind(DefectType.STRING, _sure(long_mm / wide_mm, STRING_ASPECT))
         return Kind(DefectType.BLOB, 0.95)
     if flow is not None and flow.type is not DefectType.OVER_EXTRUSION:
         return flow
-    long_mm, wide_mm, along = _spread([piece] if piece is not None else [])
+    long_mm, wide_mm, along = spread([piece] if piece is not None else [])
     if long_mm > SKIPPED_ASPECT * wide_mm and not at_rim:
-        way = _bead_way(job, line, np.asarray(region.box_mm))
+        way = bead_way(job, line, np.asarray(region.box_mm))
         if way is not None and abs(float(way @ along)) > ALONG_COSINE:
             return Kind(DefectType.MISSING_BEADS, _sure(long_mm / wide_mm, SKIPPED_ASPECT))
-    if region.type in (DefectType.VOID, DefectType.CHIP):
+    whole_layers = piece is not None and (
+        piece.volume() > WHOLE_LAYERS * layer_mm * float(piece.project().area())
+    )
+    if whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
         return Kind(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
     return Kind(region.type, 0.95)
-
-
-def _chain(
-    piece: manifold3d.Manifold | None, pieces: list[manifold3d.Manifold]
-) -> list[manifold3d.Manifold]:
-    """A piece and all that lie near it, one after another: noise cuts a string to pieces."""
-    if piece is None:
-        return []
-    boxes = np.array([one.bounding_box() for one in pieces]).reshape(-1, 2, 3)
-    inside = np.array([one is piece for one in pieces])
-    while True:
-        gap = np.array([
-            [np.maximum(np.maximum(a[0] - b[1], b[0] - a[1]), 0.0).max() for b in boxes[inside]]
-            for a in boxes
-        ]).min(axis=1)  # fmt: skip
-        grown = gap < CHAIN_MM
-        if (grown == inside).all():
-            return [one for one, mine in zip(pieces, inside, strict=True) if mine]
-        inside = grown
 
 
 def _at_rim(plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"]) -> bool:
@@ -319,58 +302,9 @@ def _at_rim(plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"]) -> b
     z = max(float(box_mm[0, 2]) - BELOW_MM, 0.5 * float(box_mm[0, 2]))
     around = np.array([[box_mm[i, 0], box_mm[j, 1], z] for i in (0, 1) for j in (0, 1)])
     inside = site.template.distance(placed.inverse().apply(around))
-    return bool((inside > -RIM_MM).any())
-
-
-def _spread(
-    pieces: list[manifold3d.Manifold],
-) -> tuple[float, float, Float[np.ndarray, " 2"]]:
-    """Length and width of some pieces seen from above, mm, and their long direction."""
-    if not pieces:
-        return 1.0, 1.0, np.array([1.0, 0.0])
-    areas = [piece.project() for piece in pieces]
-    rings = [np.asarray(ring, dtype=np.float64) for area in areas for ring in area.to_polygons()]
-    corners = np.concatenate([_dense(ring) for ring in rings])
-    middle = corners.mean(axis=0)
-    _, axes = np.linalg.eigh(np.cov((corners - middle).T))
-    across, along = axes[:, 0], axes[:, 1]
-    long_mm = float(np.ptp(corners @ along))
-    # as wide as its area says: noise makes fringes
-    area_mm2 = sum(float(area.area()) for area in areas)
-    wide_mm = min(float(np.ptp(corners @ across)), 1.2 * area_mm2 / max(long_mm, 1e-6))
-    return long_mm, max(wide_mm, 1e-6), along
-
-
-def _dense(ring: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """A ring's outline in even steps: corners alone would weigh fringes."""
-    ends = np.roll(ring, -1, axis=0)
-    length = np.linalg.norm(ends - ring, axis=1)
-    count = np.maximum(1, np.ceil(length / 0.1).astype(np.int64))
-    owner = np.repeat(np.arange(len(ring)), count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    return np.asarray(ring[owner] + (ends - ring)[owner] * (step / count[owner])[:, None])
-
-
-def _bead_way(
-    job: Job, line: int, box_mm: Float[np.ndarray, "2 3"]
-) -> Float[np.ndarray, " 2"] | None:
-    """The direction of most of the last layer's beads over a box."""
-    beads = job.beads
-    done = beads.line < line
-    if not done.any():
-        return None
-    pick = done & (beads.layer == beads.layer[done].max())
-    step = (beads.end_mm - beads.start_mm)[pick, :2]
-    middle = 0.5 * (beads.end_mm + beads.start_mm)[pick, :2]
-    length = np.linalg.norm(step, axis=1)
-    over = ((middle + 0.5 * np.abs(step) >= box_mm[0, :2])
-            & (middle - 0.5 * np.abs(step) <= box_mm[1, :2])).all(axis=1)  # fmt: skip
-    if not (over & (length > 0.5)).any():
-        return None
-    way, weight = step[over], length[over]
-    angle = np.arctan2(way[:, 1], way[:, 0])
-    mean = 0.5 * np.angle((weight * np.exp(2j * angle)).sum())
-    return np.array([np.cos(mean), np.sin(mean)])
+    foot_mm = float(placed.apply(site.template.bounds_mm)[:, 2].min())
+    # near the bed the foot is nearer than any rim
+    return bool((inside > -min(RIM_MM, 0.8 * (z - foot_mm))).any())
 
 
 def _everywhere(plan: RepairPlan, site: Site, whole: Kind) -> Region:

@@ -6,7 +6,9 @@ It holds and adds up; what is done at a stop is decided in `decide` and done in 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from amrepair.errors import LoopError
 from amrepair.loop.decide import Decision
@@ -162,3 +164,26 @@ def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[
     if final:
         stops.append(Stop(None, job.footer_start_line, job.layers[-1].z_mm))
     return tuple(stops)
+
+
+def look_to_json(look: Look) -> dict[str, object]:
+    """A look as it stands on the tape."""
+    return {
+        "look": look.number,
+        "stop": look.stop.label,
+        "layer": look.stop.layer_index,
+        "z_mm": look.stop.z_mm,
+        "frame": look.scan.frame,
+        "missing_mm3": round(look.plan.deficit.missing_mm3, 6),
+        "excess_mm3": round(look.plan.deficit.excess_mm3, 6),
+        "decision": look.decision.to_json(),
+        "printed": look.printed,
+        "declined": look.declined,
+    }
+
+
+def as_recorded(scan: Scan) -> Scan:
+    """A scan as its file will hold it: normals in single precision."""
+    if scan.normals is None:
+        return scan
+    return replace(scan, normals=scan.normals.astype(np.float32).astype(np.float64))

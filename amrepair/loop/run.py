@@ -17,15 +17,16 @@ import numpy as np
 from amrepair.errors import LoopError
 from amrepair.frames import Transform
 from amrepair.loop import travel
-from amrepair.loop.decide import Action, Decision, Situation, decide, gravest, judge
-from amrepair.loop.findings import early_action, findings
+from amrepair.loop.decide import Action, Decision
+from amrepair.loop.findings import early_action
 from amrepair.loop.kinds import typed
-from amrepair.loop.limits import Limits, beyond
-from amrepair.loop.looks import LEFT_RATIO, Look, LoopReport, Stop
+from amrepair.loop.limits import Limits
+from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
 from amrepair.loop.next_layer import rewritten_layer
+from amrepair.loop.situation import decide_look
 from amrepair.loop.tape import Sent, Tape, TapeEndsError, report_from_json, report_to_json
 from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
-from amrepair.scans import Scan, Scanner, ScanRequest
+from amrepair.scans import Scanner, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import Printer, PrintReport
@@ -34,8 +35,6 @@ from gcode.progress import Progress, silent
 from gcode.reader import Job
 
 MAX_ITERATIONS = 3
-# A repair that leaves more than this share of what it found has met something else than noise.
-STUCK_RATIO = 0.8
 
 PickUp = Callable[[Sequence[Sent]], PrintReport | None]
 """Finds out where the printer is, and has it finish what it was sent last."""
@@ -289,35 +288,22 @@ class _Run:
         )
         with self._watch("decide"):
             plan = typed(plan, self._job, site, stop.line, self._scanner.build_from_scanner)
-            decision = self._decide(plan, site, stop, here, seen_twice=again)
+            decision = decide_look(
+                plan,
+                self._job,
+                site,
+                stop,
+                here,
+                seen_twice=again,
+                max_iterations=self._max_iterations,
+                limits=self._limits,
+            )
         look = self._outcome(Look(number, stop, scan, plan, decision, printed=False), taped)
         self._looks.append(look)
         if taped is None:
             self._record(look)
             self._tape.write("look", **look_to_json(look))
         return look
-
-    def _decide(
-        self, plan: RepairPlan, site: Site, stop: Stop, here: Sequence[Look], *, seen_twice: bool
-    ) -> Decision:
-        """What the table says of a plan."""
-        verdicts = tuple(
-            judge(finding)
-            for finding in findings(
-                plan, self._job, site.setup,
-                layer_index=stop.layer_index, line=stop.line, seen_twice=seen_twice,
-            )
-        )  # fmt: skip
-        situation = Situation(
-            gravest=gravest(verdicts),
-            seen_twice=seen_twice,
-            refused=plan.checked is None,
-            last_pass=sum(look.printed for look in here) >= self._max_iterations,
-            stuck=_stuck(here, plan),
-            little_left=_done(here, plan),
-            beyond="" if self._limits is None else beyond(plan, self._limits),
-        )
-        return decide(verdicts, situation)
 
     def _outcome(self, look: Look, taped: dict[str, object] | None) -> Look:
         """Ask whoever is to be asked; a taped look was answered then."""
@@ -390,29 +376,6 @@ class _Run:
         return pick_up(tuple(self._sent))
 
 
-def look_to_json(look: Look) -> dict[str, object]:
-    """A look as it stands on the tape."""
-    return {
-        "look": look.number,
-        "stop": look.stop.label,
-        "layer": look.stop.layer_index,
-        "z_mm": look.stop.z_mm,
-        "frame": look.scan.frame,
-        "missing_mm3": round(look.plan.deficit.missing_mm3, 6),
-        "excess_mm3": round(look.plan.deficit.excess_mm3, 6),
-        "decision": look.decision.to_json(),
-        "printed": look.printed,
-        "declined": look.declined,
-    }
-
-
-def as_recorded(scan: Scan) -> Scan:
-    """A scan as its file will hold it: normals in single precision."""
-    if scan.normals is None:
-        return scan
-    return replace(scan, normals=scan.normals.astype(np.float32).astype(np.float64))
-
-
 def _why(decision: Decision) -> str:
     """One line on why a run was ended."""
     own = [v for v in decision.verdicts if v.action is decision.action]
@@ -426,18 +389,3 @@ def _guess(site: Site, scanner: Scanner) -> Transform:
     if site.build_from_template is None:
         raise LoopError("the loop needs to know where the part stands on the bed")
     return site.build_from_template.inverse() @ scanner.build_from_scanner
-
-
-def _stuck(here: Sequence[Look], plan: RepairPlan) -> bool:
-    """Whether the last repair at this stop changed next to nothing."""
-    if not here or not here[-1].printed:
-        return False
-    return plan.deficit.missing_mm3 > STUCK_RATIO * here[-1].plan.deficit.missing_mm3
-
-
-def _done(looks: Sequence[Look], plan: RepairPlan) -> bool:
-    """Whether what is left is a small share of what was found: more passes would only add rims."""
-    if not looks:
-        return False
-    left_mm3 = sum(region.volume_mm3 for region in plan.to_fill)
-    return left_mm3 <= LEFT_RATIO * looks[0].plan.deficit.missing_mm3

@@ -11,11 +11,11 @@ from pathlib import Path
 import manifold3d as m3
 import numpy as np
 import pytest
-import trimesh
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
 from link_forks import Forks, until
-from loop_children import PRINTER, beads_of, scan_of
+from loop_bench import LAYER, PLACE_MM, SIZE_MM, scan_of, solid_mesh
+from loop_children import PRINTER, beads_of
 
 from amrepair.frames import Transform
 from amrepair.loop import plan_stops
@@ -30,16 +30,8 @@ from gcode.reader import read_job
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 
-PLACE_MM = (100.0, 90.0, 0.0)
-SIZE_MM = (16.0, 12.0, 1.6)
-LAYER = 4
 SLOW = "always slow_reader s=0.001"
 KILLED = -9
-
-
-def solid_mesh(solid: m3.Manifold) -> trimesh.Trimesh:
-    mesh = solid.to_mesh64()
-    return trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +56,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stands = part.trim_by_plane((0.0, 0.0, -1.0), -top_mm).translate(PLACE_MM)
         pocket = m3.Manifold.cube((5.0, 5.0, 2.0)).translate((105.0, 93.0, top_mm - 0.6))
         for name, solid in (("whole", stands), ("broken", stands - pocket)):
-            write_ply(scan_of(solid_mesh(solid), 1), here / f"{name}-{label}.ply")
+            write_ply(scan_of(solid), here / f"{name}-{label}.ply")
     return here
 
 

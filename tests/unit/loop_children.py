@@ -8,7 +8,6 @@ import signal
 import traceback
 from pathlib import Path
 
-import numpy as np
 from link_children import QUICK
 
 from amrepair.frames import Transform
@@ -115,14 +114,3 @@ def loop(folder: str, port: str, go_on: bool = False, die_after: int = 0) -> int
     (here / "told").write_text(told)
     printer.close()
     return code
-
-
-def scan_of(mesh: object, seed: int) -> Scan:
-    """A cloud of a mesh's surface with a little noise."""
-    import trimesh
-
-    points, faces = trimesh.sample.sample_surface(mesh, 15_000, seed=seed)
-    rng = np.random.default_rng(seed)
-    noisy = np.asarray(points) + rng.normal(scale=0.02, size=points.shape)
-    normals = np.asarray(mesh.face_normals)[faces]  # type: ignore[attr-defined]
-    return Scan(noisy, 0.02, "scanner", normals.astype(np.float32).astype(np.float64))
