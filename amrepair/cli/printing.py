@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from amrepair.cli.asking import ask_to_go_on, ask_to_print
 from amrepair.cli.files import open_template
 from amrepair.cli.live import (
     VIEW_PORT,
@@ -30,7 +31,6 @@ from amrepair.errors import InputError, LoopError
 from amrepair.frames import Transform
 from amrepair.loop import (
     MAX_ITERATIONS,
-    Decision,
     LoopReport,
     Stop,
     Tape,
@@ -44,7 +44,7 @@ from amrepair.loop.pick_up import pick_up_serial
 from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
-from amrepair.repair import RepairPlan, Stopwatch
+from amrepair.repair import Stopwatch
 from amrepair.report import report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
@@ -66,6 +66,7 @@ from gcode.profiles import (
 from gcode.reader import Job, read_job
 
 APPROVALS = ("ask", "auto")
+SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
 
 
 def add_to(app: typer.Typer) -> None:
@@ -295,12 +296,13 @@ def _print(
                 sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads),
                 stops=begun.stops,
                 max_iterations=setting.max_iterations,
-                approve=(page.approve if view else _ask) if ask else lambda plan: True,
-                ask=(page.ask_to_go_on if view else _ask_to_go_on) if ask else None,
+                approve=(page.approve if view else ask_to_print) if ask else lambda plan: True,
+                ask=(page.ask_to_go_on if view else ask_to_go_on) if ask else None,
                 limits=Limits.of(setup.process) if setting.limited else None,
                 record=page.recording(begun.folder.record),
                 tape=begun.tape,
                 pick_up=pick_up,
+                silent_stops=SILENT_STOPS,
                 seed=setting.seed,
                 watch=watch,
                 progress=page.watching(bars),
@@ -373,27 +375,3 @@ def _placed_solid(template: Template, placed: Transform) -> Any:
     """The part as it should be, where it stands."""
     solid: Any = template.solid()
     return solid.transform(placed.matrix[:3])
-
-
-def _ask(plan: RepairPlan) -> bool:
-    """Show what would be printed, and wait for a word."""
-    cost = plan.estimate
-    console.errors.print(
-        f"{len(plan.to_fill)} regions, {plan.deficit.missing_mm3:.1f} mm³ missing; a repair takes "
-        f"{cost.print_time_s if cost else 0:.0f} s and {cost.filament_mm if cost else 0:.0f} mm of "
-        f"filament; the nozzle cannot reach {plan.unreachable_mm3:.1f} mm³."
-    )
-    return typer.confirm("Print it?", default=False, err=True)
-
-
-def _ask_to_go_on(decision: Decision) -> bool:
-    """Say why the run rests, and wait for a word."""
-    for verdict in decision.verdicts:
-        if verdict.action is decision.action:
-            one = verdict.finding
-            low, high = one.box_mm
-            console.errors.print(
-                f"{one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
-                f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}."
-            )
-    return typer.confirm("Go on all the same? (no ends the run)", default=False, err=True)

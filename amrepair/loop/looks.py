@@ -78,12 +78,15 @@ class LoopReport:
         What the link says of each part of the job (rewritten layers included) and of each repair.
     stopped
         Why the run was ended before the job was: parked, heaters off; empty if it was not.
+    passed
+        Stops that were passed by without a look: the scanner did not answer.
     """
 
     looks: tuple[Look, ...]
     job_prints: tuple[PrintReport, ...]
     repair_prints: tuple[PrintReport, ...]
     stopped: str = ""
+    passed: tuple[Stop, ...] = ()
 
     def at_stop(self, stop: Stop) -> tuple[Look, ...]:
         """The looks of one stop."""
@@ -106,8 +109,8 @@ class LoopReport:
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether every stop was left within tolerance (`left_well`), and there was none to end."""
-        found_mm3, well = 0.0, not self.stopped
+        """Whether every stop was left within tolerance (`left_well`), and each was looked at."""
+        found_mm3, well = 0.0, not self.stopped and not self.passed
         for stop in self.stops:
             looks = self.at_stop(stop)
             found_mm3 += looks[0].plan.deficit.missing_mm3

@@ -147,6 +147,7 @@ def loop_result(
         "seed": seed,
         "versions": versions(setup),
         "stopped": report.stopped or None,
+        "passed_by": [stop.label for stop in report.passed],
         "stops": [_stop_row(look) for look in report.looks],
     }
     return dict(rounded(result))

@@ -89,19 +89,22 @@ class Small:
         self, folder: Path, scans: Callable[[int], Scan], **options: object
     ) -> tuple[LoopReport, list[str]]:
         """Print with one stop; the report, and every line that was sent."""
+        folder.mkdir(exist_ok=True)
         printer = Thermal(folder / "sent.gcode")
         printer.connect()
         eye = Scripted(scans)
-        report = run_loop(
-            self.job,
-            self.checked,
-            printer,
-            eye,
-            sites(self.job, self.template, self.placed, self.setup, by_beads=False),
-            stops=plan_stops(self.job, [LAYER], final=False),
-            **options,  # type: ignore[arg-type]
-        )
-        printer.close()
+        try:
+            report = run_loop(
+                self.job,
+                self.checked,
+                printer,
+                eye,
+                sites(self.job, self.template, self.placed, self.setup, by_beads=False),
+                stops=plan_stops(self.job, [LAYER], final=False),
+                **options,  # type: ignore[arg-type]
+            )
+        finally:
+            printer.close()
         lines = (folder / "sent.gcode").read_text().splitlines()
         return report, [*lines, *["heaters off"] * printer.switched_off]
 

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from loop_bench import LAYER, Small, scan_of
 
+from amrepair.errors import ScannerError
 from amrepair.frames import Transform
 from amrepair.loop import Action, Tape
 from amrepair.loop.limits import Limits
 from amrepair.loop.tape import read_events
+from amrepair.scans import Scan
 from gcode.moves import Program
 from gcode.reader import read_job
 
@@ -55,7 +57,8 @@ def test_a_thin_gap_is_left_to_the_next_layer_which_carries_it(tmp_path: Path) -
     assert not report.repair_prints
     laid, planned = laid_mm3(sent, small), laid_mm3(small.job.program.text.splitlines(), small)
     above = round(small.job.layers[LAYER + 1].z_mm, 3)
-    assert laid[above] - planned[above] == pytest.approx(look.plan.deficit.missing_mm3, rel=0.3)
+    # a bead carries no more than the printer's section allows: most of it, and never more
+    assert 0.5 < (laid[above] - planned[above]) / look.plan.deficit.missing_mm3 < 1.05
 
 
 def test_what_the_head_would_hit_ends_the_run_before_the_next_move(
@@ -127,4 +130,43 @@ def test_a_part_that_came_off_ends_the_run(small: Small, tmp_path: Path) -> None
     report, sent = small.run(tmp_path, lambda n: scan_of(small.standing).moved(moved))
     assert report.stopped.startswith("stop: detached")
     assert not report.repair_prints
+    assert sent[-1] == "heaters off"
+
+
+def silent(n: int) -> Scan:
+    raise ScannerError("nothing new in the folder")
+
+
+def test_a_silent_scanner_does_not_cost_the_print(small: Small, tmp_path: Path) -> None:
+    report, sent = small.run(tmp_path, silent, silent_stops=1, tape=Tape(tmp_path))
+    assert [stop.label for stop in report.passed] == [f"layer-{LAYER:03d}"]
+    assert not report.looks
+    assert not report.within_tolerance
+    assert small.job.program.text.splitlines()[-2] in sent
+    assert [e["event"] for e in read_events(tmp_path)].count("no_look") == 1
+
+
+def test_a_scanner_that_is_gone_ends_the_run(small: Small, tmp_path: Path) -> None:
+    with pytest.raises(ScannerError, match="nothing new"):
+        small.run(tmp_path, silent)
+    assert small.job.program.text.splitlines()[-2] not in (tmp_path / "sent.gcode").read_text()
+
+
+def test_a_scan_that_does_not_fit_is_taken_again_before_the_run_ends(
+    small: Small, tmp_path: Path
+) -> None:
+    away = Transform.from_rotation_translation(
+        "scanner", "scanner", rotation=np.eye(3), translation_mm=np.array([40.0, 0.0, 0.0])
+    )
+    taken = []
+
+    def scans(n: int) -> Scan:
+        taken.append(n)
+        return scan_of(small.standing).moved(away) if n == 1 else scan_of(small.standing)
+
+    report, _ = small.run(tmp_path / "once", scans)
+    assert taken == [1, 2]
+    assert not report.stopped
+    report, sent = small.run(tmp_path / "gone", lambda n: scan_of(small.standing).moved(away))
+    assert report.stopped.startswith("stop: twice the scan did not fit")
     assert sent[-1] == "heaters off"
