@@ -22,7 +22,7 @@ from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.situation import decide_look
-from amrepair.loop.tape import Sent, Tape, report_from_json, report_to_json
+from amrepair.loop.tape import Sent, Tape, TapeEndsError, report_from_json, report_to_json
 from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
 from amrepair.scans import Scanner, ScanRequest
 from gcode.check import CheckedProgram
@@ -119,6 +119,8 @@ class Run:
 
     def at(self, stop: Stop) -> bool:
         """Look, decide, repair, until there is nothing more to do; whether the job goes on."""
+        if self._tape.only_read:
+            return self._again(stop)
         state = self._job.state_after(stop.line)
         site = self._site_at(stop)
         with self._watch("print"):
@@ -146,6 +148,16 @@ class Run:
                 self._send("back", program)
             if look is not None:
                 self._change_next(stop, site, look)
+        return True
+
+    def _again(self, stop: Stop) -> bool:
+        """Look at the recorded scans of a stop, however it is decided now."""
+        if self._tape.live:
+            raise TapeEndsError("the record ends here")
+        site = self._site_at(stop)
+        _, parked = travel.park(site.setup, self._job.state_after(stop.line))
+        while self._tape.next_stop() == stop.label:
+            self._try_to_look(stop, site, parked)
         return True
 
     def _change_next(self, stop: Stop, site: Site, look: Look) -> None:
@@ -267,11 +279,13 @@ class Run:
         progress: Progress = silent,
     ) -> PrintReport | None:
         """Send a program, or find on the tape that it was sent."""
+        if self._tape.only_read:
+            return None
         end = checked.program.text.count("\n") if end is None else end
         began = self._tape.next("send")
         if began is not None:
             self._require_same(began, kind, checked, first, end)
-            if not self._tape.live or self._tape.only_read:
+            if not self._tape.live:
                 done = self._tape.next("sent")
                 self._sent.append(Sent(kind, checked, first, end, done=True))
                 return report_from_json(done["report"]) if done else None
@@ -295,7 +309,7 @@ class Run:
     ) -> None:
         """A resumed run must come to the very lines that were sent."""
         said = (began["kind"], began["sha256"], began["first"], began["end"])
-        if said != (kind, checked.program.sha256, first, end) and not self._tape.only_read:
+        if said != (kind, checked.program.sha256, first, end):
             raise LoopError(
                 f"the record says that '{said[0]}' was sent there, lines {said[2]} to {said[3]} of "
                 f"{str(said[1])[:12]}, this run comes to '{kind}', lines {first} to {end} of "

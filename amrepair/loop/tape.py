@@ -21,7 +21,7 @@ from gcode.check import CheckedProgram
 from gcode.hosts.port import PrintReport
 
 TAPE = "run.jsonl"
-VERSION = 1
+LOOKS = ("look", "no_look")
 
 
 class TapeEndsError(LoopError):
@@ -68,6 +68,8 @@ class Tape:
         self.only_read = only_read
         self._clock = clock
         self._events = [] if path is None else read_events(path)
+        if only_read:  # what was sent follows from what was seen and answered
+            self._events = [e for e in self._events if e.get("event") in LOOKS]
         self._at = 0
         self._fd: int | None = None
 
@@ -103,6 +105,10 @@ class Tape:
         """The scan of a recorded look."""
         assert self.path is not None
         return read_scan(self.path / scan_name(number), frame=frame)
+
+    def next_stop(self) -> str | None:
+        """The label of the stop of the next recorded look."""
+        return None if self.live else str(self._events[self._at].get("stop"))
 
     def peek(self) -> str | None:
         """What kind of event comes next."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import random
 import shutil
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,7 +27,8 @@ from amrepair.loop.tape import read_events
 from amrepair.scans import write_ply
 from amrepair.template import MeshSdf
 from gcode.check import check
-from gcode.profiles import load_setup
+from gcode.firmware import EmulatedPrinterProcess
+from gcode.profiles import load_printer, load_setup
 from gcode.reader import read_job
 from gcode.slicing.job import plan_part
 from gcode.writer import write
@@ -202,3 +205,51 @@ def test_forty_kills_at_any_moment(forks: Forks, prepared: Path, tmp_path: Path)
             assert bench.executed() == bench.planned()
         forks.kill(bench.printer)
     assert kills >= 10
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_command_goes_on_after_a_kill(prepared: Path, tmp_path: Path) -> None:
+    """`amrepair loop` killed while it waits for a scan; `--resume` takes one and ends the job."""
+    job, drop, out = tmp_path / "job.gcode", tmp_path / "scans", tmp_path / "run"
+    shutil.copy(prepared / "run" / JOB, job)
+    drop.mkdir()
+    part = solid_mesh(m3.Manifold.cube(SIZE_MM))
+    part.export(tmp_path / "part.stl")
+    whole = (prepared / f"whole-layer-{LAYER:03d}.ply").read_bytes()
+    final = (prepared / "whole-final.ply").read_bytes()
+    program = [
+        sys.executable,
+        "-W",
+        "ignore",
+        "-c",
+        "from amrepair.cli import main; main()",
+        "loop",
+    ]
+    told = (tmp_path / "told").open("w")
+    with EmulatedPrinterProcess("prusa", printer=load_printer(PRINTER)) as machine:
+        words = [str(job), "--template", str(tmp_path / "part.stl"), "--port", machine.port]
+        words += ["--scanner", f"watch:{drop}", "--approve", "auto", "--out", str(out)]
+        words += ["--at-layer", str(LAYER)]
+        first = subprocess.Popen([*program, *words], stdout=told, stderr=told)
+        until(lambda: len(read_events(out)) >= 4 or first.poll() is not None)
+        assert first.poll() is None, (tmp_path / "told").read_text()
+        first.kill()
+        first.wait()
+        again = subprocess.Popen(
+            [*program, "--resume", str(out), "--json"], stdout=told, stderr=told
+        )
+        # the sensor looks whenever it likes; its files name the layer
+        for n in range(1200):
+            done = [e for e in read_events(out) if e["event"] == "look"]
+            if again.poll() is not None:
+                break
+            name = f"layer-{LAYER:03d}-{n}.ply" if not done else f"end-{n}.ply"
+            aside = tmp_path / "aside.ply"
+            aside.write_bytes((whole if not done else final) + bytes(n % 250 + 1))
+            aside.rename(drop / name)
+            time.sleep(0.5)
+        assert again.wait() == 0, (tmp_path / "told").read_text()
+    kinds = [e["kind"] for e in read_events(out) if e["event"] == "send"]
+    assert kinds == ["job", "park", "back", "back", "job", "park", "back", "back", "job"]
+    assert (out / "report.html").is_file()

@@ -43,13 +43,17 @@ def test_a_line_that_a_kill_cut_short_was_never_begun(tmp_path: Path, cut: int) 
 
 
 def test_a_replay_ends_with_the_tape_and_writes_nothing(tmp_path: Path) -> None:
-    Tape(tmp_path).write("send", kind="job")
+    recorded = Tape(tmp_path)
+    recorded.write("send", kind="job")
+    recorded.write("look", look=1, stop="layer-003")
     tape = Tape(tmp_path, only_read=True)
-    tape.next("send")
+    assert tape.next_stop() == "layer-003"
+    tape.next("look")
     tape.write("send", kind="park")
+    assert tape.next_stop() is None
     with pytest.raises(TapeEndsError):
-        tape.next("sent")
-    assert len(read_events(tmp_path)) == 1
+        tape.next("look")
+    assert len(read_events(tmp_path)) == 2
 
 
 def test_a_run_that_a_question_ended_looks_anew(tmp_path: Path) -> None:
