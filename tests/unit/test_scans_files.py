@@ -154,3 +154,14 @@ def test_a_file_that_goes_while_it_is_looked_at_is_no_error(tmp_path: Path) -> N
         (1.0, lambda: write_ply(make(2), there)),
     ]
     assert np.array_equal(scanner.scan(ask(3)).points_mm, make(2).points_mm)
+
+
+def test_a_late_layer_does_not_answer_for_the_finished_part(tmp_path: Path) -> None:
+    # regression: a second file of the last layer looked at was taken for the finished part
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    write_ply(make(1), tmp_path / "layer-004-b.ply")
+    time.plan = [(2.0, lambda: write_ply(make(2), tmp_path / "end.ply"))]
+    assert np.array_equal(
+        scanner.scan(ScanRequest("final", None, 1.0)).points_mm, make(2).points_mm
+    )
