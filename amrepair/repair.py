@@ -195,6 +195,7 @@ def plan_repair(
     guess: Transform | None = None,
     interruption: ModalState | None = None,
     strict: bool = True,
+    wanted: Callable[[Region], bool] = lambda region: True,
     rng: np.random.Generator | None = None,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
@@ -212,6 +213,8 @@ def plan_repair(
     strict
         Raise where the checker refuses the program; else return a plan without one, that says so:
         a job must not die of a patch that is never sent.
+    wanted
+        Which of the missing regions the program is to fill.
 
     Raises
     ------
@@ -273,7 +276,7 @@ def plan_repair(
         )
         _refuse_ambiguity(scan, site, registration, deficit)
     layer_mm = site.setup.process.layer_height_mm
-    fillable = _fillable(deficit)
+    fillable = _fillable(deficit, wanted)
     if fillable.is_empty():
         return RepairPlan(
             registration, anomaly, deficit, None, None, None, build_from_scan, layer_mm, moved
@@ -380,15 +383,24 @@ def _refuse_ambiguity(scan: Scan, site: Site, registration: Registration, defici
             )
 
 
-def _fillable(deficit: Deficit) -> manifold3d.Manifold:
-    """The missing pieces that are worth a repair."""
+def _fillable(deficit: Deficit, wanted: Callable[[Region], bool]) -> manifold3d.Manifold:
+    """The missing pieces that are worth a repair, and wanted in it."""
     pieces = deficit.missing.decompose()
     boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
     keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces])
     pieces = [piece for piece, kept in zip(pieces, keep, strict=True) if kept]
+    regions = [region for region in deficit.regions if region.label is Label.MISSING]
+    pieces = [piece for piece in pieces if not regions or wanted(_region_of(piece, regions))]
     if not pieces:
         return manifold3d.Manifold()
     return manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add)
+
+
+def _region_of(piece: manifold3d.Manifold, regions: list[Region]) -> Region:
+    """The region that a piece is: the one whose box is nearest to its own."""
+    box = np.asarray(piece.bounding_box()).reshape(2, 3)
+    off_mm = [float(np.abs(np.asarray(region.box_mm) - box).max()) for region in regions]
+    return regions[int(np.argmin(off_mm))]
 
 
 def _start_of(interruption: ModalState | None) -> tuple[float, float, float] | None:

@@ -7,7 +7,18 @@ from typing import Annotated
 import typer
 
 import amrepair
-from amrepair.cli import benchmark, health, inspect, live, mend, printing, simulation, templates
+from amrepair.cli import (
+    benchmark,
+    calibration,
+    health,
+    inspect,
+    live,
+    mend,
+    printing,
+    replaying,
+    simulation,
+    templates,
+)
 from amrepair.errors import AmrepairError
 from gcode.cli import console
 from gcode.errors import GcodeError
@@ -41,6 +52,8 @@ templates.add_to(app)
 inspect.add_to(app)
 mend.add_to(app)
 printing.add_to(app)
+calibration.add_to(app)
+replaying.add_to(app)
 benchmark.add_to(app)
 health.add_to(app)
 live.add_to(app)

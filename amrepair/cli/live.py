@@ -20,7 +20,7 @@ from gcode.cli import console
 from gcode.progress import Progress
 
 if TYPE_CHECKING:
-    from amrepair.loop import Look
+    from amrepair.loop import Decision, Look
     from amrepair.repair import RepairPlan
     from amrepair.report.operator import Operator
     from gcode.reader import Job
@@ -148,6 +148,10 @@ class NoView:
         """Nobody is asked."""
         return True
 
+    def ask_to_go_on(self, decision: Decision) -> bool:
+        """Nobody is asked."""
+        return False
+
     def recording(self, record: Callable[[Look], None]) -> Callable[[Look], None]:
         """The same."""
         return record
@@ -179,6 +183,10 @@ class ShownRun:
     def approve(self, plan: RepairPlan) -> bool:
         """Wait for a button, where the run asks at all."""
         return self.page.approve(plan) if self.ask else True
+
+    def ask_to_go_on(self, decision: Decision) -> bool:
+        """Wait for a button: whether the job goes on all the same."""
+        return self.page.ask(decision)
 
     def recording(self, record: Callable[[Look], None]) -> Callable[[Look], None]:
         """Record a look, then show it."""

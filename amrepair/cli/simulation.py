@@ -23,14 +23,17 @@ from amrepair.cli.options import (
     SeedOption,
     scaled_mesh,
 )
+from amrepair.errors import LoopError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
+    from amrepair.frames import Transform
+    from amrepair.loop import Tape
     from amrepair.report import ReportData
     from amrepair.report.folder import RunFolder
-    from amrepair.simulate.run import SimulatedRun
+    from amrepair.simulate.run import PreparedRun, SimulatedRun
 
 DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
 
@@ -98,6 +101,7 @@ def simulate(
     setup = load_setup(printer, material, process)
     path = part or bracket_path()
     mesh = scaled_mesh(path, scale, setup)
+    ids = (printer, material, process)
     place_on_bed(np.asarray(mesh.bounds, dtype=np.float64), setup)  # refused before any work
     folder = RunFolder(out)
     with bars.shown():
@@ -119,6 +123,7 @@ def simulate(
                 max_iterations=max_iterations,
                 approve=page.approve,
                 record=page.recording(folder.record),
+                begun=lambda pose: _recorded(prepared, folder, pose, ids, max_iterations),
                 watch=watch,
                 progress=page.watching(bars),
             )
@@ -128,12 +133,42 @@ def simulate(
     with watch("report"):
         write_report(_report_data(run, path, result), folder.file("report.html"))
     within = run.report.within_tolerance
+    if run.report.stopped:
+        console.errors.print(f"The run was ended: {run.report.stopped}.")
     if as_json:
         console.show_json(result)
     else:
         _say(run, result, folder, within)
+    if run.report.stopped:
+        raise typer.Exit(LoopError.exit_code)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def _recorded(
+    run: PreparedRun,
+    folder: RunFolder,
+    pose: Transform,
+    ids: tuple[str, str, str],
+    max_iterations: int,
+) -> Tape:
+    """Write down what the run begins with; the tape that it is recorded on."""
+    from amrepair.loop import Tape
+    from amrepair.loop.setting import Setting, forget, keep
+
+    forget(folder.path)
+    setting = Setting.of(
+        run.setup,
+        ids,
+        stops=run.stops,
+        build_from_template=run.build_from_template,
+        build_from_scanner=pose,
+        by_beads=run.by_beads,
+        seed=run.seed,
+        max_iterations=max_iterations,
+    )
+    keep(folder.path, setting, run.checked.program.text, run.template)
+    return Tape(folder.path)
 
 
 def _result(

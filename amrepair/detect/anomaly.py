@@ -26,7 +26,14 @@ class DefectType(StrEnum):
     VOID = "void"
     UNDER_EXTRUSION = "under_extrusion"
     CHIP = "chip"
+    MISSING_BEADS = "missing_beads"
+    OVER_EXTRUSION = "over_extrusion"
     BLOB = "blob"
+    STRING = "string"
+    LAYER_SHIFT = "layer_shift"
+    WARP = "warp"
+    DETACHED = "detached"
+    CLOG = "clog"
     UNKNOWN = "unknown"
 
 
@@ -44,6 +51,8 @@ class Region:
         The largest |deviation| in it.
     below_bead
         Too small for one bead to fix.
+    confidence
+        That it is there and is of that type, 0 to 1; 1 where nobody has judged it.
     """
 
     label: Label
@@ -53,6 +62,7 @@ class Region:
     depth_mm: float
     box_mm: Float[np.ndarray, "2 3"]
     below_bead: bool = False
+    confidence: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float
 
 from amrepair.detect import Label
 from amrepair.detect.detection import BED_BAND_MM
+from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
-from amrepair.loop import LoopReport
+from amrepair.loop.findings import reach_of
 from amrepair.repair import RepairPlan
 from amrepair.report.data import (
     BeadPath,
@@ -84,25 +85,11 @@ def region_rows(plan: RepairPlan) -> tuple[RegionRow, ...]:
         elif region.below_bead:
             note = _NOTE_TOO_SMALL
         elif plan.patch is not None:
-            reach = _reachable_ratio(plan, region.box_mm)
-            if reach is not None and reach < 0.999:
+            reach = reach_of(plan, region.box_mm)
+            if reach < 0.999:
                 note = "; ".join(sorted({u.reason for u in plan.patch.unreachable}))
         rows.append(RegionRow(str(region.type), region.volume_mm3, region.box_mm, reach, note))
     return tuple(rows)
-
-
-def _reachable_ratio(plan: RepairPlan, box_mm: Any) -> float | None:
-    """Share of the patch's region that overlaps this box the most."""
-    assert plan.patch is not None
-    best, found = 0.0, None
-    low, high = np.asarray(box_mm, dtype=np.float64).reshape(2, 3)
-    for part in plan.patch.regions:
-        other_low, other_high = np.asarray(part.box_mm, dtype=np.float64).reshape(2, 3)
-        overlap = np.minimum(high, other_high) - np.maximum(low, other_low)
-        shared = float(np.prod(np.maximum(overlap, 0.0)))
-        if shared > best:
-            best, found = shared, float(part.reachable_ratio)
-    return found
 
 
 def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None) -> dict[str, Any]:
@@ -159,6 +146,8 @@ def loop_result(
         "seconds": dict(seconds),
         "seed": seed,
         "versions": versions(setup),
+        "stopped": report.stopped or None,
+        "passed_by": [stop.label for stop in report.passed],
         "stops": [_stop_row(look) for look in report.looks],
     }
     return dict(rounded(result))
@@ -176,6 +165,9 @@ def _stop_row(look: LoopLook) -> dict[str, Any]:
         "rmse_mm": plan.registration.rmse_mm,
         "within_tolerance": plan.within_tolerance,
         "printed": look.printed,
+        "declined": look.declined,
+        "decision": str(look.decision.action),
+        "row": look.decision.row,
     }
 
 
@@ -273,30 +265,34 @@ def solid_mesh(solid: Any) -> SolidMesh | None:
 
 
 def decision_of(look: LoopLook) -> Decision:
-    """What was decided at a look, and why."""
-    plan = look.plan
-    found = [
-        f"{len(plan.to_fill)} regions are large enough for a bead, "
-        f"{plan.deficit.missing_mm3:.1f} mm³ in all."
-        if plan.to_fill
-        else "Nothing is missing that a bead could fill."
-    ]
-    if look.printed:
-        choice = "fill now"
-    elif look.declined:
-        choice = "leave: the operator declined"
-    elif plan.within_tolerance or not plan.to_fill:
-        choice = "go on" if plan.within_tolerance else "go on: printing cannot take excess away"
-    elif plan.refused:
-        choice = "go on: the checker refused the repair"
-        found.append(plan.refused)
-    elif plan.checked is None:
-        choice = "go on: nothing of it can be reached"
-    else:
-        choice = "go on: little is left, or the last repair changed little or was the last allowed"
+    """What was decided at a look, and why: the rows of the table that fitted."""
+    plan, decided = look.plan, look.decision
+    choice = str(decided.action)
+    if look.declined:
+        choice += ": the operator declined" if decided.action is Action.FILL_NOW else ": ended"
+    reasons = [f"{_sentence(decided.reason)} ({decided.row})"]
+    same: dict[tuple[str, str, str, str, str], list[float]] = {}
+    for verdict in decided.verdicts:
+        one = verdict.finding
+        key = (one.kind, str(one.type), str(verdict.action), verdict.reason, verdict.row)
+        same.setdefault(key, []).append(one.volume_mm3)
+    for (kind, type_, action, reason, row), volumes in same.items():
+        count = "" if len(volumes) == 1 else f"{len(volumes)} × "
+        reasons.append(
+            f"{count}{type_.replace('_', ' ')}, {sum(volumes):.1f} mm³ {kind}: {action}, {reason} "
+            f"({row})"
+        )
+    if plan.refused:
+        reasons.append(plan.refused)
+    if decided.situation.beyond:
+        reasons.append(_sentence(decided.situation.beyond))
     if plan.unreachable_mm3 > 0:
-        found.append(f"The nozzle cannot reach {plan.unreachable_mm3:.1f} mm³.")
-    return Decision(f"{look.stop.label}, z = {look.stop.z_mm:.2f} mm", choice, tuple(found))
+        reasons.append(f"The nozzle cannot reach {plan.unreachable_mm3:.1f} mm³.")
+    return Decision(f"{look.stop.label}, z = {look.stop.z_mm:.2f} mm", choice, tuple(reasons))
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."
 
 
 def wire_counters(report: LoopReport) -> tuple[Counter, ...]:

@@ -12,6 +12,7 @@ import trimesh
 
 from amrepair.errors import InputError
 from amrepair.loop import Look
+from amrepair.loop.tape import scan_name
 from amrepair.scans import write_ply
 from gcode.slicing.layers import mesh_of
 
@@ -66,7 +67,7 @@ class RunFolder:
     def record(self, look: Look) -> None:
         """Write scan, deficit and program of one look."""
         n, plan = look.number, look.plan
-        self._whole(f"scan-{n}.ply", lambda path: write_ply(look.scan, path))
+        self._whole(scan_name(n), lambda path: write_ply(look.scan, path))
         if not plan.deficit.missing.is_empty():
             self.write_solid(f"deficit-{n}.stl", plan.deficit.missing)
         if plan.checked is not None and look.printed:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.loop import Look
+from amrepair.loop import Decision, Look
 from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.collect import of_the_part
@@ -255,6 +255,15 @@ class LiveView:
         if self._operator is None:
             return True
         self.show_plan(plan, "Print this repair?")
+        return self._operator.ask() is Verdict.APPROVE
+
+    def ask(self, decision: Decision) -> bool:
+        """Show why the run rests and wait: Approve goes on all the same, Skip ends it."""
+        if self._operator is None:
+            return False
+        own = [v for v in decision.verdicts if v.action is decision.action]
+        why = [f"- {v.finding.type}: {v.reason}" for v in own] or [f"- {decision.reason}"]
+        self._found.content = "\n".join(["**Go on all the same?** (Skip ends the run)", *why])
         return self._operator.ask() is Verdict.APPROVE
 
     def record(self, look: Look) -> None:

@@ -137,6 +137,8 @@ def summary_of(data: ReportData) -> tuple[str, str, str]:
 def outcome_of(result: Mapping[str, object], *, within_tolerance: bool) -> Outcome:
     """How a run ended, told from its `--json` result and whether its exit code is 0."""
     figures = Figures.from_result(result)
+    if result.get("stopped"):
+        return Outcome.STOPPED
     if not figures.missing_mm3_before > NEGLIGIBLE_MM3 and figures.filament_mm <= 0:
         return Outcome.NOTHING_TO_REPAIR if within_tolerance else Outcome.NOT_WITHIN_TOLERANCE
     if figures.missing_mm3_after is None and figures.repaired_ratio is None and within_tolerance:

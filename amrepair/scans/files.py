@@ -157,13 +157,13 @@ class WatchedFolderScanner:
     def _try(self, path: Path, request: ScanRequest) -> tuple[Scan | None, str | None]:
         """The scan, if the file answers the request; else why not."""
         named = LAYER_IN_NAME.search(path.stem)
-        if named is not None and request.layer_index is not None:
-            layer = int(named.group(1))
-            if layer > request.layer_index:
+        if named is not None:
+            layer, asked = int(named.group(1)), request.layer_index
+            if asked is not None and layer > asked:
                 return None, f"{path.name} belongs to a later layer"
-            if layer < request.layer_index:
+            if asked is None or layer < asked:  # nothing with a layer's name is the finished part
                 self._forget(path)
-                _log.warning("%s came too late: layer %d is asked for", path, request.layer_index)
+                _log.warning("%s came too late: %s is asked for", path, request.label)
                 return None, f"{path.name} belongs to an earlier layer"
         try:
             digest = hashlib.sha256(path.read_bytes()).digest()

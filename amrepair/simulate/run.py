@@ -18,8 +18,9 @@ from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
-from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, plan_stops, run_loop
-from amrepair.repair import RepairPlan, Site, Stopwatch
+from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, Tape, plan_stops, run_loop
+from amrepair.loop.sites import sites
+from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.simulate.defects import Defect, PlacedDefect
 from amrepair.simulate.placement import place
 from amrepair.simulate.scanner import (
@@ -30,7 +31,6 @@ from amrepair.simulate.scanner import (
 )
 from amrepair.simulate.stage import DefectTruth, Stage
 from amrepair.simulate.world import World
-from amrepair.template import PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
 from gcode.firmware import EmulatedPrinterProcess
@@ -39,7 +39,6 @@ from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job, read_job
 from gcode.slicing.job import PartPlan, plan_part
-from gcode.slicing.layers import LayerGrid
 from gcode.writer import write
 
 # Below this share of infill a layer's inside is planned to be open: beads, not CAD, are expected.
@@ -73,6 +72,11 @@ class PreparedRun:
     defects: tuple[PlacedDefect, ...]
     stops: tuple[Stop, ...]
     seed: int
+
+    @property
+    def by_beads(self) -> bool:
+        """Whether layers are judged by the job's beads: their inside is planned to be open."""
+        return self.setup.process.infill_ratio < SOLID_RATIO
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,12 +203,18 @@ def simulate_run(
     max_iterations: int = MAX_ITERATIONS,
     approve: Callable[[RepairPlan], bool] = lambda plan: True,
     record: Callable[[Look], None] = lambda look: None,
+    begun: Callable[[Transform], Tape] | None = None,
     model: ScannerModel | None = None,
     clock: Callable[[], float] = time.monotonic,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
 ) -> SimulatedRun:
     """Print the job on an emulated printer and let the loop mend what goes wrong.
+
+    Parameters
+    ----------
+    begun
+        Called with the scanner's calibrated pose; returns the tape that the run is recorded on.
 
     Raises
     ------
@@ -246,6 +256,7 @@ def simulate_run(
             wire_log=wire_log,
         )
         printer.connect()
+        tape = begun(pose.build_from_scanner_calibrated) if begun is not None else None
 
         def recorded(look: Look) -> None:
             now = printer.temperatures()
@@ -258,12 +269,15 @@ def simulate_run(
                 run.checked,
                 printer,
                 stage,
-                lambda stop: _site(run, stop),
+                sites(
+                    run.job, run.template, run.build_from_template, run.setup, by_beads=run.by_beads
+                ),
                 stops=run.stops,
                 max_iterations=max_iterations,
                 approve=approve,
                 record=recorded,
-                rng=np.random.default_rng([run.seed, 3]),
+                tape=tape,
+                seed=run.seed,
                 watch=watch,
                 progress=progress,
             )
@@ -278,43 +292,4 @@ def simulate_run(
         printer_clock_s=printer_clock_s,
         print_wall_s=watch.seconds.get("print", 0.0) + watch.seconds.get("repair", 0.0),
         temperatures=np.array(temperatures, dtype=np.float64).reshape(-1, 3),
-    )
-
-
-def _site(run: PreparedRun, stop: Stop) -> Site:
-    """What is expected at a stop.
-
-    A finished part and solid layers are judged by the template; a layer with sparse infill by the
-    beads that the job planned.
-    """
-    process = run.setup.process
-    grid = LayerGrid.from_tops(
-        [layer.z_mm for layer in run.job.layers], layer_height_mm=process.layer_height_mm
-    )
-    if stop.layer_index is None:
-        return Site(run.template, run.setup, grid, run.build_from_template)
-    z_mm = stop.z_mm - float(run.build_from_template.translation_mm[2])
-    template = run.template.below_z(z_mm)
-    if process.infill_ratio >= SOLID_RATIO:
-        return Site(template, run.setup, grid, run.build_from_template, stop.z_mm)
-    return Site(
-        template,
-        run.setup,
-        grid,
-        run.build_from_template,
-        stop.z_mm,
-        planned=_planned(run, stop),
-    )
-
-
-def _planned(run: PreparedRun, stop: Stop) -> Template:
-    """The beads of the job up to a stop, in the template's frame."""
-    beads = run.job.beads
-    done = (beads.line < stop.line) & (beads.layer >= 0)
-    template_from_build = run.build_from_template.inverse()
-    return PlannedSdf.from_beads(
-        template_from_build.apply(beads.start_mm[done]),
-        template_from_build.apply(beads.end_mm[done]),
-        beads.section_mm2[done],
-        beads.height_mm[done],
     )

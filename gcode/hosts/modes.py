@@ -67,10 +67,17 @@ def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tup
                 yield start + offset, command
 
 
-def modes_after(checked: PrintableProgram, line: int, dialect: str) -> Modes:
-    """Return the modes after the lines [0, line) of a program."""
-    modes = Modes()
-    for start in range(0, line, 4096):
+def modes_after(
+    checked: PrintableProgram,
+    line: int,
+    dialect: str,
+    *,
+    first: int = 0,
+    modes: Modes | None = None,
+) -> Modes:
+    """Return the modes after the lines [first, line) of a program, from `modes` before them."""
+    modes = modes or Modes()
+    for start in range(first, line, 4096):
         for text in checked.lines(start, min(line, start + 4096)):
             modes = follow(modes, text, dialect)
     return modes

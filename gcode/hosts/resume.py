@@ -10,7 +10,7 @@ names the interval: the last line known to be executed, the last that can have b
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import NoReturn
 
@@ -36,6 +36,8 @@ def resume(
     *,
     release_c: float,
     pose_confirmed: bool = False,
+    end: int | None = None,
+    before: Sequence[tuple[PrintableProgram, int, int]] = (),
     progress: Progress = silent,
     wall_clock: Callable[[], float] = time.time,
 ) -> PrintReport:
@@ -49,13 +51,20 @@ def resume(
         Below this bed temperature the material lets go of the bed.
     pose_confirmed
         A rescan has shown since that the part stands where it stood.
+    end
+        Where the part of the program that was being printed ends; None is the program's end.
+    before
+        What was printed before the program's first line, as (program, first, end): a program
+        within a job knows its place and modes from there.
 
     Raises
     ------
     ResumeRefusedError
         Naming the interval; the heaters have been told to switch off.
     """
-    return _Resumption(printer, checked, release_c, pose_confirmed, wall_clock).run(progress)
+    return _Resumption(
+        printer, checked, release_c, pose_confirmed, wall_clock, end=end, before=before
+    ).run(progress)
 
 
 class _Resumption:
@@ -66,11 +75,14 @@ class _Resumption:
         release_c: float,
         pose_confirmed: bool,
         wall_clock: Callable[[], float],
+        *,
+        end: int | None,
+        before: Sequence[tuple[PrintableProgram, int, int]],
     ) -> None:
-        self._printer, self._checked = printer, checked
+        self._printer, self._checked, self._before = printer, checked, before
         self._release_c, self._pose_confirmed = release_c, pose_confirmed
         self._now_s = wall_clock()
-        self._total = checked.program.text.count("\n") + 1
+        self._total = checked.program.text.count("\n") + 1 if end is None else end
         self._journal, self._job = self._last_job()
         self._heard_s: float | None = None
         self._left_alone = False
@@ -94,7 +106,7 @@ class _Resumption:
             printer.connect(before_hello=self._settle)
             place = printer.place()
             line = self._job.acked if printer.dialect.verifies else self._line_by_place(place)
-            modes = modes_after(self._checked, line, printer.dialect.name)
+            modes = self._modes_after(line)
             self._require_place(place, modes, line)
             if not self._pose_confirmed:
                 self._require_motors()
@@ -183,7 +195,7 @@ class _Resumption:
         if len(doubtful) > MOST_IN_DOUBT:
             self._refuse(f"{len(doubtful)} lines are in doubt and the firmware counts none")
         dialect = self._printer.dialect.name
-        modes = modes_after(self._checked, job.acked, dialect)
+        modes = self._modes_after(job.acked)
         fitting = [job.acked] if _fits(place, modes) else []
         for index in doubtful:
             modes = follow(modes, self._checked.lines(index, index + 1)[0], dialect)
@@ -197,6 +209,13 @@ class _Resumption:
             )
         self._settled_at(fitting[0])
         return fitting[0]
+
+    def _modes_after(self, line: int) -> Modes:
+        """The modes after the program's lines [0, line), and all that was printed before them."""
+        dialect, modes = self._printer.dialect.name, Modes()
+        for program, first, end in (*self._before, (self._checked, 0, line)):
+            modes = modes_after(program, end, dialect, first=first, modes=modes)
+        return modes
 
     # ------------------------------------------------------------------ is it safe
 

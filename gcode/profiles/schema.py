@@ -170,3 +170,6 @@ class ProcessProfile(_Profile):
     infill_overlap_ratio: Ratio = 0.15
     max_gap_layers: Annotated[float, Field(ge=1, le=4)] = 2.0
     surface_allowance_mm: Annotated[float, Field(ge=0, le=1)] = 0.05
+    unasked_max_mm3: Positive = 500.0  # the most that a repair may be printed of without asking
+    unasked_max_s: Positive = 1800.0
+    unasked_min_reachable_ratio: Ratio = 0.5

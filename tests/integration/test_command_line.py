@@ -308,3 +308,13 @@ def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
     assert result["missing_mm3_after"] is not None
     assert (out / "report.html").is_file()
     assert (out / "scan-1.ply").is_file()
+    again = call("replay", out, "--json")
+    assert (again.returncode, json.loads(again.stdout)["same"]) == (0, True), again.stderr
+    refused(call("loop", "--resume", out), "was printed to its end")
+    record = out / "run.jsonl"
+    record.write_text(
+        record.read_text().replace(
+            '"decision": {"action": "go on"', '"decision": {"action": "stop"'
+        )
+    )
+    assert call("replay", out).returncode == 1

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from amrepair.errors import AlignmentError, AmrepairError, InputError, LoopError
-from amrepair.loop import Look, _park, _return, locate_part, plan_stops
+from amrepair.loop import Look, locate_part, plan_stops, travel
 from amrepair.repair import RepairPlan
 from amrepair.report.collect import look_of, loop_result
 from amrepair.simulate.defects import parse_defect
@@ -23,8 +23,6 @@ from amrepair.simulate.run import (
 )
 from amrepair.template import MeshSdf
 from gcode.errors import LinkError
-from gcode.hosts.file import FilePrinter
-from gcode.hosts.port import PrintableProgram, PrintReport
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import read_job
@@ -166,22 +164,15 @@ def test_heaters_are_off_when_the_loop_breaks(template: MeshSdf, tmp_path: Path)
 
 
 def test_the_nozzle_is_back_where_the_job_left_it_before_it_goes_on(
-    broken: SimulatedRun, tmp_path: Path
+    broken: SimulatedRun,
 ) -> None:
     # regression: the way back was written as if the nozzle had never parked, so X and Y were left
     # out, and the nozzle came down and unretracted at the park corner
     run = broken.prepared
     state = run.job.state_after(run.stops[0].line)
-    sent: list[str] = []
-
-    class Recorder(FilePrinter):
-        def print(self, checked: PrintableProgram, **_: object) -> PrintReport:
-            sent.append(checked.program.text)
-            return PrintReport(True, 0, 0, 0, 0, 0, 0.0, 0, (0.0, 0.0, 0.0), 0)
-
-    recorder = Recorder(tmp_path / "unused.gcode")
-    parked = _park(recorder, run.setup, state)
-    _return(recorder, run.setup, state, parked)
+    program, parked = travel.park(run.setup, state)
+    back = travel.way_back(run.setup, state, parked)
+    sent = [one.program.text for one in (program, *back)]
     head = run.job.program.text.split("\n")[: run.stops[0].line]
     text = "\n".join([*head, *sent])
     after = read_job(Program(text, run.setup.printer.dialect)).state_after(text.count("\n"))

@@ -6,6 +6,7 @@ and forks itself for every sender and every printer it is asked for.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -23,9 +24,9 @@ DEADLINE_S = 60.0
 class Forks:
     """The test's side."""
 
-    def __init__(self) -> None:
+    def __init__(self, children: str = "link_children") -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", str(Path(__file__))],
+            [sys.executable, "-W", "ignore", str(Path(__file__)), children],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(UNIT)))},
@@ -61,6 +62,10 @@ class Forks:
         """Start a sender; `outcome` tells what became of it."""
         return self._start(do="send", port=str(port), journal=str(journal), **options)
 
+    def start(self, do: str, **request: object) -> int:
+        """Start a child that does what `do` names in the module of children."""
+        return self._start(do=do, **request)
+
     def _start(self, **request: object) -> int:
         pid = int(self._ask(**request))
         self._living.add(pid)
@@ -86,7 +91,7 @@ def until(true: Callable[[], object]) -> None:
 
 
 def _serve() -> None:
-    import link_children  # imports all that children need
+    children = importlib.import_module(sys.argv[1])  # imports all that children need
 
     for line in sys.stdin.buffer:
         request = json.loads(line)
@@ -104,7 +109,7 @@ def _serve() -> None:
                     null = os.open(os.devnull, os.O_RDWR)
                     os.dup2(null, 0)
                     os.dup2(null, 1)
-                    code = getattr(link_children, what)(**request)
+                    code = getattr(children, what)(**request)
                 finally:
                     os._exit(code)
         sys.stdout.write(f"{answer}\n")

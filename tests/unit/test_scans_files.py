@@ -101,3 +101,67 @@ def test_file_scanner_reads_its_file(tmp_path: Path) -> None:
     write_ply(make(5), tmp_path / "a.ply")
     scan = FileScanner(tmp_path / "a.ply").scan(ScanRequest("final", None, 1.0))
     assert np.array_equal(scan.points_mm, make(5).points_mm)
+
+
+def test_a_file_that_shrinks_and_comes_back_whole_is_taken_once(tmp_path: Path) -> None:
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    write_ply(make(4), tmp_path / "whole.hidden")
+    whole = (tmp_path / "whole.hidden").read_bytes()
+    path = tmp_path / "a.ply"
+    time.plan = [
+        (0.2, lambda: path.write_bytes(whole)),
+        (0.5, lambda: path.write_bytes(b"")),  # the exporter begins anew
+        (2.0, lambda: path.write_bytes(whole)),
+    ]
+    assert np.array_equal(scanner.scan(ask(1)).points_mm, make(4).points_mm)
+    assert time.now_s >= 2.0
+    with pytest.raises(ScannerError, match="no new file"):
+        scanner.scan(ask(2))
+
+
+def test_a_file_written_aside_and_renamed_is_taken(tmp_path: Path) -> None:
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    aside = tmp_path / ".layer-001.ply"
+    time.plan = [
+        (0.3, lambda: write_ply(make(1), aside)),
+        (1.5, lambda: aside.rename(tmp_path / "layer-001.ply")),
+    ]
+    assert np.array_equal(scanner.scan(ask(1)).points_mm, make(1).points_mm)
+    assert time.now_s >= 1.5
+
+
+def test_a_late_scan_of_an_earlier_layer_never_answers_for_a_later_one(tmp_path: Path) -> None:
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    time.plan = [
+        (0.5, lambda: write_ply(make(1), tmp_path / "layer-001.ply")),
+        (6.0, lambda: write_ply(make(2), tmp_path / "layer-002.ply")),
+    ]
+    with pytest.raises(ScannerError, match="earlier layer"):
+        scanner.scan(ask(2))
+    assert np.array_equal(scanner.scan(ask(2)).points_mm, make(2).points_mm)
+
+
+def test_a_file_that_goes_while_it_is_looked_at_is_no_error(tmp_path: Path) -> None:
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    gone, there = tmp_path / "a.ply", tmp_path / "b.ply"
+    time.plan = [
+        (0.1, lambda: write_ply(make(1), gone)),
+        (0.4, gone.unlink),
+        (1.0, lambda: write_ply(make(2), there)),
+    ]
+    assert np.array_equal(scanner.scan(ask(3)).points_mm, make(2).points_mm)
+
+
+def test_a_late_layer_does_not_answer_for_the_finished_part(tmp_path: Path) -> None:
+    # regression: a second file of the last layer looked at was taken for the finished part
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    write_ply(make(1), tmp_path / "layer-004-b.ply")
+    time.plan = [(2.0, lambda: write_ply(make(2), tmp_path / "end.ply"))]
+    assert np.array_equal(
+        scanner.scan(ScanRequest("final", None, 1.0)).points_mm, make(2).points_mm
+    )

@@ -1,0 +1,138 @@
+"""What `amrepair calibrate` does once its words are read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from amrepair.errors import InputError
+from amrepair.loop.calibrate import calibrate, target_solid, write_calibration
+from amrepair.scans import Scan, ScanRequest, WatchedFolderScanner, read_scan
+from amrepair.template import MeshSdf, PlannedSdf
+from amrepair.template.port import Template
+from gcode.check import CheckedProgram, check
+from gcode.cli import console
+from gcode.hosts import connect
+from gcode.hosts.journal import default_path
+from gcode.moves import Program
+from gcode.profiles import PrintSetup, load_setup
+from gcode.reader import read_job
+from gcode.slicing.job import plan_part
+from gcode.slicing.layers import mesh_of
+from gcode.writer import write
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where the scan comes from, and what stands there."""
+
+    port: str | None
+    scanner: str | None
+    scan: Path | None
+    job: Path | None
+    layer: int
+    timeout_s: float
+
+
+def write_target(path: Path, ids: tuple[str, str, str], *, as_json: bool) -> None:
+    """Only the target's G-code."""
+    setup = load_setup(*ids)
+    console.writable(path)
+    text = _target(setup).program.text
+    console.write_whole(path, lambda whole: whole.write_text(text, encoding="utf-8"))
+    if as_json:
+        console.show_json({"gcode": str(path)})
+    else:
+        console.out.print(f"{path}: print it, scan it, then --scan FILE.")
+
+
+def run(
+    output: Path,
+    ids: tuple[str, str, str],
+    source: Source,
+    *,
+    max_residual_mm: float,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Find the scanner and write the file."""
+    setup = load_setup(*ids)
+    bars = console.Bars()
+    console.writable(output)
+    with bars.shown():
+        standing = _standing(setup, source.job, source.layer)
+        cloud = _scan(setup, source, bars)
+        found = calibrate(
+            cloud, standing, max_residual_mm=max_residual_mm, rng=np.random.default_rng(seed)
+        )
+    about = {"printer": setup.printer.id, "scan": cloud.source}
+    write_calibration(output, found, about)
+    if as_json:
+        console.show_json({**found.to_json(), **about, "calibration": str(output), "seed": seed})
+        return
+    console.out.print(
+        f"{output}: the target lies {found.residual_mm:.3f} mm off where it should be (limit "
+        f"{max_residual_mm:g}), the bed {found.bed_mm:.3f} mm off a plane; the next best turn fits "
+        f"{found.runner_up:.1f} times worse."
+    )
+
+
+def _standing(setup: PrintSetup, job: Path | None, layer: int) -> Template:
+    """What stands on the bed, build frame."""
+    if job is None:
+        import trimesh
+
+        vertices, faces = mesh_of(target_solid(setup.printer))
+        return MeshSdf.from_mesh(trimesh.Trimesh(vertices, faces, process=False))
+    try:
+        text = job.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"the job {job} cannot be read ({error.strerror})") from error
+    made = read_job(
+        Program(text, setup.printer.dialect),
+        filament_diameter_mm=setup.printer.filament_diameter_mm,
+        dialect=setup.printer.dialect,
+    )
+    if layer >= len(made.layers):
+        raise InputError(f"--layer is {layer}; the job has layers 0 to {len(made.layers) - 1}")
+    beads = made.beads
+    done = (beads.layer >= 0) & (beads.layer <= layer)
+    return PlannedSdf.from_beads(
+        beads.start_mm[done], beads.end_mm[done], beads.section_mm2[done], beads.height_mm[done]
+    )
+
+
+def _target(setup: PrintSetup) -> CheckedProgram:
+    """The target's program."""
+    plan = plan_part(target_solid(setup.printer), setup)
+    return check(write(plan.toolpath, setup, title="calibration target"), setup)
+
+
+def _scan(setup: PrintSetup, source: Source, bars: console.Bars) -> Scan:
+    """The file, or what the scanner drops after the target was printed."""
+    port, scanner, scan = source.port, source.scanner, source.scan
+    if scan is not None:
+        if port is not None or scanner is not None:
+            raise InputError("--scan is a scan that there is; leave --port and --scanner out")
+        return read_scan(scan, frame="scanner")
+    if port is None or scanner is None or not scanner.startswith("watch:"):
+        raise InputError(
+            "give --port and --scanner watch:DIR to print and scan the target, or --scan FILE"
+        )
+    eye = WatchedFolderScanner(Path(scanner.removeprefix("watch:")), timeout_s=source.timeout_s)
+    checked = _target(setup)
+    machine = connect(
+        port,
+        dialect=setup.printer.dialect,
+        baud=setup.printer.baud,
+        journal=default_path(port),
+    )
+    machine.connect()
+    try:
+        machine.print(checked, progress=bars)
+        machine.finish_moves()
+        return eye.scan(ScanRequest("target", None, float(setup.process.layer_height_mm)))
+    finally:
+        machine.close()

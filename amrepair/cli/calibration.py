@@ -1,0 +1,79 @@
+"""`amrepair calibrate`: print a target, scan it, write where the scanner hangs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amrepair.cli.options import (
+    JsonOption,
+    MaterialOption,
+    PrinterOption,
+    ProcessOption,
+    SeedOption,
+)
+from gcode.cli import console
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(
+        "calibrate",
+        epilog=console.examples(
+            "amrepair calibrate --port /dev/ttyACM0 --scanner watch:scans -o calibration.json",
+            "amrepair calibrate --target-gcode target.gcode",
+            "amrepair calibrate --scan target.ply -o calibration.json",
+            "amrepair calibrate --scan layer.ply --job job.gcode --layer 0 --json",
+        ),
+    )(calibrate_command)
+
+
+def calibrate_command(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="File to write, for 'loop --calibration'.")
+    ] = Path("calibration.json"),
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
+    process: ProcessOption = DEFAULT_PROCESS,
+    port: Annotated[
+        str | None, typer.Option(help="Print the target there: device path, or a server's.")
+    ] = None,
+    scanner: Annotated[
+        str | None, typer.Option(help="watch:DIR: where the scan of the target will be dropped.")
+    ] = None,
+    scan: Annotated[
+        Path | None, typer.Option(help="Scan of a target, or layer, that stands there already.")
+    ] = None,
+    job: Annotated[
+        Path | None, typer.Option(help="The job whose layers stand there, instead of the target.")
+    ] = None,
+    layer: Annotated[
+        int, typer.Option(min=0, help="Last layer that stands there, counted from 0.")
+    ] = 0,
+    target_gcode: Annotated[
+        Path | None, typer.Option(help="Only write the target's G-code, to print it elsewhere.")
+    ] = None,
+    max_residual_mm: Annotated[
+        float, typer.Option(min=0.001, max=1.0, help="Refuse a calibration that is worse.")
+    ] = 0.15,
+    scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Find where the scanner hangs over the bed, from a printed target or a job's first layers."""
+    from amrepair.cli import calibrating
+
+    if target_gcode is not None:
+        calibrating.write_target(target_gcode, (printer, material, process), as_json=as_json)
+        return
+    calibrating.run(
+        output,
+        (printer, material, process),
+        calibrating.Source(port, scanner, scan, job, layer, scan_timeout_s),
+        max_residual_mm=max_residual_mm,
+        seed=seed,
+        as_json=as_json,
+    )

@@ -1,0 +1,316 @@
+"""What `amrepair loop` does once its words are read: begin or go on, print, tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from amrepair.cli.asking import ask_to_go_on, ask_to_print
+from amrepair.cli.live import NoView, ShownRun, live_view
+from amrepair.errors import InputError, LoopError
+from amrepair.frames import Transform
+from amrepair.loop import (
+    MAX_ITERATIONS,
+    LoopReport,
+    Stop,
+    Tape,
+    locate_part,
+    plan_stops,
+    run_loop,
+)
+from amrepair.loop.calibrate import read_calibration
+from amrepair.loop.limits import Limits
+from amrepair.loop.pick_up import pick_up_serial
+from amrepair.loop.setting import Setting, forget, keep, open_run
+from amrepair.loop.sites import sites
+from amrepair.loop.tape import read_events
+from amrepair.repair import Stopwatch
+from amrepair.report import report_of_loop, summary_of_result, write_report
+from amrepair.report.collect import loop_result
+from amrepair.report.folder import RunFolder
+from amrepair.scans import Scanner, WatchedFolderScanner
+from amrepair.template import open_template
+from amrepair.template.port import Template
+from gcode.check import CheckedProgram, check
+from gcode.cli import console
+from gcode.hosts import connect
+from gcode.hosts.journal import default_path
+from gcode.moves import Program
+from gcode.profiles import PrintSetup, load_setup
+from gcode.reader import Job, read_job
+
+SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
+
+
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """All that a run needs, new or gone on with."""
+
+    folder: RunFolder
+    setting: Setting
+    setup: PrintSetup
+    job: Job
+    checked: CheckedProgram
+    template: Template
+    stops: tuple[Stop, ...]
+    tape: Tape
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """Whether and where the run is shown."""
+
+    view: bool
+    host: str
+    port: int
+    token: str | None
+
+
+def run(
+    job_file: Path | None,
+    template: Path | None,
+    out: Path,
+    ids: tuple[str, str, str],
+    layers: list[int],
+    calibration: Path | None,
+    shown: Page,
+    *,
+    resume: Path | None,
+    pose_confirmed: bool,
+    port: str | None,
+    scanner: str | None,
+    approve: str | None,
+    as_json: bool,
+    **said: Any,
+) -> None:
+    """Run the loop from its beginning, or go on with a run.
+
+    `layers` is how often to stop and after which layers besides; `said` is the scan's time limit
+    and the seed.
+    """
+    watch, bars = Stopwatch(), console.Bars()
+    if resume is not None:
+        if job_file is not None:
+            raise InputError("--resume takes the job from the run's folder; leave JOB out")
+        begun = _gone_on_with(resume, port, scanner, approve)
+    else:
+        begun = _new_run(
+            _given(job_file, "JOB"),
+            _given(template, "--template"),
+            out,
+            ids,
+            layers,
+            calibration,
+            watch,
+            bars,
+            port=_given(port, "--port"),
+            scanner=_given(scanner, "--scanner"),
+            approve=approve or "ask",
+            **said,
+        )
+    ask = begun.setting.approve == "ask"
+    with live_view(
+        shown.view,
+        ask=ask,
+        title=begun.setting.title,
+        host=shown.host,
+        port=shown.port,
+        token=shown.token,
+    ) as page:
+        report = _print(
+            begun,
+            page,
+            watch,
+            bars,
+            view=shown.view,
+            going_on=resume is not None,
+            pose=pose_confirmed,
+        )
+    _tell(begun, report, watch, as_json=as_json)
+
+
+def _given(value: Any, name: str) -> Any:
+    if value is None:
+        raise InputError(f"{name} is missing; give it, or --resume RUN to go on with a run")
+    return value
+
+
+def _new_run(
+    job_file: Path,
+    template: Path,
+    out: Path,
+    ids: tuple[str, str, str],
+    layers: list[int],
+    calibration: Path | None,
+    watch: Stopwatch,
+    bars: console.Bars,
+    **said: Any,
+) -> _Begun:
+    """Read, check and write down what a run begins with."""
+    setup = load_setup(*ids)
+    pose = read_calibration(calibration)
+    _scanner(said["scanner"], pose, said["scan_timeout_s"])  # refused before any work
+    folder = RunFolder(out)
+    before = read_events(out)
+    if before and before[-1].get("event") != "end":
+        raise InputError(
+            f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume {out}') "
+            "or name another folder with --out"
+        )
+    job = _job(job_file, setup)
+    checked = check(job.program, setup)
+    every, *at = layers
+    regular = [*range(every - 1, len(job.layers) - 1, every)] if every else []
+    stops = plan_stops(job, [*regular, *at])
+    with watch("template"):
+        field = open_template(template, progress=bars)
+    with watch("locate"):
+        placed = locate_part(job, field, layer_height_mm=setup.process.layer_height_mm)
+    setting = Setting.of(
+        setup, ids, stops=stops, build_from_template=placed, build_from_scanner=pose,
+        by_beads=True, max_iterations=MAX_ITERATIONS, limited=said["approve"] == "auto",
+        title=job_file.name, **said,
+    )  # fmt: skip
+    forget(out)
+    keep(out, setting, job.program.text, field)
+    return _Begun(folder, setting, setup, job, checked, field, stops, Tape(out))
+
+
+def _gone_on_with(
+    folder: Path, port: str | None, scanner: str | None, approve: str | None
+) -> _Begun:
+    """Open a run's folder; what is said now counts more than what was said then."""
+    run = open_run(folder)
+    changes: dict[str, Any] = {"port": port, "scanner": scanner, "approve": approve}
+    setting = replace(run.setting, **{k: v for k, v in changes.items() if v is not None})
+    if not setting.port:
+        raise InputError(f"the run in {folder} was simulated; there is no printer to go on with")
+    tape = Tape(folder)
+    tape.reopen()
+    checked = check(run.job.program, run.setup)
+    return _Begun(
+        RunFolder(folder), setting, run.setup, run.job, checked, run.template, run.stops, tape
+    )
+
+
+def _print(
+    begun: _Begun,
+    page: NoView | ShownRun,
+    watch: Stopwatch,
+    bars: console.Bars,
+    *,
+    view: bool,
+    going_on: bool,
+    pose: bool,
+) -> LoopReport:
+    """Connect and run the loop."""
+    setting, setup, ask = begun.setting, begun.setup, begun.setting.approve == "ask"
+    machine = connect(
+        setting.port,
+        dialect=setup.printer.dialect,
+        baud=setup.printer.baud,
+        wire_log=begun.folder.file("wire.log"),
+        journal=default_path(setting.port),
+    )
+    pick_up = None
+    if going_on:
+        pick_up = pick_up_serial(
+            machine, release_c=setup.material.bed_release_c, pose_confirmed=pose
+        )
+    eye = _scanner(setting.scanner, setting.scanner_pose, setting.scan_timeout_s)
+    page.show_run(begun.job, _placed_solid(begun.template, setting.placed))
+    if not going_on:
+        machine.connect()
+    page.drives(machine.pause, machine.resume)
+    try:
+        with bars.shown():
+            return run_loop(
+                begun.job,
+                begun.checked,
+                machine,
+                eye,
+                sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads),
+                stops=begun.stops,
+                max_iterations=setting.max_iterations,
+                approve=(page.approve if view else ask_to_print) if ask else lambda plan: True,
+                ask=(page.ask_to_go_on if view else ask_to_go_on) if ask else None,
+                limits=Limits.of(setup.process) if setting.limited else None,
+                record=page.recording(begun.folder.record),
+                tape=begun.tape,
+                pick_up=pick_up,
+                silent_stops=SILENT_STOPS,
+                seed=setting.seed,
+                watch=watch,
+                progress=page.watching(bars),
+            )
+    finally:
+        machine.close()
+        begun.tape.close()
+
+
+def _tell(begun: _Begun, report: LoopReport, watch: Stopwatch, *, as_json: bool) -> None:
+    """Result, report, exit code."""
+    folder, setting, setup = begun.folder, begun.setting, begun.setup
+    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
+    printed = [look for look in report.looks if look.printed]
+    last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
+    result = loop_result(
+        report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
+    )
+    folder.write_json("result.json", result)
+    within = report.within_tolerance
+    data = report_of_loop(
+        report,
+        result,
+        title=f"Run: {setting.title}",
+        setup=setup,
+        about={"job": setting.title},
+        expected=_placed_solid(begun.template, setting.placed),
+    )
+    write_report(data, folder.file("report.html"))
+    if as_json:
+        console.show_json(result)
+    else:
+        for line in summary_of_result(result, within_tolerance=within):
+            console.out.print(line)
+        console.out.print(f"Report: {folder.file('report.html')}")
+    if report.stopped:
+        console.errors.print(
+            f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
+            f"amrepair loop --resume {folder.path} --approve ask",
+            markup=False,
+        )
+        raise typer.Exit(LoopError.exit_code)
+    if not within:
+        raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def _job(path: Path, setup: PrintSetup) -> Job:
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"the job {path} cannot be read ({error.strerror})") from error
+    return read_job(
+        Program(text, setup.printer.dialect),
+        filament_diameter_mm=setup.printer.filament_diameter_mm,
+        dialect=setup.printer.dialect,
+    )
+
+
+def _scanner(spec: str, pose: Transform, timeout_s: float) -> Scanner:
+    if not spec.startswith("watch:"):
+        raise InputError(
+            f"--scanner is {spec!r}; give watch:DIR (a simulated scanner belongs to "
+            "'amrepair simulate')"
+        )
+    folder = Path(spec.removeprefix("watch:"))
+    return WatchedFolderScanner(folder, build_from_scanner=pose, timeout_s=timeout_s)
+
+
+def _placed_solid(template: Template, placed: Transform) -> Any:
+    """The part as it should be, where it stands."""
+    solid: Any = template.solid()
+    return solid.transform(placed.matrix[:3])

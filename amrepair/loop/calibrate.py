@@ -1,0 +1,308 @@
+"""Where the scanner hangs over the bed: found once, written to a file, read by every run.
+
+The bed gives height and tilt, what was printed on it the rest: a target that looks like itself
+from one side alone, or the first layers of any job. Every turn about the vertical is tried.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.align.thinning import thin_out
+from amrepair.errors import AlignmentError, InputError
+from amrepair.frames import Transform, rotation_from_vector
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+from gcode.profiles import PrinterProfile
+
+RIGID = 1e-4
+"""A rotation's rows are orthonormal to this."""
+MAX_RESIDUAL_MM = 0.15
+"""Beyond it the refinement of every scan may start from the wrong place."""
+TARGET_MM = 1.0
+TURNS = 90
+TRIED_POINTS, FIT_POINTS, FIT_STEPS = 1_000, 10_000, 24
+PLANE_TRIES, PLANE_MM, LEAST_BED = 200, 0.15, 0.2
+CAP_MM = 3.0
+SAME_FIT = 1.25
+"""Another turn that fits within this factor may as well be the true one."""
+LEAST_APART_RAD = float(np.deg2rad(20.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A scanner's pose, and how well it is known.
+
+    Attributes
+    ----------
+    residual_mm
+        Root mean square distance of the target's points from where they should be.
+    bed_mm
+        The same of the bed's points from a plane: noise, and how flat the bed is.
+    runner_up
+        How many times worse the next best turn fits.
+    """
+
+    build_from_scanner: Transform
+    residual_mm: float
+    bed_mm: float
+    runner_up: float
+    points: int
+
+    def to_json(self) -> dict[str, Any]:
+        """As it stands in the file."""
+        return {
+            "build_from_scanner": self.build_from_scanner.matrix.tolist(),
+            "residual_mm": round(self.residual_mm, 5),
+            "bed_mm": round(self.bed_mm, 5),
+            "runner_up": round(self.runner_up, 3),
+            "points": self.points,
+        }
+
+
+def target_solid(printer: PrinterProfile) -> manifold3d.Manifold:
+    """The printed target, build frame: an angle with unlike arms and a square off its end.
+
+    Large, so that a turn shows; low, so that it is printed in minutes.
+    """
+    x, y = printer.bed_size_mm
+    long_mm, short_mm = 0.45 * x, 0.3 * y
+    corner = (0.275 * x, 0.3 * y)
+    arms = manifold3d.Manifold.cube((long_mm, 8.0, TARGET_MM)).translate((*corner, 0.0))
+    arms += manifold3d.Manifold.cube((8.0, short_mm, TARGET_MM)).translate((*corner, 0.0))
+    square = manifold3d.Manifold.cube((14.0, 14.0, TARGET_MM))
+    return arms + square.translate((corner[0] + 0.7 * long_mm, corner[1] + 0.7 * short_mm, 0.0))
+
+
+def calibrate(
+    scan: Scan,
+    standing: Template,
+    *,
+    max_residual_mm: float = MAX_RESIDUAL_MM,
+    rng: np.random.Generator | None = None,
+) -> Calibration:
+    """Find the scanner's pose from a scan of the bed and of what stands on it.
+
+    Parameters
+    ----------
+    scan
+        In the scanner's own frame, whatever that is; the bed must be seen.
+    standing
+        What stands there, build frame.
+
+    Raises
+    ------
+    AlignmentError
+        If there is no bed, nothing on it, another turn fits as well, or the residual is too large.
+    """
+    rng = rng or np.random.default_rng(0)
+    level, bed_mm = _level(scan, rng)
+    flat = level.apply(scan.points_mm)
+    top_mm = float(standing.bounds_mm[1, 2])
+    above = (flat[:, 2] > min(0.5 * top_mm, top_mm - 3 * bed_mm)) & (flat[:, 2] < 2 * top_mm + 1)
+    if above.sum() < 200:
+        raise AlignmentError(
+            f"the scan {scan.source} has {int(above.sum())} points above the bed, at least 200 are "
+            "needed; is the target there, and is the bed seen around it?"
+        )
+    centre = _middle(standing)
+    tried = thin_out(flat[above], TRIED_POINTS, rng)
+    turns = [_turned(angle, tried, centre) for angle in np.arange(TURNS) * 2 * np.pi / TURNS]
+    cost = np.array([_cost(standing, turn, tried) for turn in turns])
+    near = np.abs(flat[:, 2]) < top_mm + 1.0
+    cloud = thin_out(scan.points_mm[near & _around(flat, flat[above])], FIT_POINTS, rng)
+    limit_mm = max(0.1, 3 * scan.sigma_mm)
+    fits: list[tuple[float, Transform]] = []
+    for k in np.argsort(cost)[:12]:
+        if any(_apart(turns[k] @ level, other) < LEAST_APART_RAD for _, other in fits):
+            continue
+        pose = _fit(cloud, standing, turns[k] @ level, limit_mm)
+        fits.append((_residual(standing, pose, cloud), pose))
+    fits.sort(key=lambda fit: fit[0])
+    residual_mm, pose = fits[0]
+    others = [mm for mm, other in fits[1:] if _apart(pose, other) >= LEAST_APART_RAD]
+    runner_up = min(others, default=np.inf) / max(residual_mm, 1e-6)
+    if residual_mm > max_residual_mm:
+        raise AlignmentError(
+            f"the target lies {residual_mm:.3f} mm off where it should be (root mean square), the "
+            f"limit is {max_residual_mm:g} mm; clean the bed, let the printer finish, scan again"
+        )
+    if runner_up < SAME_FIT:
+        raise AlignmentError(
+            f"another turn of the scan fits nearly as well ({runner_up:.2f} times the residual, at "
+            f"least {SAME_FIT:g} is needed); use a target that looks like itself from one side only"
+        )
+    return Calibration(pose, residual_mm, bed_mm, float(min(runner_up, 1e3)), len(cloud))
+
+
+def write_calibration(
+    path: Path, found: Calibration, about: Mapping[str, str] | None = None
+) -> None:
+    """Write the file that `loop` reads, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.new")
+    try:
+        temporary.write_text(json.dumps({**found.to_json(), **(about or {})}, indent=2) + "\n")
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"the calibration {path} cannot be written ({error.strerror})") from error
+
+
+def _level(scan: Scan, rng: np.random.Generator) -> tuple[Transform, float]:
+    """The bed as the plane of most points, up where the sensors or fewer points are."""
+    points = thin_out(scan.points_mm, FIT_POINTS, rng)
+    limit_mm = max(PLANE_MM, 3 * scan.sigma_mm)
+    best: tuple[int, Float[np.ndarray, " 3"], float] = (0, np.array([0.0, 0.0, 1.0]), 0.0)
+    for _ in range(PLANE_TRIES):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        size = float(np.linalg.norm(normal))
+        if size < 1e-6:
+            continue
+        normal = normal / size
+        count = int((np.abs((points - a) @ normal) < limit_mm).sum())
+        if count > best[0]:
+            best = (count, normal, float(a @ normal))
+    count, normal, offset = best
+    if count < LEAST_BED * len(points):
+        raise AlignmentError(
+            f"no plane holds {LEAST_BED:.0%} of the points of {scan.source} (the best {count} of "
+            f"{len(points)}); the bed must be seen around the target"
+        )
+    for limit in (limit_mm, limit_mm, 0.7 * limit_mm):
+        on = points[np.abs(points @ normal - offset) < limit]
+        middle = on.mean(axis=0)
+        _, _, axes = np.linalg.svd(on - middle, full_matrices=False)
+        normal, offset = axes[2], float(middle @ axes[2])
+    distance = points @ normal - offset
+    if scan.sensors_mm is not None:
+        up = float(np.median(scan.sensors_mm @ normal - offset)) > 0
+    else:
+        up = int((distance > 2 * limit_mm).sum()) > int((distance < -2 * limit_mm).sum())
+    if not up:
+        normal, offset = -normal, -offset
+    side = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    rotation = np.stack([side, np.cross(normal, side), normal])
+    level = Transform.from_rotation_translation(
+        "level", "scanner", rotation=rotation, translation_mm=np.array([0.0, 0.0, -offset])
+    )
+    return level, float(np.sqrt(((on @ axes[2] - middle @ axes[2]) ** 2).mean()))
+
+
+def _middle(standing: Template) -> Float[np.ndarray, " 3"]:
+    """The mean of what a scanner above would see of the target's top."""
+    points, normals = standing.surface_points(1.0)
+    top = points[normals[:, 2] > 0.7]
+    return np.asarray(top.mean(axis=0))
+
+
+def _turned(
+    angle_rad: float, points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"]
+) -> Transform:
+    """Build from level: turned about the vertical, the middle of the points on the target's."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    shift = centre - rotation @ points.mean(axis=0)
+    shift[2] = 0.0
+    return Transform.from_rotation_translation(
+        "build", "level", rotation=rotation, translation_mm=shift
+    )
+
+
+def _cost(standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"]) -> float:
+    distance = standing.distance(pose.apply(points))
+    return float(np.minimum(np.abs(distance), CAP_MM).mean())
+
+
+def _around(flat: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Any:  # (n,) bool
+    """Points within the target's box and a margin: the far bed tells no more than the near."""
+    low, high = target[:, :2].min(axis=0) - 5.0, target[:, :2].max(axis=0) + 5.0
+    return ((flat[:, :2] >= low) & (flat[:, :2] <= high)).all(axis=1)
+
+
+def _field(
+    standing: Template, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Signed distance, and gradient, from target and bed together: whichever is nearer."""
+    f_mm, gradient = standing.distance_and_gradient(points)
+    bed = points[:, 2] < f_mm
+    return (
+        np.where(bed, points[:, 2], f_mm),
+        np.where(bed[:, None], np.array([0.0, 0.0, 1.0]), gradient),
+    )
+
+
+def _fit(
+    points: Float[np.ndarray, "n 3"], standing: Template, guess: Transform, limit_mm: float
+) -> Transform:
+    """Gauss-Newton on the field of target and bed, its robust scale falling to `limit_mm`."""
+    pose = guess
+    for scale_mm in np.geomspace(2.0, limit_mm, FIT_STEPS):
+        placed = pose.apply(points)
+        f_mm, gradient = _field(standing, placed)
+        weight = 1.0 / (1.0 + (f_mm / scale_mm) ** 2) ** 2
+        centre = placed.mean(axis=0)
+        jacobian = np.concatenate([np.cross(placed - centre, gradient), gradient], axis=1)
+        normal = jacobian.T @ (weight[:, None] * jacobian) + 1e-6 * np.eye(6)
+        step = -np.linalg.solve(normal, jacobian.T @ (weight * f_mm))
+        turn = rotation_from_vector(step[:3])
+        moved = Transform.from_rotation_translation(
+            "build", "build", rotation=turn, translation_mm=step[3:] + centre - turn @ centre
+        )
+        pose = moved @ pose
+    return pose
+
+
+def _residual(standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"]) -> float:
+    """Root mean square distance of the points from the target or the bed, whichever is nearer."""
+    placed = pose.apply(points)
+    off = np.minimum(np.abs(standing.distance(placed)), np.abs(placed[:, 2]))
+    return float(np.sqrt((np.minimum(off, CAP_MM) ** 2).mean()))
+
+
+def _apart(a: Transform, b: Transform) -> float:
+    """Angle between two poses, rad."""
+    cosine = (np.trace((a.matrix @ np.linalg.inv(b.matrix))[:3, :3]) - 1.0) / 2.0
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def read_calibration(path: Path | None) -> Transform:
+    """The pose of a scanner: build from scanner; identity where there is no file.
+
+    Raises
+    ------
+    InputError
+        If the file holds none.
+    """
+    if path is None:
+        return Transform.identity("build", "scanner")
+    try:
+        matrix = np.array(json.loads(path.read_text())["build_from_scanner"], float)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"the calibration {path} cannot be read ({error}); it is a JSON object with "
+            "build_from_scanner, a 4×4 matrix"
+        ) from error
+    if matrix.shape != (4, 4):
+        raise InputError(f"the calibration {path} holds {matrix.shape}, not 4×4")
+    turn = matrix[:3, :3]
+    if not (np.abs(turn @ turn.T - np.eye(3)).max() < RIGID and np.linalg.det(turn) > 0):
+        raise InputError(
+            f"the calibration {path} is no rigid motion: its rotation stretches or mirrors; "
+            "calibrate again"
+        )
+    return Transform("build", "scanner", matrix)

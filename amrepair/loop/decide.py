@@ -1,0 +1,362 @@
+"""Decisions as a table: what is done about a finding, and what then happens at the stop.
+
+Both tables are data: rows with conditions and a reason, the first that fits counts. The page
+`docs/explanation/decisions.md` is made from them, and a test holds it to that. Facts come from
+`findings`; nothing is measured, printed or asked here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+from amrepair.detect.anomaly import DefectType
+from amrepair.repair import EXCESS_LAYERS, MIN_REPAIR_MM3
+
+
+class Action(StrEnum):
+    """What can be decided, the gravest first."""
+
+    STOP = "stop"
+    PAUSE = "pause and ask"
+    LOOK_AGAIN = "look again"
+    FILL_NOW = "fill now"
+    FILL_WITH_NEXT = "fill with the next layer"
+    LOWER_NEXT = "lower the next layer's flow"
+    GO_ON = "go on"
+
+
+class Cover(StrEnum):
+    """What the job lays over a place in its next layer."""
+
+    NOTHING = "nothing"
+    OPEN = "open infill"
+    SOLID = "solid beads"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One region, as far as the table looks at it.
+
+    Attributes
+    ----------
+    kind
+        `missing` or `excess`.
+    confidence
+        That it is there and is of that type, 0 to 1.
+    thickness_layers, height_layers
+        Mean thickness, and from lowest to highest point, in layers of the job.
+    reachable_ratio
+        Share that the nozzle reaches; 1 where nobody has asked yet.
+    hit_mm
+        How deep the head would run into it on the job's next moves; 0 if it clears it.
+    box_mm
+        Lowest and highest corner, build frame.
+    """
+
+    kind: str
+    type: DefectType
+    confidence: float
+    volume_mm3: float
+    thickness_layers: float
+    height_layers: float
+    reachable_ratio: float
+    cover: Cover
+    hit_mm: float
+    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]]
+    seen_twice: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What the second table looks at, beside the findings' own decisions.
+
+    Attributes
+    ----------
+    gravest
+        The gravest decision of a finding; `fill now` counts only as long as it is worth another
+        pass.
+    seen_twice
+        This stop was looked at again already, nothing printed between.
+    refused
+        The checker refuses the patch, or nothing of it is left to print.
+    last_pass, stuck, little_left
+        Why another pass would not help.
+    beyond
+        A limit of the profile that the repair would exceed, where nobody is asked; else empty.
+    """
+
+    gravest: Action
+    seen_twice: bool = False
+    refused: bool = False
+    last_pass: bool = False
+    stuck: bool = False
+    little_left: bool = False
+    beyond: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One fact compared with one value."""
+
+    fact: str
+    test: str
+    value: Any
+
+    def fits(self, facts: Finding | Situation) -> bool:
+        """Whether it holds."""
+        found = getattr(facts, self.fact)
+        if self.test == "is":
+            return bool(found == self.value)
+        if self.test == "in":
+            return found in self.value
+        if self.test == "stated":
+            return bool(found)
+        return bool(found >= self.value) if self.test == "≥" else bool(found < self.value)
+
+    def __str__(self) -> str:
+        if self.test == "stated":
+            return self._name()
+        if isinstance(self.value, bool):
+            return self._name() if self.value else f"not {self._name()}"
+        if self.test == "in":
+            return f"{self._name()} is {' or '.join(str(v) for v in self.value)}"
+        value = f"{self.value:g}" if isinstance(self.value, float) else str(self.value)
+        return f"{self._name()} {self.test} {value}{_UNITS.get(self.fact, '')}"
+
+    def _name(self) -> str:
+        return _NAMES.get(self.fact, self.fact)
+
+
+_NAMES = {
+    "thickness_layers": "mean thickness",
+    "height_layers": "height",
+    "volume_mm3": "volume",
+    "reachable_ratio": "share in reach",
+    "cover": "covered next by",
+    "hit_mm": "in the head's way by",
+    "seen_twice": "looked at twice",
+    "last_pass": "it was the last pass allowed",
+    "stuck": "the last pass changed little",
+    "little_left": "little is left",
+    "refused": "nothing of the patch may be printed",
+    "gravest": "gravest",
+    "beyond": "beyond a limit for printing unasked",
+}
+_UNITS = {
+    "thickness_layers": " layers",
+    "height_layers": " layers",
+    "volume_mm3": " mm³",
+    "hit_mm": " mm",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of a table."""
+
+    id: str
+    action: Action
+    when: tuple[Condition, ...]
+    reason: str
+
+    def fits(self, facts: Finding | Situation) -> bool:
+        """Whether all its conditions hold."""
+        return all(condition.fits(facts) for condition in self.when)
+
+
+SURE = 0.9
+"""Confidence from which a run is ended without asking first."""
+DOUBTFUL = 0.25
+"""Confidence below which another look is taken."""
+THIN_LAYERS = 0.75
+"""A bead laid into less than this has no room under the nozzle."""
+ONE_LAYER = 1.75
+"""What is lower than this, noise and all, lies within one layer."""
+LEAST_LAYERS = 0.2
+"""Less than this is within what a layer's beads differ by themselves."""
+ENDS = (DefectType.DETACHED, DefectType.LAYER_SHIFT)
+BEYOND_MENDING = (*ENDS, DefectType.WARP, DefectType.CLOG)
+"""What adding material cannot mend."""
+
+
+def _is(fact: str, value: object) -> Condition:
+    return Condition(fact, "in" if isinstance(value, tuple) else "is", value)
+
+
+def _from(fact: str, value: float) -> Condition:
+    return Condition(fact, "≥", value)
+
+
+def _below(fact: str, value: float) -> Condition:
+    return Condition(fact, "<", value)
+
+
+_MISSING, _EXCESS = _is("kind", "missing"), _is("kind", "excess")
+
+FINDINGS: tuple[Row, ...] = (
+    Row("F1", Action.STOP, (_is("type", ENDS), _from("confidence", SURE)),
+        "what is printed from here on would land beside the part"),
+    Row("F2", Action.LOOK_AGAIN, (_is("type", BEYOND_MENDING), _below("confidence", SURE),
+                                  _is("seen_twice", False)),
+        "a false alarm would cost the print"),
+    Row("F3", Action.PAUSE, (_is("type", BEYOND_MENDING),),
+        "adding material cannot mend it; somebody has to look"),
+    Row("F4", Action.PAUSE, (_EXCESS, _from("hit_mm", 1e-6)),
+        "the head would hit it on its next moves; cut it off, or end the print"),
+    Row("F5", Action.GO_ON, (_EXCESS, _is("type", (DefectType.STRING,))),
+        "strings come off by hand, and the nozzle melts through them"),
+    Row("F6", Action.LOWER_NEXT, (_EXCESS, _from("volume_mm3", MIN_REPAIR_MM3),
+                                  _from("thickness_layers", LEAST_LAYERS),
+                                  _below("thickness_layers", EXCESS_LAYERS),
+                                  _is("cover", (Cover.SOLID, Cover.OPEN))),
+        "the next layer's beads have less room there"),
+    Row("F7", Action.GO_ON, (_EXCESS,),
+        "printing cannot take excess away"),
+    Row("F8", Action.GO_ON, (_MISSING, _below("volume_mm3", MIN_REPAIR_MM3)),
+        "smaller than is worth a stop of the print"),
+    Row("F9", Action.LOOK_AGAIN, (_MISSING, _below("confidence", DOUBTFUL),
+                                  _is("seen_twice", False)),
+        "it hardly stands out from the noise"),
+    Row("F10", Action.GO_ON, (_MISSING, _below("confidence", DOUBTFUL)),
+        "two looks do not make it stand out from the noise"),
+    Row("F11", Action.FILL_WITH_NEXT, (_MISSING, _below("thickness_layers", THIN_LAYERS),
+                                       _from("thickness_layers", LEAST_LAYERS),
+                                       _below("height_layers", ONE_LAYER),
+                                       _is("cover", Cover.SOLID)),
+        "thinner than a bead of its own; the next layer's beads can carry it"),
+    Row("F12", Action.FILL_WITH_NEXT, (_MISSING, _below("reachable_ratio", 0.05),
+                                       _below("height_layers", ONE_LAYER),
+                                       _is("cover", Cover.SOLID)),
+        "the nozzle cannot get down to it, and the next layer's beads can carry it"),
+    Row("F13", Action.GO_ON, (_MISSING, _below("reachable_ratio", 0.05)),
+        "nothing of it can be reached"),
+    Row("F14", Action.FILL_NOW, (_MISSING,),
+        "a bead fits, and the nozzle reaches it"),
+)  # fmt: skip
+"""What is done about one finding."""
+
+_FILL = _is("gravest", Action.FILL_NOW)
+STOPS: tuple[Row, ...] = (
+    Row("S1", Action.STOP, (_is("gravest", Action.STOP),),
+        "a finding ends the run: parked, heaters off"),
+    Row("S2", Action.PAUSE, (_is("gravest", Action.PAUSE),),
+        "a finding needs somebody's word; where nobody can be asked, the run ends parked"),
+    Row("S3", Action.LOOK_AGAIN, (_is("gravest", Action.LOOK_AGAIN), _is("seen_twice", False)),
+        "another scan, nothing moved between"),
+    Row("S4", Action.GO_ON, (_FILL, _is("little_left", True)),
+        "what is left is a small share of what was found; more passes would only add rims"),
+    Row("S5", Action.GO_ON, (_FILL, _is("stuck", True)),
+        "the last pass left most of what it found: it has met something else than a defect"),
+    Row("S6", Action.GO_ON, (_FILL, _is("last_pass", True)),
+        "as many passes as are allowed have been made"),
+    Row("S7", Action.GO_ON, (_FILL, _is("refused", True)),
+        "the checker refuses the patch, or the nozzle reaches nothing of it"),
+    Row("S8", Action.PAUSE, (_FILL, Condition("beyond", "stated", None)),
+        "larger than the profile lets be printed unasked"),
+    Row("S9", Action.FILL_NOW, (_FILL,),
+        "the patch has passed the checker"),
+    Row("S10", Action.FILL_WITH_NEXT, (_is("gravest", Action.FILL_WITH_NEXT),),
+        "the job's next layer is rewritten, bead by bead"),
+    Row("S11", Action.LOWER_NEXT, (_is("gravest", Action.LOWER_NEXT),),
+        "the job's next layer is rewritten, bead by bead"),
+    Row("S12", Action.GO_ON, (),
+        "nothing is left to decide"),
+)  # fmt: skip
+"""What happens at the stop."""
+
+_GRAVITY = tuple(Action)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the table says of one finding."""
+
+    finding: Finding
+    action: Action
+    row: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What was decided at a look, with all that it rests on."""
+
+    action: Action
+    row: str
+    reason: str
+    situation: Situation
+    verdicts: tuple[Verdict, ...]
+
+    @property
+    def changes_next(self) -> tuple[Verdict, ...]:
+        """Findings that the next layer's flow is to carry, once the stop is left."""
+        wanted = {Action.FILL_WITH_NEXT, Action.LOWER_NEXT}
+        return tuple(verdict for verdict in self.verdicts if verdict.action in wanted)
+
+    def to_json(self) -> dict[str, Any]:
+        """As it stands in the run's record."""
+        return {
+            "action": str(self.action),
+            "row": self.row,
+            "reason": self.reason,
+            "situation": {k: _plain(v) for k, v in asdict(self.situation).items()},
+            "findings": [
+                {**{k: _plain(v) for k, v in asdict(verdict.finding).items()},
+                 "action": str(verdict.action), "row": verdict.row, "reason": verdict.reason}
+                for verdict in self.verdicts
+            ],
+        }  # fmt: skip
+
+
+def judge(finding: Finding) -> Verdict:
+    """The first row that fits a finding."""
+    row = next(row for row in FINDINGS if row.fits(finding))
+    return Verdict(finding, row.action, row.id, row.reason)
+
+
+def gravest(verdicts: Sequence[Verdict]) -> Action:
+    """The gravest of some decisions; `go on` where there are none."""
+    return min((v.action for v in verdicts), key=_GRAVITY.index, default=Action.GO_ON)
+
+
+def decide(verdicts: Sequence[Verdict], situation: Situation) -> Decision:
+    """What happens at the stop.
+
+    A patch that is not to be printed does not hide what else was found: then the next gravest
+    counts.
+    """
+    row = next(row for row in STOPS if row.fits(situation))
+    if situation.gravest is Action.FILL_NOW and row.action is Action.GO_ON:
+        rest = gravest([v for v in verdicts if v.action is not Action.FILL_NOW])
+        if rest is not Action.GO_ON:
+            also = next(other for other in STOPS if other.when == (_is("gravest", rest),))
+            return Decision(
+                also.action, f"{row.id}, {also.id}", f"{row.reason}; {also.reason}",
+                situation, tuple(verdicts),
+            )  # fmt: skip
+    return Decision(row.action, row.id, row.reason, situation, tuple(verdicts))
+
+
+def tables() -> str:
+    """Both tables as they stand in the documentation."""
+    parts = []
+    for title, rows in (("What is done about a finding", FINDINGS), ("At the stop", STOPS)):
+        lines = [f"### {title}", "", "| row | when | decision | because |", "|---|---|---|---|"]
+        for row in rows:
+            when = ", ".join(str(condition) for condition in row.when) or "otherwise"
+            lines.append(f"| {row.id} | {when} | {row.action} | {row.reason} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, StrEnum):
+        return str(value)
+    if isinstance(value, float):
+        return round(value, 6)
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value

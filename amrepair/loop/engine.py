@@ -1,0 +1,339 @@
+"""One run, step by step: the job, the stops, the looks, the wire.
+
+`run` has the loop over the stops; here is what happens at each. Everything is on the tape before
+it is done, and what the tape has is not done again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from amrepair.errors import AlignmentError, LoopError, ScannerError
+from amrepair.frames import Transform
+from amrepair.loop import travel
+from amrepair.loop.decide import Action, Decision
+from amrepair.loop.findings import early_action
+from amrepair.loop.kinds import typed
+from amrepair.loop.limits import Limits
+from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
+from amrepair.loop.next_layer import rewritten_layer
+from amrepair.loop.situation import decide_look
+from amrepair.loop.tape import Sent, Tape, TapeEndsError, report_from_json, report_to_json
+from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
+from amrepair.scans import Scanner, ScanRequest
+from gcode.check import CheckedProgram
+from gcode.errors import GcodeError
+from gcode.hosts.port import Printer, PrintReport
+from gcode.moves import ModalState
+from gcode.progress import Progress, silent
+from gcode.reader import Job
+
+PickUp = Callable[[Sequence[Sent]], PrintReport | None]
+"""Finds out where the printer is, and has it finish what it was sent last."""
+
+
+class Run:
+    """One run: what was sent, seen and decided so far."""
+
+    def __init__(
+        self,
+        job: Job,
+        checked: CheckedProgram,
+        printer: Printer,
+        scanner: Scanner,
+        site_at: Callable[[Stop], Site],
+        *,
+        max_iterations: int,
+        approve: Callable[[RepairPlan], bool],
+        ask: Callable[[Decision], bool] | None,
+        limits: Limits | None,
+        record: Callable[[Look], None],
+        tape: Tape,
+        pick_up: PickUp | None,
+        silent_stops: int,
+        seed: int,
+        watch: Stopwatch,
+        progress: Progress,
+    ) -> None:
+        self._job, self._checked, self._printer, self._scanner = job, checked, printer, scanner
+        self._site_at, self._max_iterations = site_at, max_iterations
+        self._approve, self._ask, self._limits, self._record = approve, ask, limits, record
+        self._tape, self._pick_up, self._seed = tape, pick_up, seed
+        self._watch, self._progress = watch, progress
+        self._sent: list[Sent] = []
+        self._next_line = 0
+        self._looks: list[Look] = []
+        self._job_prints: list[PrintReport] = []
+        self._repair_prints: list[PrintReport] = []
+        self._stopped = ""
+        self._silent_stops, self._silent = silent_stops, 0
+        self._passed: list[Stop] = []
+
+    def report(self) -> LoopReport:
+        """What became of it so far."""
+        return LoopReport(
+            tuple(self._looks),
+            tuple(self._job_prints),
+            tuple(self._repair_prints),
+            self._stopped,
+            tuple(self._passed),
+        )
+
+    # ------------------------------------------------------------------ the job
+
+    def print_job(self, end: int) -> None:
+        """Print the job's lines up to `end`, and wait until the nozzle rests."""
+        first, lines = self._next_line, self._checked.program.text.count("\n")
+        if first >= end:
+            return
+
+        def whole_job(stage: str, done: float, total: float) -> None:
+            """The link tells of this part; people want to know of the job."""
+            self._progress("print", float(first) + done, float(lines))
+
+        with self._watch("print"):
+            report = self._send("job", self._checked, first, end, whole_job)
+        if report is not None:
+            self._job_prints.append(report)
+            if not report.ok:
+                raise LoopError(
+                    f"the job was stopped at line {report.next_line + 1} of {lines}; heaters are "
+                    "off"
+                )
+        self._next_line = end
+
+    def end(self) -> None:
+        """The last word on the tape."""
+        if not self._tape.only_read and not (self._tape.peek() and self._tape.next("end")):
+            if self._stopped:
+                self._go_live()
+                with contextlib.suppress(GcodeError, OSError):
+                    self._printer.heaters_off()
+            self._tape.write("end", stopped=self._stopped)
+
+    # ------------------------------------------------------------------ a stop
+
+    def at(self, stop: Stop) -> bool:
+        """Look, decide, repair, until there is nothing more to do; whether the job goes on."""
+        if self._tape.only_read:
+            return self._again(stop)
+        state = self._job.state_after(stop.line)
+        site = self._site_at(stop)
+        with self._watch("print"):
+            program, parked = travel.park(site.setup, state)
+            self._send("park", program)
+        while True:
+            look = self._try_to_look(stop, site, parked)
+            if look is None:
+                if self._stopped:
+                    return False
+                break
+            action = look.decision.action
+            if look.printed and look.plan.checked is not None:
+                with self._watch("repair"):
+                    report = self._send("repair", look.plan.checked)
+                    if report is not None:
+                        self._repair_prints.append(report)
+            elif action is Action.STOP or (action is Action.PAUSE and look.declined):
+                self._stopped = _why(look.decision)
+                return False
+            elif action is not Action.LOOK_AGAIN:
+                break
+        with self._watch("print"):
+            for program in travel.way_back(site.setup, state, parked):
+                self._send("back", program)
+            if look is not None:
+                self._change_next(stop, site, look)
+        return True
+
+    def _again(self, stop: Stop) -> bool:
+        """Look at the recorded scans of a stop, however it is decided now."""
+        if self._tape.live:
+            raise TapeEndsError("the record ends here")
+        site = self._site_at(stop)
+        _, parked = travel.park(site.setup, self._job.state_after(stop.line))
+        while self._tape.next_stop() == stop.label:
+            self._try_to_look(stop, site, parked)
+        return True
+
+    def _change_next(self, stop: Stop, site: Site, look: Look) -> None:
+        """Print the next layer with its flow changed, where that was decided."""
+        if not look.decision.changes_next or stop.layer_index is None:
+            return
+        changed = rewritten_layer(
+            self._job, site.setup, stop.layer_index + 1, look.plan, look.decision.changes_next
+        )
+        if changed is None:
+            return
+        report = self._send("next layer", changed.checked)
+        if report is not None:
+            self._job_prints.append(report)
+        self._next_line = changed.end_line
+
+    def _try_to_look(self, stop: Stop, site: Site, parked: ModalState) -> Look | None:
+        """A look; None where the scanner is silent, or (with `_stopped`) nothing fits the part."""
+        for attempt in (1, 2):
+            if self._tape.peek() == "no_look":
+                taped = self._tape.next("no_look") or {}
+                outcome, why = str(taped["outcome"]), str(taped["why"])
+            else:
+                try:
+                    look = self._look(stop, site, parked)
+                except ScannerError as error:
+                    if self._silent >= self._silent_stops:
+                        raise
+                    outcome, why = "pass by", str(error)
+                except AlignmentError as error:
+                    outcome, why = ("again" if attempt == 1 else "stop"), str(error)
+                else:
+                    self._silent = 0
+                    return look
+                self._tape.write("no_look", stop=stop.label, outcome=outcome, why=why)
+            if outcome == "pass by":
+                self._silent += 1
+                self._passed.append(stop)
+                return None
+        self._stopped = f"stop: twice the scan did not fit the part: {why}"
+        return None
+
+    def _look(self, stop: Stop, site: Site, parked: ModalState) -> Look:
+        """Scan, plan, decide; what is to be printed is on the tape when this returns."""
+        number, here = len(self._looks) + 1, [k for k in self._looks if k.stop == stop]
+        taped = self._tape.next("look")
+        if taped is None:
+            self._go_live()
+        with self._watch("scan"):
+            self._progress(f"scan {stop.label}", 0.0, 1.0)
+            request = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
+            scan = (
+                as_recorded(self._scanner.scan(request))
+                if taped is None
+                else self._tape.scan(number, str(taped["frame"]))
+            )
+            self._progress(f"scan {stop.label}", 1.0, 1.0)
+        passes = sum(look.printed for look in here)
+        again = bool(here) and not here[-1].printed
+        plan = plan_repair(
+            scan,
+            site,
+            title=f"repair of {stop.label}, pass {passes + 1}",
+            guess=_guess(site, self._scanner),
+            interruption=parked,
+            strict=False,
+            wanted=lambda region: (
+                early_action(region, self._job, site.setup, stop.layer_index)
+                is not Action.FILL_WITH_NEXT
+            ),
+            rng=np.random.default_rng([self._seed, number]),
+            watch=self._watch,
+            progress=self._progress,
+        )
+        with self._watch("decide"):
+            plan = typed(plan, self._job, site, stop.line, self._scanner.build_from_scanner)
+            decision = decide_look(
+                plan,
+                self._job,
+                site,
+                stop,
+                here,
+                seen_twice=again,
+                max_iterations=self._max_iterations,
+                limits=self._limits,
+            )
+        look = self._outcome(Look(number, stop, scan, plan, decision, printed=False), taped)
+        self._looks.append(look)
+        if taped is None:
+            self._record(look)
+            self._tape.write("look", **look_to_json(look))
+        return look
+
+    def _outcome(self, look: Look, taped: dict[str, object] | None) -> Look:
+        """Ask whoever is to be asked; a taped look was answered then."""
+        if taped is not None:
+            return replace(look, printed=bool(taped["printed"]), declined=bool(taped["declined"]))
+        action = look.decision.action
+        if action is Action.FILL_NOW:
+            granted = self._approve(look.plan)
+            return replace(look, printed=granted, declined=not granted)
+        if action is Action.PAUSE:
+            if self._ask is None or not self._ask(look.decision):
+                return replace(look, declined=True)
+            fills = [v for v in look.decision.verdicts if v.action is Action.FILL_NOW]
+            situation = look.decision.situation
+            if fills and not (situation.refused or situation.last_pass or situation.stuck):
+                return replace(look, printed=self._approve(look.plan))
+        return look
+
+    # ------------------------------------------------------------------ the wire
+
+    def _send(
+        self,
+        kind: str,
+        checked: CheckedProgram,
+        first: int = 0,
+        end: int | None = None,
+        progress: Progress = silent,
+    ) -> PrintReport | None:
+        """Send a program, or find on the tape that it was sent."""
+        if self._tape.only_read:
+            return None
+        end = checked.program.text.count("\n") if end is None else end
+        began = self._tape.next("send")
+        if began is not None:
+            self._require_same(began, kind, checked, first, end)
+            if not self._tape.live:
+                done = self._tape.next("sent")
+                self._sent.append(Sent(kind, checked, first, end, done=True))
+                return report_from_json(done["report"]) if done else None
+            self._sent.append(Sent(kind, checked, first, end, done=False))
+            report = self._go_live()
+        else:
+            self._go_live()
+            self._tape.write("send", kind=kind, sha256=checked.program.sha256, first=first, end=end)
+            self._sent.append(Sent(kind, checked, first, end, done=False))
+            report = None
+        if report is None:
+            report = self._printer.print(checked, lines=range(first, end), progress=progress)
+        if report.ok:
+            self._printer.finish_moves()
+            self._sent[-1] = replace(self._sent[-1], done=True)
+            self._tape.write("sent", report=report_to_json(report))
+        return report
+
+    def _require_same(
+        self, began: dict[str, object], kind: str, checked: CheckedProgram, first: int, end: int
+    ) -> None:
+        """A resumed run must come to the very lines that were sent."""
+        said = (began["kind"], began["sha256"], began["first"], began["end"])
+        if said != (kind, checked.program.sha256, first, end):
+            raise LoopError(
+                f"the record says that '{said[0]}' was sent there, lines {said[2]} to {said[3]} of "
+                f"{str(said[1])[:12]}, this run comes to '{kind}', lines {first} to {end} of "
+                f"{checked.program.sha256[:12]}; the job, the profiles or the program have changed"
+            )
+
+    def _go_live(self) -> PrintReport | None:
+        """Before the first thing that the tape lacks: where is the printer?"""
+        if self._pick_up is None:
+            return None
+        pick_up, self._pick_up = self._pick_up, None
+        return pick_up(tuple(self._sent))
+
+
+def _why(decision: Decision) -> str:
+    """One line on why a run was ended."""
+    own = [v for v in decision.verdicts if v.action is decision.action]
+    kinds = ", ".join(sorted({str(v.finding.type) for v in own}))
+    reason = own[0].reason if own else decision.situation.beyond or decision.reason
+    return f"{decision.action}: {kinds + ': ' if kinds else ''}{reason}"
+
+
+def _guess(site: Site, scanner: Scanner) -> Transform:
+    """Pose of the scan in the template, as far as calibration knows it."""
+    if site.build_from_template is None:
+        raise LoopError("the loop needs to know where the part stands on the bed")
+    return site.build_from_template.inverse() @ scanner.build_from_scanner

@@ -1,0 +1,214 @@
+"""From a plan to the facts that the table of decisions looks at.
+
+Regions come from the deficit; from the job comes what its next layer lays over them, and whether
+the head would run into what stands out. Types and confidence are `kinds`'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.detect import Label, Region
+from amrepair.loop.decide import Action, Cover, Finding, judge
+from amrepair.repair import RepairPlan
+from gcode.check import find_refusals
+from gcode.errors import ReadError
+from gcode.moves import Program
+from gcode.profiles import PrintSetup
+from gcode.reader import Job
+from gcode.surfaces import HeightField
+
+# Of a region's box, filled by the next layer's beads.
+SOLID_SHARE, OPEN_SHARE = 0.6, 0.05
+EXCESS_CELL_MM = 0.2
+AROUND_MM = 0.5
+# What stands out less than this is pressed down by the nozzle's flat.
+LEAST_HIT_LAYERS = 1.0
+_HITS = "hits what stands there"
+
+
+def next_layer(job: Job, layer_index: int | None) -> int | None:
+    """The layer that covers another; None above the last and for the finished part."""
+    if layer_index is None or layer_index + 1 >= len(job.layers):
+        return None
+    return layer_index + 1
+
+
+def cover_of(job: Job, layer_index: int | None, box_mm: Float[np.ndarray, "2 3"]) -> Cover:
+    """What the next layer lays over a box."""
+    layer = next_layer(job, layer_index)
+    if layer is None:
+        return Cover.NOTHING
+    beads = job.beads
+    pick = beads.layer == layer
+    start, end = beads.start_mm[pick, :2], beads.end_mm[pick, :2]
+    low, high = box_mm[0, :2], box_mm[1, :2]
+    volume = float(clipped_mm(start, end, low, high) @ beads.section_mm2[pick])
+    room_mm3 = float(np.prod(np.maximum(high - low, 1e-6))) * job.layers[layer].height_mm
+    share = volume / max(room_mm3, 1e-9)
+    if share >= SOLID_SHARE:
+        return Cover.SOLID
+    return Cover.OPEN if share >= OPEN_SHARE else Cover.NOTHING
+
+
+def clipped_mm(
+    start: Float[np.ndarray, "n 2"],
+    end: Float[np.ndarray, "n 2"],
+    low: Float[np.ndarray, " 2"],
+    high: Float[np.ndarray, " 2"],
+) -> Float[np.ndarray, " n"]:
+    """(n,) length of each segment within an XY box, mm."""
+    step = end - start
+    enter, leave = np.zeros(len(start)), np.ones(len(start))
+    for axis in (0, 1):
+        still = np.abs(step[:, axis]) < 1e-12
+        safe = np.where(still, 1.0, step[:, axis])
+        a, b = (low[axis] - start[:, axis]) / safe, (high[axis] - start[:, axis]) / safe
+        first, last = np.minimum(a, b), np.maximum(a, b)
+        out = still & ((start[:, axis] < low[axis]) | (start[:, axis] > high[axis]))
+        enter = np.maximum(enter, np.where(still, np.where(out, 2.0, 0.0), first))
+        leave = np.minimum(leave, np.where(still, 1.0, last))
+    return np.maximum(leave - enter, 0.0) * np.linalg.norm(step, axis=1)
+
+
+def hit_mm(
+    job: Job,
+    setup: PrintSetup,
+    excess: manifold3d.Manifold,
+    *,
+    line: int,
+    end_line: int,
+) -> float:
+    """How deep the head runs into a solid on lines [line, end_line) of the job; 0 if it clears it.
+
+    The checker's own sweep judges, tool head and all.
+    """
+    x0, y0, _, x1, y1, _ = excess.bounding_box()
+    box = (x0 - AROUND_MM, y0 - AROUND_MM, x1 + AROUND_MM, y1 + AROUND_MM)
+    field = HeightField.from_manifold(excess, EXCESS_CELL_MM, box_mm=box)
+    text = "\n".join(job.program.text.split("\n")[line:end_line]) + "\n"
+    try:
+        state = job.state_after(line)
+    except ReadError:
+        return 0.0
+    refusals = find_refusals(
+        Program(text, job.program.dialect), setup, as_built=field, initial=state
+    )
+    deep = [float(r.value.split()[0]) for r in refusals if r.what.endswith(_HITS)]
+    return max(deep, default=0.0)
+
+
+def findings(
+    plan: RepairPlan,
+    job: Job,
+    setup: PrintSetup,
+    *,
+    layer_index: int | None,
+    line: int,
+    seen_twice: bool = False,
+) -> tuple[Finding, ...]:
+    """The facts about every region of a plan.
+
+    Parameters
+    ----------
+    layer_index, line
+        The layer just finished (None: the finished part), and the job's next line.
+    seen_twice
+        Whether this stop was looked at before, nothing printed between.
+    """
+    after = next_layer(job, layer_index)
+    end_line = job.layers[after].end_line if after is not None else line
+    pieces = plan.deficit.excess.decompose() if not plan.deficit.excess.is_empty() else []
+    found = []
+    for region in plan.deficit.regions:
+        reach, hit = 1.0, 0.0
+        if region.label is Label.MISSING:
+            reach = reach_of(plan, region.box_mm)
+        elif after is not None and height_mm(region) >= LEAST_HIT_LAYERS * plan.layer_height_mm:
+            piece = matching(pieces, region.box_mm)
+            if piece is not None:
+                hit = hit_mm(job, setup, piece, line=line, end_line=end_line)
+        found.append(
+            Finding(
+                kind="missing" if region.label is Label.MISSING else "excess",
+                type=region.type,
+                confidence=float(region.confidence),
+                volume_mm3=float(region.volume_mm3),
+                thickness_layers=thickness_mm(region) / plan.layer_height_mm,
+                height_layers=float(height_mm(region) / plan.layer_height_mm),
+                reachable_ratio=reach,
+                cover=cover_of(job, layer_index, np.asarray(region.box_mm)),
+                hit_mm=hit,
+                box_mm=_corners(region.box_mm),
+                seen_twice=seen_twice,
+            )
+        )
+    return tuple(found)
+
+
+def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int | None) -> Action:
+    """What the table says of a missing region before anybody knows what can be reached of it."""
+    layer_mm = setup.process.layer_height_mm
+    finding = Finding(
+        kind="missing",
+        type=region.type,
+        confidence=1.0,
+        volume_mm3=float(region.volume_mm3),
+        thickness_layers=thickness_mm(region) / layer_mm,
+        height_layers=float(height_mm(region) / layer_mm),
+        reachable_ratio=1.0,
+        cover=cover_of(job, layer_index, np.asarray(region.box_mm)),
+        hit_mm=0.0,
+        box_mm=_corners(region.box_mm),
+    )
+    return judge(finding).action
+
+
+def thickness_mm(region: Region) -> float:
+    """Mean thickness: the volume over half the surface, which is one side of a flat piece."""
+    return float(region.volume_mm3 / max(region.area_mm2, 1e-9))
+
+
+def height_mm(region: Region) -> float:
+    """From the lowest to the highest point of a region."""
+    return float(np.ptp(np.asarray(region.box_mm)[:, 2]))
+
+
+def matching(
+    pieces: Sequence[manifold3d.Manifold], box_mm: Float[np.ndarray, "2 3"]
+) -> manifold3d.Manifold | None:
+    """The piece whose box is nearest to a region's."""
+    if not pieces:
+        return None
+    boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
+    return pieces[int(np.argmin([np.abs(box - box_mm).max() for box in boxes]))]
+
+
+def reach_of(plan: RepairPlan, box_mm: Float[np.ndarray, "2 3"]) -> float:
+    """Share that the nozzle reaches of the patch's region that overlaps a box most.
+
+    1 where no patch was planned for it.
+    """
+    if plan.patch is None:
+        return 1.0
+    best, found = 0.0, 1.0
+    low, high = np.asarray(box_mm, dtype=np.float64).reshape(2, 3)
+    for part in plan.patch.regions:
+        other_low, other_high = np.asarray(part.box_mm, dtype=np.float64).reshape(2, 3)
+        shared = float(
+            np.prod(np.maximum(np.minimum(high, other_high) - np.maximum(low, other_low), 0.0))
+        )
+        if shared > best:
+            best, found = shared, float(part.reachable_ratio)
+    return found
+
+
+def _corners(
+    box_mm: Float[np.ndarray, "2 3"],
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    (a, b, c), (d, e, f) = np.asarray(box_mm, dtype=np.float64).tolist()
+    return (a, b, c), (d, e, f)

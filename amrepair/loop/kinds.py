@@ -1,0 +1,322 @@
+"""Types of defects with a confidence, from geometry and from the job's own beads.
+
+What went wrong with the whole print comes first (it came off, layers are shifted, it curls up):
+then every region is of that. Then what went wrong with the flow, told from the last layer's beads
+in the order they were printed: too little from some bead on is a clog, too little everywhere is
+under-extrusion. What is left has a place, and is told by its shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import manifold3d
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from amrepair.detect import Label, Region
+from amrepair.detect.anomaly import DefectType
+from amrepair.frames import Transform
+from amrepair.loop.findings import matching
+from amrepair.loop.shapes import bead_way, last_beads, spread, tall_mm
+from amrepair.loop.shapes import chain as chain_of
+from amrepair.repair import RepairPlan, Site
+from gcode.reader import Job
+
+# A calibration is good to a tenth or two; a part that moved farther has come off.
+MOVED_MM, MOVED_RAD = 0.8, float(np.deg2rad(1.5))
+# Between two groups of layers: as a share of the layer height, and of what the walls tell.
+SHIFT_LAYERS, SHIFT_SHARE = 1.0, 0.35
+LEAST_POINTS, MOST_POINTS = 120, 6_000
+# Walls are looked at off the bed and off the top's rim; the bed, off the part.
+LOW_WALL_MM, HIGH_WALL_MM, BESIDE_MM, TOP_BAND_MM = 0.8, 0.5, 1.5, 1.2
+BELOW_MM, RIM_MM = 0.7, 0.5
+# Of a layer's height: less than this is what a layer's beads differ by themselves.
+SHORT = 0.3
+# A surface that bends: range of its parabola, in layers; share of the deviation it explains.
+WARP_LAYERS, LIFTED_LAYERS, WARP_SHARE = 1.0, 0.6, 0.45
+# Of a layer's beads: too little or too much flow over at least this share is the layer's own.
+LAYER_SHARE = 0.55
+CLOG_SHARE = (0.12, 0.9)
+# Before a clog, of what it takes away after its beginning.
+BEFORE_CLOG = 0.4
+# Longer along the beads than across them by this much: beads were skipped.
+SKIPPED_ASPECT = 2.2
+STRING_ASPECT, STRING_WIDTH_MM = 4.0, 2.2
+STRING_TALL = 0.25
+ALONG_COSINE = 0.9
+# Mean depth, in layers: less than whole beads are missing where it is shallower.
+WHOLE_LAYERS = 0.7
+TOP_COSINE, WALL_COSINE = 0.8, 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class _Surface:
+    """Points of the scan, build frame, with their deviations and outward directions.
+
+    `noise_mm` is that of one point; heights are above the bed as the scan itself shows it.
+    """
+
+    place_mm: Float[np.ndarray, "s 3"]
+    deviation_mm: Float[np.ndarray, " s"]
+    outward: Float[np.ndarray, "s 3"]
+    noise_mm: float
+
+    def part(self, pick: Bool[np.ndarray, " s"]) -> _Surface:
+        """Some of the points, evenly thinned where they are many."""
+        which = np.flatnonzero(pick)
+        which = which[:: max(1, -(-len(which) // MOST_POINTS))]
+        return _Surface(
+            self.place_mm[which], self.deviation_mm[which], self.outward[which], self.noise_mm
+        )
+
+    def __len__(self) -> int:
+        return len(self.place_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A type and how sure it is."""
+
+    type: DefectType
+    confidence: float
+
+
+def typed(
+    plan: RepairPlan, job: Job, site: Site, line: int, build_from_scanner: Transform
+) -> RepairPlan:
+    """The plan with every region typed.
+
+    Parameters
+    ----------
+    line
+        The job's first line that is not yet printed.
+    build_from_scanner
+        Where the scanner's calibration says that the scan lies.
+    """
+    layer_mm = plan.layer_height_mm
+    seen = _surfaces(plan, site)
+    whole, flow = _came_off(plan, build_from_scanner), None
+    if whole is None and seen is not None:
+        found = (_shifted(seen[1], layer_mm), _warped(seen[0], layer_mm))
+        whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
+    if whole is None and seen is not None:
+        flow = _flow(seen[0], job, line, layer_mm)
+    pieces = {
+        Label.MISSING: _pieces(plan.deficit.missing),
+        Label.EXCESS: _pieces(plan.deficit.excess),
+    }
+    regions = []
+    for region in plan.deficit.regions:
+        there = _there(region.depth_mm, plan.deficit.tolerance_mm)
+        rim = _at_rim(plan, site, np.asarray(region.box_mm))
+        kind = whole or _of_region(
+            region, pieces[region.label], flow, job, line, at_rim=rim, layer_mm=layer_mm
+        )
+        regions.append(
+            replace(region, type=kind.type, confidence=min(kind.confidence, there)
+                    if whole is None else kind.confidence)
+        )  # fmt: skip
+    if whole is not None and not any(r.volume_mm3 >= 1.0 for r in regions):
+        regions.append(_everywhere(plan, site, whole))
+    return replace(plan, deficit=replace(plan.deficit, regions=tuple(regions)))
+
+
+def _there(depth_mm: float, tolerance_mm: float) -> float:
+    """That a region is there at all: a half at half the tolerance, 15 in 16 at twice."""
+    return float(1.0 - 0.25 ** (depth_mm / max(tolerance_mm, 1e-6)))
+
+
+def _sure(value: float, limit: float) -> float:
+    """Confidence of a measure against its limit: a half there, 0.9 at twice."""
+    return float(1.0 - 0.5 ** ((value / max(limit, 1e-9)) ** 1.7))
+
+
+def _pieces(solid: manifold3d.Manifold) -> list[manifold3d.Manifold]:
+    return [] if solid.is_empty() else solid.decompose()
+
+
+def _surfaces(plan: RepairPlan, site: Site) -> tuple[_Surface, _Surface] | None:
+    """What was seen of the top, and of the walls; None where no evidence says how noisy it is."""
+    evidence = plan.anomaly.evidence
+    if evidence is None or len(evidence.surfels) == 0:
+        return None
+    every = max(1, len(plan.anomaly.points_mm) // (12 * MOST_POINTS))
+    points, deviation = plan.anomaly.points_mm[::every], plan.anomaly.deviation_mm[::every]
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    height = placed.apply(points)[:, 2]
+    beside = np.flatnonzero((deviation > BESIDE_MM) & (np.abs(height) < 0.5))
+    bed_mm = float(np.median(height[beside])) if len(beside) >= LEAST_POINTS else 0.0
+    near = np.flatnonzero((np.abs(deviation) < 3.0) & (height > LOW_WALL_MM))
+    near = near[:: max(1, -(-len(near) // (4 * MOST_POINTS)))]
+    expected = site.planned or site.template
+    gradient = expected.distance_and_gradient(points[near])[1]
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    outward = placed.rotate(gradient / np.maximum(length, 1e-9))
+    place = placed.apply(points[near])
+    corrected = deviation[near] - bed_mm * np.maximum(outward[:, 2], 0.0)
+    noise_mm = max(float(evidence.surfels.spread_mm), plan.scan.sigma_mm)
+    seen = _Surface(place, corrected, outward, noise_mm)
+    level_mm = float(placed.apply(expected.bounds_mm)[:, 2].max())
+    top = seen.part((outward[:, 2] > TOP_COSINE) & (place[:, 2] > level_mm - TOP_BAND_MM))
+    walls = (np.abs(outward[:, 2]) < WALL_COSINE) & (place[:, 2] < level_mm - HIGH_WALL_MM)
+    return top, seen.part(walls)
+
+
+def _came_off(plan: RepairPlan, build_from_scanner: Transform) -> Kind | None:
+    """Whether the part lies somewhere else than where the calibration and the job have it."""
+    moved = plan.build_from_scan @ build_from_scanner.inverse()
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    points = plan.scan.points_mm
+    some = points[:: max(1, len(points) // MOST_POINTS)]
+    centre = placed.apply(some).mean(axis=0, keepdims=True)
+    off_mm = float(np.linalg.norm(moved.apply(centre) - centre))
+    cosine = float(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0))
+    turned_rad = float(np.arccos(cosine))
+    share = max(off_mm / MOVED_MM, turned_rad / MOVED_RAD)
+    return Kind(DefectType.DETACHED, _sure(share, 1.0)) if share > 1.0 else None
+
+
+def _shifted(walls: _Surface, layer_mm: float) -> Kind | None:
+    """Walls above some height stand beside those below: two shifts tell them better than one."""
+    z, dev, out = walls.place_mm[:, 2], walls.deviation_mm, walls.outward[:, :2]
+    if len(walls) < 2 * LEAST_POINTS:
+        return None
+    total = float(((dev - dev.mean()) ** 2).sum())
+    best = (0.0, 0.0)
+    for cut in np.quantile(z, np.linspace(0.1, 0.9, 17)):
+        shifts, left = [], 0.0
+        for part in (z > cut, z <= cut):
+            design = np.column_stack([out[part], np.ones(part.sum())])
+            found, *_ = np.linalg.lstsq(design, dev[part], rcond=None)
+            shifts.append(found[:2])
+            left += float(((dev[part] - design @ found) ** 2).sum())
+        best = max(best, (total - left, float(np.linalg.norm(shifts[0] - shifts[1]))))
+    gained, jump_mm = best
+    share = gained / max(total - len(walls) * walls.noise_mm**2, 0.3 * total, 1e-12)
+    if jump_mm > SHIFT_LAYERS * layer_mm and share > SHIFT_SHARE:
+        sure = _sure(jump_mm, SHIFT_LAYERS * layer_mm) * min(1.0, share / (1.5 * SHIFT_SHARE))
+        return Kind(DefectType.LAYER_SHIFT, sure)
+    return None
+
+
+def _warped(top: _Surface, layer_mm: float) -> Kind | None:
+    """The top bends up at its rim: a parabola explains what flow and place do not."""
+    if len(top) < LEAST_POINTS:
+        return None
+    xy, dev = top.place_mm[:, :2], top.deviation_mm
+    centre, half = 0.5 * (xy.min(axis=0) + xy.max(axis=0)), 0.5 * np.ptp(xy, axis=0)
+    x, y = ((xy - centre) / np.maximum(half, 1.0)).T
+    design = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
+    found, *_ = np.linalg.lstsq(design, dev, rcond=None)
+    fitted = design @ found
+    flat = float(((dev - dev.mean()) ** 2).sum())
+    gained = flat - float(((dev - fitted) ** 2).sum())
+    share = gained / max(flat - len(top) * top.noise_mm**2, 0.2 * flat, 1e-9)
+    middle = np.hypot(x, y) < 0.4
+    rim = np.hypot(x, y) > 1.0
+    if not middle.any() or not rim.any():
+        return None
+    high_mm = float(np.percentile(fitted[rim], 90))
+    lifted_mm = high_mm - float(fitted[middle].mean())
+    up = high_mm > LIFTED_LAYERS * layer_mm  # what sinks in the middle is no curl
+    if up and lifted_mm > WARP_LAYERS * layer_mm and share > WARP_SHARE:
+        sure = _sure(lifted_mm, WARP_LAYERS * layer_mm) * min(1.0, share / (1.5 * WARP_SHARE))
+        return Kind(DefectType.WARP, sure)
+    return None
+
+
+def _flow(top: _Surface, job: Job, line: int, layer_mm: float) -> Kind | None:
+    """What the last layer's beads carry, in the order they were printed."""
+    points = last_beads(job, line)
+    if len(points) < 30 or len(top) < LEAST_POINTS:
+        return None
+    window = max(4, round(6 * (top.noise_mm / layer_mm) ** 2 / 0.3**2))  # noise well below a third
+    distance, nearest = cKDTree(top.place_mm[:, :2]).query(points[:, :2], k=min(window, 60))
+    seen = distance[:, 0] < 1.0
+    if seen.sum() < 30:
+        return None
+    low = -top.deviation_mm[nearest[seen]].mean(axis=1) / layer_mm
+    short = low > SHORT
+    if np.mean(low < -SHORT) > LAYER_SHARE:
+        return Kind(DefectType.OVER_EXTRUSION, float(np.mean(low < -SHORT)))
+    if not short.any():
+        return None
+    n, total = len(low), np.concatenate([[0.0], np.cumsum(low)])
+    k = np.arange(1, n)
+    before, after = total[1:-1] / k, (total[-1] - total[1:-1]) / (n - k)
+    at = int(np.argmax(k * (n - k) * (after - before) ** 2))
+    share, rest = 1.0 - (at + 1) / n, float(short[at + 1 :].mean())
+    if (
+        CLOG_SHARE[0] < share < CLOG_SHARE[1]
+        and after[at] > SHORT
+        and before[at] < BEFORE_CLOG * after[at]
+        and rest > LAYER_SHARE
+    ):
+        return Kind(DefectType.CLOG, min(1.0, rest))
+    if short.mean() > LAYER_SHARE:
+        return Kind(DefectType.UNDER_EXTRUSION, float(short.mean()))
+    return None
+
+
+def _of_region(
+    region: Region,
+    pieces: list[manifold3d.Manifold],
+    flow: Kind | None,
+    job: Job,
+    line: int,
+    *,
+    at_rim: bool,
+    layer_mm: float,
+) -> Kind:
+    """The type of one region, its place and shape considered."""
+    piece = matching(pieces, np.asarray(region.box_mm))
+    if region.label is Label.EXCESS:
+        if flow is not None and flow.type is DefectType.OVER_EXTRUSION:
+            return flow
+        chain = chain_of(piece, pieces)
+        long_mm, wide_mm, _ = spread(chain)
+        lies = tall_mm(chain) < STRING_TALL * long_mm  # what climbs a wall is its seam
+        if lies and long_mm > STRING_ASPECT * wide_mm and wide_mm < STRING_WIDTH_MM:
+            return Kind(DefectType.STRING, _sure(long_mm / wide_mm, STRING_ASPECT))
+        return Kind(DefectType.BLOB, 0.95)
+    if flow is not None and flow.type is not DefectType.OVER_EXTRUSION:
+        return flow
+    long_mm, wide_mm, along = spread([piece] if piece is not None else [])
+    if long_mm > SKIPPED_ASPECT * wide_mm and not at_rim:
+        way = bead_way(job, line, np.asarray(region.box_mm))
+        if way is not None and abs(float(way @ along)) > ALONG_COSINE:
+            return Kind(DefectType.MISSING_BEADS, _sure(long_mm / wide_mm, SKIPPED_ASPECT))
+    whole_layers = piece is not None and (
+        piece.volume() > WHOLE_LAYERS * layer_mm * float(piece.project().area())
+    )
+    if whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
+        return Kind(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
+    return Kind(region.type, 0.95)
+
+
+def _at_rim(plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"]) -> bool:
+    """Whether a region reaches the part's outline seen from above, a little below its floor."""
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    z = max(float(box_mm[0, 2]) - BELOW_MM, 0.5 * float(box_mm[0, 2]))
+    around = np.array([[box_mm[i, 0], box_mm[j, 1], z] for i in (0, 1) for j in (0, 1)])
+    inside = site.template.distance(placed.inverse().apply(around))
+    foot_mm = float(placed.apply(site.template.bounds_mm)[:, 2].min())
+    # near the bed the foot is nearer than any rim
+    return bool((inside > -min(RIM_MM, 0.8 * (z - foot_mm))).any())
+
+
+def _everywhere(plan: RepairPlan, site: Site, whole: Kind) -> Region:
+    """A region of no volume that stands for the whole part."""
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    box = placed.apply(site.template.bounds_mm)
+    return Region(
+        label=Label.EXCESS,
+        type=whole.type,
+        volume_mm3=0.0,
+        area_mm2=0.0,
+        depth_mm=0.0,
+        box_mm=np.stack([box.min(axis=0), box.max(axis=0)]),
+        confidence=whole.confidence,
+    )

@@ -1,0 +1,192 @@
+"""Stops, looks and the report of a run: what a loop remembers.
+
+It holds and adds up; what is done at a stop is decided in `decide` and done in `run`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from amrepair.errors import LoopError
+from amrepair.loop.decide import Decision
+from amrepair.repair import MIN_REPAIR_MM3, RepairPlan
+from amrepair.scans import Scan
+from gcode.hosts.port import PrintReport
+from gcode.reader import Job
+
+# Of what was missing at a stop, this share may be left, and as much may stand out.
+LEFT_RATIO = 0.08
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A moment at which the job rests and is looked at.
+
+    Attributes
+    ----------
+    layer_index
+        The layer just finished; None for the finished part, before the end script.
+    line
+        The first program line that is not yet sent.
+    z_mm
+        Height printed so far, build frame.
+    """
+
+    layer_index: int | None
+    line: int
+    z_mm: float
+
+    @property
+    def label(self) -> str:
+        """`layer-044` or `final`."""
+        return "final" if self.layer_index is None else f"layer-{self.layer_index:03d}"
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One scan at a stop, what was planned from it, what was decided, and what became of it.
+
+    Attributes
+    ----------
+    printed
+        The plan's program was, or is about to be, printed.
+    declined
+        Somebody was asked, and said no.
+    """
+
+    number: int
+    stop: Stop
+    scan: Scan
+    plan: RepairPlan
+    decision: Decision
+    printed: bool
+    declined: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class LoopReport:
+    """What became of a run.
+
+    Attributes
+    ----------
+    looks
+        Every scan in order, with its plan.
+    job_prints, repair_prints
+        What the link says of each part of the job (rewritten layers included) and of each repair.
+    stopped
+        Why the run was ended before the job was: parked, heaters off; empty if it was not.
+    passed
+        Stops that were passed by without a look: the scanner did not answer.
+    """
+
+    looks: tuple[Look, ...]
+    job_prints: tuple[PrintReport, ...]
+    repair_prints: tuple[PrintReport, ...]
+    stopped: str = ""
+    passed: tuple[Stop, ...] = ()
+
+    def at_stop(self, stop: Stop) -> tuple[Look, ...]:
+        """The looks of one stop."""
+        return tuple(look for look in self.looks if look.stop == stop)
+
+    @property
+    def stops(self) -> tuple[Stop, ...]:
+        """Stops in order."""
+        return tuple(dict.fromkeys(look.stop for look in self.looks))
+
+    @property
+    def first_looks(self) -> tuple[Look, ...]:
+        """The first look of every stop."""
+        return tuple(self.at_stop(stop)[0] for stop in self.stops)
+
+    @property
+    def last_looks(self) -> tuple[Look, ...]:
+        """The last look of every stop."""
+        return tuple(self.at_stop(stop)[-1] for stop in self.stops)
+
+    @property
+    def within_tolerance(self) -> bool:
+        """Whether every stop was left within tolerance (`left_well`), and each was looked at."""
+        found_mm3, well = 0.0, not self.stopped and not self.passed
+        for stop in self.stops:
+            looks = self.at_stop(stop)
+            found_mm3 += looks[0].plan.deficit.missing_mm3
+            well = well and left_well(looks, found_mm3)
+        return well
+
+
+def left_well(looks: Sequence[Look], found_mm3: float) -> bool:
+    """Whether a stop was left within tolerance.
+
+    Nothing that is worth a repair is left, beyond a share of what was found; and no more than
+    that share stands out: a repair's own rims are not a new defect.
+
+    Parameters
+    ----------
+    looks
+        Those of the stop.
+    found_mm3
+        Volume found missing in the job so far: a later look sees earlier repairs, too.
+    """
+    last = looks[-1].plan
+    if last.within_tolerance:
+        return True
+    allowed_mm3 = LEFT_RATIO * found_mm3
+    missing_mm3 = sum(region.volume_mm3 for region in last.to_fill)
+    excess_mm3 = sum(region.volume_mm3 for region in last.too_much)
+    before_mm3 = sum(region.volume_mm3 for region in looks[0].plan.too_much)
+    unmended_mm3 = min(before_mm3, excess_mm3)  # excess that was there before the repair
+    return (
+        missing_mm3 <= allowed_mm3
+        and excess_mm3 - unmended_mm3 <= allowed_mm3
+        and unmended_mm3 <= max(allowed_mm3, MIN_REPAIR_MM3)
+    )
+
+
+def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[Stop, ...]:
+    """Stops after the given layers, rising, and one for the finished part.
+
+    Raises
+    ------
+    LoopError
+        If the job has no such layer.
+    """
+    stops = []
+    for index in sorted(set(layers)):
+        if not 0 <= index < len(job.layers):
+            raise LoopError(
+                f"there is no layer {index} to stop after; the job has layers 0 to "
+                f"{len(job.layers) - 1}"
+            )
+        layer = job.layers[index]
+        if index < len(job.layers) - 1 or not final:
+            stops.append(Stop(index, layer.end_line, layer.z_mm))
+    if final:
+        stops.append(Stop(None, job.footer_start_line, job.layers[-1].z_mm))
+    return tuple(stops)
+
+
+def look_to_json(look: Look) -> dict[str, object]:
+    """A look as it stands on the tape."""
+    return {
+        "look": look.number,
+        "stop": look.stop.label,
+        "layer": look.stop.layer_index,
+        "z_mm": look.stop.z_mm,
+        "frame": look.scan.frame,
+        "missing_mm3": round(look.plan.deficit.missing_mm3, 6),
+        "excess_mm3": round(look.plan.deficit.excess_mm3, 6),
+        "decision": look.decision.to_json(),
+        "printed": look.printed,
+        "declined": look.declined,
+    }
+
+
+def as_recorded(scan: Scan) -> Scan:
+    """A scan as its file will hold it: normals in single precision."""
+    if scan.normals is None:
+        return scan
+    return replace(scan, normals=scan.normals.astype(np.float32).astype(np.float64))

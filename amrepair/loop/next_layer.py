@@ -1,0 +1,50 @@
+"""The job's next layer, its flow changed where a table of decisions says so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import manifold3d
+import numpy as np
+
+from amrepair.loop.decide import Action, Verdict
+from amrepair.loop.findings import matching
+from amrepair.repair import RepairPlan
+from gcode.errors import GcodeError
+from gcode.profiles import PrintSetup
+from gcode.reader import Job
+from gcode.resumption.flow import ChangedLayer, GapField, change_flow
+
+CELL_MM = 0.2
+
+
+def rewritten_layer(
+    job: Job, setup: PrintSetup, layer: int, plan: RepairPlan, verdicts: Sequence[Verdict]
+) -> ChangedLayer | None:
+    """The layer as it is to be printed; None where nothing of it changes or may be printed.
+
+    Parameters
+    ----------
+    layer
+        Index of the layer to be rewritten.
+    plan
+        Whose solids the verdicts are about.
+    """
+    solids: list[tuple[manifold3d.Manifold, float]] = []
+    for solid, action, sign in (
+        (plan.deficit.missing, Action.FILL_WITH_NEXT, 1.0),
+        (plan.deficit.excess, Action.LOWER_NEXT, -1.0),
+    ):
+        pieces = solid.decompose() if not solid.is_empty() else []
+        for verdict in verdicts:
+            if verdict.action is action:
+                piece = matching(pieces, np.array(verdict.finding.box_mm))
+                if piece is not None:
+                    solids.append((piece, sign))
+    if not solids:
+        return None
+    gap = GapField.from_solids(solids, CELL_MM)
+    try:
+        return change_flow(job, setup, job.layers[layer].index, gap)
+    except GcodeError:
+        return None  # the layer is then printed as it is

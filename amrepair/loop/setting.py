@@ -1,0 +1,227 @@
+"""The setting of a run: all that is needed to look at its scans again, kept in the run's folder.
+
+`run.json` names the profiles (with their hashes), the stops and the poses; the job and the
+template lie beside it. It holds no secret and no clock.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from amrepair.errors import InputError
+from amrepair.frames import Transform
+from amrepair.loop.looks import Stop, plan_stops
+from amrepair.template import MeshSdf, load_template
+from amrepair.template.port import Template
+from gcode.moves import Program
+from gcode.profiles import PrintSetup, load_setup
+from gcode.reader import Job, read_job
+from gcode.slicing.layers import mesh_of
+
+SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
+VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What a run was begun with.
+
+    Attributes
+    ----------
+    layers
+        After which the run looks; `final`: and at the finished part.
+    by_beads
+        Layers are judged by the job's beads, else by the template's cut.
+    build_from_template, build_from_scanner
+        4×4, rows.
+    limited
+        Whether it prints without asking, within the profile's limits.
+    """
+
+    printer: str
+    material: str
+    process: str
+    profiles: dict[str, str]
+    layers: tuple[int, ...]
+    final: bool
+    by_beads: bool
+    build_from_template: tuple[tuple[float, ...], ...]
+    build_from_scanner: tuple[tuple[float, ...], ...]
+    seed: int
+    max_iterations: int
+    limited: bool = False
+    port: str = ""
+    scanner: str = ""
+    scan_timeout_s: float = 120.0
+    approve: str = ""
+    title: str = "job"
+
+    @classmethod
+    def of(
+        cls,
+        setup: PrintSetup,
+        ids: tuple[str, str, str],
+        *,
+        stops: Sequence[Stop],
+        build_from_template: Transform,
+        build_from_scanner: Transform,
+        **others: Any,
+    ) -> Setting:
+        """From what a run is begun with; `ids` are the profiles as they were named."""
+        return cls(
+            printer=_whole(ids[0]),
+            material=_whole(ids[1]),
+            process=_whole(ids[2]),
+            profiles=setup.hashes,
+            layers=tuple(s.layer_index for s in stops if s.layer_index is not None),
+            final=any(s.layer_index is None for s in stops),
+            build_from_template=_rows(build_from_template),
+            build_from_scanner=_rows(build_from_scanner),
+            **others,
+        )
+
+    @property
+    def placed(self) -> Transform:
+        """Build from template."""
+        return Transform("build", "template", np.array(self.build_from_template))
+
+    @property
+    def scanner_pose(self) -> Transform:
+        """Build from scanner."""
+        return Transform("build", "scanner", np.array(self.build_from_scanner))
+
+    def setup(self) -> PrintSetup:
+        """The profiles, which must not have changed.
+
+        Raises
+        ------
+        InputError
+            If one has.
+        """
+        setup = load_setup(self.printer, self.material, self.process)
+        changed = [key for key, value in setup.hashes.items() if self.profiles.get(key) != value]
+        if changed:
+            raise InputError(
+                f"the profile {changed[0]} has changed since the run was recorded; decisions "
+                "depend on it: restore it, or begin a new run"
+            )
+        return setup
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A run's folder, opened."""
+
+    setting: Setting
+    setup: PrintSetup
+    job: Job
+    template: Template
+    stops: tuple[Stop, ...]
+
+
+def keep(folder: Path, setting: Setting, job_text: str, template: Template) -> None:
+    """Write setting, job and template; whole files.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _put(folder / JOB, job_text)
+        _keep_template(folder, template)
+        _put(
+            folder / SETTING,
+            json.dumps({"version": VERSION, **asdict(setting)}, indent=2, ensure_ascii=False)
+            + "\n",
+        )
+    except OSError as error:
+        raise InputError(
+            f"the run's folder {folder} cannot be written ({error.strerror}); name another one"
+        ) from error
+
+
+def open_run(folder: Path) -> Recorded:
+    """Read a run's folder.
+
+    Raises
+    ------
+    InputError
+        If something of it is missing, or a profile has changed.
+    """
+    try:
+        said = json.loads((folder / SETTING).read_text(encoding="utf-8"))
+        text = (folder / JOB).read_text(encoding="utf-8", errors="replace")
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{folder} is not the folder of a recorded run ({error}); name the one that 'loop' or "
+            "'simulate' wrote"
+        ) from error
+    if not isinstance(said, dict) or said.pop("version", None) != VERSION:
+        raise InputError(f"{folder / SETTING} is of another version than {VERSION}")
+    try:
+        setting = Setting(**{key: _tuples(value) for key, value in said.items()})
+    except TypeError as error:
+        raise InputError(f"{folder / SETTING} cannot be read ({error})") from error
+    setup = setting.setup()
+    job = read_job(
+        Program(text, setup.printer.dialect),
+        filament_diameter_mm=setup.printer.filament_diameter_mm,
+        dialect=setup.printer.dialect,
+    )
+    stops = plan_stops(job, setting.layers, final=setting.final)
+    return Recorded(setting, setup, job, _kept_template(folder), stops)
+
+
+def _keep_template(folder: Path, template: Template) -> None:
+    """As its own file; an exact mesh, which has none, as its triangles."""
+    save: Any = getattr(template, "save", None)
+    (folder / MESH).unlink(missing_ok=True)
+    if save is not None:
+        save(folder / TEMPLATE)
+        return
+    vertices, faces = mesh_of(template.solid())
+    with (folder / MESH).open("wb") as file:
+        np.savez(file, vertices_mm=vertices, faces=faces)
+
+
+def _kept_template(folder: Path) -> Template:
+    if not (folder / MESH).is_file():
+        return load_template(folder / TEMPLATE)
+    with np.load(folder / MESH) as kept:
+        mesh = trimesh.Trimesh(kept["vertices_mm"], kept["faces"], process=False)
+    return MeshSdf.from_mesh(mesh)
+
+
+def forget(folder: Path) -> None:
+    """Take an earlier run's record out of a folder that a new run is to have."""
+    for pattern in ("run.json*", "scan-*.ply", "repair-*.gcode", "deficit-*.stl"):
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
+
+
+def _whole(name: str) -> str:
+    """A profile's name; a path is kept from wherever it is read again."""
+    return str(Path(name).resolve()) if name.endswith(".toml") or "/" in name else name
+
+
+def _rows(transform: Transform) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(v) for v in row) for row in transform.matrix)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def _put(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.new")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)

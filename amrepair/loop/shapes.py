@@ -1,0 +1,103 @@
+"""Shapes of regions and ways of beads: how long, how wide, along what."""
+
+from __future__ import annotations
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float
+
+from gcode.reader import Job
+
+CHAIN_MM = 4.0
+"""Pieces nearer than this are one thing that noise has cut."""
+BEAD_STEP_MM = 0.6
+
+
+def chain(
+    piece: manifold3d.Manifold | None, pieces: list[manifold3d.Manifold]
+) -> list[manifold3d.Manifold]:
+    """A piece and all that lie near it, one after another: noise cuts a string to pieces."""
+    if piece is None:
+        return []
+    boxes = np.array([one.bounding_box() for one in pieces]).reshape(-1, 2, 3)
+    inside = np.array([one is piece for one in pieces])
+    while True:
+        gap = np.array([
+            [np.maximum(np.maximum(a[0] - b[1], b[0] - a[1]), 0.0).max() for b in boxes[inside]]
+            for a in boxes
+        ]).min(axis=1)  # fmt: skip
+        grown = gap < CHAIN_MM
+        if (grown == inside).all():
+            return [one for one, mine in zip(pieces, inside, strict=True) if mine]
+        inside = grown
+
+
+def tall_mm(pieces: list[manifold3d.Manifold]) -> float:
+    """From the lowest to the highest point of some pieces."""
+    boxes = np.array([piece.bounding_box() for piece in pieces]).reshape(-1, 2, 3)
+    return float(boxes[:, 1, 2].max() - boxes[:, 0, 2].min()) if len(boxes) else 0.0
+
+
+def spread(
+    pieces: list[manifold3d.Manifold],
+) -> tuple[float, float, Float[np.ndarray, " 2"]]:
+    """Length and width of some pieces seen from above, mm, and their long direction."""
+    if not pieces:
+        return 1.0, 1.0, np.array([1.0, 0.0])
+    areas = [piece.project() for piece in pieces]
+    rings = [np.asarray(ring, dtype=np.float64) for area in areas for ring in area.to_polygons()]
+    corners = np.concatenate([_dense(ring) for ring in rings])
+    middle = corners.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((corners - middle).T))
+    across, along = axes[:, 0], axes[:, 1]
+    long_mm = float(np.ptp(corners @ along))
+    # as wide as its area says: noise makes fringes
+    area_mm2 = sum(float(area.area()) for area in areas)
+    wide_mm = min(float(np.ptp(corners @ across)), 1.2 * area_mm2 / max(long_mm, 1e-6))
+    return long_mm, max(wide_mm, 1e-6), along
+
+
+def _dense(ring: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """A ring's outline in even steps: corners alone would weigh fringes."""
+    ends = np.roll(ring, -1, axis=0)
+    length = np.linalg.norm(ends - ring, axis=1)
+    count = np.maximum(1, np.ceil(length / 0.1).astype(np.int64))
+    owner = np.repeat(np.arange(len(ring)), count)
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return np.asarray(ring[owner] + (ends - ring)[owner] * (step / count[owner])[:, None])
+
+
+def bead_way(
+    job: Job, line: int, box_mm: Float[np.ndarray, "2 3"]
+) -> Float[np.ndarray, " 2"] | None:
+    """The direction of most of the last layer's beads over a box."""
+    beads = job.beads
+    done = beads.line < line
+    if not done.any():
+        return None
+    pick = done & (beads.layer == beads.layer[done].max())
+    step = (beads.end_mm - beads.start_mm)[pick, :2]
+    middle = 0.5 * (beads.end_mm + beads.start_mm)[pick, :2]
+    length = np.linalg.norm(step, axis=1)
+    over = ((middle + 0.5 * np.abs(step) >= box_mm[0, :2])
+            & (middle - 0.5 * np.abs(step) <= box_mm[1, :2])).all(axis=1)  # fmt: skip
+    if not (over & (length > 0.5)).any():
+        return None
+    way, weight = step[over], length[over]
+    angle = np.arctan2(way[:, 1], way[:, 0])
+    mean = 0.5 * np.angle((weight * np.exp(2j * angle)).sum())
+    return np.array([np.cos(mean), np.sin(mean)])
+
+
+def last_beads(job: Job, line: int) -> Float[np.ndarray, "n 3"]:
+    """Places along the beads of the last layer before a line, as printed."""
+    beads = job.beads
+    done = beads.line < line
+    if not done.any() or beads.layer[done].max() < 0:
+        return np.zeros((0, 3))
+    pick = done & (beads.layer == beads.layer[done].max())
+    start, step = beads.start_mm[pick], beads.end_mm[pick] - beads.start_mm[pick]
+    count = np.maximum(1, np.ceil(np.linalg.norm(step, axis=1) / BEAD_STEP_MM).astype(np.int64))
+    owner = np.repeat(np.arange(len(count)), count)
+    along = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return np.asarray(start[owner] + step[owner] * ((along + 0.5) / count[owner])[:, None])

@@ -1,0 +1,55 @@
+"""What is expected at each stop of a job: the finished part, or what is printed so far."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from amrepair.frames import Transform
+from amrepair.loop.looks import Stop
+from amrepair.repair import Site
+from amrepair.template import PlannedSdf
+from amrepair.template.port import Template
+from gcode.profiles import PrintSetup
+from gcode.reader import Job
+from gcode.slicing.layers import LayerGrid
+
+
+def sites(
+    job: Job,
+    template: Template,
+    build_from_template: Transform,
+    setup: PrintSetup,
+    *,
+    by_beads: bool = True,
+) -> Callable[[Stop], Site]:
+    """What is expected at a stop, for `run_loop`.
+
+    A finished part is judged by its template. A layer is, too, where `by_beads` is false (all of
+    it is planned to be solid); else by the beads that the job planned, so that open infill is
+    none of the defects.
+    """
+    grid = LayerGrid.from_tops(
+        [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
+    )
+    template_from_build = build_from_template.inverse()
+
+    def at(stop: Stop) -> Site:
+        if stop.layer_index is None:
+            return Site(template, setup, grid, build_from_template)
+        z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
+        planned = None
+        if by_beads:
+            beads = job.beads
+            done = (beads.line < stop.line) & (beads.layer >= 0)
+            planned = PlannedSdf.from_beads(
+                template_from_build.apply(beads.start_mm[done]),
+                template_from_build.apply(beads.end_mm[done]),
+                beads.section_mm2[done],
+                beads.height_mm[done],
+            )
+        below = template.below_z(z_mm)
+        return Site(below, setup, grid, build_from_template, stop.z_mm, planned=planned)
+
+    return at

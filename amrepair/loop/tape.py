@@ -1,0 +1,207 @@
+"""The tape of a run: what was sent, seen and decided, written ahead of the wire.
+
+One JSON object a line in `run.jsonl`, each on the disk before what it says begins. A run that was
+killed is gone on with by running the same loop over its tape: what the tape has is not done again.
+A replay is the same, and ends with the tape. A line that a kill cut short was never begun.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from amrepair.errors import InputError, LoopError
+from amrepair.scans import Scan, read_scan
+from gcode.check import CheckedProgram
+from gcode.hosts.port import PrintReport
+
+TAPE = "run.jsonl"
+LOOKS = ("look", "no_look")
+
+
+class TapeEndsError(LoopError):
+    """A replay has come to the end of what was recorded."""
+
+
+def scan_name(number: int) -> str:
+    """Name of the file that a look's scan is kept in."""
+    return f"scan-{number}.ply"
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """Lines [first, end) of a program, sent or about to be."""
+
+    kind: str
+    checked: CheckedProgram
+    first: int
+    end: int
+    done: bool
+
+
+class Tape:
+    """What a run remembers; without a path it remembers nothing and costs nothing.
+
+    Parameters
+    ----------
+    path
+        The run's folder, where there is one.
+    only_read
+        Nothing is written, and nothing happens beyond the tape's end (`TapeEndsError`).
+    clock
+        Wall clock, s since 1970.
+    """
+
+    def __init__(
+        self,
+        path: Path | None = None,
+        *,
+        only_read: bool = False,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self.path = path
+        self.only_read = only_read
+        self._clock = clock
+        self._events = [] if path is None else read_events(path)
+        if only_read:  # what was sent follows from what was seen and answered
+            self._events = [e for e in self._events if e.get("event") in LOOKS]
+        self._at = 0
+        self._fd: int | None = None
+
+    @property
+    def live(self) -> bool:
+        """Whether all that was recorded has been gone through."""
+        return self._at >= len(self._events)
+
+    def next(self, event: str) -> dict[str, Any] | None:
+        """The next thing recorded, which must be of this kind; None at the tape's end.
+
+        Raises
+        ------
+        LoopError
+            If something else was recorded: the tape does not belong to this run.
+        TapeEndsError
+            At the end of a tape that is only read.
+        """
+        if self.live:
+            if self.only_read:
+                raise TapeEndsError("the record ends here")
+            return None
+        found = self._events[self._at]
+        if found.get("event") != event:
+            raise LoopError(
+                f"the record {self.path} has '{found.get('event')}' where this run comes to "
+                f"'{event}'; it is of another job, other stops or another version"
+            )
+        self._at += 1
+        return found
+
+    def scan(self, number: int, frame: str) -> Scan:
+        """The scan of a recorded look."""
+        assert self.path is not None
+        return read_scan(self.path / scan_name(number), frame=frame)
+
+    def next_stop(self) -> str | None:
+        """The label of the stop of the next recorded look."""
+        return None if self.live else str(self._events[self._at].get("stop"))
+
+    def peek(self) -> str | None:
+        """What kind of event comes next."""
+        return None if self.live else str(self._events[self._at].get("event"))
+
+    def reopen(self) -> None:
+        """A run that a decision has ended is to go on: its last look is taken anew.
+
+        Raises
+        ------
+        InputError
+            If it was printed to its end, or nothing was recorded.
+        """
+        if not self._events:
+            raise InputError(f"{self.path} has no record of a run; name the folder of one")
+        last = self._events[-1]
+        if last.get("event") != "end":
+            return
+        if not last.get("stopped"):
+            raise InputError(
+                f"the run in {self.path} was printed to its end; there is nothing left"
+            )
+        self.write("reopened")
+        self._events = self._events[:-2]
+
+    def write(self, event: str, **said: Any) -> None:
+        """Put an event on the disk."""
+        if self.path is None or self.only_read:
+            return
+        line = json.dumps({"event": event, "time_s": round(self._clock(), 3), **said})
+        try:
+            if self._fd is None:
+                self._fd = self._open(self.path / TAPE)
+            os.write(self._fd, line.encode() + b"\n")
+            os.fsync(self._fd)
+        except OSError as error:
+            raise LoopError(
+                f"the record {self.path / TAPE} cannot be written ({error.strerror}); nothing is "
+                "sent that is not on the disk"
+            ) from error
+
+    def _open(self, path: Path) -> int:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        size = os.fstat(fd).st_size
+        if size and os.pread(fd, 1, size - 1) != b"\n":  # cut short by a kill
+            whole = os.pread(fd, size, 0).rfind(b"\n") + 1
+            os.ftruncate(fd, whole)
+        return fd
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
+
+def read_events(folder: Path) -> list[dict[str, Any]]:
+    """The events of a run's folder, oldest first; none where nothing was recorded.
+
+    Raises
+    ------
+    InputError
+        If the file is none of ours.
+    """
+    path = folder / TAPE
+    if not path.is_file():
+        return []
+    lines = path.read_bytes().split(b"\n")[:-1]  # the last is empty, or was cut short
+    try:
+        events: list[dict[str, Any]] = []
+        for line in lines:
+            event = dict(json.loads(line))
+            if event.get("event") == "reopened":  # it was ended by a question: look anew
+                events = events[:-2]
+            else:
+                events.append(event)
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"{path} is no record of a run ({error}); name the run's folder"
+        ) from error
+    return events
+
+
+def report_to_json(report: PrintReport) -> dict[str, Any]:
+    """A link's report as it stands on the tape."""
+    return asdict(report)
+
+
+def report_from_json(said: dict[str, Any]) -> PrintReport:
+    """The same, read back."""
+    known = {field.name for field in fields(PrintReport)}
+    values = {key: value for key, value in said.items() if key in known}
+    for key in ("round_trip_s", "warnings"):
+        values[key] = tuple(values.get(key, ()))
+    return PrintReport(**values)

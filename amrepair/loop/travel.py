@@ -1,0 +1,73 @@
+"""The loop's own moves: aside for a scan, and back to where the job rests.
+
+They are made and checked here, and sent by `run`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gcode.check import CheckedProgram, check
+from gcode.moves import FinishMoves, ModalState, Move, Retract, Toolpath, Travel
+from gcode.profiles import PrintSetup
+from gcode.writer import write
+
+PARK_LIFT_MM = 10.0
+
+
+def park(setup: PrintSetup, state: ModalState) -> tuple[CheckedProgram, ModalState]:
+    """Retract, lift, go aside, rest; the program, and the machine's state after it."""
+    machine = setup.printer
+    x, y, z = (float(v) for v in state.position_mm)
+    park_z = min(max(machine.park_mm[2], z + PARK_LIFT_MM), machine.max_z_mm)
+    place = (machine.park_mm[0], machine.park_mm[1], park_z)
+    moves: list[Move] = []
+    if machine.retraction_mm > 0:
+        moves.append(Retract(machine.retraction_mm, machine.retraction_speed_mm_s))
+    moves += [
+        Travel(np.array([[x, y, park_z]]), machine.z_speed_mm_s),
+        Travel(np.array([place]), machine.travel_speed_mm_s),
+        FinishMoves(),
+    ]
+    program = _program(setup, moves, state, "park for a scan", restore=False)
+    after = replace(
+        state, position_mm=place, e_mm=0.0, absolute_xyz=True, absolute_e=False, units_mm=True
+    )
+    return program, after
+
+
+def way_back(
+    setup: PrintSetup, state: ModalState, parked: ModalState
+) -> tuple[CheckedProgram, CheckedProgram]:
+    """Back to where the job rests; then everything as it was."""
+    machine = setup.printer
+    x, y, z = (float(v) for v in state.position_mm)
+    park_z = float(parked.position_mm[2])
+    moves: list[Move] = [
+        Travel(np.array([[x, y, park_z]]), machine.travel_speed_mm_s),
+        Travel(np.array([[x, y, z]]), machine.z_speed_mm_s),
+    ]
+    if machine.retraction_mm > 0:
+        moves.append(Retract(-machine.retraction_mm, machine.retraction_speed_mm_s))
+    # the way back starts from the park; the modes are put back once the nozzle has arrived
+    back = _program(setup, moves, parked, "back to the job", restore=False)
+    arrived = replace(parked, position_mm=state.position_mm)
+    modes = _program(setup, [], state, "go on with the job", restore=True, initial=arrived)
+    return back, modes
+
+
+def _program(
+    setup: PrintSetup,
+    moves: Sequence[Move],
+    state: ModalState,
+    title: str,
+    *,
+    restore: bool,
+    initial: ModalState | None = None,
+) -> CheckedProgram:
+    """Write and check a short program of the loop's own."""
+    program = write(Toolpath(tuple(moves)), setup, title=title, resume=state, restore=restore)
+    return check(program, setup, initial=initial or state)

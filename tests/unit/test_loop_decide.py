@@ -1,0 +1,116 @@
+"""The table of decisions: every row can be reached, and the page says what the code does."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from amrepair.detect.anomaly import DefectType
+from amrepair.loop.decide import (
+    FINDINGS,
+    STOPS,
+    Action,
+    Cover,
+    Finding,
+    Situation,
+    decide,
+    gravest,
+    judge,
+    tables,
+)
+
+PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "decisions.md"
+VOID = Finding(
+    kind="missing", type=DefectType.VOID, confidence=0.99, volume_mm3=30.0, thickness_layers=3.0,
+    height_layers=4.0, reachable_ratio=0.9, cover=Cover.SOLID, hit_mm=0.0,
+    box_mm=((0.0, 0.0, 1.0), (5.0, 5.0, 1.8)),
+)  # fmt: skip
+BLOB = replace(VOID, kind="excess", type=DefectType.BLOB)
+THIN = replace(VOID, thickness_layers=0.4, height_layers=0.8)
+
+CASES = {
+    "F1": replace(VOID, type=DefectType.DETACHED),
+    "F2": replace(VOID, type=DefectType.LAYER_SHIFT, confidence=0.5),
+    "F3": replace(VOID, type=DefectType.WARP),
+    "F4": replace(BLOB, hit_mm=0.4),
+    "F5": replace(BLOB, type=DefectType.STRING),
+    "F6": replace(BLOB, thickness_layers=0.8),
+    "F7": BLOB,
+    "F8": replace(VOID, volume_mm3=0.5),
+    "F9": replace(VOID, confidence=0.1),
+    "F10": replace(VOID, confidence=0.1, seen_twice=True),
+    "F11": THIN,
+    "F12": replace(VOID, thickness_layers=0.9, height_layers=1.0, reachable_ratio=0.0),
+    "F13": replace(VOID, reachable_ratio=0.0),
+    "F14": VOID,
+}
+SITUATIONS = {
+    "S1": Situation(Action.STOP),
+    "S2": Situation(Action.PAUSE),
+    "S3": Situation(Action.LOOK_AGAIN),
+    "S4": Situation(Action.FILL_NOW, little_left=True),
+    "S5": Situation(Action.FILL_NOW, stuck=True),
+    "S6": Situation(Action.FILL_NOW, last_pass=True),
+    "S7": Situation(Action.FILL_NOW, refused=True),
+    "S8": Situation(Action.FILL_NOW, beyond="too much"),
+    "S9": Situation(Action.FILL_NOW),
+    "S10": Situation(Action.FILL_WITH_NEXT),
+    "S11": Situation(Action.LOWER_NEXT),
+    "S12": Situation(Action.GO_ON),
+}
+
+
+@pytest.mark.parametrize("row", FINDINGS, ids=lambda row: row.id)
+def test_every_row_for_a_finding_can_be_reached(row) -> None:  # type: ignore[no-untyped-def]
+    verdict = judge(CASES[row.id])
+    assert (verdict.row, verdict.action, verdict.reason) == (row.id, row.action, row.reason)
+
+
+@pytest.mark.parametrize("row", STOPS, ids=lambda row: row.id)
+def test_every_row_for_a_stop_can_be_reached(row) -> None:  # type: ignore[no-untyped-def]
+    decision = decide((), SITUATIONS[row.id])
+    assert (decision.row, decision.action) == (row.id, row.action)
+
+
+def test_what_adding_material_cannot_mend_is_never_filled() -> None:
+    for kind in (DefectType.DETACHED, DefectType.LAYER_SHIFT, DefectType.WARP, DefectType.CLOG):
+        for confidence in (0.1, 0.5, 0.95):
+            for finding in (VOID, BLOB, THIN):
+                case = replace(finding, type=kind, confidence=confidence)
+                assert judge(case).action in (Action.STOP, Action.PAUSE, Action.LOOK_AGAIN)
+                again = judge(replace(case, seen_twice=True))
+                assert again.action in (Action.STOP, Action.PAUSE)
+
+
+def test_the_gravest_counts_and_the_thin_waits_for_the_next_layer() -> None:
+    verdicts = [judge(VOID), judge(THIN), judge(CASES["F6"])]
+    assert gravest(verdicts) is Action.FILL_NOW
+    assert gravest([]) is Action.GO_ON
+    decision = decide(verdicts, Situation(Action.FILL_NOW, last_pass=True))
+    assert decision.action is Action.FILL_WITH_NEXT
+    assert decision.row == "S6, S10"
+    assert {v.row for v in decision.changes_next} == {"F11", "F6"}
+
+
+def test_a_decision_goes_to_the_record_with_all_that_it_rests_on() -> None:
+    said = decide([judge(VOID)], Situation(Action.FILL_NOW)).to_json()
+    assert said["action"] == "fill now"
+    assert said["findings"][0]["reachable_ratio"] == 0.9
+    assert said["findings"][0]["row"] == "F14"
+    assert said["findings"][0]["box_mm"] == [[0.0, 0.0, 1.0], [5.0, 5.0, 1.8]]
+
+
+def test_the_page_has_the_tables_of_the_code(regenerate_golden: bool) -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    part = re.compile(r"<!-- tables -->\n(.*?)<!-- end -->", re.DOTALL)
+    wanted = f"\n{tables()}\n"
+    if regenerate_golden:
+        made = part.sub(lambda _: f"<!-- tables -->\n{wanted}<!-- end -->", text)
+        PAGE.write_text(made, encoding="utf-8")
+        return
+    found = part.search(text)
+    assert found is not None
+    assert found.group(1) == wanted

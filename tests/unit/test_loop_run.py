@@ -1,0 +1,177 @@
+"""What the loop does with each decision: on a small job, a file for a printer, scans by script."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loop_bench import LAYER, Small, scan_of
+
+from amrepair.errors import ScannerError
+from amrepair.frames import Transform
+from amrepair.loop import Action, Tape
+from amrepair.loop.limits import Limits
+from amrepair.loop.tape import read_events
+from amrepair.scans import Scan
+from gcode.moves import Program
+from gcode.reader import read_job
+
+
+@pytest.fixture(scope="module")
+def small() -> Small:
+    return Small.made()
+
+
+def laid_mm3(lines: list[str], small: Small) -> dict[float, float]:
+    """Plastic by height, as the sent lines have it."""
+    job = read_job(Program("\n".join(lines) + "\n", "prusa"), dialect="prusa")
+    beads = job.beads
+    length = np.linalg.norm(beads.end_mm - beads.start_mm, axis=1)
+    z = np.round(beads.end_mm[:, 2], 3)
+    return {float(h): float((length * beads.section_mm2)[z == h].sum()) for h in np.unique(z)}
+
+
+def last_bead(small: Small) -> str:
+    lines = small.job.program.text.splitlines()
+    return [line for line in lines if line.startswith("G1 X") and " E" in line][-1]
+
+
+def test_a_low_rise_makes_the_next_layer_thinner_there(small: Small, tmp_path: Path) -> None:
+    bump = small.block(-0.05, 0.17)
+    report, sent = small.run(tmp_path, lambda n: scan_of(small.standing + bump))
+    (look,) = report.looks
+    assert look.decision.action is Action.LOWER_NEXT
+    assert {v.row for v in look.decision.changes_next} == {"F6"}
+    laid, planned = laid_mm3(sent, small), laid_mm3(small.job.program.text.splitlines(), small)
+    above = round(small.job.layers[LAYER + 1].z_mm, 3)
+    found_mm3 = look.plan.deficit.excess_mm3
+    assert found_mm3 > 3.0
+    assert planned[above] - laid[above] == pytest.approx(found_mm3, rel=0.25)
+    for height, volume in planned.items():
+        if height != above:
+            assert laid[height] == pytest.approx(volume, rel=1e-6)
+
+
+def test_a_thin_gap_is_left_to_the_next_layer_which_carries_it(tmp_path: Path) -> None:
+    small = Small.made("repair_0.30", 2.4)
+    gap = small.block(-0.2, 0.5, size_mm=7.0)
+    report, sent = small.run(tmp_path, lambda n: scan_of(small.standing - gap))
+    (look,) = report.looks
+    assert look.decision.action is Action.FILL_WITH_NEXT, look.decision.to_json()
+    assert not report.repair_prints
+    laid, planned = laid_mm3(sent, small), laid_mm3(small.job.program.text.splitlines(), small)
+    above = round(small.job.layers[LAYER + 1].z_mm, 3)
+    # a bead carries no more than the printer's section allows: most of it, and never more
+    assert 0.5 < (laid[above] - planned[above]) / look.plan.deficit.missing_mm3 < 1.05
+
+
+def test_what_the_head_would_hit_ends_the_run_before_the_next_move(
+    small: Small, tmp_path: Path
+) -> None:
+    tower = small.block(-0.1, 1.5, size_mm=3.0)
+    report, sent = small.run(
+        tmp_path, lambda n: scan_of(small.standing + tower), tape=Tape(tmp_path)
+    )
+    assert report.stopped.startswith("pause and ask: blob: the head would hit it")
+    assert not report.within_tolerance
+    (verdict,) = [v for v in report.looks[0].decision.verdicts if v.row == "F4"]
+    assert verdict.finding.hit_mm > 0.8
+    job_lines = small.job.program.text.splitlines()
+    after = [
+        line for line in job_lines[small.job.layers[LAYER].end_line :] if line.startswith("G1 X")
+    ]
+    assert after[0] not in sent[-60:]
+    assert sent[-1] == "heaters off"
+    assert read_events(tmp_path)[-1]["stopped"] == report.stopped
+
+
+def test_somebody_may_say_go_on(small: Small, tmp_path: Path) -> None:
+    tower = small.block(-0.1, 1.5, size_mm=3.0)
+    asked = []
+
+    def ask(decision: object) -> bool:
+        asked.append(decision)
+        return True
+
+    report, sent = small.run(tmp_path, lambda n: scan_of(small.standing + tower), ask=ask)
+    assert len(asked) == 1
+    assert not report.stopped
+    assert sum(line == "M107" for line in sent) >= 1
+    assert last_bead(small) in sent
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(5.0, 1e4, 0.0), Limits(1e4, 1.0, 0.0), Limits(1e4, 1e4, 0.999)],
+    ids=["volume", "time", "reach"],
+)  # fmt: skip
+def test_unasked_only_within_the_profile_s_limits(
+    small: Small, tmp_path: Path, limits: Limits
+) -> None:
+    pocket = small.block(-0.6, 0.5)
+    report, _ = small.run(tmp_path, lambda n: scan_of(small.standing - pocket), limits=limits)
+    assert report.stopped.startswith("pause and ask: ")
+    assert "the profile" in report.stopped
+    assert report.looks[0].decision.row == "S8"
+    assert not report.repair_prints
+
+
+def test_within_the_limits_it_prints_unasked(small: Small, tmp_path: Path) -> None:
+    pocket = small.block(-0.6, 0.5)
+    report, _ = small.run(
+        tmp_path,
+        lambda n: scan_of(small.standing - pocket if n == 1 else small.standing),
+        limits=Limits.of(small.setup.process),
+    )
+    assert not report.stopped
+    assert [look.decision.action for look in report.looks] == [Action.FILL_NOW, Action.GO_ON]
+    assert report.looks[0].plan.deficit.regions[0].type == "void"
+
+
+def test_a_part_that_came_off_ends_the_run(small: Small, tmp_path: Path) -> None:
+    moved = Transform.from_rotation_translation(
+        "scanner", "scanner", rotation=np.eye(3), translation_mm=np.array([2.0, -1.2, 0.0])
+    )
+    report, sent = small.run(tmp_path, lambda n: scan_of(small.standing).moved(moved))
+    assert report.stopped.startswith("stop: detached")
+    assert not report.repair_prints
+    assert sent[-1] == "heaters off"
+
+
+def silent(n: int) -> Scan:
+    raise ScannerError("nothing new in the folder")
+
+
+def test_a_silent_scanner_does_not_cost_the_print(small: Small, tmp_path: Path) -> None:
+    report, sent = small.run(tmp_path, silent, silent_stops=1, tape=Tape(tmp_path))
+    assert [stop.label for stop in report.passed] == [f"layer-{LAYER:03d}"]
+    assert not report.looks
+    assert not report.within_tolerance
+    assert last_bead(small) in sent
+    assert [e["event"] for e in read_events(tmp_path)].count("no_look") == 1
+
+
+def test_a_scanner_that_is_gone_ends_the_run(small: Small, tmp_path: Path) -> None:
+    with pytest.raises(ScannerError, match="nothing new"):
+        small.run(tmp_path, silent)
+    assert last_bead(small) not in (tmp_path / "sent.gcode").read_text()
+
+
+def test_a_scan_that_does_not_fit_is_taken_again_before_the_run_ends(
+    small: Small, tmp_path: Path
+) -> None:
+    away = Transform.from_rotation_translation(
+        "scanner", "scanner", rotation=np.eye(3), translation_mm=np.array([40.0, 0.0, 0.0])
+    )
+    taken = []
+
+    def scans(n: int) -> Scan:
+        taken.append(n)
+        return scan_of(small.standing).moved(away) if n == 1 else scan_of(small.standing)
+
+    report, _ = small.run(tmp_path / "once", scans)
+    assert taken == [1, 2]
+    assert not report.stopped
+    report, sent = small.run(tmp_path / "gone", lambda n: scan_of(small.standing).moved(away))
+    assert report.stopped.startswith("stop: twice the scan did not fit")
+    assert sent[-1] == "heaters off"

@@ -1,0 +1,92 @@
+"""The tape: whole lines only, in order, and a question that ended a run is asked anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from amrepair.errors import InputError, LoopError
+from amrepair.loop.tape import TAPE, Tape, TapeEndsError, read_events
+
+
+def test_what_was_written_comes_back_in_order(tmp_path: Path) -> None:
+    tape = Tape(tmp_path, clock=lambda: 7.0)
+    tape.write("send", kind="job", first=0, end=9)
+    tape.write("sent", ok=True)
+    assert tape.live
+    tape.close()
+    again = Tape(tmp_path)
+    assert not again.live
+    assert again.next("send") == {
+        "event": "send", "time_s": 7.0, "kind": "job", "first": 0, "end": 9,
+    }  # fmt: skip
+    with pytest.raises(LoopError, match="has 'sent' where this run comes to 'look'"):
+        again.next("look")
+    assert again.next("sent") is not None
+    assert again.next("look") is None
+
+
+@pytest.mark.parametrize("cut", [1, 5, 30])
+def test_a_line_that_a_kill_cut_short_was_never_begun(tmp_path: Path, cut: int) -> None:
+    tape = Tape(tmp_path)
+    tape.write("send", kind="job")
+    tape.write("send", kind="park")
+    tape.close()
+    path = tmp_path / TAPE
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert [event["kind"] for event in read_events(tmp_path)] == ["job"]
+    after = Tape(tmp_path)
+    after.write("send", kind="park")
+    after.close()
+    assert [event["kind"] for event in read_events(tmp_path)] == ["job", "park"]
+
+
+def test_a_replay_ends_with_the_tape_and_writes_nothing(tmp_path: Path) -> None:
+    recorded = Tape(tmp_path)
+    recorded.write("send", kind="job")
+    recorded.write("look", look=1, stop="layer-003")
+    tape = Tape(tmp_path, only_read=True)
+    assert tape.next_stop() == "layer-003"
+    tape.next("look")
+    tape.write("send", kind="park")
+    assert tape.next_stop() is None
+    with pytest.raises(TapeEndsError):
+        tape.next("look")
+    assert len(read_events(tmp_path)) == 2
+
+
+def test_a_run_that_a_question_ended_looks_anew(tmp_path: Path) -> None:
+    tape = Tape(tmp_path)
+    for event in ("send", "sent", "look"):
+        tape.write(event, look=1)
+    tape.write("end", stopped="pause and ask: warp")
+    again = Tape(tmp_path)
+    again.reopen()
+    assert [again.next(event) is not None for event in ("send", "sent", "look")] == [
+        True, True, False,
+    ]  # fmt: skip
+    again.write("look", look=1)
+    assert [event["event"] for event in read_events(tmp_path)] == ["send", "sent", "look"]
+
+
+def test_a_run_that_is_over_is_over(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no record"):
+        Tape(tmp_path).reopen()
+    tape = Tape(tmp_path)
+    tape.write("end", stopped="")
+    with pytest.raises(InputError, match="printed to its end"):
+        Tape(tmp_path).reopen()
+
+
+def test_a_file_of_somebody_elses_is_refused(tmp_path: Path) -> None:
+    (tmp_path / TAPE).write_text("[1, 2]\nnonsense\n")
+    with pytest.raises(InputError, match="no record"):
+        Tape(tmp_path)
+
+
+def test_without_a_path_nothing_is_remembered() -> None:
+    tape = Tape()
+    tape.write("send", kind="job")
+    assert tape.live
+    assert tape.next("send") is None
