@@ -76,15 +76,15 @@ class Painter:
         for spot, shade in zip(flat, shades.tolist(), strict=True):
             self._shapes.append((spot[2], "point", spot[None, :2], tuple(shade), 0.14))
 
-    def beads(self, beads: Any, chosen: np.ndarray, colour: Colour) -> None:
-        """Beads of a program, some of them."""
+    def beads(self, beads: Any, chosen: np.ndarray, colour: Colour, nearer_mm: float = 0.0) -> None:
+        """Beads of a program, some of them; drawn after what lies within `nearer_mm` of them."""
         start, end = self._flat(beads.start_mm[chosen]), self._flat(beads.end_mm[chosen])
         along = beads.end_mm[chosen] - beads.start_mm[chosen]
         turned = np.abs(np.arctan2(along[:, 1], along[:, 0])) / np.pi
         for a, b, light in zip(start, end, 0.8 + 0.3 * turned, strict=True):
             shade = tuple(int(min(255, c * light)) for c in colour)
             line = np.stack([a[:2], b[:2]])
-            self._shapes.append(((a[2] + b[2]) / 2, "line", line, shade, BEAD_MM))  # type: ignore[arg-type]
+            self._shapes.append(((a[2] + b[2]) / 2 - nearer_mm, "line", line, shade, BEAD_MM))  # type: ignore[arg-type]
 
     def save(self, path: Path) -> None:
         """Put it on paper."""
@@ -153,19 +153,20 @@ def template_from_scans(out: Path, image: Path) -> None:
 
 
 def run_in_simulation(out: Path, image: Path) -> None:
-    """A look: the scan by its deviation is grey, the deficit blue, the repair's beads green."""
+    """The job's beads up to the stop grey, where they are written; the deficit blue; the repair."""
     painter = Painter(28.0, 48.0)
-    looked = amrepair.read_scan(out / "scan-1.ply", frame="build")
-    scan = looked.points_mm
-    deficits = sorted(out.glob("deficit-1*.stl"))
-    solid = trimesh.load_mesh(deficits[0])
+    solid = trimesh.load_mesh(out / "deficit-1.stl")
     low, high = solid.bounds
-    near = ((scan > low - 12.0) & (scan < high + 12.0)).all(axis=1)
-    painter.points(scan[near], _lit(looked)[near])
-    painter.mesh(solid, BLUE)
+    if (out / "job.gcode").is_file():
+        beads = _beads(out / "job.gcode")
+        laid = (beads.end_mm[:, 2] <= high[2] + 0.01) & (beads.layer >= 0)
+        near = (np.abs(beads.end_mm - (low + high) / 2.0)[:, :2] < 14.0).all(axis=1)
+        painter.beads(beads, laid & near, GREY)
+    else:
+        painter.mesh(solid, BLUE)
     beads = _beads(out / "repair-1.gcode")
     inside = ((beads.start_mm > low - 0.6) & (beads.start_mm < high + 0.6)).all(axis=1)
-    painter.beads(beads, inside, GREEN)
+    painter.beads(beads, inside, GREEN, nearer_mm=0.6)
     painter.save(image)
 
 
