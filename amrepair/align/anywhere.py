@@ -34,7 +34,7 @@ CLEAR_SIGMAS, CLEAR_MM = 4.0, 0.1
 CONTRADICTED_RATIO, CONTRADICTED_SIGMAS = 0.003, 4.0
 APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
 # With fewer points on the part the search is made thorough; then features are asked too.
-WELL_EXPLAINED, EXPLAINED = 0.85, 0.7
+WELL_EXPLAINED, EXPLAINED = 0.97, 0.7
 PLAUSIBLE = 0.6  # a mean distance above this share of the cap is no fit that more points would mend
 
 
