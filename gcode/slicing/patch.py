@@ -220,6 +220,7 @@ class _Model:
         self.laid_mm = np.zeros(self.shape)
         self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
         self.lost: list[Unprintable] = []
+        self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
         window = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
         # the lowest pass lies at most one thick bead above the deficit's floor
         self.reach = Reach(
@@ -393,11 +394,11 @@ def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: _Model) -> l
     step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     t = (step / count[owner])[:, None]
     points = np.concatenate([xy[owner] + (xy[owner + 1] - xy[owner]) * t, xy[-1:]])
-    ok = np.ones(len(points) - 1, dtype=bool)
     closer = 2 + int(np.ceil(3 * STEP_MM / model.reach.field.cell_mm))
-    for share in np.linspace(0.0, 1.0, closer):  # than the checker's own steps of half a cell
-        at = points[:-1] + (points[1:] - points[:-1]) * share
-        ok &= _surely_free(at, reach, model)
+    # closer than the checker's own steps of half a cell
+    share = np.linspace(0.0, 1.0, closer)[:, None, None]
+    between = points[:-1] + (points[1:] - points[:-1]) * share
+    ok = _surely_free(between.reshape(-1, 2), reach, model).reshape(closer, -1).all(axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
     pieces_mm = (lengths / count)[owner]
     return [
@@ -416,11 +417,9 @@ def _surely_free(
     points_mm: Float[np.ndarray, "n 2"], reach: Bool[np.ndarray, "_ry _rx"], model: _Model
 ) -> Bool[np.ndarray, " n"]:
     """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
-    ok = np.ones(len(points_mm), dtype=bool)
-    for dx in (-ROUNDING_MM, ROUNDING_MM):
-        for dy in (-ROUNDING_MM, ROUNDING_MM):
-            ok &= model.reach.free_at_points(points_mm + np.array([dx, dy]), reach)
-    return ok
+    little = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    near = (points_mm + little[:, None, :]).reshape(-1, 2)
+    return model.reach.free_at_points(near, reach).reshape(4, -1).all(axis=0)
 
 
 def _weighed(
@@ -683,4 +682,8 @@ def _reason(
         return COVERED
     if not (0 <= row < ny and 0 <= column < nx):
         return COVERED
-    return model.reach.reason_at(row, column, float(model.top_mm[iy, ix]))
+    # the tip over the first bead that is lacking: the lowest, where a bridge was laid over it
+    under_bridge = model.sunk_mm[iy, ix] > 0
+    lies_mm = model.floor_mm[iy, ix] + (0.0 if under_bridge else model.laid_mm[iy, ix])
+    tip_mm = min(lies_mm + model.most_mm, model.top_mm[iy, ix])
+    return model.reach.reason_at(row, column, float(tip_mm))

@@ -18,6 +18,8 @@ from gcode.surfaces import HeightField
 TIP_PRESS_MM = 0.06
 # The noise of the field: half of what the checker allows.
 BODY_PRESS_MM = 0.05
+# The tip lies somewhere in its cell: half of a fine one.
+ASIDE_MM = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,7 @@ def least_tip(
 ) -> Float[np.ndarray, "ny nx"]:
     """How high the tip must at least be, by column of the window, for a slice to clear all."""
     press_mm = TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_PRESS_MM
-    under_mm = field.max_within(part.polygon_mm, window, anywhere=True)
+    under_mm = field.max_within(part.polygon_mm, window, aside_mm=ASIDE_MM)
     return np.asarray(under_mm - part.z_from_mm - press_mm)
 
 

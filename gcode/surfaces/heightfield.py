@@ -144,7 +144,7 @@ class HeightField:
         polygon_mm: Sequence[tuple[float, float]],
         window: tuple[slice, slice] | None = None,
         *,
-        anywhere: bool = False,
+        aside_mm: float = 0.0,
     ) -> Float[np.ndarray, "_my _mx"]:
         """Greatest height under a convex polygon placed with its origin on each cell's centre.
 
@@ -155,12 +155,12 @@ class HeightField:
             the answer is never too low.
         window
             Rows and columns of the cells that are asked about; all by default.
-        anywhere
-            The origin may lie anywhere in its cell, not only at the centre.
+        aside_mm
+            The origin may lie this far from its cell's centre, each way.
         """
         ny, nx = self.shape
         rows, columns = window or (slice(0, ny), slice(0, nx))
-        dy, low, high = footprint_rows(polygon_mm, self.cell_mm, anywhere=anywhere)
+        dy, low, high = footprint_rows(polygon_mm, self.cell_mm, aside_mm=aside_mm)
         box = len(dy) > 0 and (low == low[0]).all() and (high == high[0]).all()
         if not box:
             return kernels.dilate_rows(
@@ -354,19 +354,18 @@ def flat_bed(size_mm: tuple[float, float], cell_mm: float) -> HeightField:
 
 
 def footprint_rows(
-    polygon_mm: Sequence[tuple[float, float]], cell_mm: float, *, anywhere: bool = False
+    polygon_mm: Sequence[tuple[float, float]], cell_mm: float, *, aside_mm: float = 0.0
 ) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
     """Rows of cell offsets (dy, low, high) that a convex polygon around a cell's centre touches.
 
-    With `anywhere`, around any point of the cell.
+    With `aside_mm`, around any point that is no farther from the centre each way.
     """
     outline = np.asarray(polygon_mm, float) / cell_mm
     closed = np.vstack([outline, outline[:1]])
-    reach = 1.0 if anywhere else 0.5  # from a cell's centre to the far side of what it touches
-    first = math.floor(outline[:, 1].min() + reach)
-    last = math.ceil(outline[:, 1].max() - reach)
-    if anywhere:
-        first, last = first - 1, last + 1
+    aside = aside_mm / cell_mm
+    reach = 0.5 + aside  # from a cell's centre to the far side of what it touches
+    first = math.floor(outline[:, 1].min() - aside + 0.5)
+    last = math.ceil(outline[:, 1].max() + aside - 0.5)
     rows: list[tuple[int, int, int]] = []
     for dy in range(first, last + 1):
         # the polygon's reach in x over the whole band of the row, [dy − reach, dy + reach]
@@ -380,8 +379,8 @@ def footprint_rows(
             else:
                 xs += [px + (y - py) * (qx - px) / (qy - py) for y in (low, high)]
         if xs:
-            grown = reach - 0.5
-            rows.append((dy, math.floor(min(xs) - grown + 0.5), math.ceil(max(xs) + grown - 0.5)))
+            low, high = min(xs) - aside, max(xs) + aside
+            rows.append((dy, math.floor(low + 0.5), math.ceil(high - 0.5)))
     table = np.array(rows, np.int64).reshape(-1, 3)
     return table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy()
 
