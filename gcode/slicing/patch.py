@@ -419,7 +419,7 @@ def _surely_free(
     """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
     little = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     near = (points_mm + little[:, None, :]).reshape(-1, 2)
-    return model.reach.free_at_points(near, reach).reshape(4, -1).all(axis=0)
+    return np.asarray(model.reach.free_at_points(near, reach).reshape(4, -1).all(axis=0))
 
 
 def _weighed(
