@@ -25,6 +25,7 @@ PARTS = Path(__file__).parents[2] / "examples" / "parts"
 KNOB, BRACKET = PARTS / "knob.stl", PARTS / "bracket.stl"
 
 
+@pytest.mark.slow
 def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
     options = SynthOptions(train=1, normal=2, per_defect=1, points=4000)
     data = synthesize([KNOB], tmp_path / "set", "anomaly-shapenet", 0, options=options)

@@ -122,6 +122,7 @@ def test_a_void_in_sparse_infill_is_mended_and_its_cells_are_left_open(template:
     assert run.repaired_ratio > 0.5
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_result(template: MeshSdf) -> None:
     twice = [
         result_of(simulate_run(prepared(template, "void:diameter=6,layers=2"))) for _ in range(2)

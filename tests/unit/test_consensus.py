@@ -224,6 +224,7 @@ def test_a_plate_is_not_laid_on_its_other_half(part: AnalyticTemplate) -> None:
         place_all([_piece(scan, rng) for scan in halves(part, 26.0, 12.0)], rng)
 
 
+@pytest.mark.slow
 def test_scans_of_different_parts_are_refused(part: AnalyticTemplate) -> None:
     ball = np.random.default_rng(0).normal(size=(8_000, 3))
     ball *= 22.0 / np.linalg.norm(ball, axis=1, keepdims=True)

@@ -32,9 +32,11 @@ def laid_mm3(lines: list[str], small: Small) -> dict[float, float]:
     return {float(h): float((length * beads.section_mm2)[z == h].sum()) for h in np.unique(z)}
 
 
-def last_bead(small: Small) -> str:
+def to_its_end(small: Small, sent: list[str]) -> bool:
+    """Whether the job's last bead was sent; its words may be those of another layer's, too."""
     lines = small.job.program.text.splitlines()
-    return [line for line in lines if line.startswith("G1 X") and " E" in line][-1]
+    last = [line for line in lines if line.startswith("G1 X") and " E" in line][-1]
+    return sent.count(last) >= lines.count(last)
 
 
 def test_a_low_rise_makes_the_next_layer_thinner_there(small: Small, tmp_path: Path) -> None:
@@ -98,7 +100,7 @@ def test_somebody_may_say_go_on(small: Small, tmp_path: Path) -> None:
     assert len(asked) == 1
     assert not report.stopped
     assert sum(line == "M107" for line in sent) >= 1
-    assert last_bead(small) in sent
+    assert to_its_end(small, sent)
 
 
 @pytest.mark.parametrize(
@@ -147,14 +149,14 @@ def test_a_silent_scanner_does_not_cost_the_print(small: Small, tmp_path: Path) 
     assert [stop.label for stop in report.passed] == [f"layer-{LAYER:03d}"]
     assert not report.looks
     assert not report.within_tolerance
-    assert last_bead(small) in sent
+    assert to_its_end(small, sent)
     assert [e["event"] for e in read_events(tmp_path)].count("no_look") == 1
 
 
 def test_a_scanner_that_is_gone_ends_the_run(small: Small, tmp_path: Path) -> None:
     with pytest.raises(ScannerError, match="nothing new"):
         small.run(tmp_path, silent)
-    assert last_bead(small) not in (tmp_path / "sent.gcode").read_text()
+    assert not to_its_end(small, (tmp_path / "sent.gcode").read_text().splitlines())
 
 
 def test_a_scan_that_does_not_fit_is_taken_again_before_the_run_ends(
