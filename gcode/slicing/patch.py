@@ -59,8 +59,9 @@ HOLD_MM = 0.4  # how far a bead may hang over a hole beside what holds it
 STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4
 LEAST_SECTION_MM2 = 0.004
-# From a bead's centre, as far as plastic is pressed sideways: half of the widest bead.
-SPREAD_NOZZLES = 0.5 * MOST_NOZZLES
+# From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which is
+# 2.5 bores across (E3D V6): not to its very rim.
+SPREAD_NOZZLES = 1.125
 # Centre lines keep off the rim of where the tip may go: contours of cells are not exact.
 DRAWN_IN_CELLS = 0.75
 ROUNDING_MM = 2e-3  # more than the text's last digit

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
 
-# The flat may press this deep into the plastic beside it: half a layer; with what a scan gets
+# The flat may press this deep into the plastic beside it; with what a scan gets
 # wrong it stays under the checker's limit.
 TIP_PRESS_MM = 0.06
 # The noise of the field: half of what the checker allows.
