@@ -14,11 +14,10 @@ from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
 from gcode.cli import console
+from gcode.cli.options import job_of
 from gcode.hosts import connect
 from gcode.hosts.journal import default_path
-from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
-from gcode.reader import read_job
 from gcode.slicing.job import plan_part
 from gcode.slicing.layers import mesh_of
 from gcode.writer import write
@@ -86,15 +85,7 @@ def _standing(setup: PrintSetup, job: Path | None, layer: int) -> Template:
 
         vertices, faces = mesh_of(target_solid(setup.printer))
         return MeshSdf.from_mesh(trimesh.Trimesh(vertices, faces, process=False))
-    try:
-        text = job.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"the job {job} cannot be read ({error.strerror})") from error
-    made = read_job(
-        Program(text, setup.printer.dialect),
-        filament_diameter_mm=setup.printer.filament_diameter_mm,
-        dialect=setup.printer.dialect,
-    )
+    made = job_of(job, setup)
     if layer >= len(made.layers):
         raise InputError(f"--layer is {layer}; the job has layers 0 to {len(made.layers) - 1}")
     beads = made.beads

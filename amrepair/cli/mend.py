@@ -21,13 +21,12 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import InputError
 from gcode.cli import console
+from gcode.cli.options import grid_of
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
     from amrepair.repair import RepairPlan
     from amrepair.turning import Turn
-    from gcode.profiles import PrintSetup
-    from gcode.slicing.layers import LayerGrid
 
 # A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
@@ -122,7 +121,7 @@ def repair(
     watch, bars = Stopwatch(), console.Bars()
     frame = "build" if scan_frame == "build" else "scanner"
     cloud = read_scan(scan, frame=frame, sensor_at=sensors(sensor_at))
-    grid = _grid(job, setup)
+    grid = grid_of(job, setup)
     with bars.shown():
         with watch("template"):
             field = open_template(template, progress=bars)
@@ -194,25 +193,3 @@ def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:
         f"Turned by {best.name} the nozzle would reach {best.reachable_ratio:.0%} of what is "
         f"missing ({now:.0%} as it stands){how}. Lay it so, scan it in the bed's frame, repair."
     ]
-
-
-def _grid(job: Path | None, setup: PrintSetup) -> LayerGrid:
-    """Layers of the job, or of the process profile."""
-    from gcode.moves import Program
-    from gcode.reader import read_job
-    from gcode.slicing.layers import LayerGrid
-
-    if job is None:
-        return LayerGrid.from_setup(setup)
-    try:
-        text = job.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"the job {job} cannot be read ({error.strerror})") from error
-    read = read_job(
-        Program(text, setup.printer.dialect),
-        filament_diameter_mm=setup.printer.filament_diameter_mm,
-        dialect=setup.printer.dialect,
-    )
-    return LayerGrid.from_tops(
-        [layer.z_mm for layer in read.layers], layer_height_mm=setup.process.layer_height_mm
-    )

@@ -36,11 +36,11 @@ from amrepair.template import open_template
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
 from gcode.cli import console
+from gcode.cli.options import job_of
 from gcode.hosts import connect
 from gcode.hosts.journal import default_path
-from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
-from gcode.reader import Job, read_job
+from gcode.reader import Job
 
 SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
 
@@ -160,7 +160,7 @@ def _new_run(
             f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume {out}') "
             "or name another folder with --out"
         )
-    job = _job(job_file, setup)
+    job = job_of(job_file, setup)
     checked = check(job.program, setup)
     every, *at = layers
     regular = [*range(every - 1, len(job.layers) - 1, every)] if every else []
@@ -286,18 +286,6 @@ def _tell(begun: _Begun, report: LoopReport, watch: Stopwatch, *, as_json: bool)
         raise typer.Exit(LoopError.exit_code)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
-
-
-def _job(path: Path, setup: PrintSetup) -> Job:
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"the job {path} cannot be read ({error.strerror})") from error
-    return read_job(
-        Program(text, setup.printer.dialect),
-        filament_diameter_mm=setup.printer.filament_diameter_mm,
-        dialect=setup.printer.dialect,
-    )
 
 
 def _scanner(spec: str, pose: Transform, timeout_s: float) -> Scanner:

@@ -31,6 +31,7 @@ TOP_ALLOWANCE_MM = 0.05
 DEFAULT_REGISTRATION_SIGMA_MM = 0.03
 # The template's distance is the height under a plane: to rounding.
 ON_PLANE_MM = 1e-4
+WELL_SEEN_POINTS = 27  # three each way
 FALSE_ALARMS_PER_SCAN = 1e-3
 # Excess farther out than this is not part of the print (clutter, the bed's rim).
 MAX_EXCESS_MM = 12.0
@@ -66,6 +67,11 @@ class Threshold:
     def low_mm(self, count: Int[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
         """(s,) limit for a mean of `count` points to go on with one."""
         return self.systematic_mm / 2 + 2 * self.sigma_mm / np.sqrt(np.maximum(count, 1))
+
+    @property
+    def well_seen_mm(self) -> float:
+        """Limit where there are points enough to start a region."""
+        return float(self.high_mm(np.array([WELL_SEEN_POINTS]))[0])
 
 
 def detect(
@@ -170,12 +176,12 @@ def detect(
         label=label,
         template_points_mm=surface_mm,
         template_label=surface_label,
-        threshold_mm=float(limit.high_mm(np.array([27]))[0]),
+        threshold_mm=limit.well_seen_mm,
         threshold_source=source,
         object_score=object_score,
         regions=regions,
         top_z_mm=top_z_mm if threshold_mm is None else None,
-        top_threshold_mm=float(top_limit.high_mm(np.array([27]))[0]),
+        top_threshold_mm=top_limit.well_seen_mm,
         evidence=evidence,
         surfel_label=np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0)),
     )
@@ -310,7 +316,7 @@ def _label_surface(
     open_ = np.flatnonzero(~present)
     if len(open_):
         # just inside the surface, as deep as the limit: empty there is more than noise
-        depth_mm = float(limit.high_mm(np.array([27]))[0])
+        depth_mm = limit.well_seen_mm
         inside = surface_mm[open_] - depth_mm * normals[open_]
         f_mm = template.distance(inside)
         cautious = evidence.clearance(inside, f_mm)[1]
@@ -339,7 +345,7 @@ def _seen_through(
     millimetre off and, in a wall so thin, within every limit; a layer over a cell leaves none.
     """
     here = np.flatnonzero(label != int(Label.MISSING))
-    depth_mm = float(limit.high_mm(np.array([27]))[0])
+    depth_mm = limit.well_seen_mm
     inside = surface_mm[here] - 0.5 * depth_mm * normals[here]
     f_mm = template.distance(inside)
     cautious = evidence.clearance(inside, f_mm)[1]

@@ -14,6 +14,7 @@ from gcode.cli.options import (
     MaterialOption,
     PrinterOption,
     ProcessOption,
+    grid_of,
     program_text,
 )
 from gcode.cli.resuming import resume_at_command
@@ -22,7 +23,6 @@ from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, l
 
 if TYPE_CHECKING:
     from gcode.hosts import Printer, PrintReport
-    from gcode.slicing.layers import LayerGrid
     from gcode.surfaces import HeightField
 
 AS_BUILT_CELL_MM = 0.2
@@ -114,7 +114,7 @@ def slice_solid(
                 shape,
                 setup,
                 as_built=field,
-                grid=_grid(job, setup),
+                grid=grid_of(job, setup),
                 standalone=True,
                 progress=bars,
             )
@@ -454,19 +454,6 @@ def _as_built(path: Path) -> HeightField:
         return HeightField.read(path)
     solid = read_solid(path)
     return HeightField.from_manifold(solid, AS_BUILT_CELL_MM, margin_mm=AROUND_MM)
-
-
-def _grid(job: Path | None, setup: Any) -> LayerGrid:
-    from gcode.moves import Program
-    from gcode.reader import read_job
-    from gcode.slicing.layers import LayerGrid
-
-    if job is None:
-        return LayerGrid.from_setup(setup)
-    read = read_job(Program(program_text(job), setup.printer.dialect))
-    return LayerGrid.from_tops(
-        [layer.z_mm for layer in read.layers], layer_height_mm=setup.process.layer_height_mm
-    )
 
 
 def _reasons(lost: tuple[Any, ...]) -> str:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gcode.cli import console
 from gcode.errors import InputError
+
+if TYPE_CHECKING:
+    from gcode.profiles import PrintSetup
+    from gcode.reader import Job
+    from gcode.slicing.layers import LayerGrid
 
 PrinterOption = Annotated[
     str,
@@ -48,3 +53,40 @@ def program_text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}).") from error
+
+
+def job_of(path: Path, setup: PrintSetup) -> Job:
+    """A job's file, read for the printer that it is meant for.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    from gcode.moves import Program
+    from gcode.reader import read_job
+
+    printer = setup.printer
+    return read_job(
+        Program(program_text(path), printer.dialect),
+        filament_diameter_mm=printer.filament_diameter_mm,
+        dialect=printer.dialect,
+    )
+
+
+def grid_of(job: Path | None, setup: PrintSetup) -> LayerGrid:
+    """Layers of a job's file; without one, those of the process profile.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    from gcode.slicing.layers import LayerGrid
+
+    if job is None:
+        return LayerGrid.from_setup(setup)
+    return LayerGrid.from_tops(
+        [layer.z_mm for layer in job_of(job, setup).layers],
+        layer_height_mm=setup.process.layer_height_mm,
+    )

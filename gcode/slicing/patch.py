@@ -300,10 +300,7 @@ def _plan_passes(
         tops = np.append(tops, high_mm)
     # the last pass ends with the deficit, not above it
     tops[-1] = min(tops[-1], high_mm)
-    most_mm = min(
-        MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm,
-        setup.process.max_gap_layers * grid.layer_height_mm,
-    )
+    most_mm = min(model.most_mm, setup.process.max_gap_layers * grid.layer_height_mm)
     passes: list[_Pass] = []
     for k, z_mm in enumerate(tops):
         following = float(tops[k + 1]) if k + 1 < len(tops) else np.inf

@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 from numba import njit
 
-# Columns do not run through vertices of a model whose coordinates are round.
 FILM_MM = 0.02
+# Columns do not run through vertices of a model whose coordinates are round.
 SHIFT_MM = (1.3e-5, 2.1e-5)
 
 
@@ -52,10 +52,11 @@ def column_tops(mesh: trimesh.Trimesh, box: Voxels) -> np.ndarray:
 
 
 @njit(cache=True)
-def _highest(triangles, origin, size, shape):
-    """Top of each column; films, which a boolean leaves on faces that coincide, are nothing."""
+def _crossings(triangles, origin, size, shape):
+    """Heights at which the columns cross triangles, and where those of each column start."""
     starts = np.zeros(shape[0] * shape[1] + 1, np.int64)
     heights = np.zeros(0)
+    cursor = starts[:-1].copy()
     for phase in range(2):
         if phase == 1:
             starts[1:] = np.cumsum(starts[1:])
@@ -76,13 +77,22 @@ def _highest(triangles, origin, size, shape):
                     y = origin[1] + j * size[1]
                     u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
                     v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
-                    if u >= 0 and v >= 0 and u + v <= 1:
-                        k = i * shape[1] + j
-                        if phase == 0:
-                            starts[k + 1] += 1
-                        else:
-                            heights[cursor[k]] = u * a[2] + v * b[2] + (1 - u - v) * c[2]
-                            cursor[k] += 1
+                    w = 1.0 - u - v
+                    if u < 0 or v < 0 or w < 0:
+                        continue
+                    k = i * shape[1] + j
+                    if phase == 0:
+                        starts[k + 1] += 1
+                    else:
+                        heights[cursor[k]] = u * a[2] + v * b[2] + w * c[2]
+                        cursor[k] += 1
+    return starts, heights
+
+
+@njit(cache=True)
+def _highest(triangles, origin, size, shape):
+    """Top of each column; films, which a boolean leaves on faces that coincide, are nothing."""
+    starts, heights = _crossings(triangles, origin, size, shape)
     tops = np.zeros(shape)
     for i in range(shape[0]):
         for j in range(shape[1]):
@@ -99,29 +109,13 @@ def _highest(triangles, origin, size, shape):
 @njit(cache=True)
 def _flips(triangles, origin, size, low_z, shape):
     """1 at the first voxel over each crossing of a triangle with a column, summed by parity."""
+    starts, heights = _crossings(triangles, origin, size, shape[:2])
     flips = np.zeros(shape, np.uint8)
-    for t in range(len(triangles)):
-        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        i0 = max(0, int(np.ceil((min(a[0], b[0], c[0]) - origin[0]) / size[0])))
-        i1 = min(shape[0] - 1, int(np.floor((max(a[0], b[0], c[0]) - origin[0]) / size[0])))
-        j0 = max(0, int(np.ceil((min(a[1], b[1], c[1]) - origin[1]) / size[1])))
-        j1 = min(shape[1] - 1, int(np.floor((max(a[1], b[1], c[1]) - origin[1]) / size[1])))
-        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-        if area == 0.0:
-            continue
-        for i in range(i0, i1 + 1):
-            x = origin[0] + i * size[0]
-            for j in range(j0, j1 + 1):
-                y = origin[1] + j * size[1]
-                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
-                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
-                w = 1.0 - u - v
-                if u < 0 or v < 0 or w < 0:
-                    continue
-                z = u * a[2] + v * b[2] + w * c[2]
-                k = int(np.ceil((z - low_z) / size[2] - 0.5))
-                if k < 0:
-                    k = 0
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            column = i * shape[1] + j
+            for z in heights[starts[column] : starts[column + 1]]:
+                k = max(0, int(np.ceil((z - low_z) / size[2] - 0.5)))
                 if k < shape[2]:
                     flips[i, j, k] ^= 1
     return flips
