@@ -205,9 +205,8 @@ def test_bug_10_a_purge_in_a_pause_makes_no_giant_extrusion() -> None:
     assert sum(e for e in motion.filament_mm if 0 < e <= 0.021) == pytest.approx(40.0, abs=0.05)
 
 
-def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
-    """Marlin#10875, Klipper#2412: two pauses, relative moves, Z as the program wants it."""
-    lines = ["G28", "G90", "G1 Z3 F600", "G91", "M83"] + ["G1 X0.1 F3000"] * 1500
+def paused_on_the_way(lines: list[str], pauses: int) -> tuple[tuple[float, ...], float]:
+    """Where a program ends that is paused so often at once and resumed, and its greatest Z, mm."""
     with EmulatedPrinterProcess(printer=profile()) as emulator:
         printer = SerialPrinter(emulator.port, supervise=False)
         printer.connect()
@@ -215,8 +214,8 @@ def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
 
         def tell(stage: str, count: float, total: float) -> None:
             if count and not asked.is_set():
-                printer.pause()
-                printer.pause()
+                for _ in range(pauses):
+                    printer.pause()
                 asked.set()
 
         def go_on() -> None:
@@ -230,36 +229,22 @@ def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
         printer.print(program(lines), progress=tell)
         thread.join(20)
         place = printer.position_mm()
+        highest_mm = float(emulator.take_motion().end_mm[:, 2].max())
         printer.close()
+    return place, highest_mm
+
+
+def test_bug_11_z_and_modes_come_back_after_a_pause_even_a_nested_one() -> None:
+    """Marlin#10875, Klipper#2412: two pauses, relative moves, Z as the program wants it."""
+    lines = ["G28", "G90", "G1 Z3 F600", "G91", "M83"] + ["G1 X0.1 F3000"] * 1500
+    place, _ = paused_on_the_way(lines, 2)
     assert place == pytest.approx((150.0, 0.0, 3.0), abs=0.01)
 
 
 def test_bug_11_a_program_in_inches_is_lifted_by_millimetres() -> None:
     """Found in review: G91 and Z5 after G20 are five inches."""
     lines = ["G28", "G20", "G90", "G1 Z0.1 F20", "G91", "M83"] + ["G1 X0.004 F100"] * 1500
-    with EmulatedPrinterProcess(printer=profile()) as emulator:
-        printer = SerialPrinter(emulator.port, supervise=False)
-        printer.connect()
-        asked = threading.Event()
-
-        def tell(stage: str, count: float, total: float) -> None:
-            if count and not asked.is_set():
-                printer.pause()
-                asked.set()
-
-        def go_on() -> None:
-            asked.wait(20)
-            while "paused" not in printer.notes:
-                asked.wait(0.01)
-            printer.resume()
-
-        thread = threading.Thread(target=go_on)
-        thread.start()
-        printer.print(program(lines), progress=tell)
-        thread.join(20)
-        place = printer.position_mm()
-        highest_mm = emulator.take_motion().end_mm[:, 2].max()
-        printer.close()
+    place, highest_mm = paused_on_the_way(lines, 1)
     assert place == pytest.approx((152.4, 0.0, 2.54), abs=0.01)
     assert highest_mm == pytest.approx(7.54, abs=0.01)
 
