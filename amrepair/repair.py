@@ -31,6 +31,7 @@ from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
+from gcode.surfaces import HeightField
 from gcode.writer import write
 
 MIN_REPAIR_MM3 = worth.MIN_REPAIR_MM3
@@ -253,25 +254,28 @@ def plan_repair(
             progress=progress,
         )
     with watch("deficit"):
-        standing = None
-        if site.planned is not None and anomaly.evidence is not None:
+        evidence = anomaly.evidence
+
+        def stands() -> HeightField:
             # what stands there is all that was seen, the bottoms of open cells too
-            standing = as_built_heights(
+            assert evidence is not None
+            return as_built_heights(
                 whole,
                 site.template,
-                anomaly.evidence,
+                evidence.spacing_mm,
                 build_from_template=placed,
                 printed_z_mm=site.printed_z_mm,
                 cell_mm=AS_BUILT_CELL_MM,
                 unseen_margin_mm=OPEN_CELL_MARGIN_MM,
             )
+
         deficit = compute_deficit(
             moved,
             expected,
             anomaly,
             build_from_template=placed,
             printed_z_mm=site.printed_z_mm,
-            as_built=standing,
+            as_built=None if site.planned is None else stands,
             progress=progress,
         )
         _refuse_ambiguity(scan, site, registration, deficit)

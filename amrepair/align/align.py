@@ -19,7 +19,7 @@ from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
 METHODS = ("robust", "paper")
-FINE_POINTS = 15_000
+FINE_POINTS, MOST_LOOKED_AT = 15_000, 150_000
 LEAST_POINTS = 50
 # A guess from a calibration is good to this; what is farther is not the part that was meant.
 BOUND_MM, BOUND_DEG = 3.0, 3.0
@@ -144,7 +144,8 @@ def _from_guess(
     rng: np.random.Generator,
 ) -> Refined:
     levelled, on_bed = level_on_bed(scan.points_mm, template, guess.matrix)
-    points = _part_only(scan.points_mm, template, levelled)
+    step = max(1, len(scan) // MOST_LOOKED_AT)
+    points = _part_only(scan.points_mm[::step], template, levelled)
     if len(points) < LEAST_POINTS:
         raise AlignmentError(
             f"the scan {scan.source} has {len(points)} points where the part should stand; check "

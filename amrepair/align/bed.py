@@ -12,6 +12,7 @@ from amrepair.align.refine import Prior
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
 
+MOST_LOOKED_AT = 80_000  # points: the bed is a plane
 BAND_MM = 1.0  # how far off the guess may have the bed
 BESIDE_MM = 2.0  # bed points this near to the part may be its skirt or its foot
 LEAST_POINTS = 300
@@ -37,6 +38,7 @@ def level_on_bed(
     The corrected guess, and whether enough bed was seen to correct it.
     """
     low, high = template.bounds_mm
+    points_mm = points_mm[:: max(1, len(points_mm) // MOST_LOOKED_AT)]
     placed = points_mm @ matrix[:3, :3].T + matrix[:3, 3]
     height = placed[:, 2] - low[2]
     beside = np.maximum(low[:2] - placed[:, :2], placed[:, :2] - high[:2]).max(axis=1)

@@ -7,6 +7,7 @@ averages say so. Empty space counts only where a ray crossed it or scanned surfa
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,6 +40,27 @@ BOX_MARGIN_MM = 1.0
 PATH_STEP_MM = 1.0
 
 
+class Standing:
+    """Heights that are made when they are first asked for: a clean layer needs none.
+
+    Parameters
+    ----------
+    make
+        Makes them; let go of once it has.
+    """
+
+    def __init__(self, make: Callable[[], HeightField]) -> None:
+        self._make: Callable[[], HeightField] | None = make
+        self._made: HeightField | None = None
+
+    def __call__(self) -> HeightField:
+        """The heights."""
+        if self._made is None:
+            assert self._make is not None
+            self._made, self._make = self._make(), None
+        return self._made
+
+
 @dataclass(frozen=True, slots=True)
 class Deficit:
     """What is missing and what is too much, build frame.
@@ -54,8 +76,8 @@ class Deficit:
         τ: the erosion that was used.
     unseen_area_mm2
         Template surface that nothing is known of.
-    as_built
-        What stands on the bed; unseen cells are solid up to the printed height and a margin.
+    stands
+        Makes `as_built`, when that is first asked for.
     """
 
     missing: manifold3d.Manifold
@@ -63,7 +85,12 @@ class Deficit:
     regions: tuple[Region, ...]
     tolerance_mm: float
     unseen_area_mm2: float
-    as_built: HeightField
+    stands: Standing
+
+    @property
+    def as_built(self) -> HeightField:
+        """What stands on the bed; unseen cells are solid up to the printed height and a margin."""
+        return self.stands()
 
     @property
     def missing_mm3(self) -> float:
@@ -85,7 +112,7 @@ def compute_deficit(
     tolerance_mm: float | None = None,
     printed_z_mm: float | None = None,
     cell_mm: float = 0.25,
-    as_built: HeightField | None = None,
+    as_built: Callable[[], HeightField] | None = None,
     progress: Progress = silent,
 ) -> Deficit:
     """Solids of what is missing and in excess.
@@ -105,7 +132,7 @@ def compute_deficit(
     cell_mm
         Cell of what the scan alone says of heights.
     as_built
-        What stands on the bed, where the caller knows; None has it made of scan and solids.
+        Makes what stands on the bed, where the caller knows; None has it made of scan and solids.
 
     Raises
     ------
@@ -149,24 +176,26 @@ def compute_deficit(
         for found in solids.values()
     )
     unseen = anomaly.template_label == int(Label.UNSEEN)
-    if as_built is None:
+
+    def stands() -> HeightField:
         seen = as_built_heights(
             scan,
             template,
-            evidence,
+            evidence.spacing_mm,
             build_from_template=build_from_template,
             printed_z_mm=printed_z_mm,
             cell_mm=cell_mm,
         )
         expected: Any = template.solid()
-        as_built = standing_heights(seen, expected.transform(matrix), missing, excess)
+        return standing_heights(seen, expected.transform(matrix), missing, excess)
+
     return Deficit(
         missing=missing,
         excess=excess,
         regions=tuple(sorted(regions, key=lambda r: (int(r.label), -r.volume_mm3))),
         tolerance_mm=tau_mm,
         unseen_area_mm2=_unseen_area(anomaly, int(unseen.sum())),
-        as_built=as_built,
+        stands=Standing(as_built or stands),
     )
 
 
@@ -274,7 +303,11 @@ def _solid_in_box(
     f = template.distance(samples)
     sign = -1.0 if label is Label.MISSING else 1.0
     # only where the template says it can be: the rest of the box needs no look at the scan
-    near = np.flatnonzero(sign * f > -2 * float(box.step_mm.max()))
+    beyond_mm = 2 * float(box.step_mm.max())
+    can_be = sign * f > -beyond_mm
+    if label is Label.EXCESS and inside.any():
+        can_be &= f < float(s.deviation_mm[inside].max()) + beyond_mm
+    near = np.flatnonzero(can_be)
     best = np.full(len(samples), -10.0 if label is Label.MISSING else 10.0)
     cautious = best.copy()
     if label is Label.MISSING:
@@ -293,10 +326,9 @@ def _solid_in_box(
         # a planned bead is thinner than 2 τ: nothing of it would be left of an eroded template,
         # but rays that went through it count as well
         core |= (sign * f > limit_mm / 4) & (beyond > limit_mm)
-    nearest = evidence.tree.query(samples[near], workers=2)[1]
-    by_label = np.zeros(len(samples), bool)
-    by_label[near] = labels[nearest] == int(label)
-    core |= by_label & (sign * f > thin_mm) & (clip < 0)
+    ask = np.flatnonzero(can_be & ~core & (sign * f > thin_mm) & (clip < 0))
+    nearest = evidence.tree.query(samples[ask], workers=2)[1]
+    core[ask[labels[nearest] == int(label)]] = True
     grow_mm = GROW_FACTOR * tau_mm + float(box.step_mm.max())
     reach = box.distance_to(core.reshape(box.shape)) - grow_mm
     return solid_from_field(box, np.maximum(clip.reshape(box.shape), np.minimum(reach, 10.0)))

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from amrepair.detect.evidence import Evidence
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -41,7 +40,7 @@ FIN_CELLS = 2
 def as_built_heights(
     scan: Scan,
     template: Template,
-    evidence: Evidence,
+    spacing_mm: float,
     *,
     build_from_template: Transform,
     printed_z_mm: float | None,
@@ -52,6 +51,8 @@ def as_built_heights(
 
     Parameters
     ----------
+    spacing_mm
+        Mean distance between neighbouring points.
     unseen_margin_mm
         What nobody saw is solid up to the printed height and this much more.
     """
@@ -59,12 +60,12 @@ def as_built_heights(
     corners = _corners(template.bounds_mm)
     box = build_from_template.apply(corners)
     low, high = box.min(axis=0) - AROUND_MM, box.max(axis=0) + AROUND_MM
-    cell_mm = max(cell_mm, 1.2 * evidence.surfels.spacing_mm)
+    cell_mm = max(cell_mm, 1.2 * spacing_mm)
     shape = tuple(np.ceil((high[:2] - low[:2]) / cell_mm).astype(int)[::-1])
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
     solid_z = top_z + unseen_margin_mm
     z, seen = _tops(points, low[:2], cell_mm, (int(shape[0]), int(shape[1])))
-    if not evidence.has_rays:
+    if scan.sensors_mm is None:
         # without rays nothing tells empty from unseen: beside the part the bed is taken as bare
         bare = ~seen & ~_footprint(template, build_from_template, low, cell_mm, z.shape)
         z = np.where(bare, 0.0, z)

@@ -40,6 +40,8 @@ BED_BAND_MM = 0.35
 # Fewer cells than this over the threshold are an outlier, not a surface.
 MIN_CORE_CELLS = 3
 SURFACE_SPACING_MM = 0.6
+# So many tell a scan's size, to the factor between two units.
+SIZE_POINTS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +191,8 @@ def detect(
 
 def _refuse_wrong_scale(scan: Scan, template: Template) -> None:
     """Metres or inches read as millimetres: the sizes differ by the factor between the units."""
-    scan_mm = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
+    some = scan.points_mm[:: max(1, len(scan) // SIZE_POINTS)]
+    scan_mm = float(np.linalg.norm(np.ptp(some, axis=0)))
     part_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
     if 0 < scan_mm * 200 < part_mm:
         raise InputError(
@@ -313,21 +316,16 @@ def _label_surface(
     distance, nearest = evidence.tree.query(surface_mm, workers=2)
     present = (distance < reach_mm) & ~missing[nearest]
     label = np.where(present, int(Label.OK), int(Label.UNSEEN))
-    open_ = np.flatnonzero(~present)
-    if len(open_):
+    if evidence.has_rays:
+        label[_seen_through(surface_mm, normals, template, evidence, limit)] = int(Label.MISSING)
+    elif missing.any():
+        open_ = np.flatnonzero(~present)
         # just inside the surface, as deep as the limit: empty there is more than noise
         depth_mm = limit.well_seen_mm
         inside = surface_mm[open_] - depth_mm * normals[open_]
         f_mm = template.distance(inside)
-        cautious = evidence.clearance(inside, f_mm)[1]
-        gone = (cautious > depth_mm / 2) & (f_mm < -depth_mm / 2)
-        if not missing.any() and not evidence.has_rays:
-            gone[:] = False
+        gone = (evidence.cautious(inside, f_mm) > depth_mm / 2) & (f_mm < -depth_mm / 2)
         label[open_[gone]] = int(Label.MISSING)
-    if evidence.has_rays:
-        label[_seen_through(surface_mm, normals, template, evidence, label, limit)] = int(
-            Label.MISSING
-        )
     return label
 
 
@@ -336,17 +334,14 @@ def _seen_through(
     normals: Float[np.ndarray, "m 3"],
     template: Template,
     evidence: Evidence,
-    label: Int[np.ndarray, " m"],
     limit: Threshold,
-) -> Int[np.ndarray, " k"]:
+) -> Bool[np.ndarray, " m"]:
     """Points that rays passed by more than noise can be, in whatever is thin.
 
     A wall one bead wide that is gone leaves points of what stood below it, less than a
     millimetre off and, in a wall so thin, within every limit; a layer over a cell leaves none.
     """
-    here = np.flatnonzero(label != int(Label.MISSING))
     depth_mm = limit.well_seen_mm
-    inside = surface_mm[here] - 0.5 * depth_mm * normals[here]
+    inside = surface_mm - 0.5 * depth_mm * normals
     f_mm = template.distance(inside)
-    cautious = evidence.clearance(inside, f_mm)[1]
-    return here[(cautious > depth_mm) & (f_mm < -depth_mm / 4)]
+    return (evidence.cautious(inside, f_mm) > depth_mm) & (f_mm < -depth_mm / 4)

@@ -60,6 +60,11 @@ class Evidence:
     faces: Faces | None = None
 
     @property
+    def spacing_mm(self) -> float:
+        """Mean distance between neighbouring points of the scan."""
+        return self.surfels.spacing_mm
+
+    @property
     def has_rays(self) -> bool:
         """Whether sensors are known."""
         return bool(self.images)
@@ -71,20 +76,37 @@ class Evidence:
 
         Positive is empty. `f_mm` is the template's distance at the points.
         """
-        if self.has_rays:
-            best = np.full(len(points_mm), -np.inf)
-            least = np.full(len(points_mm), -np.inf)
-            for image in self.images:
-                seen, cautious = image.clearance(points_mm)
-                best = np.maximum(best, seen)
-                least = np.maximum(least, cautious)
-            best = self._sharpened(points_mm, f_mm, np.maximum(best, SOLID_MM))
-            return best, np.maximum(least, SOLID_MM)
+        if not self.has_rays:
+            near = self._by_surface(points_mm, f_mm)
+            return near, near
+        best, least = self._by_rays(points_mm)
+        return self._sharpened(points_mm, f_mm, best), least
+
+    def cautious(
+        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """The cautious half of `clearance`, which costs the less."""
+        if not self.has_rays:
+            return self._by_surface(points_mm, f_mm)
+        return self._by_rays(points_mm)[1]
+
+    def _by_surface(
+        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """What the scanned surface says where there are no rays."""
         if self.faces is not None:
-            near = self.faces.clearance(points_mm, f_mm)
-        else:
-            near = self.surface_clearance(points_mm, f_mm)
-        return near, near
+            return self.faces.clearance(points_mm, f_mm)
+        return self.surface_clearance(points_mm, f_mm)
+
+    def _by_rays(
+        self, points_mm: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """The emptiest of what the range images say, and of their cautious answers."""
+        best = np.full(len(points_mm), SOLID_MM)
+        least = best.copy()
+        for image in self.images:
+            image.raise_clearance(points_mm, best, least)
+        return best, least
 
     def _sharpened(
         self,
@@ -147,12 +169,12 @@ def gather(
     off = off | _strips(template, surfels, off)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
-    images = range_images(scan, spacing_mm=surfels.spacing_mm)
+    images = range_images(scan)
     tree = cKDTree(surfels.place_mm, compact_nodes=False, balanced_tree=False)
     faces = None
-    if len(which) and scan.sensors_mm is not None and scan.sensor_index is not None:
-        to_sensor = scan.sensors_mm[scan.sensor_index] - scan.points_mm
-        normal[which] = _toward(surfels.planes(which), surfels.mean_of(to_sensor)[which])
+    facing = surfels.toward_sensors(which, scan)
+    if facing is not None:
+        normal[which] = _toward(surfels.planes(which), facing)
     elif len(which):
         spacing_mm = max(PATCH_MM, surfels.spacing_mm)
         places, normals = template.surface_points(spacing_mm)
@@ -175,7 +197,7 @@ def with_stubs(
     beside it is gone it is a surface of its own, and faces the sensors.
     """
     s = evidence.surfels
-    if len(gone_mm) == 0 or scan.sensors_mm is None or scan.sensor_index is None:
+    if len(gone_mm) == 0 or not evidence.has_rays:
         return evidence
     reach_mm = STUB_CELLS * s.cell_mm
     near = np.isfinite(
@@ -184,9 +206,10 @@ def with_stubs(
     which = np.flatnonzero(near & ~labelled & ~evidence.off & (s.deviation_mm < -STUB_MM))
     if len(which) == 0:
         return evidence
+    facing = s.toward_sensors(which, scan)
+    if facing is None:
+        return evidence
     off, normal = evidence.off.copy(), evidence.normal.copy()
-    to_sensor = scan.sensors_mm[scan.sensor_index] - scan.points_mm
-    facing = s.mean_of(to_sensor)[which]
     off[which] = True
     normal[which] = facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
     return replace(evidence, off=off, normal=normal)

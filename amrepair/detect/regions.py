@@ -66,7 +66,10 @@ def area_per_point(surface_mm: Float[np.ndarray, "m 3"]) -> float:
     """Rough area per template point, from how many cells of 2 mm they fill."""
     if len(surface_mm) == 0:
         return 0.0
-    cells = len(np.unique(np.floor(surface_mm / 2.0).astype(np.int64), axis=0))
+    index = np.floor(surface_mm / 2.0).astype(np.int64)
+    index -= index.min(axis=0)
+    size = index.max(axis=0) + 1
+    cells = len(np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]))
     return 1.5 * 4.0 * cells / len(surface_mm)
 
 

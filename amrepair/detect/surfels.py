@@ -12,10 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.detect import surfel_kernels as kernels
+from amrepair.scans import Scan
 
 MIN_CELL_MM, MAX_CELL_MM = 0.3, 2.0
 # Occupied unit cells hold about 1.5 cell² of surface each (a plane at a random slope).
 AREA_PER_CELL = 1.5
+# A grid of so many cells is counted in place; points of a larger one are sorted.
+MOST_CELLS = 16_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +74,17 @@ class Surfels:
         covariance = second - mean[:, :, None] * mean[:, None, :]
         return np.asarray(np.linalg.eigh(covariance)[1][:, :, 0])
 
-    def mean_of(self, vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "s 3"]:
-        """(s, 3) mean over each cell of per-point vectors."""
-        return np.add.reduceat(vectors[self.order], self.start[:-1], axis=0) / self.count[:, None]
+    def toward_sensors(
+        self, which: Int[np.ndarray, " q"], scan: Scan
+    ) -> Float[np.ndarray, "q 3"] | None:
+        """(q, 3) mean way from some cells' points to what saw them; None where nobody knows."""
+        if scan.sensors_mm is None or scan.sensor_index is None:
+            return None
+        return np.asarray(
+            kernels.mean_to_sensor(
+                which, self.order, self.start, scan.points_mm, scan.sensors_mm, scan.sensor_index
+            )
+        )
 
     def grow(
         self, seeds: Bool[np.ndarray, " s"], through: Bool[np.ndarray, " s"]
@@ -95,26 +106,20 @@ def make_surfels(
     keep: Bool[np.ndarray, " n"],
 ) -> Surfels:
     """Condense the points in `keep`; the cell follows their spacing."""
-    chosen = np.flatnonzero(keep)
-    kept = np.ascontiguousarray(points_mm[chosen])
-    spacing_mm = estimate_spacing(kept)
+    box, kept = kernels.kept_box(points_mm, keep)
+    if kept == 0:
+        box = np.zeros((2, 3))
+    spacing_mm = _spacing(points_mm, keep, box, kept)
     cell_mm = float(np.clip(2.0 * spacing_mm, MIN_CELL_MM, MAX_CELL_MM))
-    keys, strides = _cell_keys(kept, cell_mm)
-    order = np.argsort(keys, kind="stable")
-    ranked = keys[order]
-    first = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]]) if len(ranked) else ranked
-    start = np.append(first, len(ranked))
+    order, start, keys, of_point, strides = _by_cell(points_mm, keep, box, cell_mm)
     # moments about one origin near the part keep float64 far from cancellation
-    origin = kept.mean(axis=0) if len(kept) else np.zeros(3)
-    f = deviation_mm[chosen]
-    sums = kernels.cell_sums(order, start, kept - origin, f)
+    origin = box.mean(axis=0)
+    sums = kernels.cell_sums(order, start, points_mm, origin, deviation_mm)
     count = np.diff(start)
-    table = kernels.neighbour_table(ranked[first], *strides)
+    table = kernels.neighbour_table(keys, *strides)
     wide = kernels.neighbour_sums(
         table, np.ascontiguousarray(np.column_stack([sums[:, 3], count.astype(float)]))
     )
-    of_point = np.full(len(points_mm), -1, np.int64)
-    of_point[chosen[order]] = np.repeat(np.arange(len(count)), count)
     mean_f = sums[:, 3] / count
     many = count >= 3
     variance = np.maximum(sums[:, 10] / count - mean_f**2, 0.0) * count / np.maximum(count - 1, 1)
@@ -132,32 +137,80 @@ def make_surfels(
         table=table,
         of_point=of_point,
         moments=sums,
-        order=chosen[order],
+        order=order,
         start=start,
     )
 
 
 def estimate_spacing(points_mm: Float[np.ndarray, "n 3"]) -> float:
     """Mean spacing of a surface cloud from how many 1 mm (or larger) cells it occupies."""
-    if len(points_mm) < 2:
+    keep = np.ones(len(points_mm), bool)
+    box, kept = kernels.kept_box(points_mm, keep)
+    return _spacing(points_mm, keep, box, kept)
+
+
+def _spacing(
+    points_mm: Float[np.ndarray, "n 3"],
+    keep: Bool[np.ndarray, " n"],
+    box_mm: Float[np.ndarray, "2 3"],
+    kept: int,
+) -> float:
+    """`estimate_spacing` of some points."""
+    if kept < 2:
         return MAX_CELL_MM / 2
     cell_mm = 1.0
     while True:
-        occupied = len(np.unique(_cell_keys(points_mm, cell_mm)[0]))
+        shape = _shape(box_mm, cell_mm)
+        if np.prod(shape.astype(float)) <= MOST_CELLS:
+            occupied = int(kernels.occupied(points_mm, keep, box_mm[0], cell_mm, shape))
+        else:
+            occupied = len(np.unique(_keys(points_mm[keep], box_mm, cell_mm, 0)))
         # a cell must hold several points, or the count of cells says nothing about area
-        if len(points_mm) >= 4 * occupied or occupied == 1 or cell_mm > 64.0:
-            return float(np.sqrt(AREA_PER_CELL * occupied * cell_mm**2 / len(points_mm)))
+        if kept >= 4 * occupied or occupied == 1 or cell_mm > 64.0:
+            return float(np.sqrt(AREA_PER_CELL * occupied * cell_mm**2 / kept))
         cell_mm *= 2.0
 
 
-def _cell_keys(
-    points_mm: Float[np.ndarray, "n 3"], cell_mm: float
-) -> tuple[Int[np.ndarray, " n"], tuple[int, int]]:
-    """Cell number of each point, and the strides of x and y (one empty layer between rows)."""
-    if len(points_mm) == 0:
-        return np.zeros(0, np.int64), (1, 1)
-    index = np.floor((points_mm - points_mm.min(axis=0)) / cell_mm).astype(np.int64) + 1
-    size = index.max(axis=0) + 2
-    stride_y = int(size[2])
-    stride_x = int(size[1]) * stride_y
-    return index @ np.array([stride_x, stride_y, 1]), (stride_x, stride_y)
+def _by_cell(
+    points_mm: Float[np.ndarray, "n 3"],
+    keep: Bool[np.ndarray, " n"],
+    box_mm: Float[np.ndarray, "2 3"],
+    cell_mm: float,
+) -> tuple[
+    Int[np.ndarray, " kept"],
+    Int[np.ndarray, " s1"],
+    Int[np.ndarray, " s"],
+    Int[np.ndarray, " n"],
+    tuple[int, int],
+]:
+    """Points in the order of their cells, where cells begin, their keys, each point's, strides."""
+    shape = _shape(box_mm, cell_mm) + 2
+    strides = (int(shape[1] * shape[2]), int(shape[2]))
+    if np.prod(shape.astype(float)) <= MOST_CELLS:
+        return *kernels.sort_by_cell(points_mm, keep, box_mm[0], cell_mm, shape), strides
+    chosen = np.flatnonzero(keep)
+    keys = _keys(points_mm[chosen], box_mm, cell_mm, 1)
+    order = np.argsort(keys, kind="stable")
+    ranked = keys[order]
+    first = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]])
+    start = np.append(first, len(ranked))
+    of_point = np.full(len(points_mm), -1, np.int64)
+    of_point[chosen[order]] = np.repeat(np.arange(len(first)), np.diff(start))
+    return chosen[order], start, ranked[first], of_point, strides
+
+
+def _shape(box_mm: Float[np.ndarray, "2 3"], cell_mm: float) -> Int[np.ndarray, " 3"]:
+    """(3,) cells that a box is divided into."""
+    return np.floor((box_mm[1] - box_mm[0]) / cell_mm).astype(np.int64) + 1
+
+
+def _keys(
+    points_mm: Float[np.ndarray, "n 3"],
+    box_mm: Float[np.ndarray, "2 3"],
+    cell_mm: float,
+    margin: int,
+) -> Int[np.ndarray, " n"]:
+    """(n,) number of each point's cell, in a grid with so many empty layers around."""
+    shape = _shape(box_mm, cell_mm) + 2 * margin
+    index = np.floor((points_mm - box_mm[0]) / cell_mm).astype(np.int64) + margin
+    return np.asarray((index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2])

@@ -101,7 +101,7 @@ def typed(
     if whole is None and seen is not None:
         found = (_shifted(seen[1], layer_mm), _warped(seen[0], layer_mm))
         whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
-    if whole is None and seen is not None:
+    if whole is None and seen is not None and plan.deficit.regions:
         flow = _flow(seen[0], job, line, layer_mm)
     pieces = {
         Label.MISSING: _pieces(plan.deficit.missing),

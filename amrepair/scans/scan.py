@@ -60,8 +60,9 @@ class Scan:
             raise InputError(
                 f"the scan {self.source} has no points; scan again or check the export"
             )
-        bad = int((~np.isfinite(self.points_mm)).any(axis=1).sum())
-        if bad:
+        finite = np.isfinite(self.points_mm)
+        if not finite.all():
+            bad = int((~finite.all(axis=1)).sum())
             raise InputError(
                 f"the scan {self.source} has {bad} of {len(self.points_mm)} points that are not "
                 "finite numbers (NaN or infinity); remove them before use"

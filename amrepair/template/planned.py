@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage
 
 from amrepair.errors import TemplateError
 from amrepair.template import planned_kernels as kernels
@@ -135,21 +134,21 @@ class PlannedSdf:
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
         """(m, 3) middles of voxel faces on the surface, thinned to the spacing, and normals."""
-        points, normals = [], []
-        padded = np.pad(self._solid, 1)
-        padded[:, :, 0] = padded[:, :, 1]  # the lowest slice goes on downwards
-        inner = (slice(1, -1),) * 3
+        every = max(1, round((spacing_mm / self.voxel_mm) ** 2))
+        points, normals, count = [], [], 0
+        room = np.empty((0, 3))
         for axis in range(3):
             for side in (-1, 1):
-                open_face = self._solid & ~np.roll(padded, -side, axis=axis)[inner]
-                index = np.argwhere(open_face)
+                found, kept = kernels.open_faces(self._solid, axis, side, every, count, room)
+                if kept > len(room):
+                    room = np.empty((kept, 3))
+                    kernels.open_faces(self._solid, axis, side, every, count, room)
                 normal = np.zeros(3)
                 normal[axis] = side
-                centre = self.origin_mm + (index + 0.5 + 0.5 * normal) * self.voxel_mm
-                points.append(centre)
-                normals.append(np.tile(normal, (len(index), 1)))
-        every = max(1, round((spacing_mm / self.voxel_mm) ** 2))
-        return np.concatenate(points)[::every], np.concatenate(normals)[::every]
+                points.append(self.origin_mm + room[:kept] * self.voxel_mm)
+                normals.append(np.tile(normal, (kept, 1)))
+                count += found
+        return np.concatenate(points), np.concatenate(normals)
 
     def solid(self) -> Any:
         """The level set f = 0 as a `manifold3d.Manifold`."""
@@ -162,9 +161,7 @@ class PlannedSdf:
 
 def _signed(solid: Bool[np.ndarray, "x y z"], voxel_mm: float) -> Float[np.ndarray, "x y z"]:
     """Signed distances at voxel centres; the surface lies midway between unlike ones."""
-    outside = ndimage.distance_transform_edt(~solid)
-    # what is below the grid is solid where the lowest slice is: it must not look like a surface
-    deep = np.concatenate([np.repeat(solid[:, :, :1], 24, axis=2), solid], axis=2)
-    inside = ndimage.distance_transform_edt(deep)[:, :, 24:]
-    signed = np.where(solid, 0.5 - inside, outside - 0.5) * voxel_mm
-    return np.ascontiguousarray(signed, dtype=np.float32)
+    to_solid = kernels.squared_distances(solid, True)
+    return np.asarray(
+        kernels.signed(solid, to_solid, kernels.squared_distances(solid, False), voxel_mm)
+    )

@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+FAR, FAR2 = 1e4, 1e8  # voxels, and squared: nothing is so far
+
 
 @njit(cache=True, nogil=True)
 def fill(start, end, width, height, origin, voxel, solid):
@@ -66,3 +68,113 @@ def interpolate(points, origin, voxel, field):
                 f += weight * field[i[0] + dx, i[1] + dy, i[2] + dz]
         out[k] = f + np.sqrt(beyond)
     return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _envelope(f, n, d, v, z):
+    """Squared distances along a line: the lower envelope of parabolas that stand at its places.
+
+    Felzenszwalb and Huttenlocher 2012, algorithm 1; `d` gets min over q of (p − q)² + f(q).
+    """
+    k = -1
+    for q in range(n):
+        if f[q] >= FAR2:
+            continue
+        s = -np.inf
+        while k >= 0:
+            s = ((f[q] + q * q) - (f[v[k]] + v[k] * v[k])) / (2.0 * q - 2.0 * v[k])
+            if s > z[k]:
+                break
+            k -= 1
+        k += 1
+        v[k] = q
+        z[k] = s if k > 0 else -np.inf
+    if k < 0:
+        for q in range(n):
+            d[q] = FAR2
+        return
+    last, k = k, 0
+    for q in range(n):
+        while k < last and z[k + 1] < q:
+            k += 1
+        d[q] = (q - v[k]) ** 2 + f[v[k]]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def squared_distances(solid, sought):
+    """(x, y, z) squared distance of every voxel to the nearest one that is `sought`, in voxels."""
+    nx, ny, nz = solid.shape
+    out = np.empty((nx, ny, nz), np.float32)
+    for x in prange(nx):
+        here = np.empty((ny, nz))
+        for y in range(ny):
+            since = FAR
+            for z in range(nz):
+                since = 0.0 if solid[x, y, z] == sought else since + 1.0
+                here[y, z] = since
+            since = FAR
+            for z in range(nz - 1, -1, -1):
+                since = 0.0 if solid[x, y, z] == sought else since + 1.0
+                here[y, z] = min(here[y, z], since, FAR) ** 2
+        f, d, v, s = np.empty(ny), np.empty(ny), np.empty(ny, np.int64), np.empty(ny)
+        for z in range(nz):
+            for y in range(ny):
+                f[y] = here[y, z]
+            _envelope(f, ny, d, v, s)
+            for y in range(ny):
+                out[x, y, z] = d[y]
+    for y in prange(ny):
+        f, d, v, s = np.empty(nx), np.empty(nx), np.empty(nx, np.int64), np.empty(nx)
+        here = out[:, y, :].copy()
+        for z in range(nz):
+            for x in range(nx):
+                f[x] = here[x, z]
+            _envelope(f, nx, d, v, s)
+            for x in range(nx):
+                here[x, z] = d[x]
+        out[:, y, :] = here
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def signed(solid, to_solid, to_empty, voxel):
+    """(x, y, z) signed distances; the surface lies midway between unlike voxels."""
+    nx, ny, nz = solid.shape
+    out = np.empty((nx, ny, nz), np.float32)
+    for x in prange(nx):
+        for y in range(ny):
+            for z in range(nz):
+                if solid[x, y, z]:
+                    out[x, y, z] = (0.5 - np.sqrt(to_empty[x, y, z])) * voxel
+                else:
+                    out[x, y, z] = (np.sqrt(to_solid[x, y, z]) - 0.5) * voxel
+    return out
+
+
+@njit(cache=True, nogil=True)
+def open_faces(solid, axis, side, every, first, out):
+    """Middles of every so-many-th face that is open towards one side; how many there were.
+
+    In units of voxels, from the grid's corner; `first` of them are left out, and the lowest slice
+    goes on downwards.
+    """
+    shape = solid.shape
+    found, kept = 0, 0
+    for x in range(shape[0]):
+        for y in range(shape[1]):
+            for z in range(shape[2]):
+                if not solid[x, y, z]:
+                    continue
+                a = x + (side if axis == 0 else 0)
+                b = y + (side if axis == 1 else 0)
+                c = max(z + (side if axis == 2 else 0), 0)
+                if 0 <= a < shape[0] and 0 <= b < shape[1] and c < shape[2] and solid[a, b, c]:
+                    continue
+                if (found + first) % every == 0:
+                    if kept < len(out):
+                        out[kept, 0] = x + 0.5 + (0.5 * side if axis == 0 else 0.0)
+                        out[kept, 1] = y + 0.5 + (0.5 * side if axis == 1 else 0.0)
+                        out[kept, 2] = z + 0.5 + (0.5 * side if axis == 2 else 0.0)
+                    kept += 1
+                found += 1
+    return found, kept

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import manifold3d as m3
 import numpy as np
 import trimesh
 
 from amrepair.frames import Transform
-from amrepair.loop import LoopReport, plan_stops, run_loop
+from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.scans import Scan, ScanRequest
 from amrepair.template import MeshSdf
@@ -85,14 +86,24 @@ class Small:
         cube = m3.Manifold.cube((size_mm, size_mm, high_mm - low_mm))
         return cube.translate((105.0, 93.0, self.top_mm + low_mm))
 
+    pose = Transform.identity("build", "scanner")
+
     def run(
-        self, folder: Path, scans: Callable[[int], Scan], **options: object
+        self,
+        folder: Path,
+        scans: Callable[[int], Scan] | Callable[[ScanRequest], Scan],
+        *,
+        stops: Sequence[Stop] | None = None,
+        **options: object,
     ) -> tuple[LoopReport, list[str]]:
-        """Print with one stop; the report, and every line that was sent."""
+        """Print with one stop, or those given; the report, and every line that was sent.
+
+        `scans` is asked for the n-th scan, or, with stops, for what is requested.
+        """
         folder.mkdir(exist_ok=True)
         printer = Thermal(folder / "sent.gcode")
         printer.connect()
-        eye = Scripted(scans)
+        eye = Scripted(scans, by_request=stops is not None)
         try:
             report = run_loop(
                 self.job,
@@ -100,7 +111,7 @@ class Small:
                 printer,
                 eye,
                 sites(self.job, self.template, self.placed, self.setup, by_beads=False),
-                stops=plan_stops(self.job, [LAYER], final=False),
+                stops=plan_stops(self.job, [LAYER], final=False) if stops is None else stops,
                 **options,  # type: ignore[arg-type]
             )
         finally:
@@ -121,8 +132,8 @@ class Thermal(FilePrinter):
 class Scripted:
     """A scanner that gives the n-th scan of a script."""
 
-    def __init__(self, scans: Callable[[int], Scan]) -> None:
-        self._scans, self._count = scans, 0
+    def __init__(self, scans: Callable[[Any], Scan], *, by_request: bool = False) -> None:
+        self._scans, self._count, self._by_request = scans, 0, by_request
 
     @property
     def build_from_scanner(self) -> Transform:
@@ -130,4 +141,4 @@ class Scripted:
 
     def scan(self, request: ScanRequest) -> Scan:
         self._count += 1
-        return self._scans(self._count)
+        return self._scans(request if self._by_request else self._count)
