@@ -6,6 +6,7 @@ not drive hardware.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import re
@@ -68,7 +69,9 @@ class WatchedFolderScanner:
     file that still grows is waited for. A file whose bytes were seen before is a duplicate. Files
     that were there before the scanner was made are old. A name with `layer-12` in it answers
     only a request for that layer: an earlier layer's file came late and is dropped, a later
-    layer's is kept for its request.
+    layer's is kept for its request. A file whose name says nothing shows what stood there when it
+    came: one that was there before the request, from a sensor that looks whenever it likes, is
+    dropped.
 
     Parameters
     ----------
@@ -114,7 +117,7 @@ class WatchedFolderScanner:
             If none arrives within the time-out; the message tells why the last one did not do.
         """
         end_s = self._clock() + self._timeout_s
-        trouble = "no new file appeared"
+        trouble = self._drop_earlier() or "no new file appeared"
         while True:
             for path in self._settled():
                 found, why = self._try(path, request)
@@ -127,6 +130,22 @@ class WatchedFolderScanner:
                     f"{self._timeout_s:g} s ({trouble}); check the scanner and its export folder"
                 )
             self._sleep(self._poll_s)
+
+    def _drop_earlier(self) -> str:
+        """Forget the files without a layer's name that came before a request; what to say of it."""
+        early = []
+        for path in self._files():
+            with contextlib.suppress(FileNotFoundError):  # it may go while it is looked at
+                if (
+                    LAYER_IN_NAME.search(path.stem) is None
+                    and (path, *_stamp(path)) not in self._done
+                ):
+                    self._forget(path)
+                    early.append(path)
+        if not early:
+            return ""
+        _log.warning("%d scans came before they were asked for; dropped", len(early))
+        return f"{early[-1].name} came before it was asked for"
 
     def _files(self) -> list[Path]:
         """Scan files in the folder; hidden and temporary names are somebody else's business."""

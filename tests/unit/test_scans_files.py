@@ -68,9 +68,9 @@ def test_waits_for_a_file_that_still_grows(tmp_path: Path) -> None:
 def test_a_repeat_is_not_a_new_scan(tmp_path: Path) -> None:
     time = Time()
     scanner = watcher(tmp_path, time)
-    write_ply(make(1), tmp_path / "a.ply")
+    time.plan = [(0.1, lambda: write_ply(make(1), tmp_path / "a.ply"))]
     scanner.scan(ask(1))
-    write_ply(make(1), tmp_path / "b.ply")
+    time.plan = [(time.now_s + 0.1, lambda: write_ply(make(1), tmp_path / "b.ply"))]
     with pytest.raises(ScannerError, match="repeats an earlier scan"):
         scanner.scan(ask(2))
 
@@ -83,6 +83,22 @@ def test_late_files_are_dropped_and_early_ones_kept(tmp_path: Path) -> None:
     write_ply(make(2), tmp_path / "layer-002.ply")
     assert np.array_equal(scanner.scan(ask(2)).points_mm, make(2).points_mm)
     assert np.array_equal(scanner.scan(ask(3)).points_mm, make(3).points_mm)
+
+
+def test_what_came_before_it_was_asked_for_is_no_answer(tmp_path: Path) -> None:
+    # regression: of a sensor that looks while the job is printed, a scan of a layer long covered
+    # was taken for the layer just finished
+    time = Time()
+    scanner = watcher(tmp_path, time)
+    write_ply(make(1), tmp_path / "0001.ply")
+    with pytest.raises(ScannerError, match=r"0001\.ply came before it was asked for"):
+        scanner.scan(ask(1))
+    write_ply(make(2), tmp_path / "0002.ply")
+    time.plan = [(time.now_s + 1.0, lambda: write_ply(make(3), tmp_path / "0003.ply"))]
+    assert np.array_equal(scanner.scan(ask(2)).points_mm, make(3).points_mm)
+    # the same name, written anew for the request
+    time.plan = [(time.now_s + 1.0, lambda: write_ply(make(4), tmp_path / "0003.ply"))]
+    assert np.array_equal(scanner.scan(ask(3)).points_mm, make(4).points_mm)
 
 
 def test_silence_is_an_error_of_the_link(tmp_path: Path) -> None:
