@@ -2,18 +2,75 @@
 
 The tape says what was sent last; the journal of the port, which program the wire last carried;
 the printer, which of its lines came last (`gcode.hosts.resume`). What was begun is finished from
-that line on; whatever does not add up is refused, heaters off, and nothing is printed twice.
+that line on. A print server has printed on by itself, and knows what became of its last file
+(`gcode.hosts.rejoin`). Whatever does not add up is refused, and nothing is printed twice.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 from amrepair.errors import InputError, LoopError
 from amrepair.loop.tape import Sent
+from gcode.hosts.file import FilePrinter
 from gcode.hosts.port import Printer, PrintReport
 from gcode.hosts.resume import resume
 from gcode.hosts.serial import SerialPrinter
+
+
+def pick_up(
+    printer: Printer, *, release_c: float, pose_confirmed: bool = False
+) -> Callable[[Sequence[Sent]], PrintReport | None]:
+    """What `run_loop` calls before the first thing that its tape lacks, whatever the printer.
+
+    Parameters
+    ----------
+    printer
+        Not connected.
+    release_c, pose_confirmed
+        As `gcode.hosts.resume.resume` has them.
+
+    Raises
+    ------
+    InputError
+        If it is a file.
+    """
+    if isinstance(printer, (SerialPrinter, FilePrinter)):
+        return pick_up_serial(printer, release_c=release_c, pose_confirmed=pose_confirmed)
+    # loaded here: a printer on a cable needs none of the web's libraries
+    from gcode.hosts.rejoin import rejoin
+    from gcode.hosts.server import ServerPrinter
+
+    if not isinstance(printer, ServerPrinter):
+        raise InputError(f"a run on a {type(printer).__name__} cannot be gone on with")
+    server: ServerPrinter[Any] = printer
+
+    def find(sent: Sequence[Sent]) -> PrintReport | None:
+        if not sent:
+            server.connect()
+            return None
+        one = sent[-1]
+        return rejoin(
+            server,
+            one.checked,
+            range(one.first, one.end),
+            done=one.done,
+            before=[(s.checked, s.first, s.end) for s in _earlier(sent)],
+            release_c=release_c,
+            pose_confirmed=pose_confirmed,
+        )
+
+    return find
+
+
+def _earlier(sent: Sequence[Sent]) -> Sequence[Sent]:
+    """What tells the machine's state before the last thing sent."""
+    one = sent[-1]
+    if one.kind == "job" and one.first > 0:
+        return (replace(one, first=0, end=one.first),)
+    return _before(sent, len(sent) - 1)
 
 
 def pick_up_serial(
@@ -31,12 +88,11 @@ def pick_up_serial(
     Raises
     ------
     InputError
-        If the printer keeps no journal here: it is a server, or a file.
+        If the printer keeps no journal here: it is a file.
     """
     if not isinstance(printer, SerialPrinter) or printer.journal is None:
         raise InputError(
-            "only a run on a serial port can be gone on with: a server prints on by itself, and a "
-            "file has nowhere to stop; begin the run anew"
+            "a run into a file cannot be gone on with: it has nowhere to stop; begin the run anew"
         )
     serial, journal = printer, printer.journal
 

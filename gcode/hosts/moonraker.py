@@ -8,11 +8,14 @@ its turn).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker_session import MoonrakerSession
+from gcode.hosts.moonraker_state import ENDS
 from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
-from gcode.hosts.server import LOOK_EVERY, ServerPrinter
+from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter
 from gcode.hosts.upload import JobFile
 from gcode.hosts.web import LIFT_COMMANDS, sentence
 from gcode.progress import Progress
@@ -31,8 +34,30 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
     def _new_session(self) -> MoonrakerSession:
         return MoonrakerSession(self.address, self._key, self._timing, self._clock, self._log)
 
-    def _greet(self) -> None:
-        self._refuse_unless_ready()
+    def _greet(self, ready: Callable[[], None]) -> None:
+        ready()
+
+    def _left(self, prefix: str) -> Left | None:
+        session, state = self._session, self._session.state
+        rows = session.listed("/server/files/list", root="gcodes")
+        mine = [r for r in rows if str(r.get("path")).startswith(prefix)]
+        if not mine:
+            return None
+        name = str(max(mine, key=lambda row: row.get("modified") or 0)["path"])
+        session.look()
+        if state.print_file == name and state.busy:
+            return Left(name, "printing")
+        if state.print_file == name and state.print_state in ENDS:
+            return Left(name, "done" if state.print_state == "complete" else "failed")
+        (about,) = session.listed("/server/files/metadata", filename=name)
+        if about.get("print_start_time") is None:
+            return Left(name, "waiting")
+        return Left(name, "failed")  # it was begun, and Klipper has done something else since
+
+    def motors_held(self) -> bool:
+        """Whether Klipper still knows X, Y and Z as homed."""
+        homed = self._session.query({"toolhead": ["homed_axes"]}).get("toolhead", {})
+        return set("xyz") <= set(str(homed.get("homed_axes", "")))
 
     def _refuse_unless_ready(self) -> None:
         self._session.look()

@@ -13,7 +13,7 @@ from gcode.errors import LinkError, PrinterError
 from gcode.hosts.moonraker_state import SUBSCRIPTION, KlippyState
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.server import ServerSession
-from gcode.hosts.web import Address, WebLog, WebTiming, refused_key
+from gcode.hosts.web import Address, WebLog, WebTiming, json_object, refused_key, sentence
 
 _MESSAGE = re.compile(r"""['"]message['"]:\s*(['"])(.*?)\1\s*[,}]""", re.DOTALL)
 
@@ -102,6 +102,16 @@ class MoonrakerSession(ServerSession[KlippyState]):
         if not isinstance(status, dict):
             raise LinkError(f"{self.address.name} answers a query without a status.")
         return {name: value for name, value in status.items() if isinstance(value, dict)}
+
+    def listed(self, path: str, **query: str) -> list[dict[str, Any]]:
+        """Return the objects of an HTTP answer's result, one or many."""
+        answer = self.request("GET", path, params=query)
+        result = (json_object(answer) or {}).get("result") if answer.status_code == 200 else None
+        if isinstance(result, dict):
+            result = [result]
+        if not isinstance(result, list):
+            raise LinkError(f"{self.address.name} does not list its files ({sentence(answer)}).")
+        return [row for row in result if isinstance(row, dict)]
 
     def look(self) -> None:
         """Ask for Klipper's state, listening and subscribing anew.

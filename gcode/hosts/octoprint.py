@@ -7,11 +7,14 @@ in a pause is left to the server's own pause script, which knows where its queue
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.octoprint_session import OctoPrintSession
+from gcode.hosts.octoprint_state import BUSY, part_of
 from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
-from gcode.hosts.server import LOOK_EVERY, ServerPrinter
+from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter
 from gcode.hosts.upload import JobFile
 from gcode.hosts.web import LIFT_COMMANDS, sentence
 from gcode.progress import Progress
@@ -35,14 +38,39 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     def _new_session(self) -> OctoPrintSession:
         return OctoPrintSession(self.address, self._key, self._timing, self._clock, self._log)
 
-    def _greet(self) -> None:
+    def _greet(self, ready: Callable[[], None]) -> None:
         if "Moonraker" in str(self._session.get("/api/version").get("text")):
             raise LinkError(
                 f"{self.address.base} is a Moonraker that answers as OctoPrint; write "
                 f"moonraker+{self.address.base}."
             )
-        self._refuse_unless_ready()
+        ready()
         self._session.listen()
+
+    def _left(self, prefix: str) -> Left | None:
+        rows = self._session.get(self.files).get("files")
+        mine = [r for r in rows or () if str(r.get("path")).startswith(prefix)]
+        if not mine:
+            return None
+        newest = max(mine, key=lambda row: row.get("date") or 0)
+        name = str(newest["path"])
+        flags = self._session.status()["state"]["flags"]
+        if self._session.printing()[0] == name and any(flags.get(f) for f in BUSY):
+            return Left(name, "printing")
+        prints = part_of(newest, "prints")
+        last = part_of(prints, "last")
+        if not prints.get("success") and not prints.get("failure"):
+            return Left(name, "waiting")
+        ended_s = last.get("date")
+        return Left(
+            name,
+            "done" if last.get("success") else "failed",
+            float(ended_s) if isinstance(ended_s, int | float) else None,
+        )
+
+    def motors_held(self) -> bool:
+        """Taken for granted: OctoPrint does not know."""
+        return True
 
     # ------------------------------------------------------------------ questions
 

@@ -113,9 +113,10 @@ class OctoPrintSession(ServerSession[ServerState]):
         """
         if not self.listening:
             self.listen()
-        report = self.get("/api/job")
+        # the flags first: a print that ends in between is then under way, not lost
         answer = self.request("GET", "/api/printer", params={"exclude": "temperature,sd"})
         flags = self._flags(answer)
+        report = self.get("/api/job")
         with self.news:
             return self.state.look(report, flags)
 

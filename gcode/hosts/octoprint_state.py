@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 ENDS = ("PrintDone", "PrintFailed", "PrintCancelled")
-_BUSY = ("printing", "paused", "pausing", "resuming", "cancelling", "finishing")
+BUSY = ("printing", "paused", "pausing", "resuming", "cancelling", "finishing")
 
 
 @dataclass(slots=True)
@@ -45,7 +45,7 @@ class ServerState:
     @property
     def at_rest(self) -> bool:
         """Whether the server does nothing with a file."""
-        return not any(self.flags.get(name) for name in _BUSY)
+        return not any(self.flags.get(name) for name in BUSY)
 
     @property
     def ended(self) -> bool:

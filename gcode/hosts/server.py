@@ -7,13 +7,15 @@ where that goes wrong. How a server is asked, and what its news mean, is in `oct
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import httpx
 
@@ -22,7 +24,7 @@ from gcode.hosts.lock import PortLock
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, Temperatures
 from gcode.hosts.proof import require_checked
 from gcode.hosts.secret import ApiKey
-from gcode.hosts.upload import JobFile
+from gcode.hosts.upload import JobFile, part_prefix
 from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, heaters_word
 from gcode.progress import Progress, silent
 
@@ -125,6 +127,21 @@ class ServerSession(ABC, Generic[State]):
 Session = TypeVar("Session", bound=ServerSession[Any])
 
 
+@dataclass(frozen=True, slots=True)
+class Left:
+    """What became of a part of a job that nobody followed to its end.
+
+    Attributes
+    ----------
+    ended_s
+        When it ended, s since 1970; None where the server does not say.
+    """
+
+    name: str
+    state: Literal["waiting", "printing", "done", "failed"]
+    ended_s: float | None = None
+
+
 class ServerPrinter(ABC, Generic[Session]):
     """A printer that a server drives.
 
@@ -159,6 +176,7 @@ class ServerPrinter(ABC, Generic[Session]):
         self._lock = PortLock(address.spec)
         self._tried_safety = False
         self._open: Session | None = None
+        self._spent = ""  # the last part's file: it tells whoever comes after us how that ended
 
     def __exit__(
         self,
@@ -176,20 +194,60 @@ class ServerPrinter(ABC, Generic[Session]):
 
     def connect(self) -> None:
         """Reach the server, open its push socket, refuse a printer that is not ready."""
+        self._reach(self._refuse_unless_ready)
+
+    def _reach(self, ready: Callable[[], None]) -> None:
         if self._open is not None:
             return
         self._lock.acquire()
         try:
             self._log = WebLog(self._wire_log) if self._wire_log else None
             self._open = self._new_session()
-            self._greet()
+            self._greet(ready)
         except BaseException:
             self.close()
             raise
 
+    def rejoin(
+        self, checked: PrintableProgram, lines: range, *, progress: Progress = silent
+    ) -> tuple[PrintReport | None, float | None]:
+        """Connect to a server that was left while it printed these lines, and follow their print.
+
+        Returns
+        -------
+        The print's report, None where it was never begun; and when it ended, s since 1970, where
+        that is known and was not just now.
+
+        Raises
+        ------
+        PortBusyError
+            If something else is being printed.
+        """
+        require_checked(checked)
+        start_s, self._tried_safety = self._clock(), False
+        job = JobFile.of(checked, lines)
+        self._reach(lambda: None)
+        left = self._left(part_prefix(checked, job.first, job.end))
+        if left is None or left.state != "printing":
+            self._refuse_unless_ready()
+        if left is None:
+            return None, None
+        job = replace(job, name=left.name)
+        if left.state == "waiting":
+            self._delete(job.name)
+            return None, None
+        if left.state != "printing":
+            self._spent = job.name
+            return self._report(checked, job, start_s, ok=left.state == "done"), left.ended_s
+        self._session.state.follow(job.name)
+        return self._watched(checked, job, start_s, progress, part=True), None
+
     def close(self) -> None:
         """Let go of the server; a print under way goes on there."""
         if self._open is not None:
+            with contextlib.suppress(LinkError):
+                self._delete(self._spent)
+            self._spent = ""
             self._open.close()
             self._open = None
         self._lock.release()
@@ -208,8 +266,24 @@ class ServerPrinter(ABC, Generic[Session]):
         """A session, not yet listening."""
 
     @abstractmethod
-    def _greet(self) -> None:
-        """See that it is the right server and its printer is ready, and listen."""
+    def _greet(self, ready: Callable[[], None]) -> None:
+        """See that it is the right server and its printer is `ready`, and listen."""
+
+    @abstractmethod
+    def _left(self, prefix: str) -> Left | None:
+        """What became of the part whose file's name begins so; None where there is none."""
+
+    @abstractmethod
+    def motors_held(self) -> bool:
+        """Whether the nozzle is where the firmware believes it is, as far as the server knows."""
+
+    @abstractmethod
+    def position_mm(self) -> tuple[float, float, float]:
+        """Ask for the logical position."""
+
+    @abstractmethod
+    def command(self, text: str) -> None:
+        """Have one command of the host's own carried out."""
 
     @abstractmethod
     def _refuse_unless_ready(self) -> None:
@@ -230,7 +304,21 @@ class ServerPrinter(ABC, Generic[Session]):
         self._refuse_unless_ready()
         job = JobFile.of(checked, lines)
         self._upload(job)
+        self._delete(self._spent)
+        self._spent = ""
         self._start(job)
+        return self._watched(checked, job, start_s, progress, part=lines is not None)
+
+    def _watched(
+        self,
+        checked: PrintableProgram,
+        job: JobFile,
+        start_s: float,
+        progress: Progress,
+        *,
+        part: bool,
+    ) -> PrintReport:
+        """Follow a print to its end; a part of a job leaves its file to tell of it."""
         try:
             ok = self._follow(job, progress)
         except BaseException as error:  # an interrupt, too: the server would print on by itself
@@ -238,7 +326,20 @@ class ServerPrinter(ABC, Generic[Session]):
             raise
         if ok:
             progress("printing", 1.0, 1.0)
-        self._session.request("DELETE", f"{self.files}/{job.name}")  # refused if held: harmless
+        if part:
+            self._spent = job.name
+        else:
+            self._delete(job.name)
+        return self._report(checked, job, start_s, ok=ok)
+
+    def _delete(self, name: str) -> None:
+        """Take a file off the server; refused if it is held: harmless."""
+        if name:
+            self._session.request("DELETE", f"{self.files}/{name}")
+
+    def _report(
+        self, checked: PrintableProgram, job: JobFile, start_s: float, *, ok: bool
+    ) -> PrintReport:
         next_line, acked, resends = self._reached(checked, job, ok=ok)
         return PrintReport(
             ok=ok,

@@ -9,6 +9,11 @@ from dataclasses import dataclass
 from gcode.hosts.port import PrintableProgram
 
 
+def part_prefix(checked: PrintableProgram, first: int, end: int) -> str:
+    """How the names of all files begin that hold those lines of a program."""
+    return f"gcode-{checked.program.sha256[:12]}-{first}-{end}-"
+
+
 @dataclass(frozen=True, slots=True)
 class JobFile:
     """Lines [first, end) of a program as one file.
@@ -35,7 +40,7 @@ class JobFile:
         rows = checked.lines(first, end)
         text = "\n".join(rows)
         return cls(
-            name=f"gcode-{checked.program.sha256[:12]}-{secrets.token_hex(4)}.gcode",
+            name=f"{part_prefix(checked, first, end)}{secrets.token_hex(4)}.gcode",
             data=(text if text.endswith("\n") else text + "\n").encode("utf-8"),
             first=first,
             end=end,

@@ -41,6 +41,7 @@ class FakeMoonraker:
             "toolhead": {"homed_axes": "xyz"},
         }
         self.files: dict[str, bytes] = {}
+        self.begun: float | None = None
         self.uploads: list[bytes] = []
         self.calls: list[str] = []
         self.scripts: list[str] = []
@@ -72,6 +73,10 @@ class FakeMoonraker:
             self.files[fields["filename"].decode()] = data
             self.uploads.append(data)
             return 201, {"result": {}}
+        if name.startswith("GET /server/files/list"):
+            return 200, {"result": [{"path": file, "modified": 1.0} for file in self.files]}
+        if name.startswith("GET /server/files/metadata"):
+            return 200, {"result": {"print_start_time": self.begun}}
         assert asked.method == "DELETE"
         del self.files[asked.path.removeprefix("/server/files/gcodes/")]
         return 200, {"result": {}}

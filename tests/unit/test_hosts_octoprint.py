@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from hashlib import sha1
 from pathlib import Path
@@ -47,6 +48,8 @@ class FakeOctoPrint:
         self.alter: Callable[[bytes], bytes] = lambda data: data
         self.on_print: Callable[[], None] = self.finish
         self.refuse: dict[tuple[str, str], Answer] = {}
+        self.prints: dict[str, dict[str, Any]] = {}
+        self.place = "X:1.50 Y:2.25 Z:3.00 E:0.00"
 
     def handle(self, asked: Asked) -> Answer:
         if asked.headers.get("x-api-key") != KEY:
@@ -77,6 +80,12 @@ class FakeOctoPrint:
             assert match is not None
             self.files[match.group(1).decode()] = self.alter(match.group(2))
             return 201, {"done": True}
+        if asked.method == "GET" and not name:
+            rows = [
+                {"path": file, "date": 1.0, "prints": self.prints.get(file, {})}
+                for file in self.files
+            ]
+            return 200, {"files": rows}
         if asked.method == "GET":
             data = self.files[name]
             return 200, {"size": len(data), "hash": sha1(data).hexdigest()}
@@ -107,7 +116,7 @@ class FakeOctoPrint:
             self.commands.append(text)
             answers = {
                 "M105": ["T:21.50 /60.00 B:22.00 /0.00"],
-                "M114": ["X:1.50 Y:2.25 Z:3.00 E:0.00 Count X:150"],
+                "M114": [f"{self.place} Count X:150"],
                 "M115": ["FIRMWARE_NAME:Marlin 2.1.2 PROTOCOL_VERSION:1.0", "Cap:EEPROM:1"],
             }.get(text, [])
             said = ["T:20.0 /0.0", *answers, "ok"]
@@ -145,6 +154,7 @@ class FakeOctoPrint:
 
     def finish(self) -> None:
         self.file_position = len(self.files[self.file])
+        self.prints[self.file] = {"success": 1, "last": {"success": True, "date": time.time()}}
         self.push()
         self.end("PrintDone")
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Request
+from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 QUIET = logging.Logger("quiet", logging.CRITICAL + 1)  # the test looks at what the client logs
@@ -114,6 +115,14 @@ class FakeServer:
             self._sockets.append((connection, protocol))
             self._flush(connection, protocol)
         self.on_open()
+        try:
+            self._hear(connection, protocol)
+        finally:
+            with self._mutex:
+                if (connection, protocol) in self._sockets:
+                    self._sockets.remove((connection, protocol))
+
+    def _hear(self, connection: socket.socket, protocol: ServerProtocol) -> None:
         while True:
             try:
                 data = connection.recv(65536)
@@ -141,6 +150,8 @@ class FakeServer:
         """Send a JSON value over every websocket."""
         with self._mutex:
             for connection, protocol in self._sockets:
+                if protocol.state is not State.OPEN:  # it has said goodbye
+                    continue
                 protocol.send_text(json.dumps(message).encode())
                 self._flush(connection, protocol)
 
