@@ -35,7 +35,9 @@ def add_to(app: typer.Typer) -> None:
         "loop",
         epilog=console.examples(
             "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
-            "--scanner watch:scans --every 20",
+            "--scanner watch:scans --every 20 --at 12.5",
+            "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
+            "--scanner watch:scans --adaptive",
             "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
             "--scanner watch:scans --view",
             "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
@@ -73,6 +75,18 @@ def loop(
     every: Annotated[
         int, typer.Option(min=0, help="Scan after every so many layers; 0: only at the end.")
     ] = 0,
+    adaptive: Annotated[
+        bool,
+        typer.Option(
+            "--adaptive",
+            help="Scan less often while all is clean, down to a fourth of --every (8 where left "
+            "out), and four times as often after trouble.",
+        ),
+    ] = False,
+    at_mm: Annotated[
+        list[float] | None,
+        typer.Option("--at", metavar="Z", help="Scan when the job has reached this height, mm."),
+    ] = None,
     at_layer: Annotated[
         list[int] | None, typer.Option("--at-layer", help="Scan after this layer, too.")
     ] = None,
@@ -115,7 +129,7 @@ def loop(
         template,
         out,
         (printer, material, process),
-        [every, *(at_layer or [])],
+        running.Looks(every, adaptive, tuple(at_layer or ()), tuple(at_mm or ())),
         calibration,
         running.Page(view, view_host, view_port, token),
         resume=resume,

@@ -23,7 +23,8 @@ from amrepair.loop import (
 )
 from amrepair.loop.calibrate import read_calibration
 from amrepair.loop.limits import Limits
-from amrepair.loop.pick_up import pick_up_serial
+from amrepair.loop.pace import Pace, layers_at
+from amrepair.loop.pick_up import pick_up
 from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
@@ -42,6 +43,7 @@ from gcode.hosts.journal import default_path
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job
 
+ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
 SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
 
 
@@ -60,6 +62,16 @@ class _Begun:
 
 
 @dataclass(frozen=True, slots=True)
+class Looks:
+    """When to look, besides at the end: every so many layers, or adaptively; and where besides."""
+
+    every: int
+    adaptive: bool
+    at_layers: tuple[int, ...]
+    at_mm: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Page:
     """Whether and where the run is shown."""
 
@@ -74,7 +86,7 @@ def run(
     template: Path | None,
     out: Path,
     ids: tuple[str, str, str],
-    layers: list[int],
+    looks: Looks,
     calibration: Path | None,
     shown: Page,
     *,
@@ -88,8 +100,7 @@ def run(
 ) -> None:
     """Run the loop from its beginning, or go on with a run.
 
-    `layers` is how often to stop and after which layers besides; `said` is the scan's time limit
-    and the seed.
+    `said` is the scan's time limit and the seed.
     """
     watch, bars = Stopwatch(), console.Bars()
     if resume is not None:
@@ -102,7 +113,7 @@ def run(
             _given(template, "--template"),
             out,
             ids,
-            layers,
+            looks,
             calibration,
             watch,
             bars,
@@ -143,7 +154,7 @@ def _new_run(
     template: Path,
     out: Path,
     ids: tuple[str, str, str],
-    layers: list[int],
+    looks: Looks,
     calibration: Path | None,
     watch: Stopwatch,
     bars: console.Bars,
@@ -162,17 +173,18 @@ def _new_run(
         )
     job = job_of(job_file, setup)
     checked = check(job.program, setup)
-    every, *at = layers
-    regular = [*range(every - 1, len(job.layers) - 1, every)] if every else []
-    stops = plan_stops(job, [*regular, *at])
+    fixed = range(looks.every - 1, len(job.layers) - 1, looks.every) if looks.every else []
+    pace = (looks.every or ADAPTIVE_LAYERS) if looks.adaptive else 0
+    layers = [*looks.at_layers, *layers_at(job, looks.at_mm), *([] if pace else fixed)]
+    stops = plan_stops(job, layers)
     with watch("template"):
         field = open_template(template, progress=bars)
     with watch("locate"):
         placed = locate_part(job, field, layer_height_mm=setup.process.layer_height_mm)
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=placed, build_from_scanner=pose,
-        by_beads=True, max_iterations=MAX_ITERATIONS, limited=said["approve"] == "auto",
-        title=job_file.name, **said,
+        by_beads=True, max_iterations=MAX_ITERATIONS, adaptive=pace,
+        limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
     keep(out, setting, job.program.text, field)
@@ -215,11 +227,9 @@ def _print(
         wire_log=begun.folder.file("wire.log"),
         journal=default_path(setting.port),
     )
-    pick_up = None
+    find = None
     if going_on:
-        pick_up = pick_up_serial(
-            machine, release_c=setup.material.bed_release_c, pose_confirmed=pose
-        )
+        find = pick_up(machine, release_c=setup.material.bed_release_c, pose_confirmed=pose)
     eye = _scanner(setting.scanner, setting.scanner_pose, setting.scan_timeout_s)
     page.show_run(begun.job, _placed_solid(begun.template, setting.placed))
     if not going_on:
@@ -238,9 +248,11 @@ def _print(
                 approve=(page.approve if view else ask_to_print) if ask else lambda plan: True,
                 ask=(page.ask_to_go_on if view else ask_to_go_on) if ask else None,
                 limits=Limits.of(setup.process) if setting.limited else None,
+                pace=Pace(setting.adaptive) if setting.adaptive else None,
                 record=page.recording(begun.folder.record),
+                keep_scan=begun.folder.keep_scan,
                 tape=begun.tape,
-                pick_up=pick_up,
+                pick_up=find,
                 silent_stops=SILENT_STOPS,
                 seed=setting.seed,
                 watch=watch,

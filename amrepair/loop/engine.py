@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -20,11 +21,12 @@ from amrepair.loop.findings import early_action
 from amrepair.loop.kinds import typed
 from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
+from amrepair.loop.memory import settled
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.situation import decide_look
 from amrepair.loop.tape import Sent, Tape, TapeEndsError, report_from_json, report_to_json
 from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
-from amrepair.scans import Scanner, ScanRequest
+from amrepair.scans import Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import Printer, PrintReport
@@ -52,6 +54,7 @@ class Run:
         ask: Callable[[Decision], bool] | None,
         limits: Limits | None,
         record: Callable[[Look], None],
+        keep_scan: Callable[[int, Scan], None],
         tape: Tape,
         pick_up: PickUp | None,
         silent_stops: int,
@@ -61,7 +64,8 @@ class Run:
     ) -> None:
         self._job, self._checked, self._printer, self._scanner = job, checked, printer, scanner
         self._site_at, self._max_iterations = site_at, max_iterations
-        self._approve, self._ask, self._limits, self._record = approve, ask, limits, record
+        self._approve, self._ask, self._limits = approve, ask, limits
+        self._record, self._keep_scan = record, keep_scan
         self._tape, self._pick_up, self._seed = tape, pick_up, seed
         self._watch, self._progress = watch, progress
         self._sent: list[Sent] = []
@@ -71,6 +75,7 @@ class Run:
         self._repair_prints: list[PrintReport] = []
         self._stopped = ""
         self._silent_stops, self._silent = silent_stops, 0
+        self._coming: tuple[Stop, Future[Site]] | None = None
         self._passed: list[Stop] = []
 
     def report(self) -> LoopReport:
@@ -85,8 +90,11 @@ class Run:
 
     # ------------------------------------------------------------------ the job
 
-    def print_job(self, end: int) -> None:
-        """Print the job's lines up to `end`, and wait until the nozzle rests."""
+    def print_job(self, end: int, coming: Stop | None = None) -> None:
+        """Print the job's lines up to `end`, and wait until the nozzle rests.
+
+        What is to be expected at the `coming` stop is made meanwhile.
+        """
         first, lines = self._next_line, self._checked.program.text.count("\n")
         if first >= end:
             return
@@ -95,7 +103,9 @@ class Run:
             """The link tells of this part; people want to know of the job."""
             self._progress("print", float(first) + done, float(lines))
 
-        with self._watch("print"):
+        with self._watch("print"), ThreadPoolExecutor(1) as beside:
+            if coming is not None and not self._tape.only_read:
+                self._coming = coming, beside.submit(self._site_at, coming)
             report = self._send("job", self._checked, first, end, whole_job)
         if report is not None:
             self._job_prints.append(report)
@@ -122,7 +132,7 @@ class Run:
         if self._tape.only_read:
             return self._again(stop)
         state = self._job.state_after(stop.line)
-        site = self._site_at(stop)
+        site = self._expected(stop)
         with self._watch("print"):
             program, parked = travel.park(site.setup, state)
             self._send("park", program)
@@ -149,6 +159,13 @@ class Run:
             if look is not None:
                 self._change_next(stop, site, look)
         return True
+
+    def _expected(self, stop: Stop) -> Site:
+        """What is expected at a stop, made beforehand or now."""
+        coming, self._coming = self._coming, None
+        if coming is not None and coming[0] == stop:
+            return coming[1].result()
+        return self._site_at(stop)
 
     def _again(self, stop: Stop) -> bool:
         """Look at the recorded scans of a stop, however it is decided now."""
@@ -215,6 +232,28 @@ class Run:
                 else self._tape.scan(number, str(taped["frame"]))
             )
             self._progress(f"scan {stop.label}", 1.0, 1.0)
+        with ThreadPoolExecutor(1) as beside:  # the disk need not wait for the plan, nor it for it
+            kept = beside.submit(self._keep_scan, number, scan) if taped is None else None
+            plan, decision = self._plan(number, stop, site, parked, scan, here)
+        if kept is not None:
+            kept.result()
+        look = self._outcome(Look(number, stop, scan, plan, decision, printed=False), taped)
+        if taped is None:
+            self._record(look)
+            self._tape.write("look", **look_to_json(look))
+        self._looks.append(settled(look, site))
+        return look
+
+    def _plan(
+        self,
+        number: int,
+        stop: Stop,
+        site: Site,
+        parked: ModalState,
+        scan: Scan,
+        here: Sequence[Look],
+    ) -> tuple[RepairPlan, Decision]:
+        """What a scan asks for, and what is decided of it; `here` are the stop's earlier looks."""
         passes = sum(look.printed for look in here)
         again = bool(here) and not here[-1].printed
         plan = plan_repair(
@@ -244,12 +283,7 @@ class Run:
                 max_iterations=self._max_iterations,
                 limits=self._limits,
             )
-        look = self._outcome(Look(number, stop, scan, plan, decision, printed=False), taped)
-        self._looks.append(look)
-        if taped is None:
-            self._record(look)
-            self._tape.write("look", **look_to_json(look))
-        return look
+        return plan, decision
 
     def _outcome(self, look: Look, taped: dict[str, object] | None) -> Look:
         """Ask whoever is to be asked; a taped look was answered then."""

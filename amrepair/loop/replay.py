@@ -13,7 +13,7 @@ from typing import Any
 from amrepair.errors import InputError, LoopError
 from amrepair.frames import Transform
 from amrepair.loop.limits import Limits
-from amrepair.loop.looks import Look
+from amrepair.loop.looks import Look, Stop, plan_stops
 from amrepair.loop.run import run_loop
 from amrepair.loop.setting import Recorded, open_run
 from amrepair.loop.sites import sites
@@ -93,7 +93,7 @@ def looks_of(
         FilePrinter(Path("/dev/null")),
         _TapeScanner(setting.scanner_pose),
         sites(run.job, run.template, setting.placed, run.setup, by_beads=setting.by_beads),
-        stops=run.stops,
+        stops=_looked_at(run, tape),
         max_iterations=setting.max_iterations,
         limits=Limits.of(run.setup.process) if setting.limited else None,
         tape=tape,
@@ -102,6 +102,15 @@ def looks_of(
         progress=progress,
     )
     return report.looks
+
+
+def _looked_at(run: Recorded, tape: Tape) -> tuple[Stop, ...]:
+    """The stops of a run: those that were planned, and those that its looks led to."""
+    if not run.setting.adaptive:
+        return run.stops
+    layers = {stop.label: stop for stop in plan_stops(run.job, range(len(run.job.layers)))}
+    labels = dict.fromkeys(label for label in tape.labels() if label in layers)
+    return tuple(layers[label] for label in labels)
 
 
 def compare(then: dict[str, Any], look: Look) -> Replayed:

@@ -15,9 +15,10 @@ from amrepair.loop.decide import Decision
 from amrepair.loop.engine import PickUp, Run
 from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, LoopReport, Stop
+from amrepair.loop.pace import Pace, Stops, had_trouble
 from amrepair.loop.tape import Tape, TapeEndsError
 from amrepair.repair import RepairPlan, Site, Stopwatch
-from amrepair.scans import Scanner
+from amrepair.scans import Scan, Scanner
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import Printer
@@ -35,11 +36,13 @@ def run_loop(
     site_at: Callable[[Stop], Site],
     *,
     stops: Sequence[Stop],
+    pace: Pace | None = None,
     max_iterations: int = MAX_ITERATIONS,
     approve: Callable[[RepairPlan], bool] = lambda plan: True,
     ask: Callable[[Decision], bool] | None = None,
     limits: Limits | None = None,
     record: Callable[[Look], None] = lambda look: None,
+    keep_scan: Callable[[int, Scan], None] = lambda number, scan: None,
     tape: Tape | None = None,
     pick_up: PickUp | None = None,
     silent_stops: int = 0,
@@ -58,6 +61,8 @@ def run_loop(
         off before this returns.
     site_at
         What is expected at a stop, and where it stands (`build_from_template` is required).
+    pace
+        Looks besides `stops`: more often after trouble, fewer while all is clean.
     approve
         Asked before every repair is sent.
     ask
@@ -67,6 +72,8 @@ def run_loop(
         What may be printed without asking; beyond them the decision is `pause and ask`.
     record
         Called with every look as soon as its outcome is known, before anything follows from it.
+    keep_scan
+        Called with a look's number and scan while the look is planned; done before `record`.
     tape
         What was sent, seen and decided, written ahead; what it already holds is not done again.
     pick_up
@@ -112,14 +119,16 @@ def run_loop(
     run = Run(
         job, checked, printer, scanner, site_at,
         max_iterations=max_iterations, approve=approve, ask=ask, limits=limits, record=record,
-        tape=tape or Tape(), pick_up=pick_up, silent_stops=silent_stops, seed=seed,
-        watch=watch or Stopwatch(), progress=progress,
+        keep_scan=keep_scan, tape=tape or Tape(), pick_up=pick_up, silent_stops=silent_stops,
+        seed=seed, watch=watch or Stopwatch(), progress=progress,
     )  # fmt: skip
     try:
-        for stop in stops:
-            run.print_job(stop.line)
+        ahead = Stops(job, stops, pace)
+        while (stop := ahead.next()) is not None:
+            run.print_job(stop.line, coming=stop)
             if not run.at(stop):
                 break
+            ahead.seen(stop, trouble=had_trouble(run.report().at_stop(stop)))
         else:
             run.print_job(checked.program.text.count("\n"))
         run.end()

@@ -20,9 +20,8 @@ from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
 from amrepair.template import MeshSdf, load_template
 from amrepair.template.port import Template
-from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
-from gcode.reader import Job, read_job
+from gcode.reader import Job, job_for
 from gcode.slicing.layers import mesh_of
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
@@ -43,6 +42,8 @@ class Setting:
         4×4, rows.
     limited
         Whether it prints without asking, within the profile's limits.
+    adaptive
+        Layers that adaptive looks begin with (`pace`); 0 where there are none.
     """
 
     printer: str
@@ -57,6 +58,7 @@ class Setting:
     seed: int
     max_iterations: int
     limited: bool = False
+    adaptive: int = 0
     port: str = ""
     scanner: str = ""
     scan_timeout_s: float = 120.0
@@ -172,11 +174,7 @@ def open_run(folder: Path) -> Recorded:
     except TypeError as error:
         raise InputError(f"{folder / SETTING} cannot be read ({error})") from error
     setup = setting.setup()
-    job = read_job(
-        Program(text, setup.printer.dialect),
-        filament_diameter_mm=setup.printer.filament_diameter_mm,
-        dialect=setup.printer.dialect,
-    )
+    job = job_for(text, setup.printer)
     stops = plan_stops(job, setting.layers, final=setting.final)
     return Recorded(setting, setup, job, _kept_template(folder), stops)
 

@@ -106,6 +106,10 @@ class Tape:
         assert self.path is not None
         return read_scan(self.path / scan_name(number), frame=frame)
 
+    def labels(self) -> list[str]:
+        """Labels of the stops that were looked at, in order, one for every look."""
+        return [str(e["stop"]) for e in self._events if e.get("event") in LOOKS]
+
     def next_stop(self) -> str | None:
         """The label of the stop of the next recorded look."""
         return None if self.live else str(self._events[self._at].get("stop"))

@@ -13,7 +13,7 @@ import trimesh
 from amrepair.errors import InputError
 from amrepair.loop import Look
 from amrepair.loop.tape import scan_name
-from amrepair.scans import write_ply
+from amrepair.scans import Scan, write_ply
 from gcode.slicing.layers import mesh_of
 
 
@@ -33,6 +33,7 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._kept: set[int] = set()
         new = [p for p in (path.absolute(), *path.absolute().parents) if not p.exists()]
         probe = path / f".write-test-{os.getpid()}"
         try:  # permissions alone do not tell: a file system may refuse root, too
@@ -64,10 +65,16 @@ class RunFolder:
         """Write an object, keys in their order."""
         return self.write_text(name, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
+    def keep_scan(self, number: int, scan: Scan) -> None:
+        """Write the scan of a look, before anything is known of it."""
+        self._whole(scan_name(number), lambda path: write_ply(scan, path))
+        self._kept.add(number)
+
     def record(self, look: Look) -> None:
         """Write scan, deficit and program of one look."""
         n, plan = look.number, look.plan
-        self._whole(scan_name(n), lambda path: write_ply(look.scan, path))
+        if n not in self._kept:
+            self.keep_scan(n, look.scan)
         if not plan.deficit.missing.is_empty():
             self.write_solid(f"deficit-{n}.stl", plan.deficit.missing)
         if plan.checked is not None and look.printed:

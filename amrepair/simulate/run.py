@@ -37,7 +37,7 @@ from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import connect
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
-from gcode.reader import Job, read_job
+from gcode.reader import Job, job_for
 from gcode.slicing.job import PartPlan, plan_part
 from gcode.writer import write
 
@@ -170,11 +170,7 @@ def prepare_run(
     with watch("check job"):
         progress("check job", 0.0, 1.0)
         checked = check(program, setup)
-        job = read_job(
-            program,
-            filament_diameter_mm=setup.printer.filament_diameter_mm,
-            dialect=program.dialect,
-        )
+        job = job_for(program, setup.printer)
         progress("check job", 1.0, 1.0)
     rng = np.random.default_rng([seed, 1])
     tops_mm = np.array(plan.grid.tops_mm)
@@ -214,7 +210,8 @@ def simulate_run(
     Parameters
     ----------
     begun
-        Called with the scanner's calibrated pose; returns the tape that the run is recorded on.
+        Called with the scanner's calibrated pose; returns the tape that the run is recorded on,
+        which is closed at its end.
 
     Raises
     ------
@@ -283,6 +280,8 @@ def simulate_run(
             )
         finally:
             printer.close()
+            if tape is not None:
+                tape.close()
         stage.finish()
         printer_clock_s = machine.clock_s()
     return SimulatedRun(

@@ -63,15 +63,9 @@ def job_of(path: Path, setup: PrintSetup) -> Job:
     InputError
         If it cannot be read.
     """
-    from gcode.moves import Program
-    from gcode.reader import read_job
+    from gcode.reader import job_for
 
-    printer = setup.printer
-    return read_job(
-        Program(program_text(path), printer.dialect),
-        filament_diameter_mm=printer.filament_diameter_mm,
-        dialect=printer.dialect,
-    )
+    return job_for(program_text(path), setup.printer)
 
 
 def grid_of(job: Path | None, setup: PrintSetup) -> LayerGrid:

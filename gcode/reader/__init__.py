@@ -5,6 +5,6 @@ comments of PrusaSlicer, SuperSlicer, OrcaSlicer, Bambu Studio, Cura and ideaMak
 nothing; `check` does, with a parser of its own.
 """
 
-from gcode.reader.job import Beads, Job, JobLayer, read_job
+from gcode.reader.job import Beads, Job, JobLayer, job_for, read_job
 
-__all__ = ["Beads", "Job", "JobLayer", "read_job"]
+__all__ = ["Beads", "Job", "JobLayer", "job_for", "read_job"]

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
+from gcode.profiles import PrinterProfile
 from gcode.reader import text_kernels as kernels
 from gcode.units import filament_area_mm2
 
@@ -202,6 +203,28 @@ def read_job(
         filament_mm=float(filament.sum()),
         _states=states,
         _pushed_mm=pushed,
+    )
+
+
+def job_for(program: Program | str, printer: PrinterProfile) -> Job:
+    """Read a program as the printer that it is meant for understands it.
+
+    Parameters
+    ----------
+    program
+        A bare text is taken in the printer's dialect.
+
+    Raises
+    ------
+    ReadError
+        If it extrudes nothing.
+    """
+    if isinstance(program, str):
+        program = Program(program, printer.dialect)
+    return read_job(
+        program,
+        filament_diameter_mm=printer.filament_diameter_mm,
+        dialect=program.dialect,
     )
 
 

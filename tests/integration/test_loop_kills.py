@@ -25,12 +25,16 @@ from amrepair.loop.replay import replay
 from amrepair.loop.setting import JOB, Setting, keep, open_run
 from amrepair.loop.tape import read_events
 from amrepair.scans import write_ply
+from amrepair.simulate.columns import IntervalMap
+from amrepair.simulate.world import World
 from amrepair.template import MeshSdf
 from gcode.check import check
 from gcode.firmware import EmulatedPrinterProcess
+from gcode.firmware.motion import MotionBatch
 from gcode.profiles import load_printer, load_setup
-from gcode.reader import read_job
+from gcode.reader import job_for, read_job
 from gcode.slicing.job import plan_part
+from gcode.units import filament_area_mm2
 from gcode.writer import write
 
 SLOW = "always slow_reader s=0.001"
@@ -40,7 +44,11 @@ KILLED = -9
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small job, its template, and scans of the part with a pocket, and without."""
-    here = tmp_path_factory.mktemp("prepared")
+    return make_ready(tmp_path_factory.mktemp("prepared"), [LAYER])
+
+
+def make_ready(here: Path, layers: list[int]) -> Path:
+    """The same, looked at after some layers and at the end."""
     setup = load_setup(PRINTER, "pla", "repair_0.20")
     part = m3.Manifold.cube(SIZE_MM)
     program = write(plan_part(part.translate(PLACE_MM), setup).toolpath, setup, title="small")
@@ -50,12 +58,13 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "build", "template", rotation=np.eye(3), translation_mm=np.array(PLACE_MM)
     )
     setting = Setting.of(
-        setup, (PRINTER, "pla", "repair_0.20"), stops=plan_stops(job, [LAYER]),
+        setup, (PRINTER, "pla", "repair_0.20"), stops=plan_stops(job, layers),
         build_from_template=placed, build_from_scanner=Transform.identity("build", "scanner"),
         by_beads=False, seed=0, max_iterations=3,
     )  # fmt: skip
     keep(here / "run", setting, program.text, MeshSdf.from_mesh(solid_mesh(part)))
-    for label, top_mm in ((f"layer-{LAYER:03d}", job.layers[LAYER].z_mm), ("final", SIZE_MM[2])):
+    tops = [(f"layer-{layer:03d}", job.layers[layer].z_mm) for layer in layers]
+    for label, top_mm in (*tops, ("final", SIZE_MM[2])):
         stands = part.trim_by_plane((0.0, 0.0, -1.0), -top_mm).translate(PLACE_MM)
         pocket = m3.Manifold.cube((5.0, 5.0, 2.0)).translate((105.0, 93.0, top_mm - 0.6))
         for name, solid in (("whole", stands), ("broken", stands - pocket)):
@@ -72,16 +81,19 @@ def forks() -> Iterator[Forks]:
 class Bench:
     """A printer and one loop after another."""
 
-    def __init__(self, forks: Forks, prepared: Path, folder: Path) -> None:
+    def __init__(
+        self, forks: Forks, prepared: Path, folder: Path, *, faults: str = "", rough: bool = False
+    ) -> None:
         shutil.copytree(prepared, folder)
-        self.forks, self.folder = forks, folder
+        self.forks, self.folder, self.rough = forks, folder, rough
         self.port, self.record = folder / "port", folder / "executed"
-        self.printer = forks.printer(self.port, self.record, faults=SLOW)
+        self.printer = forks.printer(self.port, self.record, faults=f"{SLOW}\n{faults}")
 
     def start(self, *, go_on: bool, die_after: int = 0) -> int:
         return self.forks.start(
-            "loop", folder=str(self.folder), port=str(self.port), go_on=go_on, die_after=die_after
-        )
+            "loop", folder=str(self.folder), port=str(self.port), go_on=go_on, die_after=die_after,
+            rough=self.rough,
+        )  # fmt: skip
 
     def executed(self) -> list[str]:
         return beads_of(self.record.read_text().splitlines()) if self.record.exists() else []
@@ -120,12 +132,31 @@ class Bench:
                 lines += (run / f"repair-{look}.gcode").read_text().split("\n")
         return beads_of(lines)
 
-    def finish(self) -> None:
-        child = self.start(go_on=True)
+    def finish(self, *, going_on: bool = True) -> None:
+        child = self.start(go_on=going_on)
         assert self.forks.wait(child) == 0, self.told()
         assert self.events()[-1]["event"] == "end"
         assert self.executed() == self.planned()
-        assert "within: True" in self.told()
+        assert f"within: {not self.rough}" in self.told()  # a rough run has passed a stop by
+
+    def built(self) -> IntervalMap:
+        """What stands on the bed: the commands that were executed, laid into a world."""
+        setup = load_setup(PRINTER, "pla", "repair_0.20")
+        beads = job_for(self.record.read_text(), setup.printer).beads
+        away = beads.end_mm[-1:] + np.array([0.0, 0.0, 20.0])
+        filament = np.linalg.norm(beads.end_mm - beads.start_mm, axis=1) * beads.section_mm2
+        n = len(filament) + 1
+        world = World(setup.printer.bed_size_mm)
+        world.deposit(
+            MotionBatch(
+                np.concatenate([beads.start_mm, away]),
+                np.concatenate([beads.end_mm, away]),
+                np.append(filament / filament_area_mm2(1.75), 0.0),
+                np.full(n, 50.0),
+                np.arange(n) * 1.0,
+            )
+        )
+        return world.snapshot()
 
 
 def test_killed_thrice_it_prints_everything_once(
@@ -145,6 +176,40 @@ def test_killed_thrice_it_prints_everything_once(
     assert [e["kind"] for e in sent].count("repair") == 2
     # what the killed and resumed run decided is what its scans say
     assert not any(look.differences for look in replay(bench.folder / "run"))
+
+
+FAULTS = """
+every 97 corrupt_in
+every 131 lose_ok
+every 173 garble_ok
+every 211 drop_in
+every 307 noise_out
+every 401 resend_without_ok
+line 150 silence s=0.4
+line 400 busy s=5
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_faults_on_both_sides_and_two_kills_end_with_the_same_part(
+    forks: Forks, tmp_path: Path
+) -> None:
+    """On the wire a fault every twenty lines; a scanner with gaps, strays and a silent stop."""
+    ready = make_ready(tmp_path / "ready", [2, LAYER])
+    calm = Bench(forks, ready, tmp_path / "calm")
+    calm.finish(going_on=False)
+    rough = Bench(forks, ready, tmp_path / "rough", faults=FAULTS, rough=True)
+    rough.kill_in(rough.start(go_on=False), "job", 40)
+    rough.kill_in(rough.start(go_on=True), "repair", 5)
+    rough.finish()
+    assert "passed by: 1" in rough.told()
+    one, other = calm.built(), rough.built()
+    apart_mm3 = one.minus(other).volume_mm3 + other.minus(one).volume_mm3
+    print(f"volume {one.volume_mm3:.2f} and {other.volume_mm3:.2f} mm³, apart {apart_mm3:.3f} mm³")
+    assert apart_mm3 < 0.01 * one.volume_mm3
+    log = [e for e in rough.events() if e["event"] == "sent"]
+    assert sum(e["report"]["resends"] for e in log) > 10  # type: ignore[index]
 
 
 def test_a_printer_that_was_reset_is_not_gone_on_with(

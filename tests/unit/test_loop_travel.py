@@ -1,0 +1,55 @@
+"""The way to the park and back: whatever modes the job was in, it finds them again."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from itertools import product
+
+import pytest
+
+from amrepair.loop import travel
+from gcode.moves import Program
+from gcode.profiles import load_setup
+from gcode.reader import read_job
+
+SETUP = load_setup()
+HEAD = """\
+M140 S60
+M190 S60
+M104 S215
+M109 S215
+G28
+G90
+M83
+G92 E0
+G1 Z0.2 F600
+G1 X100 Y100 F6000
+G1 X120 Y100 E1 F1200
+G3 X120 Y110 I0 J5 E0.8
+G1 X100 Y110 E1
+"""
+
+
+@pytest.mark.parametrize(
+    ("relative", "absolute_e", "inches", "tool"), list(product((False, True), repeat=4))
+)
+def test_every_mode_comes_back(relative: bool, absolute_e: bool, inches: bool, tool: bool) -> None:
+    lines = [HEAD.rstrip(), "M204 P1500", "M106 S128", "M104 S207.5"]
+    lines += ["T1"] * tool + ["M82", "G92 E42.5"] * absolute_e
+    lines += ["G1 F1800", *["G91"] * relative]
+    lines += ["M82" if absolute_e else "M83", *["G20"] * inches]
+    head = "\n".join(lines) + "\n"
+    dialect = SETUP.printer.dialect
+    job = read_job(Program(head, dialect))
+    state = job.state_after(head.count("\n"))
+    assert (state.absolute_xyz, state.absolute_e) == (not relative, absolute_e)
+    assert (state.units_mm, state.tool) == (not inches, int(tool))
+    program, parked = travel.park(SETUP, state)
+    sent = [one.program.text for one in (program, *travel.way_back(SETUP, state, parked))]
+    text = "".join([head, *sent])
+    after = read_job(Program(text, dialect)).state_after(text.count("\n"))
+    wanted, found = asdict(state), asdict(after)
+    for name in ("position_mm", "e_mm", "feed_mm_s", "fan_ratio", "acceleration_mm_s2"):
+        assert found.pop(name) == pytest.approx(wanted.pop(name), abs=2e-3), name
+    assert found == wanted
+    assert "M400" in sent[0]  # the scan waits for the last move
