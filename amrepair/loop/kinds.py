@@ -36,6 +36,8 @@ BELOW_MM, RIM_MM = 0.7, 0.5
 SHORT = 0.3
 # A surface that bends: range of its parabola, in layers; share of the deviation it explains.
 WARP_LAYERS, LIFTED_LAYERS, WARP_SHARE = 1.0, 0.6, 0.45
+# Where its parabola is highest a curled surface itself is as high, by this much.
+RISEN_SHARE = 0.5
 # Of a layer's beads: too little or too much flow over at least this share is the layer's own.
 LAYER_SHARE = 0.55
 CLOG_SHARE = (0.12, 0.9)
@@ -220,7 +222,9 @@ def _warped(top: _Surface, layer_mm: float) -> Kind | None:
         return None
     high_mm = float(np.percentile(fitted[rim], 90))
     lifted_mm = high_mm - float(fitted[middle].mean())
-    up = high_mm > LIFTED_LAYERS * layer_mm  # what sinks in the middle is no curl
+    # what sinks in the middle is no curl; nor is a chip, whose parabola rises where nothing does
+    risen_mm = float(np.median(dev[rim & (fitted >= high_mm)]))
+    up = high_mm > LIFTED_LAYERS * layer_mm and risen_mm > RISEN_SHARE * high_mm
     if up and lifted_mm > WARP_LAYERS * layer_mm and share > WARP_SHARE:
         sure = _sure(lifted_mm, WARP_LAYERS * layer_mm) * min(1.0, share / (1.5 * WARP_SHARE))
         return Kind(DefectType.WARP, sure)

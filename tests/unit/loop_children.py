@@ -56,7 +56,8 @@ def emulate(link: str, record: str, faults: str = "") -> int:
 class StoredScanner:
     """The broken part until a repair of the stop is on the tape, the whole part then.
 
-    A rough one loses a fifth of the points, finds some elsewhere, and says nothing at `MUTE`.
+    A rough one loses a fifth of the points, finds some elsewhere, and says nothing at `MUTE`, where
+    nothing is wrong.
     """
 
     def __init__(self, folder: Path, *, rough: bool = False) -> None:
@@ -69,7 +70,7 @@ class StoredScanner:
     def scan(self, request: ScanRequest) -> Scan:
         looks = [e for e in read_events(self._folder / "run") if e["event"] == "look"]
         mended = any(e["printed"] and e["stop"] == request.label for e in looks)
-        which = "whole" if mended else "broken"
+        which = "whole" if mended or request.label == MUTE else "broken"
         scan = read_scan(self._folder / f"{which}-{request.label}.ply", frame="scanner")
         if not self._rough:
             return scan
