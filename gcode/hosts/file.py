@@ -82,16 +82,17 @@ class FilePrinter:
         if self._file is None:
             raise LinkError(f"{self.path} is not open; call connect() first.")
         start_s = self._clock()
-        first, end = (0, len(checked.program.text)) if lines is None else (lines.start, lines.stop)
+        text = checked.program.text
+        whole = text.count("\n") + (not text.endswith("\n"))  # no line follows the last newline
+        first, end = (0, whole) if lines is None else (lines.start, min(lines.stop, whole))
         written, size = 0, 0
         for line in checked.lines(first, end):
             self._file.write(line + "\n")
             written += bool(line.partition(";")[0].strip())
             size += len(line) + 1
         progress("writing", 1.0, 1.0)
-        next_line = checked.program.text.count("\n") if lines is None else end
         seconds = self._clock() - start_s
-        return PrintReport(True, written, 0, 0, 0, size, seconds, next_line, (0.0, 0.0, 0.0), first)
+        return PrintReport(True, written, 0, 0, 0, size, seconds, end, (0.0, 0.0, 0.0), first)
 
     def finish_moves(self) -> None:
         """Nothing moves."""
