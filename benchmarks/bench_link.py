@@ -126,12 +126,12 @@ def machine(lines: list[str], window: int, turns: Turns) -> None:
             pump()
         while poll.poll(50):
             link.receive(os.read(fd, 4096), clock())
-        for index, line in enumerate(lines):
-            if index % TURN_LINES == 0:
-                turns("", index, 0)
-            os.write(fd, link.send(line, clock()))
-            while not link.ready:
-                pump()
+        for first in range(0, len(lines), TURN_LINES):
+            turns("", first, 0)
+            for line in link.prepare(lines[first : first + TURN_LINES]):
+                os.write(fd, link.send(line, clock()))
+                while not link.ready:
+                    pump()
         while not link.idle:
             pump()
         turns("", len(lines), 0)

@@ -7,6 +7,7 @@ It opens the port, greets, tests, asks and listens; it knows nothing of programs
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import threading
@@ -255,6 +256,18 @@ class SerialConversation:
         """Send one command of the host's own (parking, heating), outside any program."""
         self._ask(text)
 
+    def hold_motors(self) -> bool:
+        """Ask the firmware to hold its motors however long nothing moves; whether it will.
+
+        Motors let go lose the nozzle's place. Where the time cannot be set (Klipper), it is left
+        as it is: the firmware itself then refuses to move until it is homed.
+        """
+        dialect = self._link.dialect
+        if not dialect.hold_motors:
+            return dialect.motors_off_s == math.inf
+        heard = self._ask(dialect.hold_motors)
+        return not any(isinstance(event, ev.UnknownCommand) for event in heard)
+
     def finish_moves(self) -> None:
         """Return when every buffered move has been made."""
         self._ask("M400")
@@ -265,11 +278,12 @@ class SerialConversation:
         if self._log is not None:
             self._log.add(self._clock(), b">", data)
         try:
-            written = os.write(self._fd, data)
-            while written < len(data):
-                select.select([], [self._fd], [], 1.0)
-                written += os.write(self._fd, data[written:])
-            self._bytes_sent += written
+            while data:
+                if not select.select([], [self._fd], [], MOST_WAIT_S)[1]:
+                    self._lost("the port takes no bytes")
+                written = os.write(self._fd, data)
+                self._bytes_sent += written
+                data = data[written:]
         except OSError as error:
             self._lost(f"the port failed ({error})")
 
@@ -281,27 +295,25 @@ class SerialConversation:
         if not self._poll.poll(wait_s * 1000 + 0.5 if wait_s > 0 else 0):
             return self._digest(self._link.tick(self._clock()))
         data = self._read()
-        return self._digest(self._link.receive(data, self._clock())) if data else []
+        return self._hear(data) if data is not None else []
 
-    def _pump_ok(self) -> None:
-        """Right after a line was sent: as `_pump`, at half the cost where it gets a plain `ok`."""
-        data = self._read() if self._poll.poll(self._first_wait_ms) else b""
-        if data and not self._link.receive_ok(data):
-            self._digest(self._link.receive(data, self._clock()))
-
-    def _read(self) -> bytes:
-        """What the printer said; nothing where somebody else has read it."""
+    def _read(self) -> bytes | None:
+        """What the printer said; None where somebody else has read it."""
         try:
-            data = os.read(self._fd, 65536)
+            return os.read(self._fd, 65536)
         except BlockingIOError:
-            return b""
+            return None
         except OSError as error:
             self._lost(f"the port failed ({error})")
+
+    def _hear(self, data: bytes) -> list[ev.Event]:
+        """Act on what the printer said."""
         if not data:
             self._lost("the port was closed")
+        now_s = self._clock()
         if self._log is not None:
-            self._log.add(self._clock(), b"<", data)
-        return data
+            self._log.add(now_s, b"<", data)
+        return self._digest(self._link.receive(data, now_s))
 
     def _digest(self, events: list[ev.Event]) -> list[ev.Event]:
         """Write what the link wants written, and act on what was said."""

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from gcode.errors import JournalError
 from gcode.hosts.journal import Journal
@@ -64,6 +65,19 @@ class JobBook:
             self._reserve(index)
         self._sent.append((self._link.last_sent + 1, index))
         self.lines_sent += 1
+
+    def before_moves(self, indices: Sequence[int]) -> int:
+        """Write down that program lines are sent next; returns how many of them may be."""
+        if indices[0] >= self._reserved:
+            self._reserve(indices[0])
+        return (
+            len(indices) if indices[-1] < self._reserved else bisect_left(indices, self._reserved)
+        )
+
+    def moves_sent(self, indices: Sequence[int]) -> None:
+        """Take note of the program lines of moves that the link has just been told of."""
+        self._sent.extend(enumerate(indices, self._link.last_sent - len(indices) + 1))
+        self.lines_sent += len(indices)
 
     def _reserve(self, index: int) -> None:
         if self._journal is None:

@@ -21,6 +21,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from gcode.errors import JournalError
@@ -321,14 +322,22 @@ class Journal:
         noted_s = self._run("SELECT MAX(time_s) FROM temperature").fetchone()[0]
         return bool(off) and (noted_s is None or max(off) > noted_s)
 
-    def last_heard_s(self) -> float | None:
-        """Return when anything was last noted of the latest job, s since the epoch."""
-        row = self._run(
-            "SELECT MAX(time_s) FROM (SELECT time_s, job FROM step UNION ALL SELECT time_s, job"
-            " FROM note UNION ALL SELECT time_s, job FROM temperature)"
-            " WHERE job = (SELECT MAX(id) FROM job)"
-        ).fetchone()
-        return None if row[0] is None else float(row[0])
+    def longest_silence_s(self, now_s: float) -> float:
+        """Return the longest time without an entry since the latest job's last step, s.
+
+        What a later attempt to go on has noted ends no silence that came before it.
+        """
+        rows = self._run(
+            "WITH latest AS (SELECT MAX(id) AS id, MAX(started_s) AS begun_s FROM job),"
+            " stepped AS (SELECT COALESCE((SELECT MAX(time_s) FROM step WHERE job = latest.id),"
+            " begun_s) AS time_s FROM latest)"
+            " SELECT time_s FROM stepped UNION"
+            " SELECT time_s FROM (SELECT job, time_s FROM note UNION SELECT job, time_s FROM"
+            " temperature) WHERE job = (SELECT id FROM latest)"
+            " AND time_s > (SELECT time_s FROM stepped) ORDER BY 1"
+        )
+        times_s = [row[0] for row in rows if row[0] is not None] or [now_s]
+        return max(b - a for a, b in pairwise([*times_s, max(now_s, times_s[-1])]))
 
     def notes(self) -> tuple[str, ...]:
         """Return the remarks, oldest first."""

@@ -9,15 +9,17 @@ names the interval: the last line known to be executed, the last that can have b
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import NoReturn
 
+from gcode.hosts.guarded import PAUSE_LIFT_MM
 from gcode.hosts.journal import FOREIGN_LINES, JobRecord, Journal, Step
 from gcode.hosts.modes import Modes, commands_of, follow, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
-from gcode.hosts.serial import PAUSE_LIFT_MM, SerialPrinter
+from gcode.hosts.serial import SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.protocol.events import PositionReport
 
@@ -26,6 +28,8 @@ SAME_PLACE_MM = 0.02
 SAME_E_MM = 0.006
 MOTORS_HELD_S = 100.0
 """Marlin lets go of the motors after 120 s without a move (DEFAULT_STEPPER_DEACTIVE_TIME)."""
+_SHIFT = re.compile(r"G0*92\b.*[XY]", re.IGNORECASE)
+"""What homing an axis makes undone."""
 MOST_IN_DOUBT = 64
 """Lines whose places are compared where there are no line numbers."""
 
@@ -84,7 +88,7 @@ class _Resumption:
         self._now_s = wall_clock()
         self._total = checked.program.text.count("\n") + 1 if end is None else end
         self._journal, self._job = self._last_job()
-        self._heard_s: float | None = None
+        self._silence_s = 0.0
         self._left_alone = False
 
     def run(self, progress: Progress) -> PrintReport:
@@ -111,6 +115,8 @@ class _Resumption:
             if not self._pose_confirmed:
                 self._require_motors()
                 self._require_warm(modes)
+            elif self._silence_s > MOTORS_HELD_S:
+                self._home_above(place, line)
             self._restore(place, modes)
         except LinkLostError as error:  # it knows nothing of the job's lines: none was sent
             printer.make_safe()
@@ -151,7 +157,7 @@ class _Resumption:
     def _settle(self, number: int | None) -> None:
         """Find the line from the printer's number, and write it down before the hello."""
         # Before this conversation adds to the journal: how was the printer left?
-        self._heard_s = self._journal.last_heard_s()
+        self._silence_s = self._journal.longest_silence_s(self._now_s)
         self._left_alone = self._journal.heaters_left_alone()
         if not self._printer.dialect.verifies:
             return
@@ -233,10 +239,9 @@ class _Resumption:
             )
 
     def _require_motors(self) -> None:
-        idle_s = self._now_s - self._heard_s if self._heard_s is not None else 0.0
-        if idle_s > MOTORS_HELD_S:
+        if self._silence_s > MOTORS_HELD_S:
             self._refuse(
-                f"the printer has been left alone for {idle_s:.0f} s and lets go of its motors "
+                f"the printer was left alone for {self._silence_s:.0f} s and lets go of its motors "
                 f"after {MOTORS_HELD_S:g} s; confirm by a rescan where the part stands, and say "
                 f"--pose-confirmed"
             )
@@ -275,6 +280,22 @@ class _Resumption:
         )
 
     # ------------------------------------------------------------------ back to work
+
+    def _home_above(self, place: PositionReport, line: int) -> None:
+        """Home X and Y, which may have been pushed, above all that was printed; never Z."""
+        modes, dialect, highest_mm = Modes(), self._printer.dialect.name, place.z_mm
+        for program, first, end in (*self._before, (self._checked, 0, line)):
+            for index, command in commands_of(program, first, end):
+                if _SHIFT.match(command):
+                    self._refuse(
+                        f"the motors may have let go, and homing X and Y would undo line "
+                        f"{index + 1}, {command!r}"
+                    )
+                modes = follow(modes, command, dialect)
+                highest_mm = max(highest_mm, modes.position_mm.get("Z", 0.0))
+        lift_mm = highest_mm + PAUSE_LIFT_MM - place.z_mm
+        for command in ("G21", "G91", f"G1 Z{lift_mm:.2f} F600", "G90", "G28 X Y"):
+            self._printer.command(command)
 
     def _restore(self, place: PositionReport, modes: Modes) -> None:
         """Lift, heat, go back to where the job left off, modes and extruder as it left them."""

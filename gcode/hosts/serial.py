@@ -1,7 +1,7 @@
-"""A printer on a serial port or pseudo-terminal: prints programs, keeps the journal, exits safely.
+"""A printer on a serial port or pseudo-terminal: prints programs, pauses, goes on.
 
-It owns the lock, the supervisor and the job; the port and the questions are `conversation`'s, what
-may be sent and what an answer means is `protocol.Link`'s.
+The port and the questions are `conversation`'s, lock and safe exits `guarded`'s, the fast way over
+plain moves is `beaten_path`'s; what may be sent and what an answer means is `protocol.Link`'s.
 """
 
 from __future__ import annotations
@@ -10,32 +10,31 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from operator import sub
 from pathlib import Path
-from types import TracebackType
 
-from gcode.errors import JournalError, LinkError, LocalProtocolError, PrinterError
-from gcode.hosts.conversation import SerialConversation
-from gcode.hosts.jobbook import TEMPERATURE_EVERY_S, JobBook
+from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.hosts.beaten_path import Exchange
+from gcode.hosts.guarded import GuardedConversation
+from gcode.hosts.jobbook import TEMPERATURE_EVERY_S
 from gcode.hosts.journal import Journal
-from gcode.hosts.lock import PortLock
 from gcode.hosts.modes import batches_of, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport
 from gcode.hosts.proof import require_checked
-from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
-from gcode.hosts.supervisor import make_safe
 from gcode.hosts.telemetry import RoundTrips
-from gcode.hosts.whereabouts import last_number
 from gcode.progress import Progress, silent
-from gcode.protocol import LinkTiming
+from gcode.protocol import PLAIN_OK, LinkTiming, WireLine
 from gcode.protocol import events as ev
 
-PAUSE_LIFT_MM = 5.0
+MOTORS_SURE = 0.8
+"""Share of the firmware's own time after which its motors are not relied on: clocks differ, and
+the pause's last move ended before it was counted."""
 BATCH_LINES = 500
 """Lines made ready, and counted, at a time."""
 
 
-class SerialPrinter(SerialConversation):
+class SerialPrinter(GuardedConversation):
     """A printer behind a serial port.
 
     Parameters
@@ -77,15 +76,12 @@ class SerialPrinter(SerialConversation):
             dialect=dialect,
             window=window,
             wire_log=wire_log,
+            journal=journal,
             timing=timing,
             clock=clock,
+            supervise=supervise,
+            guard=guard,
         )
-        self._journal = journal
-        self._supervise = supervise
-        self._guard = guard
-        self._supervisor: Supervisor | None = None
-        self._lock = PortLock(port)
-        self._book = JobBook(self._link, journal, clock)
         self._round_trips = RoundTrips()
         self._pause_asked = threading.Event()
         self._go_on = threading.Event()
@@ -98,85 +94,6 @@ class SerialPrinter(SerialConversation):
     def __enter__(self) -> SerialPrinter:
         self.connect()
         return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is not None:
-            self.make_safe()
-        self.close()
-
-    # ------------------------------------------------------------------ connection
-
-    def connect(self, *, before_hello: Callable[[int | None], None] | None = None) -> None:
-        """Open the port, agree on line numbers and ask who is there.
-
-        Parameters
-        ----------
-        before_hello
-            Told the number of the last line that the printer has received (None: it does not
-            say), before a hello makes it forget that; what it raises ends the attempt.
-        """
-        if self._serial is not None:
-            return
-        self._lock.acquire()
-        try:
-            self._open_port()
-            if before_hello is not None:
-                self._ask_number(before_hello)
-            counted = self._journal is not None and self._link.dialect.verifies
-            self._greet(self._journal.open_session() if self._journal and counted else 0)
-            if self._guard and self._link.dialect.verifies:
-                self._test_guard()
-            self._learn()
-            self._prove()  # from here on a silent reset cannot be taken for a resend request
-        except BaseException:
-            self.close()
-            raise
-        if self._supervise:
-            self._supervisor = Supervisor(self._fd, self._lock.fd, self._journal_path())
-
-    def _journal_path(self) -> Path | None:
-        return self._journal.path if self._journal is not None else None
-
-    def _ask_number(self, before_hello: Callable[[int | None], None]) -> None:
-        number = None
-        if self._link.dialect.verifies:
-            try:
-                number = last_number(
-                    self._fd, timing=self._link.timing, clock=self._clock, note=self._log_wire
-                )
-            except OSError as error:
-                raise LinkError(
-                    f"{self.port} failed ({error}) when asked for its line number; check the "
-                    f"printer and its cable."
-                ) from error
-        try:
-            before_hello(number)
-        except LinkError:
-            self._note(make_safe(self._fd))
-            raise
-
-    def close(self) -> None:
-        """Let go of the printer; heaters stay as they are (`make_safe` switches them off)."""
-        if self._supervisor is not None:
-            self._supervisor.stand_down()
-            self._supervisor = None
-        self._close_port()
-        self._lock.release()
-
-    # ------------------------------------------------------------------ questions
-
-    @property
-    def journal(self) -> Journal | None:
-        """Where the job is written down."""
-        return self._journal
-
-    def _before_own_command(self) -> None:
-        self._book.before_own_command()
 
     # ------------------------------------------------------------------ printing
 
@@ -205,6 +122,8 @@ class SerialPrinter(SerialConversation):
                 whole = self._carry_out(checked, first, end, progress)
                 if whole and end >= total:
                     self._book.finish()
+                elif whole:
+                    self.hold_motors()  # nobody knows when the next part comes
         except (LinkError, LocalProtocolError):
             self._book.lost()
             self.make_safe()
@@ -260,34 +179,84 @@ class SerialPrinter(SerialConversation):
         self, checked: PrintableProgram, indices: list[int], commands: list[str]
     ) -> bool:
         """Send some lines, each when there is room for it; False if the job was aborted."""
-        link, clock, before_line, asked = (
-            self._link,
-            self._clock,
-            self._book.before_line,
-            self._asked,
-        )
-        trips_s: list[float] = []
-        heard_s = clock()
-        if heard_s >= self._ask_s:
-            self._note_temperatures(heard_s)  # now, for lines made ready lose their numbers by it
-        for index, line, command in zip(indices, link.prepare(commands), commands, strict=True):
-            if self._attention.is_set() and not self._attend(checked, index):
+        link, at = self._link, 0
+        lines, trips_s = link.prepare(commands), list[float]()
+        while at < len(indices):
+            if self._attention.is_set() and not self._attend(checked, indices[at]):
                 return False
-            if heard_s >= self._ask_s:
-                self._note_temperatures(heard_s)
-            before_line(index)
-            sent_s = clock()
-            self._write(link.send(line, sent_s))
-            if command[:4] in asked:
-                asked[command[:4]] += 1
-            if not link.ready:
-                self._pump_ok()
-                while not link.ready:
+            if self._clock() >= self._ask_s:
+                self._note_temperatures(self._clock())
+            if lines.first + at != link.last_sent + 1:  # a command of our own came between
+                indices, commands, at = indices[at:], commands[at:], 0
+                lines = link.prepare(commands)
+            moves = link.moves(lines, at)
+            if moves:
+                sent_s = self._send_moves(moves, indices[at : at + len(moves)], trips_s)
+                at += len(sent_s)
+            else:
+                sent_s = [self._send_line(lines[at], indices[at], commands[at])]
+                at += 1
+            if not moves or not link.idle:
+                while not link.ready or (lines.is_move(at) and not link.idle):
                     self._pump()
-            heard_s = clock()
-            trips_s.append(heard_s - sent_s)
+                trips_s.append(self._clock() - sent_s[-1])
         self._round_trips.add(trips_s)
         return True
+
+    def _send_line(self, line: str | WireLine, index: int, command: str) -> float:
+        """Send a line that is no plain move, or comes at a moment that is not; returns when."""
+        self._book.before_line(index)
+        sent_s = self._clock()
+        self._write(self._link.send(line, sent_s))
+        if command[:4] in self._asked:
+            self._asked[command[:4]] += 1
+        return sent_s
+
+    def _send_moves(
+        self, moves: Sequence[bytes], indices: Sequence[int], trips_s: list[float]
+    ) -> list[float]:
+        """Send plain moves while the answers are plain; returns when each was sent."""
+        moves = moves[: self._book.before_moves(indices)]
+        poll, wait_ms, link = self._poll.poll, self._first_wait_ms, self._link
+        exchange = Exchange(
+            self._fd,
+            wait=lambda: poll(wait_ms),
+            clock=self._clock,
+            oks=link.oks,
+            asked_to_stop=self._attention.is_set,
+            window=link.window,
+            most_bytes=link.dialect.rx_bytes,
+        )
+        failure = None
+        try:
+            exchange.run(moves)
+        except OSError as error:
+            failure = error
+        finally:
+            self._account(exchange, moves, indices)
+        if failure is not None:
+            self._lost(f"the port failed ({failure})")
+        trips_s += map(sub, exchange.answered_s, exchange.sent_s)
+        if exchange.rest:
+            self._write(exchange.rest)
+        if exchange.answer is not None:
+            self._hear(exchange.answer)
+        return exchange.sent_s
+
+    def _account(self, exchange: Exchange, moves: Sequence[bytes], indices: Sequence[int]) -> None:
+        """Tell link, journal, log and counters what became of moves."""
+        sent_s, answered_s = exchange.sent_s, exchange.answered_s
+        if not sent_s:
+            return
+        written = moves[: len(sent_s)]
+        self._link.moves_sent(written, len(answered_s), max([sent_s[-1], *answered_s[-1:]]))
+        self._book.moves_sent(indices[: len(sent_s)])
+        self._bytes_sent += sum(map(len, written)) - len(exchange.rest)
+        if self._log is not None:
+            for index, move in enumerate(written):
+                self._log.add(sent_s[index], b">", move)
+                if index < len(answered_s):
+                    self._log.add(answered_s[index], b"<", PLAIN_OK)
 
     # ------------------------------------------------------------------ pause, abort, stop
 
@@ -329,6 +298,7 @@ class SerialPrinter(SerialConversation):
         place = self._where()
         modes = modes_after(checked, line, self._link.dialect.name)
         self._lift()
+        held, since_s = self.hold_motors(), self._clock()
         self._note("paused")
         self._mutex.release()  # others may ask while the job rests
         try:
@@ -338,66 +308,29 @@ class SerialPrinter(SerialConversation):
             self._mutex.acquire()
         if self._abort_asked.is_set():
             return False
+        if not held:
+            self._require_motors(self._clock() - since_s)
         for command in modes.restore(place.x_mm, place.y_mm, place.z_mm, place.e_mm):
             self._ask(command)
         self._note("resumed")
         return True
 
-    def _lift(self) -> None:
-        for command in ("G21", "G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
-            self._ask(command)
+    def _require_motors(self, idle_s: float) -> None:
+        """Refuse to go on where the firmware has let go of its motors."""
+        dialect = self._link.dialect
+        if idle_s >= dialect.motors_off_s * MOTORS_SURE:
+            raise PrinterError(
+                f"The job rested for {idle_s:.0f} s; this firmware lets go of its motors after "
+                f"{dialect.motors_off_s:.0f} s, so the nozzle's place is not certain any more and "
+                f"nothing further was sent. The last program line executed is "
+                f"{self._book.executed_line + 1}. Home X and Y alone (G28 X Y), never Z onto the "
+                f"part, and go on by 'gcode resume-at'."
+            )
 
     def emergency_stop(self) -> None:
         """Send M112, past every queue that the firmware lets it pass."""
-        self._write(b"\nM112\n")
-        self._link.give_up("an emergency stop was asked for")
-
-    def heaters_off(self) -> None:
-        """Switch hotend, bed and fan off, acknowledged."""
-        for command in SAFE_COMMANDS:
-            self._ask(command)
-
-    def make_safe(self) -> None:
-        """Heaters off and nozzle lifted, by any means left; says loudly if it cannot."""
-        if self._serial is None:
-            return
-        try:
-            if self._link.ended or not self._link.idle:
-                data = b"\n" + b"".join(command.encode() + b"\n" for command in SAFE_COMMANDS)
-                self._write(data)
-                self._note("heaters told to switch off by unnumbered lines; nothing confirms it")
-            else:
-                self._switch_off()
-        except (LinkError, LocalProtocolError, OSError) as error:
-            self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
-
-    def _switch_off(self) -> None:
-        try:
-            self.heaters_off()
-            self._lift()
-            self._note(f"{self._heaters_now()}, nozzle lifted")
-        except JournalError:  # numbered lines must be written down first, these need not
-            self._note(make_safe(self._fd))
-
-    def _heaters_now(self) -> str:
-        """What the printer says of its heaters; an `ok` alone confirms nothing."""
-        for event in self._ask("M105"):
-            if isinstance(event, ev.TemperatureReport) and all(
-                heater.target_c == 0.0 for heater in event.heaters.values()
-            ):
-                return "heaters off (the printer reports targets of 0)"
-        return "heaters told to switch off, nothing confirms it"
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What the host did of its own accord since the last `print` began."""
-        return tuple(self._warnings)
-
-    def _note(self, text: str) -> None:
-        self._warnings.append(text)
-        if self._log is not None:
-            self._log.add(self._clock(), b"#", text.encode("ascii", "replace"))
-        self._book.note(text)
+        self._attention.set()
+        super().emergency_stop()
 
     # ------------------------------------------------------------------ what is heard
 

@@ -5,14 +5,15 @@ No I/O, no clock, no threads (h11 is the model). `hosts` gives it a port and a c
 
 from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
 from gcode.protocol.ledger import HISTORY_LINES
-from gcode.protocol.lines import WireLine, checksum, wire_text
-from gcode.protocol.link import Link
+from gcode.protocol.lines import WireLine, WireLines, checksum, wire_text
+from gcode.protocol.link import PLAIN_OK, Link
 from gcode.protocol.timing import LinkTiming
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
 
 __all__ = [
     "HISTORY_LINES",
     "LINK_DIALECTS",
+    "PLAIN_OK",
     "TRANSITIONS",
     "Link",
     "LinkDialect",
@@ -20,6 +21,7 @@ __all__ = [
     "Signal",
     "State",
     "WireLine",
+    "WireLines",
     "checksum",
     "wire_text",
 ]

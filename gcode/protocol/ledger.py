@@ -6,6 +6,7 @@ It counts and keeps; when to send, and what to believe, is the business of `link
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 from gcode.protocol.lines import WireLine
 
@@ -56,6 +57,17 @@ class Ledger:
         self.wire_bytes += len(data)
         if slow:
             self._last_slow = number
+
+    def add_moves(self, moves: Sequence[bytes], acknowledged: int) -> None:
+        """Note quick lines that followed one another, and how many of them are acknowledged.
+
+        Every line before is acknowledged.
+        """
+        self._lines.extend(moves)
+        self.last += len(moves)
+        self.cursor = self.last + 1
+        self.acked += acknowledged
+        self.wire_bytes = sum(map(len, moves[acknowledged:]))
 
     def acknowledge(self, number: int) -> None:
         """Note that every line up to `number` is acknowledged."""

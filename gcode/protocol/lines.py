@@ -7,10 +7,11 @@ the printer is busy with the line before.
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Sequence
 from functools import reduce
 from operator import xor
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -31,6 +32,7 @@ _MACRO = re.compile(r"[A-Za-z_]{2}")
 
 _QUICK = frozenset(("G0 ", "G1 "))
 _NEWLINE = 10
+_CHECKSUMS = tuple(f"*{value}\n" for value in range(256))
 _FRAME_BYTES = 18
 """Most that number and checksum add to a command: `N`, nine digits, a space, `*255`, newline."""
 
@@ -74,11 +76,60 @@ def wire_line(number: int, command: str, dialect: LinkDialect) -> WireLine:
     return WireLine(number, command, data, _takes_long(text.decode("ascii")))
 
 
-def wire_lines(first: int, commands: Sequence[str], dialect: LinkDialect) -> list[str | WireLine]:
-    """Make many lines at once, numbered from `first` on: three times as fast as one by one.
+class WireLines(Sequence[str | WireLine]):
+    """Commands that come next, made ready together; each is what `Link.send` takes.
 
-    A command that the dialect cannot carry is left as it is, for its turn to be refused.
+    Attributes
+    ----------
+    first
+        Number of the first of them.
     """
+
+    __slots__ = ("_breaks", "_commands", "_data", "_dialect", "first")
+
+    def __init__(self, first: int, commands: Sequence[str], dialect: LinkDialect) -> None:
+        self.first = first
+        self._commands = commands
+        self._dialect = dialect
+        self._data = _numbered_at_once(first, commands, dialect)
+        self._breaks = [i for i, line in enumerate(commands) if line[:3] not in _QUICK]
+
+    def __len__(self) -> int:
+        return len(self._commands)
+
+    @overload
+    def __getitem__(self, index: int) -> str | WireLine: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[str | WireLine]: ...
+    def __getitem__(self, index: int | slice) -> str | WireLine | Sequence[str | WireLine]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        command, number = self._commands[index], self.first + range(len(self))[index]
+        if self._data is not None:
+            return WireLine(number, command, self._data[index], _takes_long(command))
+        try:
+            return wire_line(number, command, self._dialect)
+        except LocalProtocolError:
+            return command
+
+    def is_move(self, index: int) -> bool:
+        """Whether `moves_from` has anything from there on; False beyond the end."""
+        after = bisect_left(self._breaks, index)
+        ends = self._breaks[after] if after < len(self._breaks) else len(self)
+        return self._data is not None and index < ends
+
+    def moves_from(self, index: int) -> list[bytes]:
+        """What is written of the plain moves from `index` on, up to the first other command."""
+        if self._data is None:
+            return []
+        after = bisect_left(self._breaks, index)
+        return self._data[index : self._breaks[after] if after < len(self._breaks) else None]
+
+
+def _numbered_at_once(
+    first: int, commands: Sequence[str], dialect: LinkDialect
+) -> list[bytes] | None:
+    """Every command's bytes, ten times as fast as one by one; None where one of them is odd."""
     text = "\n".join(commands)
     plain = (
         text.isascii()
@@ -88,27 +139,15 @@ def wire_lines(first: int, commands: Sequence[str], dialect: LinkDialect) -> lis
         and max(map(len, commands)) <= dialect.max_line_bytes - _FRAME_BYTES
     )
     if not plain:
-        return [_line_or_command(first + i, line, dialect) for i, line in enumerate(commands)]
+        return None
     if not dialect.numbered:
-        made = [line.encode() + b"\n" for line in commands]
-    else:
-        bodies = [f"N{number} {line}" for number, line in enumerate(commands, first)]
-        data = np.frombuffer("\n".join((*bodies, "")).encode(), dtype=np.uint8)
-        ends = np.flatnonzero(data == _NEWLINE)
-        sums = np.bitwise_xor.reduceat(data, np.concatenate(([0], ends[:-1] + 1))) ^ _NEWLINE
-        made = [
-            b"%b*%d\n" % (body.encode(), x) for body, x in zip(bodies, sums.tolist(), strict=True)
-        ]
-    numbers = range(first, first + len(commands))
-    slow = [line[:3] not in _QUICK and _takes_long(line) for line in commands]
-    return list(map(WireLine._make, zip(numbers, commands, made, slow, strict=True)))
-
-
-def _line_or_command(number: int, command: str, dialect: LinkDialect) -> str | WireLine:
-    try:
-        return wire_line(number, command, dialect)
-    except LocalProtocolError:
-        return command
+        return (text + "\n").encode().splitlines(keepends=True)
+    bodies = [f"N{number} {line}" for number, line in enumerate(commands, first)]
+    data = np.frombuffer("\n".join((*bodies, "")).encode(), dtype=np.uint8)
+    ends = np.flatnonzero(data == _NEWLINE)
+    sums = np.bitwise_xor.reduceat(data, np.concatenate(([0], ends[:-1] + 1))) ^ _NEWLINE
+    whole = map(str.__add__, bodies, map(_CHECKSUMS.__getitem__, sums.tolist()))
+    return "".join(whole).encode().splitlines(keepends=True)
 
 
 def _takes_long(text: str) -> bool:

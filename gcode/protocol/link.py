@@ -18,11 +18,11 @@ What it does not do: judge G-code, know what a job is, retry by reopening, or sl
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from gcode.errors import LocalProtocolError
-from gcode.protocol.belief import Belief, Verdict
-from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
+from gcode.protocol.belief import Verdict
 from gcode.protocol.events import (
     Acknowledged,
     Busy,
@@ -30,27 +30,25 @@ from gcode.protocol.events import (
     Event,
     Greeted,
     LineError,
-    LinkLost,
     Ok,
     PrinterReset,
-    Probed,
     Resend,
     ResendRefused,
     ResendRequested,
-    SpareOk,
     TemperatureReport,
     UnknownCommand,
     Unrecognised,
     Waiting,
 )
-from gcode.protocol.inbox import Inbox
-from gcode.protocol.ledger import Ledger
-from gcode.protocol.lines import WireLine, numbered, wire_line, wire_lines
+from gcode.protocol.lines import WireLine, WireLines, wire_line
+from gcode.protocol.recovery import NEVER_S, Recovery
 from gcode.protocol.replies import parse_reply
-from gcode.protocol.timing import LinkTiming
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
 
-NEVER_S = float("inf")
+PLAIN_OK = b"ok\n"
+"""The answer that nearly every line gets."""
+_OKS = re.compile(rb"(?:ok N\d{1,10} P\d+ B\d+\n)+")
+_OK_NUMBER = re.compile(rb"N(\d+)")
 
 # Looked up once: Python 3.11 takes 0.1 µs to find a member of an enumeration, ten times a line.
 _GREETING, _IDLE, _WAITING = State.GREETING, State.IDLE, State.WAITING
@@ -58,7 +56,7 @@ _REWINDING, _PROBING = State.REWINDING, State.PROBING
 _SENT, _ACKED, _DRAINED = Signal.SENT, Signal.ACKED, Signal.DRAINED
 
 
-class Link:
+class Link(Recovery):
     """One conversation with one printer.
 
     Parameters
@@ -68,36 +66,6 @@ class Link:
     window
         Most lines under way at once; 1 unless the printer is known to buffer (ADVANCED_OK).
     """
-
-    def __init__(
-        self,
-        dialect: str | LinkDialect = "marlin",
-        *,
-        window: int = 1,
-        timing: LinkTiming | None = None,
-    ) -> None:
-        self.dialect = LINK_DIALECTS[dialect] if isinstance(dialect, str) else dialect
-        self.window = window
-        self.timing = timing or LinkTiming()
-        self.state = State.UNGREETED
-        self.resends = 0
-        self.probes = 0
-        self.spare_oks = 0
-        self._inbox = Inbox()
-        self._out = bytearray()
-        self._events: list[Event] = []
-        self._hello_at_s = 0.0
-        self._reset_numbers(0)
-
-    def _reset_numbers(self, number: int) -> None:
-        self._ledger = Ledger(number)
-        self._belief = Belief(self.timing, number)
-        self._swallow_until_s = -1.0
-        self._rewind_until_s = 0.0
-        self._rewind_at_once = False
-        self._heard_s = 0.0
-        self._deadline_s = NEVER_S
-        self._probing_since_s: float | None = None
 
     # ------------------------------------------------------------------ what the caller asks
 
@@ -125,16 +93,6 @@ class Link:
             and ledger.wire_bytes < self.dialect.rx_bytes
         )
 
-    @property
-    def idle(self) -> bool:
-        """Whether every line sent is acknowledged and nothing is in doubt."""
-        return self.state is _IDLE
-
-    @property
-    def ended(self) -> bool:
-        """Whether the link has ended (`LOST`, `HALTED`) and only `hello` leads on."""
-        return self.state is State.LOST or self.state is State.HALTED
-
     def hello(self, now_s: float, *, number: int = 0) -> bytes:
         """Start numbering afresh: `M110`, the first line of any conversation.
 
@@ -148,21 +106,62 @@ class Link:
         self._hello_at_s = now_s
         return self._hello_bytes(now_s)
 
-    def _hello_bytes(self, now_s: float) -> bytes:
-        self._deadline_s = now_s + self.timing.doubt_s * 5
-        if not self.dialect.numbered:
-            return b"\nM105\n"
-        # The newline ends whatever half line a dead sender left in the printer's buffer.
-        number = self._ledger.last
-        return b"\n" + numbered(number, b"M110 N%d" % number)
-
-    def prepare(self, commands: Sequence[str]) -> list[str | WireLine]:
-        """Make what `send` takes out of the commands that come next, all at once.
+    def prepare(self, commands: Sequence[str]) -> WireLines:
+        """Make what `send` and `moves` take out of the commands that come next, all at once.
 
         It promises nothing: where another line comes between, `send` numbers anew; what the
         dialect cannot carry is refused when its turn comes.
         """
-        return wire_lines(self._ledger.last + 1, commands, self.dialect)
+        return WireLines(self._ledger.last + 1, commands, self.dialect)
+
+    def moves(self, lines: WireLines, index: int) -> list[bytes]:
+        """Return what may be written of the plain moves that follow, one after another.
+
+        The beaten path, which costs nothing between two lines: as long as the answers are `oks`
+        and nothing else, as many may be under way as the window allows. Whatever happens,
+        `moves_sent` has to be told before anything else is asked of the link. Empty where `send`
+        must have its turn: lines under way, something in doubt, a command that is no plain move.
+        """
+        if (
+            self.state is not _IDLE
+            or lines.first + index != self._ledger.last + 1
+            or self._swallow_until_s >= 0
+            or not self._inbox.empty
+        ):
+            return []
+        return lines.moves_from(index)
+
+    def oks(self, data: bytes, answered: int) -> int:
+        """How many acknowledgements `data` is, after `answered` of moves; 0 where it is not only.
+
+        Those with numbers (ADVANCED_OK) must name the lines that are next.
+        """
+        count = data.count(b"\n")
+        if data == PLAIN_OK * count:
+            return count
+        if not _OKS.fullmatch(data):
+            return 0
+        first = self._ledger.last + 1 + answered
+        numbers = [int(number) for number in _OK_NUMBER.findall(data)]
+        return count if numbers == list(range(first, first + count)) else 0
+
+    def moves_sent(self, written: Sequence[bytes], answered: int, now_s: float) -> None:
+        """Take note of moves written, and of how many were acknowledged.
+
+        Parameters
+        ----------
+        written
+            The first of what `moves` returned; a line that may have been written counts.
+        now_s
+            When the last was written or acknowledged, whatever came last.
+        """
+        self._ledger.add_moves(written, answered)
+        if answered:
+            self._belief.progress()
+            self._probing_since_s = None
+        if answered < len(written) and self.state is _IDLE:
+            self.state = TRANSITIONS[_IDLE][_SENT]
+            self._listen_anew(now_s)
 
     def send(self, command: str | WireLine, now_s: float) -> bytes:
         """Give the next line its number and return the bytes to write.
@@ -213,33 +212,8 @@ class Link:
         if self.idle:
             self._belief.confirm(self._ledger.last)
 
-    def receive_ok(self, data: bytes) -> bool:
-        """Take the answer that nearly every line gets: the beaten path of `receive`.
-
-        True where `data` is an `ok`, one line was under way and nothing is in doubt: the line is
-        acknowledged. False where it is anything else: nothing is taken, `receive` is to have it.
-        """
-        ledger = self._ledger
-        if (
-            data == b"ok\n"
-            and self.state is _WAITING
-            and ledger.last - ledger.acked == 1
-            and self._swallow_until_s < 0
-            and self._inbox.empty
-        ):
-            ledger.acked = ledger.last
-            ledger.wire_bytes = 0
-            self._belief.progress()
-            self._probing_since_s = None
-            self.state = TRANSITIONS[_WAITING][_DRAINED]
-            self._deadline_s = NEVER_S
-            return True
-        return False
-
     def receive(self, data: bytes, now_s: float) -> list[Event]:
         """Take bytes from the printer and return what they mean; any bytes at all are fine."""
-        if self.receive_ok(data):
-            return [Acknowledged(self._ledger.acked)]
         for raw, readable in self._inbox.take(data):
             if readable:
                 self._reply(raw, now_s)
@@ -261,13 +235,6 @@ class Link:
             self._greet_again(now_s)
         elif self.state in (_WAITING, _PROBING):
             self._silence(now_s)
-        events, self._events = self._events, []
-        return events
-
-    def give_up(self, why: str) -> list[Event]:
-        """End the link for a reason of the caller's (the port is gone, an error was seen)."""
-        if self.state not in (State.UNGREETED, State.HALTED, State.LOST):
-            self._lose(why)
         events, self._events = self._events, []
         return events
 
@@ -380,109 +347,3 @@ class Link:
             # The request itself may be garbled: ask again before believing it.
             self._swallow_until_s = now_s + self.timing.resend_grace_s
             self._doubt(now_s)
-
-    def _serve(self, number: int, now_s: float) -> None:
-        """Make ready to send again from line `number`, once older answers are in."""
-        ledger = self._ledger
-        if number <= ledger.last:
-            self.resends += 1
-        self._events.append(ResendRequested(number, served=True))
-        if number - 1 > ledger.acked:
-            self._events.append(Acknowledged(number - 1))
-        ledger.expect_again(number)
-        self._rewind_until_s = now_s + self.timing.resend_grace_s
-        self._rewind_at_once = False
-        self._go(Signal.RESEND)
-
-    def _rewind(self, now_s: float) -> None:
-        """Send again from the line asked for, now that all older answers are in."""
-        ledger = self._ledger
-        self._rewind_at_once = False
-        self._swallow_until_s = -1.0
-        ledger.rewind()
-        if ledger.cursor > ledger.last:
-            self._belief.stale = None
-            self._probing_since_s = None
-            self._go(_DRAINED)
-            self._deadline_s = NEVER_S
-            return
-        self._go(Signal.REWOUND)
-        self._belief.stale = ledger.cursor + 1
-        self._transmit()
-        self._listen_anew(now_s)
-
-    def _on_reset(self, reset: PrinterReset, now_s: float) -> None:
-        if self.state is _GREETING:
-            self._go(Signal.RESET)
-            self._deadline_s = min(self._deadline_s, now_s + self.timing.resend_grace_s)
-        elif self.state not in (State.UNGREETED, State.LOST):
-            self._lose(f"the printer started anew ({reset.banner})", Signal.RESET)
-
-    # ------------------------------------------------------------------ time
-
-    def _silence(self, now_s: float) -> None:
-        since_s = self._probing_since_s
-        if since_s is None:
-            since_s = self._probing_since_s = self._heard_s
-        slow = self._ledger.slow_under_way
-        limit_s = self.timing.slow_give_up_s if slow else self.timing.give_up_s
-        if now_s - since_s >= limit_s:
-            self._lose(f"no answer to line {self._ledger.acked + 1} for {now_s - since_s:.1f} s")
-            return
-        if not self.dialect.verifies:
-            # Nothing can be sent twice here: wait, and in the end stop.
-            self._deadline_s = since_s + limit_s
-            return
-        number = self._ledger.cursor - 1
-        self._out += self._ledger.data(number)
-        self.probes += 1
-        self._events.append(Probed(number))
-        self._go(Signal.SILENCE)
-        self._deadline_s = now_s + min(self._silence_s(), max(limit_s / 8, self.timing.doubt_s))
-
-    def _greet_again(self, now_s: float) -> None:
-        if now_s - self._hello_at_s >= self.timing.give_up_s:
-            self._lose("the printer does not answer to M110")
-        else:
-            self._out += self._hello_bytes(now_s)
-
-    def _silence_s(self) -> float:
-        slow = self._ledger.slow_under_way
-        return self.timing.slow_silence_s if slow else self.timing.silence_s
-
-    def _listen_anew(self, now_s: float) -> None:
-        self._heard_s = now_s
-        self._probing_since_s = None
-        self._deadline_s = now_s + self._silence_s()
-
-    def _doubt(self, now_s: float, after_s: float | None = None) -> None:
-        """Something is odd: wait only shortly before asking again."""
-        if self.state in (_WAITING, _PROBING):
-            wait_s = self.timing.doubt_s if after_s is None else after_s
-            self._deadline_s = min(self._deadline_s, now_s + wait_s)
-
-    # ------------------------------------------------------------------ small parts
-
-    def _transmit(self) -> None:
-        """Put lines that wait to be sent (again) on the wire, as far as the window allows."""
-        ledger = self._ledger
-        while ledger.cursor <= ledger.last and ledger.cursor - 1 - ledger.acked < self.window:
-            self._out += ledger.next_again()
-
-    def _spare(self, why: str) -> None:
-        self.spare_oks += 1
-        self._events.append(SpareOk(why))
-
-    def _lose(self, why: str, signal: Signal = Signal.GIVE_UP) -> None:
-        self._go(signal)
-        self._deadline_s = NEVER_S
-        self._out.clear()
-        self._events.append(LinkLost(why, self._ledger.acked, self._ledger.last))
-
-    def _go(self, signal: Signal) -> None:
-        try:
-            self.state = TRANSITIONS[self.state][signal]
-        except KeyError:
-            raise LocalProtocolError(
-                f"{signal.value!r} is not possible while the link is {self.state.value}."
-            ) from None

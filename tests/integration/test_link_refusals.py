@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,11 +28,30 @@ def bench(forks: Forks, tmp_path: Path) -> Bench:
     return Bench(forks, tmp_path)
 
 
-def test_motors_that_may_have_let_go_need_a_rescan(bench: Bench) -> None:
+def test_motors_that_may_have_let_go_need_a_rescan_and_are_homed_anew(bench: Bench) -> None:
     bench.kill_after(bench.send(), 600)
-    assert "lets go of its motors" in bench.go_on(later_s=130.0)["error"]
-    assert bench.go_on(later_s=130.0, pose_confirmed=True)["first_line"] > 600
+    until(lambda: b"targets of 0" in notes(bench.journal))
+    left_alone(bench.journal, 130.0)
+    assert "lets go of its motors" in bench.go_on()["error"]
+    # regression: what the refused attempt had noted was taken for a sign of life
+    assert "was left alone for 13" in bench.go_on()["error"]
+    before = bench.record.read_text()
+    assert bench.go_on(pose_confirmed=True)["first_line"] > 600
     assert bench.executed() == BEADS
+    again = bench.record.read_text().removeprefix(before).splitlines()
+    lift = next(i for i, line in enumerate(again) if line.startswith("G1 Z"))
+    assert again[lift : lift + 3] == [again[lift], "G90", "G28 X Y"]
+    assert float(again[lift].split()[1][1:]) > 0, "away from the part before X and Y move"
+    assert not any(line.startswith("G28") for line in again[lift + 3 :]), "never Z"
+
+
+def left_alone(journal: Path, seconds: float) -> None:
+    """Make everything that the journal holds so much older."""
+    with contextlib.closing(sqlite3.connect(journal)) as db:
+        for table in ("step", "note", "temperature"):
+            db.execute(f"UPDATE {table} SET time_s = time_s - ?", (seconds,))
+        db.execute("UPDATE job SET started_s = started_s - ?", (seconds,))
+        db.commit()
 
 
 @pytest.mark.parametrize("how", ["reset", "silent_reset", "killed"])

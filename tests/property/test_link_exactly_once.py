@@ -54,12 +54,13 @@ def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
     seed=st.integers(0, 99),
     window=st.sampled_from([1, 1, 4]),
     advanced=st.booleans(),
+    by_moves=st.booleans(),
 )
 def test_every_command_runs_once_and_in_order(
-    faults: str, seed: int, window: int, advanced: bool
+    faults: str, seed: int, window: int, advanced: bool, by_moves: bool
 ) -> None:
     lines = program(40)
-    talk = Conversation(faults, window=window, seed=seed, advanced_ok=advanced)
+    talk = Conversation(faults, window=window, seed=seed, advanced_ok=advanced, by_moves=by_moves)
     assert talk.job(lines), talk.lost
     assert talk.program == lines
 
@@ -70,12 +71,14 @@ def test_every_command_runs_once_and_in_order(
     end=st.tuples(st.integers(5, 40), st.sampled_from(ENDING)),
     seed=st.integers(0, 99),
     window=st.sampled_from([1, 4]),
+    by_moves=st.booleans(),
 )
 def test_where_it_cannot_go_on_it_stops_and_names_the_true_interval(
-    faults: str, end: tuple[int, str], seed: int, window: int
+    faults: str, end: tuple[int, str], seed: int, window: int, by_moves: bool
 ) -> None:
     lines = program(40)
-    talk = Conversation(faults + f"\nline {end[0]} {end[1]}", window=window, seed=seed)
+    script = faults + f"\nline {end[0]} {end[1]}"
+    talk = Conversation(script, window=window, seed=seed, by_moves=by_moves)
     done = talk.job(lines)
     executed = talk.program
     assert executed == lines[: len(executed)]  # a prefix: in order, none twice
@@ -92,10 +95,13 @@ def test_where_it_cannot_go_on_it_stops_and_names_the_true_interval(
     faults=fault_scripts(("lose_ok", "garble_ok", "drop_in", "corrupt_in")),
     firmware=st.sampled_from(["klipper", "reprap"]),
     seed=st.integers(0, 99),
+    by_moves=st.booleans(),
 )
-def test_without_numbers_nothing_is_ever_sent_twice(faults: str, firmware: str, seed: int) -> None:
+def test_without_numbers_nothing_is_ever_sent_twice(
+    faults: str, firmware: str, seed: int, by_moves: bool
+) -> None:
     lines = program(40)
-    talk = Conversation(faults, dialect=firmware, firmware=firmware, seed=seed)
+    talk = Conversation(faults, dialect=firmware, firmware=firmware, seed=seed, by_moves=by_moves)
     done = talk.job(lines)
     assert len(talk.executed) <= talk.link.last_sent + 1
     if not done:

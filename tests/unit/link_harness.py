@@ -28,6 +28,7 @@ class Conversation:
     window: int = 1
     seed: int = 0
     advanced_ok: bool = False
+    by_moves: bool = False  # plain moves go the beaten path
     executed: list[bytes] = field(default_factory=list)
     events: list[ev.Event] = field(default_factory=list)
     now_s: float = 0.0
@@ -115,10 +116,46 @@ class Conversation:
         self.hello()
         if self.link.ended or not self.finish():
             return False
+        if self.by_moves:
+            return self._send_by_moves(lines) and self.finish()
         for line in lines:
             if not self.send(line):
                 return False
         return self.finish()
+
+    def _send_by_moves(self, commands: list[str]) -> bool:
+        """As a host does: moves while the answers are plain, one by one where they are not."""
+        at = 0
+        while at < len(commands):
+            self.wait()
+            if self.link.ended:
+                return False
+            lines = self.link.prepare(commands[at:])
+            if moves := self.link.moves(lines, 0):
+                at += self._send_moves(moves)
+            else:
+                self.core.feed(self.link.send(lines[0], self.now_s), self.now_s)
+                at += 1
+        return True
+
+    def _send_moves(self, moves: list[bytes]) -> int:
+        written = answered = 0
+        data = b""
+        while answered < len(moves):
+            for move in moves[written : answered + self.window]:
+                self.core.feed(move, self.now_s)
+                written += 1
+            self.core.run(wall_s=self.now_s)
+            data = self.core.take_output()
+            self.now_s += 0.0005
+            count = self.link.oks(data, answered)
+            if not 0 < count <= written - answered:
+                break
+            answered, data = answered + count, b""
+        self.link.moves_sent(moves[:written], answered, self.now_s)
+        self.events += self.link.receive(data, self.now_s) if data else []
+        self.core.feed(self.link.take_output(), self.now_s)
+        return written
 
     @property
     def program(self) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sqlite3
 import sys
@@ -35,9 +36,9 @@ def test_no_line_goes_out_before_the_disk_says_that_it_may(
         ) as printer,
     ):
         reader = sqlite3.connect(path)
-        write = printer._write
+        write = os.write
 
-        def watched(data: bytes) -> None:
+        def watched(fd: int, data: bytes) -> int:
             match = re.match(rb"N(\d+) (.*)\*", data)
             if match is not None and (text := match.group(2).decode()) in lines:
                 index = lines.index(text)
@@ -47,10 +48,11 @@ def test_no_line_goes_out_before_the_disk_says_that_it_may(
                 assert line <= index < reserved
                 assert int(match.group(1)) == number + index - line
                 seen.append(index)
-            write(data)
+            return write(fd, data)
 
-        monkeypatch.setattr(printer, "_write", watched)
+        monkeypatch.setattr(os, "write", watched)
         report = printer.print(program(lines))
+        monkeypatch.undo()
         reader.close()
     assert report.ok
     assert seen == list(range(len(lines)))
@@ -86,3 +88,16 @@ def test_a_file_says_which_part_it_took(tmp_path: Path, monkeypatch: pytest.Monk
     with FilePrinter(tmp_path / "part.gcode") as printer:
         report = printer.print(program(moves(9)), lines=range(3, 6))
     assert (report.first_line, report.next_line, report.lines_acked) == (3, 6, 3)
+
+
+def test_a_file_is_the_program_and_nothing_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # regression: after the last newline a further, empty line was written
+    monkeypatch.setattr("gcode.hosts.file.require_checked", lambda checked: None)
+    job = program([*moves(3), "; end"])
+    for name, parts in (("whole", (None,)), ("parts", (range(2), range(2, 5)))):
+        with FilePrinter(tmp_path / name) as printer:
+            reports = [printer.print(job, lines=part) for part in parts]
+        assert (tmp_path / name).read_text() == job.program.text
+        assert reports[-1].next_line == 4

@@ -85,7 +85,7 @@ def test_a_safe_exit_says_off_only_where_the_printer_reports_it(
     commands: tuple[str, ...] | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if commands is not None:  # a firmware that takes M104 S0 and does nothing
-        monkeypatch.setattr(serial_host, "SAFE_COMMANDS", commands)
+        monkeypatch.setattr("gcode.hosts.guarded.SAFE_COMMANDS", commands)
     with (
         EmulatedPrinterProcess(printer=profile()) as emulator,
         SerialPrinter(emulator.port, supervise=False) as printer,

@@ -1,0 +1,192 @@
+"""A conversation that ends safely: one sender a printer, heaters off whatever becomes of it.
+
+It owns the lock, the supervisor, the journal and the safe exits; what is printed is `serial`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from gcode.errors import JournalError, LinkError, LocalProtocolError
+from gcode.hosts.conversation import SerialConversation
+from gcode.hosts.jobbook import JobBook
+from gcode.hosts.journal import Journal
+from gcode.hosts.lock import PortLock
+from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
+from gcode.hosts.supervisor import make_safe
+from gcode.hosts.whereabouts import last_number
+from gcode.protocol import LinkTiming
+from gcode.protocol import events as ev
+
+PAUSE_LIFT_MM = 5.0
+
+
+class GuardedConversation(SerialConversation):
+    """A printer that is left safe; see `SerialPrinter` for the parameters."""
+
+    def __init__(
+        self,
+        port: str,
+        *,
+        baud: int,
+        dialect: str,
+        window: int,
+        wire_log: Path | None,
+        journal: Journal | None,
+        timing: LinkTiming | None,
+        clock: Callable[[], float],
+        supervise: bool,
+        guard: bool,
+    ) -> None:
+        super().__init__(
+            port,
+            baud=baud,
+            dialect=dialect,
+            window=window,
+            wire_log=wire_log,
+            timing=timing,
+            clock=clock,
+        )
+        self._journal = journal
+        self._supervise = supervise
+        self._guard = guard
+        self._supervisor: Supervisor | None = None
+        self._lock = PortLock(port)
+        self._book = JobBook(self._link, journal, clock)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            self.make_safe()
+        self.close()
+
+    def connect(self, *, before_hello: Callable[[int | None], None] | None = None) -> None:
+        """Open the port, agree on line numbers and ask who is there.
+
+        Parameters
+        ----------
+        before_hello
+            Told the number of the last line that the printer has received (None: it does not
+            say), before a hello makes it forget that; what it raises ends the attempt.
+        """
+        if self._serial is not None:
+            return
+        self._lock.acquire()
+        try:
+            self._open_port()
+            if before_hello is not None:
+                self._ask_number(before_hello)
+            counted = self._journal is not None and self._link.dialect.verifies
+            self._greet(self._journal.open_session() if self._journal and counted else 0)
+            if self._guard and self._link.dialect.verifies:
+                self._test_guard()
+            self._learn()
+            self._prove()  # from here on a silent reset cannot be taken for a resend request
+        except BaseException:
+            self.close()
+            raise
+        if self._supervise:
+            self._supervisor = Supervisor(self._fd, self._lock.fd, self._journal_path())
+
+    def _journal_path(self) -> Path | None:
+        return self._journal.path if self._journal is not None else None
+
+    def _ask_number(self, before_hello: Callable[[int | None], None]) -> None:
+        number = None
+        if self._link.dialect.verifies:
+            try:
+                number = last_number(
+                    self._fd, timing=self._link.timing, clock=self._clock, note=self._log_wire
+                )
+            except OSError as error:
+                raise LinkError(
+                    f"{self.port} failed ({error}) when asked for its line number; check the "
+                    f"printer and its cable."
+                ) from error
+        try:
+            before_hello(number)
+        except LinkError:
+            self._note(make_safe(self._fd))
+            raise
+
+    def close(self) -> None:
+        """Let go of the printer; heaters stay as they are (`make_safe` switches them off)."""
+        if self._supervisor is not None:
+            self._supervisor.stand_down()
+            self._supervisor = None
+        self._close_port()
+        self._lock.release()
+
+    # ------------------------------------------------------------------ questions
+
+    @property
+    def journal(self) -> Journal | None:
+        """Where the job is written down."""
+        return self._journal
+
+    def _before_own_command(self) -> None:
+        self._book.before_own_command()
+
+    # ------------------------------------------------------------------ safe exits
+
+    def emergency_stop(self) -> None:
+        """Send M112, past every queue that the firmware lets it pass."""
+        self._write(b"\nM112\n")
+        self._link.give_up("an emergency stop was asked for")
+
+    def heaters_off(self) -> None:
+        """Switch hotend, bed and fan off, acknowledged."""
+        for command in SAFE_COMMANDS:
+            self._ask(command)
+
+    def make_safe(self) -> None:
+        """Heaters off and nozzle lifted, by any means left; says loudly if it cannot."""
+        if self._serial is None:
+            return
+        try:
+            if self._link.ended or not self._link.idle:
+                data = b"\n" + b"".join(command.encode() + b"\n" for command in SAFE_COMMANDS)
+                self._write(data)
+                self._note("heaters told to switch off by unnumbered lines; nothing confirms it")
+            else:
+                self._switch_off()
+        except (LinkError, LocalProtocolError, OSError) as error:
+            self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+
+    def _switch_off(self) -> None:
+        try:
+            self.heaters_off()
+            self._lift()
+            self._note(f"{self._heaters_now()}, nozzle lifted")
+        except JournalError:  # numbered lines must be written down first, these need not
+            self._note(make_safe(self._fd))
+
+    def _heaters_now(self) -> str:
+        """What the printer says of its heaters; an `ok` alone confirms nothing."""
+        for event in self._ask("M105"):
+            if isinstance(event, ev.TemperatureReport) and all(
+                heater.target_c == 0.0 for heater in event.heaters.values()
+            ):
+                return "heaters off (the printer reports targets of 0)"
+        return "heaters told to switch off, nothing confirms it"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the host did of its own accord since the last `print` began."""
+        return tuple(self._warnings)
+
+    def _note(self, text: str) -> None:
+        self._warnings.append(text)
+        if self._log is not None:
+            self._log.add(self._clock(), b"#", text.encode("ascii", "replace"))
+        self._book.note(text)
+
+    def _lift(self) -> None:
+        for command in ("G21", "G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
+            self._ask(command)

@@ -1,0 +1,140 @@
+"""Plain moves by the fast way: whatever ends it, what was sent and answered is right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+
+from gcode.hosts import beaten_path
+from gcode.hosts.beaten_path import MOST_S, Exchange
+
+MOVES = [b"N%d G1 X1*1\n" % number for number in range(10, 20)]
+
+
+class Port:
+    """Answers from a script; an exception in it is raised, None is silence."""
+
+    def __init__(self, *answers: bytes | Exception | None, takes: list[int] | None = None) -> None:
+        self.answers = list(answers)
+        self.takes = takes or []
+        self.written = b""
+        self.most_under_way = self.answered = 0
+        self.now_s = 0.0
+
+    def write(self, fd: int, data: bytes) -> int:
+        taken = self.takes.pop(0) if self.takes else len(data)
+        if taken < 0:
+            raise BlockingIOError
+        self.written += data[:taken]
+        under_way = self.written.count(b"\n") - self.answered
+        self.most_under_way = max(self.most_under_way, under_way)
+        return taken
+
+    def wait(self) -> bool:
+        return bool(self.answers) and self.answers[0] is not None
+
+    def read(self, fd: int, size: int) -> bytes:
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        assert answer is not None
+        self.answered += answer.count(b"ok")
+        return answer
+
+    def clock(self) -> float:
+        self.now_s += 0.01
+        return self.now_s
+
+    def exchange(self, *, window: int = 1, most_bytes: int = 120) -> Exchange:
+        return Exchange(
+            0,
+            wait=self.wait,
+            clock=self.clock,
+            oks=lambda data, answered: data.count(b"\n") * (data == b"ok\n" * data.count(b"\n")),
+            asked_to_stop=lambda: False,
+            window=window,
+            most_bytes=most_bytes,
+        )
+
+
+@pytest.fixture
+def at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Port], Port]:
+    def plug_in(port: Port) -> Port:
+        monkeypatch.setattr(beaten_path, "os", SimpleNamespace(write=port.write, read=port.read))
+        return port
+
+    return plug_in
+
+
+@pytest.mark.parametrize("window", [1, 4])
+@pytest.mark.parametrize(
+    ("end", "answer"),
+    [
+        (b"Resend: 12\nok\n", b"Resend: 12\nok\n"),
+        (b"ok T:20\n", b"ok T:20\n"),
+        (b"", b""),  # the port was closed
+        (b"ok\n" * 5, b"ok\n" * 5),  # more than is under way
+        (None, None),
+        (BlockingIOError(), None),  # somebody else has read it
+    ],
+)
+def test_anything_odd_ends_it_and_is_handed_on(
+    at: Callable[[Port], Port], window: int, end: bytes | Exception | None, answer: bytes | None
+) -> None:
+    port = at(Port(b"ok\n", b"ok\n", end))
+    exchange = port.exchange(window=window)
+    exchange.run(MOVES)
+    assert (len(exchange.sent_s), len(exchange.answered_s)) == (2 + window, 2)
+    assert (exchange.answer, exchange.rest) == (answer, b"")
+    assert port.written == b"".join(MOVES[: 2 + window])
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_a_port_that_fails_leaves_the_count_behind(at: Callable[[Port], Port], window: int) -> None:
+    exchange = at(Port(b"ok\n", OSError(5, "gone"))).exchange(window=window)
+    with pytest.raises(OSError, match="gone"):
+        exchange.run(MOVES)
+    assert (len(exchange.sent_s), len(exchange.answered_s)) == (1 + window, 1)
+
+
+@pytest.mark.parametrize("taken", [3, 0, -1])
+def test_what_a_full_port_does_not_take_is_kept(at: Callable[[Port], Port], taken: int) -> None:
+    size = len(MOVES[0])
+    port = at(Port(b"ok\n", takes=[size, taken]))
+    exchange = port.exchange()
+    exchange.run(MOVES)
+    assert port.written + exchange.rest == MOVES[0] + MOVES[1]
+    assert (len(exchange.sent_s), len(exchange.answered_s)) == (2, 1)
+
+
+def test_no_more_is_under_way_than_window_and_buffer_allow(at: Callable[[Port], Port]) -> None:
+    port = at(Port(*[b"ok\n", b"ok\nok\n"] * 4))
+    exchange = port.exchange(window=4)
+    exchange.run(MOVES)
+    assert port.most_under_way == 4
+    assert (len(exchange.sent_s), len(exchange.answered_s)) == (10, 10)
+    port = at(Port(*[b"ok\n"] * 10))
+    port.exchange(window=9, most_bytes=2 * len(MOVES[0])).run(MOVES)
+    assert port.most_under_way == 2
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_it_ends_in_time_with_nothing_under_way(at: Callable[[Port], Port], window: int) -> None:
+    port = at(Port(*[b"ok\n"] * 200))
+    exchange = port.exchange(window=window)
+    exchange.run(MOVES * 20)
+    assert MOST_S <= port.now_s < MOST_S + 0.1
+    assert 0 < len(exchange.sent_s) == len(exchange.answered_s) < 200
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_who_asks_to_stop_waits_for_no_further_move(
+    at: Callable[[Port], Port], window: int
+) -> None:
+    port = at(Port(*[b"ok\n"] * 20))
+    exchange = port.exchange(window=window)
+    exchange.asked_to_stop = lambda: port.answered >= 2
+    exchange.run(MOVES)
+    assert len(exchange.sent_s) == len(exchange.answered_s) == 1 + window
