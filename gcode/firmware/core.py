@@ -11,17 +11,14 @@ import math
 import random
 import re
 from collections.abc import Callable
-from functools import reduce
-from operator import xor
 
 from gcode.firmware.faults import Fault, FaultScript
+from gcode.firmware.framing import RENUMBERED, unframed
 from gcode.firmware.machine import Machine
 from gcode.firmware.variants import VARIANTS, Variant
 from gcode.profiles import PrinterProfile
 
 MAX_CMD_SIZE = 96
-_NUMBERED = re.compile(rb"N\s*(-?\d{1,10})\s*")
-_RENUMBERED = re.compile(rb"N(-?\d{1,10})")
 _EMERGENCY = re.compile(rb"(?:^|\n)(?:N\d+ ?)?(M108|M112|M410)\b")
 _BUSY_EVERY_S = 2.0
 _MOST_REPORTS = 5000
@@ -159,10 +156,7 @@ class FirmwareCore:
             return
         if self.variant.name != "klipper" and len(command) >= MAX_CMD_SIZE:
             command = command[: MAX_CMD_SIZE - 1]  # cut silently, as the firmware does
-        if self._numbers == "verify":
-            checked = self._verify(command, faults)
-        else:
-            checked = self._strip(command)
+        checked = self._accept(command, faults)
         if checked is None:
             return
         before = len(self._out)
@@ -170,49 +164,14 @@ class FirmwareCore:
         if "corrupt_out" in faults and len(self._out) > before + 1:
             self._out[before:] = _flip(bytes(self._out[before:-1]), self._rng) + b"\n"
 
-    def _verify(self, command: bytes, faults: dict[str, Fault]) -> bytes | None:
-        """Marlin's `get_serial_commands`: number, then checksum; or a resend request."""
-        if command[0] != 78:  # N
-            return command
-        match = _NUMBERED.match(command)
-        star = command.rfind(b"*")
-        if match is None:
-            return command
-        number = int(match.group(1))
-        renumbers = b"M110" in command
-        if renumbers and (again := _RENUMBERED.search(command[4:])) is not None:
-            number = int(again.group(1))
-        if not renumbers and number != self.last_number + 1:
-            self._reject("Line Number is not Last Line Number+1", faults)
-            return None
-        if star < 0:
-            self._reject("No Checksum with line number", faults)
-            return None
-        try:
-            right = int(command[star + 1 :]) == reduce(xor, command[:star])
-        except ValueError:
-            right = False
-        if not right:
-            self._reject("checksum mismatch", faults)
-            return None
-        self.last_number = number
-        return command[match.end() : star].rstrip()
-
-    def _strip(self, command: bytes) -> bytes | None:
-        """Strip number and checksum; RepRapFirmware drops a line whose checksum is wrong."""
-        match = _NUMBERED.match(command)
-        star = command.rfind(b"*")
-        if match is None:
-            return command
-        body = command[match.end() :] if star < 0 else command[match.end() : star]
-        if self._numbers == "checksum" and star >= 0:
-            try:
-                if int(command[star + 1 :]) != reduce(xor, command[:star]):
-                    return None
-            except ValueError:
-                return None
-            self.last_number = int(match.group(1))
-        return body.strip() or None
+    def _accept(self, command: bytes, faults: dict[str, Fault]) -> bytes | None:
+        """The command freed of number and checksum; None if it is refused or dropped."""
+        framed = unframed(command, self._numbers, self.last_number)
+        if framed.refusal:
+            self._reject(framed.refusal, faults)
+        if framed.number is not None:
+            self.last_number = framed.number
+        return framed.command
 
     def _reject(self, why: str, faults: dict[str, Fault]) -> None:
         self._rx.clear()  # the firmware flushes its receive buffer
@@ -227,7 +186,7 @@ class FirmwareCore:
     def _execute(self, command: bytes, faults: dict[str, Fault]) -> None:
         machine = self.machine
         if command.startswith(b"M110"):
-            if match := _RENUMBERED.search(command):
+            if match := RENUMBERED.search(command):
                 self.last_number = int(match.group(1))
         elif machine.execute(command) and self.record is not None:
             self.record(command)

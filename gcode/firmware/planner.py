@@ -72,6 +72,7 @@ class Planner:
         self._unit = (0.0, 0.0, 0.0, 0.0)
         self._last_speed = 0.0
         self.moves_executed = 0
+        self.moved_s = 0.0  # when the last move ended
         self._head_s = 0.0
 
     @property
@@ -142,6 +143,7 @@ class Planner:
         block = self.blocks.popleft()
         self.executed.extend((*block.start, *block.end, block.filament_mm, block.commanded, end_s))
         self.moves_executed += 1
+        self.moved_s = end_s
         self.head_end_s = math.inf
         self.start_head(end_s)
 

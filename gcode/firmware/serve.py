@@ -195,6 +195,7 @@ class PtyServer:
                     "hotend_target_c": machine.hotend.target_c,
                     "bed_c": machine.bed.temperature_c(machine.clock_s),
                     "bed_target_c": machine.bed.target_c,
+                    "motors_let_go": machine.let_go,
                     "fan_ratio": machine.fan_ratio,
                     "position_mm": [machine.x, machine.y, machine.z],
                     "buffered": len(machine.planner.blocks),

@@ -38,6 +38,7 @@ class Variant:
     keepalive: bool
     temperatures_in_ok: bool
     advanced_ok: bool
+    motors_off_s: float  # after the last move; infinity where they keep a part of their current
 
 
 _MARLIN_CAPABILITIES = (
@@ -73,6 +74,7 @@ VARIANTS: dict[str, Variant] = {
         keepalive=True,
         temperatures_in_ok=True,
         advanced_ok=False,
+        motors_off_s=120.0,
     ),
     # MK3S: Prusa-Firmware, where only M82 and M83 set the extruder's mode.
     "prusa": Variant(
@@ -94,6 +96,7 @@ VARIANTS: dict[str, Variant] = {
         keepalive=True,
         temperatures_in_ok=True,
         advanced_ok=False,
+        motors_off_s=120.0,
     ),
     "klipper": Variant(
         name="klipper",
@@ -109,6 +112,7 @@ VARIANTS: dict[str, Variant] = {
         keepalive=False,
         temperatures_in_ok=True,
         advanced_ok=False,
+        motors_off_s=600.0,
     ),
     "reprap": Variant(
         name="reprap",
@@ -125,5 +129,6 @@ VARIANTS: dict[str, Variant] = {
         keepalive=False,
         temperatures_in_ok=True,
         advanced_ok=False,
+        motors_off_s=float("inf"),
     ),
 }

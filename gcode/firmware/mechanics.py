@@ -1,0 +1,308 @@
+"""The emulated mechanics: moves, heaters, clock, and what they report of themselves.
+
+A command that takes long leaves a `Wait` behind; `core` lets the clock run and ends it.
+Coordinates inside are native, in the build frame: bed corner at the origin, Z up, mm.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gcode.firmware.planner import Planner
+from gcode.firmware.thermal import BED, HOTEND, Heater
+from gcode.firmware.variants import Variant
+from gcode.profiles import AxisLimits, PrinterProfile
+from gcode.units import mm_s_from_mm_min
+
+ARC_SEGMENT_MM = 0.5
+"""Chord of an arc (Marlin's MIN_ARC_SEGMENT_MM … MAX_ARC_SEGMENT_MM lie around it)."""
+MAX_EXTRUDE_MM = 200.0
+"""EXTRUDE_MAXLENGTH of Marlin."""
+LARGEST = 1e7
+"""No number of a command counts for more; nor does it where it is none."""
+MOST_CHORDS = 10_000
+SOFT_MARGIN_MM = 10.0
+"""How far over the bed's edge the head reaches (purge lines beside the bed)."""
+HOMING_MM_S = 50.0
+_WORD = re.compile(rb"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+)?)")
+
+
+@dataclass(slots=True)
+class Wait:
+    """A command under way.
+
+    Attributes
+    ----------
+    end_s
+        When it ends, by the printer's clock; infinity where only a user ends it.
+    heating
+        Whether it reports temperatures every second (M109, M190).
+    then
+        What is left to do at the end, before the `ok`.
+    """
+
+    end_s: float
+    heating: bool = False
+    reason: str = "processing"
+    then: Callable[[], None] | None = None
+    next_report_s: float = 0.0
+    next_busy_s: float = 0.0
+
+
+class Mechanics:
+    """A Cartesian printer with one extruder, a heated bed and a fan."""
+
+    def __init__(self, profile: PrinterProfile, variant: Variant) -> None:
+        self.profile = profile
+        self.variant = variant
+        self.replies: list[str] = []
+        self.ok_text = ""
+        self.wait: Wait | None = None
+        self.clock_s = 0.0
+        self.planner = self._new_planner()
+        self.power_up()
+        self.let_go = 0  # how often moves came after the motors had been let go
+
+    def power_up(self) -> None:
+        """Forget everything, as after a reset; the clock and what was executed stay."""
+        executed = self.planner.executed
+        self.planner = self._new_planner()
+        self.planner.executed = executed
+        self.hotend, self.bed = Heater(HOTEND), Heater(BED)
+        for heater in (self.hotend, self.bed):
+            heater.set_target(0.0, self.clock_s)
+        self.x = self.y = self.z = 0.0
+        self.e = 0.0  # logical, as G92 sets it
+        self.offset = [0.0, 0.0, 0.0]  # logical = native + offset
+        self.homed = False
+        self.must_home = False
+        self.motors_off_s = self.variant.motors_off_s
+        self.planner.moved_s = self.clock_s
+        self.absolute = True
+        self.absolute_e = True
+        self.unit_mm = 1.0
+        self.feed_mm_s = 25.0
+        self.speed_ratio = self.flow_ratio = 1.0
+        self.fan_ratio = 0.0
+        self.min_extrude_c = self.profile.min_extrude_c
+        self.may_extrude_cold = False
+        self.killed = False
+        self.auto_temperature_s = self.auto_position_s = 0.0
+        self.message = ""
+        self.wait = None
+
+    def _new_planner(self) -> Planner:
+        profile = self.profile
+        return Planner(
+            max_speed_mm_s=_axes(profile.max_speed_mm_s),
+            max_acceleration_mm_s2=_axes(profile.max_acceleration_mm_s2),
+            max_jerk_mm_s=_axes(profile.max_jerk_mm_s),
+        )
+
+    def target_of(self, words: dict[str, float]) -> tuple[tuple[float, float, float], float]:
+        """Where words lead to, in the modes there are, mm; and how much they extrude, mm."""
+        here = [self.x, self.y, self.z]
+        for axis, letter in enumerate("XYZ"):
+            if letter in words:
+                value = words[letter] * self.unit_mm
+                here[axis] = value - self.offset[axis] if self.absolute else here[axis] + value
+        de = 0.0
+        if "E" in words:
+            de = words["E"] * self.unit_mm - (self.e if self.absolute_e else 0.0)
+        if words.get("F", 0) > 0:
+            self.feed_mm_s = mm_s_from_mm_min(words["F"] * self.unit_mm)
+        return (here[0], here[1], here[2]), de
+
+    def move_to(self, target: tuple[float, float, float], de_mm: float) -> None:
+        """Queue a move; a full queue lets the clock run until there is room."""
+        if not self.planner.blocks and self._motors_let_go():
+            return
+        start = (self.x, self.y, self.z)
+        if de_mm:
+            self.e += de_mm
+            de_mm *= self.flow_ratio
+            if not self.may_extrude_cold and self.hotend.temperature_c(self.clock_s) < (
+                self.min_extrude_c
+            ):
+                self._cold()
+                de_mm = 0.0
+            elif de_mm > MAX_EXTRUDE_MM:
+                self.replies.append("echo: too long extrusion prevented")
+                de_mm = 0.0
+        if self.homed:
+            target = self._soft_limits(target)
+        self.x, self.y, self.z = target
+        planner = self.planner
+        if planner.full:
+            planner.start_head(self.clock_s)
+            self.let_pass(max(planner.head_end_s, self.clock_s))
+        planner.push(start, target, de_mm, self.feed_mm_s * self.speed_ratio)
+
+    def _motors_let_go(self) -> bool:
+        """Whether a firmware whose motors have been let go refuses to move; Marlin does not."""
+        if not self.must_home:
+            if self.clock_s - self.planner.moved_s <= self.motors_off_s:
+                return False
+            self.let_go += 1
+            self.planner.moved_s = self.clock_s
+            self.must_home = self.variant.name == "klipper"
+        if self.must_home:
+            self.replies.append("!! Must home axis first")
+        return self.must_home
+
+    def _cold(self) -> None:
+        if self.variant.name == "klipper":
+            self.replies.append("!! Extrude below minimum temp")
+        else:
+            self.replies.append(f"{self.variant.echo_prefix} cold extrusion prevented")
+
+    def _soft_limits(self, target: tuple[float, float, float]) -> tuple[float, float, float]:
+        width, depth = self.profile.bed_size_mm
+        x = min(max(target[0], -SOFT_MARGIN_MM), width + SOFT_MARGIN_MM)
+        y = min(max(target[1], -SOFT_MARGIN_MM), depth + SOFT_MARGIN_MM)
+        return x, y, min(max(target[2], 0.0), self.profile.max_z_mm)
+
+    def let_pass(self, until_s: float) -> None:
+        """Let the clock run to `until_s` and execute what ends by then."""
+        self.planner.advance(until_s, self.clock_s)
+        self.clock_s = max(self.clock_s, until_s)
+        if self.wait is not None and self.wait.heating:
+            self.planner.moved_s = self.clock_s  # M109 and M190 keep the motors on
+
+    def arc(self, rest: bytes, *, clockwise: bool) -> None:
+        """Queue the chords of a G2 or G3."""
+        words = words_of(rest)
+        start = (self.x, self.y, self.z)
+        target, de_mm = self.target_of(words)
+        centre = _arc_centre(start, target, words, self.unit_mm, clockwise=clockwise)
+        if centre is None:
+            self.replies.append(f"{self.variant.error_prefix}G2/G3 bad parameters")
+            return
+        radius = math.hypot(start[0] - centre[0], start[1] - centre[1])
+        first = math.atan2(start[1] - centre[1], start[0] - centre[0])
+        last = math.atan2(target[1] - centre[1], target[0] - centre[0])
+        sweep = (first - last if clockwise else last - first) % (2 * math.pi)
+        if sweep < 1e-9:
+            sweep = 2 * math.pi  # the end is the start: a full circle
+        length = math.hypot(radius * sweep, target[2] - start[2])
+        count = min(max(1, math.ceil(length / ARC_SEGMENT_MM)), MOST_CHORDS)
+        for index in range(1, count + 1):
+            ratio = index / count
+            angle = first + (-sweep if clockwise else sweep) * ratio
+            point = (
+                centre[0] + radius * math.cos(angle),
+                centre[1] + radius * math.sin(angle),
+                start[2] + (target[2] - start[2]) * ratio,
+            )
+            self.move_to(target if index == count else point, de_mm / count)
+
+    def record_jump(self, here: tuple[float, float, float]) -> None:
+        """Record a move made outside of the queue, by homing."""
+        there = (self.x, self.y, self.z)
+        if here != there:
+            self.planner.executed.extend((*here, *there, 0.0, HOMING_MM_S, self.clock_s))
+
+    def wait_for(
+        self,
+        end_s: float,
+        *,
+        heating: bool = False,
+        reason: str = "processing",
+        then: Callable[[], None] | None = None,
+    ) -> None:
+        """Leave a command under way until `end_s`."""
+        self.wait = Wait(
+            end_s, heating, reason, then, self.clock_s + 1.0, next_busy_s=self.clock_s + 2.0
+        )
+
+    def kill(self, why: str) -> None:
+        """Stop for good: heaters off, queue dropped, deaf until a reset."""
+        place = self.planner.stop(self.clock_s, self.clock_s)
+        if place is not None:
+            self.x, self.y, self.z = place
+        for heater in (self.hotend, self.bed):
+            heater.set_target(0.0, self.clock_s)
+        self.fan_ratio = 0.0
+        self.wait = None
+        if why:
+            self.replies.append(f"{self.variant.error_prefix}{why}")
+        if self.variant.name == "klipper":
+            self.replies.append("!! Shutdown due to M112 command")
+        else:
+            self.replies.append(f"{self.variant.error_prefix}Printer halted. kill() called!")
+        self.killed = True
+
+    def quick_stop(self) -> None:
+        """Drop the queue (M410)."""
+        place = self.planner.stop(self.clock_s, self.clock_s)
+        if place is not None:
+            self.x, self.y, self.z = place
+        self.wait = None
+
+    def temperatures(self) -> str:
+        """The text of a temperature report."""
+        hotend, bed, now_s = self.hotend, self.bed, self.clock_s
+        if self.variant.name == "klipper":
+            return (
+                f"B:{bed.temperature_c(now_s):.1f} /{bed.target_c:.1f} "
+                f"T0:{hotend.temperature_c(now_s):.1f} /{hotend.target_c:.1f}"
+            )
+        return (
+            f"T:{hotend.temperature_c(now_s):.2f} /{hotend.target_c:.2f} "
+            f"B:{bed.temperature_c(now_s):.2f} /{bed.target_c:.2f} @:0 B@:0"
+        )
+
+    def position_text(self, logical: list[float] | None = None) -> str:
+        """The text of a position report."""
+        x, y, z = logical or [
+            native + offset
+            for native, offset in zip((self.x, self.y, self.z), self.offset, strict=True)
+        ]
+        text = f"X:{x:.3f} Y:{y:.3f} Z:{z:.3f} E:{self.e:.4f}"
+        if self.variant.name in ("marlin", "prusa"):
+            steps = (int(self.x * 80), int(self.y * 80), int(self.z * 400))
+            text += f" Count X:{steps[0]} Y:{steps[1]} Z:{steps[2]}"
+        return text
+
+
+def _axes(limits: AxisLimits) -> tuple[float, float, float, float]:
+    return limits.x, limits.y, limits.z, limits.e
+
+
+def words_of(rest: bytes) -> dict[str, float]:
+    """Parameters by letter; a letter without a number counts as 0."""
+    words: dict[str, float] = {}
+    for letter, number in _WORD.findall(rest.upper()):
+        value = float(number) if number.strip(b"+-.") else 0.0
+        words[letter.decode()] = min(max(value, -LARGEST), LARGEST)
+    return words
+
+
+def _arc_centre(
+    start: tuple[float, float, float],
+    end: tuple[float, float, float],
+    words: dict[str, float],
+    unit_mm: float,
+    *,
+    clockwise: bool,
+) -> tuple[float, float] | None:
+    """Centre of an arc from its I J offsets or its radius R (Marlin's `G2_G3.cpp`)."""
+    if "R" in words:
+        radius = words["R"] * unit_mm
+        dx, dy = end[0] - start[0], end[1] - start[1]
+        chord = math.hypot(dx, dy)
+        if chord < 1e-9 or abs(radius) < chord / 2 - 1e-6:
+            return None
+        height = math.sqrt(max(radius * radius - chord * chord / 4, 0.0))
+        if clockwise != (radius < 0):
+            height = -height
+        return (
+            (start[0] + end[0]) / 2 - height * dy / chord,
+            (start[1] + end[1]) / 2 + height * dx / chord,
+        )
+    if "I" not in words and "J" not in words:
+        return None
+    return start[0] + words.get("I", 0.0) * unit_mm, start[1] + words.get("J", 0.0) * unit_mm
