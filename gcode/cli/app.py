@@ -302,7 +302,7 @@ def send(
     if not resume:
         machine.connect()  # a printer that refuses us is not ours to abort
     try:
-        with bars.shown():
+        with console.signals_end_it(), bars.shown():
             if resume and isinstance(machine, SerialPrinter):
                 report = resume_job(
                     machine,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -113,6 +114,30 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         raise InputError(f"{path} cannot be written ({error.strerror}).") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def signals_end_it() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end what is under way as an interrupt does: by its safe exits.
+
+    One that is ignored (`nohup`) stays so.
+    """
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    taken = [
+        number
+        for number in (signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) is signal.SIG_DFL
+    ]
+    for number in taken:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None:

@@ -133,9 +133,12 @@ def test_fifty_kills_execute_nothing_twice(forks: Forks, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_a_thousand_kills_execute_nothing_twice(forks: Forks, tmp_path: Path) -> None:
-    seen = hang(forks, tmp_path, 1000, seed=2)
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("part", range(10))
+def test_a_thousand_kills_execute_nothing_twice(forks: Forks, tmp_path: Path, part: int) -> None:
+    """A hundred at a time, so that a part can be run by name."""
+    seen = hang(forks, tmp_path, 100, seed=2 + part)
     print(dict(seen))
-    assert seen["senders killed"] > 300
-    assert seen["gone on"] > 100
+    assert seen["senders killed"] > 25
+    assert seen["gone on"] > 5
+    assert seen["intervals true"] > 10

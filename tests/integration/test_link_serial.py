@@ -177,6 +177,68 @@ def test_a_killed_sender_leaves_heaters_off_and_a_whole_journal(tmp_path: Path) 
             journal.close()
 
 
+_ENDED = """
+import sys
+sys.path[:0] = {path!r}
+from link_helpers import program, moves
+import gcode.hosts.serial as host
+from gcode.cli import console
+host.require_checked = lambda checked: None
+with console.signals_end_it(), host.SerialPrinter(sys.argv[1], supervise=False) as printer:
+    tell = lambda stage, done, total: done and print("go", flush=True)
+    printer.print(program(["M104 S200", "M302 S0", "G28", *moves(200000)]), progress=tell)
+"""
+
+
+def test_a_sender_that_is_told_to_end_leaves_the_printer_safe_itself(tmp_path: Path) -> None:
+    record, root = tmp_path / "executed", Path(__file__).parent.parent.parent
+    code = _ENDED.format(path=[str(root), str(root / "tests" / "unit")])
+    with EmulatedPrinterProcess(printer=profile(), record=record) as emulator:
+        sender = subprocess.Popen(
+            [sys.executable, "-c", code, emulator.port],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert sender.stdout is not None
+        sender.stdout.readline()
+        sender.send_signal(signal.SIGTERM)
+        _, said = sender.communicate(timeout=20)
+        state = emulator.state()
+    assert "KeyboardInterrupt" in said
+    assert (state["hotend_target_c"], state["bed_target_c"]) == (0, 0)
+    told = record.read_text().splitlines()
+    assert 0 < sum(line.startswith("G1 X") for line in told) < 200000
+    assert "M104 S0" in told[-10:]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_million_lines_stream_in_constant_memory(tmp_path: Path) -> None:
+    """From the tenth part on no more than a batch comes to this process's memory."""
+    page_bytes = os.sysconf("SC_PAGE_SIZE")
+    held: list[int] = []
+
+    def tell(stage: str, done: float, total: float) -> None:
+        if done >= total / 10:
+            held.append(int(Path("/proc/self/statm").read_text().split()[1]) * page_bytes)
+
+    job = program(moves(1_000) * 1_000)
+    with (
+        EmulatedPrinterProcess(printer=profile()) as emulator,
+        SerialPrinter(
+            emulator.port,
+            journal=Journal(tmp_path / "journal.sqlite"),
+            wire_log=tmp_path / "wire.log",
+        ) as printer,
+    ):
+        report = printer.print(job, progress=tell)
+    assert report.ok
+    assert report.lines_acked == 1_000_000
+    print(f"{report.seconds:.0f} s, grown by {(max(held) - held[0]) / 1e6:.2f} MB")
+    assert max(held) - held[0] < 4_000_000
+
+
 def test_a_lost_link_never_claims_that_the_heaters_are_off(tmp_path: Path) -> None:
     # regression: the log said "heaters off" although nobody had confirmed it
     wire = tmp_path / "wire.log"
