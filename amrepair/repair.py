@@ -17,6 +17,7 @@ from jaxtyping import Bool
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
+from amrepair.align.standing import refuse_impossible
 from amrepair.deficit import Deficit, as_built_heights, compute_deficit, worth
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.errors import AlignmentError
@@ -220,7 +221,8 @@ def plan_repair(
     Raises
     ------
     AlignmentError
-        If the scan cannot be aligned, or equally good poses lead to different repairs.
+        If the scan cannot be aligned, equally good poses lead to different repairs, or a finished
+        part would stand in the bed or beyond it.
     DeficitError
         If the deficit is no valid solid.
     gcode.errors.GcodeError
@@ -241,6 +243,9 @@ def plan_repair(
         outer = _outside_open_infill(scan, site, guess)
         registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
     placed = _build_from_template(site, scan, registration)
+    if site.printed_z_mm is None:
+        said = site.build_from_template is not None or guess is not None
+        refuse_impossible(site.template, placed, site.setup.printer, said=said)
     build_from_scan = placed @ registration.template_from_scan
     with watch("detect"):
         whole = scan.moved(registration.template_from_scan)

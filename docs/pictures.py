@@ -139,7 +139,7 @@ def offline_repair(out: Path, image: Path) -> None:
 
 
 def template_from_scans(out: Path, image: Path) -> None:
-    """The template's surface."""
+    """The template's surface, laid on its heavier side."""
     painter = Painter()
     mesh = trimesh.load_mesh(out / "template.stl")
     lying = np.linalg.svd(
@@ -148,6 +148,8 @@ def template_from_scans(out: Path, image: Path) -> None:
     turn = np.eye(4)
     turn[:3, :3] = lying[2] * np.sign(np.linalg.det(lying[2]))
     mesh.apply_transform(turn)
+    if mesh.center_mass[2] > mesh.bounds[:, 2].mean():  # axes have no sign; a part has a foot
+        mesh.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
     painter.mesh(mesh, (150, 170, 205))
     painter.save(image)
 

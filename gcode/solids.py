@@ -39,7 +39,8 @@ def read_solid(path: Path) -> Any:
     4560
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file.")
+        what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
+        raise InputError(f"{path}: {what}.")
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a solid is one of {', '.join(SUFFIXES)}.")
     try:

@@ -16,6 +16,9 @@ def main() -> None:
         from amrepair.cli.app import main as run
 
         run()
+    except KeyboardInterrupt:  # while the libraries were loading
+        sys.stderr.write("amrepair: interrupted\n")
+        sys.exit(130)
     except ImportError as error:
         sys.stderr.write(f"amrepair: a library that it needs cannot be loaded: {error}\n")
         _say_what_is_wrong()

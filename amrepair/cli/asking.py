@@ -2,32 +2,62 @@
 
 from __future__ import annotations
 
-import typer
-
+from amrepair.errors import InputError
 from amrepair.loop import Decision
 from amrepair.repair import RepairPlan
+from amrepair.report.text import plan_lines
 from gcode.cli import console
 
 
-def ask_to_print(plan: RepairPlan) -> bool:
-    """Show what would be printed, and wait for a word."""
-    cost = plan.estimate
-    console.errors.print(
-        f"{len(plan.to_fill)} regions, {plan.deficit.missing_mm3:.1f} mm³ missing; a repair takes "
-        f"{cost.print_time_s if cost else 0:.0f} s and {cost.filament_mm if cost else 0:.0f} mm of "
-        f"filament; the nozzle cannot reach {plan.unreachable_mm3:.1f} mm³."
-    )
-    return typer.confirm("Print it?", default=False, err=True)
+class Terminal:
+    """Asks between the bars.
+
+    Parameters
+    ----------
+    bars
+        Taken away while a question waits.
+    """
+
+    def __init__(self, bars: console.Bars) -> None:
+        self._bars = bars
+
+    def to_print(self, plan: RepairPlan) -> bool:
+        """Show what would be printed, and wait for a word."""
+        with self._bars.paused():
+            for line in plan_lines(plan):
+                console.errors.print(f"  {line}", markup=False)
+            return confirmed("Print this repair?")
+
+    def to_go_on(self, decision: Decision) -> bool:
+        """Say why the run rests, and wait for a word."""
+        with self._bars.paused():
+            for verdict in decision.verdicts:
+                if verdict.action is decision.action:
+                    one = verdict.finding
+                    low, high = one.box_mm
+                    console.errors.print(
+                        f"  {one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
+                        f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}.",
+                        markup=False,
+                    )
+            return confirmed("Go on all the same (no ends the run)?")
 
 
-def ask_to_go_on(decision: Decision) -> bool:
-    """Say why the run rests, and wait for a word."""
-    for verdict in decision.verdicts:
-        if verdict.action is decision.action:
-            one = verdict.finding
-            low, high = one.box_mm
-            console.errors.print(
-                f"{one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
-                f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}."
-            )
-    return typer.confirm("Go on all the same? (no ends the run)", default=False, err=True)
+def confirmed(question: str) -> bool:
+    """Ask on standard error, read a word from standard input; anything but y or yes is no.
+
+    Raises
+    ------
+    InputError
+        If standard input is closed: nobody can answer.
+    """
+    console.errors.print(f"{question} [y/N] ", end="", markup=False)
+    try:
+        answer = input()
+    except EOFError as error:
+        console.errors.print()
+        raise InputError(
+            "nobody answers: standard input is closed; run it in a terminal, ask in a browser "
+            "(--view), or let it decide within the profile's limits (--approve auto)"
+        ) from error
+    return answer.strip().lower() in {"y", "yes"}

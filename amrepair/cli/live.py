@@ -119,7 +119,8 @@ def _refuse(path: Path) -> None:
 
     known = JOB_SUFFIXES | {".safetensors"} | set(MESH_SUFFIXES) | SCAN_SUFFIXES
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file")
+        what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
+        raise InputError(f"{path}: {what}")
     if path.suffix.lower() not in known:
         raise InputError(f"{path} cannot be shown; it is one of {', '.join(sorted(known))}")
 

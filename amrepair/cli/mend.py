@@ -99,9 +99,11 @@ def repair(
     from amrepair.repair import Site, Stopwatch, plan_repair
     from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
     from amrepair.report.collect import plan_result
+    from amrepair.report.text import left_out_lines
     from amrepair.scans import read_scan
     from amrepair.template import open_template
     from amrepair.turning import turns_named, turns_of
+    from gcode.cli.words import what_it_does
     from gcode.profiles import load_setup
 
     if scan_frame not in FRAMES:
@@ -172,8 +174,15 @@ def repair(
     else:
         for line in summary_of_result(result, within_tolerance=within):
             console.out.print(line)
-        if program is not None:
-            console.out.print(f"Repair: {output}")
+        for line in left_out_lines(plan):
+            console.out.print(f"Left out, {line}.", markup=False)
+        if program is not None and plan.estimate is not None:
+            does = what_it_does(program, plan.estimate)
+            console.out.print(f"Repair: {output}: {does}.", markup=False)
+        elif not within:
+            older = "; the file of that name is older, and not for this scan" * output.exists()
+            said = f"{output} was not written: no bead can be laid{older}."
+            console.out.print(said, markup=False)
         for line in _suggestion(plan, ranked):
             console.out.print(line)
     if not within:

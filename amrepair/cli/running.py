@@ -8,12 +8,14 @@ from typing import Any
 
 import typer
 
-from amrepair.cli.asking import ask_to_go_on, ask_to_print
+from amrepair.cli.asking import Terminal
 from amrepair.cli.live import NoView, ShownRun, live_view
+from amrepair.cli.warmth import ThermalLog
 from amrepair.errors import InputError, LoopError
 from amrepair.frames import Transform
 from amrepair.loop import (
     MAX_ITERATIONS,
+    Look,
     LoopReport,
     Stop,
     Tape,
@@ -29,7 +31,7 @@ from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
 from amrepair.repair import Stopwatch
-from amrepair.report import report_of_loop, summary_of_result, write_report
+from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scanner, WatchedFolderScanner
@@ -131,7 +133,7 @@ def run(
         port=shown.port,
         token=shown.token,
     ) as page:
-        report = _print(
+        report, warmth = _print(
             begun,
             page,
             watch,
@@ -140,7 +142,7 @@ def run(
             going_on=resume is not None,
             pose=pose_confirmed,
         )
-    _tell(begun, report, watch, as_json=as_json)
+    _tell(begun, report, warmth, watch, as_json=as_json)
 
 
 def _given(value: Any, name: str) -> Any:
@@ -217,8 +219,8 @@ def _print(
     view: bool,
     going_on: bool,
     pose: bool,
-) -> LoopReport:
-    """Connect and run the loop."""
+) -> tuple[LoopReport, tuple[TemperatureSeries, ...]]:
+    """Connect and run the loop; what became of it, and how warm it was at its looks."""
     setting, setup, ask = begun.setting, begun.setup, begun.setting.approve == "ask"
     machine = connect(
         setting.port,
@@ -235,9 +237,16 @@ def _print(
     if not going_on:
         machine.connect()
     page.drives(machine.pause, machine.resume)
+    word, warmth = Terminal(bars), ThermalLog(machine.temperatures)
+    shown = page.recording(begun.folder.record)
+
+    def recorded(look: Look) -> None:
+        shown(look)
+        warmth.note()
+
     try:
         with bars.shown():
-            return run_loop(
+            report = run_loop(
                 begun.job,
                 begun.checked,
                 machine,
@@ -245,11 +254,11 @@ def _print(
                 sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads),
                 stops=begun.stops,
                 max_iterations=setting.max_iterations,
-                approve=(page.approve if view else ask_to_print) if ask else lambda plan: True,
-                ask=(page.ask_to_go_on if view else ask_to_go_on) if ask else None,
+                approve=(page.approve if view else word.to_print) if ask else lambda plan: True,
+                ask=(page.ask_to_go_on if view else word.to_go_on) if ask else None,
                 limits=Limits.of(setup.process) if setting.limited else None,
-                pace=Pace(setting.adaptive) if setting.adaptive else None,
-                record=page.recording(begun.folder.record),
+pace=Pace(setting.adaptive) if setting.adaptive else None,
+                record=recorded,
                 keep_scan=begun.folder.keep_scan,
                 tape=begun.tape,
                 pick_up=find,
@@ -258,12 +267,20 @@ def _print(
                 watch=watch,
                 progress=page.watching(bars),
             )
+        return report, warmth.series()
     finally:
         machine.close()
         begun.tape.close()
 
 
-def _tell(begun: _Begun, report: LoopReport, watch: Stopwatch, *, as_json: bool) -> None:
+def _tell(
+    begun: _Begun,
+    report: LoopReport,
+    warmth: tuple[TemperatureSeries, ...],
+    watch: Stopwatch,
+    *,
+    as_json: bool,
+) -> None:
     """Result, report, exit code."""
     folder, setting, setup = begun.folder, begun.setting, begun.setup
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
@@ -281,6 +298,7 @@ def _tell(begun: _Begun, report: LoopReport, watch: Stopwatch, *, as_json: bool)
         setup=setup,
         about={"job": setting.title},
         expected=_placed_solid(begun.template, setting.placed),
+        temperatures=warmth,
     )
     write_report(data, folder.file("report.html"))
     if as_json:

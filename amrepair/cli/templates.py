@@ -58,6 +58,8 @@ def fit(
     if paper and recipe != "paper":
         raise InputError(f"--paper belongs to --recipe paper, the recipe is {recipe}")
     settings = with_settings(VARIANTS, paper, "--paper")
+    if output.suffix != ".safetensors":
+        raise InputError(f"{output}: a template is written as .safetensors; rename it")
     console.writable(output)
     bars = console.Bars()
     meshes, scans = sort_inputs(inputs)

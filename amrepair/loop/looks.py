@@ -88,31 +88,34 @@ class LoopReport:
     stopped: str = ""
     passed: tuple[Stop, ...] = ()
 
-    def at_stop(self, stop: Stop) -> tuple[Look, ...]:
-        """The looks of one stop."""
-        return tuple(look for look in self.looks if look.stop == stop)
+    @property
+    def by_stop(self) -> dict[Stop, tuple[Look, ...]]:
+        """The looks of every stop, stops in order; one walk over the looks."""
+        found: dict[Stop, list[Look]] = {}
+        for look in self.looks:
+            found.setdefault(look.stop, []).append(look)
+        return {stop: tuple(looks) for stop, looks in found.items()}
 
     @property
     def stops(self) -> tuple[Stop, ...]:
         """Stops in order."""
-        return tuple(dict.fromkeys(look.stop for look in self.looks))
+        return tuple(self.by_stop)
 
     @property
     def first_looks(self) -> tuple[Look, ...]:
         """The first look of every stop."""
-        return tuple(self.at_stop(stop)[0] for stop in self.stops)
+        return tuple(looks[0] for looks in self.by_stop.values())
 
     @property
     def last_looks(self) -> tuple[Look, ...]:
         """The last look of every stop."""
-        return tuple(self.at_stop(stop)[-1] for stop in self.stops)
+        return tuple(looks[-1] for looks in self.by_stop.values())
 
     @property
     def within_tolerance(self) -> bool:
         """Whether every stop was left within tolerance (`left_well`), and each was looked at."""
         found_mm3, well = 0.0, not self.stopped and not self.passed
-        for stop in self.stops:
-            looks = self.at_stop(stop)
+        for looks in self.by_stop.values():
             found_mm3 += looks[0].plan.deficit.missing_mm3
             well = well and left_well(looks, found_mm3)
         return well

@@ -15,7 +15,7 @@ from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.collect import of_the_part
 from amrepair.report.operator import Operator, Verdict
-from amrepair.report.text import duration, length, quantity
+from amrepair.report.text import plan_lines
 from gcode.moves import Extrude, Toolpath
 from gcode.progress import Progress
 from gcode.reader import Job
@@ -76,6 +76,7 @@ class LiveView:
         self._operator = operator
         self._open = True
         self._job_steps: list[tuple[int, Any]] = []
+        self._grown = 0  # of the steps, those that are shown
         self._switches: dict[str, Any] = {}
         self._handles: dict[str, Any] = {}
         scene, gui = self.server.scene, self.server.gui
@@ -205,6 +206,7 @@ class LiveView:
             )
             handle.visible = grown
             self._job_steps.append((int(beads.line[part[-1]]), handle))
+        self._grown = len(self._job_steps) if grown else 0
 
     def say(self, title: str, lines: list[str]) -> None:
         """Words beside the scene."""
@@ -220,14 +222,23 @@ class LiveView:
             progress(stage, done, total)
             if not self._open:
                 return
-            share = 100 * done / max(total, 1e-9)
-            self._stage.content = f"**{stage}**: {share:.0f} %"
+            words = f"**{stage}**: {100 * done / max(total, 1e-9):.0f} %"
+            if words != self._stage.content:  # it is told of every line; people read per cent
+                self._stage.content = words
             if stage == "print":
-                for line, handle in self._job_steps:
-                    if handle.visible != (line < done):
-                        handle.visible = line < done
+                self._grow_to(done)
 
         return told
+
+    def _grow_to(self, line: float) -> None:
+        """Show the job's beads up to a line; only pieces that change are touched."""
+        steps = self._job_steps
+        while self._grown < len(steps) and steps[self._grown][0] < line:
+            steps[self._grown][1].visible = True
+            self._grown += 1
+        while self._grown > 0 and steps[self._grown - 1][0] >= line:
+            self._grown -= 1
+            steps[self._grown][1].visible = False
 
     def show_plan(self, plan: RepairPlan, label: str) -> None:
         """Draw a scan with its deviations, what is missing, what is too much, and the patch."""
@@ -248,7 +259,8 @@ class LiveView:
             self.show_toolpath("repair", plan.patch.toolpath)
         else:
             self._remove("repair")
-        self._found.content = _words(plan, label)
+        found = [f"- {line}" for line in plan_lines(plan)]
+        self._found.content = "\n".join([f"**{label}**", *found])
 
     def approve(self, plan: RepairPlan) -> bool:
         """Show a plan and wait for Approve or Skip (the `approve` of `run_loop`)."""
@@ -327,23 +339,3 @@ class LiveView:
         handle = self._handles.pop(name, None)
         if handle is not None:
             handle.remove()
-
-
-def _words(plan: RepairPlan, label: str) -> str:
-    """What was found and what a repair would take."""
-    count = len(plan.to_fill)
-    lines = [
-        f"**{label}**",
-        f"- missing: {quantity(plan.deficit.missing_mm3, 'mm³')} in {count} "
-        f"region{'' if count == 1 else 's'}",
-        f"- too much: {quantity(plan.deficit.excess_mm3, 'mm³')}",
-        f"- out of reach: {quantity(plan.unreachable_mm3, 'mm³')}",
-    ]
-    if plan.estimate is not None:
-        cost = plan.estimate
-        lines.append(
-            f"- a repair takes {duration(cost.print_time_s)} and {length(cost.filament_mm)}"
-        )
-    if plan.refused:
-        lines.append(f"- the checker refuses it: {plan.refused}")
-    return "\n".join(lines)

@@ -8,8 +8,14 @@ from __future__ import annotations
 import math
 from collections import Counter as Tally
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from amrepair.report.data import Figures, Outcome, RegionRow, ReportData, regions_from_result
+
+if TYPE_CHECKING:
+    from amrepair.repair import RepairPlan
 
 # Below this a volume is less than half of the smallest bead that can be placed (0.08 mm³).
 NEGLIGIBLE_MM3 = 0.04
@@ -198,6 +204,9 @@ def _left(outcome: Outcome, figures: Figures) -> str:
     if figures.missing_mm3_after is None:
         if outcome is Outcome.NOTHING_TO_REPAIR:
             parts.append("Nothing is left to do")
+        elif figures.filament_mm <= 0:
+            missing = figures.missing_mm3_before > NEGLIGIBLE_MM3
+            parts.append("All of it is still missing" if missing else "There is nothing to print")
         else:
             parts.append("What is left is not known yet: scan again after printing")
     elif figures.missing_mm3_after > NEGLIGIBLE_MM3:
@@ -214,6 +223,49 @@ def _left(outcome: Outcome, figures: Figures) -> str:
         )
     text = "; ".join(parts)
     return text[0].upper() + text[1:] + "."
+
+
+def plan_lines(plan: RepairPlan) -> list[str]:
+    """What was found at a scan, and what its repair would do: said before anything moves."""
+    regions = plan.to_fill
+    lines = [f"missing: {quantity(plan.deficit.missing_mm3, 'mm³')} in {_count(regions, 'region')}"]
+    if regions:
+        low = np.min([np.asarray(region.box_mm)[0] for region in regions], axis=0)
+        high = np.max([np.asarray(region.box_mm)[1] for region in regions], axis=0)
+        lines[0] += (
+            f", at X {low[0]:.1f} to {high[0]:.1f}, Y {low[1]:.1f} to {high[1]:.1f}, "
+            f"Z {low[2]:.2f} to {high[2]:.2f} mm"
+        )
+    if plan.too_much:
+        count = _count(plan.too_much, "region")
+        lines.append(f"too much, which printing cannot take away: {count}")
+    if plan.estimate is not None:
+        cost = plan.estimate
+        lines.append(
+            f"the repair takes {duration(cost.print_time_s)} and {length(cost.filament_mm)} of "
+            "filament"
+        )
+    elif regions:
+        lines.append("no repair can be printed here")
+    lines += [f"out of reach: {line}" for line in left_out_lines(plan)]
+    if plan.refused:
+        lines.append(f"the checker refuses it: {plan.refused}")
+    return lines
+
+
+def left_out_lines(plan: RepairPlan) -> list[str]:
+    """What a plan leaves out, by reason: `3.9 mm³: the nozzle would touch …`, largest first."""
+    if plan.patch is None:
+        return []
+    by_reason: Tally[str] = Tally()
+    for piece in (*plan.patch.unreachable, *plan.patch.unprintable):
+        by_reason[piece.reason] += piece.volume_mm3  # type: ignore[assignment]
+    worth = [(reason, mm3) for reason, mm3 in by_reason.most_common() if mm3 > NEGLIGIBLE_MM3]
+    return [f"{quantity(mm3, 'mm³')}: {reason}" for reason, mm3 in worth]
+
+
+def _count(things: Sequence[object], name: str) -> str:
+    return f"{len(things)} {name}{'' if len(things) == 1 else 's'}"
 
 
 def _article(word: str) -> str:

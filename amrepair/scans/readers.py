@@ -75,7 +75,8 @@ def read_scan(
     path = Path(path)
     suffix = path.suffix.lower()
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file")
+        what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
+        raise InputError(f"{path}: {what}")
     if suffix in HEIGHT_SUFFIXES or (suffix == ".npy" and _is_map(path)):
         scan = read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
     elif suffix == ".npz":

@@ -15,6 +15,7 @@ from gcode.cli.options import (
     PrinterOption,
     ProcessOption,
     grid_of,
+    plain_text,
     program_text,
 )
 from gcode.cli.resuming import resume_at_command
@@ -277,6 +278,8 @@ def send(
 ) -> None:
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
     from gcode.check import check as check_program
+    from gcode.cli.words import what_it_does
+    from gcode.estimate import estimate as estimate_program
     from gcode.hosts import connect
     from gcode.hosts.journal import default_path
     from gcode.hosts.resume import resume as resume_job
@@ -288,6 +291,10 @@ def send(
     field = _as_built(as_built) if as_built is not None else None
     checked = check_program(
         Program(program_text(file), setup.printer.dialect), setup, as_built=field
+    )
+    cost = estimate_program(checked.program, setup.printer)
+    console.errors.print(
+        f"{file} on {setup.printer.name}: {what_it_does(checked.program, cost)}.", markup=False
     )
     machine = connect(
         port,
@@ -339,11 +346,14 @@ def emulate(
     accelerated: Annotated[bool, typer.Option(help="Let the printer's clock jump.")] = False,
 ) -> None:
     """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
+    from gcode.dialects import DIALECTS
     from gcode.firmware import serve_forever
     from gcode.firmware.faults import parse_faults
     from gcode.profiles import load_printer
 
-    script = parse_faults(program_text(faults)) if faults is not None else None
+    if firmware not in DIALECTS:
+        raise InputError(f"--firmware is {firmware!r}; it is one of {', '.join(DIALECTS)}.")
+    script = parse_faults(plain_text(faults)) if faults is not None else None
     machine = load_printer(printer)
     with tempfile.TemporaryDirectory(prefix="gcode-emulate-") as folder:
         serve_forever(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -63,6 +64,18 @@ class Bars:
                 yield self
         else:
             yield self
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Take the bars away while somebody is asked: they would be drawn over the answer."""
+        drawn = self._bars.live.is_started
+        if drawn:
+            self._bars.stop()
+        try:
+            yield
+        finally:
+            if drawn:
+                self._bars.start()
 
 
 def examples(*lines: str) -> str:
@@ -143,13 +156,33 @@ def signals_end_it() -> Iterator[None]:
 def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None:
     """Run an application; a known error becomes one sentence and its exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    sys.exit(_exit_code(app, name, known))  # no error is alive any more, nor what it held
+
+
+def _exit_code(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> int:
     try:
         app(prog_name=name)
+    except SystemExit as end:
+        if end.code == INTERRUPTED:  # typer ends so on Ctrl+C, without a word
+            errors.print(f"{name}: interrupted")
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
     except known as error:
-        errors.print(
-            f"{name}: {error}", style="bold red" if errors.is_terminal else None, markup=False
-        )
-        sys.exit(getattr(error, "exit_code", 2))
-    except KeyboardInterrupt:
-        errors.print(f"{name}: interrupted")
-        sys.exit(INTERRUPTED)
+        style = "bold red" if errors.is_terminal else None
+        errors.print(f"{name}: {error}", style=style, markup=False)
+        return int(getattr(error, "exit_code", InputError.exit_code))
+    except OSError as error:
+        errors.print(f"{name}: {in_words(error)}", markup=False)
+        return InputError.exit_code
+    return 0
+
+
+def in_words(error: OSError) -> str:
+    """What the system refused, and where; a full disk above all."""
+    where = f"{error.filename}: " if error.filename else ""
+    hint = {
+        errno.ENOSPC: "; free some, or write elsewhere",
+        errno.EFBIG: "; the limit on the size of files is too low",
+        errno.EACCES: "; choose a place that you may write to",
+        errno.EROFS: "; choose a place that can be written to",
+    }.get(error.errno or 0, "")
+    return f"{where}{error.strerror or error}{hint}."

@@ -47,12 +47,32 @@ def program_text(path: Path) -> str:
     Raises
     ------
     InputError
-        If it cannot be read.
+        If it cannot be read, or holds no G-code at all: anything passes a check of nothing.
+    """
+    text = plain_text(path)
+    if not any(line.partition(";")[0].strip() for line in text.splitlines()):
+        raise InputError(f"{path} has no command in it; slice the part again.")
+    return text
+
+
+def plain_text(path: Path) -> str:
+    """The text of a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is no text.
     """
     try:
-        return path.read_text(encoding="utf-8", errors="replace")
+        text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}).") from error
+    if "\0" in text:
+        raise InputError(
+            f"{path} is no text; give a program as plain G-code (a slicer may have to be told not "
+            "to write binary G-code)."
+        )
+    return text
 
 
 def job_of(path: Path, setup: PrintSetup) -> Job:

@@ -1,0 +1,70 @@
+"""Standing: whether a pose puts a part where a part can stand: on the bed, within the printer.
+
+A scan in the scanner's own frame that is taken for one in the bed's puts the part into the bed or
+beside it; so does an origin that is not where the user thought. Both are refused before any work.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.errors import AlignmentError
+from amrepair.frames import Transform
+from amrepair.template.port import Template
+from gcode.profiles import PrinterProfile
+from gcode.slicing.layers import mesh_of
+
+# More than any calibration, raft or warp puts a part off; less than any layer it would be moved by.
+SLACK_MM = 1.0
+
+
+def box_on_bed(template: Template, placed: Transform) -> Float[np.ndarray, "2 3"]:
+    """Lowest and highest corner of the part's box, build frame, mm."""
+    vertices, _ = mesh_of(template.solid())
+    points = placed.apply(np.asarray(vertices, dtype=np.float64))
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def refuse_impossible(
+    template: Template, placed: Transform, printer: PrinterProfile, *, said: bool
+) -> None:
+    """Refuse a pose in which the part would stand in the bed or beyond the printer.
+
+    Parameters
+    ----------
+    placed
+        Build from template.
+    said
+        Somebody gave the pose, so what is wrong is the pose; else the scan's frame is.
+
+    Raises
+    ------
+    AlignmentError
+        Saying by how much, and what to give instead.
+    """
+    low, high = box_on_bed(template, placed)
+    where = (
+        f"X {low[0]:.1f} to {high[0]:.1f}, Y {low[1]:.1f} to {high[1]:.1f}, "
+        f"Z {low[2]:.1f} to {high[2]:.1f} mm"
+    )
+    room = np.array([*printer.bed_size_mm, printer.max_z_mm])
+    beyond = bool((low[:2] < -SLACK_MM).any() or (high > room + SLACK_MM).any())
+    if low[2] >= -SLACK_MM and not beyond:
+        return
+    if not said:
+        raise AlignmentError(
+            f"taken as bed coordinates, the scan puts the part at {where}, where nothing can "
+            f"stand on a bed of {room[0]:g} × {room[1]:g} mm; if the scan is in the scanner's own "
+            "frame, say where the part stands: --scan-frame unknown --part-pose X,Y,Z,RZ"
+        )
+    if low[2] < -SLACK_MM and not beyond:
+        shift_mm = placed.translation_mm[2] - low[2]
+        raise AlignmentError(
+            f"this pose puts the part at {where}, {-low[2]:.1f} mm into the bed: a pose places the "
+            f"origin of the part's own file; to stand on the bed it has Z = {shift_mm:.3f}"
+        )
+    raise AlignmentError(
+        f"this pose puts the part at {where}, beyond the {room[0]:g} × {room[1]:g} × {room[2]:g} "
+        f"mm of printer '{printer.id}'; a pose places the origin of the part's own file"
+    )

@@ -1,0 +1,157 @@
+"""What the command lines say to people: questions, refusals, what a program will do."""
+
+from __future__ import annotations
+
+import errno
+import io
+from pathlib import Path
+
+import manifold3d as m3
+import pytest
+import typer
+
+import gcode
+from amrepair.align.standing import refuse_impossible
+from amrepair.cli.asking import confirmed
+from amrepair.cli.options import part_pose
+from amrepair.cli.warmth import ThermalLog
+from amrepair.errors import AlignmentError, AmrepairError, InputError
+from amrepair.template import MeshSdf
+from gcode.cli import console
+from gcode.cli.options import plain_text, program_text
+from gcode.cli.words import what_it_does
+from gcode.errors import InputError as GcodeInputError
+from gcode.errors import LinkError
+from gcode.estimate import estimate
+from gcode.hosts.port import Temperatures
+from gcode.moves import Program
+from tests.unit.loop_bench import solid_mesh
+
+SETUP = gcode.load_setup()
+PROGRAM = Program(
+    "M140 S60\nM104 S215\nG28 X Y\nM190 S60\nM109 S215\nG90\nM83\nG1 X50 Y50 Z2 F3000\n"
+    "G1 X60 Y50 E1.2 F1200\nM104 S0\nM140 S0\n",
+    "prusa",
+)
+
+
+@pytest.fixture(scope="module")
+def sunk() -> MeshSdf:
+    """A part whose file has its foot 15 mm below its origin."""
+    return MeshSdf.from_mesh(solid_mesh(m3.Manifold.cube((20.0, 10.0, 8.0)).translate((0, 0, -15))))
+
+
+@pytest.mark.parametrize("pose", ["100,80,15,0", "100,80,15,90", "5,200,14.5,0", "100,80,40,0"])
+def test_a_part_on_the_bed_is_let_through(sunk: MeshSdf, pose: str) -> None:
+    refuse_impossible(sunk, part_pose(pose), SETUP.printer, said=True)
+
+
+def test_a_part_in_the_bed_is_told_the_height_that_it_needs(sunk: MeshSdf) -> None:
+    with pytest.raises(AlignmentError, match=r"15\.0 mm into the bed.*Z = 15\.000"):
+        refuse_impossible(sunk, part_pose("100,80,0,0"), SETUP.printer, said=True)
+
+
+@pytest.mark.parametrize("pose", ["245,80,15,0", "-5,80,15,0", "100,80,300,0"])
+def test_a_part_beyond_the_printer_is_refused(sunk: MeshSdf, pose: str) -> None:
+    with pytest.raises(AlignmentError, match=r"beyond the 250 × 210 × 210"):
+        refuse_impossible(sunk, part_pose(pose), SETUP.printer, said=True)
+
+
+def test_a_scan_in_a_frame_of_its_own_is_asked_for_a_pose(sunk: MeshSdf) -> None:
+    with pytest.raises(AlignmentError, match="--scan-frame unknown --part-pose"):
+        refuse_impossible(sunk, part_pose("-100,80,15,40"), SETUP.printer, said=False)
+
+
+def test_what_a_program_does_is_said_before_it_is_sent() -> None:
+    said = what_it_does(PROGRAM, estimate(PROGRAM, SETUP.printer))
+    assert said.startswith("heats the nozzle to 215 °C, heats the bed to 60 °C, homes X and Y but")
+    assert "not Z, lays 1 mm of filament at Z 2.00 to 2.00 mm" in said
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(b"", "no command"), (b"; only words\n\n", "no command"), (b"GCDE\0\0\1", "is no text")],
+)
+def test_a_file_without_gcode_passes_no_check(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "job.gcode"
+    path.write_bytes(content)
+    with pytest.raises(GcodeInputError, match=said):
+        program_text(path)
+
+
+def test_a_folder_is_no_text(tmp_path: Path) -> None:
+    with pytest.raises(GcodeInputError, match="Is a directory"):
+        plain_text(tmp_path)
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("y\n", True), ("Yes\n", True), ("\n", False),
+                                             ("n\n", False), ("what?\n", False)])  # fmt: skip
+def test_only_yes_is_yes(monkeypatch: pytest.MonkeyPatch, typed: str, meant: bool) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+    assert confirmed("Print this repair?") is meant
+
+
+def test_nobody_there_to_answer_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    with pytest.raises(InputError, match="--approve auto"):
+        confirmed("Print this repair?")
+
+
+def ended(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> int:
+    app = typer.Typer(pretty_exceptions_enable=False)
+
+    @app.command()
+    def go() -> None:
+        raise error
+
+    monkeypatch.setattr("sys.argv", ["amrepair"])
+    with pytest.raises(SystemExit) as end:
+        console.run(app, "amrepair", (AmrepairError,))
+    assert isinstance(end.value.code, int)
+    return end.value.code
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "amrepair: interrupted"),
+        (InputError("no such thing"), 2, "amrepair: no such thing"),
+        (OSError(errno.ENOSPC, "No space left on device"), 2, "No space left on device; free"),
+        (PermissionError(errno.EACCES, "Permission denied", "a.npz"), 2, "a.npz: Permission den"),
+        (typer.Exit(3), 3, ""),
+    ],
+)
+def test_every_end_has_its_code_and_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException,
+    code: int,
+    said: str,
+) -> None:
+    assert ended(monkeypatch, error) == code
+    told = capsys.readouterr().err.strip()
+    assert said in told
+    assert len(told.splitlines()) == bool(said)
+
+
+@pytest.mark.parametrize(("bed_c", "names"), [(60.0, ["hotend", "bed"]), (None, ["hotend"])])
+def test_a_run_knows_how_warm_it_was(bed_c: float | None, names: list[str]) -> None:
+    clock, hotend_c = iter([100.0, 103.0, 110.0]), iter([205.0, 210.0])
+    log = ThermalLog(lambda: Temperatures(next(hotend_c), 215.0, bed_c, bed_c), lambda: next(clock))
+    log.note()
+    log.note()
+    series = log.series()
+    assert [one.name for one in series] == names
+    assert series[0].time_s.tolist() == [3.0, 10.0]
+    assert series[0].measured_c.tolist() == [205.0, 210.0]
+    assert series[0].target_c is not None
+    assert series[0].target_c.tolist() == [215.0, 215.0]
+
+
+def test_a_printer_without_temperatures_stops_no_run() -> None:
+    def silent() -> Temperatures:
+        raise LinkError("it is a file and has no temperatures.")
+
+    log = ThermalLog(silent)
+    log.note()
+    assert log.series() == ()
