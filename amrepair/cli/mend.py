@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,9 +20,10 @@ from amrepair.cli.options import (
     part_pose,
     sensors,
 )
-from amrepair.errors import InputError
+from amrepair.errors import AmrepairError, InputError
 from gcode.cli import console
 from gcode.cli.options import grid_of
+from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 FRAMES = ("build", "unknown")
 # Less than this share out of reach is not worth turning the part over.
 WORTH_TURNING_RATIO = 0.05
+UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
 
 def add_to(app: typer.Typer) -> None:
@@ -109,9 +112,10 @@ def repair(
     if scan_frame not in FRAMES:
         raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
     if scan_frame == "unknown" and pose is None:
+        hint = pose_of_job(job, template, (printer, material, process))
         raise InputError(
             "--scan-frame unknown needs --part-pose X,Y,Z,RZ: an aligned shape does not say where "
-            "the part stands on the bed"
+            f"the part stands on the bed; {hint}"
         )
     turns = turns_named(turn or [])
     if standing is not None and standing.suffix != ".npz":
@@ -187,6 +191,36 @@ def repair(
             console.out.print(line)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def pose_of_job(job: Path | None, template: Path, ids: tuple[str, str, str]) -> str:
+    """What to type as the pose, where a job tells where it prints the part: a hint, no answer.
+
+    The job cannot know whether the part was taken off meanwhile, so somebody has to say it.
+    """
+    from amrepair.loop import locate_part
+    from amrepair.template import open_template
+    from gcode.cli.options import job_of
+    from gcode.profiles import load_setup
+
+    if job is None:
+        return "with --job JOB.gcode this message tells where that job prints the part"
+    setup = load_setup(*ids)
+    bars = console.Bars()
+    try:
+        with bars.shown():
+            field = open_template(template, progress=bars)
+            placed = locate_part(
+                job_of(job, setup), field, layer_height_mm=setup.process.layer_height_mm
+            )
+    except (AmrepairError, GcodeError) as error:
+        return f"{job} does not tell, either: {error}"
+    if placed.matrix[2, 2] < UPRIGHT:
+        return f"{job} prints it lying in another way than its own file has it"
+    x, y, z = placed.translation_mm
+    turn_deg = math.degrees(math.atan2(placed.matrix[1, 0], placed.matrix[0, 0]))
+    words = f"{x:.3f},{y:.3f},{z:.3f},{turn_deg:.2f}"
+    return f"{job} prints it at --part-pose {words}: say so if it stands there still"
 
 
 def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:

@@ -174,15 +174,18 @@ def _new_run(
             "or name another folder with --out"
         )
     job = job_of(job_file, setup)
-    checked = check(job.program, setup)
     fixed = range(looks.every - 1, len(job.layers) - 1, looks.every) if looks.every else []
     pace = (looks.every or ADAPTIVE_LAYERS) if looks.adaptive else 0
     layers = [*looks.at_layers, *layers_at(job, looks.at_mm), *([] if pace else fixed)]
     stops = plan_stops(job, layers)
-    with watch("template"):
-        field = open_template(template, progress=bars)
-    with watch("locate"):
-        placed = locate_part(job, field, layer_height_mm=setup.process.layer_height_mm)
+    with bars.shown():
+        checked = check(job.program, setup, progress=bars)
+        with watch("template"):
+            field = open_template(template, progress=bars)
+        with watch("locate"):
+            bars("locate", 0.0, 1.0)
+            placed = locate_part(job, field, layer_height_mm=setup.process.layer_height_mm)
+            bars("locate", 1.0, 1.0)
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=placed, build_from_scanner=pose,
         by_beads=True, max_iterations=MAX_ITERATIONS, adaptive=pace,

@@ -112,7 +112,7 @@ def mesh(
 
     console.writable(output)
     bars = console.Bars()
-    template = open_template(file, progress=bars)
-    cut = template if below_z_mm is None else template.below_z(below_z_mm)
     with bars.shown():
+        template = open_template(file, progress=bars)
+        cut = template if below_z_mm is None else template.below_z(below_z_mm)
         write_mesh(extract_mesh(cut, voxel_mm, level_mm=level_mm), output)

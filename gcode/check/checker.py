@@ -11,7 +11,10 @@ from gcode.check.words import COMMANDS
 from gcode.errors import CheckRefusedError, InputError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
+from gcode.progress import Progress, silent
 from gcode.surfaces import HeightField
+
+SAY_EVERY_LINES = 5000  # some hundredths of a second
 
 
 def find_refusals(
@@ -20,9 +23,10 @@ def find_refusals(
     *,
     as_built: HeightField | None = None,
     initial: ModalState | None = None,
+    progress: Progress = silent,
 ) -> tuple[Refusal, ...]:
     """Everything that speaks against printing a program, in its order; see `check`."""
-    return _judge(program, setup, as_built, initial)[0]
+    return _judge(program, setup, as_built, initial, progress)[0]
 
 
 def check(
@@ -31,6 +35,7 @@ def check(
     *,
     as_built: HeightField | None = None,
     initial: ModalState | None = None,
+    progress: Progress = silent,
 ) -> CheckedProgram:
     """Judge a program.
 
@@ -59,7 +64,7 @@ def check(
     ...     print(error)  # doctest: +ELLIPSIS
     The checker refuses the program: ...cold...
     """
-    refusals, report = _judge(program, setup, as_built, initial)
+    refusals, report = _judge(program, setup, as_built, initial, progress)
     if refusals:
         more = f" (and {len(refusals) - 1} more)" if len(refusals) > 1 else ""
         raise CheckRefusedError(f"The checker refuses the program: {refusals[0]}{more}.", refusals)
@@ -71,6 +76,7 @@ def _judge(
     setup: PrintSetup,
     as_built: HeightField | None,
     initial: ModalState | None,
+    progress: Progress,
 ) -> tuple[tuple[Refusal, ...], CheckReport]:
     if program.dialect not in COMMANDS:
         raise InputError(
@@ -80,6 +86,8 @@ def _judge(
     top_mm = as_built.top_mm if as_built is not None else None
     judge = Judge(program, setup, top_mm, initial)
     for number, raw in enumerate(lines, start=1):
+        if number % SAY_EVERY_LINES == 0:
+            progress("check", float(number), float(len(lines)))
         judge.read(number, raw)
     judge.end()
     refusals, clearance_mm = list(judge.refusals), math.inf

@@ -170,7 +170,9 @@ def check(
     setup = load_setup(printer, material)
     program = Program(program_text(file), setup.printer.dialect)
     field = _as_built(as_built) if as_built is not None else None
-    refusals = find_refusals(program, setup, as_built=field)
+    bars = console.Bars()
+    with bars.shown():
+        refusals = find_refusals(program, setup, as_built=field, progress=bars)
     if as_json:
         console.show_json(
             {
@@ -289,9 +291,10 @@ def send(
 
     setup = load_setup(printer, material)
     field = _as_built(as_built) if as_built is not None else None
-    checked = check_program(
-        Program(program_text(file), setup.printer.dialect), setup, as_built=field
-    )
+    program = Program(program_text(file), setup.printer.dialect)
+    bars = console.Bars()
+    with bars.shown():
+        checked = check_program(program, setup, as_built=field, progress=bars)
     cost = estimate_program(checked.program, setup.printer)
     console.errors.print(
         f"{file} on {setup.printer.name}: {what_it_does(checked.program, cost)}.", markup=False
@@ -305,7 +308,6 @@ def send(
     )
     if resume and not isinstance(machine, SerialPrinter):
         raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")
-    bars = console.Bars()
     if not resume:
         machine.connect()  # a printer that refuses us is not ours to abort
     try:

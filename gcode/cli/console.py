@@ -23,6 +23,7 @@ from gcode.profiles.names import Kind, list_profiles
 
 NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130
+COUNTED = 2  # stages of fewer steps are told in per cent alone
 SAY_EVERY_S = 10.0  # how often a log without a terminal hears of progress
 
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -40,6 +41,7 @@ class Bars:
             TextColumn("{task.description:<24}"),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f} %"),
+            TextColumn("{task.fields[count]}"),
             TimeRemainingColumn(elapsed_when_finished=True),
             console=errors,
         )
@@ -53,8 +55,9 @@ class Bars:
                 errors.print(f"{stage}: {100 * done / max(total, 1e-9):.0f} %")
             return
         if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total)
-        self._bars.update(self._tasks[stage], completed=done, total=total)
+            self._tasks[stage] = self._bars.add_task(stage, total=total, count="")
+        count = f"{done:.0f}/{total:.0f}" if total >= COUNTED else ""
+        self._bars.update(self._tasks[stage], completed=done, total=total, count=count)
 
     @contextmanager
     def shown(self) -> Iterator[Bars]:
@@ -106,8 +109,15 @@ def writable(path: Path) -> None:
         Naming it.
     """
     folder = path.parent
-    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"{path} cannot be written; name a file in a folder that is there.")
+    if path.is_dir():
+        why = "it is a folder; name a file in it"
+    elif not folder.is_dir():
+        why = f"there is no folder {folder}; make it first"
+    elif not os.access(folder, os.W_OK):
+        why = f"no permission to write in {folder.resolve()}; choose another folder"
+    else:
+        return
+    raise InputError(f"{path} cannot be written: {why}.")
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:

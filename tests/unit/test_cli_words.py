@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import errno
 import io
+import re
 from pathlib import Path
 
 import manifold3d as m3
 import pytest
 import typer
+from rich.console import Console
 
 import gcode
 from amrepair.align.standing import refuse_impossible
 from amrepair.cli.asking import confirmed
+from amrepair.cli.mend import pose_of_job
 from amrepair.cli.options import part_pose
 from amrepair.cli.warmth import ThermalLog
 from amrepair.errors import AlignmentError, AmrepairError, InputError
@@ -25,6 +28,8 @@ from gcode.errors import LinkError
 from gcode.estimate import estimate
 from gcode.hosts.port import Temperatures
 from gcode.moves import Program
+from gcode.slicing.job import plan_part
+from gcode.writer import write
 from tests.unit.loop_bench import solid_mesh
 
 SETUP = gcode.load_setup()
@@ -91,6 +96,20 @@ def test_only_yes_is_yes(monkeypatch: pytest.MonkeyPatch, typed: str, meant: boo
     assert confirmed("Print this repair?") is meant
 
 
+def test_bars_are_away_while_somebody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "errors", Console(file=io.StringIO(), force_terminal=True))
+    bars = console.Bars()
+    with bars.shown():
+        bars("print", 1.0, 2.0)
+        assert bars._bars.live.is_started
+        with bars.paused():
+            assert not bars._bars.live.is_started
+        assert bars._bars.live.is_started
+    with bars.paused():  # nothing is drawn yet, or any more
+        assert not bars._bars.live.is_started
+    assert not bars._bars.live.is_started
+
+
 def test_nobody_there_to_answer_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     with pytest.raises(InputError, match="--approve auto"):
@@ -155,3 +174,33 @@ def test_a_printer_without_temperatures_stops_no_run() -> None:
     log = ThermalLog(silent)
     log.note()
     assert log.series() == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "why"), [(".", "it is a folder"), ("none/a.gcode", "there is no folder"), ("a.g", "")]
+)
+def test_an_output_is_refused_with_the_reason(tmp_path: Path, name: str, why: str) -> None:
+    if not why:
+        console.writable(tmp_path / name)
+        return
+    with pytest.raises(GcodeInputError, match=why):
+        console.writable(tmp_path / name)
+
+
+def test_a_job_tells_what_to_type_as_the_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solid = m3.Manifold.cube((16.0, 12.0, 1.0)) + m3.Manifold.cube((6.0, 4.0, 2.0))
+    template = MeshSdf.from_mesh(solid_mesh(solid))
+    monkeypatch.setattr("amrepair.template.open_template", lambda path, **_: template)
+    job, part = tmp_path / "job.gcode", tmp_path / "part.stl"
+    path = plan_part(solid.rotate((0, 0, 90)).translate((100.0, 90.0, 0.0)), SETUP).toolpath
+    job.write_text(write(path, SETUP, title="L").text)
+    ids = ("prusa_mk3s", "pla", "repair_0.20")
+    words = re.search(r"--part-pose (\S+): say so", pose_of_job(job, part, ids))
+    assert words is not None
+    told = [float(word) for word in words.group(1).split(",")]
+    assert told == pytest.approx([100.0, 90.0, 0.0, 90.0], abs=0.1)
+    assert "--job" in pose_of_job(None, part, ids)
+    part.write_text("no job")
+    assert "does not tell" in pose_of_job(part, part, ids)
