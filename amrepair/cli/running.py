@@ -271,6 +271,13 @@ pace=Pace(setting.adaptive) if setting.adaptive else None,
                 progress=page.watching(bars),
             )
         return report, warmth.series()
+    except KeyboardInterrupt:
+        console.errors.print(
+            "The heaters were told to switch off. When somebody has looked, go on with: "
+            f"amrepair loop --resume {begun.folder.path}",
+            markup=False,
+        )
+        raise
     finally:
         machine.close()
         begun.tape.close()
