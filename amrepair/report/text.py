@@ -257,10 +257,13 @@ def left_out_lines(plan: RepairPlan) -> list[str]:
     """What a plan leaves out, by reason: `3.9 mm³: the nozzle would touch …`, largest first."""
     if plan.patch is None:
         return []
-    by_reason: Tally[str] = Tally()
-    for piece in (*plan.patch.unreachable, *plan.patch.unprintable):
-        by_reason[piece.reason] += piece.volume_mm3  # type: ignore[assignment]
-    worth = [(reason, mm3) for reason, mm3 in by_reason.most_common() if mm3 > NEGLIGIBLE_MM3]
+    pieces = [(piece.reason, piece.volume_mm3) for piece in plan.patch.unreachable]
+    pieces += [(piece.reason, piece.volume_mm3) for piece in plan.patch.unprintable]
+    by_reason: dict[str, float] = {}
+    for reason, volume_mm3 in pieces:
+        by_reason[reason] = by_reason.get(reason, 0.0) + volume_mm3
+    ranked = sorted(by_reason.items(), key=lambda item: -item[1])
+    worth = [(reason, mm3) for reason, mm3 in ranked if mm3 > NEGLIGIBLE_MM3]
     return [f"{quantity(mm3, 'mm³')}: {reason}" for reason, mm3 in worth]
 
 
