@@ -260,7 +260,7 @@ def _print(
                 approve=(page.approve if view else word.to_print) if ask else lambda plan: True,
                 ask=(page.ask_to_go_on if view else word.to_go_on) if ask else None,
                 limits=Limits.of(setup.process) if setting.limited else None,
-pace=Pace(setting.adaptive) if setting.adaptive else None,
+                pace=Pace(setting.adaptive) if setting.adaptive else None,
                 record=recorded,
                 keep_scan=begun.folder.keep_scan,
                 tape=begun.tape,

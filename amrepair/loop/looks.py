@@ -88,6 +88,10 @@ class LoopReport:
     stopped: str = ""
     passed: tuple[Stop, ...] = ()
 
+    def at_stop(self, stop: Stop) -> tuple[Look, ...]:
+        """The looks of one stop."""
+        return tuple(look for look in self.looks if look.stop == stop)
+
     @property
     def by_stop(self) -> dict[Stop, tuple[Look, ...]]:
         """The looks of every stop, stops in order; one walk over the looks."""

@@ -43,6 +43,7 @@ pytestmark = [
 SLOW = "always slow_reader s=0.004"  # long enough to press a button while it prints
 PROGRAM = "from amrepair.cli import main; main()"
 AGAIN = "look again"
+SENSOR_S = 1.0  # a scan takes its time; one from before it was asked for would be no answer
 QUIET_S = 1.5  # a thousand times what a line takes
 
 
@@ -142,6 +143,8 @@ class Command:
                 if self._over.wait(0.1):
                     return
                 looks = [e for e in read_events(self.out) if e["event"] == "look"]
+            if self._over.wait(SENSOR_S):
+                return
             here = not looks or looks[-1]["stop"] == stop
             stays = not looks or looks[-1]["printed"] or looks[-1]["decision"]["action"] == AGAIN
             label = stop if here and stays else "final"
