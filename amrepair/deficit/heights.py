@@ -1,12 +1,14 @@
 """The as-built height field: what stands on the bed, for the slicer and the checker.
 
-Heights are robust means of what was seen from above. What nobody saw is solid up to the printed
-height and a margin, unless the scan shows no bed at all: then the bed around the part is bare.
+Heights are robust means of what was seen from above. What no ray reached is solid up to the printed
+height and a margin. A cloud without rays cannot tell empty from unseen: where it has no points the
+part stands as it was designed, and that margin; where it was designed open, nothing does.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import manifold3d
 import numpy as np
@@ -34,7 +36,9 @@ TRUST_MM = 0.3
 NOISE_MM = 0.1
 # Two layers: thinner material over a void is the solids' own rounding at its rim.
 FILM_MM = 0.4
+LEAST_FILM_MM = 0.1  # that the scan can tell from nothing
 FIN_CELLS = 2
+CHANCE_CELLS = 5
 
 
 def as_built_heights(
@@ -54,24 +58,26 @@ def as_built_heights(
     spacing_mm
         Mean distance between neighbouring points.
     unseen_margin_mm
-        What nobody saw is solid up to the printed height and this much more.
+        What nobody saw is solid up to the printed height, or without rays up to the template, and
+        this much more.
     """
     points = build_from_template.apply(scan.points_mm)
     corners = _corners(template.bounds_mm)
     box = build_from_template.apply(corners)
     low, high = box.min(axis=0) - AROUND_MM, box.max(axis=0) + AROUND_MM
     cell_mm = max(cell_mm, 1.2 * spacing_mm)
-    shape = tuple(np.ceil((high[:2] - low[:2]) / cell_mm).astype(int)[::-1])
+    nx, ny = (math.ceil(v) for v in (high[:2] - low[:2]) / cell_mm)
+    shape = (ny, nx)
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
-    solid_z = top_z + unseen_margin_mm
-    z, seen = _tops(points, low[:2], cell_mm, (int(shape[0]), int(shape[1])))
+    solid_z = np.full(shape, top_z + unseen_margin_mm)
+    z, seen = _tops(points, low[:2], cell_mm, shape)
+    known = seen
     if scan.sensors_mm is None:
-        # without rays nothing tells empty from unseen: beside the part the bed is taken as bare
-        bare = ~seen & ~_footprint(template, build_from_template, low, cell_mm, z.shape)
+        designed_z = _designed(template, build_from_template, low[:2], cell_mm, shape)
+        bare = ~seen & (designed_z <= 0)
         z = np.where(bare, 0.0, z)
         known = seen | bare
-    else:
-        known = seen
+        solid_z = np.minimum(solid_z, designed_z + unseen_margin_mm)
     z, closed = _close_gaps(z, known, cell_mm)
     seen = seen | (closed & ~known)
     known = closed
@@ -110,16 +116,21 @@ def standing_heights(
     )
     columns = [_columns(solid, fine) for solid in (expected, missing)]
     z_mm = raster_kernels.column_rest(*columns[0], *columns[1], FILM_MM, 0.0).reshape(ny, nx)
+    x, y = fine.centres_mm()
+    cells = seen.cells_of(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    cells = np.clip(cells, 0, np.array(seen.shape) - 1)
+    at = (cells[:, 0].reshape(fine.shape), cells[:, 1].reshape(fine.shape))
+    # a film that the scan sees, around there too, is what is left of the part
+    films = raster_kernels.column_rest(*columns[0], *columns[1], LEAST_FILM_MM, 0.0).reshape(ny, nx)
+    # a few cells without a point on it among others are chance
+    sampled = ndimage.grey_closing(np.where(seen.seen, seen.z_mm, 0.0), CHANCE_CELLS)
+    z_mm = np.where(ndimage.minimum_filter(sampled, 3)[at] > films - TRUST_MM, films, z_mm)
     untouched = (columns[1][0][1:] == columns[1][0][:-1]).reshape(ny, nx)
     # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
     beside = ~ndimage.binary_erosion(untouched, np.ones((3, 3)), border_value=1)
     z_mm = np.where(beside, ndimage.grey_opening(z_mm, FIN_CELLS), z_mm)
     if not excess.is_empty():
         z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
-    x, y = fine.centres_mm()
-    cells = seen.cells_of(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    cells = np.clip(cells, 0, np.array(seen.shape) - 1)
-    at = (cells[:, 0].reshape(fine.shape), cells[:, 1].reshape(fine.shape))
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
     # beside walls, where the solids are the sharper of the two unless something else stands there
     around = 2 * math.ceil(BY_WALL_CELLS * seen.cell_mm / cell_mm) + 1
@@ -130,11 +141,11 @@ def standing_heights(
     # what is much lower was seen on another side: of this one no point fell into the cell
     beneath = seen.z_mm[at] < z_mm - TRUST_MM
     known = seen.seen[at]
-    # where something is missing it was seen to be; below it there is what was expected
-    sharp = np.where(known, by_wall | agrees | beneath, ~untouched)
-    return HeightField(
-        fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | ~untouched
-    )
+    # where something is missing it was seen to be; below it there is what was expected, and at
+    # its rim, where columns and cells do not end alike
+    rim = ndimage.binary_dilation(~untouched, np.ones((around, around)))
+    sharp = np.where(known, by_wall | agrees | beneath, rim)
+    return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
 
 
 def _columns(
@@ -196,23 +207,22 @@ def _close_gaps(
     return np.where(small, np.asarray(by_group)[groups], z_mm), seen | small
 
 
-def _footprint(
+def _designed(
     template: Template,
     build_from_template: Transform,
-    low_mm: Float[np.ndarray, " 3"],
+    low_mm: Float[np.ndarray, " 2"],
     cell_mm: float,
-    shape: tuple[int, ...],
-) -> Bool[np.ndarray, "ny nx"]:
-    """Cells that the template covers: its surface points, and what lies between them."""
-    apart_mm = max(0.6, cell_mm)
-    surface, _ = template.surface_points(apart_mm)
-    xy = build_from_template.apply(surface)[:, :2]
-    index = np.floor((xy - low_mm[:2]) / cell_mm).astype(np.int64)
-    ok = ((index >= 0) & (index < (shape[1], shape[0]))).all(axis=1)
-    covered = np.zeros(shape, bool)
-    covered[index[ok, 1], index[ok, 0]] = True
-    reach = max(1, round(0.9 / cell_mm))
-    # closed, not grown: a rim of unseen cells around the part would bar the nozzle from its edges
-    padded = np.pad(covered, reach + 1)
-    closed = ndimage.binary_closing(padded, iterations=reach)
-    return np.asarray(closed[reach + 1 : -reach - 1, reach + 1 : -reach - 1])
+    shape: tuple[int, int],
+) -> Float[np.ndarray, "ny nx"]:
+    """Top of the template by cell; 0 where it has nothing."""
+    solid: Any = template.solid()
+    high_mm = low_mm + cell_mm * np.array(shape[::-1])
+    return (
+        HeightField.from_manifold(
+            solid.transform(build_from_template.matrix[:3]),
+            cell_mm,
+            box_mm=(float(low_mm[0]), float(low_mm[1]), float(high_mm[0]), float(high_mm[1])),
+        )
+        .z_mm[: shape[0], : shape[1]]
+        .astype(np.float64)
+    )

@@ -69,6 +69,8 @@ NEAR_MM = 1.0  # a travel as short as this needs no lift
 CLEAR_MM = 0.5  # of the tip over everything on a travel
 STANDALONE_LIFT_MM = 5.0
 NOT_LISTED_MM3 = 0.02
+# A flat top: as much area, as wide, within so little height.
+FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
 COVERED = "covered by what stands above it"
 TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
 Box = tuple[float, float, float, float, float, float]
@@ -301,27 +303,62 @@ def _plan_passes(
     # the last pass ends with the deficit, not above it
     tops[-1] = min(tops[-1], high_mm)
     most_mm = min(model.most_mm, setup.process.max_gap_layers * grid.layer_height_mm)
+    flats = _flats(model, tops)
+    ends = np.full(model.shape, np.inf)  # where a flat top lies, off the job's layers
+    for flat_mm in flats:
+        ends[np.abs(model.top_mm - flat_mm) <= 1.5 * FLAT_MM] = flat_mm
+    heights = np.sort(np.concatenate([tops, flats]))
     passes: list[_Pass] = []
-    for k, z_mm in enumerate(tops):
-        following = float(tops[k + 1]) if k + 1 < len(tops) else np.inf
-        one = _plan_pass(model, float(z_mm), following, most_mm, k, grid.layer_height_mm, setup)
+    for k, z_mm in enumerate(heights):
+        on_grid = not (np.abs(flats - z_mm) < ROUNDING_MM).any()
+        later = tops[tops > z_mm + ROUNDING_MM]
+        following = np.minimum(ends, float(later[0]) if len(later) else np.inf)
+        here = ends > z_mm + ROUNDING_MM if on_grid else ends == z_mm
+        one = _plan_pass(
+            model, float(z_mm), here, following, most_mm, k, grid.layer_height_mm, setup
+        )
         if one is not None:
             passes.append(one)
-        progress("slice patch", float(k + 1), float(len(tops)))
+        progress("slice patch", float(k + 1), float(len(heights)))
     return passes
+
+
+def _flats(model: _Model, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """Heights at which flat areas of the deficit end between the job's layers.
+
+    They get a pass of their own there: the nozzle's flat makes the surface, at its own height.
+    """
+    tops = model.top_mm
+    steps = np.round(tops[np.isfinite(tops)] / FLAT_MM).astype(np.int64)
+    if not len(steps):
+        return np.zeros(0)
+    area_mm2 = np.bincount(steps - steps.min()) * model.cell_mm**2
+    often = np.flatnonzero(ndimage.convolve1d(area_mm2, np.ones(3), mode="constant") >= FLAT_MM2)
+    least = np.ones((round(FLAT_WIDE_MM / model.cell_mm),) * 2)
+    found: list[float] = []
+    for step in often[np.argsort(-area_mm2[often])] + steps.min():
+        z_mm = float(step * FLAT_MM)
+        if np.abs(np.array([*tops_mm, *found]) - z_mm).min() < LEAST_THICK_MM:
+            continue
+        # no rim or slope that passes through this height
+        flat = ndimage.binary_opening(np.abs(tops - z_mm) <= 1.5 * FLAT_MM, least)
+        if flat.sum() * model.cell_mm**2 >= FLAT_MM2:
+            found.append(float(np.median(tops[flat])))
+    return np.array(found)
 
 
 def _plan_pass(
     model: _Model,
     z_mm: float,
-    following_mm: float,
+    here: Bool[np.ndarray, "ny nx"],
+    following_mm: Float[np.ndarray, "ny nx"],
     most_mm: float,
     index: int,
     layer_mm: float,
     setup: PrintSetup,
 ) -> _Pass | None:
-    """Fill what is due at this height."""
-    thick = _due(model, z_mm, following_mm, most_mm, layer_mm)
+    """Fill what is due at this height, among the columns that are filled at it."""
+    thick = _due(model, z_mm, here, following_mm, most_mm, layer_mm)
     if not thick.any():
         return None
     reach = model.reach.at(z_mm)
@@ -353,7 +390,12 @@ def _plan_pass(
 
 
 def _due(
-    model: _Model, z_mm: float, following_mm: float, most_mm: float, layer_mm: float
+    model: _Model,
+    z_mm: float,
+    here: Bool[np.ndarray, "ny nx"],
+    following_mm: Float[np.ndarray, "ny nx"],
+    most_mm: float,
+    layer_mm: float,
 ) -> Float[np.ndarray, "ny nx"]:
     """Thickness to lay by column now: the gap, where waiting would make it too deep for a bead.
 
@@ -368,19 +410,34 @@ def _due(
     thick = np.clip(np.minimum(gap, wanted + AGREE_MM), 0.0, None)
     last = model.top_mm <= z_mm + 1e-6
     due = (following_mm - model.surface_mm > most_mm) | last
-    active = due & (wanted > LEAST_THICK_MM / 2) & (thick >= LEAST_THICK_MM)
+    active = here & due & (wanted > LEAST_THICK_MM / 2) & (thick >= LEAST_THICK_MM)
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
     active &= model.top_mm > z_mm - 0.5 * layer_mm
     deep = active & (gap > DEEP_RATIO * most_mm)
     if deep.any():
-        held = ndimage.binary_dilation(
-            ((active & ~deep) | (gap < most_mm)), iterations=round(HOLD_MM / model.cell_mm)
-        )
+        held = _beside((active & ~deep) | (gap < most_mm), deep, HOLD_MM, model.cell_mm)
         lidded = np.minimum(thick, layer_mm)
         model.sunk_mm = np.where(deep & held, model.sunk_mm + thick - lidded, model.sunk_mm)
         thick = np.where(deep & held, lidded, thick)
         active &= ~deep | held
     return np.where(active, thick, 0.0)
+
+
+def _beside(
+    what: Bool[np.ndarray, "ny nx"],
+    asked: Bool[np.ndarray, "ny nx"],
+    within_mm: float,
+    cell_mm: float,
+) -> Bool[np.ndarray, "ny nx"]:
+    """Which columns, among those asked about, lie within a distance of others."""
+    margin = int(np.ceil(within_mm / cell_mm)) + 1
+    rows, columns = (
+        slice(max(int(at.min()) - margin, 0), int(at.max()) + margin + 1) for at in asked.nonzero()
+    )
+    beside = np.zeros_like(what)
+    apart = ndimage.distance_transform_edt(~what[rows, columns])
+    beside[rows, columns] = apart * cell_mm <= within_mm + 1e-9
+    return beside
 
 
 def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: _Model) -> list[Bead]:

@@ -223,3 +223,34 @@ def test_nothing_small_is_dropped_in_silence(
     assert tops[0] - floor_mm <= 0.32
     assert tops[-1] == pytest.approx(high[2])
     assert np.diff(tops).max(initial=0.0) <= 0.32 + 1e-9
+
+
+def test_a_flat_top_between_two_layers_is_made_at_its_own_height() -> None:
+    """A nozzle that passes over it half a layer higher leaves beads, not a surface."""
+    block = m3.Manifold.cube((30.0, 30.0, 3.7)).translate((60.0, 60.0, 0.0))
+    missing = m3.Manifold.cube((12.0, 9.0, 0.7)).translate((74.0, 74.0, 3.0))
+    higher = m3.Manifold.cube((4.0, 4.0, 1.3)).translate((63.0, 63.0, 3.7))
+    plan, _ = plan_of(missing + higher, block)
+    heights = [
+        round(float(move.points_mm[0, 2]), 3)
+        for move in plan.toolpath
+        if isinstance(move, Extrude) and move.points_mm[0, 0] > 70.0
+    ]
+    assert max(heights) == pytest.approx(3.7, abs=0.011)
+    assert plan.beads_mm3 == pytest.approx((missing + higher).volume(), rel=0.03)
+
+
+def test_overhangs_grow_as_far_along_a_diagonal_as_along_the_grid() -> None:
+    """By one and the same distance a layer: a diamond of cells held diagonals back."""
+    shares = []
+    for turn_deg in (0.0, 45.0):
+        post = m3.Manifold.cube((30.0, 4.0, 2.0))
+        wing = m3.Manifold.cube((24.0, 5.0, 2.0)).translate((3.0, 2.0, 2.0))
+        post, wing = (
+            solid.rotate((0.0, 0.0, turn_deg)).translate((80.0, 60.0, 0.0))
+            for solid in (post, wing)
+        )
+        plan, _ = plan_of(wing, post)
+        shares.append(plan.reachable_mm3 / wing.volume())
+    assert shares[0] > 0.75
+    assert shares[1] > shares[0] - 0.03

@@ -1,0 +1,68 @@
+"""The as-built field of a bare cloud, beside pieces that were taken away."""
+
+from __future__ import annotations
+
+import manifold3d as m3
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.deficit import compute_deficit
+from amrepair.frames import Transform
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf
+from gcode.surfaces import HeightField
+
+HERE = Transform.from_rotation_translation(
+    "build", "template", rotation=np.eye(3), translation_mm=np.zeros(3)
+)
+
+
+def mesh_of(solid: m3.Manifold) -> trimesh.Trimesh:
+    mesh = solid.to_mesh64()
+    return trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
+
+
+def box(*corners: float) -> m3.Manifold:
+    low, high = np.array(corners[:3]), np.array(corners[3:])
+    return m3.Manifold.cube(tuple(high - low)).translate(tuple(low))
+
+
+def field_of(part: m3.Manifold, gone: m3.Manifold) -> HeightField:
+    """Of a part that lacks a piece, seen from every side but from below, without rays."""
+    standing = mesh_of(part - gone)
+    points, faces = trimesh.sample.sample_surface(standing, int(standing.area / 0.04), seed=1)
+    noise = np.random.default_rng(0).normal(scale=0.03, size=points.shape)
+    seen = np.asarray(standing.face_normals)[faces][:, 2] > -0.5
+    scan = Scan((np.asarray(points) + noise)[seen], 0.03, "template")
+    template = MeshSdf.from_mesh(mesh_of(part))
+    return compute_deficit(scan, template, build_from_template=HERE).as_built
+
+
+def heights(field: HeightField, x: tuple[float, float], y: tuple[float, float]) -> np.ndarray:
+    grid = np.stack(np.meshgrid(np.arange(*x, 0.1), np.arange(*y, 0.1)), axis=-1)
+    return field.sample(grid.reshape(-1, 2))
+
+
+def test_a_slot_that_was_designed_stays_open() -> None:
+    """It was taken as unseen, so as high as the part and more: nothing beside it got filled."""
+    part = box(0, 0, 0, 30, 20, 6) - box(10, 9.5, -1, 40, 10.5, 7)
+    field = field_of(part, box(20, 0, 4, 30, 20, 7))
+    assert heights(field, (20.5, 29.5), (9.75, 10.25)).max() < 4.2
+    assert heights(field, (12.0, 18.0), (9.75, 10.25)).max() < 6.2
+
+
+def test_the_rim_of_a_lost_bridge_is_no_wall() -> None:
+    """Unseen columns at its rim stood as designed, a millimetre higher, one cell wide."""
+    part = box(0, 0, 0, 40, 10, 6) - box(10, -1, -1, 30, 11, 4)
+    field = field_of(part, box(18, -1, 3, 35, 11, 7))
+    assert heights(field, (18.5, 34.5), (-0.5, 10.5)).max() < 3.2
+
+
+def test_a_thin_roof_that_is_left_is_a_floor() -> None:
+    """Less than two layers over a hollow was taken for the rounding of a rim."""
+    part = box(0, 0, 0, 30, 20, 6) - box(8, -1, 1, 22, 21, 3.7)
+    field = field_of(part, box(4, 4, 4, 26, 16, 7))
+    inside = heights(field, (9.0, 21.0), (6.0, 14.0))
+    assert np.quantile(inside, 0.02) == pytest.approx(4.0, abs=0.15)
+    assert inside.max() == pytest.approx(4.0, abs=0.15)
