@@ -27,13 +27,13 @@ from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
 from amrepair.simulate.world import World
 from amrepair.template import PlannedSdf, load_mesh
-from amrepair.template.mesh_file import as_manifold
 from gcode.firmware.motion import MotionBatch
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, read_job
 from gcode.slicing.job import plan_part
 from gcode.slicing.layers import LayerGrid
+from gcode.solids import as_manifold
 from gcode.writer import write
 
 OURS = Path(__file__).parents[1] / "examples" / "parts"

@@ -1,19 +1,22 @@
 """Solids from mesh files, for slicing: read, checked, never guessed.
 
-STL, OBJ, 3MF and PLY, mm, in the build frame. What manifold3d does not take as a closed solid is
-refused in one sentence; nothing is scaled, turned or filled.
+STL, OBJ, 3MF and PLY, mm, in the build frame. Vertices are joined as far as single precision parts
+them, and bodies that overlap are united, which is said; what is still no closed solid is refused
+in one sentence. Nothing is scaled, turned or filled.
 """
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
-import manifold3d
 import numpy as np
-import trimesh
+from jaxtyping import Float, Int
 
 from gcode.errors import InputError
+
+_log = logging.getLogger(__name__)
 
 SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
 WELD_RATIO = 1e-6  # of the extent: STL holds single precision
@@ -38,6 +41,8 @@ def read_solid(path: Path) -> Any:
     >>> round(gcode.read_solid(Path("placed.stl")).volume())  # mm³
     4560
     """
+    import trimesh
+
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
         raise InputError(f"{path}: {what}.")
@@ -57,21 +62,80 @@ def read_solid(path: Path) -> Any:
     extent = float(np.ptp(vertices, axis=0).max())
     if extent <= 0:
         raise InputError(f"{path}: the mesh has no extent; export it again.")
-    digits = int(np.floor(-np.log10(extent * WELD_RATIO)))
-    mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=digits)
-    mesh.update_faces(mesh.nondegenerate_faces())
-    solid = manifold3d.Manifold(
-        manifold3d.Mesh64(
-            np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.uint64)
-        )
-    )
-    if solid.status() != manifold3d.Error.NoError or solid.is_empty():
+    solid = first_closed(vertices, np.asarray(mesh.faces))
+    if solid is None:
         raise InputError(
-            f"{path}: the mesh is no closed surface ({solid.status().name}); repair it first."
+            f"{path}: the mesh is no closed surface (NotManifold), nor when vertices within "
+            f"{WELD_RATIO * extent:.2g} mm are joined; repair it first."
         )
+    solid, overlap_mm3 = unite_overlaps(solid)
+    if overlap_mm3 > 0:
+        _log.warning("%s: bodies overlapped by %.3g mm³ and were united", path.name, overlap_mm3)
     if solid.volume() <= 1e-9 * extent**3:
         raise InputError(
             f"{path}: the mesh encloses {solid.volume():.3g} mm³, which is no solid; is it inside "
             "out?"
         )
     return solid
+
+
+def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
+    """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
+    import manifold3d
+
+    # copies: the binding takes no read-only arrays, and trimesh's are
+    return manifold3d.Manifold(
+        manifold3d.Mesh64(
+            np.array(vertices_mm, dtype=np.float64, order="C"),
+            np.array(faces, dtype=np.uint64, order="C"),
+        )
+    )
+
+
+def is_valid(solid: Any) -> bool:
+    """Whether manifold3d takes it as a closed, oriented, non-empty solid."""
+    import manifold3d
+
+    return bool(solid.status() == manifold3d.Error.NoError and not solid.is_empty())
+
+
+def first_closed(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
+    """The first closed solid among the file's own triangles, welded ever more; None if none is.
+
+    As they are: a file that shares vertices means it, and bodies that touch stay apart. Then equal
+    vertices are one, as STL needs; then those that single precision may have parted.
+    """
+    import trimesh
+
+    welded = trimesh.Trimesh(vertices_mm, faces, process=False)
+    extent = float(np.ptp(vertices_mm, axis=0).max())
+    if len(vertices_mm) < 3 * len(faces):
+        solid = as_manifold(welded.vertices, welded.faces)
+        if is_valid(solid):
+            return solid
+    for digits in (None, int(np.floor(-np.log10(extent * WELD_RATIO)))):
+        welded.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=digits)
+        solid = as_manifold(welded.vertices, welded.faces)
+        if is_valid(solid):
+            return solid
+    # slivers without area may hold a surface together, so they go last
+    welded.update_faces(welded.nondegenerate_faces())
+    solid = as_manifold(welded.vertices, welded.faces)
+    if is_valid(solid):
+        return solid
+    return None
+
+
+def unite_overlaps(solid: Any) -> tuple[Any, float]:
+    """Unite bodies that overlap, whose common part would count twice; with its volume, mm³."""
+    import manifold3d
+
+    parts = solid.decompose()
+    bodies = [part for part in parts if part.volume() > 0]
+    if len(bodies) < 2 or len(bodies) < len(parts):
+        return solid, 0.0  # which cavity belongs to which body is not ours to guess
+    united = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
+    overlap_mm3 = float(sum(part.volume() for part in bodies) - united.volume())
+    if not is_valid(united) or overlap_mm3 <= 1e-6 * united.volume():
+        return solid, 0.0
+    return united, overlap_mm3

@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from amrepair.bench.synth_views import Rays, Shape, Surface, sample_shape, sensors_around
 from amrepair.errors import InputError
-from amrepair.template.mesh_file import as_manifold, is_valid, manifold_arrays
+from amrepair.template.mesh_file import manifold_arrays
+from gcode.solids import as_manifold, is_valid
 
 # The face of a tool: a change without measure, above every limit of visibility.
 NEW_SURFACE_MM = 1e9

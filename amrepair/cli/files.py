@@ -11,7 +11,7 @@ from gcode.cli.console import write_whole
 
 def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     """Meshes and scans among a template's inputs; a PLY without faces is a scan."""
-    from amrepair.template.mesh_file import SUFFIXES
+    from gcode.solids import SUFFIXES
 
     meshes: list[Path] = []
     scans: list[Path] = []
@@ -39,7 +39,7 @@ def write_mesh(mesh: Any, path: Path) -> None:
     InputError
         If the ending is none of a mesh.
     """
-    from amrepair.template.mesh_file import SUFFIXES
+    from gcode.solids import SUFFIXES
 
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a mesh is written as one of {', '.join(SUFFIXES)}")

@@ -95,9 +95,9 @@ def show_file(page: LiveView, path: Path) -> None:
     from amrepair.report.live import PART
     from amrepair.scans import read_scan
     from amrepair.template import load_template
-    from amrepair.template.mesh_file import SUFFIXES as MESH_SUFFIXES
     from amrepair.template.mesh_file import load_mesh
     from gcode.reader import read_job
+    from gcode.solids import SUFFIXES as MESH_SUFFIXES
 
     _refuse(path)
     suffix = path.suffix.lower()
@@ -115,7 +115,7 @@ def show_file(page: LiveView, path: Path) -> None:
 
 def _refuse(path: Path) -> None:
     from amrepair.scans.files import SUFFIXES as SCAN_SUFFIXES
-    from amrepair.template.mesh_file import SUFFIXES as MESH_SUFFIXES
+    from gcode.solids import SUFFIXES as MESH_SUFFIXES
 
     known = JOB_SUFFIXES | {".safetensors"} | set(MESH_SUFFIXES) | SCAN_SUFFIXES
     if not path.is_file():

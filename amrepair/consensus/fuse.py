@@ -18,8 +18,9 @@ from amrepair.consensus import consensus_kernels as kernels
 from amrepair.consensus.cloud import Cells
 from amrepair.device import open3d
 from amrepair.errors import TemplateError
-from amrepair.template.mesh_file import as_manifold, is_valid, manifold_arrays
+from amrepair.template.mesh_file import manifold_arrays
 from amrepair.template.mesh_sdf import MeshSdf
+from gcode.solids import as_manifold, is_valid
 
 if TYPE_CHECKING:
     import trimesh

@@ -23,9 +23,9 @@ from amrepair.template.file import (
     stored_metadata,
     write_template,
 )
-from amrepair.template.mesh_file import as_manifold
 from amrepair.template.port import Template
 from amrepair.template.surface import mesh_points
+from gcode.solids import as_manifold
 
 if TYPE_CHECKING:
     import trimesh

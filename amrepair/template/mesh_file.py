@@ -17,15 +17,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
+from gcode.solids import SUFFIXES, WELD_RATIO, as_manifold, first_closed, is_valid, unite_overlaps
 
 if TYPE_CHECKING:
     import trimesh
 
 _log = logging.getLogger(__name__)
 
-SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
-# Welding tolerance relative to the largest extent: STL stores float32, good to 6e-8 of a value.
-WELD_RATIO = 1e-6
 # Cracks narrower than this share of the extent are closed: 0.01 mm on a part of 100 mm.
 SEW_RATIO = 1e-4
 MAX_LID_EDGES = 32  # a larger hole has a shape that we do not know
@@ -134,30 +132,11 @@ def edge_census(faces: Int[np.ndarray, "f 3"]) -> EdgeCensus:
     )
 
 
-def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
-    """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
-    import manifold3d as m3
-
-    # copies: the binding takes no read-only arrays, and trimesh's are
-    mesh = m3.Mesh64(
-        np.array(vertices_mm, dtype=np.float64, order="C"),
-        np.array(faces, dtype=np.uint64, order="C"),
-    )
-    return m3.Manifold(mesh)
-
-
 def manifold_arrays(solid: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """(v, 3) float64 vertices and (f, 3) int64 faces of a `manifold3d.Manifold`."""
     mesh = solid.to_mesh64()
     vertices = np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3]
     return np.ascontiguousarray(vertices), np.asarray(mesh.tri_verts).astype(np.int64)
-
-
-def is_valid(solid: Any) -> bool:
-    """Whether manifold3d takes it as a closed, oriented, non-empty solid."""
-    import manifold3d as m3
-
-    return bool(solid.status() == m3.Error.NoError and not solid.is_empty())
 
 
 def close_mesh(mesh: trimesh.Trimesh, *, source: str) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
@@ -180,11 +159,13 @@ def close_mesh(mesh: trimesh.Trimesh, *, source: str) -> tuple[trimesh.Trimesh, 
     working.update_faces(working.nondegenerate_faces())
     if len(working.faces) == 0:
         raise TemplateError(f"the mesh {source} has only triangles without area; export it again")
-    solid = as_manifold(working.vertices, working.faces)
-    if not is_valid(solid):
+    solid = first_closed(vertices, np.asarray(mesh.faces))
+    if solid is None:
         solid = _mend(working, source, notes)
     solid = _orient(solid, notes)
-    solid = _unite_overlaps(solid, notes)
+    solid, overlap_mm3 = unite_overlaps(solid)
+    if overlap_mm3 > 0:
+        notes.append(f"bodies overlapped by {overlap_mm3:.3g} mm³ and were united")
     _refuse_flat(solid, extent_mm, source)
     closed_vertices, closed_faces = manifold_arrays(solid)
     return trimesh.Trimesh(closed_vertices, closed_faces, process=False), tuple(notes)
@@ -292,25 +273,6 @@ def _orient(solid: Any, notes: list[str]) -> Any:
     vertices, faces = manifold_arrays(solid)
     notes.append("turned outside out: its triangles faced inwards")
     return as_manifold(vertices, faces[:, ::-1])
-
-
-def _unite_overlaps(solid: Any, notes: list[str]) -> Any:
-    """Unite bodies that overlap: a ray count would call their common part hollow."""
-    import manifold3d as m3
-
-    parts = solid.decompose()
-    bodies = [part for part in parts if part.volume() > 0]
-    if len(bodies) < 2:
-        return solid
-    united = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
-    lost = sum(part.volume() for part in bodies) - united.volume()
-    if not is_valid(united) or lost <= 1e-6 * united.volume():
-        return solid
-    cavities = [part for part in parts if part.volume() < 0]
-    if cavities:
-        return solid  # which cavity belongs to which body is not ours to guess
-    notes.append(f"{len(bodies)} bodies overlapped by {lost:.3g} mm³ and were united")
-    return united
 
 
 def require_mesh(mesh: Any, *, source: str) -> trimesh.Trimesh:

@@ -14,9 +14,10 @@ from jaxtyping import Float
 
 from amrepair.device import open3d
 from amrepair.template.cut import CutTemplate
-from amrepair.template.mesh_file import as_manifold, require_mesh
+from amrepair.template.mesh_file import require_mesh
 from amrepair.template.port import Template
 from amrepair.template.surface import mesh_points
+from gcode.solids import as_manifold
 
 if TYPE_CHECKING:
     import trimesh

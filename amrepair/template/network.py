@@ -18,9 +18,9 @@ from jaxtyping import Float
 from amrepair.errors import TemplateError
 from amrepair.template.cut import CutTemplate
 from amrepair.template.file import require_kind, stored_mesh, stored_metadata, write_template
-from amrepair.template.mesh_file import as_manifold
 from amrepair.template.port import Template
 from amrepair.template.surface import mesh_points
+from gcode.solids import as_manifold
 
 if TYPE_CHECKING:
     import torch

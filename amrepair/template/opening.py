@@ -6,9 +6,9 @@ from pathlib import Path
 
 from amrepair.errors import InputError
 from amrepair.template.fitting import load_or_fit, load_template
-from amrepair.template.mesh_file import SUFFIXES
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
+from gcode.solids import SUFFIXES
 
 TEMPLATE_SUFFIX = ".safetensors"
 

@@ -153,7 +153,7 @@ class PlannedSdf:
     def solid(self) -> Any:
         """The level set f = 0 as a `manifold3d.Manifold`."""
         from amrepair.template.extract import extract_mesh
-        from amrepair.template.mesh_file import as_manifold
+        from gcode.solids import as_manifold
 
         mesh = extract_mesh(self, self.voxel_mm)
         return as_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))

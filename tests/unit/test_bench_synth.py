@@ -15,7 +15,7 @@ from amrepair.bench.synth import SynthOptions, synthesize
 from amrepair.bench.synth_defects import Defect, Part, damage, make_part
 from amrepair.bench.synth_views import Rays, look, sample_shape, sensor_towards, sensors_around
 from amrepair.errors import InputError
-from amrepair.template.mesh_file import as_manifold
+from gcode.solids import as_manifold
 
 SIZE_MM = np.array([60.0, 40.0, 20.0])
 SMALL = SynthOptions(train=2, normal=2, per_defect=1, points=3000)
