@@ -89,7 +89,7 @@ class Deficit:
 
     @property
     def as_built(self) -> HeightField:
-        """What stands on the bed; unseen cells are solid up to the printed height and a margin."""
+        """What stands on the bed; unseen cells are solid as `as_built_heights` says."""
         return self.stands()
 
     @property
