@@ -52,7 +52,7 @@ PART = Path(__file__).parents[1] / "examples" / "parts" / "bracket.stl"
 PIT_MM, PIT_LAYERS = 8.0, 3
 FIRST_LAYER = 30
 # A part of the job takes a printer at least so long: what the loop prepares meanwhile is free.
-LAYERS_S, BRIEF_LINES = 2.0, 200
+LAYERS_S, BRIEF_LINES = 1.0, 200
 
 
 class Clocked(FilePrinter):
