@@ -37,7 +37,9 @@ from gcode.solids import as_manifold
 from gcode.writer import write
 
 OURS = Path(__file__).parents[1] / "examples" / "parts"
-FILES = ("cura_slicer", "orca_slicer", "plant-sign", "screw", "prusaslicer-cube")
+# Not the PrusaSlicer cube of the same folder: its layer at z = 0.45 was cut out of the file, and
+# looks that want those 45 mm³ back are right.
+FILES = ("cura_slicer", "orca_slicer", "plant-sign", "screw")
 HERE = Transform.identity("build", "template")
 FILAMENT_MM2 = float(np.pi / 4 * 1.75**2)
 

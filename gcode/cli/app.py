@@ -346,6 +346,13 @@ def emulate(
     faults: Annotated[Path | None, typer.Option(help="Fault script.")] = None,
     link: Annotated[Path | None, typer.Option(help="Name for the pseudo-terminal.")] = None,
     accelerated: Annotated[bool, typer.Option(help="Let the printer's clock jump.")] = False,
+    motion: Annotated[
+        Path | None,
+        typer.Option(
+            help="File that executed moves are appended to as they happen, nine float64 each: "
+            "start and end, mm, filament, mm, speed, mm/s, the printer's clock, s."
+        ),
+    ] = None,
 ) -> None:
     """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
     from gcode.dialects import DIALECTS
@@ -364,6 +371,7 @@ def emulate(
             faults=script,
             link=link or Path(folder) / "ttyEMU0",
             accelerated=accelerated,
+            motion=motion,
             on_port=typer.echo,
         )
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+
+ROW_NUMBERS = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +33,12 @@ class MotionBatch:
     speed_mm_s: Float[np.ndarray, " n"]
     time_s: Float[np.ndarray, " n"]
 
+    @classmethod
+    def from_bytes(cls, data: bytes) -> MotionBatch:
+        """Rows of nine float64: start, end, filament, speed, time; what the emulator writes."""
+        rows = np.frombuffer(data, dtype=np.float64).reshape(-1, ROW_NUMBERS)
+        return cls(rows[:, 0:3], rows[:, 3:6], rows[:, 6], rows[:, 7], rows[:, 8])
+
     def __len__(self) -> int:
         return len(self.filament_mm)
 
@@ -46,3 +55,28 @@ class MotionBatch:
             np.concatenate([batch.speed_mm_s for batch in batches]),
             np.concatenate([batch.time_s for batch in batches]),
         )
+
+
+class MotionFile:
+    """Moves that another process's emulated printer executed (`gcode emulate --motion FILE`).
+
+    Parameters
+    ----------
+    path
+        Of the file; it may not be there yet.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._read_bytes = 0
+
+    def take(self) -> MotionBatch:
+        """Everything executed since the last call, in order; a row half written waits."""
+        if not self.path.is_file():
+            return MotionBatch.concatenate([])
+        with self.path.open("rb") as file:
+            file.seek(self._read_bytes)
+            data = file.read()
+        whole = len(data) - len(data) % (8 * ROW_NUMBERS)
+        self._read_bytes += whole
+        return MotionBatch.from_bytes(data[:whole])

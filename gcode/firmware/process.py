@@ -18,8 +18,6 @@ import threading
 from pathlib import Path
 from types import TracebackType
 
-import numpy as np
-
 import gcode
 from gcode.errors import LinkError
 from gcode.firmware.faults import FaultScript, parse_faults
@@ -179,18 +177,7 @@ class EmulatedPrinterProcess:
                 except OSError:
                     break
                 if kind == b"m":
-                    self._motion.append(_batch(payload))
+                    self._motion.append(MotionBatch.from_bytes(payload))
                 else:
                     self._answers.put(json.loads(payload))
         self._answers.put(None)
-
-
-def _batch(payload: bytes) -> MotionBatch:
-    rows = np.frombuffer(payload, dtype=np.float64).reshape(-1, 9)
-    return MotionBatch(
-        start_mm=rows[:, 0:3],
-        end_mm=rows[:, 3:6],
-        filament_mm=rows[:, 6],
-        speed_mm_s=rows[:, 7],
-        time_s=rows[:, 8],
-    )

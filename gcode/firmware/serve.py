@@ -7,6 +7,7 @@ serves until interrupted. Frames on the socket, both ways: kind (1 byte), length
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import math
@@ -19,7 +20,9 @@ import time
 import tty
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
+from gcode.errors import InputError
 from gcode.firmware.core import FirmwareCore
 from gcode.firmware.faults import FaultScript
 from gcode.profiles import PrinterProfile
@@ -40,6 +43,8 @@ class PtyServer:
         Path of the link to create, pointing to the pseudo-terminal.
     control
         Socket of the parent, or None.
+    motion
+        File that executed moves are appended to, before anything is answered; or None.
     clock
         The host's time, s.
     """
@@ -50,11 +55,13 @@ class PtyServer:
         link: Path,
         *,
         control: socket.socket | None = None,
+        motion: BinaryIO | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.core = core
         self.link = link
         self._control = control
+        self._motion = motion
         self._control_in = b""
         self._clock = clock
         self._start_s = clock()
@@ -136,11 +143,18 @@ class PtyServer:
             # Accelerated time never runs slower than the wall's.
             core.pass_time(machine.clock_s + now_s - self._idle_from_s)
         self._idle_from_s = now_s
+        if self._motion is not None and machine.planner.executed:
+            self._motion.write(machine.planner.executed.tobytes())
+            self._motion.flush()
+            del machine.planner.executed[:]
         data = core.take_output()
         if data:
             self._write(data)
-        if self._control is not None and len(machine.planner.executed) >= MOTION_FRAME_NUMBERS:
-            self._send_motion()
+        if len(machine.planner.executed) >= MOTION_FRAME_NUMBERS:
+            if self._control is not None:
+                self._send_motion()
+            else:
+                del machine.planner.executed[:]  # nobody asks for it
 
     def _write(self, data: bytes) -> None:
         """Write as much as the host reads; what a full, unread port cannot take is lost."""
@@ -224,6 +238,7 @@ def serve_forever(
     faults: FaultScript | None = None,
     link: Path,
     accelerated: bool = False,
+    motion: Path | None = None,
     on_port: Callable[[str], None] | None = None,
 ) -> None:
     """Serve an emulated printer until interrupted (the command line's `gcode emulate`).
@@ -232,14 +247,26 @@ def serve_forever(
     ----------
     link
         Where the port's path is made.
+    motion
+        File that executed moves are appended to (see `gcode.firmware.motion.MotionFile`).
     on_port
         Told the path once it can be opened.
+
+    Raises
+    ------
+    InputError
+        If that file cannot be opened.
     """
     core = FirmwareCore(profile, firmware, faults=faults, accelerated=accelerated)
-    server = PtyServer(core, link)
-    if on_port is not None:
-        on_port(str(link))
-    try:
-        server.serve()
-    except KeyboardInterrupt:
-        return
+    with contextlib.ExitStack() as stack:
+        file: BinaryIO | None = None
+        if motion is not None:
+            try:
+                file = stack.enter_context(motion.open("ab"))
+            except OSError as error:
+                raise InputError(f"{motion}: the motion cannot be written ({error}).") from error
+        server = PtyServer(core, link, motion=file)
+        if on_port is not None:
+            on_port(str(link))
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve()
