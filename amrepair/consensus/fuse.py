@@ -18,6 +18,7 @@ from amrepair.consensus import consensus_kernels as kernels
 from amrepair.consensus.cloud import Cells
 from amrepair.device import open3d
 from amrepair.errors import TemplateError
+from amrepair.template.extract import zero_level
 from amrepair.template.mesh_file import manifold_arrays
 from amrepair.template.mesh_sdf import MeshSdf
 from gcode.solids import as_manifold, is_valid
@@ -285,7 +286,6 @@ def _surface(
     """Marching cubes, without dust; a valid solid."""
     import manifold3d as m3
     import trimesh
-    from skimage.measure import marching_cubes
 
     # the rim of the grid is outside: what reaches it is closed there
     for axis in range(3):
@@ -295,10 +295,8 @@ def _surface(
             grid[tuple(rim)] = np.maximum(grid[tuple(rim)], edge)
     if not grid.min() < 0:
         raise TemplateError("the scans enclose nothing; scan all sides of the part")
-    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
-        grid, 0.0, spacing=(edge,) * 3
-    )
-    solid = as_manifold(np.asarray(vertices, dtype=np.float64) + low, np.asarray(faces))
+    vertices, faces = zero_level(grid, edge)
+    solid = as_manifold(vertices + low, faces)
     if not is_valid(solid):
         raise TemplateError("the fused surface is no valid solid; scan the part more evenly")
     if solid.volume() < 0:

@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from amrepair.errors import TemplateError
+from gcode.solids import as_manifold, is_valid
 
 if TYPE_CHECKING:
     from amrepair.template.port import Template
 
 # Fine cells along the edge of a coarse block: few empty blocks, few half-empty ones.
 BLOCK_CELLS = 8
+BLOCKS_AT_ONCE = 1_000  # what fits into a processor's cache
 # Learned fields are Lipschitz 1 only nearly; the band is wider by this factor.
 BAND_SAFETY = 1.25
 MAX_CELLS = 400_000_000
+LEAST_VOXELS = 1e-3  # far below what the field is good to
 
 
 def extract_mesh(template: Template, voxel_mm: float, *, level_mm: float = 0.0) -> trimesh.Trimesh:
@@ -37,23 +40,46 @@ def extract_mesh(template: Template, voxel_mm: float, *, level_mm: float = 0.0) 
     Raises
     ------
     TemplateError
-        If the voxel is not positive, the grid would be too large, or the level set is empty.
+        If the voxel is not positive, the grid would be too large, the level set is empty, or not
+        a closed solid.
 
     References
     ----------
     Lorensen and Cline, *Marching Cubes*, SIGGRAPH 1987 (scikit-image's `marching_cubes`).
     """
-    from skimage.measure import marching_cubes
-
     field, low_mm = band_field(template, voxel_mm, level_mm=level_mm)
     if not (field.min() < 0.0 < field.max()):
         raise TemplateError(
             f"the template has no surface at level {level_mm} mm; choose a level nearer to 0"
         )
+    vertices, faces = zero_level(field, voxel_mm)
+    vertices = vertices + low_mm
+    if not is_valid(as_manifold(vertices, faces)):
+        raise TemplateError(
+            f"the surface at level {level_mm} mm with a voxel of {voxel_mm} mm is no closed solid; "
+            "choose another voxel"
+        )
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def zero_level(
+    field: Float[np.ndarray, "nx ny nz"], voxel_mm: float
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Vertices about the first node, mm, and faces of f = 0, closed within the field.
+
+    Where a node lies on the surface the triangles around it shrink to nothing and are lost, and
+    the surface is open; so nodes nearer than `LEAST_VOXELS` are moved off it, in place.
+    """
+    from skimage.measure import marching_cubes
+
+    least = np.float32(LEAST_VOXELS * voxel_mm)
+    flat = field.reshape(-1)
+    on = np.flatnonzero(np.abs(flat) < least)
+    flat[on] = np.where(flat[on] < 0, -least, least)
     vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
         field, 0.0, spacing=(voxel_mm,) * 3
     )
-    return trimesh.Trimesh(vertices + low_mm, faces, process=False)
+    return np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
 
 
 def band_field(
@@ -75,12 +101,18 @@ def band_field(
     edge_mm = BLOCK_CELLS * voxel_mm
     block_index = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), -1).reshape(-1, 3)
     centre = template.distance(low_mm + (block_index + 0.5) * edge_mm - 0.5 * voxel_mm) - level_mm
-    near = np.abs(centre) <= BAND_SAFETY * 0.5 * np.sqrt(3.0) * edge_mm
-    field = np.repeat(np.sign(centre).astype(np.float32) * np.float32(edge_mm), BLOCK_CELLS**3)
-    field = field.reshape(-1, BLOCK_CELLS, BLOCK_CELLS, BLOCK_CELLS)
+    far = np.copysign(np.float32(edge_mm), centre).astype(np.float32).reshape(blocks)
+    field = np.empty(shape, dtype=np.float32)
+    # cells of block (i, j, k) are at [i, :, j, :, k, :]
+    cells = field.reshape([n for count in blocks for n in (int(count), BLOCK_CELLS)])
+    cells[:] = far[:, None, :, None, :, None]
+    near = block_index[np.abs(centre) <= BAND_SAFETY * 0.5 * np.sqrt(3.0) * edge_mm]
     inner = np.stack(np.meshgrid(*[np.arange(BLOCK_CELLS)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    cells = block_index[near][:, None, :] * BLOCK_CELLS + inner
-    values = template.distance(low_mm + cells.reshape(-1, 3) * voxel_mm) - level_mm
-    field[near] = values.astype(np.float32).reshape(-1, *[BLOCK_CELLS] * 3)
-    field = field.reshape(*blocks, *[BLOCK_CELLS] * 3).transpose(0, 3, 1, 4, 2, 5).reshape(shape)
-    return np.ascontiguousarray(field), low_mm
+    inner_mm = low_mm + inner * voxel_mm
+    for first in range(0, len(near), BLOCKS_AT_ONCE):
+        some = near[first : first + BLOCKS_AT_ONCE]
+        nodes_mm = (some * edge_mm)[:, None, :] + inner_mm
+        values = template.distance(nodes_mm.reshape(-1, 3)) - level_mm
+        i, j, k = some.T
+        cells[i, :, j, :, k, :] = values.reshape(-1, *[BLOCK_CELLS] * 3)
+    return field, low_mm

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     import trimesh
 
 KIND = "grid"
-# Central differences of the gradient, in coarse cells: wide enough for float32, within an edge.
-GRADIENT_CELLS = 0.1
 _ARRAYS = ("base", "cells", "blocks", "vertices_mm", "faces")
 
 
@@ -102,16 +100,20 @@ class Grid:
 
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) signed distance, mm."""
-        return np.asarray(
-            kernels.evaluate(
-                np.ascontiguousarray(points_mm, dtype=np.float64),
-                self.origin_mm,
-                self.cell_mm,
-                self.base,
-                self.block_of,
-                self.blocks,
-            )
-        )
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        return np.asarray(kernels.evaluate(points, *self._numbers))
+
+    def distance_and_gradient(
+        self, points_mm: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """(n,) signed distance, mm, and (n, 3) its gradient within the cell."""
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        distance, gradient = kernels.evaluate_with_gradient(points, *self._numbers)
+        return np.asarray(distance), np.asarray(gradient)
+
+    @property
+    def _numbers(self) -> tuple[Any, ...]:
+        return self.origin_mm, self.cell_mm, self.base, self.block_of, self.blocks
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,15 +173,8 @@ class LearnedSdf:
     def distance_and_gradient(
         self, points_mm: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-        """(n,) signed distance and (n, 3) its gradient, by central differences."""
-        step_mm = GRADIENT_CELLS * self.grid.cell_mm
-        gradient = np.empty((len(points_mm), 3))
-        for axis in range(3):
-            offset = np.zeros(3)
-            offset[axis] = step_mm
-            ahead, behind = self.distance(points_mm + offset), self.distance(points_mm - offset)
-            gradient[:, axis] = (ahead - behind) / (2.0 * step_mm)
-        return self.distance(points_mm), gradient
+        """(n,) signed distance and (n, 3) its gradient."""
+        return self.grid.distance_and_gradient(points_mm)
 
     def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) standard deviation between normal parts, 0 where none is known."""

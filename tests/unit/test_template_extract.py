@@ -9,6 +9,7 @@ import trimesh
 from amrepair.errors import TemplateError
 from amrepair.template.extract import extract_mesh
 from amrepair.template.mesh_sdf import MeshSdf
+from gcode.solids import as_manifold, is_valid
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +26,22 @@ def test_a_level_of_a_ball_is_a_ball(ball: MeshSdf, level_mm: float) -> None:
     assert mesh.volume == pytest.approx(truth_mm3, rel=0.005)
     radius_mm = np.linalg.norm(mesh.vertices, axis=1)
     assert np.abs(radius_mm - 10.0 - level_mm).max() < 0.03
+
+
+@pytest.mark.parametrize("voxel_mm", [0.4, 0.5])
+@pytest.mark.parametrize(
+    "shape",
+    [trimesh.creation.box((20.0, 16.0, 8.0)), trimesh.creation.cylinder(6.0, 12.0)],
+    ids=["box", "cylinder"],
+)
+def test_a_surface_on_the_grid_is_closed(shape: trimesh.Trimesh, voxel_mm: float) -> None:
+    exact = MeshSdf.from_mesh(shape)  # its faces lie on nodes of the grid
+    made = extract_mesh(exact, voxel_mm)
+    solid = as_manifold(np.asarray(made.vertices), np.asarray(made.faces))
+    assert is_valid(solid)
+    assert solid.genus() == 0
+    # edges are cut off by a chord of a voxel
+    assert solid.volume() == pytest.approx(float(shape.volume), rel=0.01)
 
 
 def test_a_layer_is_cut_flat(ball: MeshSdf) -> None:
