@@ -40,6 +40,8 @@ VISIBLE_SIGMAS = 2.0
 # A sample counts as anomalous only where the view shows this much of the defect.
 MIN_LABELLED_RATIO = 0.003
 MIN_LABELLED = 8
+# A view of a bent end alone does not show what it is bent against.
+MIN_NORMAL_RATIO = 0.1
 MAX_VIEWS = 40
 MAX_SINGLE_VIEWS = 25  # then the defect is shown in a full scan
 SIDE_POINTS = 4000
@@ -296,12 +298,14 @@ def _defective(
             index=index,
             single=single and attempt < MAX_SINGLE_VIEWS,
         )
-        need = max(MIN_LABELLED, MIN_LABELLED_RATIO * len(made.cloud.points))
-        if made.cloud.labels.sum() >= need:
+        labels = made.cloud.labels
+        need = max(MIN_LABELLED, MIN_LABELLED_RATIO * len(labels))
+        if labels.sum() >= need and 1.0 - labels.mean() >= MIN_NORMAL_RATIO:
             return made
     raise InputError(
-        f"no view of a {defect} on this part showed {MIN_LABELLED_RATIO:.1%} of its points in "
-        f"{MAX_VIEWS} tries; ask for more points or leave the part out"
+        f"no view of a {defect} on this part showed {MIN_LABELLED_RATIO:.1%} of its points and "
+        f"{MIN_NORMAL_RATIO:.0%} beside it in {MAX_VIEWS} tries; ask for more points or leave the "
+        "part out"
     )
 
 

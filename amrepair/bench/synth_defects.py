@@ -24,6 +24,7 @@ from gcode.solids import as_manifold, is_valid
 # The face of a tool: a change without measure, above every limit of visibility.
 NEW_SURFACE_MM = 1e9
 SEED_POINTS = 400
+BEND_POINTS = 4_000
 MAX_ATTEMPTS = 30
 # Less material than this part of the diagonal under a seed is too thin to dent or crack.
 MIN_THICKNESS_RATIO = 0.008
@@ -232,17 +233,19 @@ def _break(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
 
 
 def _bend(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
-    """One end is bent about an axis across the part's longest direction."""
+    """The smaller end is bent about an axis across the part's longest direction."""
     diagonal_mm = part.diagonal_mm
     fine = part.solid.refine_to_length(diagonal_mm / 60)
     vertices, faces = manifold_arrays(fine)
-    centred = vertices - vertices.mean(axis=0)
-    axes = np.linalg.svd(centred.T @ centred)[0]
+    # shares of the surface, not of vertices: those crowd where the mesh is finely divided
+    surface = sample_shape(part.shape, BEND_POINTS, rng).points_mm
+    middle = surface.mean(axis=0)
+    axes = np.linalg.svd((surface - middle).T @ (surface - middle))[0]
     along = axes[:, 0] * (1 if rng.random() < 0.5 else -1)
     turn = rng.uniform(0, 2 * np.pi)
     side = np.cos(turn) * axes[:, 1] + np.sin(turn) * axes[:, 2]
-    u, v = centred @ along, centred @ side
-    start = float(np.quantile(u, rng.uniform(0.55, 0.75)))
+    u, v = (vertices - middle) @ along, (vertices - middle) @ side
+    start = float(np.quantile((surface - middle) @ along, rng.uniform(0.55, 0.75)))
     angle_rad = np.deg2rad(rng.uniform(5.0, 10.0))
     zone_mm = 0.08 * diagonal_mm
     # an arc of length `zone`, then straight on: exact bending of the line v = 0
