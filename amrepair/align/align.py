@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.align.anywhere import pose_from_anywhere
+from amrepair.align.anywhere import (
+    DOUBTFUL,
+    Found,
+    explained_if_mirrored,
+    limits_mm,
+    pose_from_anywhere,
+)
 from amrepair.align.bed import bed_prior, level_on_bed
 from amrepair.align.checks import refuse_repeated
 from amrepair.align.pam import PAPER, PamOptions, align_paper
@@ -23,11 +29,14 @@ FINE_POINTS, MOST_LOOKED_AT = 15_000, 150_000
 LEAST_POINTS = 50
 # A guess from a calibration is good to this; what is farther is not the part that was meant.
 BOUND_MM, BOUND_DEG = 3.0, 3.0
-LEAST_INLIERS = 0.5
-NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
-INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
-INLIER_SIGMAS = 3.0
-SCALE_JUMP = 5.0  # sizes that differ by more are another unit
+# From a guess much of what is seen may be bed. From any pose less than this is another part: views
+# of other parts lay up to two thirds of themselves on one; then nearly every printed defect passes.
+LEAST_INLIERS, LEAST_FROM_ANYWHERE, LEAST_OF_KNOWN = 0.5, 0.7, 0.35
+MIRRORED_BETTER = 0.4  # of what is left unexplained, where the mirror image is meant
+# Sizes that differ by more are another unit, or too little of the part; large scans hold the bed.
+SMALLEST_RATIO, LARGEST_RATIO = 0.15, 20.0
+UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3, "mils": 0.0254}
+UNIT_SLACK = 1.8  # a view may show less than the part, a turned box more
 SIZE_JUMP = 1.6  # sizes that differ by more are worth a word
 
 
@@ -39,6 +48,7 @@ def align(
     guess: Transform | None = None,
     bound_mm: float = BOUND_MM,
     bound_deg: float = BOUND_DEG,
+    part_is_known: bool = False,
     pam_options: PamOptions = PAPER,
     rng: np.random.Generator | None = None,
     progress: Progress = silent,
@@ -53,6 +63,8 @@ def align(
         Template from the scan's frame, good to the bounds; only refinement runs then.
     bound_mm, bound_deg
         How far the result may lie from the guess.
+    part_is_known
+        The scan is of this part and no mirror image, however bent: less of it has to fit.
     pam_options
         Of the method `paper`: the code's variants and the ablations.
     rng
@@ -89,48 +101,85 @@ def align(
         return align_paper(
             scan, template, options=pam_options, guess=guess, rng=rng, progress=progress
         )
-    sigma_mm = float(np.hypot(max(scan.sigma_mm, 1e-3), NOISE_FLOOR_MM))
-    inlier_mm = max(INLIER_MM, INLIER_SIGMAS * sigma_mm)
     progress("align", 0.0, 1.0)
-    if guess is not None:
-        if guess.source != scan.frame:
-            raise InputError(
-                f"the guess starts from frame {guess.source}, the scan {scan.source} is in "
-                f"{scan.frame}"
-            )
-        found = _from_guess(scan, template, guess, sigma_mm, bound_mm, bound_deg, rng)
-        alternatives: tuple[Transform, ...] = ()
-    else:
+    if guess is None:
         _refuse_other_size(scan, template)
-        answer = pose_from_anywhere(
-            scan.points_mm,
-            template,
-            sigma_mm=sigma_mm,
-            inlier_mm=inlier_mm,
-            rng=rng,
-            progress=progress,
+        return _from_anywhere(scan, template, part_is_known, rng, progress)
+    if guess.source != scan.frame:
+        raise InputError(
+            f"the guess starts from frame {guess.source}, the scan {scan.source} is in {scan.frame}"
         )
-        found = answer.best
-        alternatives = tuple(Transform("template", scan.frame, m) for m in answer.others)
+    sigma_mm, inlier_mm = limits_mm(scan.sigma_mm)
+    found = _from_guess(scan, template, guess, sigma_mm, bound_mm, bound_deg, rng)
     progress("align", 1.0, 1.0)
-    inlier = np.abs(found.residual_mm) <= inlier_mm
-    ratio = float(inlier.mean())
-    if not found.converged or ratio < LEAST_INLIERS:
+    ratio = float((np.abs(found.residual_mm) <= inlier_mm).mean())
+    _refuse_misfit(scan, found, ratio, inlier_mm, LEAST_INLIERS, "")
+    answer = Found(found, (), ratio, scan.points_mm, 0.0, sigma_mm, inlier_mm)
+    return _registration(scan, answer)
+
+
+def _from_anywhere(
+    scan: Scan,
+    template: Template,
+    part_is_known: bool,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Registration:
+    """From any pose; a mirror image and too little of the part are refused."""
+    found = pose_from_anywhere(
+        scan.points_mm, template, sigma_mm=scan.sigma_mm, rng=rng, progress=progress
+    )
+    ratio = found.explained_ratio
+    progress("align", 1.0, 1.0)
+    if LEAST_OF_KNOWN < ratio < DOUBTFUL and not part_is_known:
+        _refuse_mirrored(scan, template, found, rng)
+    least = LEAST_OF_KNOWN if part_is_known else LEAST_FROM_ANYWHERE
+    sizes = _other_size(scan, template)
+    _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
+    return _registration(scan, found)
+
+
+def _refuse_mirrored(
+    scan: Scan, template: Template, found: Found, rng: np.random.Generator
+) -> None:
+    """Refuse a left hand where a right hand was meant: its mirror image fits far better."""
+    mirrored, ratio = explained_if_mirrored(found, template, rng), found.explained_ratio
+    if 1.0 - mirrored < MIRRORED_BETTER * (1.0 - ratio):
         raise AlignmentError(
-            f"the scan {scan.source} does not fit its template: {ratio:.0%} of its points lie "
-            f"within {inlier_mm:.2g} mm (at least {LEAST_INLIERS:.0%} are needed)"
-            + ("" if found.converged else " and the refinement did not converge")
-            + "; check part, unit and calibration"
-            + ("" if guess is not None else _other_size(scan, template))
+            f"the scan {scan.source} shows the mirror image of its template: mirrored, "
+            f"{mirrored:.0%} of its points lie within {found.inlier_mm:.2g} mm, as it is "
+            f"{ratio:.0%}; check the export's axes (left-handed?), or take the template of the "
+            "other hand"
         )
+
+
+def _refuse_misfit(
+    scan: Scan, found: Refined, ratio: float, inlier_mm: float, least: float, sizes: str
+) -> None:
+    if found.converged and ratio >= least:
+        return
+    raise AlignmentError(
+        f"the scan {scan.source} does not fit its template: {ratio:.0%} of its points lie "
+        f"within {inlier_mm:.2g} mm (at least {least:.0%} are needed)"
+        + ("" if found.converged else " and the refinement did not converge")
+        + f"; check part, unit and calibration{sizes}"
+    )
+
+
+def _registration(scan: Scan, found: Found) -> Registration:
+    best = found.best
+    inlier = np.abs(best.residual_mm) <= found.inlier_mm
     return Registration(
-        template_from_scan=Transform("template", scan.frame, found.matrix),
-        rmse_mm=float(np.sqrt(np.mean(found.residual_mm[inlier] ** 2))),
-        inlier_ratio=ratio,
-        information=found.information,
-        symmetric_alternatives=alternatives,
-        method=method,
-        iterations=found.iterations,
+        template_from_scan=Transform("template", scan.frame, best.matrix),
+        rmse_mm=float(np.sqrt(np.mean(best.residual_mm[inlier] ** 2))),
+        inlier_ratio=found.explained_ratio,
+        clutter_ratio=found.left_out_ratio,
+        information=best.information,
+        symmetric_alternatives=tuple(
+            Transform("template", scan.frame, other) for other in found.others
+        ),
+        method="robust",
+        iterations=best.iterations,
     )
 
 
@@ -200,16 +249,15 @@ def _other_size(scan: Scan, template: Template) -> str:
 
 
 def _refuse_other_size(scan: Scan, template: Template) -> None:
-    size = np.linalg.norm(np.ptp(scan.points_mm, axis=0))
-    other = np.linalg.norm(np.ptp(template.bounds_mm, axis=0))
-    ratio = float(size / max(float(other), 1e-12))
-    if not 1.0 / (SCALE_JUMP * 4) < ratio < SCALE_JUMP * 4:
-        hint = ""
-        if 0.0005 < ratio < 0.002:
-            hint = " (metres for millimetres?)"
-        elif 0.03 < ratio < 0.05 or 500 < ratio < 2000:
-            hint = " (inches or micrometres for millimetres?)"
-        raise AlignmentError(
-            f"the scan {scan.source} is {size:.3g} mm across, its template {other:.3g} mm: "
-            f"they cannot be the same part in the same unit{hint}"
-        )
+    size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
+    other = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    ratio = size / max(other, 1e-12)
+    if SMALLEST_RATIO <= ratio <= LARGEST_RATIO:
+        return
+    near = [unit for unit, mm in UNITS.items() if 1 / UNIT_SLACK < ratio * mm < UNIT_SLACK]
+    hint = f" ({' or '.join(near)} for millimetres?)" if near else ""
+    raise AlignmentError(
+        f"the scan {scan.source} is {size:.3g} mm across, its template {other:.3g} mm: they cannot "
+        f"be the same part in the same unit{hint}"
+        + ("" if near or ratio > 1.0 else ", or it shows too little of it")
+    )

@@ -1,8 +1,8 @@
 """The pose of a scan of which nothing is known: search, refine on the field, and what fits as well.
 
 Every rotation is tried on a coarse field (`search`); what is left is refined on the template
-itself. Where that leaves points unexplained, features are asked as well (clutter moves the box
-that the search starts from). All poses that fit alike are returned: the caller must not guess.
+itself. Where that leaves points unexplained, clutter is looked for and left out, and features are
+asked as well. All poses that fit alike are returned: the caller must not guess.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.align.coarse import by_features
+from amrepair.align.clutter import noise_across, without_clutter
+from amrepair.align.coarse import by_features, cube_rotations
+from amrepair.align.families import best_turns, slides
 from amrepair.align.refine import Refined, refine
 from amrepair.align.search import QUICK, THOROUGH, CoarseField, Effort, search
 from amrepair.align.thinning import thin_out
@@ -33,8 +35,17 @@ SAME_FIT, SAME_FIT_MM = 1.5, 0.005
 CLEAR_SIGMAS, CLEAR_MM = 4.0, 0.1
 CONTRADICTED_RATIO, CONTRADICTED_SIGMAS = 0.003, 4.0
 APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
-# With fewer points on the part the search is made thorough; then features are asked too.
-WELL_EXPLAINED, EXPLAINED = 0.97, 0.7
+NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
+INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
+INLIER_SIGMAS = 3.0
+# Fewer explained, and the noise is measured (taken where it is more than was said, up to what a
+# thin wall's two sides could pretend), and the mirror image tried.
+DOUBTFUL, NOISIER, MOST_NOISE_MM = 0.93, 1.5, 0.25
+# With fewer points on the part the search goes on, is made thorough, and features are asked too.
+WELL_EXPLAINED, MOSTLY_EXPLAINED, EXPLAINED = 0.97, 0.95, 0.7
+BETWEEN = rotation_from_vector(np.array([0.15, -0.1, 0.08]))  # half the gap between rotations
+FEW_TRIED = 3  # poses refined of what is left without clutter, and of the mirror image
+CLEARED = 0.85  # with fewer on the part clutter is looked for, until so many are
 PLAUSIBLE = 0.6  # a mean distance above this share of the cap is no fit that more points would mend
 
 
@@ -46,10 +57,23 @@ class Found:
     ----------
     others
         (4, 4) template from scan, best first.
+    explained_ratio
+        Share of the points that lie on the part in the best pose, clutter left aside.
+    part_mm
+        (n, 3) what may be the part: the scan, or a sample of it without clutter.
+    left_out_ratio
+        Share of the points that was taken for clutter.
+    sigma_mm, inlier_mm
+        How well points were taken to agree with the template, and how near explained ones lie.
     """
 
     best: Refined
     others: tuple[Float[np.ndarray, "4 4"], ...]
+    explained_ratio: float
+    part_mm: Float[np.ndarray, "n 3"]
+    left_out_ratio: float
+    sigma_mm: float
+    inlier_mm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +101,19 @@ class _Clouds:
         return bool(np.linalg.norm(away, axis=1).max() > APART_RATIO * self.diagonal_mm)
 
 
+def limits_mm(noise_mm: float) -> tuple[float, float]:
+    """How well points can agree with the template, and how near explained ones lie."""
+    sigma_mm = float(np.hypot(max(noise_mm, 1e-3), NOISE_FLOOR_MM))
+    return sigma_mm, max(INLIER_MM, INLIER_SIGMAS * sigma_mm)
+
+
 def pose_from_anywhere(
     points_mm: Float[np.ndarray, "n 3"],
     template: Template,
     *,
     sigma_mm: float,
-    inlier_mm: float,
     rng: np.random.Generator,
+    noise_is_measured: bool = False,
     progress: Progress = silent,
 ) -> Found:
     """The best pose and those that fit as well; it may still be a bad one.
@@ -93,17 +123,44 @@ def pose_from_anywhere(
     points_mm
         (n, 3) in the scan's frame.
     sigma_mm
-        How well points can agree with the template at best.
-    inlier_mm
-        Points nearer than this to the surface are explained.
+        Noise of the points, as was said; measured where that leaves them unexplained.
     """
-    clouds = _clouds(points_mm, template, sigma_mm, rng)
+    sigma_mm, inlier_mm = limits_mm(sigma_mm)
+    clouds, left_out_ratio = _clouds(points_mm, template, sigma_mm, rng), 0.0
+    part_mm = points_mm
     field = CoarseField.of(template)
     progress("align", 0.1, 1.0)
     found = _refined(_worth_refining(clouds, field, QUICK, rng), clouds, template)
-    if _explained(found[0][1], inlier_mm) < WELL_EXPLAINED:
-        progress("align", 0.3, 1.0)
-        starts = _worth_refining(clouds, field, THOROUGH, rng)
+    if _explained(found[0][1], inlier_mm) < DOUBTFUL and not noise_is_measured:
+        measured_mm = min(noise_across(points_mm, rng), MOST_NOISE_MM)
+        if measured_mm > NOISIER * sigma_mm:
+            return pose_from_anywhere(
+                points_mm,
+                template,
+                sigma_mm=measured_mm,
+                rng=rng,
+                noise_is_measured=True,
+                progress=progress,
+            )
+    if _explained(found[0][1], inlier_mm) < CLEARED:
+        progress("align", 0.2, 1.0)
+        for kept in without_clutter(points_mm, rng):
+            fewer = _clouds(kept.points_mm, template, sigma_mm, rng)
+            starts = _worth_refining(fewer, field, QUICK, rng)[:FEW_TRIED]
+            again = _refined(starts, fewer, template)
+            if _explained(again[0][1], inlier_mm) > _explained(found[0][1], inlier_mm):
+                clouds, found, left_out_ratio = fewer, again, kept.left_out_ratio
+                part_mm = kept.points_mm
+            if _explained(found[0][1], inlier_mm) > CLEARED:
+                break
+    share = _explained(found[0][1], inlier_mm)
+    if share < WELL_EXPLAINED:
+        progress("align", 0.4, 1.0)
+        starts = _twins(found[0][1], clouds, field, rng)
+        if share < MOSTLY_EXPLAINED:
+            starts += _worth_refining(clouds, field, THOROUGH, rng)
+        else:
+            starts += _worth_refining(clouds, field, QUICK, rng, turn=BETWEEN)
         found = sorted(found + _refined(starts, clouds, template), key=_by_score)
     if _explained(found[0][1], inlier_mm) < EXPLAINED:
         progress("align", 0.6, 1.0)
@@ -112,11 +169,16 @@ def pose_from_anywhere(
         if extra:
             starts = [pose.matrix for pose in search(clouds.dense_mm, field, rng, only=extra)]
             found = sorted(found + _refined(starts, clouds, template), key=_by_score)
+    progress("align", 0.8, 1.0)
+    if _explained(found[0][1], inlier_mm) > EXPLAINED:
+        turned = _refined(_turns(found, clouds, template, rng), clouds, template)
+        found = sorted(found + turned, key=_by_score)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
     if not best.converged and best_score < PLAUSIBLE * clouds.cap_mm:
         best = _finished(best, clouds, template, True)
-    slid = _refined(_slides(best, clouds), clouds, template, finish=False)
+    beside = slides(best, clouds.dense_mm, 1.5 * APART_RATIO * clouds.diagonal_mm)
+    slid = _refined(beside, clouds, template, finish=False)
     slid = [(score, _finished(moved, clouds, template, False)) for score, moved in slid]
     others: list[Float[np.ndarray, "4 4"]] = []
     for score, other in sorted(found[1:] + slid, key=_by_score):
@@ -125,7 +187,18 @@ def pose_from_anywhere(
         new = all(clouds.apart(other.matrix, known) for known in (best.matrix, *others))
         if new and not _contradicted(other, best, sigma_mm):
             others.append(other.matrix)
-    return Found(best, tuple(others))
+    # not of the thinned cloud: few scattered points fill as many voxels as many on the surface
+    sample = part_mm[rng.permutation(len(part_mm))[:DENSE_POINTS]]
+    residual = template.distance(sample @ best.matrix[:3, :3].T + best.matrix[:3, 3])
+    ratio = float((np.abs(residual) <= inlier_mm).mean())
+    return Found(best, tuple(others), ratio, part_mm, left_out_ratio, sigma_mm, inlier_mm)
+
+
+def explained_if_mirrored(found: Found, template: Template, rng: np.random.Generator) -> float:
+    """Share of the points that lie on the part where what may be the part is mirrored first."""
+    clouds = _clouds(found.part_mm * np.array([-1.0, 1.0, 1.0]), template, found.sigma_mm, rng)
+    starts = _worth_refining(clouds, CoarseField.of(template), QUICK, rng)
+    return _explained(_refined(starts[:FEW_TRIED], clouds, template)[0][1], found.inlier_mm)
 
 
 def _clouds(
@@ -151,12 +224,30 @@ def _worth_refining(
     field: CoarseField,
     effort: Effort,
     rng: np.random.Generator,
+    *,
+    turn: Float[np.ndarray, "3 3"] | None = None,
 ) -> list[Float[np.ndarray, "4 4"]]:
-    poses = search(clouds.dense_mm, field, rng, effort=effort)
+    poses = search(clouds.dense_mm, field, rng, effort=effort, turn=turn)
     limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
     fits = poses[0].score_mm <= 3.0 * clouds.sigma_mm + GOOD_CELLS * field.cell_mm
     most = MOST_REFINED if fits else MOST_DOUBTFUL
     return [pose.matrix for pose in poses[:most] if pose.score_mm <= limit_mm]
+
+
+def _twins(
+    best: Refined, clouds: _Clouds, field: CoarseField, rng: np.random.Generator
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The pose turned in its template as a box can be: a nearly symmetric part's others."""
+    centre = field.box_mm.mean(axis=0)
+    turned = []
+    for turn in cube_rotations():
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn @ best.matrix[:3, :3]
+        matrix[:3, 3] = turn @ (best.matrix[:3, 3] - centre) + centre
+        turned.append(matrix)
+    poses = search(clouds.dense_mm, field, rng, only=tuple(turned))
+    limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
+    return [pose.matrix for pose in poses[:MOST_DOUBTFUL] if pose.score_mm <= limit_mm]
 
 
 def _by_score(one: tuple[float, Refined]) -> float:
@@ -217,10 +308,29 @@ def _finished(rough: Refined, clouds: _Clouds, template: Template, move: bool) -
     placed = clouds.dense_mm @ rough.matrix[:3, :3].T + rough.matrix[:3, 3]
     return Refined(
         rough.matrix,
-        rough.information,
+        rough.information * len(clouds.dense_mm) / len(rough.residual_mm),
         template.distance(placed),
         rough.converged,
         rough.iterations,
+    )
+
+
+def _turns(
+    found: list[tuple[float, Refined]],
+    clouds: _Clouds,
+    template: Template,
+    rng: np.random.Generator,
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Starts where poses like the best can turn freely, or nearly."""
+    limit = SAME_FIT * found[0][0] + SAME_FIT_MM
+    return best_turns(
+        [pose for score, pose in found if score <= limit],
+        clouds.dense_mm,
+        template,
+        diagonal_mm=clouds.diagonal_mm,
+        sigma_mm=clouds.sigma_mm,
+        cap_mm=clouds.cap_mm,
+        rng=rng,
     )
 
 
@@ -231,27 +341,3 @@ def _contradicted(other: Refined, best: Refined, sigma_mm: float) -> bool:
     against, for_it = int((off & ~off_best).sum()), int((off_best & ~off).sum())
     chance = CONTRADICTED_SIGMAS * float(np.sqrt(against + for_it))
     return against - for_it > max(CONTRADICTED_RATIO * len(off), chance)
-
-
-def _slides(best: Refined, clouds: _Clouds) -> list[Float[np.ndarray, "4 4"]]:
-    """Poses beside the best, along whatever motion the scan hardly hinders (a turned cylinder)."""
-    centre = clouds.dense_mm.mean(axis=0)
-    local = (clouds.dense_mm - centre) @ best.matrix[:3, :3].T
-    reach_mm = float(np.linalg.norm(local, axis=1).max())
-    place = best.matrix[:3, :3] @ centre + best.matrix[:3, 3]
-    # rotations in units of the motion of the farthest point
-    unit = np.array([1.0 / reach_mm] * 3 + [1.0] * 3)
-    values, vectors = np.linalg.eigh(best.information * np.outer(unit, unit))
-    step_mm = 1.5 * APART_RATIO * clouds.diagonal_mm
-    found = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        # Σ f² / σ² after a step, by the quadratic model
-        if value * step_mm**2 > len(clouds.dense_mm):
-            break
-        for way in (1.0, -1.0):
-            motion = way * step_mm * unit * vector
-            moved = np.eye(4)
-            moved[:3, :3] = rotation_from_vector(motion[:3]) @ best.matrix[:3, :3]
-            moved[:3, 3] = place + motion[3:] - moved[:3, :3] @ centre
-            found.append(moved)
-    return found

@@ -20,6 +20,7 @@ STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
 STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
 MAX_ITERATIONS = 60
 HASTE = 15  # iterations with whole steps
+SLOWEST = 1.0 / 32  # of a step
 INLIER_SIGMAS = 4.0
 
 
@@ -98,7 +99,7 @@ def refine(
     local = points_mm - centre
     scale, converged, hessian = start_scale_mm, False, np.zeros((6, 6))
     f = np.zeros(len(points_mm))
-    iterations, last = 0, np.zeros(6)
+    iterations, last, pace = 0, np.zeros(6), 1.0
     while iterations < max_iterations:
         iterations += 1
         turned = local @ rotation.T
@@ -120,9 +121,11 @@ def refine(
         turn = float(np.linalg.norm(step[:3]))
         if turn > 0.2:  # a step this wide has left the linear range
             step *= 0.2 / turn
-        if iterations > HASTE and float(step @ last) < 0.0:
-            step *= 0.5  # to and fro across an edge of the field
+        if iterations > HASTE:
+            # to and fro across an edge of the field, where its gradient turns at once
+            pace = max(SLOWEST, 0.5 * pace) if float(step @ last) < 0.0 else min(1.0, 2.0 * pace)
         last = step
+        step = pace * step
         rotation = rotation_from_vector(step[:3]) @ rotation
         place = place + step[3:]
         moved_mm = float(np.linalg.norm(step[3:])) + reach_mm * float(np.linalg.norm(step[:3]))

@@ -21,7 +21,9 @@ class Registration:
     rmse_mm
         Root mean square of |f| over the inliers.
     inlier_ratio
-        Share of scan points explained by the template.
+        Share of the scan's points explained by the template, clutter left aside.
+    clutter_ratio
+        Share of the scan that is not taken for the part: scattered points, bed, other pieces.
     information
         (6, 6) Gauss–Newton Hessian JᵀWJ / σ², order (rotation x y z about the scan's centroid in
         rad, translation x y z in mm); its inverse is the covariance.
@@ -38,3 +40,4 @@ class Registration:
     symmetric_alternatives: tuple[Transform, ...]
     method: str
     iterations: int
+    clutter_ratio: float = 0.0

@@ -135,6 +135,7 @@ def search(
     rng: np.random.Generator,
     *,
     effort: Effort = QUICK,
+    turn: Float[np.ndarray, "3 3"] | None = None,
     only: tuple[Float[np.ndarray, "4 4"], ...] | None = None,
 ) -> list[Pose]:
     """Poses that fit best, best first, each where no better one is near.
@@ -143,6 +144,8 @@ def search(
     ----------
     points_mm
         (n, 3) evenly spread over what was scanned, scan's frame.
+    turn
+        A rotation of all that are tried: between those of another search.
     only
         Poses to start from instead of all rotations.
     """
@@ -152,6 +155,8 @@ def search(
     cap_mm = CAP_RATIO * field.diagonal_mm
     if only is None:
         rotations = spread_rotations(effort.rotations)
+        if turn is not None:
+            rotations = np.ascontiguousarray(rotations @ turn)
         places = kernels.starts(
             clouds[0] - centre, rotations, field.box_mm, *grid, 0.1 * field.diagonal_mm
         )

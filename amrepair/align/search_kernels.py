@@ -15,7 +15,16 @@ DAMPING = 1e-4
 WIDEST_TURN_RAD = 0.35  # of one step
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
+def nearest_node(x, y, z, origin, cell, values):
+    """Distance at the node nearest to a point: enough to choose between places far apart."""
+    i = min(max(int((x - origin[0]) / cell + 0.5), 0), values.shape[0] - 1)
+    j = min(max(int((y - origin[1]) / cell + 0.5), 0), values.shape[1] - 1)
+    k = min(max(int((z - origin[2]) / cell + 0.5), 0), values.shape[2] - 1)
+    return values[i, j, k]
+
+
+@njit(cache=True, nogil=True, inline="always")
 def field_at(x, y, z, origin, cell, values):
     """Distance and its gradient by trilinear interpolation; beyond the grid, to its border."""
     gx, gy, gz = (x - origin[0]) / cell, (y - origin[1]) / cell, (z - origin[2]) / cell
@@ -67,9 +76,9 @@ def starts(points, rotations, box, origin, cell, values, cap):
             pz = shifts[2, choice // 9]
             total = 0.0
             for i in range(0, n, 2):
-                f = field_at(
+                f = nearest_node(
                     turned[i, 0] + px, turned[i, 1] + py, turned[i, 2] + pz, origin, cell, values
-                )[0]
+                )
                 total += min(abs(f), cap)
                 if total >= best:
                     break

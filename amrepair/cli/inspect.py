@@ -101,6 +101,7 @@ def align(
         "template_from_scan": found.template_from_scan.matrix.tolist(),
         "rmse_mm": found.rmse_mm,
         "inlier_ratio": found.inlier_ratio,
+        "clutter_ratio": found.clutter_ratio,
         "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
         "method": found.method,
         "iterations": found.iterations,
@@ -112,6 +113,11 @@ def align(
         return
     if chosen:
         console.out.print(f"Part: {chosen['template']}, confidence {chosen['confidence']:.2f}.")
+    if found.clutter_ratio > 0.0:
+        console.out.print(
+            f"{found.clutter_ratio:.0%} of the scan is not the part (scattered points, what it "
+            "stands on, other pieces) and was left aside."
+        )
     console.out.print(
         f"Aligned: {found.rmse_mm:.3f} mm rms over {found.inlier_ratio:.1%} of the points, "
         f"{len(found.symmetric_alternatives)} other poses fit as well."

@@ -89,7 +89,8 @@ def test_clutter_does_not_mislead() -> None:
     noise = rng.uniform((-30, -30, -20), (70, 50, 30), (len(points) // 4, 3))
     found, off_mm = aligned(template, np.concatenate([points, noise]), seed=3)
     assert off_mm < 0.1
-    assert 0.7 < found.inlier_ratio < 0.9
+    assert found.inlier_ratio > 0.7  # the rest is noise, as much of it as was not left out
+    assert found.inlier_ratio + found.clutter_ratio > 0.9
 
 
 def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,182 @@
+"""Poses along a motion that a scan hardly hinders: steps to both sides, and once all around.
+
+On a disc with a notch nearly every turn fits nearly; the one that fits is narrower than any search
+over all rotations is dense. So where a pose can turn freely, it is turned all the way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.align.refine import Refined
+from amrepair.align.thinning import thin_out
+from amrepair.frames import rotation_from_vector
+from amrepair.template.port import Template
+
+STEP_RATIO = 0.01  # of the diagonal: what the farthest point moves from one pose to the next
+SWEPT_POINTS = 4_000
+MOST_FAMILIES = 6
+BEST_OF_EACH = 3
+SAME_STEPS = 4.0  # from the nearest pose of a family: the axis is known no better
+MOST_RESISTING = 0.02  # share of the points that a motion may press against the surface
+LEAST_RADIUS = 0.02  # of the diagonal, about the axis: less turns nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A rigid motion that changes the fit hardly.
+
+    Attributes
+    ----------
+    turn, shift
+        (3,) each, template frame, about and of the cloud's centroid; the cloud's farthest point
+        moves by about 1 mm.
+    """
+
+    turn: Float[np.ndarray, " 3"]
+    shift: Float[np.ndarray, " 3"]
+
+    def applied(
+        self, matrix: Float[np.ndarray, "4 4"], centre_mm: Float[np.ndarray, " 3"], step_mm: float
+    ) -> Float[np.ndarray, "4 4"]:
+        """(4, 4) the pose after a small step."""
+        place = matrix[:3, :3] @ centre_mm + matrix[:3, 3]
+        moved = np.eye(4)
+        moved[:3, :3] = rotation_from_vector(step_mm * self.turn) @ matrix[:3, :3]
+        moved[:3, 3] = place + step_mm * self.shift - moved[:3, :3] @ centre_mm
+        return moved
+
+
+def motions(
+    pose: Refined, cloud_mm: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " 6"], list[Motion]]:
+    """(6,) how much each motion is hindered (Σ f² / σ² after a step of 1 mm), and the motions."""
+    centre = cloud_mm.mean(axis=0)
+    reach_mm = float(np.linalg.norm(cloud_mm - centre, axis=1).max())
+    # rotations in units of the motion of the farthest point
+    unit = np.array([1.0 / reach_mm] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(pose.information * np.outer(unit, unit))
+    return values, [Motion(unit[:3] * one[:3], one[3:]) for one in vectors.T]
+
+
+def slides(
+    pose: Refined, cloud_mm: Float[np.ndarray, "n 3"], step_mm: float
+) -> list[Float[np.ndarray, "4 4"]]:
+    """A step along every motion that leaves the residuals within the noise, both ways."""
+    centre = cloud_mm.mean(axis=0)
+    return [
+        motion.applied(pose.matrix, centre, way * step_mm)
+        for value, motion in zip(*motions(pose, cloud_mm), strict=True)
+        if value * step_mm**2 <= len(cloud_mm)
+        for way in (1.0, -1.0)
+    ]
+
+
+def best_turns(
+    poses: Sequence[Refined],
+    judged_mm: Float[np.ndarray, "n 3"],
+    template: Template,
+    *,
+    diagonal_mm: float,
+    sigma_mm: float,
+    cap_mm: float,
+    rng: np.random.Generator,
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The best poses of each family: those that turn freely, turned once around.
+
+    Parameters
+    ----------
+    poses
+        Best first, refined on the points in `judged_mm`.
+    judged_mm
+        (n, 3) in the scan's frame.
+    diagonal_mm
+        Of the template.
+    sigma_mm
+        That the poses' information was made with.
+    cap_mm
+        Farther off is as bad.
+    """
+    step_mm = STEP_RATIO * diagonal_mm
+    cloud = thin_out(judged_mm, SWEPT_POINTS, rng)
+    known: list[Float[np.ndarray, "k 4 4"]] = []
+    found: list[Float[np.ndarray, "4 4"]] = []
+    for pose in poses:
+        if len(known) == MOST_FAMILIES:
+            break
+        if any(_among(pose.matrix, family, cloud, step_mm) for family in known):
+            continue
+        for value, motion in zip(*motions(pose, judged_mm), strict=True):
+            share = value * sigma_mm**2 / len(judged_mm)
+            family = _turned(pose.matrix, motion, judged_mm, share, diagonal_mm)
+            if family is None:
+                continue
+            known.append(family)
+            scores = np.array([_score(cloud, one, template, cap_mm) for one in family])
+            found += [family[k] for k in _lowest(scores)]
+    return found
+
+
+def _turned(
+    matrix: Float[np.ndarray, "4 4"],
+    motion: Motion,
+    cloud_mm: Float[np.ndarray, "n 3"],
+    share: float,
+    diagonal_mm: float,
+) -> Float[np.ndarray, "k 4 4"] | None:
+    """(k, 4, 4) the pose turned around the motion's axis; None where that is hindered.
+
+    `share` is of the points that resist, were all of them moved by as much as the farthest.
+    """
+    placed = cloud_mm @ matrix[:3, :3].T + matrix[:3, 3]
+    centre = placed.mean(axis=0)
+    rate = float(np.linalg.norm(motion.turn))
+    if rate < 1e-9:
+        return None
+    axis = motion.turn / rate
+    through = centre + np.cross(axis, motion.shift) / rate
+    away = placed - through
+    radius_mm = float(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1).max())
+    in_part = LEAST_RADIUS * diagonal_mm < radius_mm < diagonal_mm
+    if not in_part or share > MOST_RESISTING * (rate * radius_mm) ** 2:
+        return None
+    count = int(np.ceil(2.0 * np.pi * radius_mm / (STEP_RATIO * diagonal_mm)))
+    family = np.tile(np.eye(4), (count, 1, 1))
+    for k in range(count):
+        turn = rotation_from_vector(2.0 * np.pi * k / count * axis)
+        family[k, :3, :3] = turn @ matrix[:3, :3]
+        family[k, :3, 3] = turn @ (matrix[:3, 3] - through) + through
+    return family
+
+
+def _among(
+    matrix: Float[np.ndarray, "4 4"],
+    family: Float[np.ndarray, "k 4 4"],
+    cloud_mm: Float[np.ndarray, "n 3"],
+    step_mm: float,
+) -> bool:
+    few = cloud_mm[:: max(1, len(cloud_mm) // 50)]
+    placed = few @ matrix[:3, :3].T + matrix[:3, 3]
+    others = np.einsum("kab,nb->kna", family[:, :3, :3], few) + family[:, None, :3, 3]
+    return bool(np.linalg.norm(others - placed, axis=2).max(axis=1).min() < SAME_STEPS * step_mm)
+
+
+def _score(
+    cloud_mm: Float[np.ndarray, "n 3"],
+    matrix: Float[np.ndarray, "4 4"],
+    template: Template,
+    cap_mm: float,
+) -> float:
+    residual = np.abs(template.distance(cloud_mm @ matrix[:3, :3].T + matrix[:3, 3]))
+    return float(np.minimum(residual, cap_mm).mean())
+
+
+def _lowest(scores: Float[np.ndarray, " k"]) -> list[int]:
+    """The deepest local minima around the circle."""
+    dips = (scores <= np.roll(scores, 1)) & (scores < np.roll(scores, -1))
+    order = np.flatnonzero(dips)
+    return [int(k) for k in order[np.argsort(scores[order], kind="stable")][:BEST_OF_EACH]]

@@ -1,0 +1,130 @@
+"""What lies around the part, the wrong hand, noise not said: aligned right, or refused with why."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from amrepair.align import Registration, align
+from amrepair.align.clutter import noise_across, without_clutter
+from amrepair.align.search import spread_rotations
+from amrepair.errors import AlignmentError
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf
+from amrepair.template.fit import fit_fast
+from amrepair.template.port import Template
+from tests.analytic import (
+    AnalyticTemplate,
+    box,
+    cylinder,
+    difference,
+    sample_surface,
+    to_trimesh,
+    union,
+)
+
+SIGMA_MM = 0.04
+Points = Float[np.ndarray, "n 3"]
+
+
+def stepped() -> AnalyticTemplate:
+    """A block with a corner cut out: it has a left and a right hand."""
+    return difference(box((0, 0, 0), (40, 24, 14)), box((24, 13, 5), (41, 25, 15)))
+
+
+def aligned(
+    template: Template, part: Points, clutter: Points, sigma_mm: float = SIGMA_MM
+) -> tuple[Registration, list[float]]:
+    """The answer for both in one random pose, and how far off its poses leave the part."""
+    rng = np.random.default_rng(7)
+    points = np.concatenate([part, clutter])
+    points = points + rng.normal(0, sigma_mm, points.shape)
+    moved = points @ spread_rotations(500)[int(rng.integers(500))].T + rng.normal(0, 60, 3)
+    found = align(Scan(moved, SIGMA_MM, "scanner", source="scan.ply"), template)
+    poses = [found.template_from_scan, *found.symmetric_alternatives]
+    off = [pose.apply(moved[: len(part)]) - points[: len(part)] for pose in poses]
+    return found, [float(np.sqrt((one**2).sum(axis=1).mean())) for one in off]
+
+
+def scattered(rng: np.random.Generator, count: int) -> Points:
+    return rng.uniform((-20, -20, -20), (60, 44, 34), (count, 3))
+
+
+def bed(rng: np.random.Generator, count: int) -> Points:
+    flat = rng.uniform((-40, -40), (80, 64), (count, 2))
+    under = (flat > (0, 0)).all(axis=1) & (flat < (40, 24)).all(axis=1)
+    return np.column_stack([flat, np.zeros(count)])[~under]
+
+
+def another_piece(rng: np.random.Generator, count: int) -> Points:
+    ball = rng.normal(size=(count, 3))
+    return (80.0, 12.0, 7.0) + 9.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("clutter", "share"), [(scattered, 0.43), (bed, 2.5), (another_piece, 0.43)]
+)
+def test_the_part_is_found_in_what_surrounds_it(clutter: object, share: float) -> None:
+    assert callable(clutter)
+    rng = np.random.default_rng(0)
+    part = sample_surface(stepped().body, 0.55, seed=1)[0]
+    if clutter is bed:
+        part = part[part[:, 2] > 0.5]
+    found, off_mm = aligned(stepped(), part, clutter(rng, int(share * len(part))))
+    assert off_mm[0] < 0.05
+    assert len(off_mm) == 1
+    assert found.inlier_ratio > 0.8
+    assert found.clutter_ratio > 0.15
+
+
+def test_a_scan_without_clutter_keeps_nearly_all_of_itself() -> None:
+    rng = np.random.default_rng(0)
+    points = sample_surface(stepped().body, 0.55, seed=2)[0]
+    kept = without_clutter(points + rng.normal(0, SIGMA_MM, points.shape), rng)
+    # edges may look scattered and a face like a bed, never more
+    assert all(one.left_out_ratio < 0.45 for one in kept)
+
+
+def test_the_other_hand_is_refused() -> None:
+    part = sample_surface(stepped().body, 0.55, seed=3)[0]
+    with pytest.raises(AlignmentError, match="mirror image"):
+        aligned(stepped(), part * (-1.0, 1.0, 1.0), part[:0])
+
+
+def test_noise_that_was_not_said_is_measured() -> None:
+    part = sample_surface(stepped().body, 0.4, seed=4)[0]
+    rng = np.random.default_rng(0)
+    for sigma_mm in (0.05, 0.25):
+        noisy = part + rng.normal(0, sigma_mm, part.shape)
+        assert noise_across(noisy, rng) == pytest.approx(sigma_mm, rel=0.25)
+    found, off_mm = aligned(stepped(), part, part[:0], sigma_mm=0.25)
+    assert off_mm[0] < 0.1
+    assert found.inlier_ratio > 0.95
+
+
+@pytest.mark.parametrize(
+    ("mm", "hint"),
+    [(1e3, "metres"), (25.4, "inches"), (10.0, "centimetres"), (1e-3, "micrometres"), (40.0, "")],
+)
+def test_the_unit_is_guessed_from_the_size(mm: float, hint: str) -> None:
+    part = sample_surface(stepped().body, 1.0, seed=5)[0] / mm
+    with pytest.raises(AlignmentError, match=rf"same unit.*{hint}"):
+        align(Scan(part, SIGMA_MM / mm, "scanner", source="scan.ply"), stepped())
+
+
+def test_a_flat_view_of_a_keyed_disc_is_ambiguous_and_holds_the_true_pose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in (("SAMPLES", 20_000), ("GRID_CELLS", 48)):
+        monkeypatch.setattr(f"amrepair.template.fit.{name}", value)
+    shape = union(cylinder((0, 0, 0), 25.0, 8.0), box((22, -1.5, 0), (28, 1.5, 8)))
+    disc = fit_fast(MeshSdf.from_mesh(to_trimesh(shape.body)))
+    rng = np.random.default_rng(6)
+    flat = rng.uniform(-28, 28, (12_000, 2))
+    key = (flat[:, 0] > 0) & (flat[:, 0] < 28) & (np.abs(flat[:, 1]) < 1.5)
+    top = flat[(np.hypot(*flat.T) < 25) | key]
+    off_mm = aligned(disc, np.column_stack([top, np.full(len(top), 8.0)]), np.zeros((0, 3)))[1]
+    # turned over, or as if seen from within: a scan without sensors does not tell
+    assert len(off_mm) >= 2
+    assert min(off_mm) < 0.2
