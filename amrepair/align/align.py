@@ -131,8 +131,12 @@ def _from_anywhere(
     )
     ratio = found.explained_ratio
     progress("align", 1.0, 1.0)
-    if LEAST_OF_KNOWN < ratio < DOUBTFUL and not part_is_known:
-        _refuse_mirrored(scan, template, found, rng)
+    if not part_is_known:
+        if LEAST_OF_KNOWN < ratio < DOUBTFUL:
+            _refuse_mirrored(scan, template, found, found.part_mm, ratio, rng)
+        if found.left_out_ratio > 0.0:  # what was left out may be half of the other hand
+            whole = ratio * (1.0 - found.left_out_ratio)
+            _refuse_mirrored(scan, template, found, scan.points_mm, whole, rng)
     least = LEAST_OF_KNOWN if part_is_known else LEAST_FROM_ANYWHERE
     sizes = _other_size(scan, template)
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
@@ -140,10 +144,15 @@ def _from_anywhere(
 
 
 def _refuse_mirrored(
-    scan: Scan, template: Template, found: Found, rng: np.random.Generator
+    scan: Scan,
+    template: Template,
+    found: Found,
+    points_mm: Float[np.ndarray, "n 3"],
+    ratio: float,
+    rng: np.random.Generator,
 ) -> None:
     """Refuse a left hand where a right hand was meant: its mirror image fits far better."""
-    mirrored, ratio = explained_if_mirrored(found, template, rng), found.explained_ratio
+    mirrored = explained_if_mirrored(points_mm, found, template, rng)
     if 1.0 - mirrored < MIRRORED_BETTER * (1.0 - ratio):
         raise AlignmentError(
             f"the scan {scan.source} shows the mirror image of its template: mirrored, "

@@ -194,9 +194,11 @@ def pose_from_anywhere(
     return Found(best, tuple(others), ratio, part_mm, left_out_ratio, sigma_mm, inlier_mm)
 
 
-def explained_if_mirrored(found: Found, template: Template, rng: np.random.Generator) -> float:
-    """Share of the points that lie on the part where what may be the part is mirrored first."""
-    clouds = _clouds(found.part_mm * np.array([-1.0, 1.0, 1.0]), template, found.sigma_mm, rng)
+def explained_if_mirrored(
+    points_mm: Float[np.ndarray, "n 3"], found: Found, template: Template, rng: np.random.Generator
+) -> float:
+    """Share of the points that lie on the part where they are mirrored first."""
+    clouds = _clouds(points_mm * np.array([-1.0, 1.0, 1.0]), template, found.sigma_mm, rng)
     starts = _worth_refining(clouds, CoarseField.of(template), QUICK, rng)
     return _explained(_refined(starts[:FEW_TRIED], clouds, template)[0][1], found.inlier_mm)
 
