@@ -10,7 +10,6 @@ import re
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +43,6 @@ SLOW = "always slow_reader s=0.004"  # long enough to press a button while it pr
 PROGRAM = "from amrepair.cli import main; main()"
 AGAIN = "look again"
 SENSOR_S = 1.0  # a scan takes its time; one from before it was asked for would be no answer
-QUIET_S = 1.5  # a thousand times what a line takes
 
 
 @pytest.fixture(scope="module")
@@ -224,26 +222,3 @@ def test_skip_prints_the_job_alone(browser: Any, command: Command, prepared: Pre
     job = prepared.job_beads()
     assert command.laid() == len(job)
     assert "leaked" not in said
-
-
-def test_pause_holds_the_nozzle_until_it_is_told_to_go_on(
-    browser: Any, command: Command, prepared: Prepared
-) -> None:
-    watched = Watched(browser, command.url())
-    page = watched.page
-    until(lambda: command.laid() > 10)
-    wait_for(page, "Pause").click()
-    wait_for(page, "Go on")
-    before = -1
-    while before != (before := command.laid()):
-        time.sleep(QUIET_S)  # the line under way, and what the printer had buffered
-    job = prepared.job_beads()
-    assert before < len(job) * 0.6  # it rests in mid-job, before its first stop
-    assert command.process.poll() is None
-    wait_for(page, "Go on").click()
-    until(lambda: command.laid() > before)
-    wait_for(page, "Approve").click()
-    code, result, said = command.ended()
-    assert code == 0, said
-    patch = beads_of(Path(result["gcode"]).read_text().splitlines())
-    assert command.laid() == len(job) + len(patch)  # nothing twice, nothing left out
