@@ -18,8 +18,9 @@ from gcode.surfaces import HeightField
 TIP_PRESS_MM = 0.06
 # The noise of the field: half of what the checker allows.
 BODY_PRESS_MM = 0.05
-# The tip lies somewhere in its cell: half of a fine one.
-ASIDE_MM = 0.05
+# The tip lies somewhere in its cell: half of a fine one. Walls are known to within one of them,
+# and a body that grazes a wall hits it in all its height.
+TIP_ASIDE_MM, BODY_ASIDE_MM = 0.05, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +40,9 @@ def least_tip(
     part: EnvelopeSlice, field: HeightField, window: tuple[slice, slice]
 ) -> Float[np.ndarray, "ny nx"]:
     """How high the tip must at least be, by column of the window, for a slice to clear all."""
-    press_mm = TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_PRESS_MM
-    under_mm = field.max_within(part.polygon_mm, window, aside_mm=ASIDE_MM)
+    tip = part.z_from_mm < 1e-9
+    press_mm, aside_mm = (TIP_PRESS_MM, TIP_ASIDE_MM) if tip else (BODY_PRESS_MM, BODY_ASIDE_MM)
+    under_mm = field.max_within(part.polygon_mm, window, aside_mm=aside_mm)
     return np.asarray(under_mm - part.z_from_mm - press_mm)
 
 
@@ -66,6 +68,7 @@ class Reach:
         window_mm: tuple[float, float, float, float] | None = None,
     ) -> None:
         window = field.window(window_mm or field.box_mm)
+        self._top_mm = field.top_mm
         # a slice that stays above everything when the tip is lowest cannot touch
         high_mm = field.top_mm - lowest_tip_mm
         self.obstacles = tuple(
@@ -74,6 +77,13 @@ class Reach:
             if part.z_from_mm <= high_mm
         )
         self.field = field.crop(window_mm or field.box_mm)
+
+    def least_over(self, way_mm: Float[np.ndarray, "n 2"]) -> float:
+        """How high the tip must at least be to go along points; where unknown, over everything."""
+        index = self.field.cells_of(way_mm)
+        if not self.obstacles or not ((index >= 0) & (index < self.field.shape)).all():
+            return self._top_mm
+        return max(float(o.least_tip_mm[index[:, 0], index[:, 1]].max()) for o in self.obstacles)
 
     def at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the tip may be at this height."""

@@ -254,3 +254,54 @@ def test_overhangs_grow_as_far_along_a_diagonal_as_along_the_grid() -> None:
         shares.append(plan.reachable_mm3 / wing.volume())
     assert shares[0] > 0.75
     assert shares[1] > shares[0] - 0.03
+
+
+def test_travels_clear_what_stands_along_the_way_not_all_that_stands() -> None:
+    """A tower far from the pocket made every hop twice its height."""
+    tower = m3.Manifold.cube((4.0, 4.0, 20.0)).translate((75.0, 120.0, 0.0))
+    rim = m3.Manifold.cube((0.8, 30.0, 1.0)).translate((74.6, 60.0, TOP_MM))
+    pockets = POCKETS["deeper"] ^ (
+        m3.Manifold.cube((4.0, 9.0, 9.0)).translate((69.0, 70.5, 0.0))
+        + m3.Manifold.cube((4.0, 9.0, 9.0)).translate((77.0, 70.5, 0.0))
+    )
+    block = BLOCK + tower + rim
+    field = HeightField.from_manifold(block - pockets, 0.25, margin_mm=8.0)
+    plan = slice_patch(
+        pockets, SETUP, as_built=field, grid=LayerGrid.from_setup(SETUP), standalone=False,
+        start_mm=(10.0, 200.0, 30.0),
+    )  # fmt: skip
+    first, last = (
+        [k for k, move in enumerate(plan.toolpath) if isinstance(move, Extrude)][end]
+        for end in (0, -1)
+    )
+    between = [move for move in plan.toolpath.moves[first:last] if isinstance(move, Travel)]
+    across = [float(move.points_mm[-1, 2]) for move in between]
+    assert TOP_MM + 1.0 < max(across) < TOP_MM + 3.0  # over the rim, not over the tower
+    state = ModalState(
+        position_mm=(10.0, 200.0, 30.0), absolute_xyz=True, absolute_e=False, e_mm=0.0,
+        feed_mm_s=50.0, fan_ratio=0.0, hotend_c=215.0, bed_c=60.0, acceleration_mm_s2=None,
+        units_mm=True, tool=0,
+    )  # fmt: skip
+    program = write(plan.toolpath, SETUP, title="pockets", resume=state)
+    assert not find_refusals(program, SETUP, as_built=field, initial=state)
+
+
+def test_seams_lie_beside_old_material() -> None:
+    """Loops along the part's sides begin at their inner side, where the seam does not show."""
+    for x, y, outward in (
+        (69.0, 60.0, (0.0, -1.0)),
+        (69.0, 84.0, (0.0, 1.0)),
+        (60.0, 69.0, (-1.0, 0.0)),
+        (84.0, 69.0, (1.0, 0.0)),
+    ):
+        edge = m3.Manifold.cube((6.0, 6.0, 0.6)).translate((x, y, TOP_MM - 0.6))
+        plan, _ = plan_of(edge)
+        loops = [
+            move.points_mm
+            for move in plan.toolpath
+            if isinstance(move, Extrude) and np.allclose(move.points_mm[0], move.points_mm[-1])
+        ]
+        assert loops
+        for loop in loops:
+            along = loop[:, :2] @ np.array(outward)
+            assert along[0] < along.max() - 1.0

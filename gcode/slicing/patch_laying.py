@@ -1,0 +1,131 @@
+"""From the passes of a patch to moves: how it begins, in which order it is laid, how it ends."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from gcode.moves import (
+    Comment,
+    FinishMoves,
+    LayerChange,
+    Prime,
+    Script,
+    SetBed,
+    SetFan,
+    SetHotend,
+)
+from gcode.profiles import PrintSetup
+from gcode.slicing.beads import width_of
+from gcode.slicing.patch_model import NEAR_MM, PatchModel
+from gcode.slicing.patch_passes import Chain, Pass, surely_free
+from gcode.slicing.pen import Pen
+from gcode.surfaces import HeightField
+
+CLEAR_MM = 0.5  # of the tip over everything on a travel
+STANDALONE_LIFT_MM = 5.0
+
+
+def begin(
+    setup: PrintSetup, field: HeightField, start_mm: tuple[float, float, float] | None
+) -> Pen:
+    """From park (mid-job), or from a machine that stands still (standalone)."""
+    if start_mm is not None:
+        pen = Pen(setup, np.array(start_mm))
+        pen.retracted = setup.printer.retraction_mm > 0
+        pen.add(SetFan(setup.material.fan_ratio))
+        return pen
+    printer, material = setup.printer, setup.material
+    safe_mm = min(field.top_mm + STANDALONE_LIFT_MM, printer.max_z_mm)
+    pen = Pen(setup, np.array([*printer.prime_mm[:2], safe_mm]))
+    pen.add(Comment("The part stands on the bed and Z is true: X and Y are homed, Z is not."))
+    pen.add(SetBed(material.bed_c))
+    pen.add(SetHotend(material.hotend_c))
+    lift = f"{safe_mm:.3f}".rstrip("0").rstrip(".")
+    pen.add(Script(("G21", "G91", "G1 Z2 F600", "G90", f"G1 Z{lift} F600", "G28 X Y"), "approach"))
+    pen.position_mm = np.array([0.0, 0.0, safe_mm])
+    pen.move_to(np.array([*printer.prime_mm[:2], safe_mm]))
+    pen.add(SetBed(material.bed_c, wait=True))
+    pen.add(SetHotend(material.hotend_c + material.repair_first_bead_delta_c, wait=True))
+    pen.move_to(np.array(printer.prime_mm))
+    if printer.prime_length_mm > 0:
+        pen.add(Prime(printer.prime_length_mm, 3.0))
+    pen.retract()
+    wipe = np.array(printer.prime_mm) + np.array([4.0, 0.0, 0.0])
+    pen.move_to(wipe)
+    pen.move_to(np.array([*wipe[:2], safe_mm]))
+    pen.add(SetFan(material.fan_ratio))
+    return pen
+
+
+def end(
+    pen: Pen,
+    setup: PrintSetup,
+    field: HeightField,
+    start_mm: tuple[float, float, float] | None,
+) -> None:
+    """Back to park (mid-job), or lifted, away, and off (standalone)."""
+    pen.retract()
+    here = pen.position_mm
+    if start_mm is not None:
+        pen.move_to(np.array([*here[:2], max(start_mm[2], here[2])]))
+        pen.move_to(np.array([*start_mm[:2], max(start_mm[2], here[2])]))
+        pen.move_to(np.array(start_mm))
+        pen.add(FinishMoves())
+        return
+    printer = setup.printer
+    safe_mm = min(max(field.top_mm + STANDALONE_LIFT_MM, printer.park_mm[2]), printer.max_z_mm)
+    pen.move_to(np.array([*here[:2], safe_mm]))
+    pen.move_to(np.array([*printer.park_mm[:2], safe_mm]))
+    pen.add(FinishMoves())
+    pen.add(SetHotend(0.0))
+    pen.add(SetBed(0.0))
+    pen.add(SetFan(0.0))
+
+
+def emit(pen: Pen, one: Pass, model: PatchModel, setup: PrintSetup) -> float:
+    """Lay one pass; returns its plastic."""
+    pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
+    laid_mm3 = 0.0
+    for chain in _ordered(one.chains, pen.position_mm[:2]):
+        target = np.array([*chain.xy_mm[0], one.z_mm])
+        gap = target - pen.position_mm
+        near = abs(gap[2]) < 1e-6 and float(np.hypot(gap[0], gap[1])) < NEAR_MM
+        samples = 2 + int(np.ceil(3 * np.hypot(gap[0], gap[1]) / model.reach.field.cell_mm))
+        way = pen.position_mm[:2] + np.linspace(0.0, 1.0, samples)[:, None] * gap[:2]
+        if near and surely_free(way, one.reach, model).all():
+            pen.move_to(target)
+        else:
+            # nothing that was laid stands higher than this pass
+            over_mm = max(model.reach.least_over(way), one.z_mm) + CLEAR_MM
+            pen.hop_to(target, over_mm=min(over_mm, setup.printer.max_z_mm))
+        lengths = np.hypot(*np.diff(chain.xy_mm, axis=0).T)
+        width_mm = float(chain.section_mm2.mean()) / one.height_mm
+        pen.extrude(
+            np.column_stack([chain.xy_mm, np.full(len(chain.xy_mm), one.z_mm)]),
+            chain.section_mm2,
+            speed_mm_s=setup.process.repair_speed_mm_s,
+            role=chain.role,
+            width_mm=width_of(width_mm, one.height_mm),
+            height_mm=one.height_mm,
+        )
+        laid_mm3 += float(lengths @ chain.section_mm2)
+    return laid_mm3
+
+
+def _ordered(chains: tuple[Chain, ...], start_mm: Float[np.ndarray, " 2"]) -> list[Chain]:
+    """Greedy: the chain whose end is nearest comes next."""
+    heads = np.array([chain.xy_mm[0] for chain in chains])
+    tails = np.array([chain.xy_mm[-1] for chain in chains])
+    alive = np.ones(len(chains), dtype=bool)
+    here = np.asarray(start_mm, dtype=np.float64)
+    out = []
+    for _ in chains:
+        to_head = np.where(alive, ((heads - here) ** 2).sum(axis=1), np.inf)
+        to_tail = np.where(alive, ((tails - here) ** 2).sum(axis=1), np.inf)
+        k = int(np.argmin(np.minimum(to_head, to_tail)))
+        alive[k] = False
+        chain = chains[k] if to_head[k] <= to_tail[k] else chains[k].reversed()
+        out.append(chain)
+        here = chain.xy_mm[-1]
+    return out

@@ -1,0 +1,101 @@
+"""What a patch is planned on: columns over a deficit, and what has been laid on them so far."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from gcode.profiles import PrintSetup
+from gcode.slicing.job import Unprintable
+from gcode.slicing.layers import mesh_of
+from gcode.slicing.reach import Reach
+from gcode.surfaces import HeightField
+from gcode.surfaces import raster_kernels as kernels
+
+FINE_MM, COARSE_MM = 0.1, 0.2
+FINE_CELLS = 250_000
+MARGIN_MM = 3.0
+# A bead thicker than this share of the bore no longer presses onto its floor.
+MOST_THICK_NOZZLES = 0.8
+SEAM_MM = 1.0  # around a loop's seam, as far as old material hides it
+NEAR_MM = 1.0  # a travel as short as this needs no lift
+
+
+class PatchModel:
+    """Columns over the deficit: what is wanted, what is there, what has been laid."""
+
+    def __init__(self, deficit: Any, setup: PrintSetup, as_built: HeightField) -> None:
+        self.deficit = deficit
+        self.as_built = as_built
+        self.box = deficit.bounding_box()
+        x0, y0, x1, y1 = (
+            self.box[0] - MARGIN_MM,
+            self.box[1] - MARGIN_MM,
+            self.box[3] + MARGIN_MM,
+            self.box[4] + MARGIN_MM,
+        )
+        fine = (x1 - x0) * (y1 - y0) / FINE_MM**2 <= FINE_CELLS
+        self.cell_mm = FINE_MM if fine else COARSE_MM
+        nx = int(np.ceil((x1 - x0) / self.cell_mm))
+        ny = int(np.ceil((y1 - y0) / self.cell_mm))
+        self.shape = (ny, nx)
+        self.origin_mm = np.array([x0, y0])
+        vertices, faces = mesh_of(deficit)
+        offsets, self._z, up = kernels.column_crossings(
+            vertices, faces, x0, y0, self.cell_mm, nx, ny
+        )
+        self._sign = up.astype(np.float64)
+        self._column = np.repeat(np.arange(nx * ny), np.diff(offsets))
+        columns_mm3 = float(self.wanted_below(np.inf).sum()) * self.cell_mm**2
+        # columns sample the solid; its own volume is exact
+        self.weight = float(deficit.volume()) / columns_mm3 if columns_mm3 > 0 else 1.0
+        self.top_mm = kernels.column_top(offsets, self._z, -np.inf).reshape(self.shape)
+        self.points_mm = self._centres()
+        floor_mm = as_built.sample(self.points_mm).reshape(self.shape)
+        self.floor_mm = floor_mm
+        self.beside_mm = ndimage.uniform_filter(floor_mm, round(2 * SEAM_MM / self.cell_mm) + 1)
+        self.surface_mm = floor_mm.copy()
+        self.laid_mm = np.zeros(self.shape)
+        self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
+        self.lost: list[Unprintable] = []
+        self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
+        window = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
+        # the lowest pass lies at most one thick bead above the deficit's floor
+        self.reach = Reach(
+            as_built,
+            setup.printer,
+            lowest_tip_mm=max(0.0, float(self.box[2])),
+            window_mm=window,
+        )
+        self.field = as_built
+
+    def _centres(self) -> Float[np.ndarray, "n 2"]:
+        ny, nx = self.shape
+        x = self.origin_mm[0] + (np.arange(nx) + 0.5) * self.cell_mm
+        y = self.origin_mm[1] + (np.arange(ny) + 0.5) * self.cell_mm
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+    def wanted_below(self, z_mm: float) -> Float[np.ndarray, "ny nx"]:
+        """Thickness of the deficit below a height, by column."""
+        below = np.bincount(
+            self._column,
+            weights=self._sign * np.minimum(self._z, z_mm),
+            minlength=self.shape[0] * self.shape[1],
+        )
+        return np.maximum(below.reshape(self.shape), 0.0)
+
+    def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
+        """Columns over which the nozzle may be, from an answer of `reach`."""
+        return self.reach.free_at_points(self.points_mm, reach).reshape(self.shape)
+
+    def surface(self) -> HeightField:
+        """The as-built field with the patch on it."""
+        cells = self.as_built.cells_of(self.points_mm)
+        ny, nx = self.as_built.shape
+        ok = ((cells >= 0) & (cells < (ny, nx))).all(axis=1) & (self.laid_mm.ravel() > 0)
+        z_mm = self.as_built.z_mm.astype(np.float64).copy()
+        np.maximum.at(z_mm, (cells[ok, 0], cells[ok, 1]), self.surface_mm.ravel()[ok])
+        return self.as_built.raised(z_mm)
