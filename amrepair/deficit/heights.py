@@ -136,6 +136,9 @@ def standing_heights(
     around = 2 * math.ceil(BY_WALL_CELLS * seen.cell_mm / cell_mm) + 1
     highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
     by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
+    # but a lip that they round off stands as high as it was seen
+    lip = (z_mm > (highest + lowest) / 2) & (np.abs(seen.z_mm[at] - highest) < TRUST_MM)
+    z_mm = np.where(by_wall & lip, np.maximum(z_mm, seen.z_mm[at]), z_mm)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
     agrees = untouched & (np.abs(seen.z_mm[at] - z_mm) < NOISE_MM)
     # what is much lower was seen on another side: of this one no point fell into the cell

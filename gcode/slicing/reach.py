@@ -18,9 +18,8 @@ from gcode.surfaces import HeightField
 TIP_PRESS_MM = 0.06
 # The noise of the field: half of what the checker allows.
 BODY_PRESS_MM = 0.05
-# The tip lies somewhere in its cell: half of a fine one. Walls are known to within one of them,
-# and a body that grazes a wall hits it in all its height.
-TIP_ASIDE_MM, BODY_ASIDE_MM = 0.05, 0.1
+# The tip lies somewhere in its cell: half of a fine one.
+ASIDE_MM = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +39,8 @@ def least_tip(
     part: EnvelopeSlice, field: HeightField, window: tuple[slice, slice]
 ) -> Float[np.ndarray, "ny nx"]:
     """How high the tip must at least be, by column of the window, for a slice to clear all."""
-    tip = part.z_from_mm < 1e-9
-    press_mm, aside_mm = (TIP_PRESS_MM, TIP_ASIDE_MM) if tip else (BODY_PRESS_MM, BODY_ASIDE_MM)
-    under_mm = field.max_within(part.polygon_mm, window, aside_mm=aside_mm)
+    press_mm = TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_PRESS_MM
+    under_mm = field.max_within(part.polygon_mm, window, aside_mm=ASIDE_MM)
     return np.asarray(under_mm - part.z_from_mm - press_mm)
 
 

@@ -66,3 +66,12 @@ def test_a_thin_roof_that_is_left_is_a_floor() -> None:
     inside = heights(field, (9.0, 21.0), (6.0, 14.0))
     assert np.quantile(inside, 0.02) == pytest.approx(4.0, abs=0.15)
     assert inside.max() == pytest.approx(4.0, abs=0.15)
+
+
+def test_the_lip_of_a_cut_stands_as_high_as_it_was_seen() -> None:
+    """The solids round it off, and the head's body grazed a wall that was said to be lower."""
+    part = box(0, 0, 0, 40, 30, 12)
+    field = field_of(part, box(10, 10, 6, 30, 20, 13))
+    for x in ((9.6, 9.9), (30.15, 30.4)):
+        assert np.quantile(heights(field, x, (11.0, 19.0)), 0.1) > 11.8
+    assert np.quantile(heights(field, (10.3, 29.7), (10.3, 19.7)), 0.99) < 6.5
