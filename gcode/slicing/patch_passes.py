@@ -1,4 +1,4 @@
-"""The passes of a patch, from the floor up: where beads are due, how thick, with how much in them."""
+"""The passes of a patch, from the floor up: where beads are due, and how much is in them."""
 
 from __future__ import annotations
 
