@@ -19,7 +19,7 @@ from gcode.cli.options import (
     program_text,
 )
 from gcode.cli.resuming import resume_at_command
-from gcode.errors import GcodeError, InputError
+from gcode.errors import GcodeError, InputError, ReadError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, list_profiles
 
 if TYPE_CHECKING:
@@ -295,7 +295,10 @@ def send(
     bars = console.Bars()
     with bars.shown():
         checked = check_program(program, setup, as_built=field, progress=bars)
-    cost = estimate_program(checked.program, setup.printer)
+    try:
+        cost = estimate_program(checked.program, setup.printer)
+    except ReadError:  # homing, heating, a test of the mesh: no print job, sent all the same
+        cost = None
     console.errors.print(
         f"{file} on {setup.printer.name}: {what_it_does(checked.program, cost)}.", markup=False
     )

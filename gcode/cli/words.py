@@ -12,16 +12,18 @@ _DEGREES = re.compile(r"\b[SR](\d+(?:\.\d+)?)")
 _HOMING = re.compile(r"G28\b(.*)")
 
 
-def what_it_does(program: Program, cost: Estimate) -> str:
+def what_it_does(program: Program, cost: Estimate | None) -> str:
     """Such as: heats the nozzle to 215 °C, homes X and Y but not Z, lays 36 mm of filament ….
 
     Parameters
     ----------
     cost
-        The program's own estimate.
+        The program's own estimate; None for one that lays nothing.
     """
     commands = [line.partition(";")[0].strip().upper() for line in program.text.splitlines()]
     said = [*_heats(commands), _homes(commands)]
+    if cost is None:
+        return ", ".join([*said, "lays no filament"])
     low, high = cost.bounds_mm[2], cost.bounds_mm[5]
     amount = f"{cost.filament_mm / 1000:.2f} m" if cost.filament_mm >= 1000 else (
         f"{cost.filament_mm:.0f} mm"

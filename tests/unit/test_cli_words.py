@@ -204,3 +204,9 @@ def test_a_job_tells_what_to_type_as_the_pose(
     assert "--job" in pose_of_job(None, part, ids)
     part.write_text("no job")
     assert "does not tell" in pose_of_job(part, part, ids)
+
+
+def test_a_program_that_lays_nothing_is_told_too() -> None:
+    """Homing and heating are no print job; they are sent all the same."""
+    said = what_it_does(Program("G28\nM140 S60\nG1 X10 F600\n", "prusa"), None)
+    assert said == "heats the bed to 60 °C, homes X, Y and Z, lays no filament"
