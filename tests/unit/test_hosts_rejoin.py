@@ -95,11 +95,11 @@ def test_what_never_began_is_printed(octo: FakeOctoPrint, moon: FakeMoonraker) -
 def test_what_is_under_way_is_followed_to_its_end(octo: FakeOctoPrint, moon: FakeMoonraker) -> None:
     octo.file = left_there(octo)
     octo.flags, octo.text, octo.completion = {"operational": True, "printing": True}, "P", 40.0
-    threading.Timer(0.1, octo.finish).start()
+    threading.Timer(1.0, octo.finish).start()
     report = gone_on(printer_at(octo))
     assert (report.ok, report.first_line, report.next_line) == (True, 0, 15)
     moon.objects["print_stats"].update(state="printing", filename=left_there(moon))
-    threading.Timer(0.1, moon.finish).start()
+    threading.Timer(1.0, moon.finish).start()
     report = gone_on(moon_printer(moon))
     assert (report.ok, report.next_line) == (True, 15)
     assert not any("print.start" in call for call in moon.calls)
