@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gcode.errors import InputError
+
+if TYPE_CHECKING:
+    import trimesh
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +65,7 @@ def read_solid(path: Path) -> Any:
     extent = float(np.ptp(vertices, axis=0).max())
     if extent <= 0:
         raise InputError(f"{path}: the mesh has no extent; export it again.")
-    solid = first_closed(vertices, np.asarray(mesh.faces))
+    solid, _ = first_closed(vertices, np.asarray(mesh.faces))
     if solid is None:
         raise InputError(
             f"{path}: the mesh is no closed surface (NotManifold), nor when vertices within "
@@ -99,8 +102,12 @@ def is_valid(solid: Any) -> bool:
     return bool(solid.status() == manifold3d.Error.NoError and not solid.is_empty())
 
 
-def first_closed(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
+def first_closed(
+    vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Any, trimesh.Trimesh]:
     """The first closed solid among the file's own triangles, welded ever more; None if none is.
+
+    With it come the triangles as they were welded last, for those who mend.
 
     As they are: a file that shares vertices means it, and bodies that touch stay apart. Then equal
     vertices are one, as STL needs; then those that single precision may have parted.
@@ -112,18 +119,18 @@ def first_closed(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "
     if len(vertices_mm) < 3 * len(faces):
         solid = as_manifold(welded.vertices, welded.faces)
         if is_valid(solid):
-            return solid
+            return solid, welded
     for digits in (None, int(np.floor(-np.log10(extent * WELD_RATIO)))):
         welded.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=digits)
         solid = as_manifold(welded.vertices, welded.faces)
         if is_valid(solid):
-            return solid
+            return solid, welded
     # slivers without area may hold a surface together, so they go last
     welded.update_faces(welded.nondegenerate_faces())
     solid = as_manifold(welded.vertices, welded.faces)
     if is_valid(solid):
-        return solid
-    return None
+        return solid, welded
+    return None, welded
 
 
 def unite_overlaps(solid: Any) -> tuple[Any, float]:

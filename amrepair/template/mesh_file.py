@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
-from gcode.solids import SUFFIXES, WELD_RATIO, as_manifold, first_closed, is_valid, unite_overlaps
+from gcode.solids import SUFFIXES, as_manifold, first_closed, is_valid, unite_overlaps
 
 if TYPE_CHECKING:
     import trimesh
@@ -152,16 +152,13 @@ def close_mesh(mesh: trimesh.Trimesh, *, source: str) -> tuple[trimesh.Trimesh, 
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     _refuse_bad_numbers(vertices, source)
     notes: list[str] = []
-    working = trimesh.Trimesh(vertices, np.asarray(mesh.faces), process=False)
     extent_mm = float(np.ptp(vertices, axis=0).max())
-    digits = int(np.floor(-np.log10(max(extent_mm, 1e-12) * WELD_RATIO)))
-    working.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=digits)
-    working.update_faces(working.nondegenerate_faces())
-    if len(working.faces) == 0:
-        raise TemplateError(f"the mesh {source} has only triangles without area; export it again")
-    solid = first_closed(vertices, np.asarray(mesh.faces))
+    solid, welded = first_closed(vertices, np.asarray(mesh.faces))
     if solid is None:
-        solid = _mend(working, source, notes)
+        if len(welded.faces) == 0:
+            what = "only triangles without area"
+            raise TemplateError(f"the mesh {source} has {what}; export it again")
+        solid = _mend(welded, source, notes)
     solid = _orient(solid, notes)
     solid, overlap_mm3 = unite_overlaps(solid)
     if overlap_mm3 > 0:

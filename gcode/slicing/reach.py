@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
@@ -78,8 +78,8 @@ class Reach:
 
     def least_over(self, way_mm: Float[np.ndarray, "n 2"]) -> float:
         """How high the tip must at least be to go along points; where unknown, over everything."""
-        index = self.field.cells_of(way_mm)
-        if not self.obstacles or not ((index >= 0) & (index < self.field.shape)).all():
+        index, inside = self._cells(way_mm)
+        if not self.obstacles or not inside.all():
             return self._top_mm
         return max(float(o.least_tip_mm[index[:, 0], index[:, 1]].max()) for o in self.obstacles)
 
@@ -94,11 +94,16 @@ class Reach:
         self, points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "ny nx"]
     ) -> Bool[np.ndarray, " n"]:
         """Values of an answer of `at` at points; outside the field nothing stands."""
-        index = self.field.cells_of(points_mm)
-        ny, nx = self.field.shape
-        inside = np.asarray(((index >= 0) & (index < (ny, nx))).all(axis=1))
-        index = np.where(inside[:, None], index, 0)
+        index, inside = self._cells(points_mm)
         return np.asarray(~inside | np.asarray(free)[index[:, 0], index[:, 1]])
+
+    def _cells(
+        self, points_mm: Float[np.ndarray, "n 2"]
+    ) -> tuple[Int[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+        """Cells of points, the first one for those outside, and which lie inside."""
+        index = self.field.cells_of(points_mm)
+        inside = np.asarray(((index >= 0) & (index < self.field.shape)).all(axis=1))
+        return np.where(inside[:, None], index, 0), inside
 
     def reason_at(self, iy: int, ix: int, z_mm: float) -> str | None:
         """What stands in the way of the tip at one column; None where nothing does."""

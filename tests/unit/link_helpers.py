@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+from gcode.hosts.port import PrintReport
+from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
 from gcode.profiles import AxisLimits, EnvelopeSlice, PrinterProfile
 
@@ -66,3 +70,34 @@ def moves(count: int) -> list[str]:
         f"G1 X{50 + (i * 7919 % 1000) / 10:.2f} Y{50 + (i * 104729 % 1000) / 10:.2f} E0.01"
         for i in range(count)
     ]
+
+
+def print_with_a_pause(
+    printer: SerialPrinter,
+    lines: list[str],
+    meanwhile: Callable[[], object] = lambda: None,
+    *,
+    pauses: int = 1,
+) -> PrintReport:
+    """Pause on the way, so often at once; once it rests, do something, and go on."""
+    asked = threading.Event()
+
+    def tell(stage: str, count: float, total: float) -> None:
+        if count and not asked.is_set():
+            for _ in range(pauses):
+                printer.pause()
+            asked.set()
+
+    def go_on() -> None:
+        asked.wait(20)
+        while "paused" not in printer.notes:
+            asked.wait(0.01)
+        meanwhile()
+        printer.resume()
+
+    thread = threading.Thread(target=go_on)
+    thread.start()
+    try:
+        return printer.print(program(lines), progress=tell)
+    finally:
+        thread.join(20)

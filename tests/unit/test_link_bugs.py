@@ -13,7 +13,7 @@ import serial
 
 sys.path.insert(0, str(Path(__file__).parent))
 from link_harness import Conversation
-from link_helpers import moves, profile, program
+from link_helpers import moves, print_with_a_pause, profile, program
 
 import gcode.hosts.serial as serial_host
 from gcode.errors import LocalProtocolError
@@ -177,24 +177,7 @@ def test_bug_10_a_purge_in_a_pause_makes_no_giant_extrusion() -> None:
     with EmulatedPrinterProcess(printer=profile()) as emulator:
         printer = SerialPrinter(emulator.port, supervise=False)
         printer.connect()
-        asked = threading.Event()
-
-        def tell(stage: str, count: float, total: float) -> None:
-            if count and not asked.is_set():
-                printer.pause()
-                asked.set()
-
-        def purge() -> None:
-            asked.wait(20)
-            while "paused" not in printer.notes:
-                asked.wait(0.01)
-            printer.command("G1 E8 F300")
-            printer.resume()
-
-        thread = threading.Thread(target=purge)
-        thread.start()
-        report = printer.print(program(lines), progress=tell)
-        thread.join(20)
+        report = print_with_a_pause(printer, lines, lambda: printer.command("G1 E8 F300"))
         printer.finish_moves()
         motion = emulator.take_motion()
         printer.close()
@@ -210,24 +193,7 @@ def paused_on_the_way(lines: list[str], pauses: int) -> tuple[tuple[float, ...],
     with EmulatedPrinterProcess(printer=profile()) as emulator:
         printer = SerialPrinter(emulator.port, supervise=False)
         printer.connect()
-        asked = threading.Event()
-
-        def tell(stage: str, count: float, total: float) -> None:
-            if count and not asked.is_set():
-                for _ in range(pauses):
-                    printer.pause()
-                asked.set()
-
-        def go_on() -> None:
-            asked.wait(20)
-            while "paused" not in printer.notes:
-                asked.wait(0.01)
-            printer.resume()
-
-        thread = threading.Thread(target=go_on)
-        thread.start()
-        printer.print(program(lines), progress=tell)
-        thread.join(20)
+        print_with_a_pause(printer, lines, pauses=pauses)
         place = printer.position_mm()
         highest_mm = float(emulator.take_motion().end_mm[:, 2].max())
         printer.close()

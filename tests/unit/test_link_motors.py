@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from link_helpers import moves, profile, program
+from link_helpers import moves, print_with_a_pause, profile, program
 
 import gcode.hosts.serial as serial_host
 from gcode.errors import PrinterError
@@ -69,26 +68,7 @@ def test_heating_keeps_the_motors_on() -> None:
 
 def print_with_a_rest(printer: SerialPrinter, rest_s: float, late_s: list[float]) -> PrintReport:
     """Pause on the way, let the host's clock go on by `rest_s`, and go on."""
-    asked = threading.Event()
-
-    def tell(stage: str, count: float, total: float) -> None:
-        if count and not asked.is_set():
-            printer.pause()
-            asked.set()
-
-    def go_on() -> None:
-        asked.wait(20)
-        while "paused" not in printer.notes:
-            asked.wait(0.01)
-        late_s[0] = rest_s
-        printer.resume()
-
-    thread = threading.Thread(target=go_on)
-    thread.start()
-    try:
-        return printer.print(program(LINES), progress=tell)
-    finally:
-        thread.join(20)
+    return print_with_a_pause(printer, LINES, lambda: late_s.__setitem__(0, rest_s))
 
 
 def test_a_pause_holds_the_motors_for_good(tmp_path: Path) -> None:
