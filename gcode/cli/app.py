@@ -276,6 +276,12 @@ def send(
         Path | None,
         typer.Option(help="Journal, written ahead of the wire; one a port where left out."),
     ] = None,
+    window: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Lines under way at once; more than 1 for firmware that buffers them."
+        ),
+    ] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
@@ -306,6 +312,7 @@ def send(
         port,
         dialect=setup.printer.dialect,
         baud=setup.printer.baud,
+        window=window,
         wire_log=wire_log,
         journal=journal or default_path(port),
     )

@@ -125,9 +125,9 @@ class Machine(Mechanics):
                 if letter in axes:
                     self.offset[axis] = 0.0
             self.planner.moved_s = self.clock_s
+            self.unhomed -= axes
             if axes == {"X", "Y", "Z"}:
                 self.homed = True
-                self.must_home = False
             self.record_jump(here)
 
         self.wait_for(drained_s + 2.0 + distance / HOMING_MM_S, then=homed)
@@ -243,8 +243,11 @@ class Machine(Mechanics):
         self.message = rest.decode("latin-1")
 
     def _m118(self, rest: bytes) -> None:
-        text = re.sub(rb"^(?:\s*[AEP]\d\s+)+", b"", rest).decode("latin-1")
-        self.replies.append(text)
+        switches = re.match(rb"(?:\s*[AEP]\d\s+)*", rest)
+        assert switches is not None
+        before = {b"A1": "//", b"E1": "echo:"}  # one of them, says Marlin
+        said = [before[word] for word in switches.group().split() if word in before]
+        self.replies.append("".join(said[:1]) + rest[switches.end() :].decode("latin-1"))
 
     def _m154(self, rest: bytes) -> None:
         self.auto_position_s = words_of(rest).get("S", 0.0)

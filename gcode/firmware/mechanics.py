@@ -78,7 +78,7 @@ class Mechanics:
         self.e = 0.0  # logical, as G92 sets it
         self.offset = [0.0, 0.0, 0.0]  # logical = native + offset
         self.homed = False
-        self.must_home = False
+        self.unhomed = set("XYZ") if self.variant.unhomed else set()
         self.motors_off_s = self.variant.motors_off_s
         self.planner.moved_s = self.clock_s
         self.absolute = True
@@ -118,9 +118,14 @@ class Mechanics:
 
     def move_to(self, target: tuple[float, float, float], de_mm: float) -> None:
         """Queue a move; a full queue lets the clock run until there is room."""
-        if not self.planner.blocks and self._motors_let_go():
-            return
+        if not self.planner.blocks:
+            self._let_go()
         start = (self.x, self.y, self.z)
+        if self.unhomed and any(
+            axis in self.unhomed and a != b for axis, a, b in zip("XYZ", start, target, strict=True)
+        ):
+            self.replies.append(self.variant.unhomed)
+            return
         if de_mm:
             self.e += de_mm
             de_mm *= self.flow_ratio
@@ -141,17 +146,14 @@ class Mechanics:
             self.let_pass(max(planner.head_end_s, self.clock_s))
         planner.push(start, target, de_mm, self.feed_mm_s * self.speed_ratio)
 
-    def _motors_let_go(self) -> bool:
-        """Whether a firmware whose motors have been let go refuses to move; Marlin does not."""
-        if not self.must_home:
-            if self.clock_s - self.planner.moved_s <= self.motors_off_s:
-                return False
-            self.let_go += 1
-            self.planner.moved_s = self.clock_s
-            self.must_home = self.variant.name == "klipper"
-        if self.must_home:
-            self.replies.append("!! Must home axis first")
-        return self.must_home
+    def _let_go(self) -> None:
+        """Let the motors go if they have rested for long; Marlin does not forget that it homed."""
+        if self.clock_s - self.planner.moved_s <= self.motors_off_s:
+            return
+        self.let_go += 1
+        self.planner.moved_s = self.clock_s
+        if self.variant.unhomed:
+            self.unhomed = set("XYZ")
 
     def _cold(self) -> None:
         if self.variant.name == "klipper":
@@ -227,11 +229,11 @@ class Mechanics:
             heater.set_target(0.0, self.clock_s)
         self.fan_ratio = 0.0
         self.wait = None
-        if why:
-            self.replies.append(f"{self.variant.error_prefix}{why}")
         if self.variant.name == "klipper":
-            self.replies.append("!! Shutdown due to M112 command")
+            self.replies.append(f"!! Shutdown due to {why or 'M112 command'}")
         else:
+            if why:
+                self.replies.append(f"{self.variant.error_prefix}{why}")
             self.replies.append(f"{self.variant.error_prefix}Printer halted. kill() called!")
         self.killed = True
 

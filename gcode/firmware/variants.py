@@ -20,6 +20,9 @@ class Variant:
     numbers
         `verify`: number and checksum must be right; `checksum`: only the checksum, a bad line is
         dropped silently; `ignore`: both are stripped unread.
+    unhomed
+        What is said to a move of an axis that is not homed, which is then not made; empty where
+        such moves are made (Marlin, unless it is built otherwise).
     modes_follow_g90
         G90 and G91 set the extruder's mode too (Marlin); `relative_only`: G91 makes E relative
         while it lasts and M83 persists (Klipper); `independent`: they leave it alone.
@@ -32,6 +35,7 @@ class Variant:
     numbers: Literal["verify", "checksum", "ignore"]
     modes_follow_g90: Literal["both", "relative_only", "independent"]
     error_prefix: str
+    unhomed: str
     unknown: str
     echo_prefix: str
     emergency_parser: bool
@@ -68,6 +72,7 @@ VARIANTS: dict[str, Variant] = {
         numbers="verify",
         modes_follow_g90="both",
         error_prefix="Error:",
+        unhomed="",
         unknown='echo:Unknown command: "{command}"',
         echo_prefix="echo:",
         emergency_parser=True,
@@ -90,6 +95,7 @@ VARIANTS: dict[str, Variant] = {
         numbers="verify",
         modes_follow_g90="independent",
         error_prefix="Error:",
+        unhomed="",
         unknown='echo:Unknown command: "{command}"',
         echo_prefix="echo:",
         emergency_parser=False,
@@ -100,12 +106,13 @@ VARIANTS: dict[str, Variant] = {
     ),
     "klipper": Variant(
         name="klipper",
-        banner=(),
+        banner=("// Klipper state: Ready",),
         firmware_line="FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12.0-emulated",
         capabilities=(),
         numbers="ignore",
         modes_follow_g90="relative_only",
         error_prefix="!! ",
+        unhomed="!! Must home axis first",
         unknown='// Unknown command:"{command}"',
         echo_prefix="// ",
         emergency_parser=False,
@@ -123,6 +130,7 @@ VARIANTS: dict[str, Variant] = {
         numbers="checksum",
         modes_follow_g90="independent",
         error_prefix="Error: ",
+        unhomed="Error: G0/G1: insufficient axes homed",
         unknown="Error: Bad command: {command}",
         echo_prefix="",
         emergency_parser=False,

@@ -1,14 +1,15 @@
-"""Plain moves and plain answers, as fast as a port can take turns: two system calls and a wait.
+"""Plain moves and plain answers, as fast as a port can take turns: two system calls a line.
 
-It knows neither numbers nor journals: what is written was made ready by the link and reserved in
-the journal before, and what became of it is told to both afterwards, whatever ended it.
+The port itself waits for the answer (`waiting`): to ask first whether there is one would be a
+third call. It knows neither numbers nor journals: what is written was made ready by the link and
+reserved in the journal before, and what became of it is told to both afterwards, whatever ended it.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from gcode.protocol import PLAIN_OK
@@ -18,14 +19,28 @@ MOST_S = 0.25
 READ_BYTES = 65536
 
 
+@contextlib.contextmanager
+def waiting(fd: int) -> Iterator[None]:
+    """Let reads wait for bytes, as long as the port was told to (VTIME), then return none.
+
+    Nor does a write return before the port has taken all: for the little that is under way, it has
+    room.
+    """
+    os.set_blocking(fd, True)
+    try:
+        yield
+    finally:
+        os.set_blocking(fd, False)
+
+
 @dataclass(slots=True)
 class Exchange:
     """What became of moves, right at every moment, so that any exception may end it.
 
     Parameters
     ----------
-    wait
-        Waits for something to read; false where nothing came.
+    fd
+        A port whose reads wait (`waiting`).
     oks
         How many plain acknowledgements some bytes are, so many having come before; 0 where they
         are anything else.
@@ -39,11 +54,10 @@ class Exchange:
     rest
         What the port did not take of the last of them.
     answer
-        What came instead of a plain `ok`; None where nothing came in time.
+        What came instead of a plain `ok`; None where nothing came in time, or the port is closed.
     """
 
     fd: int
-    wait: Callable[[], object]
     clock: Callable[[], float]
     oks: Callable[[bytes, int], int]
     asked_to_stop: Callable[[], bool]
@@ -62,25 +76,24 @@ class Exchange:
         OSError
             If the port fails.
         """
-        with contextlib.suppress(BlockingIOError):  # somebody else has read the answer
-            if self.window == 1:
-                self._one_by_one(moves)
-            else:
-                self._by_window(moves)
+        if self.window == 1:
+            self._one_by_one(moves)
+        else:
+            self._by_window(moves)
 
     def _one_by_one(self, moves: Sequence[bytes]) -> None:
-        fd, clock, wait, asked_to_stop = self.fd, self.clock, self.wait, self.asked_to_stop
+        fd, clock, asked_to_stop = self.fd, self.clock, self.asked_to_stop
         read, noted, answered = os.read, self.sent_s.append, self.answered_s.append
         until_s = clock() + MOST_S
         for move in moves:
             if asked_to_stop():
                 return
             noted(clock())
-            if not self._write(move) or not wait():
+            if not self._write(move):
                 return
             answer = read(fd, READ_BYTES)
             if answer != PLAIN_OK and self.oks(answer, len(self.answered_s)) != 1:
-                self.answer = answer
+                self.answer = answer or None
                 return
             now_s = clock()
             answered(now_s)
@@ -101,12 +114,12 @@ class Exchange:
                 self.sent_s += [now_s] * (sent - first)
                 if not self._write(b"".join(moves[first:sent])):
                     return
-            if answered == sent or not self.wait():
+            if answered == sent:
                 return
             answer = os.read(self.fd, READ_BYTES)
             count = self.oks(answer, answered)
             if not 0 < count <= sent - answered:
-                self.answer = answer
+                self.answer = answer or None
                 return
             under_way -= sum(map(len, moves[answered : answered + count]))
             answered += count
@@ -114,10 +127,7 @@ class Exchange:
 
     def _write(self, data: bytes) -> bool:
         """Write all of `data`; else keep the rest, for those who can wait."""
-        try:
-            taken = os.write(self.fd, data)
-        except BlockingIOError:
-            taken = 0
+        taken = os.write(self.fd, data)
         if taken < len(data):
             self.rest = data[taken:]
             return False

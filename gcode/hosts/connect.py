@@ -16,6 +16,7 @@ def connect(
     *,
     dialect: str = "marlin",
     baud: int = 115200,
+    window: int = 1,
     wire_log: Path | None = None,
     journal: Path | None = None,
 ) -> Printer:
@@ -26,6 +27,9 @@ def connect(
     port
         A device path, `octoprint+http://…`, `moonraker+http://…` or `file:PATH`. The servers'
         API keys come from the environment or the keys file (`secret`), never with the name.
+    window
+        Lines under way at once on a device; more than 1 only for firmware that buffers them and
+        numbers its answers (ADVANCED_OK).
 
     Raises
     ------
@@ -60,6 +64,7 @@ def connect(
     return SerialPrinter(
         port,
         baud=baud,
+        window=window,
         dialect=dialect,
         wire_log=wire_log,
         journal=Journal(journal) if journal is not None else None,

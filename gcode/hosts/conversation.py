@@ -28,6 +28,8 @@ from gcode.protocol import events as ev
 Answer = TypeVar("Answer")
 QUERY_TRIES = 3
 MOST_WAIT_S = 0.5
+PROOF_QUIET_S = 0.2
+"""A printer that has said nothing for so long has nothing left to say."""
 
 
 class SerialConversation:
@@ -57,7 +59,6 @@ class SerialConversation:
         self._serial: serial.Serial | None = None
         self._fd = -1
         self._poll = select.poll()
-        self._first_wait_ms = 1000.0 * min(self._link.timing.silence_s, MOST_WAIT_S)
         self._mutex = threading.RLock()
         self._capabilities = Capabilities("")
         self._position: ev.PositionReport | None = None
@@ -65,6 +66,7 @@ class SerialConversation:
         self._asked = {"M114": 0, "M115": 0}
         self._heard = {"M114": 0, "M115": 0}
         self._failure: Exception | None = None
+        self._ended_by = ""  # why another thread has ended the link
         self._warnings: deque[str] = deque(maxlen=100)
         self._stalls = self._bytes_sent = 0
         self._refused_numbers: list[int] = []
@@ -99,17 +101,22 @@ class SerialConversation:
             raise LinkError(f"{self.port} cannot be opened ({error}); check the path.") from error
         self._serial = device
         self._fd = device.fileno()
-        self._keep_line_up()
+        self._set_up_port()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
 
-    def _keep_line_up(self) -> None:
-        """Clear HUPCL: closing the port must not drop DTR and so reset the printer."""
+    def _set_up_port(self) -> None:
+        """Clear HUPCL: closing the port must not drop DTR and so reset the printer.
+
+        And say how long a read waits, where one waits (`beaten_path`): VTIME, tenths of a second.
+        """
         import termios
 
+        wait_s = min(self._link.timing.silence_s, MOST_WAIT_S)
         with contextlib.suppress(termios.error):
             attributes = termios.tcgetattr(self._fd)
             attributes[2] &= ~termios.HUPCL
+            attributes[6][termios.VMIN], attributes[6][termios.VTIME] = 0, max(1, int(10 * wait_s))
             termios.tcsetattr(self._fd, termios.TCSANOW, attributes)
 
     def _close_port(self) -> None:
@@ -123,7 +130,7 @@ class SerialConversation:
 
     def _greet(self, number: int = 0) -> None:
         self._greeted = False
-        self._failure = None
+        self._failure, self._ended_by = None, ""
         self._write(self._link.hello(self._clock(), number=number))
         while not self._greeted:
             self._pump()
@@ -243,13 +250,17 @@ class SerialConversation:
         """Make sure that the printer has received every line, whatever its `ok`s say.
 
         A question is carried out once and answered once: when all questions of a kind are
-        answered, the last of them has been received, and with it every line before.
+        answered, the last of them has been received, and with it every line before. Where one is
+        missing, an answer was garbled, or the `ok`s are ahead of the printer: it is heard out, and
+        from then on only new questions count.
         """
         for kind in (*("M114",) * 4, "M115", "M114", "M115"):
             self._ask(kind)
             if self._heard[kind] >= self._asked[kind]:
                 self._link.confirm()
                 return
+            self._settle(PROOF_QUIET_S)
+            self._asked[kind] = self._heard[kind] = 0
         self._lost("the printer does not prove that it received the last lines")
 
     def command(self, text: str) -> None:
@@ -321,6 +332,9 @@ class SerialConversation:
             self._write(output)
         for event in events:
             self._on_event(event)
+        if self._ended_by:
+            why, self._ended_by = self._ended_by, ""
+            raise self._lost_error(why)
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure

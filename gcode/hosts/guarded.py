@@ -5,6 +5,7 @@ It owns the lock, the supervisor, the journal and the safe exits; what is printe
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +22,8 @@ from gcode.protocol import LinkTiming
 from gcode.protocol import events as ev
 
 PAUSE_LIFT_MM = 5.0
+REST_S = 2.0
+"""Longest wait for the answers under way before a safe exit goes past them."""
 
 
 class GuardedConversation(SerialConversation):
@@ -138,7 +141,8 @@ class GuardedConversation(SerialConversation):
     def emergency_stop(self) -> None:
         """Send M112, past every queue that the firmware lets it pass."""
         self._write(b"\nM112\n")
-        self._link.give_up("an emergency stop was asked for")
+        self._ended_by = "an emergency stop was asked for"
+        self._link.give_up(self._ended_by)
 
     def heaters_off(self) -> None:
         """Switch hotend, bed and fan off, acknowledged."""
@@ -146,18 +150,39 @@ class GuardedConversation(SerialConversation):
             self._ask(command)
 
     def make_safe(self) -> None:
-        """Heaters off and nozzle lifted, by any means left; says loudly if it cannot."""
+        """Heaters off and nozzle lifted, by any means left; says loudly if it cannot.
+
+        An interrupt comes in the middle of a line, and then its answer is waited for. Where none
+        comes, and while something heats, unnumbered lines go past it; after a lost link nobody
+        knows where the nozzle is, and it stays there.
+        """
         if self._serial is None:
             return
-        try:
-            if self._link.ended or not self._link.idle:
-                data = b"\n" + b"".join(command.encode() + b"\n" for command in SAFE_COMMANDS)
-                self._write(data)
-                self._note("heaters told to switch off by unnumbered lines; nothing confirms it")
-            else:
-                self._switch_off()
-        except (LinkError, LocalProtocolError, OSError) as error:
-            self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+        with self._mutex:
+            try:
+                if self._comes_to_rest():
+                    self._switch_off()
+                else:
+                    self._go_past()
+            except (LinkError, LocalProtocolError, OSError) as error:
+                self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+
+    def _comes_to_rest(self) -> bool:
+        """Hear out what is under way, unless that takes minutes; whether nothing is left of it."""
+        until_s = self._clock() + REST_S
+        with contextlib.suppress(LinkError):  # it says what everybody knows: something is wrong
+            while not self._link.idle and not self._link.ended and not self._link.slow_under_way:
+                left_s = until_s - self._clock()
+                if left_s <= 0:
+                    break
+                self._pump(limit_s=left_s)
+        return self._link.idle
+
+    def _go_past(self) -> None:
+        """Make safe by unnumbered lines; nothing of the job is sent after them."""
+        lift = not self._link.ended
+        self._link.give_up("the printer was made safe")
+        self._note(make_safe(self._fd, lift=lift))
 
     def _switch_off(self) -> None:
         try:

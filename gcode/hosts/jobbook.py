@@ -43,6 +43,8 @@ class JobBook:
         self._sent: deque[tuple[int, int]] = deque(maxlen=2 * HISTORY_LINES)
         self._first = self._end = 0
         self._reserved = 0  # end of the journal's open step; 0 if none is open
+        self._coming = 0  # what it is being extended to; 0 if it is not
+        self._paced = (0.0, 0)  # when it was extended last, and where
         self._noted_s = self._noted_bed_c = -math.inf
         self.lines_sent = 0
 
@@ -50,7 +52,7 @@ class JobBook:
         """Turn to a new page: program lines [first, end)."""
         self._sent.clear()
         self._first, self._end = first, end
-        self._reserved = self.lines_sent = 0
+        self._reserved = self._coming = self.lines_sent = 0
 
     def begin(self, checked: PrintableProgram, port: str) -> None:
         """Write the job down."""
@@ -61,15 +63,13 @@ class JobBook:
 
     def before_line(self, index: int) -> None:
         """Write down that program line `index` is sent next."""
-        if index >= self._reserved:
-            self._reserve(index)
+        self._have_reserved(index)
         self._sent.append((self._link.last_sent + 1, index))
         self.lines_sent += 1
 
     def before_moves(self, indices: Sequence[int]) -> int:
         """Write down that program lines are sent next; returns how many of them may be."""
-        if indices[0] >= self._reserved:
-            self._reserve(indices[0])
+        self._have_reserved(indices[0])
         return (
             len(indices) if indices[-1] < self._reserved else bisect_left(indices, self._reserved)
         )
@@ -79,21 +79,45 @@ class JobBook:
         self._sent.extend(enumerate(indices, self._link.last_sent - len(indices) + 1))
         self.lines_sent += len(indices)
 
-    def _reserve(self, index: int) -> None:
-        if self._journal is None:
+    def _have_reserved(self, index: int) -> None:
+        """Return when line `index` may be sent; have the lines after it reserved meanwhile."""
+        journal = self._journal
+        if journal is None:
             self._reserved = self._end
             return
-        step = self._journal.step_lines if self._link.dialect.verifies else UNCOUNTED_STEP
-        reserved = min(index + step, self._end)
-        self._journal.reserve(index, self._next_number(), reserved, self.executed_line + 1)
-        self._reserved = reserved
+        if index >= self._reserved and self._coming:
+            journal.extended()
+            self._reserved, self._coming = self._coming, 0
+        counted = self._link.dialect.verifies
+        step = journal.step_lines // 2 if counted else UNCOUNTED_STEP
+        if index >= self._reserved:
+            reserved = min(index + step, self._end)
+            journal.reserve(index, self._next_number(), reserved, self.executed_line + 1)
+            self._reserved, self._paced = reserved, (self._clock(), index)
+        if counted and not self._coming and self._reserved < self._end:
+            self._coming = min(self._reserved + max(step, self._pace(index)), self._end)
+            journal.extend(self._coming, self.executed_line + 1)
+
+    def _pace(self, index: int) -> int:
+        """How many lines go out in half a step's time, as fast as they went since the last."""
+        assert self._journal is not None
+        now_s, (since_s, first) = self._clock(), self._paced
+        self._paced = now_s, index
+        rate = (index - first) / max(now_s - since_s, 1e-6)
+        return int(rate * self._journal.step_s / 2)
+
+    def _close_step(self) -> None:
+        """Reserve anew before the next line."""
+        if self._coming and self._journal is not None:
+            self._journal.extended()
+        self._reserved = self._coming = 0
 
     def before_own_command(self) -> None:
         """Write down that the next wire number is no program line's."""
         if self._journal is not None and self._reserved:
+            self._close_step()
             line = self.last_sent_line + 1
             self._journal.reserve(line, self._next_number(), line, self.executed_line + 1)
-            self._reserved = 0
 
     def _next_number(self) -> int | None:
         return self._link.last_sent + 1 if self._link.dialect.verifies else None

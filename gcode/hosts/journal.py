@@ -2,8 +2,9 @@
 
 Before a line goes out, the journal already says that it may (`reserved`): after a crash the
 uncertain interval is [acked, reserved), never smaller than the truth. Lines are reserved in steps,
-one synchronous commit each, so that the wire does not wait for the disk; where the printer counts
-no lines the step is short, for its place must tell them apart.
+and a step that is under way is extended by one synchronous commit while its lines go out, so that
+the wire does not wait for the disk; where the printer counts no lines the step is short, for its
+place must tell them apart.
 A step also says which wire number its first line gets, and every command of the host's own is
 preceded by an empty step: so the number that a printer has reached names one program line.
 Numbers begin anew with every session, above all that were used before: a printer whose number
@@ -20,6 +21,7 @@ import random
 import sqlite3
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -122,20 +124,22 @@ class Journal:
 
     Parameters
     ----------
-    step_lines
-        Lines reserved by one commit: the widest interval that a crash can leave uncertain
-        before the printer is asked.
+    step_lines, step_s
+        So many lines are reserved ahead at most, or as many as go out in so many seconds where
+        that is more: the widest interval that a crash can leave uncertain before the printer is
+        asked. A disk is asked no more often by a faster printer.
     """
 
     def __init__(
         self,
         path: Path,
         *,
-        step_lines: int = 512,
+        step_lines: int = 500,
+        step_s: float = 0.4,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self.path = path
-        self.step_lines = step_lines
+        self.step_lines, self.step_s = step_lines, step_s
         self._clock = clock
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -148,6 +152,8 @@ class Journal:
             raise JournalError(
                 f"The journal {path} cannot be used ({error}); name another file."
             ) from error
+        self._disk: ThreadPoolExecutor | None = None
+        self._extension: Future[None] | None = None
         self._job: int | None = None
         self._session: int | None = None
         self._settled: int | None = None
@@ -224,18 +230,40 @@ class Journal:
         acked
             Every program line below is acknowledged.
         """
-        self._run("BEGIN IMMEDIATE")
-        try:
-            if number is not None:
-                row = (self._job, line, number, up_to, self._clock())
-                self._run("INSERT INTO step VALUES (?, ?, ?, ?, ?)", *row)
-            progress = (up_to, acked, self._job)
-            self._run("UPDATE job SET reserved = ?, acked = ? WHERE id = ?", *progress)
-            self._run("COMMIT")
-        except JournalError:
-            with contextlib.suppress(JournalError):
-                self._run("ROLLBACK")
-            raise
+        steps = []
+        if number is not None:
+            row = (self._job, line, number, up_to, self._clock())
+            steps.append(("INSERT INTO step VALUES (?, ?, ?, ?, ?)", row))
+        self._await_disk()
+        self._advance(up_to, acked, *steps)
+
+    def extend(self, up_to: int, acked: int) -> None:
+        """Begin to say that the lines up to `up_to` may be sent as well; see `extended`.
+
+        They get the numbers that follow in the step under way: nothing else may be sent between.
+        A thread waits for the disk meanwhile.
+        """
+        if self._disk is None:
+            self._disk = ThreadPoolExecutor(1, "journal")
+        last = "(SELECT MAX(rowid) FROM step)"
+        step = f"UPDATE step SET reserved = ?, time_s = ? WHERE rowid = {last}"
+        self._extension = self._disk.submit(
+            self._advance, up_to, acked, (step, (up_to, self._clock()))
+        )
+
+    def extended(self) -> None:
+        """Return when what `extend` was told is on the disk.
+
+        Raises
+        ------
+        JournalError
+            If it is not.
+        """
+        if self._extension is not None:
+            error = self._extension.exception()
+            self._extension = None  # now, and not where the wait was interrupted
+            if error is not None:
+                raise error
 
     def acknowledged(self, acked: int) -> None:
         """Say that every program line below `acked` has been received, proved by an answer."""
@@ -349,9 +377,34 @@ class Journal:
 
     def close(self) -> None:
         """Close the file."""
+        if self._disk is not None:
+            self._disk.shutdown()
         self._db.close()
 
+    def _advance(self, reserved: int, acked: int, *steps: tuple[str, tuple[object, ...]]) -> None:
+        """Write what is said of steps, and how far the job is, in one synchronous commit."""
+        progress = (reserved, acked, self._job)
+        self._execute("BEGIN IMMEDIATE")
+        try:
+            for sql, values in steps:
+                self._execute(sql, *values)
+            self._execute("UPDATE job SET reserved = ?, acked = ? WHERE id = ?", *progress)
+            self._execute("COMMIT")
+        except JournalError:
+            with contextlib.suppress(JournalError):
+                self._execute("ROLLBACK")
+            raise
+
+    def _await_disk(self) -> None:
+        """One writer at a time; what became of an extension is `extended`'s to tell."""
+        if self._extension is not None:
+            self._extension.exception()
+
     def _run(self, sql: str, *values: object) -> sqlite3.Cursor:
+        self._await_disk()
+        return self._execute(sql, *values)
+
+    def _execute(self, sql: str, *values: object) -> sqlite3.Cursor:
         try:
             return self._db.execute(sql, values)
         except sqlite3.Error as error:

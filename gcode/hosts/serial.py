@@ -15,7 +15,7 @@ from operator import sub
 from pathlib import Path
 
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
-from gcode.hosts.beaten_path import Exchange
+from gcode.hosts.beaten_path import Exchange, waiting
 from gcode.hosts.guarded import GuardedConversation
 from gcode.hosts.jobbook import TEMPERATURE_EVERY_S
 from gcode.hosts.journal import Journal
@@ -158,8 +158,9 @@ class SerialPrinter(GuardedConversation):
         """Stream, and prove that all has arrived; False if the job was aborted."""
         self._book.begin(checked, self.port)
         whole = self._stream(checked, first, end, progress)
-        self._prove()
-        self._book.proved()
+        if whole or self._comes_to_rest():
+            self._prove()
+            self._book.proved()
         return whole
 
     def _stream(self, checked: PrintableProgram, first: int, end: int, progress: Progress) -> bool:
@@ -170,9 +171,21 @@ class SerialPrinter(GuardedConversation):
                 progress("printing", float(indices[0] - first), total)
                 if not self._send_batch(checked, indices, commands):
                     return False
-        while not self._link.idle:
-            self._pump()
+        if not self._await_room(next_is_move=True):
+            return False
         progress("printing", total, total)
+        return True
+
+    def _await_room(self, *, next_is_move: bool) -> bool:
+        """Listen until a line may be sent, before moves until nothing is under way.
+
+        False if the job was aborted, which waits for no heater.
+        """
+        link = self._link
+        while not (link.idle or (link.ready and not next_is_move)):
+            if self._abort_asked.is_set():
+                return False
+            self._pump()
         return True
 
     def _send_batch(
@@ -197,8 +210,8 @@ class SerialPrinter(GuardedConversation):
                 sent_s = [self._send_line(lines[at], indices[at], commands[at])]
                 at += 1
             if not moves or not link.idle:
-                while not link.ready or (lines.is_move(at) and not link.idle):
-                    self._pump()
+                if not self._await_room(next_is_move=lines.is_move(at)):
+                    return False
                 trips_s.append(self._clock() - sent_s[-1])
         self._round_trips.add(trips_s)
         return True
@@ -217,10 +230,9 @@ class SerialPrinter(GuardedConversation):
     ) -> list[float]:
         """Send plain moves while the answers are plain; returns when each was sent."""
         moves = moves[: self._book.before_moves(indices)]
-        poll, wait_ms, link = self._poll.poll, self._first_wait_ms, self._link
+        link = self._link
         exchange = Exchange(
             self._fd,
-            wait=lambda: poll(wait_ms),
             clock=self._clock,
             oks=link.oks,
             asked_to_stop=self._attention.is_set,
@@ -229,7 +241,8 @@ class SerialPrinter(GuardedConversation):
         )
         failure = None
         try:
-            exchange.run(moves)
+            with waiting(self._fd):
+                exchange.run(moves)
         except OSError as error:
             failure = error
         finally:
@@ -282,6 +295,7 @@ class SerialPrinter(GuardedConversation):
     def _attend(self, checked: PrintableProgram, line: int) -> bool:
         """Do what was asked for meanwhile; False on abort."""
         self._attention.clear()
+        self._digest([])  # an emergency stop
         if self._pause_asked.is_set() and not self._sit_out_pause(checked, line):
             return False
         return not self._abort_asked.is_set()
@@ -339,8 +353,8 @@ class SerialPrinter(GuardedConversation):
             self._book.temperature(event)
         elif isinstance(event, ev.HostAction):
             self.actions.append(event.action)
-            if event.action.split()[0] in ("pause", "cancel"):
-                (self.pause if event.action.startswith("pause") else self.abort)()
+            asked = {"pause": self.pause, "resume": self.resume, "cancel": self.abort}
+            asked.get(event.action.split()[0], lambda: None)()
 
     def _fault(self, text: str) -> Exception:
         return PrinterError(

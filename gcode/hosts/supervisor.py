@@ -13,20 +13,19 @@ import sys
 import time
 
 HEATERS_OFF = (b"M104 S0", b"M140 S0")
-COMMANDS = (
-    b"M108",  # ends a wait for temperature, where the firmware lets it pass the queue
-    *HEATERS_OFF,
-    b"M107",
+END_WAIT = b"M108"
+"""Ends a wait for temperature, where the firmware lets it pass the queue."""
+LIFT = (
     b"G21",  # the program may have been in inches
     b"G91",
     b"G1 Z5 F600",
     b"G90",
-    *HEATERS_OFF,  # again: a line may have been lost
 )
-"""Heaters first; then the nozzle away from the part."""
 QUESTIONS = 3
 _TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 ANSWER_S = 0.5
+SILENT_S = 0.1
+"""The same for who has not answered so far: its receive buffer holds all that is said."""
 
 
 def main() -> None:
@@ -41,19 +40,25 @@ def main() -> None:
             db.commit()
 
 
-def make_safe(port_fd: int) -> str:
-    """Send the commands, each answered or given up on; return what became of them."""
+def make_safe(port_fd: int, *, lift: bool = True) -> str:
+    """Send the commands, each answered or given up on; return what became of them.
+
+    Heaters first; then, with `lift`, the nozzle away from the part; heaters again, because a line
+    may have been lost.
+    """
     answered = 0
+    os.set_blocking(port_fd, False)  # the sender may have died while it waited in a read
     write(port_fd, b"\n")  # ends the half line that a killed sender may have left
     wait(port_fd, 0.05)
-    for command in COMMANDS:
+    commands = (END_WAIT, *HEATERS_OFF, b"M107", *(LIFT if lift else ()), *HEATERS_OFF)
+    for said, command in enumerate(commands):
         if not write(port_fd, command + b"\n"):
-            return "THE PORT IS GONE, heaters could not be reached"
-        answered += wait(port_fd, ANSWER_S)[0]
+            return "THE PORT IS GONE, HEATERS COULD NOT BE REACHED"
+        answered += wait(port_fd, ANSWER_S if answered or said < 2 else SILENT_S)[0]
     if not answered:
         return "heaters told to switch off, NO ANSWER"
     if confirmed_off(port_fd):
-        return "heaters off (the printer reports targets of 0), nozzle lifted"
+        return "heaters off (the printer reports targets of 0)" + ", nozzle lifted" * lift
     return "heaters told to switch off, nothing confirms it"
 
 

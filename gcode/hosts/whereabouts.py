@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from gcode.protocol import LinkTiming
 from gcode.protocol.events import Busy, Resend, TemperatureReport
+from gcode.protocol.inbox import Inbox
 from gcode.protocol.replies import parse_reply
 
 QUESTION = b"\nN2147483646 M105*0\n"
@@ -59,7 +60,7 @@ def _listen(
     for_answer: bool,
 ) -> int | None:
     """Hear the printer out until it has been quiet for a while; the last line it asked for."""
-    inbox, asked_for = b"", None
+    inbox, asked_for = Inbox(), None
     now_s = clock()
     end_s = now_s + timing.give_up_s
     quiet_s = now_s + (timing.give_up_s if for_answer else timing.doubt_s)
@@ -70,9 +71,8 @@ def _listen(
         if not data:
             return None
         note(b"<", data)
-        *lines, inbox = (inbox + data).split(b"\n")
-        for raw in lines:
-            reply = parse_reply(raw.rstrip(b"\r"))
+        for raw, readable in inbox.take(data):
+            reply = parse_reply(raw) if readable else None
             if isinstance(reply, Resend):
                 asked_for = reply.number
             elif isinstance(reply, Busy | TemperatureReport):  # a long command goes first

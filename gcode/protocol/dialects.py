@@ -23,8 +23,6 @@ class LinkDialect:
         The longest line the firmware takes; longer ones are cut silently (MAX_CMD_SIZE).
     rx_bytes
         Receive buffer of the firmware: what may be under way beyond one line.
-    greets
-        The firmware prints a banner when it starts, so that a reset can be told.
     buffered_lines
         Most lines that are acknowledged and not yet moved: what a reset loses.
     motors_off_s
@@ -39,7 +37,6 @@ class LinkDialect:
     verifies: bool
     max_line_bytes: int
     rx_bytes: int
-    greets: bool
     buffered_lines: int = 80
     motors_off_s: float = 120.0
     hold_motors: str = ""
@@ -49,16 +46,16 @@ LINK_DIALECTS: dict[str, LinkDialect] = {
     # BUFSIZE 4 to 16 and BLOCK_BUFFER_SIZE 16 to 64 in Marlin's shipped configurations.
     # MAX_CMD_SIZE 96, RX_BUFFER_SIZE 128 (Configuration_adv.h of Marlin 2.1).
     # DEFAULT_STEPPER_DEACTIVE_TIME 120; `M84 S0` sets the time to never (M18_M84.cpp).
-    "marlin": LinkDialect("marlin", True, True, 95, 120, True, hold_motors="M84 S0"),
-    "prusa": LinkDialect("prusa", True, True, 95, 120, True, hold_motors="M84 S0"),
+    "marlin": LinkDialect("marlin", True, True, 95, 120, hold_motors="M84 S0"),
+    "prusa": LinkDialect("prusa", True, True, 95, 120, hold_motors="M84 S0"),
     # gcode.py strips N and checksum unread; a pseudo-terminal loses nothing, so a lost answer
     # means a lost host process: nothing can be proved and nothing is sent again. Its look-ahead
     # is seconds long (toolhead.py, BUFFER_TIME_HIGH 2 s): 1000 of the shortest moves.
     # M84 takes no S there: it lets go at once. After [idle_timeout], 600 s, a move is refused
     # until all axes are homed.
-    "klipper": LinkDialect("klipper", False, False, 4095, 4095, False, 1000, motors_off_s=600.0),
+    "klipper": LinkDialect("klipper", False, False, 4095, 4095, 1000, motors_off_s=600.0),
     # RepRapFirmware 3.6 drops a line with a bad checksum silently and executes a repeated
     # number again: a line without an answer cannot be sent twice.
     # An idle motor keeps 30 % of its current (M906 I30) and its place.
-    "reprap": LinkDialect("reprap", True, False, 255, 255, False, motors_off_s=float("inf")),
+    "reprap": LinkDialect("reprap", True, False, 255, 255, motors_off_s=float("inf")),
 }

@@ -93,6 +93,11 @@ class Link(Recovery):
             and ledger.wire_bytes < self.dialect.rx_bytes
         )
 
+    @property
+    def slow_under_way(self) -> bool:
+        """Whether a line that may take minutes is not acknowledged yet."""
+        return self._ledger.slow_under_way
+
     def hello(self, now_s: float, *, number: int = 0) -> bytes:
         """Start numbering afresh: `M110`, the first line of any conversation.
 

@@ -61,11 +61,13 @@ _ACTION = re.compile(r"//\s?action:\s*(\S.*)")
 _UNKNOWN = re.compile(r"(?:echo:\s*|//\s*)?unknown command:.*", re.IGNORECASE | re.DOTALL)
 
 # What firmwares print as they boot: Marlin `start`, reset causes (`setup()` of MarlinCore),
-# Repetier the same; Klipper tells of its restart with `// Klipper state:`.
+# Repetier the same; Klipper tells of its restart with `// Klipper state:`; RepRap.cpp of
+# RepRapFirmware.
 _BANNER = re.compile(
     r"start"
     r"|(?:echo:\s*)?(?:PowerUp|External Reset|Brown out Reset|Watchdog Reset|Software Reset)\s*"
     r"|//\s?Klipper state: (?:Disconnect|Shutdown|Startup|Ready)"
+    r"|RepRapFirmware\b.* is up and running\.?"
 )
 # Transmission errors of Marlin, Prusa, Repetier and OctoPrint's virtual printer.
 _LINE_ERROR = re.compile(

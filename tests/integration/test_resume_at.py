@@ -90,8 +90,8 @@ def judge(made: Resumption, job: Program, setup: PrintSetup) -> Ran:
     lines = made.checked.program.text.split("\n")
     stood = ["G28", f"G1 Z{standing_mm:.3f}", "G1 X20 Y30"]
     ran = run(lines, at, printer, stood)
-    heat = [f"M140 S{made.bed_c}", f"M109 S{made.hotend_c}"]  # what START_PRINT would have done
-    true = run(job.text.split("\n"), made.first_line, printer, heat)
+    begun = ["G28", f"M140 S{made.bed_c}", f"M109 S{made.hotend_c}"]  # what START_PRINT does
+    true = run(job.text.split("\n"), made.first_line, printer, begun)
     assert len(true.body) > 20
     assert ran.body[: len(true.body)] == pytest.approx(true.body, abs=2e-4)
     assert len(ran.body) == len(true.body)

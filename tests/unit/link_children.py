@@ -86,7 +86,7 @@ def send(
     job = program(text)
     told: dict[str, object] = {}
     code = 0
-    book = Journal(Path(journal), step_lines=64)
+    book = Journal(Path(journal), step_lines=64, step_s=0.0)
     printer = serial_host.SerialPrinter(port, journal=book, dialect=dialect, timing=QUICK)
     try:
         if go_on:

@@ -30,10 +30,12 @@ class Conversation:
     advanced_ok: bool = False
     by_moves: bool = False  # plain moves go the beaten path
     executed: list[bytes] = field(default_factory=list)
+    given: list[str] = field(default_factory=list)  # to the link, in order
     events: list[ev.Event] = field(default_factory=list)
     now_s: float = 0.0
     rounds: int = 0
     asked: int = 0
+    written_off: int = 0
 
     def __post_init__(self) -> None:
         self.core = FirmwareCore(
@@ -90,13 +92,14 @@ class Conversation:
         if self.link.ended:
             return False
         self.core.feed(self.link.send(command, self.now_s), self.now_s)
+        self.given.append(command)
         return True
 
     def finish(self) -> bool:
         """Until all is acknowledged and proved by a report that only the last line can cause.
 
         Every M114 is executed once and reports once: as many reports as questions, or the last
-        one has not been received.
+        one has not been received; or a report was garbled, after which only new questions count.
         """
         for _ in range(20):
             if not self.send("M114"):
@@ -106,10 +109,15 @@ class Conversation:
                 self.exchange()
             if self.link.ended:
                 return False
-            if sum(isinstance(event, ev.PositionReport) for event in self.events) >= self.asked:
+            if self.reports() - self.written_off >= self.asked:
                 self.link.confirm()
                 return True
+            self.settle(0.3)
+            self.asked, self.written_off = 0, self.reports()
         raise AssertionError("M114 is never answered")
+
+    def reports(self) -> int:
+        return sum(isinstance(event, ev.PositionReport) for event in self.events)
 
     def job(self, lines: list[str]) -> bool:
         """Hello, the lines, the proof; False if the link ended."""
@@ -131,11 +139,13 @@ class Conversation:
             if self.link.ended:
                 return False
             lines = self.link.prepare(commands[at:])
+            first = at
             if moves := self.link.moves(lines, 0):
                 at += self._send_moves(moves)
             else:
                 self.core.feed(self.link.send(lines[0], self.now_s), self.now_s)
                 at += 1
+            self.given += commands[first:at]
         return True
 
     def _send_moves(self, moves: list[bytes]) -> int:

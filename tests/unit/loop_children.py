@@ -110,7 +110,7 @@ def loop(
         (here / "told").write_text(traceback.format_exc())
         return 5
     tape = Dying(here / "run", die_after)
-    book = Journal(here / "journal.sqlite", step_lines=64)
+    book = Journal(here / "journal.sqlite", step_lines=64, step_s=0.0)
     printer = SerialPrinter(port, journal=book, dialect="prusa", timing=QUICK)
     code = 0
     try:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import time
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parent))
+from link_helpers import profile
+
+from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import beaten_path
-from gcode.hosts.beaten_path import MOST_S, Exchange
+from gcode.hosts.beaten_path import MOST_S, Exchange, waiting
+from gcode.hosts.serial import SerialPrinter
 
 MOVES = [b"N%d G1 X1*1\n" % number for number in range(10, 20)]
 
@@ -25,21 +34,17 @@ class Port:
 
     def write(self, fd: int, data: bytes) -> int:
         taken = self.takes.pop(0) if self.takes else len(data)
-        if taken < 0:
-            raise BlockingIOError
         self.written += data[:taken]
         under_way = self.written.count(b"\n") - self.answered
         self.most_under_way = max(self.most_under_way, under_way)
         return taken
 
-    def wait(self) -> bool:
-        return bool(self.answers) and self.answers[0] is not None
-
     def read(self, fd: int, size: int) -> bytes:
-        answer = self.answers.pop(0)
+        answer = self.answers.pop(0) if self.answers else None
         if isinstance(answer, Exception):
             raise answer
-        assert answer is not None
+        if answer is None:  # nothing came in time
+            return b""
         self.answered += answer.count(b"ok")
         return answer
 
@@ -50,7 +55,6 @@ class Port:
     def exchange(self, *, window: int = 1, most_bytes: int = 120) -> Exchange:
         return Exchange(
             0,
-            wait=self.wait,
             clock=self.clock,
             oks=lambda data, answered: data.count(b"\n") * (data == b"ok\n" * data.count(b"\n")),
             asked_to_stop=lambda: False,
@@ -74,10 +78,9 @@ def at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Port], Port]:
     [
         (b"Resend: 12\nok\n", b"Resend: 12\nok\n"),
         (b"ok T:20\n", b"ok T:20\n"),
-        (b"", b""),  # the port was closed
+        (b"", None),  # the port was closed
         (b"ok\n" * 5, b"ok\n" * 5),  # more than is under way
         (None, None),
-        (BlockingIOError(), None),  # somebody else has read it
     ],
 )
 def test_anything_odd_ends_it_and_is_handed_on(
@@ -99,7 +102,7 @@ def test_a_port_that_fails_leaves_the_count_behind(at: Callable[[Port], Port], w
     assert (len(exchange.sent_s), len(exchange.answered_s)) == (1 + window, 1)
 
 
-@pytest.mark.parametrize("taken", [3, 0, -1])
+@pytest.mark.parametrize("taken", [3, 0])
 def test_what_a_full_port_does_not_take_is_kept(at: Callable[[Port], Port], taken: int) -> None:
     size = len(MOVES[0])
     port = at(Port(b"ok\n", takes=[size, taken]))
@@ -138,3 +141,24 @@ def test_who_asks_to_stop_waits_for_no_further_move(
     exchange.asked_to_stop = lambda: port.answered >= 2
     exchange.run(MOVES)
     assert len(exchange.sent_s) == len(exchange.answered_s) == 1 + window
+
+
+def test_a_read_waits_half_a_second_and_no_longer() -> None:
+    """On a real pseudo-terminal: for an answer that comes, and for one that does not."""
+    with (
+        EmulatedPrinterProcess(printer=profile()) as emulator,
+        SerialPrinter(emulator.port, supervise=False) as printer,
+    ):
+        fd = printer._fd
+        assert not os.get_blocking(fd)
+        with pytest.raises(BlockingIOError):  # not as if the port were closed
+            os.read(fd, 10)
+        with waiting(fd):
+            os.write(fd, b"M118 there\n")
+            assert os.read(fd, 10).startswith(b"there")
+            while os.read(fd, 10):
+                pass
+            start_s = time.monotonic()
+            assert os.read(fd, 10) == b""
+        assert 0.3 < time.monotonic() - start_s < 20.0
+        assert not os.get_blocking(fd)

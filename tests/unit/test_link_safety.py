@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import sqlite3
 import sys
@@ -42,8 +43,9 @@ def answering(report: bytes | None) -> tuple[str, list[bytes]]:
 
     thread = threading.Thread(target=serve)
     thread.start()
-    with ours:
+    with ours:  # as a sender left it that was killed while it waited in a read
         said = supervisor.make_safe(ours.fileno())
+        assert not os.get_blocking(ours.fileno())
         ours.shutdown(socket.SHUT_RDWR)
     thread.join(10)
     return said, heard
@@ -142,10 +144,10 @@ def test_how_cold_the_bed_was_counts_from_when_it_was_warm(tmp_path: Path) -> No
 class FullDisk(Journal):
     """Takes the job's beginning, then nothing more."""
 
-    def _run(self, sql: str, *values: object) -> sqlite3.Cursor:
+    def _execute(self, sql: str, *values: object) -> sqlite3.Cursor:
         if "UPDATE" in sql or "note" in sql:
             raise JournalError("The journal cannot be written (disk full).")
-        return super()._run(sql, *values)
+        return super()._execute(sql, *values)
 
 
 def test_a_full_disk_does_not_keep_the_heaters_on(tmp_path: Path) -> None:
@@ -159,6 +161,33 @@ def test_a_full_disk_does_not_keep_the_heaters_on(tmp_path: Path) -> None:
             printer.print(program(moves(100)))
         state = emulator.state()
         printer.close()
+    assert state["hotend_target_c"] == 0
+    assert "heaters off" in printer.notes[-1]
+
+
+class FullLater(Journal):
+    """Takes the job's beginning and its first step."""
+
+    def _execute(self, sql: str, *values: object) -> sqlite3.Cursor:
+        if "UPDATE step" in sql:
+            raise JournalError("The journal cannot be written (disk full).")
+        return super()._execute(sql, *values)
+
+
+def test_what_could_not_be_reserved_is_not_sent(tmp_path: Path) -> None:
+    """Steps are extended by a thread: its failure must reach the sender before the next line."""
+    record = tmp_path / "executed"
+    journal = FullLater(tmp_path / "journal.sqlite", step_lines=64, step_s=0.0)
+    with EmulatedPrinterProcess(printer=profile(), record=record) as emulator:
+        printer = SerialPrinter(emulator.port, journal=journal, supervise=False)
+        printer.connect()
+        with pytest.raises(JournalError, match="disk full"):
+            printer.print(program(moves(100)))
+        state = emulator.state()
+        printer.close()
+    journal.close()
+    told = record.read_text().splitlines()
+    assert [line for line in told if line in moves(100)] == moves(32)
     assert state["hotend_target_c"] == 0
     assert "heaters off" in printer.notes[-1]
 

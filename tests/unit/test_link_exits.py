@@ -1,0 +1,196 @@
+"""Interrupted, aborted, stopped in the middle of a line or of heating: safe, and it says so."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from link_forks import until
+from link_helpers import moves, profile, program
+
+import gcode.hosts.serial as serial_host
+from gcode.errors import LinkError
+from gcode.firmware import EmulatedPrinterProcess
+from gcode.hosts import LinkLostError, supervisor
+from gcode.hosts.serial import SerialPrinter
+from gcode.protocol import Link
+from gcode.protocol import events as ev
+
+HEAD = ["M104 S200", "M302 S0", "G28", "G1 Z2 F600", "M83"]
+MOVES = moves(900)
+
+
+@pytest.fixture(autouse=True)
+def _no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_host, "require_checked", lambda checked: None)
+
+
+class Bench:
+    """A printer, and somebody who does something once it has carried out some command."""
+
+    def __init__(self, emulator: EmulatedPrinterProcess, record: Path) -> None:
+        self.emulator, self.record = emulator, record
+
+    def told(self) -> list[str]:
+        return self.record.read_text().splitlines() if self.record.exists() else []
+
+    def once(self, command: str, act: Callable[[], object]) -> threading.Thread:
+        def wait() -> None:
+            until(lambda: command in self.told())
+            act()
+
+        thread = threading.Thread(target=wait, daemon=True)
+        thread.start()
+        return thread
+
+    def targets_c(self) -> tuple[object, object]:
+        state = self.emulator.state()
+        return state["hotend_target_c"], state["bed_target_c"]
+
+
+@contextmanager
+def bench(tmp_path: Path, **options: object) -> Iterator[Bench]:
+    record = tmp_path / "executed"
+    with EmulatedPrinterProcess(printer=profile(), record=record, **options) as emulator:  # type: ignore[arg-type]
+        yield Bench(emulator, record)
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_an_interrupt_in_the_middle_of_a_line_lifts_the_nozzle(tmp_path: Path) -> None:
+    # regression: an interrupt nearly always comes while an answer is awaited, and then nothing was
+    # lifted and nothing confirmed
+    lines = [*HEAD, *moves(400)]
+    with bench(tmp_path, faults="always slow_reader s=0.004") as it:
+        printer = SerialPrinter(it.emulator.port, supervise=False)
+        thread = it.once(lines[50], interrupt)
+        with pytest.raises(KeyboardInterrupt), printer:
+            printer.print(program(lines))
+        thread.join(10)
+        told, state = it.told(), it.emulator.state()
+    assert printer.notes[-1] == "heaters off (the printer reports targets of 0), nozzle lifted"
+    printed = [line for line in told if line in lines]
+    assert len(printed) < len(lines)
+    assert printed == lines[: len(printed)]
+    assert (state["hotend_target_c"], state["bed_target_c"]) == (0, 0)
+    assert told[-5:] == ["G21", "G91", "G1 Z5 F600", "G90", "M105"]
+
+
+@pytest.mark.parametrize(
+    ("firmware", "said"), [("marlin", "heaters off"), ("prusa", "told to switch off")]
+)
+def test_an_interrupt_while_it_heats_waits_for_no_heater(
+    firmware: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In real time; a firmware without emergency parser reads nothing before M190 has ended."""
+    monkeypatch.setattr(supervisor, "ANSWER_S", 0.2)
+    with bench(tmp_path, firmware=firmware, accelerated=False) as it:
+        printer = SerialPrinter(it.emulator.port, supervise=False, dialect=firmware)
+        thread = it.once("M190 S60", interrupt)
+        with pytest.raises(KeyboardInterrupt), printer:
+            printer.print(program(["M104 S200", "M190 S60", "G28"]))
+        thread.join(10)
+        assert said in printer.notes[-1]
+        assert it.targets_c() == ((0, 0) if firmware == "marlin" else (200, 60))
+        assert "G28" not in it.told()
+
+
+def test_an_abort_while_it_heats_waits_for_no_heater(tmp_path: Path) -> None:
+    # regression: the job ended when the bed was warm
+    with bench(tmp_path, accelerated=False) as it:
+        printer = SerialPrinter(it.emulator.port, supervise=False)
+        printer.connect()
+        thread = it.once("M190 S60", printer.abort)
+        report = printer.print(program(["M104 S200", "M190 S60", "G28"]))
+        thread.join(10)
+        assert (report.ok, report.next_line) == (False, 1)
+        assert it.targets_c() == (0, 0)
+        assert "G28" not in it.told()
+        printer.close()
+
+
+def test_an_emergency_stop_of_a_printer_that_says_nothing_ends_the_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # regression: who waited for an answer waited for ever
+    monkeypatch.setattr(supervisor, "ANSWER_S", 0.01)
+    lines = [*HEAD, *moves(60)]
+    with bench(tmp_path, faults="line 40 dead") as it:
+        printer = SerialPrinter(it.emulator.port, supervise=False)
+        printer.connect()
+        before = len(it.told())
+        thread = it.once(lines[20], printer.emergency_stop)
+        with pytest.raises(LinkLostError, match="an emergency stop was asked for") as caught:
+            printer.print(program(lines))
+        thread.join(10)
+        printed = [line for line in it.told()[before:] if line in lines]
+        printer.close()
+    assert caught.value.last_executed_line < len(printed) <= caught.value.last_sent_line + 1
+
+
+def test_a_link_that_was_lost_can_be_greeted_anew() -> None:
+    # regression: what an ended conversation had left unsaid ended the next one
+    link = Link()
+    link.hello(0.0)
+    link.receive(b"ok\n", 0.0)
+    link.send("G1 X1", 0.0)
+    link.give_up("the cable was pulled")
+    link.hello(1.0)
+    assert link.receive(b"ok\n", 1.0) == [ev.Greeted()]
+
+
+def test_the_printers_own_buttons_pause_and_go_on(tmp_path: Path) -> None:
+    # regression: a pause by the printer's display could not be ended there (`//action:resume`)
+    lines = [*HEAD, *MOVES[:20], "M118 A1 action:pause", *MOVES[20:]]
+    with bench(tmp_path) as it, SerialPrinter(it.emulator.port, supervise=False) as printer:
+        fd = os.open(it.emulator.port, os.O_RDWR | os.O_NOCTTY)
+        press = lambda: os.write(fd, b"M118 A1 action:resume\n")  # noqa: E731
+        thread = it.once("G1 Z5 F600", press)
+        report = printer.print(program(lines))
+        thread.join(10)
+        os.close(fd)
+        assert report.ok
+        assert list(printer.actions) == ["pause", "resume"]
+        assert {"paused", "resumed"} <= set(printer.notes)
+    assert [line for line in it.told() if line in MOVES] == MOVES
+
+
+@pytest.mark.parametrize("firmware", ["klipper", "reprap"])
+@pytest.mark.parametrize(
+    ("lines", "said"), [(["G28", *MOVES[:60]], "started anew"), (MOVES, "hom")]
+)
+def test_a_restart_is_noticed_where_lines_are_not_verified(
+    firmware: str,
+    lines: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By what they say as they start; where that is lost, by the refusal to move unhomed."""
+    monkeypatch.setattr(supervisor, "ANSWER_S", 0.05)
+    with bench(tmp_path, firmware=firmware, faults="line 30 reset") as it:
+        printer = SerialPrinter(it.emulator.port, dialect=firmware, supervise=False)
+        printer.connect()
+        with pytest.raises(LinkError, match=said):
+            printer.print(program(["M302 S0", *lines]))
+        told = it.told()
+        printer.close()
+    assert sum(line in lines for line in told) < (35 if "G28" in lines else 2)
+
+
+def test_a_garbled_answer_does_not_cost_the_job_its_proof(tmp_path: Path) -> None:
+    # regression: one M114 and one M115 whose answers were garbled, and no later one would do
+    with bench(tmp_path) as it, SerialPrinter(it.emulator.port, supervise=False) as printer:
+        for kind in ("M114", "M115"):
+            printer._asked[kind] += 1  # as if one had been asked, and its answer not been heard
+        assert printer.print(program(["G28", *MOVES[:50]])).ok
