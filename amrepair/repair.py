@@ -93,6 +93,8 @@ class Site:
         Height printed so far, build frame; None for a finished part.
     allowance_mm
         What the process may leave (half a layer for a CAD template, 0 for planned beads).
+    on_fixture
+        Somebody said that a finished part's foot is above the bed.
 
     Examples
     --------
@@ -111,6 +113,7 @@ class Site:
     printed_z_mm: float | None = None
     allowance_mm: float = 0.1
     planned: Template | None = None
+    on_fixture: bool = False
 
     @classmethod
     def of_part(
@@ -222,7 +225,7 @@ def plan_repair(
     ------
     AlignmentError
         If the scan cannot be aligned, equally good poses lead to different repairs, or a finished
-        part would stand in the bed or beyond it.
+        part would stand in the bed, in the air or beyond the printer.
     DeficitError
         If the deficit is no valid solid.
     gcode.errors.GcodeError
@@ -245,7 +248,9 @@ def plan_repair(
     placed = _build_from_template(site, scan, registration)
     if site.printed_z_mm is None:
         said = site.build_from_template is not None or guess is not None
-        refuse_impossible(site.template, placed, site.setup.printer, said=said)
+        refuse_impossible(
+            site.template, placed, site.setup.printer, said=said, raised=site.on_fixture
+        )
     build_from_scan = placed @ registration.template_from_scan
     with watch("detect"):
         whole = scan.moved(registration.template_from_scan)

@@ -1,7 +1,8 @@
 """Standing: whether a pose puts a part where a part can stand: on the bed, within the printer.
 
 A scan in the scanner's own frame that is taken for one in the bed's puts the part into the bed or
-beside it; so does an origin that is not where the user thought. Both are refused before any work.
+beside it, or in the air; so does an origin that is not where the user thought. All are refused
+before any work.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from gcode.slicing.layers import mesh_of
 
 # More than any calibration, raft or warp puts a part off; less than any layer it would be moved by.
 SLACK_MM = 1.0
+# Thicker than slicers lay rafts (Cura's and PrusaSlicer's usual ones are 0.8 to 2.5 mm).
+RAFT_MM = 3.0
 
 
 def box_on_bed(template: Template, placed: Transform) -> Float[np.ndarray, "2 3"]:
@@ -27,9 +30,14 @@ def box_on_bed(template: Template, placed: Transform) -> Float[np.ndarray, "2 3"
 
 
 def refuse_impossible(
-    template: Template, placed: Transform, printer: PrinterProfile, *, said: bool
+    template: Template,
+    placed: Transform,
+    printer: PrinterProfile,
+    *,
+    said: bool,
+    raised: bool = False,
 ) -> None:
-    """Refuse a pose in which the part would stand in the bed or beyond the printer.
+    """Refuse a pose in which the part would stand in the bed, in the air or beyond the printer.
 
     Parameters
     ----------
@@ -37,6 +45,8 @@ def refuse_impossible(
         Build from template.
     said
         Somebody gave the pose, so what is wrong is the pose; else the scan's frame is.
+    raised
+        Somebody said that it stands on a fixture, so that its foot is above the bed.
 
     Raises
     ------
@@ -50,8 +60,22 @@ def refuse_impossible(
     )
     room = np.array([*printer.bed_size_mm, printer.max_z_mm])
     beyond = bool((low[:2] < -SLACK_MM).any() or (high > room + SLACK_MM).any())
-    if low[2] >= -SLACK_MM and not beyond:
+    floats = bool(low[2] > RAFT_MM) and not raised
+    if low[2] >= -SLACK_MM and not beyond and not floats:
         return
+    shift_mm = placed.translation_mm[2] - low[2]
+    if floats and not beyond:
+        cure = (
+            f"a pose places the origin of the part's own file; to stand on the bed it has "
+            f"Z = {shift_mm:.3f}"
+            if said
+            else "if the scan is in the scanner's own frame, say where the part stands: "
+            "--scan-frame unknown --part-pose X,Y,Z,RZ"
+        )
+        raise AlignmentError(
+            f"the part would stand at {where}, its foot {low[2]:.1f} mm above the bed; {cure}; "
+            "if it does stand on a fixture, say --on-fixture"
+        )
     if not said:
         raise AlignmentError(
             f"taken as bed coordinates, the scan puts the part at {where}, where nothing can "
@@ -59,7 +83,6 @@ def refuse_impossible(
             "frame, say where the part stands: --scan-frame unknown --part-pose X,Y,Z,RZ"
         )
     if low[2] < -SLACK_MM and not beyond:
-        shift_mm = placed.translation_mm[2] - low[2]
         raise AlignmentError(
             f"this pose puts the part at {where}, {-low[2]:.1f} mm into the bed: a pose places the "
             f"origin of the part's own file; to stand on the bed it has Z = {shift_mm:.3f}"

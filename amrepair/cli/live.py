@@ -178,12 +178,16 @@ class ShownRun:
         self.page.show_job(job)
 
     def drives(self, pause: Callable[[], None], resume: Callable[[], None]) -> None:
-        """What the pause button calls."""
+        """What the pause button calls; rests first where it was pressed already."""
         self.operator.on_pause, self.operator.on_resume = pause, resume
+        self.operator.wait_while_paused()  # pressed before there was a printer to pause
 
     def approve(self, plan: RepairPlan) -> bool:
-        """Wait for a button, where the run asks at all."""
-        return self.page.approve(plan) if self.ask else True
+        """Wait for a button, where the run asks at all; else for the end of a pause."""
+        if self.ask:
+            return self.page.approve(plan)
+        self.operator.wait_while_paused()
+        return True
 
     def ask_to_go_on(self, decision: Decision) -> bool:
         """Wait for a button: whether the job goes on all the same."""

@@ -73,6 +73,12 @@ def repair(
             help="X,Y,Z,RZ: place of the part's own origin on the bed, mm, and its turn, degrees.",
         ),
     ] = None,
+    on_fixture: Annotated[
+        bool,
+        typer.Option(
+            "--on-fixture", help="The part stands on something: its foot is above the bed."
+        ),
+    ] = False,
     sensor_at: SensorOption = None,
     job: Annotated[
         Path | None, typer.Option(help="The job's G-code: repair layers lie on its layers.")
@@ -132,7 +138,9 @@ def repair(
         with watch("template"):
             field = open_template(template, progress=bars)
         guess = placed.inverse() if placed is not None and frame == "build" else None
-        site = Site(field, setup, grid, placed if frame == "scanner" else None)
+        site = Site(
+            field, setup, grid, placed if frame == "scanner" else None, on_fixture=on_fixture
+        )
         plan = plan_repair(
             cloud,
             site,

@@ -124,6 +124,7 @@ def simulate(
                 approve=page.approve,
                 record=page.recording(folder.record),
                 begun=lambda pose: _recorded(prepared, folder, pose, ids, max_iterations),
+                connected=lambda printer: page.drives(printer.pause, printer.resume),
                 watch=watch,
                 progress=page.watching(bars),
             )

@@ -16,6 +16,7 @@ from amrepair.report import guarded
 from amrepair.report.collect import of_the_part
 from amrepair.report.operator import Operator, Verdict
 from amrepair.report.text import plan_lines
+from gcode.errors import GcodeError
 from gcode.moves import Extrude, Toolpath
 from gcode.progress import Progress
 from gcode.reader import Job
@@ -90,7 +91,7 @@ class LiveView:
             self._pause = gui.add_button("Pause")
             self._approve.on_click(lambda _: operator.decide(Verdict.APPROVE))
             self._skip.on_click(lambda _: operator.decide(Verdict.SKIP))
-            self._pause.on_click(lambda _: operator.toggle_pause())
+            self._pause.on_click(lambda _: self._toggle_pause(operator))
             operator.changed = self._show_operator
         self._folder = gui.add_folder("Shown")
 
@@ -284,6 +285,14 @@ class LiveView:
         self.show_plan(look.plan, f"{look.stop.label}: {outcome}")
         if self._operator is not None:
             self._operator.wait_while_paused()
+
+    def _toggle_pause(self, operator: Operator) -> None:
+        """Pause or go on; what the printer has against it is said here: nobody else hears it."""
+        try:
+            operator.toggle_pause()
+        except GcodeError as error:
+            now = "The run rests before its next part" if operator.paused else "The run goes on"
+            self._stage.content = f"**{now}**, but the printer: {error}"
 
     def _show_operator(self) -> None:
         assert self._operator is not None

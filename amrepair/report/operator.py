@@ -76,13 +76,19 @@ class Operator:
         return True
 
     def toggle_pause(self) -> bool:
-        """Rest, or go on; returns whether it rests now."""
+        """Rest, or go on; returns whether it rests now.
+
+        What the printer says to it is the caller's; the run rests all the same before its next
+        part.
+        """
         with self._state:
             self._paused = not self._paused
             resting = self._paused
             self._state.notify_all()
-        (self.on_pause if resting else self.on_resume)()
-        self.changed()
+        try:
+            (self.on_pause if resting else self.on_resume)()
+        finally:
+            self.changed()
         return resting
 
     def wait_while_paused(self) -> None:

@@ -34,7 +34,7 @@ from amrepair.simulate.world import World
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
 from gcode.firmware import EmulatedPrinterProcess
-from gcode.hosts import connect
+from gcode.hosts import Printer, connect
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job, job_for
@@ -200,6 +200,7 @@ def simulate_run(
     approve: Callable[[RepairPlan], bool] = lambda plan: True,
     record: Callable[[Look], None] = lambda look: None,
     begun: Callable[[Transform], Tape] | None = None,
+    connected: Callable[[Printer], None] = lambda printer: None,
     model: ScannerModel | None = None,
     clock: Callable[[], float] = time.monotonic,
     watch: Stopwatch | None = None,
@@ -212,6 +213,8 @@ def simulate_run(
     begun
         Called with the scanner's calibrated pose; returns the tape that the run is recorded on,
         which is closed at its end.
+    connected
+        Called with the printer before anything is printed: a view's pause button needs it.
 
     Raises
     ------
@@ -253,6 +256,7 @@ def simulate_run(
             wire_log=wire_log,
         )
         printer.connect()
+        connected(printer)
         tape = begun(pose.build_from_scanner_calibrated) if begun is not None else None
 
         def recorded(look: Look) -> None:

@@ -2,7 +2,8 @@
 
 Sparse infill is no defect: the expected solid is the union of the beads that were planned, told
 as a distance field between voxels of about a layer's height. Only the last millimetres below the
-layer are held; what is farther down was looked at before, and is covered.
+layer are held; what is farther down was looked at before, and is covered: there the field says
+outside, so that nothing is ever missing below it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from amrepair.template.port import Template
 
 DEPTH_MM = 4.0
 MARGIN_MM = 3.0
+# Below its lowest beads nothing is planned: the bed is there, or what was looked at before.
+BELOW_MM = 1.5
 LEAST_VOXEL_MM, MOST_VOXEL_MM = 0.1, 0.25
 MAX_VOXELS = 60_000_000
 
@@ -79,10 +82,11 @@ class PlannedSdf:
         high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
         # faces of voxels lie on the last layer's top
         levels = int(np.ceil((top_mm - low[2]) / voxel_mm - 1e-6))
-        above = int(np.ceil(MARGIN_MM / voxel_mm))
-        origin = np.array([low[0] - MARGIN_MM, low[1] - MARGIN_MM, top_mm - levels * voxel_mm])
+        above, below = (int(np.ceil(margin / voxel_mm)) for margin in (MARGIN_MM, BELOW_MM))
+        foot_mm = top_mm - levels * voxel_mm
+        origin = np.array([low[0] - MARGIN_MM, low[1] - MARGIN_MM, foot_mm - below * voxel_mm])
         size = np.ceil((high[:2] + MARGIN_MM - origin[:2]) / voxel_mm).astype(int)
-        shape = (int(size[0]), int(size[1]), levels + above)
+        shape = (int(size[0]), int(size[1]), below + levels + above)
         if np.prod([float(n) for n in shape]) > MAX_VOXELS:
             raise TemplateError(
                 f"a planned template of {shape[0]}×{shape[1]}×{shape[2]} voxels is over the limit "
@@ -98,7 +102,7 @@ class PlannedSdf:
             voxel_mm,
             solid,
         )
-        bounds = np.array([[low[0], low[1], origin[2]], [high[0], high[1], top_mm]])
+        bounds = np.array([[low[0], low[1], foot_mm], [high[0], high[1], top_mm]])
         return cls(origin, voxel_mm, bounds, _signed(solid, voxel_mm), solid)
 
     @property
@@ -107,11 +111,8 @@ class PlannedSdf:
         return 0.25 * self.voxel_mm
 
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """(n,) signed distance, mm; below the grid that of its lowest slice."""
+        """(n,) signed distance, mm; beyond the grid a lower bound of it."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        if (points[:, 2] < self.origin_mm[2]).any():
-            points = points.copy()
-            points[:, 2] = np.maximum(points[:, 2], self.origin_mm[2] + 0.5 * self.voxel_mm)
         return np.asarray(kernels.interpolate(points, self.origin_mm, self.voxel_mm, self._field))
 
     def distance_and_gradient(

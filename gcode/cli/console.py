@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import signal
+import stat
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,11 +24,30 @@ from gcode.profiles.names import Kind, list_profiles
 
 NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130
+READER_GONE = 141  # as of a program that SIGPIPE ended: 128 + 13
 COUNTED = 2  # stages of fewer steps are told in per cent alone
 SAY_EVERY_S = 10.0  # how often a log without a terminal hears of progress
 
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
-out = Console(highlight=False, soft_wrap=True)
+
+# Typer's own, by way of a public name: it has moved between versions.
+_UsageError: type[Exception] = typer.BadParameter.__mro__[2]
+
+
+class ReaderGoneError(Exception):
+    """Whoever read what we print has gone (`… | head -1`): nothing failed, nobody listens."""
+
+
+class _Told(Console):
+    """A console that leaves the end of a program to `run`."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        raise ReaderGoneError
+
+
+errors = _Told(stderr=True, highlight=False, soft_wrap=True)
+out = _Told(highlight=False, soft_wrap=True)
+_json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 
 
 class Bars:
@@ -97,7 +117,12 @@ def profile_ids(kind: Kind) -> Callable[[str], list[str]]:
 
 def show_json(result: Mapping[str, Any]) -> None:
     """One object on standard output, nothing else there."""
-    sys.stdout.write(json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+    _json_shown.append(True)
+    try:
+        sys.stdout.write(json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError as error:
+        raise ReaderGoneError from error
 
 
 def writable(path: Path) -> None:
@@ -164,26 +189,88 @@ def signals_end_it() -> Iterator[None]:
 
 
 def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None:
-    """Run an application; a known error becomes one sentence and its exit code."""
+    """Run an application; a known error becomes one sentence and its exit code.
+
+    With `--json` the sentence is one object on standard output, too: `error` and `exit_code`.
+    """
+    for stream in ("stdout", "stderr"):  # closed by the shell (`>&-`): Python has None there
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, Path(os.devnull).open("w"))  # noqa: SIM115  until the end
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     sys.exit(_exit_code(app, name, known))  # no error is alive any more, nor what it held
 
 
 def _exit_code(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> int:
+    _json_shown.clear()
+    piped = _is_pipe()
     try:
-        app(prog_name=name)
+        code = _ended(app, name, known)
+        sys.stdout.flush()
+    except (ReaderGoneError, BrokenPipeError):
+        code = READER_GONE
+    if code == READER_GONE or (piped and not _is_pipe()):  # help sends the rest nowhere by itself
+        _send_nowhere()
+        return READER_GONE
+    return code
+
+
+def _ended(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> int:
+    try:
+        code = app(prog_name=name, standalone_mode=False)
     except SystemExit as end:
-        if end.code == INTERRUPTED:  # typer ends so on Ctrl+C, without a word
-            errors.print(f"{name}: interrupted")
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except typer.Abort:
+        code = INTERRUPTED
+    except _UsageError as error:
+        return _misused(error)
     except known as error:
         style = "bold red" if errors.is_terminal else None
-        errors.print(f"{name}: {error}", style=style, markup=False)
-        return int(getattr(error, "exit_code", InputError.exit_code))
+        return _failed(f"{name}: {error}", int(getattr(error, "exit_code", 2)), style)
+    except BrokenPipeError:
+        raise
     except OSError as error:
-        errors.print(f"{name}: {in_words(error)}", markup=False)
+        return _failed(f"{name}: {in_words(error)}", InputError.exit_code)
+    if code == INTERRUPTED:  # typer ends so on Ctrl+C, without a word
+        return _failed(f"{name}: interrupted", code)
+    return code if isinstance(code, int) else 0
+
+
+def _misused(error: Exception) -> int:
+    """Words that no command understands, in one sentence; help where a group was called alone."""
+    context = getattr(error, "ctx", None)
+    if type(error).__name__ == "NoArgsIsHelpError":
+        error.show()  # type: ignore[attr-defined]
         return InputError.exit_code
-    return 0
+    said = " ".join(error.format_message().split()).rstrip(".")  # type: ignore[attr-defined]
+    where = context.command_path if context is not None else ""
+    hint = f"; '{where} --help' shows what it takes" if where else ""
+    return _failed(f"{where}: {said[:1].lower()}{said[1:]}{hint}.", InputError.exit_code)
+
+
+def _failed(sentence: str, code: int, style: str | None = None) -> int:
+    """Tell of a failure once for people and, where it was asked for, once for programs."""
+    errors.print(sentence, style=style, markup=False)
+    if "--json" in sys.argv[1:] and not _json_shown:
+        show_json({"error": sentence, "exit_code": code})
+    return code
+
+
+def _is_pipe() -> bool:
+    try:
+        return stat.S_ISFIFO(os.fstat(sys.stdout.fileno()).st_mode)
+    except (OSError, ValueError, AttributeError):  # no file, closed, or none at all
+        return False
+
+
+def _send_nowhere() -> None:
+    """What is still to be written out has no reader; the end of Python must not trip over it."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def in_words(error: OSError) -> str:

@@ -156,7 +156,7 @@ def test_a_bad_scan_is_refused(
     assert "Traceback" not in str(said)
     sentences = [line for line in str(said).strip().splitlines() if not line.endswith("%")]
     assert len(sentences) == 1  # beside the progress
-    assert shown == ""
+    assert json.loads(str(shown)) == {"error": sentences[0], "exit_code": 2}
     assert not out.is_file()
     assert not (out.is_dir() and list(out.iterdir()))
 

@@ -116,6 +116,10 @@ def test_a_click_decides(browser: Any, run: Run, button: str, regenerate_golden:
     page.wait_for_function("() => document.querySelector('canvas') !== null")
     if button == "Approve" and regenerate_golden:
         page.wait_for_timeout(5000)  # a picture for people: let everything arrive
+        page.locator(".mantine-Notification-closeButton").evaluate_all(
+            "buttons => buttons.forEach((button) => button.click())"
+        )  # viser's word on a browser that draws without a GPU
+        page.wait_for_timeout(1000)
         Image.fromarray(picture(page)).save(PICTURES / "live-view.png", optimize=True)
     # part, scan, what is missing and the patch are drawn by now or within some frames
     pictures = (picture(page) for _ in range(100))

@@ -6,10 +6,13 @@ Chromium presses the buttons; what became of it is read from what the printer ca
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +42,8 @@ pytestmark = [
     pytest.mark.timeout(900),
     pytest.mark.skipif(bool(why_not()), reason=why_not()),
 ]
-SLOW = "always slow_reader s=0.004"  # long enough to press a button while it prints
+SLOW = "always slow_reader s=0.01"  # long enough to see it print
+QUIET_S = 1.5  # a hundred times what a line takes
 PROGRAM = "from amrepair.cli import main; main()"
 AGAIN = "look again"
 SENSOR_S = 1.0  # a scan takes its time; one from before it was asked for would be no answer
@@ -222,3 +226,30 @@ def test_skip_prints_the_job_alone(browser: Any, command: Command, prepared: Pre
     job = prepared.job_beads()
     assert command.laid() == len(job)
     assert "leaked" not in said
+
+
+def test_pause_holds_the_nozzle_until_it_is_told_to_go_on(
+    browser: Any, command: Command, prepared: Prepared
+) -> None:
+    watched = Watched(browser, command.url())
+    page = watched.page
+    until(lambda: command.laid() > 10)
+    os.kill(command.printer.pid, signal.SIGSTOP)  # it prints, and waits for our click
+    wait_for(page, "Pause").click()
+    go_on = wait_for(page, "Go on")
+    os.kill(command.printer.pid, signal.SIGCONT)
+    page.get_by_text("the nozzle is lifted after the line under way").wait_for()
+    before = -1
+    while before != (before := command.laid()):
+        time.sleep(QUIET_S)  # the line under way, and what the printer had buffered
+    job = prepared.job_beads()
+    assert 10 < before < len(job) * 0.6  # it rests in mid-job, before its first stop
+    assert command.process.poll() is None
+    go_on.click()
+    until(lambda: command.laid() > before)
+    wait_for(page, "Approve").click()
+    code, result, said = command.ended()
+    assert code == 0, said
+    patch = beads_of(Path(result["gcode"]).read_text().splitlines())
+    assert command.laid() == len(job) + len(patch)  # nothing twice, nothing left out
+    assert watched.complaints == []

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import errno
 import io
+import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import manifold3d as m3
@@ -21,6 +25,7 @@ from amrepair.cli.warmth import ThermalLog
 from amrepair.errors import AlignmentError, AmrepairError, InputError
 from amrepair.template import MeshSdf
 from gcode.cli import console
+from gcode.cli.app import app as gcode_app
 from gcode.cli.options import plain_text, program_text
 from gcode.cli.words import what_it_does
 from gcode.errors import InputError as GcodeInputError
@@ -46,7 +51,7 @@ def sunk() -> MeshSdf:
     return MeshSdf.from_mesh(solid_mesh(m3.Manifold.cube((20.0, 10.0, 8.0)).translate((0, 0, -15))))
 
 
-@pytest.mark.parametrize("pose", ["100,80,15,0", "100,80,15,90", "5,200,14.5,0", "100,80,40,0"])
+@pytest.mark.parametrize("pose", ["100,80,15,0", "100,80,15,90", "5,200,14.5,0", "100,80,17.5,0"])
 def test_a_part_on_the_bed_is_let_through(sunk: MeshSdf, pose: str) -> None:
     refuse_impossible(sunk, part_pose(pose), SETUP.printer, said=True)
 
@@ -54,6 +59,16 @@ def test_a_part_on_the_bed_is_let_through(sunk: MeshSdf, pose: str) -> None:
 def test_a_part_in_the_bed_is_told_the_height_that_it_needs(sunk: MeshSdf) -> None:
     with pytest.raises(AlignmentError, match=r"15\.0 mm into the bed.*Z = 15\.000"):
         refuse_impossible(sunk, part_pose("100,80,0,0"), SETUP.printer, said=True)
+
+
+@pytest.mark.parametrize(("said", "cure"), [(True, "Z = 15"), (False, "--scan-frame unknown")])
+def test_a_part_in_the_air_is_refused_unless_it_stands_on_a_fixture(
+    sunk: MeshSdf, said: bool, cure: str
+) -> None:
+    pose = part_pose("100,80,40,0")
+    with pytest.raises(AlignmentError, match=rf"foot 25\.0 mm above the bed.*{cure}.*--on-fix"):
+        refuse_impossible(sunk, pose, SETUP.printer, said=said)
+    refuse_impossible(sunk, pose, SETUP.printer, said=said, raised=True)
 
 
 @pytest.mark.parametrize("pose", ["245,80,15,0", "-5,80,15,0", "100,80,300,0"])
@@ -151,6 +166,67 @@ def test_every_end_has_its_code_and_one_sentence(
     told = capsys.readouterr().err.strip()
     assert said in told
     assert len(told.splitlines()) == bool(said)
+
+
+def test_with_json_a_failure_is_one_object_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app = typer.Typer(pretty_exceptions_enable=False)
+
+    @app.command()
+    def go(as_json: bool = typer.Option(False, "--json"), told: bool = False) -> None:
+        if told:
+            console.show_json({"ok": False})
+        raise InputError("no such thing")
+
+    for words in (["--json"], ["--json", "--told"]):
+        monkeypatch.setattr("sys.argv", ["amrepair", *words])
+        with pytest.raises(SystemExit) as end:
+            console.run(app, "amrepair", (AmrepairError,))
+        assert end.value.code == 2
+        out, err = capsys.readouterr()
+        assert err.strip() == "amrepair: no such thing"
+        failure = {"error": "amrepair: no such thing", "exit_code": 2}
+        assert json.loads(out) == ({"ok": False} if "--told" in words else failure)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--nonsense", "gcode: no such option: --nonsense; 'gcode --help' shows what it takes."),
+        ("check", "gcode check: missing argument 'file'; 'gcode check --help' shows"),
+        ("resume-at a.gcode --layer x -o b", "gcode resume-at: invalid value for '--layer'"),
+        ("emulat", "gcode: no such command 'emulat'"),
+    ],
+)
+def test_a_usage_error_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: str, said: str
+) -> None:
+    monkeypatch.setattr("sys.argv", ["gcode", *words.split(), "--json"])
+    with pytest.raises(SystemExit) as end:
+        console.run(gcode_app, "gcode", (GcodeInputError,))
+    out, err = capsys.readouterr()
+    assert end.value.code == 2
+    assert err.startswith(said)
+    assert len(err.strip().splitlines()) == 1
+    assert json.loads(out) == {"error": err.strip(), "exit_code": 2}
+
+
+@pytest.mark.parametrize(
+    "words", ["profiles show prusa_mk3s", "profiles list", "--help", "check none.gcode --json"]
+)
+def test_a_reader_that_has_gone_ends_it_quietly(words: str) -> None:
+    """Such as `gcode … | head -1`: no traceback, and the code that a shell gives for SIGPIPE."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    with os.fdopen(writes, "wb") as pipe:
+        done = subprocess.run(
+            [sys.executable, "-c", "from gcode.cli import main; main()", *words.split()],
+            stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=120, check=False,
+        )  # fmt: skip
+    assert done.returncode == console.READER_GONE
+    said = [line for line in done.stderr.splitlines() if "cannot be read" not in line]
+    assert said == []
 
 
 @pytest.mark.parametrize(("bed_c", "names"), [(60.0, ["hotend", "bed"]), (None, ["hotend"])])

@@ -19,13 +19,14 @@ from typer.testing import CliRunner
 import amrepair
 import gcode
 from amrepair.cli.app import app
-from amrepair.cli.live import show_file
+from amrepair.cli.live import ShownRun, show_file
 from amrepair.errors import InputError, MissingDependencyError
 from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.guarded import Guard
 from amrepair.report.live import LiveView, deviation_colours
 from amrepair.report.operator import Operator, Verdict
+from gcode.errors import LinkError
 
 TOKEN = "0123456789abcdef0123"
 WAIT_S = 60.0
@@ -253,6 +254,46 @@ def test_buttons_are_dead_until_a_question_is_asked(view: LiveView, plan: Repair
     thread.join(WAIT_S)
     assert found == [True]
     assert view._approve.disabled
+
+
+def test_a_pause_before_there_is_a_printer_holds_the_run_at_once(view: LiveView) -> None:
+    """Regression: it was said to rest, and printed."""
+    operator = view._operator
+    assert operator is not None
+    watcher = Watcher(operator)
+    shown, said = ShownRun(view, operator, ask=False), list[str]()
+    operator.toggle_pause()
+
+    def go() -> bool:
+        shown.drives(lambda: said.append("pause"), lambda: said.append("resume"))
+        said.append("print")
+        return shown.approve(None)  # type: ignore[arg-type]  # nobody is asked
+
+    thread, found = answer_of(go)
+    watcher.until(lambda: operator.paused)
+    thread.join(0.05)
+    assert (said, found) == ([], [])
+    operator.toggle_pause()
+    thread.join(WAIT_S)
+    assert (sorted(said), found) == (["print", "resume"], [True])
+
+
+def test_a_printer_that_does_not_pause_is_told_on_the_page(view: LiveView) -> None:
+    """Such as OctoPrint between two prints; the error was lost in a thread of the page's."""
+    operator = view._operator
+    assert operator is not None
+
+    def refuse() -> None:
+        raise LinkError("OctoPrint does not pause (it does not print).")
+
+    operator.on_pause = operator.on_resume = refuse
+    view._toggle_pause(operator)
+    assert operator.paused
+    assert view._pause.label == "Go on"
+    assert "rests before its next part**, but the printer: OctoPrint" in view._stage.content
+    view._toggle_pause(operator)
+    assert not operator.paused
+    assert "goes on**, but the printer: OctoPrint" in view._stage.content
 
 
 def test_the_part_grows_with_the_print(view: LiveView, example_files: Path) -> None:

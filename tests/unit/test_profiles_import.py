@@ -340,8 +340,9 @@ def test_the_command_writes_lists_and_never_overwrites(tmp_path: Path) -> None:
     }
     before = Path(made["path"]).read_bytes()
     again = call(*words)
-    assert (again.returncode, again.stdout) == (2, "")
+    assert again.returncode == 2
     assert "is there already" in again.stderr
+    assert json.loads(again.stdout) == {"error": again.stderr.strip(), "exit_code": 2}
     assert Path(made["path"]).read_bytes() == before
 
 

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from amrepair.loop import plan_stops
+from amrepair.loop.sites import sites
+from amrepair.repair import plan_repair
+from amrepair.template import PlannedSdf
 from amrepair.template import planned_kernels as kernels
+from tests.unit.loop_bench import LAYER, Small, scan_of
 
 
 @pytest.fixture(params=range(3))
@@ -50,3 +55,38 @@ def test_open_faces_are_those_of_shifted_copies(solid: np.ndarray, every: int) -
             found.append(room[:kept].copy())
             count += faces
     np.testing.assert_array_equal(np.concatenate(found), np.concatenate(wanted)[::every])
+
+
+def beads_of_a_block(layers: int) -> PlannedSdf:
+    """Lines along X side by side, 10 × 6 mm, 0.2 mm a layer."""
+    y, z = np.meshgrid(np.arange(0.2, 6.0, 0.4), 0.2 * np.arange(1, layers + 1))
+    start = np.column_stack([np.zeros(y.size), y.ravel(), z.ravel()])
+    count = len(start)
+    return PlannedSdf.from_beads(
+        start, start + [10.0, 0.0, 0.0], np.full(count, 0.08), np.full(count, 0.2)
+    )
+
+
+@pytest.mark.parametrize("layers", [5, 40])
+def test_nothing_is_planned_below_the_lowest_beads(layers: int) -> None:
+    """Regression: the lowest slice went on downwards, into the bed, and was called missing there."""
+    planned = beads_of_a_block(layers)
+    foot_mm = float(planned.bounds_mm[0, 2])
+    assert foot_mm == pytest.approx(max(0.0, 0.2 * layers - 4.2), abs=0.21)
+    below_mm = np.array([0.3, 1.0, 5.0, 30.0])
+    middle = np.tile([5.0, 3.0, 0.0], (4, 1)) + np.outer(foot_mm - below_mm, [0, 0, 1])
+    assert planned.distance(middle) == pytest.approx(below_mm, abs=0.1)
+    assert planned.distance(middle[:1] + [0.0, 0.0, 0.7])[0] == pytest.approx(-0.4, abs=0.1)
+
+
+@pytest.mark.parametrize("depth_mm", [0.0, 0.55])
+def test_a_scan_all_around_finds_the_pocket_and_nothing_below_the_bed(depth_mm: float) -> None:
+    """Regression: 5,906 mm³ of an intact block of 192 mm³ were missing, 31 mm into the bed."""
+    small = Small.made()
+    stop = plan_stops(small.job, [LAYER])[0]
+    site = sites(small.job, small.template, small.placed, small.setup, by_beads=True)(stop)
+    pocket = small.block(-depth_mm, 1.0, 5.0)
+    scan = scan_of(small.standing - pocket if depth_mm else small.standing)
+    guess = small.placed.inverse() @ small.pose
+    plan = plan_repair(scan, site, title="pocket", guess=guess, strict=False)
+    assert plan.deficit.missing_mm3 == pytest.approx(25.0 * depth_mm, rel=0.05, abs=0.1)
