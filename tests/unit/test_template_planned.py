@@ -62,21 +62,21 @@ def beads_of_a_block(layers: int) -> PlannedSdf:
     y, z = np.meshgrid(np.arange(0.2, 6.0, 0.4), 0.2 * np.arange(1, layers + 1))
     start = np.column_stack([np.zeros(y.size), y.ravel(), z.ravel()])
     count = len(start)
-    return PlannedSdf.from_beads(
-        start, start + [10.0, 0.0, 0.0], np.full(count, 0.08), np.full(count, 0.2)
-    )
+    end = start + np.array([10.0, 0.0, 0.0])
+    return PlannedSdf.from_beads(start, end, np.full(count, 0.08), np.full(count, 0.2))
 
 
 @pytest.mark.parametrize("layers", [5, 40])
 def test_nothing_is_planned_below_the_lowest_beads(layers: int) -> None:
-    """Regression: the lowest slice went on downwards, into the bed, and was called missing there."""
+    """Regression: the lowest slice went on into the bed, and was called missing there."""
     planned = beads_of_a_block(layers)
     foot_mm = float(planned.bounds_mm[0, 2])
     assert foot_mm == pytest.approx(max(0.0, 0.2 * layers - 4.2), abs=0.21)
     below_mm = np.array([0.3, 1.0, 5.0, 30.0])
     middle = np.tile([5.0, 3.0, 0.0], (4, 1)) + np.outer(foot_mm - below_mm, [0, 0, 1])
     assert planned.distance(middle) == pytest.approx(below_mm, abs=0.1)
-    assert planned.distance(middle[:1] + [0.0, 0.0, 0.7])[0] == pytest.approx(-0.4, abs=0.1)
+    middle[:, 2] = foot_mm + 0.4
+    assert planned.distance(middle) == pytest.approx(-0.4, abs=0.1)
 
 
 @pytest.mark.parametrize("depth_mm", [0.0, 0.55])
