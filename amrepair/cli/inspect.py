@@ -13,8 +13,10 @@ from amrepair.errors import InputError
 from gcode.cli import console
 
 if TYPE_CHECKING:
+    from amrepair.detect import AnomalyMap
     from amrepair.library import Recognition
     from amrepair.repair import Stopwatch
+    from amrepair.report.folder import RunFolder
     from amrepair.scans import Scan
 
 _COLOURS = ((180, 180, 180), (0, 90, 200), (220, 120, 0))  # ok, missing, excess
@@ -65,7 +67,8 @@ def align(
     as_json: JsonOption = False,
 ) -> None:
     """Find where a scan lies in its template."""
-    import numpy as np
+    with console.starting():
+        import numpy as np
 
     from amrepair.align import align as align_scan
     from amrepair.align.pam import VARIANTS
@@ -77,8 +80,9 @@ def align(
         raise InputError(f"--pam belongs to --method paper, the method is {method}")
     settings = with_settings(VARIANTS, pam, "--pam")
     watch, bars = Stopwatch(), console.Bars()
-    cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
     with bars.shown():
+        with bars.stage("read scan"):
+            cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
         if template.is_dir():
             known = from_library(cloud, template, method, seed, watch, bars)
             found, chosen = known.registration, chosen_part(known)
@@ -93,9 +97,10 @@ def align(
                     rng=np.random.default_rng(seed),
                     progress=bars,
                 )
-    if output is not None:
-        moved = cloud.moved(found.template_from_scan)
-        console.write_whole(output, lambda path: write_ply(moved, path))
+        if output is not None:
+            moved = cloud.moved(found.template_from_scan)
+            with bars.stage("write"):
+                console.write_whole(output, lambda path: write_ply(moved, path))
     # the pose is an input of other programs: all its digits
     result: dict[str, Any] = {
         "template_from_scan": found.template_from_scan.matrix.tolist(),
@@ -155,20 +160,22 @@ def detect(
     as_json: JsonOption = False,
 ) -> None:
     """Align a scan and say what is missing and what is too much."""
-    import numpy as np
+    with console.starting():
+        import numpy as np
 
     from amrepair.align import align as align_scan
     from amrepair.detect import detect as detect_defects
     from amrepair.repair import Stopwatch
     from amrepair.report.collect import rounded
     from amrepair.report.folder import RunFolder
-    from amrepair.scans import read_scan, write_ply
+    from amrepair.scans import read_scan
     from amrepair.template import open_template
 
     watch, bars = Stopwatch(), console.Bars()
-    cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
-    folder = RunFolder(out)
     with bars.shown():
+        with bars.stage("read scan"):
+            cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
+        folder = RunFolder(out)
         chosen: dict[str, Any] = {}
         if template.is_dir():
             known = from_library(cloud, template, "robust", seed, watch, bars)
@@ -179,27 +186,8 @@ def detect(
                 found = align_scan(cloud, field, rng=np.random.default_rng(seed), progress=bars)
         with watch("detect"):
             anomaly = detect_defects(cloud.moved(found.template_from_scan), field, progress=bars)
-    console.write_whole(
-        folder.file("anomaly.npz"),
-        lambda path: np.savez_compressed(
-            path,
-            points_mm=cloud.points_mm,
-            deviation_mm=anomaly.deviation_mm,
-            score=anomaly.score,
-            label=anomaly.label,
-            template_points_mm=anomaly.template_points_mm,
-            template_label=anomaly.template_label,
-        ),
-    )
-    console.write_whole(
-        folder.file("anomaly.ply"),
-        lambda path: write_ply(
-            cloud,
-            path,
-            colours=np.array(_COLOURS)[anomaly.label],
-            scalars={"deviation": anomaly.deviation_mm, "label": anomaly.label},
-        ),
-    )
+        with bars.stage("write"):
+            _keep(folder, cloud, anomaly)
     result = {
         "object_score": anomaly.object_score,
         "threshold": anomaly.threshold_mm,
@@ -236,3 +224,32 @@ def detect(
             f"  {region.label.name.lower()} {region.type}: {region.volume_mm3:.1f} mm³, "
             f"{region.depth_mm:.2f} mm deep"
         )
+
+
+def _keep(folder: RunFolder, cloud: Scan, anomaly: AnomalyMap) -> None:
+    """The anomaly map as arrays, and as a coloured cloud."""
+    import numpy as np
+
+    from amrepair.scans import write_ply
+
+    console.write_whole(
+        folder.file("anomaly.npz"),
+        lambda path: np.savez_compressed(
+            path,
+            points_mm=cloud.points_mm,
+            deviation_mm=anomaly.deviation_mm,
+            score=anomaly.score,
+            label=anomaly.label,
+            template_points_mm=anomaly.template_points_mm,
+            template_label=anomaly.template_label,
+        ),
+    )
+    console.write_whole(
+        folder.file("anomaly.ply"),
+        lambda path: write_ply(
+            cloud,
+            path,
+            colours=np.array(_COLOURS)[anomaly.label],
+            scalars={"deviation": anomaly.deviation_mm, "label": anomaly.label},
+        ),
+    )

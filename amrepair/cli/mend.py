@@ -103,7 +103,8 @@ def repair(
     as_json: JsonOption = False,
 ) -> None:
     """Make the G-code that prints only what is missing on a finished part."""
-    import numpy as np
+    with console.starting():
+        import numpy as np
 
     from amrepair.repair import Site, Stopwatch, plan_repair
     from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
@@ -132,9 +133,10 @@ def repair(
     setup = load_setup(printer, material, process)
     watch, bars = Stopwatch(), console.Bars()
     frame = "build" if scan_frame == "build" else "scanner"
-    cloud = read_scan(scan, frame=frame, sensor_at=sensors(sensor_at))
-    grid = grid_of(job, setup)
     with bars.shown():
+        with bars.stage("read"):
+            cloud = read_scan(scan, frame=frame, sensor_at=sensors(sensor_at))
+            grid = grid_of(job, setup)
         with watch("template"):
             field = open_template(template, progress=bars)
         guess = placed.inverse() if placed is not None and frame == "build" else None
@@ -172,15 +174,16 @@ def repair(
         result["turns"] = [asdict(one) for one in ranked]
     within = plan_is_enough(plan)
     if report is not None:
-        data = report_of_plan(
-            plan,
-            result,
-            title=f"Repair of {scan.name}",
-            setup=setup,
-            template=field,
-            scan_name=scan.name,
-        )
-        console.write_whole(report, lambda path: write_report(data, path))
+        with bars.shown(), bars.stage("report"):
+            data = report_of_plan(
+                plan,
+                result,
+                title=f"Repair of {scan.name}",
+                setup=setup,
+                template=field,
+                scan_name=scan.name,
+            )
+            console.write_whole(report, lambda path: write_report(data, path))
     if as_json:
         console.show_json(result)
     else:

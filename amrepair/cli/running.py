@@ -142,7 +142,7 @@ def run(
             going_on=resume is not None,
             pose=pose_confirmed,
         )
-    _tell(begun, report, warmth, watch, as_json=as_json)
+    _tell(begun, report, warmth, watch, bars, as_json=as_json)
 
 
 def _given(value: Any, name: str) -> Any:
@@ -288,6 +288,7 @@ def _tell(
     report: LoopReport,
     warmth: tuple[TemperatureSeries, ...],
     watch: Stopwatch,
+    bars: console.Bars,
     *,
     as_json: bool,
 ) -> None:
@@ -301,16 +302,17 @@ def _tell(
     )
     folder.write_json("result.json", result)
     within = report.within_tolerance
-    data = report_of_loop(
-        report,
-        result,
-        title=f"Run: {setting.title}",
-        setup=setup,
-        about={"job": setting.title},
-        expected=_placed_solid(begun.template, setting.placed),
-        temperatures=warmth,
-    )
-    write_report(data, folder.file("report.html"))
+    with bars.shown(), bars.stage("report"):
+        data = report_of_loop(
+            report,
+            result,
+            title=f"Run: {setting.title}",
+            setup=setup,
+            about={"job": setting.title},
+            expected=_placed_solid(begun.template, setting.placed),
+            temperatures=warmth,
+        )
+        write_report(data, folder.file("report.html"))
     if as_json:
         console.show_json(result)
     else:

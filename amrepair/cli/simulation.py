@@ -131,7 +131,7 @@ def simulate(
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     result = _result(run, folder, seed, seconds)
     folder.write_json("result.json", result)
-    with watch("report"):
+    with watch("report"), bars.shown(), bars.stage("report"):
         write_report(_report_data(run, path, result), folder.file("report.html"))
     within = run.report.within_tolerance
     if run.report.stopped:

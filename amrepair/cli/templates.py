@@ -52,8 +52,9 @@ def fit(
     seed: SeedOption = 0,
 ) -> None:
     """Fit the signed distance field that scans are held against."""
-    from amrepair.template import fit_template
-    from amrepair.template.paper import VARIANTS
+    with console.starting():
+        from amrepair.template import fit_template
+        from amrepair.template.paper import VARIANTS
 
     if paper and recipe != "paper":
         raise InputError(f"--paper belongs to --recipe paper, the recipe is {recipe}")
@@ -108,11 +109,13 @@ def mesh(
     ] = None,
 ) -> None:
     """Extract the template's surface as a closed mesh."""
-    from amrepair.template import extract_mesh, open_template
+    with console.starting():
+        from amrepair.template import extract_mesh, open_template
 
     console.writable(output)
     bars = console.Bars()
     with bars.shown():
         template = open_template(file, progress=bars)
         cut = template if below_z_mm is None else template.below_z(below_z_mm)
-        write_mesh(extract_mesh(cut, voxel_mm, level_mm=level_mm), output)
+        with bars.stage("extract"):
+            write_mesh(extract_mesh(cut, voxel_mm, level_mm=level_mm), output)

@@ -82,17 +82,17 @@ def fit_from_scans(
     rng = np.random.default_rng(seed)
     pieces = []
     for k, scan in enumerate(scans):
-        progress("fit", 0.1 * k / len(scans), 1.0)
+        progress("fit: scans", 0.2 * k / len(scans), 1.0)
         pieces.append(_piece(scan, rng))
     nominal = None if mesh is None else MeshSdf.from_mesh(mesh)
     if nominal is None:
         placed = place_all(pieces, rng) if len(pieces) > 1 else Placed((0,), (np.eye(4),), 0.0, ())
     else:
         placed = _on_mesh(scans, nominal, rng)
-    progress("fit", 0.35, 1.0)
+    progress("fit: scans", 0.7, 1.0)
     cloud = _joined([pieces[k] for k in placed.which], [scans[k] for k in placed.which], placed)
     fused = fuse(cloud, behind=nominal)
-    progress("fit", 0.5, 1.0)
+    progress("fit: scans", 1.0, 1.0)
     notes = _notes(scans, placed, fused, len(placed.which))
     closed = fused.mesh
     closed.metadata["notes"] = notes
@@ -107,7 +107,7 @@ def fit_from_scans(
         MeshSdf.from_mesh(closed),
         seed=seed,
         metadata=metadata,
-        progress=lambda stage, done, total: progress(stage, 0.5 + 0.5 * done / total, 1.0),
+        progress=progress,
     )
     spread = fused.spread
     template = replace(

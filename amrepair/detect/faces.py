@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.detect.holes import is_closed, spoken_of
 from amrepair.detect.rooms import Rooms, find_rooms
 from amrepair.detect.surfels import Surfels
 from amrepair.detect.winding import Shell
@@ -236,7 +237,17 @@ def find_faces(
         )
         return Faces(places, deviations, is_off, normal, spacing_mm, tree, shell)
 
-    return faces_with(_standing(faces_with, template, patches, present, rooms))
+    holes = np.flatnonzero(~present)
+    spoken, looked_at = spoken_of(
+        template, patches.place_mm[holes], place[which], outward, spacing_mm=spacing_mm
+    )
+    present[holes[~spoken]] = True
+    seen_mm2 = patches.vector_mm2[present].sum(axis=0)
+    closed = is_closed(seen_mm2, patches.vector_mm2.sum(axis=0), vectors)
+    if closed:
+        return faces_with(_standing(faces_with, template, patches, present, rooms))
+    lit = looked_at[spoken]
+    return faces_with(_standing_unless_faced(faces_with, template, patches, present, rooms, lit))
 
 
 def _around(
@@ -289,22 +300,68 @@ def _standing(
     of 0, since broken faces close it from within. It is covered where they close it from outside
     (1). Else it is unseen: then the template's own surface is taken to stand there.
     """
-    holes = np.flatnonzero(~present)
-    probes = patches.place_mm[holes] - PROBE_MM * _unit(patches.vector_mm2[holes])
-    f_mm = template.distance(probes)
-    room = rooms.value_at(probes)
+    probes, f_mm, room = _probes(template, patches, holes := np.flatnonzero(~present), rooms)
     keep = present
     for _ in range(2):  # what is unseen elsewhere pulls on the first answer
         faces = faces_with(keep)
         inside = faces.shell.winding(probes)
-        distance, nearest = faces.tree.query(probes, workers=2)
-        faced = faces.off[nearest] & (distance < NEAR_SPACINGS * faces.spacing_mm)
-        faced[faced] = faces.clearance(probes[faced], f_mm[faced]) > 0
+        faced = _faced(faces, probes, f_mm)
         unseen = (inside > OPEN_WINDING) & (inside < 1 - OPEN_WINDING / 2) & ~faced & (room <= 0)
         # a patch that stands closes the surface itself: only the others are asked again
         keep = keep.copy()
         keep[holes[unseen]] = True
     return keep
+
+
+def _standing_unless_faced(
+    faces_with: Callable[[Bool[np.ndarray, " m"]], Faces],
+    template: Template,
+    patches: Patches,
+    present: Bool[np.ndarray, " m"],
+    rooms: Rooms,
+    lit: Bool[np.ndarray, " h"],
+) -> Bool[np.ndarray, " m"]:
+    """The same of a scan that leaves more open than what is broken: views of a part.
+
+    There a winding number of 0 tells nothing: all stands at first, and a patch goes where broken
+    faces look at it, or the opening that those leave which went before. So what is gone grows from
+    the faces on, as far as their openings are wide, and never to walls that nobody saw. `lit` are
+    the holes' patches that a face looks at along its normal.
+    """
+    probes, f_mm, room = _probes(template, patches, holes := np.flatnonzero(~present), rooms)
+    faces = faces_with(np.ones(len(present), dtype=bool))
+    # the template's own surface alone is 1 inside, but for how finely it is cut in patches
+    inside = 1.0 + faces_with(np.zeros(len(present), dtype=bool)).shell.winding(probes)
+    gone = np.zeros(len(holes), dtype=bool)
+    new = (_faced(faces, probes, f_mm) | (room > 0) | lit) & (inside < 1 - OPEN_WINDING / 3)
+    new |= inside < 1 - OPEN_WINDING
+    while new.any():
+        gone |= new
+        went = Shell.of(patches.place_mm[holes[new]], patches.vector_mm2[holes[new]])
+        rest = np.flatnonzero(~gone)
+        inside[rest] -= went.winding(probes[rest])
+        new = ~gone & (inside < 1 - OPEN_WINDING)
+    keep = np.ones(len(present), dtype=bool)
+    keep[holes[gone | (inside > 1 + OPEN_WINDING)]] = False  # gone, or covered
+    return keep
+
+
+def _probes(
+    template: Template, patches: Patches, holes: Int[np.ndarray, " h"], rooms: Rooms
+) -> tuple[Float[np.ndarray, "h 3"], Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
+    """Places just inside the holes' patches, the template's distance there, and their rooms."""
+    probes = patches.place_mm[holes] - PROBE_MM * _unit(patches.vector_mm2[holes])
+    return probes, template.distance(probes), rooms.value_at(probes)
+
+
+def _faced(
+    faces: Faces, probes: Float[np.ndarray, "h 3"], f_mm: Float[np.ndarray, " h"]
+) -> Bool[np.ndarray, " h"]:
+    """Where a broken face is near, and looks at the place."""
+    distance, nearest = faces.tree.query(probes, workers=2)
+    faced = faces.off[nearest] & (distance < NEAR_SPACINGS * faces.spacing_mm)
+    faced[faced] = faces.clearance(probes[faced], f_mm[faced]) > 0
+    return np.asarray(faced)
 
 
 def _planes(

@@ -21,6 +21,7 @@ GRID_CELLS = 128  # along the longest side
 MARGIN_CELLS = 6.0
 FINE = 4  # a cell that bends is divided into so many along each edge
 SAMPLES = 300_000
+AT_ONCE = 100_000  # distances: a second of a large mesh
 HELD_OUT = 40_000
 BAND_CELLS = 1.0  # the field is looked at this far around the surface
 LEAST_RESIDUAL_MM = 0.008  # cells where the grid is better than this are left as they are
@@ -51,14 +52,11 @@ def fit_fast(
     base = _base(exact, origin, cell, shape, progress)
     bare = Grid.bare(origin, cell, base)
     points = _samples(exact, SAMPLES, BAND_CELLS * cell, rng)
-    residual = np.abs(exact.distance(points) - bare.distance(points))
-    progress("fit", 0.6, 1.0)
+    residual = np.abs(_measured(exact, points, "fit: compare", progress) - bare.distance(points))
     cells = _bent(bare, points, residual)
-    grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells))
-    progress("fit", 0.95, 1.0)
+    grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, progress))
     held = _on_surface(exact, HELD_OUT, rng)
     bias_mm = float(np.quantile(np.abs(grid.distance(held)), 0.99))
-    progress("fit", 1.0, 1.0)
     return LearnedSdf(grid=grid, mesh=exact.mesh, bias_mm=bias_mm, metadata=metadata or {})
 
 
@@ -73,13 +71,25 @@ def _base(
     axes = [origin[a] + cell * np.arange(shape[a]) for a in range(3)]
     base = np.empty(tuple(shape), dtype=np.float32)
     plane = np.stack(np.meshgrid(axes[1], axes[2], indexing="ij"), axis=-1).reshape(-1, 2)
-    step = max(1, 400_000 // len(plane))
+    step = max(1, AT_ONCE // len(plane))
     for first in range(0, shape[0], step):
         xs = axes[0][first : first + step]
         nodes = np.column_stack([np.repeat(xs, len(plane)), np.tile(plane, (len(xs), 1))])
         base[first : first + step] = exact.distance(nodes).reshape(len(xs), shape[1], shape[2])
-        progress("fit", 0.5 * min(first + step, shape[0]) / shape[0], 1.0)
+        progress("fit: grid", float(first + len(xs)), float(shape[0]))
     return base
+
+
+def _measured(
+    exact: MeshSdf, points_mm: Float[np.ndarray, "n 3"], stage: str, progress: Progress
+) -> Float[np.ndarray, " n"]:
+    """(n,) exact distances, some at a time."""
+    found = np.empty(len(points_mm))
+    for first in range(0, len(points_mm), AT_ONCE):
+        last = min(first + AT_ONCE, len(points_mm))
+        found[first:last] = exact.distance(points_mm[first:last])
+        progress(stage, float(last), float(len(points_mm)))
+    return found
 
 
 def _on_surface(exact: MeshSdf, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
@@ -112,7 +122,7 @@ def _bent(
 
 
 def _blocks(
-    exact: MeshSdf, bare: Grid, cells: Int[np.ndarray, "b 3"]
+    exact: MeshSdf, bare: Grid, cells: Int[np.ndarray, "b 3"], progress: Progress
 ) -> Float[np.ndarray, "b r r r"]:
     """(b, r+1, r+1, r+1) exact distances; nodes that blocks share are asked once."""
     inner = np.stack(np.meshgrid(*[np.arange(FINE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -122,5 +132,5 @@ def _blocks(
     different, first, back = np.unique(key, return_index=True, return_inverse=True)
     del different
     where = bare.origin_mm + nodes[first] * (bare.cell_mm / FINE)
-    values = exact.distance(where).astype(np.float32)
+    values = _measured(exact, where, "fit: details", progress).astype(np.float32)
     return values[back].reshape(len(cells), *[FINE + 1] * 3)

@@ -71,8 +71,10 @@ def fit_template(
                 f"a template is fitted to one mesh, {len(source)} inputs were given"
             )
         source = source[0]
+    progress("read mesh", 0.0, 1.0)
     mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
     closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
+    progress("read mesh", 1.0, 1.0)
     metadata = made_from(closed, recipe, seed)
     exact = MeshSdf.from_mesh(closed)
     if recipe == "paper":
@@ -125,8 +127,10 @@ def load_or_fit(
     cache_dir
         Default: `$XDG_CACHE_HOME/amrepair/templates`, or `~/.cache/amrepair/templates`.
     """
+    progress("read mesh", 0.0, 1.0)
     mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
     closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
+    progress("read mesh", 1.0, 1.0)
     folder = cache_dir or default_cache_dir()
     key = json.dumps([mesh_sha256(closed), "fast", seed, FORMAT_VERSION, amrepair.__version__])
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.safetensors"

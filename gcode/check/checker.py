@@ -90,9 +90,12 @@ def _judge(
             progress("check", float(number), float(len(lines)))
         judge.read(number, raw)
     judge.end()
+    progress("check", float(len(lines)), float(len(lines)))
     refusals, clearance_mm = list(judge.refusals), math.inf
     if as_built is not None:
+        progress("sweep", 0.0, 1.0)
         hits, clearance_mm = sweep(judge.moves, lines, setup.printer, as_built)
+        progress("sweep", 1.0, 1.0)
         refusals += hits
     refusals.sort(key=lambda refusal: refusal.line)
     report = CheckReport(

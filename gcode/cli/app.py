@@ -102,10 +102,11 @@ def slice_solid(
 
     console.writable(output)
     setup = load_setup(printer, material, process)
-    shape = read_solid(solid)
     bars = console.Bars()
     lost: tuple[Any, ...] = ()
     with bars.shown():
+        with bars.stage("read solid"):
+            shape = read_solid(solid)
         if as_built is None:
             field = None
             toolpath = slice_part(shape, setup, progress=bars)
@@ -122,10 +123,11 @@ def slice_solid(
             toolpath, lost = plan.toolpath, (*plan.unreachable, *plan.unprintable)
         if not toolpath.extrusions:
             raise InputError(f"{solid}: nothing of it can be printed: {_reasons(lost)}.")
-        program = write(toolpath, setup, title=f"{solid.name}")
-    check_program(program, setup, as_built=field)
+        with bars.stage("write"):
+            program = write(toolpath, setup, title=f"{solid.name}")
+        check_program(program, setup, as_built=field, progress=bars)
+        cost = estimate_program(program, setup.printer, progress=bars)
     console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
-    cost = estimate_program(program, setup.printer)
     result = {
         "gcode": str(output),
         "solid_mm3": round(float(shape.volume()), 4),
@@ -163,9 +165,10 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Judge a program: limits, temperatures, sections, and the tool head against --as-built."""
-    from gcode.check import find_refusals
-    from gcode.moves import Program
-    from gcode.profiles import load_setup
+    with console.starting():
+        from gcode.check import find_refusals
+        from gcode.moves import Program
+        from gcode.profiles import load_setup
 
     setup = load_setup(printer, material)
     program = Program(program_text(file), setup.printer.dialect)
@@ -217,13 +220,16 @@ def estimate(
     as_json: JsonOption = False,
 ) -> None:
     """Tell how long a program takes and what it uses; heating left out."""
-    from gcode.estimate import estimate as estimate_program
-    from gcode.moves import Program
-    from gcode.profiles import load_printer
+    with console.starting():
+        from gcode.estimate import estimate as estimate_program
+        from gcode.moves import Program
+        from gcode.profiles import load_printer
 
-    machine = load_printer(printer) if printer is not None else None
-    dialect = machine.dialect if machine is not None else "marlin"
-    found = estimate_program(Program(program_text(file), dialect), machine)
+    bars = console.Bars()
+    with bars.shown():
+        machine = load_printer(printer) if printer is not None else None
+        dialect = machine.dialect if machine is not None else "marlin"
+        found = estimate_program(Program(program_text(file), dialect), machine, progress=bars)
     result = {
         "print_time_s": round(found.print_time_s, 1),
         "filament_mm": round(found.filament_mm, 2),
@@ -302,7 +308,8 @@ def send(
     with bars.shown():
         checked = check_program(program, setup, as_built=field, progress=bars)
     try:
-        cost = estimate_program(checked.program, setup.printer)
+        with bars.shown():
+            cost = estimate_program(checked.program, setup.printer, progress=bars)
     except ReadError:  # homing, heating, a test of the mesh: no print job, sent all the same
         cost = None
     console.errors.print(

@@ -9,7 +9,6 @@ import os
 import signal
 import stat
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,8 @@ from typing import Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from gcode.errors import InputError
 from gcode.profiles.names import Kind, list_profiles
@@ -26,7 +26,6 @@ NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130
 READER_GONE = 141  # as of a program that SIGPIPE ended: 128 + 13
 COUNTED = 2  # stages of fewer steps are told in per cent alone
-SAY_EVERY_S = 10.0  # how often a log without a terminal hears of progress
 
 
 # Typer's own, by way of a public name: it has moved between versions.
@@ -50,34 +49,45 @@ out = _Told(highlight=False, soft_wrap=True)
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 
 
-class Bars:
-    """A bar for every stage on a terminal; a line now and then where there is none."""
+class _TimeLeft(TimeRemainingColumn):
+    """Time left; time spent where nobody can tell how much is left."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def render(self, task: Task) -> Text:
+        if task.total is not None:
+            return super().render(task)
+        spent_s = int(task.elapsed or 0.0)
+        return Text(f"for {spent_s // 60}:{spent_s % 60:02d}", style="progress.remaining")
+
+
+class Bars:
+    """A bar for every stage on a terminal; nothing where there is none."""
+
+    def __init__(self) -> None:
         self._tasks: dict[str, TaskID] = {}
-        self._said_s = clock()
         self._bars = Progress(
             TextColumn("{task.description:<24}"),
             BarColumn(),
-            TextColumn("{task.percentage:>3.0f} %"),
+            TextColumn("{task.fields[share]:>5}"),
             TextColumn("{task.fields[count]}"),
-            TimeRemainingColumn(elapsed_when_finished=True),
+            _TimeLeft(elapsed_when_finished=True),
             console=errors,
         )
 
     def __call__(self, stage: str, done: float, total: float) -> None:
         """Report that `done` of `total` of `stage` is finished."""
         if not errors.is_terminal:
-            now_s = self._clock()
-            if now_s - self._said_s >= SAY_EVERY_S:
-                self._said_s = now_s
-                errors.print(f"{stage}: {100 * done / max(total, 1e-9):.0f} %")
             return
+        uncounted = total < COUNTED
+        known = None if uncounted and done <= 0 else total  # a bar that swings until more is known
         if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total, count="")
-        count = f"{done:.0f}/{total:.0f}" if total >= COUNTED else ""
-        self._bars.update(self._tasks[stage], completed=done, total=total, count=count)
+            self._tasks[stage] = self._bars.add_task(stage, total=known, count="", share="")
+        self._bars.update(
+            self._tasks[stage],
+            completed=done,
+            total=known,
+            count="" if uncounted else f"{done:.0f}/{total:.0f}",
+            share="" if known is None else f"{100 * done / max(total, 1e-9):.0f} %",
+        )
 
     @contextmanager
     def shown(self) -> Iterator[Bars]:
@@ -87,6 +97,13 @@ class Bars:
                 yield self
         else:
             yield self
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """A bar that swings while something runs that does not tell how far it is."""
+        self(name, 0.0, 1.0)
+        yield
+        self(name, 1.0, 1.0)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -99,6 +116,16 @@ class Bars:
         finally:
             if drawn:
                 self._bars.start()
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """Say so while libraries load: from a cold disk that takes seconds."""
+    if not errors.is_terminal:
+        yield
+        return
+    with errors.status("loading"):
+        yield
 
 
 def examples(*lines: str) -> str:

@@ -31,9 +31,10 @@ def resume_at_command(
     as_json: JsonOption = False,
 ) -> None:
     """Make a checked job from a layer on: heated, primed, lowered onto the part, Z not homed."""
-    from gcode.moves import Program
-    from gcode.profiles import load_setup
-    from gcode.resumption import resume_at
+    with console.starting():
+        from gcode.moves import Program
+        from gcode.profiles import load_setup
+        from gcode.resumption import resume_at
 
     console.writable(output)
     if standing is not None:
@@ -41,13 +42,16 @@ def resume_at_command(
             raise InputError(f"{standing}: what stands there is written as .npz; rename it.")
         console.writable(standing)
     setup = load_setup(printer, material)
-    made = resume_at(
-        Program(program_text(job), setup.printer.dialect),
-        setup,
-        z_mm=z_mm,
-        layer=layer,
-        title=job.name,
-    )
+    bars = console.Bars()
+    with bars.shown():
+        made = resume_at(
+            Program(program_text(job), setup.printer.dialect),
+            setup,
+            z_mm=z_mm,
+            layer=layer,
+            title=job.name,
+            progress=bars,
+        )
     program = made.checked.program
     console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
     if standing is not None:

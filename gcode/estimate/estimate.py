@@ -9,6 +9,7 @@ import numpy as np
 from gcode.estimate import planner_kernels as kernels
 from gcode.moves import Program
 from gcode.profiles import AxisLimits, PrinterProfile
+from gcode.progress import Progress, silent
 from gcode.reader import Job, read_job
 from gcode.units import filament_area_mm2
 
@@ -40,7 +41,12 @@ class Estimate:
     bounds_mm: tuple[float, float, float, float, float, float]
 
 
-def estimate(program: Program | Job, printer: PrinterProfile | None = None) -> Estimate:
+def estimate(
+    program: Program | Job,
+    printer: PrinterProfile | None = None,
+    *,
+    progress: Progress = silent,
+) -> Estimate:
     """Estimate a program on a printer (a plain one where none is named).
 
     Raises
@@ -60,7 +66,8 @@ def estimate(program: Program | Job, printer: PrinterProfile | None = None) -> E
     diameter_mm = printer.filament_diameter_mm if printer is not None else _PLAIN_DIAMETER_MM
     job = program
     if isinstance(job, Program):
-        job = read_job(job, filament_diameter_mm=diameter_mm)
+        job = read_job(job, filament_diameter_mm=diameter_mm, progress=progress)
+    progress("estimate", 0.0, 1.0)
     speed, acceleration, jerk = (
         (printer.max_speed_mm_s, printer.max_acceleration_mm_s2, printer.max_jerk_mm_s)
         if printer is not None
@@ -76,6 +83,7 @@ def estimate(program: Program | Job, printer: PrinterProfile | None = None) -> E
     # what was pulled back must first come forward again before it counts
     position = np.cumsum(pushed)
     used_mm = float(np.maximum.accumulate(np.maximum(position, 0.0))[-1])
+    progress("estimate", 1.0, 1.0)
     return Estimate(
         print_time_s=float(spent_s.sum()),
         filament_mm=used_mm,

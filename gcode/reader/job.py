@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile
+from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
 from gcode.units import filament_area_mm2
 
@@ -28,6 +29,7 @@ _ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$")
 _LEAST_LAYER_MM = 0.015
 _SQUARE_LOSS = 1.0 - math.pi / 4.0
 UNKNOWN_ROLE = "unknown"
+READ_STEPS = 4.0  # words, states, beads, layers: about a second each for a million lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,11 @@ class Job:
 
 
 def read_job(
-    program: Program | str, *, filament_diameter_mm: float = 1.75, dialect: str = "marlin"
+    program: Program | str,
+    *,
+    filament_diameter_mm: float = 1.75,
+    dialect: str = "marlin",
+    progress: Progress = silent,
 ) -> Job:
     """Read a program.
 
@@ -173,14 +179,17 @@ def read_job(
     """
     if isinstance(program, str):
         program = Program(program, dialect)
+    progress("read", 0.0, READ_STEPS)
     lines = program.text.split("\n")
     kinds, codes, words = _tokens(program.text, len(lines))
+    progress("read", 1.0, READ_STEPS)
     states = np.zeros((len(lines) + 1, kernels.STATES))
     states[0, :3] = np.nan
     states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
     states[0, kernels.S_ACC] = np.nan
     pushed = np.zeros(len(lines))
     kernels.run(kinds, codes, words, program.dialect in _BOTH_MODES, states, pushed)
+    progress("read", 2.0, READ_STEPS)
     none3, none1, none0 = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
     count = kernels.beads(kinds, codes, words, states, pushed, none3, none3, none1, none0, True)
     if count == 0:
@@ -190,9 +199,11 @@ def read_job(
     kernels.beads(kinds, codes, words, states, pushed, start, end, filament, owner, False)
     known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
     start, end, filament, owner = start[known], end[known], filament[known], owner[known]
+    progress("read", 3.0, READ_STEPS)
     comments = [(int(i), lines[i]) for i in np.flatnonzero(kinds == ord(";"))]
     layers = _layers(comments, end, owner, filament, len(lines))
     beads = _beads(comments, layers, start, end, filament, owner, filament_diameter_mm)
+    progress("read", READ_STEPS, READ_STEPS)
     return Job(
         program=program,
         layers=layers,

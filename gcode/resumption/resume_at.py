@@ -18,6 +18,7 @@ from gcode.dialects import number
 from gcode.errors import InputError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile, PrintSetup
+from gcode.progress import Progress, silent
 from gcode.reader import Job, read_job
 from gcode.reader.job import JobLayer
 from gcode.resumption.settings import Settings, settings_before
@@ -64,6 +65,7 @@ def resume_at(
     z_mm: float | None = None,
     layer: int | None = None,
     title: str = "a job",
+    progress: Progress = silent,
 ) -> Resumption:
     """Make the job that is left when a part stands up to a layer.
 
@@ -83,11 +85,14 @@ def resume_at(
     ReadError, CheckRefusedError
         If the job cannot be understood, or what would be printed is refused.
     """
-    job = read_job(program, filament_diameter_mm=setup.printer.filament_diameter_mm)
+    diameter_mm = setup.printer.filament_diameter_mm
+    job = read_job(program, filament_diameter_mm=diameter_mm, progress=progress)
+    progress("what stands", 0.0, 1.0)
     first = _first_layer(job, z_mm, layer)
     line = first.first_line
     state, settings = job.state_after(line), settings_before(job, line)
     field = standing_field(job.beads, line, setup.printer)
+    progress("what stands", 1.0, 1.0)
     hotend_c, bed_c = _temperatures(settings, setup)
     head = _Head(setup, state, clear_mm=_clear_mm(field.top_mm, state, setup.printer))
     head.comment(
@@ -103,7 +108,7 @@ def resume_at(
     body = program.text.rstrip().split("\n")[line:]
     text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
     return Resumption(
-        checked=check(Program(text, program.dialect), setup, as_built=field),
+        checked=check(Program(text, program.dialect), setup, as_built=field, progress=progress),
         standing=field,
         layer=first,
         first_line=line,

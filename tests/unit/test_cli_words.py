@@ -125,6 +125,31 @@ def test_bars_are_away_while_somebody_is_asked(monkeypatch: pytest.MonkeyPatch) 
     assert not bars._bars.live.is_started
 
 
+def drawn(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> tuple[console.Bars, io.StringIO]:
+    text = io.StringIO()
+    monkeypatch.setattr(console, "errors", Console(file=text, force_terminal=terminal, width=100))
+    return console.Bars(), text
+
+
+def test_bars_tell_stage_count_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    bars, text = drawn(monkeypatch, terminal=True)
+    with bars.shown():
+        bars("check", 500.0, 2000.0)
+        with bars.stage("read scan"):
+            bars._bars.refresh()
+            assert re.search(r"read scan .* for 0:0\d", text.getvalue())  # nobody knows how long
+        bars("check", 2000.0, 2000.0)
+    assert re.search(r"check .* 25 % 500/2000 ", text.getvalue())
+    assert re.search(r"read scan .* 100 % ", text.getvalue())
+
+
+def test_bars_are_quiet_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    bars, text = drawn(monkeypatch, terminal=False)
+    with console.starting(), bars.shown(), bars.stage("read"):
+        bars("check", 1.0, 2.0)
+    assert text.getvalue() == ""
+
+
 def test_nobody_there_to_answer_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     with pytest.raises(InputError, match="--approve auto"):
