@@ -26,6 +26,7 @@ UNSEEN_MARGIN_MM = 1.0
 AROUND_MM = 8.0
 # Points within this of a cell's top are one surface with its noise.
 TOP_BAND_MM = 0.3
+AROUND_CELL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
 # An unseen patch smaller than this between seen ones is a gap of sampling, not a place to hide.
 GAP_MM2 = 1.0
 FINE_CELL_MM, MOST_CELLS = 0.1, 2_000_000
@@ -181,19 +182,36 @@ def _tops(
     cell_mm: float,
     shape: tuple[int, int],
 ) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
-    """Mean height of each cell's topmost surface."""
+    """Mean height of each cell's topmost surface.
+
+    A point alone above the others of its cell, which no neighbouring cell has anything as high as,
+    is none: a scanner's stray would keep the nozzle away from all around it.
+    """
     index = np.floor((points_mm[:, :2] - low_mm) / cell_mm).astype(np.int64)
     ok = ((index >= 0) & (index < shape[::-1])).all(axis=1)
     flat = index[ok, 1] * shape[1] + index[ok, 0]
     z = points_mm[ok, 2]
+    top, mean, count = _topmost(flat, z, shape)
+    around = ndimage.maximum_filter(top, footprint=AROUND_CELL, mode="constant", cval=-np.inf)
+    all_of = np.bincount(flat, minlength=top.size).reshape(shape)
+    alone = (count == 1) & (all_of > 1) & (around < top - TOP_BAND_MM)
+    if alone.any():
+        stray = alone.ravel()[flat] & (z == top.ravel()[flat])
+        _, mean, count = _topmost(flat[~stray], z[~stray], shape)
+    return mean, count > 0
+
+
+def _topmost(
+    flat: Int[np.ndarray, " n"], z: Float[np.ndarray, " n"], shape: tuple[int, int]
+) -> tuple[Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"], Int[np.ndarray, "ny nx"]]:
+    """By cell: the highest point, and the mean and number of those on one surface with it."""
     top = np.full(shape[0] * shape[1], -np.inf)
     np.maximum.at(top, flat, z)
     near = z >= top[flat] - TOP_BAND_MM
     total = np.bincount(flat[near], weights=z[near], minlength=len(top))
     count = np.bincount(flat[near], minlength=len(top))
-    seen = count > 0
-    mean = np.where(seen, total / np.maximum(count, 1), 0.0)
-    return mean.reshape(shape), seen.reshape(shape)
+    mean = np.where(count > 0, total / np.maximum(count, 1), 0.0)
+    return top.reshape(shape), mean.reshape(shape), count.reshape(shape)
 
 
 def _close_gaps(

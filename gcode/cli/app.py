@@ -23,7 +23,10 @@ from gcode.errors import GcodeError, InputError, ReadError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, list_profiles
 
 if TYPE_CHECKING:
+    from gcode.estimate import Estimate
     from gcode.hosts import Printer, PrintReport
+    from gcode.moves import Program
+    from gcode.profiles import PrinterProfile
     from gcode.surfaces import HeightField
 
 AS_BUILT_CELL_MM = 0.2
@@ -291,9 +294,10 @@ def send(
     as_json: JsonOption = False,
 ) -> None:
     """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from gcode.check import check as check_program
     from gcode.cli.words import what_it_does
-    from gcode.estimate import estimate as estimate_program
     from gcode.hosts import connect
     from gcode.hosts.journal import default_path
     from gcode.hosts.resume import resume as resume_job
@@ -305,15 +309,11 @@ def send(
     field = _as_built(as_built) if as_built is not None else None
     program = Program(program_text(file), setup.printer.dialect)
     bars = console.Bars()
-    with bars.shown():
+    with ThreadPoolExecutor(1) as beside, bars.shown():  # nobody waits for the estimate alone
+        cost = beside.submit(_cost_of, program, setup.printer)
         checked = check_program(program, setup, as_built=field, progress=bars)
-    try:
-        with bars.shown():
-            cost = estimate_program(checked.program, setup.printer, progress=bars)
-    except ReadError:  # homing, heating, a test of the mesh: no print job, sent all the same
-        cost = None
     console.errors.print(
-        f"{file} on {setup.printer.name}: {what_it_does(checked.program, cost)}.", markup=False
+        f"{file} on {setup.printer.name}: {what_it_does(program, cost.result())}.", markup=False
     )
     machine = connect(
         port,
@@ -441,6 +441,16 @@ def profiles_show(
         f"There is no profile '{profile}'; 'gcode profiles list' names them (for a file of your "
         "own, say --kind)."
     )
+
+
+def _cost_of(program: Program, printer: PrinterProfile) -> Estimate | None:
+    """What a program takes; None for homing, heating, a test of the mesh, sent all the same."""
+    from gcode.estimate import estimate as estimate_program
+
+    try:
+        return estimate_program(program, printer)
+    except ReadError:
+        return None
 
 
 def _abort(machine: Printer) -> None:

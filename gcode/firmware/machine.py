@@ -79,7 +79,7 @@ class Machine(Mechanics):
             elif letter == 90:  # Z
                 z = value * unit - self.offset[2] if self.absolute else z + value * unit
             elif letter == 69:  # E
-                de = value * unit - self.e if self.absolute_e else value * unit
+                de = value * unit - self.e if self.e_is_absolute else value * unit
             elif letter == 70 and value > 0:  # F; Marlin takes no other for a feed
                 self.feed_mm_s = value * unit / 60.0
         self.move_to((x, y, z), de)

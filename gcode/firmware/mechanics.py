@@ -102,6 +102,13 @@ class Mechanics:
             max_jerk_mm_s=_axes(profile.max_jerk_mm_s),
         )
 
+    @property
+    def e_is_absolute(self) -> bool:
+        """Whether an E tells where the extruder is to be; Klipper's G91 makes it relative, too."""
+        if self.variant.modes_follow_g90 == "relative_only":
+            return self.absolute_e and self.absolute
+        return self.absolute_e
+
     def target_of(self, words: dict[str, float]) -> tuple[tuple[float, float, float], float]:
         """Where words lead to, in the modes there are, mm; and how much they extrude, mm."""
         here = [self.x, self.y, self.z]
@@ -111,7 +118,7 @@ class Mechanics:
                 here[axis] = value - self.offset[axis] if self.absolute else here[axis] + value
         de = 0.0
         if "E" in words:
-            de = words["E"] * self.unit_mm - (self.e if self.absolute_e else 0.0)
+            de = words["E"] * self.unit_mm - (self.e if self.e_is_absolute else 0.0)
         if words.get("F", 0) > 0:
             self.feed_mm_s = mm_s_from_mm_min(words["F"] * self.unit_mm)
         return (here[0], here[1], here[2]), de

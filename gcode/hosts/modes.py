@@ -92,7 +92,7 @@ def follow(modes: Modes, text: str, dialect: str) -> Modes:
     name = match.group(1) + match.group(2)
     words = {letter: float(value) for letter, value in _WORD.findall(command[match.end() :])}
     if name in ("G0", "G1", "G2", "G3"):
-        return _move(modes, words)
+        return _move(modes, words, g91_moves_e=dialect == "klipper")
     if name in ("G90", "G91"):
         absolute = name == "G90"
         if dialect == "marlin":
@@ -128,13 +128,15 @@ def _heat(modes: Modes, name: str, words: dict[str, float]) -> Modes:
     return modes
 
 
-def _move(modes: Modes, words: dict[str, float]) -> Modes:
+def _move(modes: Modes, words: dict[str, float], *, g91_moves_e: bool) -> Modes:
+    """A move; Klipper's G91 makes E relative while it lasts, whatever M82 says."""
+    absolute_e = modes.absolute_e and (modes.absolute or not g91_moves_e)
     place = dict(modes.position_mm)
     for letter in "XYZE":
         if letter not in words:
             continue
         value = words[letter] * modes.unit_mm
-        absolute = modes.absolute_e if letter == "E" else modes.absolute
+        absolute = absolute_e if letter == "E" else modes.absolute
         if absolute:
             place[letter] = value
         elif letter in place:

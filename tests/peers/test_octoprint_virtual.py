@@ -21,7 +21,10 @@ pytestmark = pytest.mark.peers
 
 # The printer takes the time that its moves would take, from 200 mm/min on.
 JOB = ["G28", "G90", "G1 F60000", *(f"G1 X{50 + i / 100:.2f} Y50" for i in range(250))]
-OWN = ("", "M114", "M115", "M105", "M104 S0", "M140 S0", "M107", "G91", "G1 Z5 F600", "G90")
+OWN = (
+    *("", "M114", "M115", "M105", "M108", "M104 S0", "M140 S0", "M107"),
+    *("G21", "G91", "G1 Z5 F600", "G90"),
+)
 QUICK = LinkTiming(silence_s=0.3, slow_silence_s=0.6, give_up_s=3.0, slow_give_up_s=6.0)
 SEEN = [line for line in JOB if line not in OWN]
 

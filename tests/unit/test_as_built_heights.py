@@ -28,13 +28,17 @@ def box(*corners: float) -> m3.Manifold:
     return m3.Manifold.cube(tuple(high - low)).translate(tuple(low))
 
 
-def field_of(part: m3.Manifold, gone: m3.Manifold) -> HeightField:
-    """Of a part that lacks a piece, seen from every side but from below, without rays."""
+def field_of(part: m3.Manifold, gone: m3.Manifold, beside: np.ndarray | None = None) -> HeightField:
+    """Of a part that lacks a piece, seen from every side but from below, without rays.
+
+    `beside`: (n, 3) points that the scan has besides.
+    """
     standing = mesh_of(part - gone)
     points, faces = trimesh.sample.sample_surface(standing, int(standing.area / 0.04), seed=1)
     noise = np.random.default_rng(0).normal(scale=0.03, size=points.shape)
     seen = np.asarray(standing.face_normals)[faces][:, 2] > -0.5
-    scan = Scan((np.asarray(points) + noise)[seen], 0.03, "template")
+    own = (np.asarray(points) + noise)[seen]
+    scan = Scan(own if beside is None else np.concatenate([own, beside]), 0.03, "template")
     template = MeshSdf.from_mesh(mesh_of(part))
     return compute_deficit(scan, template, build_from_template=HERE).as_built
 
@@ -75,3 +79,14 @@ def test_the_lip_of_a_cut_stands_as_high_as_it_was_seen() -> None:
     for x in ((9.6, 9.9), (30.15, 30.4)):
         assert np.quantile(heights(field, x, (11.0, 19.0)), 0.1) > 11.8
     assert np.quantile(heights(field, (10.3, 29.7), (10.3, 19.7)), 0.99) < 6.5
+
+
+def test_a_stray_point_is_no_pole_and_a_pole_is_one() -> None:
+    """One point above a floor kept the nozzle away from all around it; two and more stand there."""
+    part = box(0, 0, 0, 30, 20, 6)
+    gone = box(5, 5, 4, 25, 15, 7)
+    strays = np.array([[10.03, 10.03, 5.2], [14.03, 8.03, 6.9], [20.03, 12.03, 5.0]])
+    field = field_of(part, gone, strays)
+    assert heights(field, (5.6, 24.4), (5.6, 14.4)).max() < 4.3
+    pole = np.array([[15.0 + dx, 10.0 + dy, 6.8] for dx in (0, 0.2, 0.4) for dy in (0, 0.2, 0.4)])
+    assert heights(field_of(part, gone, pole), (14.9, 15.5), (9.9, 10.5)).max() > 6.5

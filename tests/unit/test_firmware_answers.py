@@ -1,0 +1,218 @@
+"""What the emulated firmwares answer, and where the dialects part."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).parent))
+from link_helpers import profile
+
+from gcode.firmware import FirmwareCore
+from gcode.hosts.modes import Modes, follow
+from gcode.protocol import checksum
+
+DIALECTS = ("marlin", "prusa", "klipper", "reprap")
+
+
+class Talk:
+    """Commands in, answers out, the printer's clock as told."""
+
+    def __init__(self, firmware: str = "marlin") -> None:
+        self.core = FirmwareCore(profile(), firmware)
+        self.machine = self.core.machine
+        self.core.power_up()
+        self.core.take_output()
+
+    def say(self, *lines: str, limit_s: float = float("inf")) -> list[str]:
+        for line in lines:
+            self.core.feed(line.encode() + b"\n")
+            self.core.run(limit_s)
+        return self.core.take_output().decode("latin-1").splitlines()
+
+    def later(self, seconds: float) -> list[str]:
+        until_s = self.machine.clock_s + seconds
+        self.core.run(until_s)
+        self.core.pass_time(until_s)
+        return self.core.take_output().decode("latin-1").splitlines()
+
+
+def numbered(number: int, command: str, *, off: int = 0) -> str:
+    body = f"N{number} {command}"
+    return f"{body}*{checksum(body.encode()) ^ off}"
+
+
+@pytest.mark.parametrize("firmware", DIALECTS)
+@pytest.mark.parametrize(("heat", "heater"), [("M109 S60", "hotend"), ("M190 S60", "bed")])
+def test_heating_is_told_every_second_and_busy_every_two(
+    firmware: str, heat: str, heater: str
+) -> None:
+    talk = Talk(firmware)
+    said = talk.say(heat, limit_s=10.0)
+    reports = [line for line in said if line.startswith(("T:", "B:"))]
+    busy = [line for line in said if "busy: processing" in line]
+    assert len(reports) == 10
+    assert len(busy) == (5 if firmware in ("marlin", "prusa") else 0)
+    assert not any(line.startswith("ok") for line in said)
+    end = talk.say(limit_s=1e6) or talk.later(1e5)
+    assert end[-1] == "ok"
+    assert getattr(talk.machine, heater).temperature_c(talk.machine.clock_s) == pytest.approx(60.0)
+    assert talk.machine.clock_s > 10.0
+
+
+def test_a_heater_follows_its_curve() -> None:
+    """First order: a third of the way takes less than half of the time, and cooling is slower."""
+    talk = Talk()
+    talk.say("M104 S200")
+    talk.later(30.0)
+    early_c = talk.machine.hotend.temperature_c(talk.machine.clock_s)
+    talk.later(30.0)
+    later_c = talk.machine.hotend.temperature_c(talk.machine.clock_s)
+    assert 22.0 < early_c < later_c < 200.0
+    assert later_c - early_c < early_c - 22.0
+    assert talk.say("M105") == [f"ok T:{later_c:.2f} /200.00 B:22.00 /0.00 @:0 B@:0"]
+
+
+def test_reports_come_by_themselves() -> None:
+    talk = Talk()
+    assert talk.say("M155 S2", "M154 S3") == ["ok", "ok"]
+    said = [line for _ in range(6) for line in talk.later(1.0)]
+    assert sum(line.startswith(" T:") for line in said) == 3
+    assert sum(line.startswith("X:0.000 Y:0.000 Z:0.000 E:0.0000") for line in said) == 2
+    talk.say("M155 S0", "M154 S0")
+    assert talk.later(20.0) == []
+
+
+@pytest.mark.parametrize("firmware", DIALECTS)
+def test_m400_is_answered_when_the_planner_is_empty(firmware: str) -> None:
+    talk = Talk(firmware)
+    talk.say("G28", "G1 X100 F600")
+    began_s = talk.machine.clock_s
+    assert talk.machine.planner.blocks
+    assert "ok" not in talk.say("M400", limit_s=began_s + 5.0)
+    assert talk.later(20.0)[-1] == "ok"
+    assert not talk.machine.planner.blocks
+
+
+def test_the_planners_queue_holds_up_the_answer() -> None:
+    """Sixteen moves of a second each: the first are taken at once, then one as one ends."""
+    talk = Talk()
+    talk.say("G28", "M400")
+    began_s = talk.machine.clock_s
+    for index in range(40):
+        talk.say(f"G1 X{10 * (index % 2) + 5} F600")
+    waited_s = talk.machine.clock_s - began_s
+    assert 20.0 < waited_s < 40.0
+
+
+@pytest.mark.parametrize(("firmware", "ends"), [("marlin", True), ("prusa", False)])
+def test_m108_ends_a_wait_where_it_passes_the_queue(firmware: str, ends: bool) -> None:
+    talk = Talk(firmware)
+    talk.say("M109 S200", limit_s=5.0)
+    said = talk.say("M108", limit_s=6.0)
+    assert ("ok" in said) == ends
+    assert (talk.machine.wait is None) == ends
+
+
+@pytest.mark.parametrize("firmware", DIALECTS)
+def test_m112_stops_for_good(firmware: str) -> None:
+    talk = Talk(firmware)
+    talk.say("M104 S200", "M140 S60")
+    said = talk.say("M112")
+    assert any("M112" in line or "halted" in line for line in said)
+    assert (talk.machine.hotend.target_c, talk.machine.bed.target_c) == (0.0, 0.0)
+    assert talk.say("G28", "M105") == []
+
+
+def test_m410_drops_what_is_queued() -> None:
+    talk = Talk()
+    talk.say("G28", "M400", "G1 X100 F600", "G1 X0", "G1 X100")
+    talk.later(3.0)
+    assert talk.say("M410")[-1] == "ok"
+    assert not talk.machine.planner.blocks
+    x_mm = talk.machine.x
+    assert 0.0 < x_mm < 100.0
+    assert talk.say("M114")[0].startswith(f"X:{x_mm:.3f} ")
+
+
+def test_g29_takes_its_time_and_tells_a_grid() -> None:
+    talk = Talk()
+    talk.say("G28")
+    began_s = talk.machine.clock_s
+    said = talk.say("G29")
+    assert said.index("Bilinear Leveling Grid:") < said.index("ok")
+    assert talk.machine.clock_s - began_s > 30.0
+
+
+@pytest.mark.parametrize(
+    ("firmware", "name", "capabilities"),
+    [("marlin", "Marlin", 9), ("prusa", "Prusa-Firmware", 3), ("klipper", "Klipper", 0),
+     ("reprap", "RepRapFirmware", 0)],
+)  # fmt: skip
+def test_who_is_there(firmware: str, name: str, capabilities: int) -> None:
+    said = Talk(firmware).say("M115")
+    assert any("FIRMWARE_NAME:" in line and name in line for line in said)
+    assert sum(line.startswith("Cap:") for line in said) == capabilities
+
+
+@pytest.mark.parametrize("firmware", DIALECTS)
+def test_a_bad_line_is_refused_dropped_or_taken(firmware: str) -> None:
+    """Checksum, then number: Marlin verifies both, RepRapFirmware one, Klipper none."""
+    talk, first = Talk(firmware), "M117 one"
+    assert talk.say(numbered(1, first))[-1] == "ok"
+    wrong_sum = talk.say(numbered(2, "M117 two", off=1))
+    wrong_number = talk.say(numbered(7, "M117 seven"))
+    if firmware in ("marlin", "prusa"):
+        for said in (wrong_sum, wrong_number):
+            assert said[0].startswith("Error:")
+            assert said[1:] == ["Resend: 2", "ok"]
+        assert talk.machine.message == "one"
+    else:
+        assert wrong_sum == ([] if firmware == "reprap" else ["ok"])
+        assert wrong_number == ["ok"]
+        assert talk.machine.message == "seven"
+
+
+@pytest.mark.parametrize("firmware", DIALECTS)
+def test_an_unknown_command_is_told_and_acknowledged(firmware: str) -> None:
+    said = Talk(firmware).say("M9999 X1")
+    assert said[-1] == "ok"
+    assert len(said) == 2
+    assert "M9999" in said[0]
+
+
+E_MODES = ("M82", "M83", "G90", "G91", "G92 E0", "G1 E2 F300", "G1 X1 E3", "G20", "G21")
+
+
+@settings(max_examples=60)
+@given(st.lists(st.sampled_from(E_MODES), min_size=1, max_size=12), st.sampled_from(DIALECTS))
+def test_the_host_knows_where_the_extruder_is(lines: list[str], firmware: str) -> None:
+    """By `hosts.modes`, as the emulated firmware does: G90 and G91 mean four different things."""
+    talk, modes = Talk(firmware), Modes()
+    for line in ("G28", "M302 P1", "G92 E0", *lines):
+        talk.say(line)
+        modes = follow(modes, line, firmware)
+    assert modes.position_mm.get("E", 0.0) == pytest.approx(talk.machine.e)
+
+
+@pytest.mark.parametrize(
+    ("firmware", "e_mm"), [("marlin", 12.0), ("prusa", 2.0), ("klipper", 12.0), ("reprap", 2.0)]
+)
+def test_what_g91_does_to_the_extruder(firmware: str, e_mm: float) -> None:
+    """Marlin: relative until M82; Klipper: relative while it lasts; the others: nothing."""
+    talk = Talk(firmware)
+    talk.say("G28", "M302 P1", "M82", "G92 E10", "G91", "G1 E2 F300")
+    assert talk.machine.e == pytest.approx(e_mm)
+    talk.say("G90", "G1 E20 F300")
+    assert talk.machine.e == pytest.approx(20.0)
+
+
+def test_m118_says_it_as_an_action() -> None:
+    talk = Talk()
+    assert talk.say("M118 A1 action:pause") == ["//action:pause", "ok"]
+    assert talk.say("M118 E1 hello") == ["echo:hello", "ok"]
+    assert talk.say("M118 hello") == ["hello", "ok"]
