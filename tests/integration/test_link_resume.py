@@ -72,8 +72,8 @@ def test_a_sender_killed_in_a_pause_is_gone_on_from(bench: Bench) -> None:
 
 def test_a_bad_line_and_kills_together_lose_nothing(forks: Forks, tmp_path: Path) -> None:
     faults = "every 37 corrupt_in\nevery 53 garble_ok\nevery 71 noise_out\nevery 97 double_ok"
-    bench = Bench(forks, tmp_path, lines=800, faults=faults + "\nalways resend_without_ok")
-    for attempt, beads in enumerate((250, 250)):
+    bench = Bench(forks, tmp_path, lines=500, faults=faults + "\nalways resend_without_ok")
+    for attempt, beads in enumerate((150, 150)):
         bench.kill_after(bench.send(go_on=attempt > 0), beads)
     bench.go_on()
     assert bench.executed() == bench.beads

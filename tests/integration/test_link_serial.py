@@ -18,7 +18,7 @@ from link_helpers import moves, profile, program
 import gcode.hosts.serial as serial_host
 from gcode.errors import LinkError, PrinterError
 from gcode.firmware import EmulatedPrinterProcess
-from gcode.hosts import LinkLostError
+from gcode.hosts import LinkLostError, supervisor
 from gcode.hosts.journal import Journal
 from gcode.hosts.serial import SerialPrinter
 from gcode.protocol import LinkTiming
@@ -61,8 +61,8 @@ def test_a_job_is_executed_and_its_plastic_is_reported(tmp_path: Path) -> None:
 def test_every_second_thing_goes_wrong_and_each_command_runs_once(tmp_path: Path) -> None:
     record = tmp_path / "executed"
     faults = "every 37 corrupt_in\nevery 53 lose_ok\nevery 61 double_ok\nevery 71 resend_storm\n"
-    faults += "line 400 silence s=0.4\nline 500 noise_in\nalways resend_without_ok"
-    lines = [*HEAT, *moves(600)]
+    faults += "line 200 silence s=0.4\nline 250 noise_in\nalways resend_without_ok"
+    lines = [*HEAT, *moves(350)]
     with (
         EmulatedPrinterProcess(printer=profile(), faults=faults, record=record) as emulator,
         SerialPrinter(emulator.port, timing=QUICK) as printer,
@@ -243,8 +243,11 @@ def test_a_million_lines_stream_in_constant_memory(tmp_path: Path) -> None:
     assert max(held) - held[0] < 4_000_000
 
 
-def test_a_lost_link_never_claims_that_the_heaters_are_off(tmp_path: Path) -> None:
+def test_a_lost_link_never_claims_that_the_heaters_are_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # regression: the log said "heaters off" although nobody had confirmed it
+    monkeypatch.setattr(supervisor, "ANSWER_S", 0.05)
     wire = tmp_path / "wire.log"
     job = program([*HEAT, *moves(200)])
     with (

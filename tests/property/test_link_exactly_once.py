@@ -60,7 +60,7 @@ def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
     )
 
 
-@settings(max_examples=200)
+@settings(max_examples=150)
 @given(
     faults=fault_scripts(MENDABLE),
     seed=st.integers(0, 99),

@@ -83,10 +83,9 @@ def test_the_lip_of_a_cut_stands_as_high_as_it_was_seen() -> None:
 
 def test_a_stray_point_is_no_pole_and_a_pole_is_one() -> None:
     """One point above a floor kept the nozzle away from all around it; two and more stand there."""
-    part = box(0, 0, 0, 30, 20, 6)
-    gone = box(5, 5, 4, 25, 15, 7)
-    strays = np.array([[10.03, 10.03, 5.2], [14.03, 8.03, 6.9], [20.03, 12.03, 5.0]])
-    field = field_of(part, gone, strays)
-    assert heights(field, (5.6, 24.4), (5.6, 14.4)).max() < 4.3
-    pole = np.array([[15.0 + dx, 10.0 + dy, 6.8] for dx in (0, 0.2, 0.4) for dy in (0, 0.2, 0.4)])
-    assert heights(field_of(part, gone, pole), (14.9, 15.5), (9.9, 10.5)).max() > 6.5
+    strays = [[4.03, 4.03, 3.2], [5.53, 6.03, 4.9], [7.03, 3.03, 3.0]]
+    pole = [[10.0 + dx, 5.0 + dy, 4.8] for dx in (0, 0.2, 0.4) for dy in (0, 0.2, 0.4)]
+    part, gone = box(0, 0, 0, 16, 10, 4), box(3, 3, 2, 13, 7, 5)
+    field = field_of(part, gone, np.array(strays + pole))
+    assert heights(field, (3.6, 8.4), (3.6, 6.4)).max() < 2.3
+    assert heights(field, (9.9, 10.5), (4.9, 5.5)).max() > 4.5
