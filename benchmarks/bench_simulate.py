@@ -18,8 +18,8 @@ import numpy as np
 import trimesh
 
 from amrepair.scans.scanner import ScanRequest
+from amrepair.simulate.parameters import ScannerModel
 from amrepair.simulate.scanner import (
-    ScannerModel,
     SimulatedScanner,
     default_sensors_mm,
     seeded_pose,

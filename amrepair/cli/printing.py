@@ -60,7 +60,11 @@ def loop(
         typer.Option(help="Device path, octoprint+http://HOST:PORT or moonraker+http://HOST:PORT."),
     ] = None,
     scanner: Annotated[
-        str | None, typer.Option(help="watch:DIR: a folder that scans are dropped in.")
+        str | None,
+        typer.Option(
+            help="watch:DIR, a folder that scans are dropped in; or simulated:FILE, of what "
+            "'gcode emulate --motion FILE' has printed."
+        ),
     ] = None,
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,

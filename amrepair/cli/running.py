@@ -165,7 +165,7 @@ def _new_run(
     """Read, check and write down what a run begins with."""
     setup = load_setup(*ids)
     pose = read_calibration(calibration)
-    _scanner(said["scanner"], pose, said["scan_timeout_s"])  # refused before any work
+    _scanner(said["scanner"], pose, said["scan_timeout_s"], setup)  # refused before any work
     folder = RunFolder(out)
     before = read_events(out)
     if before and before[-1].get("event") != "end":
@@ -235,7 +235,9 @@ def _print(
     find = None
     if going_on:
         find = pick_up(machine, release_c=setup.material.bed_release_c, pose_confirmed=pose)
-    eye = _scanner(setting.scanner, setting.scanner_pose, setting.scan_timeout_s)
+    eye = _scanner(
+        setting.scanner, setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed
+    )
     page.show_run(begun.job, _placed_solid(begun.template, setting.placed))
     if not going_on:
         machine.connect()
@@ -330,14 +332,29 @@ def _tell(
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
 
 
-def _scanner(spec: str, pose: Transform, timeout_s: float) -> Scanner:
-    if not spec.startswith("watch:"):
-        raise InputError(
-            f"--scanner is {spec!r}; give watch:DIR (a simulated scanner belongs to "
-            "'amrepair simulate')"
+def _scanner(
+    spec: str, pose: Transform, timeout_s: float, setup: PrintSetup, seed: int = 0
+) -> Scanner:
+    kind, _, where = spec.partition(":")
+    if kind == "watch" and where:
+        return WatchedFolderScanner(Path(where), build_from_scanner=pose, timeout_s=timeout_s)
+    if kind == "simulated" and where:
+        from amrepair.simulate.live import PrintedScanner
+        from amrepair.simulate.parameters import DEFAULT_SCANNER, load_world
+        from gcode.firmware.motion import MotionFile
+
+        return PrintedScanner(
+            MotionFile(Path(where)),
+            printer=setup.printer,
+            pose=pose,
+            told=load_world(),
+            scanner=DEFAULT_SCANNER,
+            seed=seed,
         )
-    folder = Path(spec.removeprefix("watch:"))
-    return WatchedFolderScanner(folder, build_from_scanner=pose, timeout_s=timeout_s)
+    raise InputError(
+        f"--scanner is {spec!r}; give watch:DIR, or simulated:FILE with the motion of an emulated "
+        "printer ('gcode emulate --motion FILE')"
+    )
 
 
 def _placed_solid(template: Template, placed: Transform) -> Any:

@@ -46,6 +46,7 @@ def add_to(app: typer.Typer) -> None:
             "amrepair simulate",
             "amrepair simulate part.stl --defect void:diameter=8,layers=4 --defect chip "
             "--seed 3 --out out/run",
+            "amrepair simulate part.stl --world world.toml --scanner laser-line",
             "amrepair simulate part.stl --printer voron_2_4 --material petg --scale fit --json",
         ),
     )(simulate)
@@ -71,6 +72,15 @@ def simulate(
     scale: Annotated[
         str, typer.Option(help="Factor for the part, or 'fit': as large as the printer allows.")
     ] = "1",
+    world: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML with what differs from the shipped world: beads, flow, shrinkage, scanners."
+        ),
+    ] = None,
+    scanner: Annotated[
+        str, typer.Option(help="structured-light, laser-line, or another of the world's file.")
+    ] = "structured-light",
     max_iterations: Annotated[
         int, typer.Option(min=0, max=10, help="Repairs at one stop, at most.")
     ] = 3,
@@ -91,6 +101,7 @@ def simulate(
     from amrepair.report import write_report
     from amrepair.report.folder import RunFolder
     from amrepair.simulate.defects import DefectKind, parse_defect
+    from amrepair.simulate.parameters import load_world
     from amrepair.simulate.part_files import bracket_path
     from amrepair.simulate.run import place_on_bed, prepare_run, simulate_run
     from gcode.profiles import load_setup
@@ -99,6 +110,8 @@ def simulate(
     defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
     defects = [d for d in defects if d.kind is not DefectKind.NONE]
     setup = load_setup(printer, material, process)
+    told = load_world(world)
+    told.scanner(scanner)  # refused before any work
     path = part or bracket_path()
     mesh = scaled_mesh(path, scale, setup)
     ids = (printer, material, process)
@@ -120,6 +133,8 @@ def simulate(
             run = simulate_run(
                 prepared,
                 wire_log=folder.file("wire.log"),
+                world=told,
+                scanner=scanner,
                 max_iterations=max_iterations,
                 approve=page.approve,
                 record=page.recording(folder.record),
@@ -130,6 +145,7 @@ def simulate(
             )
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     result = _result(run, folder, seed, seconds)
+    result["world"] = {"file": world and str(world), "sha256": told.sha256, "scanner": scanner}
     folder.write_json("result.json", result)
     with watch("report"), bars.shown(), bars.stage("report"):
         write_report(_report_data(run, path, result), folder.file("report.html"))

@@ -5,6 +5,10 @@ Per short step of the path the volume pushed out (1) levels the columns under th
 lowest first, up to the nozzle's height; (2) what is left fills further columns in order of
 distance; (3) what finds no room rides along with the nozzle and, once it is more than
 `carry_limit`, rises as a ridge around the nozzle's flat. Volume is conserved to rounding.
+A groove below the layer that is narrower than `bridges` columns is not filled: the strand spans
+it and bulges in by a meniscus, and a void stays. So a layer whose lines leave room between them
+stands at the nozzle's height all the same, and what it lacks lies between its beads.
+A strand that nothing holds comes down before it is laid (`strand_kernels`).
 The step positions are dithered over one column (a low-discrepancy sequence from the segment's own
 coordinates), so that a wall's mean position does not depend on where it falls in the grid.
 """
@@ -15,14 +19,37 @@ import numpy as np
 from numba import njit
 
 from amrepair.simulate.columns_kernels import FRESH, grown, insert, surface_below
+from amrepair.simulate.strand_kernels import (
+    AT_BOTH,
+    AT_END,
+    AT_START,
+    NO_ANCHOR,
+    drop_of,
+    groove_columns,
+    highest_below,
+    is_held,
+    lifted,
+    run_ahead,
+    strand_reach,
+)
 
 # Entries of `state`, floats: what the nozzle carries along, and where it last was.
 CARRY, LAST_X, LAST_Y, LAST_Z, LOST, LAST_T = 0, 1, 2, 3, 4, 5
+# Whether the last step was held, and the stretch without hold that it belongs to: how far it has
+# come, how long it is (0: none), which of its ends are held.
+HELD, RUN_DONE, RUN_LENGTH, RUN_KIND = 6, 7, 8, 9
+LAST_GAP = 10  # how deep below the nozzle the last strand reached
+LAID_Z, LAYER = 11, 12  # height of the layer that is being laid, and its number
+STATE_SIZE = 13
+NEW_LAYER_MM = 0.03  # strands that differ by less in height are of one layer
 # Additive recurrence of the plastic number: the 2-D low-discrepancy sequence R2 (M. Roberts, 2018)
 R2_X, R2_Y = 0.7548776662466927, 0.5698402909980532
 LEAST_MM = 1e-9  # mm of column: less than this waits for the next step
 RIDGE_STEP_MM = 0.05  # a ridge grows evenly, by this much at a time
 MOST_RIDGE_STEPS = 4000
+# A void lower than this is filled: fewer voids, and the top sinks by no more than this over one.
+LEAST_VOID_MM = 0.03
+MENISCUS = np.pi / 8  # mean depth of half a circle over a groove, in groove widths
 
 
 # The common cases are told twice, inline: a call with arrays costs more than the work itself.
@@ -38,8 +65,11 @@ def surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level):
-    """As `insert`, for plastic that begins on the topmost solid."""
+def stack(hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level):
+    """As `insert`, for plastic that begins on the topmost solid; notes what the layer found."""
+    if stamp[iy, ix] != layer:
+        stamp[iy, ix] = layer
+        before[iy, ix] = hi[iy, ix]
     if bottom == hi[iy, ix] and (bottom > lo[iy, ix] or bottom == 0.0):
         hi[iy, ix] = level
     else:
@@ -47,11 +77,25 @@ def stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit):
+def floor_under(
+    hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit, bridges,
+    cell,
+):  # fmt: skip
     """Where plastic coming from height z begins to stack: on what lies below, or hanging."""
     surface = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
-    if z - surface > gap_limit:
-        surface = z - thickness
+    underside = z - thickness
+    if z - surface > gap_limit + LEAST_MM:
+        surface = underside
+    elif underside - surface > LEAST_VOID_MM:
+        across = groove_columns(
+            hi, before, stamp, layer, iy, ix, underside - LEAST_VOID_MM, bridges
+        )
+        if across > 0:
+            # a column that is low by a share of the layer is open over that share of its width
+            open_share = min(1.0, (underside - surface) / thickness)
+            spanned = underside - MENISCUS * across * cell * open_share**2
+            if spanned > surface + LEAST_VOID_MM:
+                surface = spanned
     return surface
 
 
@@ -72,29 +116,9 @@ def level_of(floors, count, amount, z):
 
 @njit(cache=True, nogil=True)
 def lay(
-    hi,
-    lo,
-    nxt,
-    pool,
-    pool_next,
-    meta,
-    window,
-    near,
-    counts,
-    phases,
-    grid,
-    state,
-    floors,
-    chosen,
-    x,
-    y,
-    z,
-    amount,
-    thickness,
-    gap_limit,
-    carry_limit,
-    flush,
-):
+    hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases, grid, state,
+    floors, chosen, x, y, z, amount, thickness, gap_limit, bridges, carry_limit, flush,
+):  # fmt: skip
     """One step: place `amount` (mm of column) from the nozzle at (x, y, z)."""
     ny, nx = hi.shape
     cell = grid[2]
@@ -106,6 +130,7 @@ def lay(
         state[LOST] += amount
         state[CARRY] = 0.0
         return
+    layer = int(state[LAYER])
     phase = int((gy - cy) * phases) * phases + int((gx - cx) * phases)
     bore, reach = counts[phase, 0], counts[phase, 1]
     flat, spread = counts[phase, 2], counts[phase, 3]
@@ -115,7 +140,10 @@ def lay(
         iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
-        bottom = floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit)
+        bottom = floor_under(
+            hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit,
+            bridges, cell,
+        )  # fmt: skip
         if bottom >= z:
             continue
         at = found
@@ -134,17 +162,9 @@ def lay(
         for k in range(found):
             if floors[k] < level:
                 stack(
-                    hi,
-                    lo,
-                    nxt,
-                    pool,
-                    pool_next,
-                    meta,
-                    chosen[k, 0],
-                    chosen[k, 1],
-                    floors[k],
-                    level,
-                )
+                    hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, chosen[k, 0],
+                    chosen[k, 1], floors[k], level,
+                )  # fmt: skip
         amount = amount - capacity if capacity <= amount else 0.0
     last = spread if (flush or amount > carry_limit) else reach
     for k in range(bore, last):
@@ -153,10 +173,13 @@ def lay(
         iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
-        bottom = floor_under(hi, lo, nxt, pool, pool_next, iy, ix, z, thickness, gap_limit)
+        bottom = floor_under(
+            hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit,
+            bridges, cell,
+        )  # fmt: skip
         if bottom < z:
             level = min(z, bottom + amount)
-            stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
+            stack(hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level)
             amount -= level - bottom
     ridge = 0
     while amount > LEAST_MM and (flush or amount > carry_limit) and ridge < MOST_RIDGE_STEPS:
@@ -170,7 +193,9 @@ def lay(
             if bottom < top:
                 bottom = max(bottom, z - thickness)
                 level = min(top, bottom + amount)
-                stack(hi, lo, nxt, pool, pool_next, meta, iy, ix, bottom, level)
+                stack(
+                    hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level
+                )
                 amount -= level - bottom
                 if amount <= LEAST_MM:
                     break
@@ -198,28 +223,57 @@ def flow_factor(regions, x, y, z):
 
 
 @njit(cache=True, nogil=True)
+def height_of_strand(
+    hi, lo, nxt, pool, pool_next, before, stamp, near, counts, phases, grid, state, start, end,
+    volume, thickness, s, k, x, y, z, step_mm, strand, thermal,
+):  # fmt: skip
+    """Height at which step k of segment s is laid, and how deep below that it fills columns.
+
+    The height is the nozzle's, or lower where nothing holds the strand. `strand` is (die swell,
+    sag / mm, droop / mm, how far beside it a neighbour lies / mm, layers that plastic pools over).
+    """
+    layer = int(state[LAYER])
+    dx, dy = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1]
+    flat = np.sqrt(dx * dx + dy * dy)
+    length = np.sqrt(flat * flat + (end[s, 2] - start[s, 2]) ** 2)
+    reach = strand_reach(volume[s], length, thickness[s], strand[0])
+    pools = max(reach, strand[4] * thickness[s])
+    flat = max(flat, 1e-9)
+    if is_held(
+        hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z,
+        dx / flat, dy / flat, strand[3], thickness[s], reach,
+    ):  # fmt: skip
+        state[HELD] = 1.0
+        state[RUN_LENGTH] = 0.0
+        return z, pools
+    each = length / max(1, int(np.ceil(length / step_mm)))
+    if state[RUN_LENGTH] <= 0.0:
+        ahead, anchored = run_ahead(
+            hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, start,
+            end, volume, thickness, s, k, step_mm, strand[0], strand[3], thermal,
+        )  # fmt: skip
+        state[RUN_LENGTH] = max(ahead, each)
+        state[RUN_DONE] = 0.0
+        state[RUN_KIND] = (AT_START if state[HELD] > 0.0 else NO_ANCHOR) + (
+            AT_END if anchored else NO_ANCHOR
+        )
+    state[HELD] = 0.0
+    done = state[RUN_DONE] + 0.5 * each
+    state[RUN_DONE] += each
+    drop = drop_of(int(state[RUN_KIND]), done, state[RUN_LENGTH], strand[1], strand[2])
+    lies_on = highest_below(
+        hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z
+    )
+    if state[RUN_KIND] == AT_BOTH and z - drop > lies_on + reach:
+        return z - drop, reach  # it hangs, as thick as it is
+    return max(z - drop, min(z, lies_on + pools)), pools
+
+
+@njit(cache=True, nogil=True)
 def deposit(
-    hi,
-    lo,
-    nxt,
-    pool,
-    pool_next,
-    meta,
-    window,
-    near,
-    counts,
-    phases,
-    grid,
-    state,
-    start,
-    end,
-    volume,
-    thickness,
-    regions,
-    step_mm,
-    gap_layers,
-    carry_limit,
-):
+    hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases, grid, state,
+    start, end, volume, thickness, regions, step_mm, bridges, strand, thermal, carry_limit,
+):  # fmt: skip
     """Lay every segment in order; returns the pool and the volume pushed out, mm³."""
     cell = grid[2]
     area = cell * cell
@@ -234,35 +288,19 @@ def deposit(
             and start[s, 1] == state[LAST_Y]
             and start[s, 2] == state[LAST_Z]
         )
+        if not chained:
+            state[HELD] = 0.0
+            state[RUN_LENGTH] = 0.0
         if not chained and state[CARRY] > 0.0:
-            pool, pool_next = grown(pool, pool_next, meta, 4 * near.shape[1] + 64)
+            pool, pool_next = grown(pool, pool_next, meta, room)
             lay(
-                hi,
-                lo,
-                nxt,
-                pool,
-                pool_next,
-                meta,
-                window,
-                near,
-                counts,
-                phases,
-                grid,
-                state,
-                floors,
-                chosen,
-                state[LAST_X],
-                state[LAST_Y],
-                state[LAST_Z],
-                0.0,
-                state[LAST_T],
-                gap_layers * state[LAST_T],
-                carry_limit,
-                True,
-            )
+                hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
+                grid, state, floors, chosen, state[LAST_X], state[LAST_Y], state[LAST_Z], 0.0,
+                state[LAST_T], state[LAST_GAP], bridges, carry_limit, True,
+            )  # fmt: skip
+        dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if volume[s] > 0.0:
-            dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
-            length = np.sqrt(dx * dx + dy * dy + dz * dz)
             steps = max(1, int(np.ceil(length / step_mm)))
             share = volume[s] / steps
             seed = np.abs(np.sin(12.9898 * start[s, 0] + 78.233 * start[s, 1]) * 43758.5453)
@@ -279,32 +317,22 @@ def deposit(
                 if amount <= 0.0 and state[CARRY] <= 0.0:
                     continue
                 pushed += amount
+                if abs(z - state[LAID_Z]) > NEW_LAYER_MM:
+                    state[LAID_Z] = z
+                    state[LAYER] += 1.0
+                z -= lifted(thermal, x, y, z)
                 if meta[FRESH] + room > len(pool_next):
                     pool, pool_next = grown(pool, pool_next, meta, room)
+                laid_z, gap = height_of_strand(
+                    hi, lo, nxt, pool, pool_next, before, stamp, near, counts, phases, grid, state,
+                    start, end, volume, thickness, s, k, x, y, z, step_mm, strand, thermal,
+                )  # fmt: skip
                 lay(
-                    hi,
-                    lo,
-                    nxt,
-                    pool,
-                    pool_next,
-                    meta,
-                    window,
-                    near,
-                    counts,
-                    phases,
-                    grid,
-                    state,
-                    floors,
-                    chosen,
-                    x + (jx - 0.5) * cell,
-                    y + (jy - 0.5) * cell,
-                    z,
-                    amount / area,
-                    thickness[s],
-                    gap_layers * thickness[s],
-                    carry_limit,
-                    amount <= 0.0,
-                )
+                    hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
+                    grid, state, floors, chosen, x + (jx - 0.5) * cell, y + (jy - 0.5) * cell,
+                    laid_z, amount / area, thickness[s], gap, bridges, carry_limit, amount <= 0.0,
+                )  # fmt: skip
         state[LAST_X], state[LAST_Y], state[LAST_Z] = end[s, 0], end[s, 1], end[s, 2]
         state[LAST_T] = thickness[s]
+        state[LAST_GAP] = strand[4] * thickness[s]
     return pool, pool_next, pushed

@@ -10,22 +10,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
+from amrepair.simulate.parameters import FlowModel
 from gcode.firmware.motion import MotionBatch
-
-# Filament is sold as 1.75 ± 0.02 to 0.05 mm: 2 to 6 % of its area at most, a third of that as a
-# standard deviation; gears and slip add as much again over a few turns.
-FLOW_SIGMA_RATIO = 0.02
-# A turn of a geared extruder's wheel pushes some 20 mm of filament: 1.2 m of a common bead. What
-# varies faster is smoothed by the melt.
-FLOW_OVER_MM = 400.0
 
 
 def noisy_flow(
     motion: MotionBatch,
     rng: np.random.Generator,
-    *,
-    sigma_ratio: float = FLOW_SIGMA_RATIO,
-    over_mm: float = FLOW_OVER_MM,
+    model: FlowModel,
 ) -> MotionBatch:
     """The same moves with flow that wanders around 1 (an Ornstein-Uhlenbeck process of the path).
 
@@ -33,11 +25,11 @@ def noisy_flow(
     ----------
     motion
         Executed moves; retractions and travels are left as they are.
-    sigma_ratio
-        Standard deviation of the flow.
-    over_mm
-        Length of path over which it forgets.
+    model
+        How much it wanders, and over what length of path.
     """
+    if model.sigma_ratio == 0.0:
+        return motion
     length_mm = np.linalg.norm(motion.end_mm - motion.start_mm, axis=1)
     laid = np.flatnonzero((motion.filament_mm > 0) & (length_mm > 0))
     if len(laid) == 0:
@@ -45,12 +37,12 @@ def noisy_flow(
     step_mm = max(float(np.median(length_mm[laid])), 1e-3)
     ends_mm = np.cumsum(length_mm[laid])
     count = int(ends_mm[-1] / step_mm) + 2
-    keep = float(np.exp(-step_mm / over_mm))
+    keep = float(np.exp(-step_mm / model.over_mm))
     kicks = rng.normal(size=count) * np.sqrt(1 - keep**2)
     kicks[0] = rng.normal()
     wander = np.asarray(lfilter([1.0], [1.0, -keep], kicks))
     middle = (ends_mm - 0.5 * length_mm[laid]) / step_mm
-    factor = 1.0 + sigma_ratio * np.interp(middle, np.arange(count), wander)
+    factor = 1.0 + model.sigma_ratio * np.interp(middle, np.arange(count), wander)
     filament = motion.filament_mm.copy()
     filament[laid] *= np.maximum(factor, 0.0)
     return replace(motion, filament_mm=filament)

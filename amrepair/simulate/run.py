@@ -22,13 +22,10 @@ from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, Tape, plan_sto
 from amrepair.loop.sites import sites
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.simulate.defects import Defect, PlacedDefect
+from amrepair.simulate.flow import noisy_flow
+from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
 from amrepair.simulate.placement import place
-from amrepair.simulate.scanner import (
-    ScannerModel,
-    SimulatedScanner,
-    default_sensors_mm,
-    seeded_pose,
-)
+from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
 from amrepair.simulate.stage import DefectTruth, Stage
 from amrepair.simulate.world import World
 from amrepair.template.port import Template
@@ -201,7 +198,8 @@ def simulate_run(
     record: Callable[[Look], None] = lambda look: None,
     begun: Callable[[Transform], Tape] | None = None,
     connected: Callable[[Printer], None] = lambda printer: None,
-    model: ScannerModel | None = None,
+    world: WorldParameters | None = None,
+    scanner: str = DEFAULT_SCANNER,
     clock: Callable[[], float] = time.monotonic,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
@@ -215,6 +213,8 @@ def simulate_run(
         which is closed at its end.
     connected
         Called with the printer before anything is printed: a view's pause button needs it.
+    world, scanner
+        The world's parameters (None: the shipped ones), and which of its scanners looks.
 
     Raises
     ------
@@ -225,21 +225,39 @@ def simulate_run(
     printer_profile = run.setup.printer
     box = run.part.bounding_box()
     centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
-    world = World(
+    told = world or load_world()
+    model = told.scanner(scanner)
+    standing = World(
         printer_profile.bed_size_mm,
+        cell_mm=told.columns_mm,
         nozzle_diameter_mm=printer_profile.nozzle_diameter_mm,
         filament_diameter_mm=printer_profile.filament_diameter_mm,
+        bead=told.bead,
+        thermal=told.thermal,
+        middle_mm=centre,
     )
     rng = np.random.default_rng([run.seed, 2])
-    sensors_mm = default_sensors_mm(centre, distance_mm=max(300.0, 2.0 * float(box[5]) + 100.0))
-    pose = seeded_pose(rng, centre_mm=centre)
+    flow_rng = np.random.default_rng([run.seed, 3])
+    sensors_mm = default_sensors_mm(
+        centre,
+        distance_mm=max(300.0, 2.0 * float(box[5]) + 100.0),
+        oblique=model.oblique_views,
+    )
+    pose = seeded_pose(
+        rng,
+        centre_mm=centre,
+        offset_mm=model.offset_mm,
+        tilt_rad=float(np.deg2rad(model.tilt_deg)),
+    )
     temperatures: list[tuple[float, float, float]] = []
     with EmulatedPrinterProcess(printer_profile.dialect, printer=printer_profile) as machine:
         stage = Stage(
-            world,
+            standing,
             defects=run.defects,
-            scanner=SimulatedScanner(world, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model),
-            take_motion=machine.take_motion,
+            scanner=SimulatedScanner(
+                standing, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model
+            ),
+            take_motion=lambda: noisy_flow(machine.take_motion(), flow_rng, told.flow),
             layer_height_mm=run.setup.process.layer_height_mm,
             part=run.part,
             box_mm=(

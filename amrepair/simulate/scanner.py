@@ -2,7 +2,10 @@
 
 It implements the `Scanner` port and knows the world only as solid. Stated simplifications: the bed
 is a plane at z = 0; a point is the surface averaged over a spot of three columns (see
-`scanner_kernels`), which also keeps the columns' staircase out of the walls' mean position.
+`scanner_kernels`), which also keeps the columns' staircase out of the walls' mean position; a
+laser line is swept by a mirror from one place, so that it differs from stripes in how densely, how
+well and from where it sees; rays meet the part before it shrank and curled, and the points are
+moved with it afterwards.
 """
 
 from __future__ import annotations
@@ -10,49 +13,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from amrepair.errors import ScannerError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import ScanRequest
-from amrepair.simulate.scanner_kernels import BED, cast
+from amrepair.simulate.columns import IntervalMap
+from amrepair.simulate.parameters import ScannerModel
+from amrepair.simulate.scanner_kernels import BED, cast, unhidden
 from amrepair.simulate.world import World
-
-
-@dataclass(frozen=True, slots=True)
-class ScannerModel:
-    """How well the sensor measures.
-
-    Attributes
-    ----------
-    sigma_mm
-        Noise along the ray where it meets the surface square; at an angle of incidence a it is
-        sigma / sqrt(cos a): the mild growth that stripe projection shows.
-    spacing_mm
-        Distance of neighbouring rays on the bed.
-    max_incidence_rad
-        Beyond this angle of incidence nothing comes back.
-    spot_half_height_mm
-        Half the height of the spot that a point averages over.
-    bed_margin_mm
-        How much of the bed around the part is measured.
-    dropout_ratio
-        Share of the points on square surface that do not come back; it grows as 1 / cos a, since
-        less light returns from a slope.
-    outlier_ratio, outlier_mm
-        Share of points that a shiny bead reflects from elsewhere, and the mean distance that they
-        are off along their rays, either way (Laplace: a few are far off).
-    """
-
-    sigma_mm: float = 0.03
-    spacing_mm: float = 0.25
-    max_incidence_rad: float = float(np.deg2rad(80.0))
-    spot_half_height_mm: float = 0.2
-    bed_margin_mm: float = 6.0
-    dropout_ratio: float = 0.0
-    outlier_ratio: float = 0.0
-    outlier_mm: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,14 +77,29 @@ def seeded_pose(
         rotation=turn @ tilt,
         translation_mm=np.array([*centre_mm, 0.0]) + rng.uniform(-50.0, 50.0, 3),
     )
+    off = calibration_error(rng, centre_mm=centre_mm, offset_mm=offset_mm, tilt_rad=tilt_rad)
+    return ScannerPose(true, off @ true)
+
+
+def calibration_error(
+    rng: np.random.Generator,
+    *,
+    centre_mm: tuple[float, float],
+    offset_mm: float,
+    tilt_rad: float,
+) -> Transform:
+    """Build from build: by how much a calibration is off, as in `seeded_pose`."""
     direction, spin = rng.normal(size=3), rng.normal(size=3)
     error = rotation_from_vector(tilt_rad * spin / np.linalg.norm(spin))
     centre = np.array([*centre_mm, 0.0])
     shift = offset_mm * direction / np.linalg.norm(direction) + centre - error @ centre
-    off = Transform.from_rotation_translation(
+    return Transform.from_rotation_translation(
         "build", "build", rotation=error, translation_mm=shift
     )
-    return ScannerPose(true, off @ true)
+
+
+# A point is the middle of a spot, and may lie this far before the first solid on a ray to it.
+_HIDDEN_MM = 0.5
 
 
 class SimulatedScanner:
@@ -187,6 +172,10 @@ class SimulatedScanner:
                 targets,
             )
             seen = self._measured(points, normals, kinds, sensor, bounds)
+            seen &= self._unhidden(solid, top_mm, sensor, points)
+            noise = self._noise(points, normals, sensor)
+            at_rest = np.where((kinds == BED)[:, None], points, self.world.as_cooled(points))
+            seen = (at_rest + noise)[seen]
             clouds.append(seen)
             indices.append(np.full(len(seen), index, dtype=np.int64))
         scanner_from_build = self._pose.build_from_scanner_true.inverse()
@@ -211,33 +200,84 @@ class SimulatedScanner:
         low, high = corners.min(axis=0), corners.max(axis=0)
         spacing_mm = self.model.spacing_mm
         x = np.arange(low[0], high[0], spacing_mm)
-        y = np.arange(low[1], high[1], spacing_mm)
+        step_mm = self.model.line_step_mm or spacing_mm
+        y = np.arange(low[1], high[1], step_mm)
         grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        grid = grid + self._rng.uniform(0.0, spacing_mm, grid.shape)
+        grid = grid + self._rng.uniform(0.0, 1.0, grid.shape) * [spacing_mm, step_mm]
         return np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
 
     def _measured(
         self,
         points: Float[np.ndarray, "n 3"],
         normals: Float[np.ndarray, "n 3"],
-        kinds: np.ndarray,
+        kinds: Int[np.ndarray, " n"],
         sensor: Float[np.ndarray, " 3"],
         bounds: Float[np.ndarray, "2 3"],
-    ) -> Float[np.ndarray, "m 3"]:
-        """(m, 3) points that come back, with noise along their rays."""
-        rays = points - sensor
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        cosine = -np.einsum("ij,ij->i", rays, normals)
+    ) -> Bool[np.ndarray, " n"]:
+        """(n,) which points send enough light back, and are asked for."""
+        cosine = _cosine(points, normals, sensor)
         margin_mm = self.model.bed_margin_mm
         low, high = bounds[0, :2] - margin_mm, bounds[1, :2] + margin_mm
         near = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
         keep = (cosine > np.cos(self.model.max_incidence_rad)) & ((kinds != BED) | near)
-        noise_mm = self._rng.normal(size=len(points)) * self.model.sigma_mm
-        spread = noise_mm / np.sqrt(np.maximum(cosine, 0.1))
         if self.model.dropout_ratio > 0:
             lost = self.model.dropout_ratio / np.maximum(cosine, 0.1)
             keep &= self._rng.random(len(points)) >= lost
+        return np.asarray(keep)
+
+    def _unhidden(
+        self,
+        solid: IntervalMap,
+        top_mm: Float[np.ndarray, "ny nx"],
+        sensor: Float[np.ndarray, " 3"],
+        points: Float[np.ndarray, "n 3"],
+    ) -> Bool[np.ndarray, " n"]:
+        """(n,) which points the camera sees too, a baseline beside the light."""
+        if self.model.baseline_mm == 0.0:
+            return np.ones(len(points), dtype=bool)
+        low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+        inward = 0.5 * (low + high) - sensor[:2]
+        far_mm = float(np.hypot(*inward))
+        # seen from above every direction is as good: Y, across a laser's line
+        aside = np.array([-inward[1], inward[0]]) / far_mm if far_mm > 1.0 else np.array([0.0, 1.0])
+        eye = sensor + np.append(self.model.baseline_mm * aside, 0.0)
+        return np.asarray(
+            unhidden(
+                solid.offsets,
+                solid.spans_mm,
+                top_mm,
+                *solid.window.corner_mm,
+                self.world.cell_mm,
+                eye,
+                points,
+                _HIDDEN_MM,
+            )
+        )
+
+    def _noise(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        normals: Float[np.ndarray, "n 3"],
+        sensor: Float[np.ndarray, " 3"],
+    ) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) errors, all along the rays."""
+        rays = points - sensor
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        cosine = np.maximum(_cosine(points, normals, sensor), 0.1)
+        noise_mm = self._rng.normal(size=len(points)) * self.model.sigma_mm
+        spread = noise_mm / cosine**self.model.slope_power
         if self.model.outlier_ratio > 0:
             shiny = self._rng.random(len(points)) < self.model.outlier_ratio
             spread = spread + shiny * self._rng.laplace(0.0, self.model.outlier_mm, len(points))
-        return (points + rays * spread[:, None])[keep]
+        return np.asarray(rays * spread[:, None])
+
+
+def _cosine(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    sensor: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, " n"]:
+    """(n,) cosine of the angle of incidence."""
+    rays = points - sensor
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.asarray(-np.einsum("ij,ij->i", rays, normals))

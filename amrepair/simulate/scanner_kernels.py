@@ -146,3 +146,18 @@ def cast(offsets, spans, top, x0, y0, cell, half_z, sensor, targets):
         else:
             normals[r] = -direction
     return points, normals, kinds
+
+
+@njit(cache=True, parallel=True)
+def unhidden(offsets, spans, top, x0, y0, cell, eye, points, tolerance):
+    """Whether a second eye, above everything, sees points (n, 3) of the surface as well."""
+    n = len(points)
+    seen = np.zeros(n, dtype=np.bool_)
+    z_top = top.max() + 1e-6
+    for r in prange(n):
+        way = points[r] - eye
+        aim = eye + way * (eye[2] / -way[2])
+        t, _ = first_hit(offsets, spans, top, z_top, x0, y0, cell, eye, aim)
+        reach = t * np.sqrt(((aim - eye) ** 2).sum())
+        seen[r] = reach >= np.sqrt((way**2).sum()) - tolerance
+    return seen

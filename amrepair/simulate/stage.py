@@ -154,7 +154,7 @@ class Stage:
         """Lay what was printed since the last look, then look; points in the scanner frame."""
         motion = self._take_motion()
         if request.label in self._stops:  # a repair: it is laid in the broken world alone
-            self.world.deposit(motion)
+            self.world.deposit(motion, onto_cold=True)
         else:
             self._stops.append(request.label)
             self._print_job(motion)

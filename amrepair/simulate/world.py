@@ -2,13 +2,15 @@
 
 Columns of at most 0.15 mm in XY, each a list of solid z-intervals in continuous z. What the
 nozzle did comes as `MotionBatch`; the world knows neither G-code nor the part that was meant.
-The bead model is told in `deposit_kernels`; its parameters are in `BeadModel`.
+The bead model is told in `deposit_kernels`, what a strand without hold does in `strand_kernels`,
+their parameters in `parameters`. What shrinks and curls is told apart from where plastic was laid:
+columns hold the part as if it had not cooled, `as_cooled` says where its points are now, and a
+nozzle that comes back to it (`onto_cold`) meets them there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import manifold3d
@@ -18,42 +20,14 @@ from jaxtyping import Float
 from amrepair.errors import InputError
 from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.defects import PlacedDefect
-from amrepair.simulate.deposit_kernels import deposit
+from amrepair.simulate.deposit_kernels import LAYER, STATE_SIZE, deposit
+from amrepair.simulate.parameters import BeadModel, ThermalModel
 from amrepair.simulate.truth import Difference
 from gcode.firmware.motion import MotionBatch
 from gcode.surfaces import HeightField
 
 MAX_CELL_MM = 0.15
 _PHASES = 8  # sub-column positions of the nozzle that have a list of neighbours of their own
-_STATE_SIZE = 6
-
-
-@dataclass(frozen=True, slots=True)
-class BeadModel:
-    """How plastic behaves under the nozzle.
-
-    Attributes
-    ----------
-    step_mm
-        Length of path per deposition step.
-    gap_layers
-        A gap below the nozzle of more layers than this is bridged, not filled.
-    reach_ratio
-        How far plastic spreads sideways at once, in nozzle diameters from the nozzle's axis.
-    spread_ratio
-        How far pressure can push it before it rises as a ridge, likewise.
-    flat_ratio
-        Radius of the nozzle's flat, likewise: ridges stand outside it.
-    carry_mm3
-        Plastic that rides along with the nozzle before it must go somewhere.
-    """
-
-    step_mm: float = 0.2
-    gap_layers: float = 2.75
-    reach_ratio: float = 1.25
-    spread_ratio: float = 2.0  # at 4.0 a solid plate's walls bulged by 0.37 mm in places
-    flat_ratio: float = 1.25
-    carry_mm3: float = 0.02
 
 
 class World:
@@ -69,6 +43,10 @@ class World:
         Bore of the nozzle, and the filament that motion is told in.
     margin_mm
         How far the world goes beyond the bed (some printers prime there).
+    bead, thermal
+        How plastic lies, and how it cools; without `thermal` it neither shrinks nor curls.
+    middle_mm
+        XY that the part shrinks towards and curls around, build frame; the bed's middle.
 
     Attributes
     ----------
@@ -85,12 +63,17 @@ class World:
         filament_diameter_mm: float = 1.75,
         margin_mm: float = 10.0,
         bead: BeadModel | None = None,
+        thermal: ThermalModel | None = None,
+        middle_mm: tuple[float, float] | None = None,
     ) -> None:
         if not 0.02 <= cell_mm <= MAX_CELL_MM:
             raise InputError(
                 f"a world's columns must be 0.02 to {MAX_CELL_MM} mm wide, not {cell_mm} mm"
             )
         self.bead = bead or BeadModel()
+        self.thermal = thermal or ThermalModel()
+        middle = (0.5 * bed_size_mm[0], 0.5 * bed_size_mm[1]) if middle_mm is None else middle_mm
+        self._middle_mm = np.array(middle)
         self.nozzle_diameter_mm = nozzle_diameter_mm
         self.filament_mm2 = np.pi / 4 * filament_diameter_mm**2
         self.columns = Columns(
@@ -99,7 +82,10 @@ class World:
             cell_mm=cell_mm,
         )
         self._near, self._counts = _neighbours(cell_mm, nozzle_diameter_mm, self.bead)
-        self._state = np.zeros(_STATE_SIZE)
+        self._state = np.zeros(STATE_SIZE)
+        # what every column's top was before the layer that last touched it, and which that was
+        self._before = np.zeros(self.columns.shape, dtype=np.float32)
+        self._stamp = np.zeros(self.columns.shape, dtype=np.int32)
         self._pulled_mm = 0.0  # filament retracted and not yet pushed back
         self._layer_tops_mm = np.zeros(0)  # heights extruded at so far, rising
         self.pushed_mm3 = 0.0
@@ -119,15 +105,24 @@ class World:
         """Volume of everything solid."""
         return self.snapshot().volume_mm3
 
-    def deposit(self, motion: MotionBatch, defects: Sequence[PlacedDefect] = ()) -> float:
+    def deposit(
+        self,
+        motion: MotionBatch,
+        defects: Sequence[PlacedDefect] = (),
+        *,
+        onto_cold: bool = False,
+    ) -> float:
         """Lay what the nozzle pushed out.
 
         Parameters
         ----------
         motion
-            Executed moves, in order, build frame.
+            Executed moves, in order, build frame; they end at a rest: a strand that has found no
+            second hold by then has none.
         defects
             Placed defects that change the flow of these moves.
+        onto_cold
+            A repair: the part has cooled, and the little that is added shrinks by next to nothing.
 
         Returns
         -------
@@ -138,29 +133,78 @@ class World:
             return 0.0
         volume_mm3 = self._pushed_mm(motion.filament_mm) * self.filament_mm2
         thickness_mm = self._thickness_mm(motion, volume_mm3)
+        if onto_cold:
+            self._state[LAYER] += 1.0  # at the height of the layer before it, but not of it
         none = np.zeros((0, 9))
         regions = np.concatenate([none, *(defect.flow_regions for defect in defects)])
         lay_all: Any = deposit
         pool, pool_next, pushed = lay_all(
             *self.columns.arrays,
+            self._before,
+            self._stamp,
             self.columns.touched,
             self._near,
             self._counts,
             _PHASES,
             np.array([*self.columns.origin_mm, self.cell_mm]),
             self._state,
-            np.ascontiguousarray(motion.start_mm, dtype=np.float64),
-            np.ascontiguousarray(motion.end_mm, dtype=np.float64),
+            self._as_laid(motion.start_mm, onto_cold=onto_cold),
+            self._as_laid(motion.end_mm, onto_cold=onto_cold),
             volume_mm3,
             thickness_mm,
             np.ascontiguousarray(regions),
             self.bead.step_mm,
-            self.bead.gap_layers,
+            int(self.bead.bridges_mm / self.cell_mm + 1e-6),
+            np.array(
+                [
+                    self.bead.swell_ratio,
+                    self.bead.sag_per_mm,
+                    self.bead.droop_per_mm,
+                    self.nozzle_diameter_mm,
+                    self.bead.pools_layers,
+                ]
+            ),
+            np.array(
+                [
+                    *self._middle_mm,
+                    self.thermal.curl_per_mm,
+                    self.thermal.held_mm,
+                    self._risen if onto_cold else -1.0,
+                ]
+            ),
             self.bead.carry_mm3 / self.cell_mm**2,
         )
         self.columns.pool, self.columns.pool_next = pool, pool_next
         self.pushed_mm3 += float(pushed)
         return float(pushed)
+
+    def as_cooled(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) where points of the part as it was laid are now, build frame."""
+        if self.thermal.shrink_ratio == 0.0 and self.thermal.curl_per_mm == 0.0:
+            return points_mm
+        away_mm = points_mm[:, :2] - self._middle_mm
+        smaller = 1.0 - self.thermal.shrink_ratio * self.thermal.rise(points_mm[:, 2])
+        out = points_mm.copy()
+        out[:, :2] = self._middle_mm + away_mm * smaller[:, None]
+        out[:, 2] += self.thermal.curl_per_mm * (away_mm**2).sum(axis=1) * self._risen
+        return out
+
+    @property
+    def _risen(self) -> float:
+        """Share of its curl that the part has now, its warm top contracted."""
+        top_mm = float(self._layer_tops_mm[-1]) if len(self._layer_tops_mm) else 0.0
+        return float(self.thermal.rise(top_mm + self.thermal.warm_mm))
+
+    def _as_laid(
+        self, place_mm: Float[np.ndarray, "n 3"], *, onto_cold: bool
+    ) -> Float[np.ndarray, "n 3"]:
+        """Where on the part as it was laid the nozzle is (its height is the kernel's business)."""
+        place = np.array(place_mm, dtype=np.float64, order="C")
+        if onto_cold and self.thermal.shrink_ratio > 0.0:
+            smaller = 1.0 - self.thermal.shrink_ratio * self.thermal.rise(place[:, 2])
+            away_mm = place[:, :2] - self._middle_mm
+            place[:, :2] = self._middle_mm + away_mm / smaller[:, None]
+        return place
 
     def add(self, solid: manifold3d.Manifold) -> float:
         """Unite the world with a solid of the build frame; returns the volume added, mm³."""
@@ -206,6 +250,7 @@ class World:
         twin.__dict__.update(self.__dict__)
         twin.columns = self.columns.copy()
         twin._state = self._state.copy()
+        twin._before, twin._stamp = self._before.copy(), self._stamp.copy()
         return twin
 
     def _pushed_mm(self, filament_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -367,7 +367,8 @@ def emulate(
         Path | None,
         typer.Option(
             help="File that executed moves are appended to as they happen, nine float64 each: "
-            "start and end, mm, filament, mm, speed, mm/s, the printer's clock, s."
+            "start and end, mm, filament, mm, speed, mm/s, the printer's clock, s; "
+            "'amrepair loop --scanner simulated:FILE' looks at what they print."
         ),
     ] = None,
 ) -> None:

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from amrepair.simulate.flow import noisy_flow
+from amrepair.simulate.parameters import FlowModel, load_world
 from gcode.firmware.motion import MotionBatch
+
+WANDERS = load_world().flow
 
 
 def moves(count: int) -> MotionBatch:
@@ -20,7 +23,7 @@ def moves(count: int) -> MotionBatch:
 
 def test_flow_wanders_as_told_and_only_where_plastic_is_laid() -> None:
     before = moves(200_000)
-    after = noisy_flow(before, np.random.default_rng(0), sigma_ratio=0.03, over_mm=100.0)
+    after = noisy_flow(before, np.random.default_rng(0), FlowModel(sigma_ratio=0.03, over_mm=100.0))
     idle = before.filament_mm <= 0
     assert (after.filament_mm[idle] == before.filament_mm[idle]).all()
     factor = after.filament_mm[~idle] / before.filament_mm[~idle]
@@ -33,10 +36,10 @@ def test_flow_wanders_as_told_and_only_where_plastic_is_laid() -> None:
 
 
 def test_the_same_seed_gives_the_same_flow() -> None:
-    first, again = (noisy_flow(moves(50), np.random.default_rng(7)) for _ in range(2))
+    first, again = (noisy_flow(moves(50), np.random.default_rng(7), WANDERS) for _ in range(2))
     assert (first.filament_mm == again.filament_mm).all()
 
 
 def test_travels_alone_stay_as_they_are() -> None:
     before = moves(1)
-    assert noisy_flow(before, np.random.default_rng(0)) is before
+    assert noisy_flow(before, np.random.default_rng(0), WANDERS) is before

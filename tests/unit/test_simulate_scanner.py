@@ -8,8 +8,8 @@ import pytest
 
 from amrepair.errors import ScannerError
 from amrepair.scans.scanner import ScanRequest
+from amrepair.simulate.parameters import ScannerModel
 from amrepair.simulate.scanner import (
-    ScannerModel,
     SimulatedScanner,
     default_sensors_mm,
     seeded_pose,
