@@ -63,7 +63,7 @@ def test_what_another_process_prints_is_seen(tmp_path: Path) -> None:
         printer.close()
     finally:
         child.terminate()
-        child.wait(timeout=10)
+        child.communicate(timeout=10)
     points = eye.build_from_scanner.apply(scan.points_mm)
     inside = (np.abs(points[:, 0] - 110) < 8) & (np.abs(points[:, 1] - 104) < 3)
     # the layer's height, within the calibration's error and the mean of some thousand points
