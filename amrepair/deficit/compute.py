@@ -307,6 +307,7 @@ def _solid_in_box(
     can_be = sign * f > -beyond_mm
     if label is Label.EXCESS and inside.any():
         can_be &= f < float(s.deviation_mm[inside].max()) + beyond_mm
+        can_be &= samples[:, 2] > float(template.bounds_mm[0, 2])  # nothing stands in the bed
     near = np.flatnonzero(can_be)
     best = np.full(len(samples), -10.0 if label is Label.MISSING else 10.0)
     cautious = best.copy()
@@ -329,6 +330,11 @@ def _solid_in_box(
     ask = np.flatnonzero(can_be & ~core & (sign * f > thin_mm) & (clip < 0))
     nearest = evidence.tree.query(samples[ask], workers=2)[1]
     core[ask[labels[nearest] == int(label)]] = True
+    if label is Label.EXCESS:
+        # one reflection in mid-air is a plane, too, but none that stands out by its label
+        found = np.flatnonzero(core)
+        nearest = evidence.tree.query(samples[found], workers=2)[1]
+        core[found[labels[nearest] != int(label)]] = False
     grow_mm = GROW_FACTOR * tau_mm + float(box.step_mm.max())
     reach = box.distance_to(core.reshape(box.shape)) - grow_mm
     return solid_from_field(box, np.maximum(clip.reshape(box.shape), np.minimum(reach, 10.0)))

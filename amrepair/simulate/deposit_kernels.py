@@ -1,13 +1,16 @@
 # mypy: disable-error-code="no-untyped-def"
 """The bead model: plastic under a moving nozzle finds its place among the columns.
 
-Per short step of the path the volume pushed out (1) levels the columns under the nozzle's bore,
-lowest first, up to the nozzle's height; (2) what is left fills further columns in order of
-distance; (3) what finds no room rides along with the nozzle and, once it is more than
-`carry_limit`, rises as a ridge around the nozzle's flat. Volume is conserved to rounding.
-A groove below the layer that is narrower than `bridges` columns is not filled: the strand spans
-it and bulges in by a meniscus, and a void stays. So a layer whose lines leave room between them
-stands at the nozzle's height all the same, and what it lacks lies between its beads.
+Per short step of the path the nozzle's flat planes off what stands a little above it, and that
+and the volume pushed out (1) level the columns under the nozzle's bore, lowest first, up to the
+nozzle's height; (2) what is left fills further columns in order of distance. What finds no room
+rides along with the nozzle and, once it is more than `carry_limit`, (3) is pressed into the voids
+right under the strand, (4) spreads farther, (5) rises as a ridge around the nozzle's flat. Volume
+is conserved to rounding.
+A groove below the layer that is narrower than `bridges` columns is not filled without pressure:
+the strand spans it and bulges in by a meniscus, and a void stays. So a layer with less plastic
+than fills it stands at the nozzle's height all the same, and what it lacks lies between its beads;
+one with as much as fills it leaves no voids.
 A strand that nothing holds comes down before it is laid (`strand_kernels`).
 The step positions are dithered over one column (a low-discrepancy sequence from the segment's own
 coordinates), so that a wall's mean position does not depend on where it falls in the grid.
@@ -40,7 +43,8 @@ CARRY, LAST_X, LAST_Y, LAST_Z, LOST, LAST_T = 0, 1, 2, 3, 4, 5
 HELD, RUN_DONE, RUN_LENGTH, RUN_KIND = 6, 7, 8, 9
 LAST_GAP = 10  # how deep below the nozzle the last strand reached
 LAID_Z, LAYER = 11, 12  # height of the layer that is being laid, and its number
-STATE_SIZE = 13
+FREE = 13  # how far from its axis a strand spreads without pressure, columns
+STATE_SIZE = 14
 NEW_LAYER_MM = 0.03  # strands that differ by less in height are of one layer
 # Additive recurrence of the plastic number: the 2-D low-discrepancy sequence R2 (M. Roberts, 2018)
 R2_X, R2_Y = 0.7548776662466927, 0.5698402909980532
@@ -50,6 +54,10 @@ MOST_RIDGE_STEPS = 4000
 # A void lower than this is filled: fewer voids, and the top sinks by no more than this over one.
 LEAST_VOID_MM = 0.03
 MENISCUS = np.pi / 8  # mean depth of half a circle over a groove, in groove widths
+LEAST_RIDGE_MM = 0.005  # what stands less above the nozzle is not planed off
+FREE_COLUMNS = 0.5  # a column that the strand's edge crosses is its own
+PRESSED_SHARE = 0.25  # of what rides along before it rises: from here on it is pressed into voids
+OPEN_LAYERS = 1.5  # a void is under the strand if its roof is no more than this below the nozzle
 
 
 # The common cases are told twice, inline: a call with arrays costs more than the work itself.
@@ -100,6 +108,51 @@ def floor_under(
 
 
 @njit(cache=True, nogil=True)
+def planed(hi, lo, near, row, count, cx, cy, z, most):
+    """What the nozzle's flat takes off columns that stand above z by up to `most`, mm of column."""
+    ny, nx = hi.shape
+    taken = 0.0
+    for k in range(count):
+        iy, ix = cy + near[row, k, 0], cx + near[row, k, 1]
+        if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
+            continue
+        over = hi[iy, ix] - z
+        if LEAST_RIDGE_MM < over <= most and lo[iy, ix] < z:
+            hi[iy, ix] = z
+            taken += over
+    return taken
+
+
+@njit(cache=True, nogil=True)
+def pressed(hi, lo, nxt, pool, pool_next, meta, near, row, count, cx, cy, z, amount, thickness):
+    """Press plastic into the voids right under what was just laid; returns what finds no room."""
+    ny, nx = hi.shape
+    for k in range(count):
+        if amount <= LEAST_MM:
+            break
+        iy, ix = cy + near[row, k, 0], cx + near[row, k, 1]
+        if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
+            continue
+        roof = lo[iy, ix]
+        if (
+            roof <= 0.0
+            or roof >= z
+            or hi[iy, ix] < z - LEAST_MM
+            or z - roof > OPEN_LAYERS * thickness
+        ):
+            continue
+        node = nxt[iy, ix]
+        floor = pool[node, 1] if node != 0 else 0.0
+        deep = roof - floor
+        if deep <= LEAST_MM or deep > thickness:
+            continue
+        fill = min(amount, deep)
+        insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, floor, floor + fill)
+        amount -= fill
+    return amount
+
+
+@njit(cache=True, nogil=True)
 def level_of(floors, count, amount, z):
     """Level to which `amount` (mm of column) fills the first `count` floors, sorted rising."""
     used = 0.0
@@ -117,7 +170,7 @@ def level_of(floors, count, amount, z):
 @njit(cache=True, nogil=True)
 def lay(
     hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases, grid, state,
-    floors, chosen, x, y, z, amount, thickness, gap_limit, bridges, carry_limit, flush,
+    floors, chosen, x, y, z, amount, thickness, gap_limit, bridges, planes, carry_limit, flush,
 ):  # fmt: skip
     """One step: place `amount` (mm of column) from the nozzle at (x, y, z)."""
     ny, nx = hi.shape
@@ -134,6 +187,8 @@ def lay(
     phase = int((gy - cy) * phases) * phases + int((gx - cx) * phases)
     bore, reach = counts[phase, 0], counts[phase, 1]
     flat, spread = counts[phase, 2], counts[phase, 3]
+    if planes > 0.0:
+        amount += planed(hi, lo, near, phase, flat, cx, cy, z, planes * thickness)
     found = 0
     capacity = 0.0
     for k in range(bore):  # columns under the bore, kept sorted by floor
@@ -166,11 +221,18 @@ def lay(
                     chosen[k, 1], floors[k], level,
                 )  # fmt: skip
         amount = amount - capacity if capacity <= amount else 0.0
-    last = spread if (flush or amount > carry_limit) else reach
-    for k in range(bore, last):
-        if amount <= LEAST_MM:
-            break
+    wide = False
+    for k in range(bore, spread):
         iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
+        if not wide and (k >= reach or np.hypot(ix + 0.5 - gx, iy + 0.5 - gy) > state[FREE]):
+            wide = True  # the strand is as wide as it is meant to be: more takes pressure
+            if flush or amount > PRESSED_SHARE * carry_limit:
+                amount = pressed(
+                    hi, lo, nxt, pool, pool_next, meta, near, phase, reach, cx, cy, z, amount,
+                    thickness,
+                )  # fmt: skip
+        if amount <= LEAST_MM or (k == reach and not flush and amount <= carry_limit):
+            break
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
         bottom = floor_under(
@@ -272,7 +334,7 @@ def height_of_strand(
 @njit(cache=True, nogil=True)
 def deposit(
     hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases, grid, state,
-    start, end, volume, thickness, regions, step_mm, bridges, strand, thermal, carry_limit,
+    start, end, volume, thickness, regions, step_mm, bridges, planes, strand, thermal, carry_limit,
 ):  # fmt: skip
     """Lay every segment in order; returns the pool and the volume pushed out, mm³."""
     cell = grid[2]
@@ -296,11 +358,13 @@ def deposit(
             lay(
                 hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
                 grid, state, floors, chosen, state[LAST_X], state[LAST_Y], state[LAST_Z], 0.0,
-                state[LAST_T], state[LAST_GAP], bridges, carry_limit, True,
+                state[LAST_T], state[LAST_GAP], bridges, planes, carry_limit, True,
             )  # fmt: skip
         dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if volume[s] > 0.0:
+            half = 0.5 * volume[s] / max(length * thickness[s], LEAST_MM)
+            state[FREE] = half / cell + FREE_COLUMNS
             steps = max(1, int(np.ceil(length / step_mm)))
             share = volume[s] / steps
             seed = np.abs(np.sin(12.9898 * start[s, 0] + 78.233 * start[s, 1]) * 43758.5453)
@@ -330,7 +394,8 @@ def deposit(
                 lay(
                     hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
                     grid, state, floors, chosen, x + (jx - 0.5) * cell, y + (jy - 0.5) * cell,
-                    laid_z, amount / area, thickness[s], gap, bridges, carry_limit, amount <= 0.0,
+                    laid_z, amount / area, thickness[s], gap, bridges, planes, carry_limit,
+                    amount <= 0.0,
                 )  # fmt: skip
         state[LAST_X], state[LAST_Y], state[LAST_Z] = end[s, 0], end[s, 1], end[s, 2]
         state[LAST_T] = thickness[s]

@@ -19,7 +19,7 @@ def noisy_flow(
     rng: np.random.Generator,
     model: FlowModel,
 ) -> MotionBatch:
-    """The same moves with flow that wanders around 1 (an Ornstein-Uhlenbeck process of the path).
+    """The same moves with flow that wanders around its mean (Ornstein-Uhlenbeck along the path).
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def noisy_flow(
     model
         How much it wanders, and over what length of path.
     """
-    if model.sigma_ratio == 0.0:
+    if model.sigma_ratio == 0.0 and model.mean_ratio == 1.0:
         return motion
     length_mm = np.linalg.norm(motion.end_mm - motion.start_mm, axis=1)
     laid = np.flatnonzero((motion.filament_mm > 0) & (length_mm > 0))
@@ -42,7 +42,7 @@ def noisy_flow(
     kicks[0] = rng.normal()
     wander = np.asarray(lfilter([1.0], [1.0, -keep], kicks))
     middle = (ends_mm - 0.5 * length_mm[laid]) / step_mm
-    factor = 1.0 + model.sigma_ratio * np.interp(middle, np.arange(count), wander)
+    factor = model.mean_ratio + model.sigma_ratio * np.interp(middle, np.arange(count), wander)
     filament = motion.filament_mm.copy()
     filament[laid] *= np.maximum(factor, 0.0)
     return replace(motion, filament_mm=filament)

@@ -49,7 +49,10 @@ class BeadModel(_Part):
         Where a strand has no two ends to hang from, it runs down and fills gaps below the nozzle
         of up to so many layers.
     bridges_mm
-        Grooves narrower than this are spanned, not filled: a void stays under the strand.
+        Grooves narrower than this are spanned, not filled: a void stays under the strand, unless
+        there is more plastic than finds room beside it.
+    planes_layers
+        What stands above the nozzle's flat by no more than this is melted and taken along.
     swell_ratio
         Diameter of a free strand over that of its section: it swells as it leaves the die.
     sag_per_mm
@@ -66,6 +69,7 @@ class BeadModel(_Part):
     carry_mm3: Annotated[float, Field(ge=0, le=1)] = 0.02
     pools_layers: Annotated[float, Field(ge=1, le=10)] = 2.75
     bridges_mm: Annotated[float, Field(ge=0, le=1)] = 0.3
+    planes_layers: Annotated[float, Field(ge=0, le=2)] = 0.5
     swell_ratio: Annotated[float, Field(ge=1, le=2)] = 1.1
     sag_per_mm: Annotated[float, Field(ge=0, le=0.1)] = 0.001
     droop_per_mm: Annotated[float, Field(ge=0, le=10)] = 0.1
@@ -76,12 +80,15 @@ class FlowModel(_Part):
 
     Attributes
     ----------
+    mean_ratio
+        Mean flow, of what was asked for.
     sigma_ratio
         Standard deviation of the flow, of 1.
     over_mm
         Length of path over which it forgets.
     """
 
+    mean_ratio: Annotated[float, Field(ge=0.5, le=1.5)] = 1.0
     sigma_ratio: Annotated[float, Field(ge=0, le=0.3)] = 0.0
     over_mm: Annotated[float, Field(ge=1, le=100000)] = 400.0
 

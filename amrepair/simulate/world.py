@@ -155,6 +155,7 @@ class World:
             np.ascontiguousarray(regions),
             self.bead.step_mm,
             int(self.bead.bridges_mm / self.cell_mm + 1e-6),
+            self.bead.planes_layers,
             np.array(
                 [
                     self.bead.swell_ratio,

@@ -12,6 +12,7 @@ from amrepair.deficit.worth import MIN_REPAIR_MM3, worth_mending
 from amrepair.detect import detect
 from amrepair.frames import Transform
 from amrepair.scans import ScanRequest
+from amrepair.simulate.parameters import load_world
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner, default_sensors_mm
 from amrepair.simulate.world import World
 from amrepair.template import MeshSdf
@@ -71,6 +72,37 @@ def test_a_strip_one_layer_deep_and_four_beads_wide_is_found_to_its_ends(
     assert found.missing_mm3 == pytest.approx(strip.volume(), rel=0.2)
     inside = (found.missing ^ strip).volume()
     assert inside > 0.8 * strip.volume()
+
+
+def test_reflections_near_what_stands_out_are_no_part_of_it(template: MeshSdf) -> None:
+    # regression: a point in mid-air beside a ridge was a blob that the head would hit, and where
+    # a tall ridge stood on a thin part, there was excess in the bed below it
+    thin_mm = 0.8
+    part = WHOLE.trim_by_plane((0.0, 0.0, -1.0), -thin_mm)
+    ridge = m3.Manifold.cube((6.0, 6.0, 1.4)).translate((22.0, 25.0, thin_mm))
+    world = World((60.0, 60.0))
+    world.add(part + ridge)
+    pose = Transform.identity("build", "scanner")
+    scanner = SimulatedScanner(
+        world,
+        pose=ScannerPose(pose, pose),
+        sensors_mm=default_sensors_mm((30.0, 30.0)),
+        rng=np.random.default_rng(0),
+        model=load_world().scanner().model_copy(update={"outlier_ratio": 0.005}),
+    )
+    scan = scanner.scan(ScanRequest("test", 3, thin_mm)).moved(PLACE)
+    layer = template.below_z(thin_mm)
+    found = compute_deficit(
+        scan,
+        layer,
+        detect(scan, layer, top_z_mm=thin_mm),
+        build_from_template=Transform.identity("build", "template"),
+        printed_z_mm=thin_mm,
+    )
+    assert found.excess.bounding_box()[2] > -0.01
+    assert found.excess_mm3 == pytest.approx(ridge.volume(), rel=0.1)
+    around = ridge.minkowski_sum(m3.Manifold.cube((0.8, 0.8, 0.8), True))
+    assert (found.excess - around).volume() < 0.02
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -23,12 +23,13 @@ def moves(count: int) -> MotionBatch:
 
 def test_flow_wanders_as_told_and_only_where_plastic_is_laid() -> None:
     before = moves(200_000)
-    after = noisy_flow(before, np.random.default_rng(0), FlowModel(sigma_ratio=0.03, over_mm=100.0))
+    told = FlowModel(mean_ratio=0.97, sigma_ratio=0.03, over_mm=100.0)
+    after = noisy_flow(before, np.random.default_rng(0), told)
     idle = before.filament_mm <= 0
     assert (after.filament_mm[idle] == before.filament_mm[idle]).all()
     factor = after.filament_mm[~idle] / before.filament_mm[~idle]
     # 2,000 times over: means are good to 3 % / sqrt(1000), deviations to a few per cent
-    assert factor.mean() == pytest.approx(1.0, abs=0.004)
+    assert factor.mean() == pytest.approx(0.97, abs=0.004)
     assert factor.std() == pytest.approx(0.03, rel=0.1)
     off = factor - factor.mean()
     apart = 90  # laid moves in 100 mm

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import manifold3d as m3
 import numpy as np
 import pytest
@@ -9,9 +11,11 @@ import pytest
 from amrepair.frames import Transform
 from amrepair.scans.scanner import ScanRequest
 from amrepair.simulate.columns import IntervalMap
+from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import ScannerModel, ThermalModel, load_world
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner
 from amrepair.simulate.world import World
+from gcode.firmware.motion import MotionBatch
 from tests.unit.test_simulate_world import (
     HEIGHT_MM,
     SECTION_MM2,
@@ -64,6 +68,52 @@ def test_a_stack_stands_at_the_nozzles_height_and_what_it_lacks_is_between_its_b
     assert off_mm.mean() == pytest.approx(0.0, abs=(1 - flow) * HEIGHT_MM + 0.02)
     share = inside.thickness_mm(HEIGHT_MM, (layers - 1) * HEIGHT_MM).mean()
     assert share / ((layers - 2) * HEIGHT_MM) == pytest.approx(flow, abs=0.012)
+
+
+def layered(flows: list[float], lines: int = 20) -> MotionBatch:
+    """A block whose layers have flows of their own."""
+    motion = block((20.03, 20.01), lines, len(flows))
+    layer = np.rint(motion.end_mm[:, 2] / HEIGHT_MM).astype(int) - 1
+    share = np.array([*flows, *[1.0] * 99])[layer]
+    return replace(motion, filament_mm=motion.filament_mm * share)
+
+
+def test_too_much_plastic_is_pressed_into_the_voids_right_under_it() -> None:
+    # every other layer lacks as much as the one above it has too much
+    scant, even = World((60.0, 60.0)), World((60.0, 60.0))
+    scant.deposit(layered([1.0, *[0.95, 1.05] * 8, 1.0]))
+    even.deposit(layered([1.0, *[0.95, 1.0] * 8, 1.0]))
+    shares = []
+    for world in (scant, even):
+        inside = world.snapshot(world.columns.box_window((21.0, 21.0), (27.0, 27.0)))
+        off_mm = inside.top_mm() - 18 * HEIGHT_MM
+        assert off_mm.mean() == pytest.approx(0.0, abs=0.02)
+        shares.append(inside.thickness_mm(HEIGHT_MM, 17 * HEIGHT_MM).mean() / (16 * HEIGHT_MM))
+    assert shares[0] == pytest.approx(1.0, abs=0.01)
+    assert shares[1] == pytest.approx(0.975, abs=0.005)
+
+
+def test_wandering_flow_leaves_a_stack_at_the_nozzles_height() -> None:
+    world = World((60.0, 60.0))
+    motion = noisy_flow(block((20.03, 20.01), 20, 50), np.random.default_rng(3), load_world().flow)
+    world.deposit(motion)
+    assert world.volume_mm3 == pytest.approx(commanded_mm3(motion), rel=1e-9)
+    inside = world.snapshot(world.columns.box_window((21.0, 21.0), (27.0, 27.0)))
+    assert inside.top_mm().mean() == pytest.approx(50 * HEIGHT_MM, abs=0.05)
+
+
+@pytest.mark.parametrize(("over_mm", "is_planed"), [(0.08, True), (0.4, False)])
+def test_the_nozzles_flat_planes_off_a_ridge_and_takes_it_along(
+    over_mm: float, is_planed: bool
+) -> None:
+    world = World((60.0, 60.0))
+    world.add(m3.Manifold.cube((40, 4, 1.0)).translate((10, 28, 0)))
+    world.add(m3.Manifold.cube((0.25, 0.25, 0.2 + over_mm)).translate((30, 30, 1.0)))
+    before_mm3 = world.volume_mm3
+    laid = strand(world, 20, 40, 1.2)
+    assert world.volume_mm3 - before_mm3 == pytest.approx(laid, rel=1e-9)
+    top_mm = strip(world, 30.0, 2.0).top_mm().max()
+    assert (top_mm < 1.201) if is_planed else (top_mm == pytest.approx(1.2 + over_mm))
 
 
 def test_lone_bead_has_the_section_that_was_pushed() -> None:
