@@ -52,6 +52,7 @@ FILES = ("cura_slicer", "orca_slicer", "plant-sign", "screw")
 PRUSA_PATTERNS = ("rectilinear", "grid", "gyroid", "honeycomb")
 # Cura's lines lie as many line widths apart as its own formulas say for 15 % (fdmprinter.def.json).
 CURA_PATTERNS = {"lines": 2.667, "grid": 5.333, "triangles": 8.0, "gyroid": 2.667}
+MOST_CURL_MM = 0.05  # a quarter of a layer; by the world's parabola ends of 130 mm rise by 0.34
 HERE = Transform.identity("build", "template")
 FILAMENT_MM2 = float(np.pi / 4 * 1.75**2)
 
@@ -169,11 +170,14 @@ def run_job(
     low, high = beads.start_mm[part].min(axis=0), beads.start_mm[part].max(axis=0)
     rng = np.random.default_rng([seed, len(name)])
     centre = (float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2)
+    # a print whose ends have come off the bed is not a clean one
+    far_mm = 0.5 * float(np.hypot(*(high - low)[:2]))
+    curl = min(told.thermal.curl_per_mm, MOST_CURL_MM / far_mm**2)
     world = World(
         (float(max(high[0] + 20, 60)), float(max(high[1] + 20, 60))),
         cell_mm=told.columns_mm,
         bead=told.bead,
-        thermal=told.thermal,
+        thermal=told.thermal.model_copy(update={"curl_per_mm": curl}),
         middle_mm=centre,
     )
     pose = seeded_pose(
