@@ -355,12 +355,16 @@ def send(
     epilog=console.examples(
         "gcode emulate",
         "gcode emulate --firmware klipper --printer voron_2_4 --link /tmp/printer --accelerated",
+        "gcode emulate --faults faults.txt --link /tmp/printer",
     ),
 )
 def emulate(
     firmware: Annotated[str, typer.Option(help="marlin, prusa, klipper or reprap.")] = "marlin",
     printer: PrinterOption = DEFAULT_PRINTER,
-    faults: Annotated[Path | None, typer.Option(help="Fault script.")] = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option(help="Fault script, such as 'every 37 corrupt_in'; one fault a line."),
+    ] = None,
     link: Annotated[Path | None, typer.Option(help="Name for the pseudo-terminal.")] = None,
     accelerated: Annotated[bool, typer.Option(help="Let the printer's clock jump.")] = False,
     motion: Annotated[

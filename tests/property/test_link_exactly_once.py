@@ -45,8 +45,24 @@ UNNUMBERED = (
 ENDING = ("reset", "silent_reset", "thermal_runaway", "dead")
 
 
+OTHERS = (
+    *("G28 X", "G4 P700", "M400", "M105", "M106 S128", "M117 hours", "M109 S40", "M140 S30"),
+    *("G92 E0", "M83", "T0", "G1 X5", "G0 Y7 F3000", "M118 E1 here", "M204 P900", "G2 X9 Y9 I2 J2"),
+)
+
+
 def program(count: int) -> list[str]:
     return [f"G1 X{i % 180} Y{i * 7 % 180} F6000" for i in range(count)]
+
+
+def programs() -> st.SearchStrategy[list[str]]:
+    """Moves, all different, and whatever else programs hold in between."""
+    one = st.sampled_from((None,) * 24 + OTHERS)
+    return st.lists(one, min_size=8, max_size=45).map(
+        lambda drawn: [
+            other or move for other, move in zip(drawn, program(len(drawn)), strict=True)
+        ]
+    )
 
 
 def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
@@ -62,6 +78,7 @@ def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
 
 @settings(max_examples=150)
 @given(
+    lines=programs(),
     faults=fault_scripts(MENDABLE),
     seed=st.integers(0, 99),
     window=st.sampled_from([1, 1, 4]),
@@ -69,9 +86,8 @@ def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
     by_moves=st.booleans(),
 )
 def test_every_command_runs_once_and_in_order(
-    faults: str, seed: int, window: int, advanced: bool, by_moves: bool
+    lines: list[str], faults: str, seed: int, window: int, advanced: bool, by_moves: bool
 ) -> None:
-    lines = program(40)
     talk = Conversation(faults, window=window, seed=seed, advanced_ok=advanced, by_moves=by_moves)
     assert talk.job(lines), talk.lost
     assert talk.program == lines
@@ -79,6 +95,7 @@ def test_every_command_runs_once_and_in_order(
 
 @settings(max_examples=150)
 @given(
+    lines=programs(),
     faults=fault_scripts(MENDABLE),
     end=st.tuples(st.integers(5, 40), st.sampled_from(ENDING)),
     seed=st.integers(0, 99),
@@ -86,9 +103,13 @@ def test_every_command_runs_once_and_in_order(
     by_moves=st.booleans(),
 )
 def test_where_it_cannot_go_on_it_stops_and_names_the_true_interval(
-    faults: str, end: tuple[int, str], seed: int, window: int, by_moves: bool
+    lines: list[str],
+    faults: str,
+    end: tuple[int, str],
+    seed: int,
+    window: int,
+    by_moves: bool,
 ) -> None:
-    lines = program(40)
     script = faults + f"\nline {end[0]} {end[1]}"
     talk = Conversation(script, window=window, seed=seed, by_moves=by_moves)
     done = talk.job(lines)
@@ -104,6 +125,7 @@ def test_where_it_cannot_go_on_it_stops_and_names_the_true_interval(
 
 @settings(max_examples=80)
 @given(
+    lines=programs(),
     faults=fault_scripts(UNNUMBERED),
     end=st.tuples(st.integers(5, 45), st.sampled_from(("lose_ok", *ENDING))),
     firmware=st.sampled_from(["klipper", "reprap"]),
@@ -111,13 +133,19 @@ def test_where_it_cannot_go_on_it_stops_and_names_the_true_interval(
     by_moves=st.booleans(),
 )
 def test_without_numbers_it_stops_and_names_the_true_interval(
-    faults: str, end: tuple[int, str], firmware: str, seed: int, by_moves: bool
+    lines: list[str],
+    faults: str,
+    end: tuple[int, str],
+    firmware: str,
+    seed: int,
+    by_moves: bool,
 ) -> None:
     """Nothing is sent twice: whatever is lost ends the link, between what it says."""
     script = faults + f"\nline {end[0]} {end[1]}"
     talk = Conversation(script, dialect=firmware, firmware=firmware, seed=seed, by_moves=by_moves)
-    done = talk.job(["G28", *program(40)])
-    executed = [line.decode("latin-1") for line in talk.executed if line != b"M105"]  # the hello
+    lines = [line for line in lines if line != "M105"]  # that is the hello of one of them
+    done = talk.job(["G28", *lines])
+    executed = [line.decode("latin-1") for line in talk.executed if line != b"M105"]
     if "corrupt_in" in faults:  # carried out as it came: no firmware of these can tell
         assert len(executed) <= talk.link.last_sent
         return

@@ -17,6 +17,7 @@ import typer
 
 from amrepair.cli.app import app as amrepair_app
 from gcode.cli.app import app as gcode_app
+from gcode.firmware.faults import KINDS
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -63,6 +64,11 @@ def test_python_on_a_page_runs(
         exec(compile(block, str(page), "exec"), names)
     if page.stem == "tutorial":
         assert (example_files / "repair.gcode").is_file()
+
+
+def test_every_fault_of_the_emulated_printer_is_on_its_page() -> None:
+    said = (DOCS / "how-to" / "rehearse-faults.md").read_text(encoding="utf-8")
+    assert dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", said, re.M)) == KINDS
 
 
 def test_every_example_is_on_its_page() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -16,9 +17,7 @@ from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parent))
 from link_forks import ROOT
-from link_helpers import profile
 
-from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts.telemetry import RoundTrips
 from gcode.hosts.wirelog import FLUSH_ENTRIES, WireLog
 
@@ -83,13 +82,23 @@ def test_the_command_line_tells_counters_and_times(tmp_path: Path) -> None:
     lines = ["M190 S60", "M109 S205", "G28", "G90", "M83", "G1 Z5 F600"]
     lines += [f"G1 X{50 + i % 90} Y{60 + i % 7} F6000" for i in range(300)]
     job.write_text("\n".join([*lines, "M104 S0", "M140 S0", ""]))
-    faults = "every 40 corrupt_in\nline 150 garble_ok"
+    faults = tmp_path / "faults.txt"
+    faults.write_text("# a bad cable\nevery 40 corrupt_in\nline 150 garble_ok\n")
     before_s = time.time()
-    with EmulatedPrinterProcess(printer=profile(), faults=faults) as emulator:
-        words = ["send", str(job), "--port", emulator.port, "--printer", "generic_marlin"]
+    program = [sys.executable, "-W", "ignore", "-c", "from gcode.cli import main; main()"]
+    printer = ["--printer", "generic_marlin"]
+    with subprocess.Popen(
+        [*program, "emulate", *printer, "--faults", str(faults), "--accelerated"],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    ) as emulator:
+        assert emulator.stdout is not None
+        port = emulator.stdout.readline().strip()
+        words = ["send", str(job), "--port", port, *printer, "--window", "1"]
         words += ["--wire-log", str(wire), "--json"]
         done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", "from gcode.cli import main; main()", *words],
+            [*program, *words],
             capture_output=True,
             text=True,
             timeout=120,
@@ -97,6 +106,9 @@ def test_the_command_line_tells_counters_and_times(tmp_path: Path) -> None:
             cwd=ROOT,
             env={**os.environ, "XDG_STATE_HOME": str(tmp_path)},
         )
+        emulator.send_signal(signal.SIGINT)
+    assert emulator.returncode == 0
+    assert not Path(port).exists()
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["lines_acked"] == len(lines) + 2
