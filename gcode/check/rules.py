@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass, field
 
-from gcode.check.words import COMMANDS, G90_SETS_E, LINE_LIMIT, PROBES
+from gcode.check.words import COMMANDS, G90_SETS_E, G91_MOVES_E, LINE_LIMIT, PROBES
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 
@@ -279,9 +279,13 @@ class Judge:
         if value is None:
             return 0.0
         value *= self._unit
-        pushed = value - self._e if self._absolute_e else value
+        pushed = value - self._e if self._e_is_absolute else value
         self._e += pushed
         return pushed
+
+    @property
+    def _e_is_absolute(self) -> bool:
+        return self._absolute_e and (self._absolute or self._dialect not in G91_MOVES_E)
 
     def _feed(self, words: dict[str, float | None]) -> None:
         value = words.get("F")

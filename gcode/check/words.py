@@ -34,3 +34,5 @@ PROBES = frozenset({"G29", "G32", "G34", "G80", "G81", "BED_MESH_CALIBRATE", "QU
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
+# Klipper's G91 makes E relative while it lasts, whatever M82 says.
+G91_MOVES_E = frozenset({"klipper"})

@@ -20,6 +20,8 @@ from gcode.units import filament_area_mm2
 
 # G90 and G91 set the extruder's mode too in Marlin alone (printers.md of each firmware's docs).
 _BOTH_MODES = frozenset({"marlin"})
+# In Klipper G91 makes E relative while it lasts, whatever M82 says (gcode_move.py).
+_G91_MOVES_E = frozenset({"klipper"})
 _LAYER_MARKS = ("LAYER_CHANGE", "CHANGE_LAYER", "BEFORE_LAYER_CHANGE")
 _CURA_LAYER = re.compile(r"LAYER:\s*(-?\d+)")
 _NUMBER = r"([-+]?\d*\.?\d+)"
@@ -188,7 +190,8 @@ def read_job(
     states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
     states[0, kernels.S_ACC] = np.nan
     pushed = np.zeros(len(lines))
-    kernels.run(kinds, codes, words, program.dialect in _BOTH_MODES, states, pushed)
+    both, g91 = program.dialect in _BOTH_MODES, program.dialect in _G91_MOVES_E
+    kernels.run(kinds, codes, words, both, g91, states, pushed)
     progress("read", 2.0, READ_STEPS)
     none3, none1, none0 = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
     count = kernels.beads(kinds, codes, words, states, pushed, none3, none3, none1, none0, True)

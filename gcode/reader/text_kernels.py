@@ -96,7 +96,7 @@ def parse(data, starts, letters, codes, kinds, words):
 
 
 @njit(cache=True, nogil=True)
-def run(kinds, codes, words, both_modes, states, pushed):
+def run(kinds, codes, words, both_modes, g91_moves_e, states, pushed):
     """States after every line (row line + 1) and filament pushed by it, mm."""
     offset = np.zeros(3)
     for line in range(len(kinds)):
@@ -118,7 +118,7 @@ def run(kinds, codes, words, both_modes, states, pushed):
                 if not np.isnan(w[F]):
                     now[S_FEED] = w[F] * unit / 60.0
                 if not np.isnan(w[E]):
-                    if now[S_ABS_E] > 0:
+                    if now[S_ABS_E] > 0 and (now[S_ABS] > 0 or not g91_moves_e):
                         pushed[line] = w[E] * unit - now[S_E]
                         now[S_E] = w[E] * unit
                     else:

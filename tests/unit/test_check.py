@@ -14,6 +14,7 @@ from gcode.check import CheckedProgram, CheckReport, check, find_refusals
 from gcode.errors import CheckRefusedError, LocalProtocolError
 from gcode.moves import ModalState, Program
 from gcode.profiles import load_setup
+from gcode.reader import read_job
 from gcode.surfaces import HeightField
 
 SETUP = load_setup()
@@ -196,3 +197,23 @@ def test_real_files_for_this_printer_pass(name: str) -> None:
     path = Path(os.environ["AMREPAIR_DATA"]) / "gcode" / f"{name}.gcode"
     text = path.read_text(errors="replace")
     assert not find_refusals(program(text), SETUP)
+
+
+@pytest.mark.parametrize("dialect", ["klipper", "marlin"])
+def test_the_end_of_a_cura_job_pulls_back_two_millimetres(dialect: str) -> None:
+    """M82, then G91: relative in Klipper and in Marlin; it was read as 1.5 m pulled back."""
+    setup = load_setup("voron_2_4")
+    lines = ["G28", "M104 S210", "M109 S210", "M82", "G92 E0", "G90", "G1 X50 Y50 Z0.3 F3000"]
+    lines += [f"G1 X{50 + 60 * (k % 2)} E{1.5 * (k + 1):.1f} F1200" for k in range(100)]
+    lines += ["G91", "G1 E-2 F2700", "G1 E-1 Z5 F600", "G90", "G1 X10 Y10 F6000", "M104 S0"]
+    job = Program("\n".join(lines) + "\n", dialect)
+    assert find_refusals(job, setup) == ()
+    pushed = read_job(job).moves()[1]
+    assert pushed[-7:].tolist() == pytest.approx([0, -2, -1, 0, 0, 0, 0])
+
+
+def test_elsewhere_g91_leaves_an_absolute_extruder_alone() -> None:
+    lines = ["G28", "M104 S210", "M109 S210", "M82", "G92 E0", "G90", "G1 X50 Y50 Z0.3 F3000"]
+    lines += ["G1 X110 E1.5 F1200", "G91", "G1 E1 F2700", "G90", "M104 S0"]
+    job = Program("\n".join(lines) + "\n", "prusa")
+    assert read_job(job).moves()[1][9] == pytest.approx(-0.5)
