@@ -50,9 +50,10 @@ def bench(
     ] = None,
 ) -> None:
     """Compare methods on a data set."""
-    from amrepair.bench.paper import BENCH_PAPER
-    from amrepair.bench.runner import run_bench
-    from amrepair.template.paper import VARIANTS
+    with console.starting():
+        from amrepair.bench.paper import BENCH_PAPER
+        from amrepair.bench.runner import run_bench
+        from amrepair.template.paper import VARIANTS
 
     recipe = with_settings({"bench": BENCH_PAPER, **VARIANTS}, paper, "--paper")
     bars = console.Bars()
@@ -77,7 +78,8 @@ def synth(
     seed: SeedOption = 0,
 ) -> None:
     """Make a data set with labelled defects from meshes."""
-    from amrepair.bench.synth import synthesize
+    with console.starting():
+        from amrepair.bench.synth import synthesize
 
     bars = console.Bars()
     with bars.shown():

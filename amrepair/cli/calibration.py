@@ -64,7 +64,8 @@ def calibrate_command(
     as_json: JsonOption = False,
 ) -> None:
     """Find where the scanner hangs over the bed, from a printed target or a job's first layers."""
-    from amrepair.cli import calibrating
+    with console.starting():
+        from amrepair.cli import calibrating
 
     if target_gcode is not None:
         calibrating.write_target(target_gcode, (printer, material, process), as_json=as_json)

@@ -67,7 +67,8 @@ def view(
     token: TokenOption = None,
 ) -> None:
     """Show files together in a browser, each with a box to hide it; Ctrl+C ends it."""
-    from amrepair.report.live import LiveView
+    with console.starting():
+        from amrepair.report.live import LiveView
 
     for path in files:
         _refuse(path)

@@ -126,7 +126,8 @@ def loop(
     """Print a job; at chosen layers and at the end scan, repair what is missing, go on."""
     if approve not in (None, *APPROVALS):
         raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
-    from amrepair.cli import running
+    with console.starting():
+        from amrepair.cli import running
 
     running.run(
         job_file,

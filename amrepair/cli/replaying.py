@@ -29,7 +29,8 @@ def replay_command(
     as_json: JsonOption = False,
 ) -> None:
     """Decide again from the recorded scans: exit 0 if all is the same, 1 if something differs."""
-    from amrepair.loop.replay import replay
+    with console.starting():
+        from amrepair.loop.replay import replay
 
     bars = console.Bars()
     with bars.shown():

@@ -95,16 +95,17 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Print a part on an emulated printer, break it, find what is missing and print only that."""
-    import numpy as np
+    with console.starting():
+        import numpy as np
 
-    from amrepair.repair import Stopwatch
-    from amrepair.report import write_report
-    from amrepair.report.folder import RunFolder
-    from amrepair.simulate.defects import DefectKind, parse_defect
-    from amrepair.simulate.parameters import load_world
-    from amrepair.simulate.part_files import bracket_path
-    from amrepair.simulate.run import place_on_bed, prepare_run, simulate_run
-    from gcode.profiles import load_setup
+        from amrepair.repair import Stopwatch
+        from amrepair.report import write_report
+        from amrepair.report.folder import RunFolder
+        from amrepair.simulate.defects import DefectKind, parse_defect
+        from amrepair.simulate.parameters import load_world
+        from amrepair.simulate.part_files import bracket_path
+        from amrepair.simulate.run import place_on_bed, prepare_run, simulate_run
+        from gcode.profiles import load_setup
 
     watch, bars = Stopwatch(), console.Bars()
     defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]

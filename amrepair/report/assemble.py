@@ -13,6 +13,7 @@ from amrepair.loop import LoopReport
 from amrepair.repair import RepairPlan
 from amrepair.report.collect import (
     decision_of,
+    decision_of_plan,
     look_of,
     region_rows,
     solid_mesh,
@@ -55,15 +56,17 @@ def report_of_plan(
         Of `plan_result`.
     """
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    enough = plan_is_enough(plan)
     solid: Any = template.solid()
     return ReportData(
         title=title,
-        outcome=outcome_of(result, within_tolerance=plan_is_enough(plan)),
+        outcome=outcome_of(result, within_tolerance=enough),
         figures=Figures.from_result(result),
         looks=(look_of(plan, "as scanned", printed=False),),
         setup={"scan": scan_name or Path(plan.scan.source).name, **_profiles(setup)},
         expected=solid_mesh(solid.transform(placed.matrix[:3])),
         regions=region_rows(plan),
+        decisions=(decision_of_plan(plan, enough=enough),),
         seconds=result["seconds"],
         provenance=versions(setup),
     )

@@ -28,6 +28,7 @@ from amrepair.report.data import (
     RegionRow,
     SolidMesh,
 )
+from amrepair.report.text import plan_lines
 from gcode.profiles import PrintSetup
 from gcode.slicing.layers import mesh_of
 
@@ -291,6 +292,22 @@ def decision_of(look: LoopLook) -> Decision:
     return Decision(f"{look.stop.label}, z = {look.stop.z_mm:.2f} mm", choice, tuple(reasons))
 
 
+def decision_of_plan(plan: RepairPlan, *, enough: bool) -> Decision:
+    """What a single planned repair comes to, and why."""
+    if plan.checked is None:
+        choice = "nothing to print" if enough else "no repair"
+    else:
+        choice = "print the repair" if enough else "print the repair: it does not fill all"
+    reasons = [_sentence(line) for line in plan_lines(plan)]
+    left = [region for region in plan.deficit.regions if region.label is Label.MISSING]
+    small = len(left) - len(plan.to_fill)
+    if small:
+        reasons.append(f"{small} smaller than is worth a repair, left as it is.")
+    if plan.checked is not None:
+        reasons.append("The program has passed the checker, against what stands there.")
+    return Decision("as scanned", choice, tuple(reasons))
+
+
 def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + "."
 
@@ -300,9 +317,13 @@ def wire_counters(report: LoopReport) -> tuple[Counter, ...]:
     prints = (*report.job_prints, *report.repair_prints)
     slowest_s = max((p.round_trip_s[2] for p in prints), default=0.0)
     return (
-        Counter("lines acknowledged", float(sum(p.lines_acked for p in prints))),
+        Counter(
+            "lines acknowledged",
+            float(sum(p.lines_acked for p in prints)),
+            "each taken by the printer",
+        ),
         Counter("resends", float(sum(p.resends for p in prints)), "lines asked for again"),
         Counter("stalls", float(sum(p.stalls for p in prints)), "silences that had to be probed"),
-        Counter("bytes sent", float(sum(p.bytes_sent for p in prints))),
+        Counter("bytes sent", float(sum(p.bytes_sent for p in prints)), "of the job and repairs"),
         Counter("slowest round trip, ms", 1e3 * slowest_s, "99th percentile"),
     )

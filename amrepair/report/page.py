@@ -334,8 +334,10 @@ def _run(data: ReportData) -> str:
 
 
 def _counted(value: float) -> str:
-    """A counter, whole where it is whole; a dash where nobody knows."""
-    return f"{value:,.10g}" if math.isfinite(value) else _DASH
+    """A counter, whole where it is whole, else to three digits; a dash where nobody knows."""
+    if not math.isfinite(value):
+        return _DASH
+    return f"{value:,.0f}" if value == round(value) else f"{value:.3g}"
 
 
 def _footer(data: ReportData) -> str:

@@ -20,6 +20,7 @@ TIP_PRESS_MM = 0.06
 BODY_PRESS_MM = 0.05
 # The tip lies somewhere in its cell: half of a fine one.
 ASIDE_MM = 0.05
+LEAST_TOLD_MM = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,4 +115,5 @@ class Reach:
                 worst, part = depth, obstacle.part
         if part is None:
             return None
-        return f"the {part.part} would touch what stands beside it by {worst:.1f} mm"
+        by = f"{worst:.1f} mm" if worst >= LEAST_TOLD_MM else f"less than {LEAST_TOLD_MM:g} mm"
+        return f"the {part.part} would touch what stands beside it by {by}"

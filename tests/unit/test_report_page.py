@@ -25,7 +25,8 @@ from amrepair.report import (
     write_report,
 )
 from amrepair.report import document as document_module
-from amrepair.report.collect import look_of
+from amrepair.report.assemble import report_of_plan
+from amrepair.report.collect import look_of, plan_result
 from amrepair.report.document import render_report
 from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
@@ -260,6 +261,23 @@ def test_a_look_of_a_plan_carries_normals_and_outlines(example_files: Path) -> N
     # what is missing is grown back by up to three times the tolerance's 0.2 mm at a rim
     assert low == pytest.approx([123.0, 80.0], abs=0.6)
     assert high == pytest.approx([130.0, 88.0], abs=0.6)
+    # and its page says what is to be done, and why
+    setup = gcode.load_setup()
+    result = plan_result(plan, gcode="r.gcode", seed=0, seconds={}, setup=setup)
+    data = report_of_plan(plan, result, title="r", setup=setup, template=site.template)
+    (decision,) = data.decisions
+    assert decision.choice == "print the repair: it does not fill all"
+    told = " ".join(decision.reasons)
+    assert re.search(r"Missing: \d+\.\d mm³ in 1 region, at X 12\d", told)
+    assert "Out of reach: 1" in told
+    assert "passed the checker" in told
+    assert "Decisions" in "".join(Elements(render_report(data)).visible)
+
+
+def test_counters_are_told_in_figures_that_people_read(data: ReportData) -> None:
+    wire = (Counter("acknowledged", 42483.0), Counter("slowest round trip, ms", 1.098156955))
+    visible = Elements(render_report(replace(data, wire=wire))).visible
+    assert {"42,483", "1.1"} <= set(visible)
 
 
 def test_the_bed_beside_the_part_is_not_drawn_as_excess(example_files: Path) -> None:
