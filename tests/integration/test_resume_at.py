@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
 from link_forks import ROOT, until
 
 from gcode.check import find_refusals
+from gcode.cli import main
 from gcode.errors import CheckRefusedError, GcodeError, InputError, ReadError
 from gcode.firmware import EmulatedPrinterProcess, FirmwareCore
 from gcode.moves import Program
@@ -318,13 +319,20 @@ def test_the_command_line_makes_it_and_prints_it(tmp_path: Path) -> None:
     ],
 )
 def test_bad_calls_end_in_one_sentence_and_write_nothing(
-    words: list[str], said: str, tmp_path: Path
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    job = tmp_path / "job.gcode"
+    job, out = tmp_path / "job.gcode", tmp_path / "out.gcode"
     job.write_text(tower(4.0).text)
-    out = tmp_path / "out.gcode"
-    done = call("resume-at", job, *(str(out) if word == "OUT" else word for word in words))
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    words = [str(out) if word == "OUT" else word for word in words]
+    monkeypatch.setattr(sys, "argv", ["gcode", "resume-at", str(job), *words])
+    with pytest.raises(SystemExit) as end:
+        main()
+    told = capsys.readouterr().err
+    assert end.value.code == 2
+    assert said in told
+    assert len(told.strip().splitlines()) == 1
     assert not out.exists()
