@@ -76,10 +76,11 @@ class Exchange:
         OSError
             If the port fails.
         """
-        if self.window == 1:
-            self._one_by_one(moves)
-        else:
-            self._by_window(moves)
+        with contextlib.suppress(BlockingIOError):  # a safe exit, by another thread
+            if self.window == 1:
+                self._one_by_one(moves)
+            else:
+                self._by_window(moves)
 
     def _one_by_one(self, moves: Sequence[bytes]) -> None:
         fd, clock, asked_to_stop = self.fd, self.clock, self.asked_to_stop
@@ -127,7 +128,10 @@ class Exchange:
 
     def _write(self, data: bytes) -> bool:
         """Write all of `data`; else keep the rest, for those who can wait."""
-        taken = os.write(self.fd, data)
+        try:
+            taken = os.write(self.fd, data)
+        except BlockingIOError:
+            taken = 0
         if taken < len(data):
             self.rest = data[taken:]
             return False

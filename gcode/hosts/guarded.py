@@ -158,14 +158,17 @@ class GuardedConversation(SerialConversation):
         """
         if self._serial is None:
             return
-        with self._mutex:
-            try:
-                if self._comes_to_rest():
-                    self._switch_off()
-                else:
-                    self._go_past()
-            except (LinkError, LocalProtocolError, OSError) as error:
-                self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+        ours = self._mutex.acquire(timeout=REST_S)  # another thread may print
+        try:
+            if ours and self._comes_to_rest():
+                self._switch_off()
+            else:
+                self._go_past()
+        except (LinkError, LocalProtocolError, OSError) as error:
+            self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+        finally:
+            if ours:
+                self._mutex.release()
 
     def _comes_to_rest(self) -> bool:
         """Hear out what is under way, unless that takes minutes; whether nothing is left of it."""
@@ -181,7 +184,9 @@ class GuardedConversation(SerialConversation):
     def _go_past(self) -> None:
         """Make safe by unnumbered lines; nothing of the job is sent after them."""
         lift = not self._link.ended
-        self._link.give_up("the printer was made safe")
+        if lift:
+            self._ended_by = "the printer was made safe"
+            self._link.give_up(self._ended_by)
         self._note(make_safe(self._fd, lift=lift))
 
     def _switch_off(self) -> None:

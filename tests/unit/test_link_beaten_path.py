@@ -34,6 +34,8 @@ class Port:
 
     def write(self, fd: int, data: bytes) -> int:
         taken = self.takes.pop(0) if self.takes else len(data)
+        if taken < 0:
+            raise BlockingIOError
         self.written += data[:taken]
         under_way = self.written.count(b"\n") - self.answered
         self.most_under_way = max(self.most_under_way, under_way)
@@ -81,6 +83,7 @@ def at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Port], Port]:
         (b"", None),  # the port was closed
         (b"ok\n" * 5, b"ok\n" * 5),  # more than is under way
         (None, None),
+        (BlockingIOError(), None),  # another thread has switched the waiting off
     ],
 )
 def test_anything_odd_ends_it_and_is_handed_on(
@@ -102,7 +105,7 @@ def test_a_port_that_fails_leaves_the_count_behind(at: Callable[[Port], Port], w
     assert (len(exchange.sent_s), len(exchange.answered_s)) == (1 + window, 1)
 
 
-@pytest.mark.parametrize("taken", [3, 0])
+@pytest.mark.parametrize("taken", [3, 0, -1])
 def test_what_a_full_port_does_not_take_is_kept(at: Callable[[Port], Port], taken: int) -> None:
     size = len(MOVES[0])
     port = at(Port(b"ok\n", takes=[size, taken]))

@@ -119,6 +119,32 @@ def test_an_abort_while_it_heats_waits_for_no_heater(tmp_path: Path) -> None:
         printer.close()
 
 
+def test_another_threads_job_does_not_hold_up_a_safe_exit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gcode.hosts.guarded.REST_S", 0.2)
+    lines, caught = [*HEAD, *moves(3000)], list[Exception]()
+    with bench(tmp_path, faults="always slow_reader s=0.004") as it:
+        printer = SerialPrinter(it.emulator.port, supervise=False)
+        printer.connect()
+
+        def job() -> None:
+            try:
+                printer.print(program(lines))
+            except LinkLostError as error:
+                caught.append(error)
+
+        thread = threading.Thread(target=job)
+        thread.start()
+        it.once(lines[20], lambda: None).join(10)
+        printer.make_safe()
+        thread.join(20)
+        assert it.targets_c() == (0, 0)
+        assert len([line for line in it.told() if line in lines]) < len(lines)
+        printer.close()
+    assert "the printer was made safe" in str(caught[0])
+
+
 def test_an_emergency_stop_of_a_printer_that_says_nothing_ends_the_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
