@@ -173,6 +173,7 @@ class GuardedConversation(SerialConversation):
     def _comes_to_rest(self) -> bool:
         """Hear out what is under way, unless that takes minutes; whether nothing is left of it."""
         until_s = self._clock() + REST_S
+        self._link.ask_soon(self._clock())  # what was being read when it came is gone
         with contextlib.suppress(LinkError):  # it says what everybody knows: something is wrong
             while not self._link.idle and not self._link.ended and not self._link.slow_under_way:
                 left_s = until_s - self._clock()

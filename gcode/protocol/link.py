@@ -217,6 +217,10 @@ class Link(Recovery):
         if self.idle:
             self._belief.confirm(self._ledger.last)
 
+    def ask_soon(self, now_s: float) -> None:
+        """Ask again in a moment: the caller may have lost an answer itself (an interrupt)."""
+        self._doubt(now_s)
+
     def receive(self, data: bytes, now_s: float) -> list[Event]:
         """Take bytes from the printer and return what they mean; any bytes at all are fine."""
         for raw, readable in self._inbox.take(data):

@@ -20,6 +20,7 @@ import gcode.hosts.serial as serial_host
 from gcode.errors import LinkError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import LinkLostError, supervisor
+from gcode.hosts.beaten_path import waiting
 from gcode.hosts.serial import SerialPrinter
 from gcode.protocol import Link
 from gcode.protocol import events as ev
@@ -117,6 +118,19 @@ def test_an_abort_while_it_heats_waits_for_no_heater(tmp_path: Path) -> None:
         assert it.targets_c() == (0, 0)
         assert "G28" not in it.told()
         printer.close()
+
+
+def test_an_answer_that_an_interrupt_took_away_is_asked_for_again(tmp_path: Path) -> None:
+    # regression: an interrupt between a read and what was to be done with it
+    with bench(tmp_path) as it, SerialPrinter(it.emulator.port, supervise=False) as printer:
+        printer.command("M104 S100")
+        printer._write(printer._link.send("G1 X5", printer._clock()))
+        with waiting(printer._fd):
+            assert os.read(printer._fd, 100) == b"ok\n"
+        printer.make_safe()
+        assert printer.notes[-1].endswith("nozzle lifted")
+        assert it.told()[-5:] == ["G21", "G91", "G1 Z5 F600", "G90", "M105"]
+        assert it.told().count("G1 X5") == 1
 
 
 def test_another_threads_job_does_not_hold_up_a_safe_exit(
