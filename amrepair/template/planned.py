@@ -78,7 +78,8 @@ class PlannedSdf:
         width = section_mm2[near] / np.maximum(height, 1e-6)
         voxel_mm = float(np.clip(np.median(height), LEAST_VOXEL_MM, MOST_VOXEL_MM))
         reach = 0.5 * float(width.max())
-        low = np.minimum(start, end).min(axis=0) - [reach, reach, float(height.max())]
+        low = np.minimum(start, end).min(axis=0) - [reach, reach, 0.0]
+        low[2] = (np.minimum(start[:, 2], end[:, 2]) - height).min()
         high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
         # faces of voxels lie on the last layer's top
         levels = int(np.ceil((top_mm - low[2]) / voxel_mm - 1e-6))

@@ -90,3 +90,16 @@ def test_a_scan_all_around_finds_the_pocket_and_nothing_below_the_bed(depth_mm: 
     guess = small.placed.inverse() @ small.pose
     plan = plan_repair(scan, site, title="pocket", guess=guess, strict=False)
     assert plan.deficit.missing_mm3 == pytest.approx(25.0 * depth_mm, rel=0.05, abs=0.1)
+
+
+def test_a_thick_bead_higher_up_does_not_lower_the_foot() -> None:
+    # regression: OrcaSlicer's beads of two layers' height put the foot a layer into the bed, and
+    # the alignment, which lays the foot on the bed, the part with it
+    x = np.arange(0.0, 4.0, 0.4)
+    low = np.column_stack([x, np.zeros(len(x)), np.full(len(x), 0.2)])
+    start = np.concatenate([low, low + np.array([0.0, 0.0, 0.2]), [[1.0, 1.0, 0.8]]])
+    end = start + np.array([0.0, 4.0, 0.0])
+    height = np.array([0.2] * (len(start) - 1) + [0.4])
+    planned = PlannedSdf.from_beads(start, end, 0.4 * height, height)
+    assert planned.bounds_mm[0, 2] == pytest.approx(0.0, abs=1e-9)
+    assert planned.bounds_mm[1, 2] == pytest.approx(0.8)
