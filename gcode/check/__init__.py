@@ -5,7 +5,7 @@ It shares no code with slicing, writer and reader, so that their mistakes are no
 """
 
 from gcode.check.checker import check, find_refusals
+from gcode.check.findings import Refusal
 from gcode.check.proof import CheckedProgram, CheckReport
-from gcode.check.rules import Refusal
 
 __all__ = ["CheckReport", "CheckedProgram", "Refusal", "check", "find_refusals"]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
+from gcode.check.findings import Refusal, Text
 from gcode.check.proof import CheckedProgram, CheckReport, _prove
-from gcode.check.rules import Judge, Refusal
+from gcode.check.rules import Judge
 from gcode.check.sweep import sweep
 from gcode.check.words import COMMANDS
 from gcode.errors import CheckRefusedError, InputError
@@ -14,7 +15,7 @@ from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.surfaces import HeightField
 
-SAY_EVERY_LINES = 5000  # some hundredths of a second
+SAY_EVERY_LINES = 20_000  # some hundredths of a second
 
 
 def find_refusals(
@@ -85,11 +86,17 @@ def _judge(
     lines = program.text.split("\n")
     top_mm = as_built.top_mm if as_built is not None else None
     judge = Judge(program, setup, top_mm, initial)
-    for number, raw in enumerate(lines, start=1):
-        if number % SAY_EVERY_LINES == 0:
-            progress("check", float(number), float(len(lines)))
-        judge.read(number, raw)
-    judge.end()
+    text = Text.of(program.text)
+    number, said = 1, 0
+    while number <= len(lines):
+        number = judge.follow(text, number, min(len(lines), said + SAY_EVERY_LINES) + 1)
+        if number - said > SAY_EVERY_LINES:
+            progress("check", float(number - 1), float(len(lines)))
+            said = number - 1
+        elif number <= len(lines):
+            judge.read(number, lines[number - 1])
+            number += 1
+    judge.end(len(lines), lines[-1])
     progress("check", float(len(lines)), float(len(lines)))
     refusals, clearance_mm = list(judge.refusals), math.inf
     if as_built is not None:
@@ -100,7 +107,7 @@ def _judge(
     refusals.sort(key=lambda refusal: refusal.line)
     report = CheckReport(
         commands=judge.commands,
-        moves=len(judge.moves.line),
+        moves=judge.moves.count,
         swept=as_built is not None,
         least_clearance_mm=clearance_mm if math.isfinite(clearance_mm) else None,
     )

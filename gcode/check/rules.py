@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
 
+import numpy as np
+from jaxtyping import Float
+
+from gcode.check import plain_kernels as plain
+from gcode.check.findings import Moves, Refusal, Text
 from gcode.check.words import COMMANDS, G90_SETS_E, G91_MOVES_E, LINE_LIMIT, PROBES
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
@@ -18,51 +22,12 @@ FLOW_SLACK = 1.05
 PLACE_SLACK_MM = 0.011
 FASTEST_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
 INCH_MM = 25.4
-MOST_SHOWN = 60  # characters of a line in a message
 HEATER_COMMANDS = {"M104": "hotend", "M109": "hotend", "M140": "bed", "M190": "bed"}
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
 _HEAD = re.compile(r"(?:N\d+\s*)?([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
 _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
 _MACHINE_LIMITS = {"M201": "max_acceleration_mm_s2", "M203": "max_speed_mm_s"}
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """One reason why a program must not be printed.
-
-    Attributes
-    ----------
-    line
-        Line of the text, counted from 1.
-    text
-        That line.
-    what
-        What is wrong.
-    value, limit
-        As text with units.
-    """
-
-    line: int
-    text: str
-    what: str
-    value: str
-    limit: str
-
-    def __str__(self) -> str:
-        text = self.text.strip()
-        shown = text if len(text) <= MOST_SHOWN else text[: MOST_SHOWN - 1] + "…"
-        return f"line {self.line} ({shown!r}): {self.what}: {self.value}, limit {self.limit}"
-
-
-@dataclass(slots=True)
-class Moves:
-    """Moves with known ends, for the sweep."""
-
-    line: list[int] = field(default_factory=list)
-    start: list[tuple[float, float, float]] = field(default_factory=list)
-    end: list[tuple[float, float, float]] = field(default_factory=list)
-    pushed_mm3: list[float] = field(default_factory=list)
 
 
 class Judge:
@@ -106,8 +71,18 @@ class Judge:
         self._ready_c = self._hotend_c  # what the hotend was waited for
         self._bed_c = state.bed_c if state else 0.0
         self._pulled_mm = 0.0
-        self._short_mm = self._short_mm3 = 0.0
+        self._short_mm3 = 0.0
         self._line, self._text = 0, ""
+        printer = setup.printer
+        x0, y0, x1, y1 = printer.reach_box_mm
+        low = (x0 - PLACE_SLACK_MM, y0 - PLACE_SLACK_MM, -PLACE_SLACK_MM)
+        high = (x1 + PLACE_SLACK_MM, y1 + PLACE_SLACK_MM, printer.max_z_mm + PLACE_SLACK_MM)
+        self._limits_of_moves = (
+            *low, *high, FASTEST_MM_S, self._area_mm2, SHORT_MM,
+            SECTION_SLACK * printer.max_bead_section_mm2,
+            FLOW_SLACK * setup.max_volumetric_mm3_s,
+            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect],
+        )  # fmt: skip
 
     # ------------------------------------------------------------------ one line
 
@@ -139,8 +114,37 @@ class Judge:
         if words is not None:
             self._act(name, words)
 
-    def end(self) -> None:
-        """Judge what the program leaves behind."""
+    def follow(self, text: Text, first: int, end: int) -> int:
+        """Judge plain moves among the lines first to end - 1; returns the first other line.
+
+        What `read` would refuse is left to it, so that both say the same.
+        """
+        if None in self._place or not all(self._homed):
+            return first
+        state = self._state()
+        counts = np.array([0, self.moves.count])
+        rows = self.moves.with_room_for(end - first)
+        at = plain.follow(
+            text.data, text.starts, first - 1, end - 1, self._plain_limits(), state, rows, counts
+        )
+        self.commands += int(counts[0])
+        self.moves.count = int(counts[1])
+        x, y, z, self._e, self._feed_mm_s, self._pulled_mm, self._short_mm3 = state[:7].tolist()
+        self._place = [x, y, z]
+        return int(at) + 1
+
+    def _state(self) -> Float[np.ndarray, " n"]:
+        modes = (self._absolute, self._e_is_absolute, self._unit)
+        used = (self._e, self._feed_mm_s, self._pulled_mm, self._short_mm3)
+        return np.array([*self._place, *used, *modes], dtype=np.float64)
+
+    def _plain_limits(self) -> Float[np.ndarray, " n"]:
+        cold = self._ready_c < self._setup.printer.min_extrude_c
+        return np.array([*self._limits_of_moves, cold], dtype=np.float64)
+
+    def end(self, number: int, raw: str) -> None:
+        """Judge what the program leaves behind after its last line."""
+        self._line, self._text = number, raw
         if not self._alone:
             return
         for what, value_c in (("hotend", self._hotend_c), ("bed", self._bed_c)):
@@ -357,10 +361,7 @@ class Judge:
             end = (float(target[0] or 0), float(target[1] or 0), float(target[2] or 0))
             length_mm = math.dist(start, end)
             if length_mm > 0:
-                self.moves.line.append(self._line)
-                self.moves.start.append(start)
-                self.moves.end.append(end)
-                self.moves.pushed_mm3.append(max(pushed_mm, 0.0) * self._area_mm2)
+                self.moves.add(self._line, start, end, max(pushed_mm, 0.0) * self._area_mm2)
         elif moved and self._standing_top_mm is not None and pushed_mm <= 0:
             z = target[2]
             if z is not None and z < self._standing_top_mm:
@@ -390,9 +391,9 @@ class Judge:
             )  # fmt: skip
             self._ready_c = math.inf  # said once
         if length_mm <= SHORT_MM:
-            self._short(pushed_mm, length_mm)
+            self._short(pushed_mm)
             return
-        self._short_mm = self._short_mm3 = 0.0
+        self._short_mm3 = 0.0
         if pushed_mm < 0:
             self._pull(pushed_mm)
             return
@@ -408,15 +409,14 @@ class Judge:
         if flow > FLOW_SLACK * limit:
             self._refuse("melts more than the hotend can", f"{flow:.1f} mm³/s", f"{limit:g} mm³/s")
 
-    def _short(self, pushed_mm: float, length_mm: float) -> None:
-        """Standing, or nearly so: lengths add up until the nozzle has moved on."""
+    def _short(self, pushed_mm: float) -> None:
+        """Standing, or nearly so: plastic adds up until the nozzle has moved on."""
         printer = self._setup.printer
         if pushed_mm < 0:
             self._pull(pushed_mm)
             return
         back_mm = min(pushed_mm, self._pulled_mm)
         self._pulled_mm -= back_mm
-        self._short_mm += length_mm
         self._short_mm3 += (pushed_mm - back_mm) * self._area_mm2
         allowed_mm3 = printer.max_extrude_only_mm * self._area_mm2
         if self._short_mm3 > allowed_mm3:

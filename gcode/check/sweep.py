@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gcode.check import sweep_kernels as kernels
-from gcode.check.rules import Moves, Refusal
+from gcode.check.findings import Moves, Refusal
 from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
 from gcode.surfaces.heightfield import footprint_rows
@@ -33,16 +33,16 @@ def sweep(
     moves: Moves, lines: list[str], printer: PrinterProfile, as_built: HeightField
 ) -> tuple[list[Refusal], float]:
     """Refusals for every move that touches, and the least clearance of the body."""
-    if not moves.line or not as_built.z_mm.size:
+    if not moves.count or not as_built.z_mm.size:
         return [], np.inf
-    start, end = np.array(moves.start), np.array(moves.end)
+    start, end, line = moves.start_mm, moves.end_mm, moves.line
     lowest_mm = float(min(start[:, 2].min(), end[:, 2].min()))
     tallest_mm = max(as_built.top_mm, float(end[:, 2].max()))
     # what stays above everything when the tip is lowest cannot touch
     slices = [p for p in printer.envelope if p.z_from_mm <= tallest_mm - lowest_mm]
     if not slices:
         return [], np.inf
-    pushed = np.array(moves.pushed_mm3)
+    pushed = moves.pushed_mm3
     length = np.linalg.norm(end - start, axis=1)
     width = np.clip(pushed / np.maximum(length, 1e-9) / 0.2, 0.0, 2 * printer.nozzle_diameter_mm)
     worst = np.full(len(start), -np.inf)
@@ -69,8 +69,8 @@ def sweep(
         slack = TIP_SLACK_MM if part.z_from_mm < 1e-9 else BODY_SLACK_MM
         refusals.append(
             Refusal(
-                moves.line[k],
-                lines[moves.line[k] - 1],
+                int(line[k]),
+                lines[int(line[k]) - 1],
                 f"the {part.part} ({part.z_from_mm:g} mm above the tip) hits what stands there",
                 f"{worst[k] + slack:.2f} mm deep",
                 f"{slack:g} mm",

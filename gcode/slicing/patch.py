@@ -22,6 +22,7 @@ from gcode.slicing.job import Unprintable
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch_laying import begin, emit, end
 from gcode.slicing.patch_model import PatchModel
+from gcode.slicing.patch_order import stages_of
 from gcode.slicing.patch_passes import AGREE_MM, LEAST_THICK_MM, NOT_LISTED_MM3, plan_passes
 from gcode.surfaces import HeightField
 
@@ -124,11 +125,12 @@ def slice_patch(
         raise SliceError("A patch in mid-job needs the place where the nozzle is parked.")
     model = PatchModel(deficit, setup, as_built)
     passes = plan_passes(model, grid, setup, progress)
-    pen = begin(setup, model.field, start_mm)
+    pen = begin(setup, as_built, start_mm)
     laid_mm3 = 0.0
-    for one in passes:
-        laid_mm3 += emit(pen, one, model, setup)
-    end(pen, setup, model.field, start_mm)
+    for stage in stages_of(passes, model, pen.position_mm[:2]):
+        for one in stage.passes:
+            laid_mm3 += emit(pen, one, stage.reach, setup)
+    end(pen, setup, as_built, start_mm)
     unreachable, regions = _left_over(model)
     return PatchPlan(
         toolpath=Toolpath(tuple(pen.moves) if laid_mm3 > 0 else ()),

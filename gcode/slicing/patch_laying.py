@@ -17,9 +17,10 @@ from gcode.moves import (
 )
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import width_of
-from gcode.slicing.patch_model import NEAR_MM, PatchModel
+from gcode.slicing.patch_model import NEAR_MM
 from gcode.slicing.patch_passes import Chain, Pass, surely_free
 from gcode.slicing.pen import Pen
+from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 
 CLEAR_MM = 0.5  # of the tip over everything on a travel
@@ -83,7 +84,7 @@ def end(
     pen.add(SetFan(0.0))
 
 
-def emit(pen: Pen, one: Pass, model: PatchModel, setup: PrintSetup) -> float:
+def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
     """Lay one pass; returns its plastic."""
     pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
     laid_mm3 = 0.0
@@ -91,13 +92,13 @@ def emit(pen: Pen, one: Pass, model: PatchModel, setup: PrintSetup) -> float:
         target = np.array([*chain.xy_mm[0], one.z_mm])
         gap = target - pen.position_mm
         near = abs(gap[2]) < 1e-6 and float(np.hypot(gap[0], gap[1])) < NEAR_MM
-        samples = 2 + int(np.ceil(3 * np.hypot(gap[0], gap[1]) / model.reach.field.cell_mm))
+        samples = 2 + int(np.ceil(3 * np.hypot(gap[0], gap[1]) / reach.field.cell_mm))
         way = pen.position_mm[:2] + np.linspace(0.0, 1.0, samples)[:, None] * gap[:2]
-        if near and surely_free(way, one.reach, model).all():
+        if near and surely_free(way, one.reach, reach).all():
             pen.move_to(target)
         else:
-            # nothing that was laid stands higher than this pass
-            over_mm = max(model.reach.least_over(way), one.z_mm) + CLEAR_MM
+            # what this stage has laid stands no higher than this pass
+            over_mm = max(reach.least_over(way), one.z_mm) + CLEAR_MM
             pen.hop_to(target, over_mm=min(over_mm, setup.printer.max_z_mm))
         lengths = np.hypot(*np.diff(chain.xy_mm, axis=0).T)
         width_mm = float(chain.section_mm2.mean()) / one.height_mm

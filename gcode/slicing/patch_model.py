@@ -62,15 +62,18 @@ class PatchModel:
         self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
         self.lost: list[Unprintable] = []
         self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
-        window = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
+        self._printer = setup.printer
+        self._window_mm = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
+        self.reach = self._reach(as_built)
+
+    def reach_over(self, finished: Bool[np.ndarray, "ny nx"]) -> Reach:
+        """Where the nozzle may be once the columns asked for are filled as planned."""
+        return self._reach(self.surface(finished))
+
+    def _reach(self, field: HeightField) -> Reach:
         # the lowest pass lies at most one thick bead above the deficit's floor
-        self.reach = Reach(
-            as_built,
-            setup.printer,
-            lowest_tip_mm=max(0.0, float(self.box[2])),
-            window_mm=window,
-        )
-        self.field = as_built
+        lowest_mm = max(0.0, float(self.box[2]))
+        return Reach(field, self._printer, lowest_tip_mm=lowest_mm, window_mm=self._window_mm)
 
     def _centres(self) -> Float[np.ndarray, "n 2"]:
         ny, nx = self.shape
@@ -91,11 +94,12 @@ class PatchModel:
         """Columns over which the nozzle may be, from an answer of `reach`."""
         return self.reach.free_at_points(self.points_mm, reach).reshape(self.shape)
 
-    def surface(self) -> HeightField:
-        """The as-built field with the patch on it."""
+    def surface(self, finished: Bool[np.ndarray, "ny nx"] | bool = True) -> HeightField:
+        """The as-built field with the patch on it, or with what of it is finished."""
         cells = self.as_built.cells_of(self.points_mm)
         ny, nx = self.as_built.shape
-        ok = ((cells >= 0) & (cells < (ny, nx))).all(axis=1) & (self.laid_mm.ravel() > 0)
+        laid = (self.laid_mm > 0) & finished
+        ok = ((cells >= 0) & (cells < (ny, nx))).all(axis=1) & laid.ravel()
         z_mm = self.as_built.z_mm.astype(np.float64).copy()
         np.maximum.at(z_mm, (cells[ok, 0], cells[ok, 1]), self.surface_mm.ravel()[ok])
         return self.as_built.raised(z_mm)

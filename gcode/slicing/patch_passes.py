@@ -21,6 +21,7 @@ from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES, Unprintable
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.medial import fill_thin
 from gcode.slicing.patch_model import PatchModel
+from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
 
 # Thinner than this no bead holds together; it is filled with the next pass, or is the tolerance.
@@ -234,7 +235,7 @@ def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: PatchModel) 
     # closer than the checker's own steps of half a cell
     share = np.linspace(0.0, 1.0, closer)[:, None, None]
     between = points[:-1] + (points[1:] - points[:-1]) * share
-    ok = surely_free(between.reshape(-1, 2), reach, model).reshape(closer, -1).all(axis=0)
+    ok = surely_free(between.reshape(-1, 2), reach, model.reach).reshape(closer, -1).all(axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
     pieces_mm = (lengths / count)[owner]
     return [
@@ -259,12 +260,12 @@ def _begun_inside(run: Bead, model: PatchModel) -> Bead:
 
 
 def surely_free(
-    points_mm: Float[np.ndarray, "n 2"], reach: Bool[np.ndarray, "_ry _rx"], model: PatchModel
+    points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "_ry _rx"], reach: Reach
 ) -> Bool[np.ndarray, " n"]:
     """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
     little = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     near = (points_mm + little[:, None, :]).reshape(-1, 2)
-    return np.asarray(model.reach.free_at_points(near, reach).reshape(4, -1).all(axis=0))
+    return np.asarray(reach.free_at_points(near, free).reshape(4, -1).all(axis=0))
 
 
 def _weighed(

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import manifold3d as m3
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from amrepair.simulate.columns import IntervalMap
 from amrepair.simulate.world import World
@@ -22,6 +26,7 @@ SETUP = load_setup()
 TOP_MM = 4.0
 BLOCK = m3.Manifold.cube((30.0, 30.0, TOP_MM)).translate((60.0, 60.0, 0.0))
 PARK = (10.0, 200.0, 20.0)
+HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
 AREA_MM2 = np.pi / 4 * 1.75**2
 
 
@@ -121,9 +126,8 @@ def test_the_plastic_is_the_missing_volume(name: str) -> None:
 @pytest.mark.parametrize("name", POCKETS)
 def test_a_patch_passes_the_checker(name: str) -> None:
     plan, field = plan_of(POCKETS[name])
-    state = ModalState(PARK, 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
-    program = write(plan.toolpath, SETUP, title="patch", resume=state, restore=False)
-    assert not find_refusals(program, SETUP, as_built=field, initial=state)
+    program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
 
 
 def test_no_bead_lies_outside_the_deficit_nor_above_it() -> None:
@@ -305,3 +309,50 @@ def test_seams_lie_beside_old_material() -> None:
         for loop in loops:
             along = loop[:, :2] @ np.array(outward)
             assert along[0] < along.max() - 1.0
+
+
+def stops_of(plan: PatchPlan) -> list[tuple[float, float]]:
+    """(x, z) of every bead's first point, in order."""
+    return [
+        (float(move.points_mm[0, 0]), float(move.points_mm[0, 2]))
+        for move in plan.toolpath
+        if isinstance(move, Extrude)
+    ]
+
+
+def test_regions_that_lie_apart_are_laid_one_after_the_other() -> None:
+    low = m3.Manifold.cube((5.0, 9.0, 1.0)).translate((63.0, 70.0, TOP_MM - 1.0))
+    far = m3.Manifold.cube((5.0, 9.0, 1.0)).translate((82.0, 70.0, TOP_MM - 1.0))
+    plan, field = plan_of(low + far)
+    left = [x < 75.0 for x, _ in stops_of(plan)]
+    assert sum(a != b for a, b in itertools.pairwise(left)) == 1
+    assert {z for x, z in stops_of(plan) if x < 75} == {z for x, z in stops_of(plan) if x > 75}
+    program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
+
+
+def test_a_region_that_would_stand_in_the_way_grows_together_with_its_neighbour() -> None:
+    # towers of 6 mm side by side: beside a finished one, the cone cannot get down
+    towers = [m3.Manifold.cube((5.0, 9.0, 6.0)).translate((x, 70.0, TOP_MM)) for x in (68.0, 75.5)]
+    plan, field = plan_of(towers[0] + towers[1], BLOCK + towers[0] + towers[1])
+    heights = [z for _, z in stops_of(plan)]
+    assert heights == sorted(heights)
+    assert len({x > 74.0 for x, _ in stops_of(plan)}) == 2
+    program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
+    assert plan.reachable_mm3 >= 0.95 * (towers[0] + towers[1]).volume()
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=8)
+def test_whatever_the_order_nothing_is_hit_and_nothing_is_left_out(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    missing = m3.Manifold()
+    for _ in range(int(rng.integers(2, 5))):
+        size = (*rng.uniform(2.5, 7.0, 2), float(rng.uniform(0.6, 3.0)))
+        x, y = rng.uniform(61.0, 82.0, 2)
+        missing += m3.Manifold.cube(size).translate((x, y, TOP_MM - rng.uniform(0.0, size[2])))
+    plan, field = plan_of(missing, BLOCK + missing)
+    program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
+    assert plan.beads_mm3 == pytest.approx(plan.reachable_mm3, rel=0.08)

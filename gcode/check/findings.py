@@ -1,0 +1,99 @@
+"""What the checker reads and what it finds: the text, its moves, and refusals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+MOST_SHOWN = 60  # characters of a line in a message
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """One reason why a program must not be printed.
+
+    Attributes
+    ----------
+    line
+        Line of the text, counted from 1.
+    text
+        That line.
+    what
+        What is wrong.
+    value, limit
+        As text with units.
+    """
+
+    line: int
+    text: str
+    what: str
+    value: str
+    limit: str
+
+    def __str__(self) -> str:
+        text = self.text.strip()
+        shown = text if len(text) <= MOST_SHOWN else text[: MOST_SHOWN - 1] + "…"
+        return f"line {self.line} ({shown!r}): {self.what}: {self.value}, limit {self.limit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A program's bytes, and where its lines begin: one place more than there are lines."""
+
+    data: UInt8[np.ndarray, " bytes"]
+    starts: Int[np.ndarray, " lines"]
+
+    @classmethod
+    def of(cls, text: str) -> Text:
+        """Lines as `split("\\n")` makes them."""
+        data = np.frombuffer(text.encode(errors="replace") + b"\n", dtype=np.uint8)
+        return cls(data, np.concatenate([[0], np.flatnonzero(data == ord("\n")) + 1]))
+
+
+class Moves:
+    """Moves with known ends, for the sweep; rows of line, start, end and plastic."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._rows = np.empty((1024, 8))
+
+    def with_room_for(self, more: int) -> Float[np.ndarray, "_rows 8"]:
+        """The table, with rows to spare after the first `count`."""
+        if self.count + more > len(self._rows):
+            grown = np.empty((max(2 * len(self._rows), self.count + more), 8))
+            grown[: self.count] = self._rows[: self.count]
+            self._rows = grown
+        return self._rows
+
+    def add(
+        self,
+        line: int,
+        start_mm: tuple[float, float, float],
+        end_mm: tuple[float, float, float],
+        pushed_mm3: float,
+    ) -> None:
+        """One more."""
+        self.with_room_for(1)[self.count] = (line, *start_mm, *end_mm, pushed_mm3)
+        self.count += 1
+
+    @property
+    def line(self) -> Int[np.ndarray, " n"]:
+        """(n,) line of each, counted from 1."""
+        return self._rows[: self.count, 0].astype(np.int64)
+
+    @property
+    def start_mm(self) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) where each begins."""
+        return np.ascontiguousarray(self._rows[: self.count, 1:4])
+
+    @property
+    def end_mm(self) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) where each ends."""
+        return np.ascontiguousarray(self._rows[: self.count, 4:7])
+
+    @property
+    def pushed_mm3(self) -> Float[np.ndarray, " n"]:
+        """(n,) plastic laid on each."""
+        return self._rows[: self.count, 7].copy()

@@ -1,0 +1,127 @@
+"""In which order a patch is laid: region by region where the nozzle allows, floor up in each.
+
+A region that is finished stands in the way of the next ones. One of which the nozzle could then not
+lay every bead is laid together with those that hinder it, pass by pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from gcode.slicing.patch_model import NEAR_MM, PatchModel
+from gcode.slicing.patch_passes import Chain, Pass, surely_free
+from gcode.slicing.reach import Reach
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """Passes laid one after the other, and where the nozzle may be meanwhile."""
+
+    passes: tuple[Pass, ...]
+    reach: Reach
+
+
+def stages_of(
+    passes: list[Pass], model: PatchModel, start_mm: Float[np.ndarray, " 2"]
+) -> list[Stage]:
+    """Split passes into stages, the regions' lowest tops first, and then what is nearest.
+
+    Parameters
+    ----------
+    start_mm
+        (2,) where the nozzle comes from.
+    """
+    label = _regions(model)
+    regions = _by_region(passes, label, model)
+    if len(regions) <= 1:
+        return [Stage(tuple(passes), model.reach)] if passes else []
+    groups: list[set[int]] = []
+    fields: list[Reach] = [model.reach]  # before each group
+    for region in _sorted(regions, start_mm):
+        # back to the last group after which it can be laid by itself
+        at = len(groups)
+        while at > 0 and not _all_free(regions[region], fields[at]):
+            at -= 1
+        groups[at:] = [set().union({region}, *groups[at:])]
+        done = set().union(*groups)
+        fields[at + 1 :] = [model.reach_over(np.isin(label, list(done)))]
+    return [
+        Stage(_of_regions(passes, group, regions, reach), reach)
+        for group, reach in zip(groups, fields[:-1], strict=True)
+    ]
+
+
+def _regions(model: PatchModel) -> Int[np.ndarray, "ny nx"]:
+    """Which connected region columns belong to, from 1; those close together are one."""
+    near = ndimage.distance_transform_edt(model.laid_mm <= 0) * model.cell_mm <= 0.5 * NEAR_MM
+    return np.asarray(ndimage.label(near)[0], dtype=np.int64)
+
+
+def _by_region(
+    passes: list[Pass], label: Int[np.ndarray, "ny nx"], model: PatchModel
+) -> dict[int, list[tuple[Pass, Chain]]]:
+    found: dict[int, list[tuple[Pass, Chain]]] = {}
+    for one in passes:
+        for chain in one.chains:
+            middle = chain.xy_mm[len(chain.xy_mm) // 2]
+            ix, iy = np.floor((middle - model.origin_mm) / model.cell_mm).astype(np.int64)
+            found.setdefault(int(label[iy, ix]), []).append((one, chain))
+    return found
+
+
+def _sorted(
+    regions: dict[int, list[tuple[Pass, Chain]]], start_mm: Float[np.ndarray, " 2"]
+) -> list[int]:
+    """By the height of their last pass; where that is the same, nearest next."""
+    tops = {k: round(max(one.z_mm for one, _ in laid), 2) for k, laid in regions.items()}
+    places = {k: laid[0][1].xy_mm[0] for k, laid in regions.items()}
+    here, out = np.asarray(start_mm, dtype=np.float64), []
+    left = set(regions)
+    while left:
+        lowest = min(tops[k] for k in left)
+        level = (k for k in sorted(left) if tops[k] == lowest)
+        chosen = min(level, key=lambda k: float(np.hypot(*(places[k] - here))))
+        left.remove(chosen)
+        out.append(chosen)
+        here = regions[chosen][-1][1].xy_mm[-1]
+    return out
+
+
+def _all_free(laid: list[tuple[Pass, Chain]], reach: Reach) -> bool:
+    """Whether the nozzle may be all along every bead."""
+    free: dict[float, Bool[np.ndarray, "ny nx"]] = {}
+    for one, chain in laid:
+        if one.z_mm not in free:
+            free[one.z_mm] = reach.at(one.z_mm)
+        if not surely_free(_along(chain, reach), free[one.z_mm], reach).all():
+            return False
+    return True
+
+
+def _along(chain: Chain, reach: Reach) -> Float[np.ndarray, "n 2"]:
+    """Points along a chain, closer than half a cell."""
+    steps = np.diff(chain.xy_mm, axis=0)
+    count = 1 + np.ceil(3 * np.hypot(*steps.T) / reach.field.cell_mm).astype(np.int64)
+    owner = np.repeat(np.arange(len(steps)), count)
+    share = (np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)) / count[owner]
+    points = chain.xy_mm[owner] + steps[owner] * share[:, None]
+    return np.concatenate([points, chain.xy_mm[-1:]])
+
+
+def _of_regions(
+    passes: list[Pass],
+    group: set[int],
+    regions: dict[int, list[tuple[Pass, Chain]]],
+    reach: Reach,
+) -> tuple[Pass, ...]:
+    own = {id(chain) for region in group for _, chain in regions[region]}
+    out = []
+    for one in passes:
+        chains = tuple(chain for chain in one.chains if id(chain) in own)
+        if chains:
+            out.append(replace(one, chains=chains, reach=reach.at(one.z_mm)))
+    return tuple(out)
