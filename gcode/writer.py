@@ -177,16 +177,35 @@ class _Text:
         self._tag("HEIGHT", number(move.height_mm, 3))
         lengths_mm = np.linalg.norm(np.diff(points, axis=0), axis=1)
         filament_mm = lengths_mm * move.section_mm2 * self._e_per_mm3
-        owed_mm = 0.0
-        for point, pushed_mm in zip(points[1:], filament_mm, strict=True):
-            words = self._place_words(point)
-            if not words:  # shorter than what is written: its plastic goes with the next
-                owed_mm += float(pushed_mm)
-                continue
-            e_word = self._e_word(float(pushed_mm) + owed_mm)
-            owed_mm = 0.0
-            self.lines.append("G1" + words + e_word + self._feed_word(move.speed_mm_s))
-        self._owed_mm += owed_mm
+        feed = self._feed_word(move.speed_mm_s)
+        # in steps of what is written; what is shorter goes with the next
+        places = np.rint(np.concatenate([[self._place], points[1:]]) * 10**XYZ_DIGITS)
+        moved = places[1:] != places[:-1]
+        going = moved.any(axis=1)
+        pushed_mm = self._owed_mm + np.concatenate([[0.0], np.cumsum(filament_mm)[going]])
+        pushed = np.rint(pushed_mm * 10**E_DIGITS)
+        pushed[0] = 0.0
+        self._owed_mm += float(filament_mm.sum()) - float(pushed[-1]) / 10**E_DIGITS
+        for (x, y, z), (to_x, to_y, to_z), e in zip(
+            (places[1:] / 10**XYZ_DIGITS + 0.0)[going].tolist(),  # no minus zero
+            moved[going].tolist(),
+            (np.diff(pushed) / 10**E_DIGITS).tolist(),
+            strict=True,
+        ):
+            line = "G1"
+            if to_x:
+                line += f" X{x!r}".removesuffix(".0")
+            if to_y:
+                line += f" Y{y!r}".removesuffix(".0")
+            if to_z:
+                line += f" Z{z!r}".removesuffix(".0")
+            if e:
+                line += f" E{number(e, E_DIGITS)}"
+            self.lines.append(line + feed)
+            feed = ""
+        self._place = (places[-1] / 10**XYZ_DIGITS).tolist()
+        if feed:  # nothing went: the next one says it
+            self._feed_mm_min = None
 
     def _tag(self, name: str, value: str) -> None:
         if self._tags.get(name) != value:
