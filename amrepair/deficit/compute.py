@@ -13,7 +13,8 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from amrepair.deficit.heights import as_built_heights, standing_heights
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
@@ -337,7 +338,35 @@ def _solid_in_box(
         core[found[labels[nearest] != int(label)]] = False
     grow_mm = GROW_FACTOR * tau_mm + float(box.step_mm.max())
     reach = box.distance_to(core.reshape(box.shape)) - grow_mm
-    return solid_from_field(box, np.maximum(clip.reshape(box.shape), np.minimum(reach, 10.0)))
+    shaped = clip.reshape(box.shape)
+    field = np.maximum(shaped, np.minimum(reach, 10.0))
+    if label is Label.MISSING:
+        field = np.where(
+            _hangs_free(f.reshape(box.shape) < 0, shaped < 0, field < 0), shaped, field
+        )
+    return solid_from_field(box, field)
+
+
+def _hangs_free(
+    wanted: Bool[np.ndarray, "x y z"],
+    may_be_gone: Bool[np.ndarray, "x y z"],
+    gone: Bool[np.ndarray, "x y z"],
+) -> Bool[np.ndarray, "x y z"]:
+    """What is left between what is gone and the air, with nothing that was seen to hold it.
+
+    The roof of a hollow, an edge: thinner than what the erosion leaves, so no growing gets there.
+    """
+    groups, count = ndimage.label(wanted & ~gone)
+    if count == 0:
+        return np.zeros_like(gone)
+    held = np.bincount(groups[~may_be_gone], minlength=count + 1) > 0
+    beside = np.bincount(groups[ndimage.binary_dilation(gone)], minlength=count + 1) > 0
+    for axis in range(3):
+        for end in (0, -1):
+            held[np.unique(groups.take(end, axis=axis))] = True  # it goes on beyond the box
+    loose = beside & ~held
+    loose[0] = False
+    return np.asarray(loose[groups])
 
 
 def _limits(

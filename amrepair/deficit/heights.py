@@ -35,10 +35,13 @@ BY_WALL_CELLS = 2.5
 # The scan may stand out this much before it overrules the solids: their tolerance, and noise.
 TRUST_MM = 0.3
 NOISE_MM = 0.1
+# What a cell with a single point may be off: of some thousand under the head one is so far.
+CHANCE_MM = 0.2
+STEEP_MM = 1.0  # between the highest and the lowest beside a wall
 # Two layers: thinner material over a void is the solids' own rounding at its rim.
 FILM_MM = 0.4
 LEAST_FILM_MM = 0.1  # that the scan can tell from nothing
-FIN_CELLS = 2
+FIN_CELLS, UNSEEN_FIN_CELLS = 2, 4
 CHANCE_CELLS = 5
 
 
@@ -130,6 +133,10 @@ def standing_heights(
     # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
     beside = ~ndimage.binary_erosion(untouched, np.ones((3, 3)), border_value=1)
     z_mm = np.where(beside, ndimage.grey_opening(z_mm, FIN_CELLS), z_mm)
+    # nor is one there that no wall is thin enough for, and of which no point was seen
+    near = ndimage.binary_dilation(~untouched, np.ones((2 * UNSEEN_FIN_CELLS - 1,) * 2))
+    unseen = near & ~ndimage.binary_dilation(seen.seen & (seen.z_mm > 0.0))[at]
+    z_mm = np.where(unseen, ndimage.grey_opening(z_mm, UNSEEN_FIN_CELLS), z_mm)
     if not excess.is_empty():
         z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
@@ -139,9 +146,18 @@ def standing_heights(
     by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
     # but a lip that they round off stands as high as it was seen
     lip = (z_mm > (highest + lowest) / 2) & (np.abs(seen.z_mm[at] - highest) < TRUST_MM)
-    z_mm = np.where(by_wall & lip, np.maximum(z_mm, seen.z_mm[at]), z_mm)
+    over_mm = seen.z_mm[at] - highest
+    lip_mm = np.where(over_mm < CHANCE_MM, np.minimum(seen.z_mm[at], highest), seen.z_mm[at])
+    z_mm = np.where(by_wall & lip, np.maximum(z_mm, lip_mm), z_mm)
+    # over a wall, points on it have drawn its cell down: what nothing was taken from ends it
+    plane_mm = ndimage.maximum_filter(np.where(untouched, z_mm, 0.0), around)
+    drawn = by_wall & lip & (np.minimum(plane_mm, highest) - lowest > STEEP_MM)
+    drawn &= np.abs(seen.z_mm[at] - plane_mm) < TRUST_MM
+    raised_mm = np.minimum(seen.z_mm[at] + 0.5 * TOP_BAND_MM, plane_mm)
+    z_mm = np.where(drawn, np.maximum(z_mm, raised_mm), z_mm)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
-    agrees = untouched & (np.abs(seen.z_mm[at] - z_mm) < NOISE_MM)
+    off_mm = seen.z_mm[at] - z_mm
+    agrees = untouched & ((np.abs(off_mm) < NOISE_MM) | _by_chance(off_mm, around))
     # what is much lower was seen on another side: of this one no point fell into the cell
     beneath = seen.z_mm[at] < z_mm - TRUST_MM
     known = seen.seen[at]
@@ -150,6 +166,13 @@ def standing_heights(
     rim = ndimage.binary_dilation(~untouched, np.ones((around, around)))
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
+
+
+def _by_chance(off_mm: Float[np.ndarray, "ny nx"], around: int) -> Bool[np.ndarray, "ny nx"]:
+    """Cells of few points: off by more than noise of many, but not off with those around them."""
+    bounded = np.clip(off_mm, -CHANCE_MM, CHANCE_MM)
+    together = ndimage.uniform_filter(bounded, around)
+    return np.asarray((np.abs(off_mm) < CHANCE_MM) & (np.abs(together) < 0.5 * NOISE_MM))
 
 
 def _columns(

@@ -28,9 +28,11 @@ from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
 LEAST_THICK_MM = 0.06
 # The floor was measured, the deficit computed from it: they agree within this.
 AGREE_MM = 0.04
-# A gap of more than this share of the thickest bead is not filled from above.
-DEEP_RATIO = 1.3
-HOLD_MM = 0.4  # how far a bead may hang over a hole beside what holds it
+# A gap of more than this share of the thickest bead is not filled from above: up to there a strand
+# of one line width, round (π/4 d² = width × gap), still reaches its floor. On a steep slope the
+# head keeps the tip this far off.
+DEEP_RATIO = 1.6
+HOLD_MM = 0.45  # a line's width: how far a bead may hang over a hole beside what holds it
 STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4
 LEAST_SECTION_MM2 = 0.004

@@ -356,3 +356,37 @@ def test_whatever_the_order_nothing_is_hit_and_nothing_is_left_out(seed: int) ->
     program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
     assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
     assert plan.beads_mm3 == pytest.approx(plan.reachable_mm3, rel=0.08)
+
+
+def test_a_steep_slope_is_filled_from_its_deep_end() -> None:
+    """The head keeps the tip off a slope: no first bead was thin enough, so little was laid."""
+    block = m3.Manifold.cube((30.0, 30.0, 10.0)).translate((60.0, 60.0, 0.0))
+    steep, yaw = np.radians(30.0), np.radians(35.0)
+    outward = np.array([np.sin(steep) * np.cos(yaw), np.sin(steep) * np.sin(yaw), np.cos(steep)])
+    missing = block.trim_by_plane(tuple(outward), float(outward @ [90.0, 90.0, 10.0]) - 3.0)
+    field = HeightField.from_manifold(block - missing, 0.1, margin_mm=8.0)
+    noise = np.abs(np.random.default_rng(0).normal(scale=0.04, size=field.shape))
+    field = field.raised(np.where(field.z_mm > 0, field.z_mm + noise, 0.0))
+    plan = slice_patch(
+        missing, SETUP, as_built=field, grid=LayerGrid.from_setup(SETUP), standalone=False,
+        start_mm=PARK,
+    )  # fmt: skip
+    assert plan.reachable_mm3 > 0.96 * missing.volume()
+    program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
+
+
+def test_beads_grow_a_line_s_width_a_layer_out_over_what_is_out_of_reach() -> None:
+    block = m3.Manifold.cube((30.0, 30.0, 12.0)).translate((60.0, 60.0, 0.0))
+    # the head gets down in the middle of a groove, and far from its walls
+    missing = m3.Manifold.cube((12.0, 30.0, 4.0)).translate((69.0, 60.0, 8.0))
+    plan, _ = plan_of(missing, block)
+    spans: dict[float, list[float]] = {}
+    for move in plan.toolpath:
+        if isinstance(move, Extrude):
+            x, z = move.points_mm[:, 0], round(float(move.points_mm[0, 2]), 2)
+            low, high = spans.get(z, [np.inf, -np.inf])
+            spans[z] = [min(low, float(x.min())), max(high, float(x.max()))]
+    widths = [spans[z][1] - spans[z][0] for z in sorted(spans) if 9.9 < z < 10.9]
+    assert len(widths) == 5
+    assert np.diff(widths) == pytest.approx(np.full(4, 2 * 0.4), abs=0.11)
