@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.machinery
 import os
 import shutil
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -29,6 +30,8 @@ class _KernelFinder:
         return None
 
 
+# a shell that starts the tests in the background has them ignore what some of them send
+signal.signal(signal.SIGINT, signal.default_int_handler)
 install_import_hook(["amrepair", "gcode"], "beartype.beartype")
 sys.meta_path.insert(0, _KernelFinder)  # type: ignore[arg-type]
 

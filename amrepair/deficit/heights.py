@@ -132,11 +132,11 @@ def standing_heights(
     untouched = (columns[1][0][1:] == columns[1][0][:-1]).reshape(ny, nx)
     # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
     beside = ~ndimage.binary_erosion(untouched, np.ones((3, 3)), border_value=1)
-    z_mm = np.where(beside, ndimage.grey_opening(z_mm, FIN_CELLS), z_mm)
+    z_mm = np.where(beside, _without_fins(z_mm, FIN_CELLS), z_mm)
     # nor is one there that no wall is thin enough for, and of which no point was seen
     near = ndimage.binary_dilation(~untouched, np.ones((2 * UNSEEN_FIN_CELLS - 1,) * 2))
     unseen = near & ~ndimage.binary_dilation(seen.seen & (seen.z_mm > 0.0))[at]
-    z_mm = np.where(unseen, ndimage.grey_opening(z_mm, UNSEEN_FIN_CELLS), z_mm)
+    z_mm = np.where(unseen, _without_fins(z_mm, UNSEEN_FIN_CELLS), z_mm)
     if not excess.is_empty():
         z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
@@ -166,6 +166,12 @@ def standing_heights(
     rim = ndimage.binary_dilation(~untouched, np.ones((around, around)))
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
+
+
+def _without_fins(z_mm: Float[np.ndarray, "ny nx"], cells: int) -> Float[np.ndarray, "ny nx"]:
+    """Lower what is thinner than so many cells; corners of what is thicker stay."""
+    thick_mm = ndimage.grey_opening(z_mm, cells)
+    return np.asarray(np.minimum(z_mm, ndimage.maximum_filter(thick_mm, 3)))
 
 
 def _by_chance(off_mm: Float[np.ndarray, "ny nx"], around: int) -> Bool[np.ndarray, "ny nx"]:

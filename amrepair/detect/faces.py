@@ -225,10 +225,21 @@ def find_faces(
     else:
         side = rooms.open_side(place[which], plane[which])
         outward = _turned(place, which, plane, area, neighbours, patches, present, spacing_mm, side)
+    holes = np.flatnonzero(~present)
+    spoken, looked_at = spoken_of(
+        template, patches.place_mm[holes], place[which], outward, spacing_mm=spacing_mm
+    )
+    present[holes[~spoken]] = True
+    seen_mm2 = patches.vector_mm2[present].sum(axis=0)
+    whole_mm2 = patches.vector_mm2.sum(axis=0)
+    vectors = outward * area[which, None]
+    closed = is_closed(seen_mm2, whole_mm2, vectors)
+    if given is None and not closed and is_closed(seen_mm2, whole_mm2, -vectors):
+        # only the other way round do they close what was seen
+        outward, vectors, closed = -outward, -vectors, True
     normal = np.zeros((len(places), 3))
     normal[which] = outward
     deviations = np.concatenate([deviation, surfels.deviation_mm[rest]])
-    vectors = outward * area[which, None]
 
     def faces_with(keep: Bool[np.ndarray, " m"]) -> Faces:
         shell = Shell.of(
@@ -237,13 +248,6 @@ def find_faces(
         )
         return Faces(places, deviations, is_off, normal, spacing_mm, tree, shell)
 
-    holes = np.flatnonzero(~present)
-    spoken, looked_at = spoken_of(
-        template, patches.place_mm[holes], place[which], outward, spacing_mm=spacing_mm
-    )
-    present[holes[~spoken]] = True
-    seen_mm2 = patches.vector_mm2[present].sum(axis=0)
-    closed = is_closed(seen_mm2, patches.vector_mm2.sum(axis=0), vectors)
     if closed:
         return faces_with(_standing(faces_with, template, patches, present, rooms))
     lit = looked_at[spoken]
