@@ -177,11 +177,11 @@ class _Text:
         self._tag("HEIGHT", number(move.height_mm, 3))
         lengths_mm = np.linalg.norm(np.diff(points, axis=0), axis=1)
         filament_mm = lengths_mm * move.section_mm2 * self._e_per_mm3
-        feed = self._feed_word(move.speed_mm_s)
         # in steps of what is written; what is shorter goes with the next
         places = np.rint(np.concatenate([[self._place], points[1:]]) * 10**XYZ_DIGITS)
         moved = places[1:] != places[:-1]
         going = moved.any(axis=1)
+        feed = self._feed_word(move.speed_mm_s) if going.any() else ""
         pushed_mm = self._owed_mm + np.concatenate([[0.0], np.cumsum(filament_mm)[going]])
         pushed = np.rint(pushed_mm * 10**E_DIGITS)
         pushed[0] = 0.0
@@ -204,8 +204,6 @@ class _Text:
             self.lines.append(line + feed)
             feed = ""
         self._place = (places[-1] / 10**XYZ_DIGITS).tolist()
-        if feed:  # nothing went: the next one says it
-            self._feed_mm_min = None
 
     def _tag(self, name: str, value: str) -> None:
         if self._tags.get(name) != value:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from gcode.moves import Role
 
@@ -80,3 +80,17 @@ def loop_bead(contour: Float[np.ndarray, "n 2"], share_mm: float, role: Role) ->
     """A closed bead along a contour."""
     xy = np.concatenate([contour, contour[:1]]).astype(np.float64)
     return Bead(xy, np.full(len(contour), share_mm), role, closed=True)
+
+
+def divided(
+    xy_mm: Float[np.ndarray, "n 2"], count: Int[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "k 2"], Int[np.ndarray, " p"]]:
+    """Points along a chain, its pieces cut into `count` (m = n - 1) equal ones; and whose each is.
+
+    Returns (p + 1, 2) points, the chain's own among them, and (p,) the piece that each begins in.
+    """
+    owner = np.repeat(np.arange(len(count)), count)
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    t = (step / count[owner])[:, None]
+    points = xy_mm[owner] + (xy_mm[owner + 1] - xy_mm[owner]) * t
+    return np.concatenate([points, xy_mm[-1:]]), owner

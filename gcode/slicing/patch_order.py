@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from gcode.slicing.beads import divided
 from gcode.slicing.patch_model import NEAR_MM, PatchModel
 from gcode.slicing.patch_passes import Chain, Pass, surely_free
 from gcode.slicing.reach import Reach
@@ -104,12 +105,9 @@ def _all_free(laid: list[tuple[Pass, Chain]], reach: Reach) -> bool:
 
 def _along(chain: Chain, reach: Reach) -> Float[np.ndarray, "n 2"]:
     """Points along a chain, closer than half a cell."""
-    steps = np.diff(chain.xy_mm, axis=0)
-    count = 1 + np.ceil(3 * np.hypot(*steps.T) / reach.field.cell_mm).astype(np.int64)
-    owner = np.repeat(np.arange(len(steps)), count)
-    share = (np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)) / count[owner]
-    points = chain.xy_mm[owner] + steps[owner] * share[:, None]
-    return np.concatenate([points, chain.xy_mm[-1:]])
+    lengths = np.hypot(*np.diff(chain.xy_mm, axis=0).T)
+    count = 1 + np.ceil(3 * lengths / reach.field.cell_mm).astype(np.int64)
+    return divided(chain.xy_mm, count)[0]
 
 
 def _of_regions(

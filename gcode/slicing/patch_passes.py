@@ -15,7 +15,7 @@ from skimage import measure
 from gcode.moves import Role
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress
-from gcode.slicing.beads import Bead, spacing_of
+from gcode.slicing.beads import Bead, divided, spacing_of
 from gcode.slicing.infill import SOLID_ANGLES_RAD, ring_beads, solid_fill
 from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES, Unprintable
 from gcode.slicing.layers import LayerGrid
@@ -45,6 +45,7 @@ ROUNDING_MM = 2e-3  # more than the text's last digit
 NOT_LISTED_MM3 = 0.02
 # A flat top: as much area, as wide, within so little height.
 FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
+ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ def plan_passes(
     flats = _flats(model, tops)
     ends = np.full(model.shape, np.inf)  # where a flat top lies, off the job's layers
     for flat_mm in flats:
-        ends[np.abs(model.top_mm - flat_mm) <= 1.5 * FLAT_MM] = flat_mm
+        ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
     heights = np.sort(np.concatenate([tops, flats]))
     passes: list[Pass] = []
     for k, z_mm in enumerate(heights):
@@ -125,7 +126,7 @@ def _flats(model: PatchModel, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndar
         if np.abs(np.array([*tops_mm, *found]) - z_mm).min() < LEAST_THICK_MM:
             continue
         # no rim or slope that passes through this height
-        flat = ndimage.binary_opening(np.abs(tops - z_mm) <= 1.5 * FLAT_MM, least)
+        flat = ndimage.binary_opening(np.abs(tops - z_mm) <= ON_FLAT_MM, least)
         if flat.sum() * model.cell_mm**2 >= FLAT_MM2:
             found.append(float(np.median(tops[flat])))
     return np.array(found)
@@ -229,10 +230,7 @@ def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: PatchModel) 
     xy = bead.xy_mm
     lengths = np.hypot(*np.diff(xy, axis=0).T)
     count = np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
-    owner = np.repeat(np.arange(len(lengths)), count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    t = (step / count[owner])[:, None]
-    points = np.concatenate([xy[owner] + (xy[owner + 1] - xy[owner]) * t, xy[-1:]])
+    points, owner = divided(xy, count)
     closer = 2 + int(np.ceil(3 * STEP_MM / model.reach.field.cell_mm))
     # closer than the checker's own steps of half a cell
     share = np.linspace(0.0, 1.0, closer)[:, None, None]

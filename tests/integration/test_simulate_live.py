@@ -71,27 +71,6 @@ def test_what_another_process_prints_is_seen(tmp_path: Path) -> None:
     assert eye.world.volume_mm3 == pytest.approx(20 * 20 * section_mm2, rel=0.06)  # flow wanders
 
 
-def test_a_row_half_written_waits(tmp_path: Path) -> None:
-    path = tmp_path / "motion.bin"
-    file = MotionFile(path)
-    assert len(file.take()) == 0
-    rows = np.arange(27, dtype=np.float64)
-    path.write_bytes(rows.tobytes()[: 2 * 72 + 5])
-    assert len(file.take()) == 2
-    path.write_bytes(rows.tobytes())
-    last = file.take()
-    assert len(last) == 1
-    assert last.start_mm[0, 0] == 18.0
-    assert last.time_s[0] == 26.0
-
-
-def test_motion_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
-    from gcode.errors import InputError as GcodeInputError
-    from gcode.firmware import serve_forever
-
-    with pytest.raises(GcodeInputError, match="cannot be written"):
-        serve_forever(
-            load_setup().printer, link=tmp_path / "port", motion=tmp_path / "none" / "motion.bin"
-        )
+def test_a_scanner_of_another_kind_is_refused() -> None:
     with pytest.raises(InputError, match="sonar"):
         load_world().scanner("sonar")
