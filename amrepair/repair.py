@@ -36,6 +36,8 @@ from gcode.surfaces import HeightField
 from gcode.writer import write
 
 MIN_REPAIR_MM3 = worth.MIN_REPAIR_MM3
+# Nothing can take so little away; a seam or two are as much.
+MIN_EXCESS_MM3 = 2.0
 # Material standing out less than two layers is ploughed by the layers after it, or is a bump.
 EXCESS_LAYERS = 2.0
 # A planned template ends below; so near to its end its distances are not to be trusted.
@@ -177,7 +179,7 @@ class RepairPlan:
             region
             for region in self.deficit.regions
             if region.label is Label.EXCESS
-            and region.volume_mm3 >= MIN_REPAIR_MM3
+            and region.volume_mm3 >= MIN_EXCESS_MM3
             and region.depth_mm >= least_mm
         )
 

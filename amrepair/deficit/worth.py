@@ -11,16 +11,17 @@ from scipy.sparse.csgraph import connected_components
 
 from amrepair.deficit.compute import BEAD_MM3
 
-# A stop of the print, and heat beside the wound, must be worth it.
-MIN_REPAIR_MM3 = 2.0
+# Heat beside the wound must be worth it: the stop has been made for the scan. It is a bead 11 mm
+# long, half of the least that skipped lines leave; clean prints show less (`bench_clean.py`).
+MIN_REPAIR_MM3 = 1.0
 # What lies this near to a defect belongs to it.
 ONE_DEFECT_MM = 1.0
 
 
-def worth_mending(
+def defect_volumes(
     boxes_mm: Sequence[Float[np.ndarray, "2 3"]], volumes_mm3: Sequence[float]
-) -> Bool[np.ndarray, " n"]:
-    """Pieces that belong to a defect of at least `MIN_REPAIR_MM3`.
+) -> Float[np.ndarray, " n"]:
+    """Volume of the defect that each piece belongs to.
 
     Skipped beads that cross leave several pieces side by side: one defect. Crumbs below what a
     bead fills join nothing.
@@ -33,16 +34,23 @@ def worth_mending(
     Returns
     -------
     numpy.ndarray
-        (n,) whether it is worth a repair.
+        (n,) mm³; a crumb's is 0.
     """
     volume = np.asarray(volumes_mm3, dtype=np.float64)
-    keep = np.zeros(len(volume), bool)
+    whole = np.zeros(len(volume))
     bead = np.flatnonzero(volume >= BEAD_MM3)
     if len(bead) == 0:
-        return keep
+        return whole
     box = np.stack([np.asarray(boxes_mm[int(k)]) for k in bead])
     low, high = box[:, 0], box[:, 1] + ONE_DEFECT_MM
     near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
     groups, group = connected_components(csr_matrix(near), directed=False)
-    keep[bead] = np.bincount(group, weights=volume[bead], minlength=groups)[group] >= MIN_REPAIR_MM3
-    return keep
+    whole[bead] = np.bincount(group, weights=volume[bead], minlength=groups)[group]
+    return whole
+
+
+def worth_mending(
+    boxes_mm: Sequence[Float[np.ndarray, "2 3"]], volumes_mm3: Sequence[float]
+) -> Bool[np.ndarray, " n"]:
+    """(n,) pieces that belong to a defect of at least `MIN_REPAIR_MM3`; see `defect_volumes`."""
+    return np.asarray(defect_volumes(boxes_mm, volumes_mm3) >= MIN_REPAIR_MM3)

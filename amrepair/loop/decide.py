@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any
 
 from amrepair.detect.anomaly import DefectType
-from amrepair.repair import EXCESS_LAYERS, MIN_REPAIR_MM3
+from amrepair.repair import EXCESS_LAYERS, MIN_EXCESS_MM3, MIN_REPAIR_MM3
 
 
 class Action(StrEnum):
@@ -46,6 +46,8 @@ class Finding:
         `missing` or `excess`.
     confidence
         That it is there and is of that type, 0 to 1.
+    defect_mm3
+        Volume of the defect that it is a piece of: with what lies beside it; a crumb has none.
     thickness_layers, height_layers
         Mean thickness, and from lowest to highest point, in layers of the job.
     reachable_ratio
@@ -60,6 +62,7 @@ class Finding:
     type: DefectType
     confidence: float
     volume_mm3: float
+    defect_mm3: float
     thickness_layers: float
     height_layers: float
     reachable_ratio: float
@@ -134,6 +137,7 @@ _NAMES = {
     "thickness_layers": "mean thickness",
     "height_layers": "height",
     "volume_mm3": "volume",
+    "defect_mm3": "the whole defect's volume",
     "reachable_ratio": "share in reach",
     "cover": "covered next by",
     "hit_mm": "in the head's way by",
@@ -149,6 +153,7 @@ _UNITS = {
     "thickness_layers": " layers",
     "height_layers": " layers",
     "volume_mm3": " mm³",
+    "defect_mm3": " mm³",
     "hit_mm": " mm",
 }
 
@@ -208,15 +213,15 @@ FINDINGS: tuple[Row, ...] = (
         "the head would hit it on its next moves; cut it off, or end the print"),
     Row("F5", Action.GO_ON, (_EXCESS, _is("type", (DefectType.STRING,))),
         "strings come off by hand, and the nozzle melts through them"),
-    Row("F6", Action.LOWER_NEXT, (_EXCESS, _from("volume_mm3", MIN_REPAIR_MM3),
+    Row("F6", Action.LOWER_NEXT, (_EXCESS, _from("volume_mm3", MIN_EXCESS_MM3),
                                   _from("thickness_layers", LEAST_LAYERS),
                                   _below("thickness_layers", EXCESS_LAYERS),
                                   _is("cover", (Cover.SOLID, Cover.OPEN))),
         "the next layer's beads have less room there"),
     Row("F7", Action.GO_ON, (_EXCESS,),
         "printing cannot take excess away"),
-    Row("F8", Action.GO_ON, (_MISSING, _below("volume_mm3", MIN_REPAIR_MM3)),
-        "smaller than is worth a stop of the print"),
+    Row("F8", Action.GO_ON, (_MISSING, _below("defect_mm3", MIN_REPAIR_MM3)),
+        "smaller than is worth a repair"),
     Row("F9", Action.LOOK_AGAIN, (_MISSING, _below("confidence", DOUBTFUL),
                                   _is("seen_twice", False)),
         "it hardly stands out from the noise"),

@@ -12,6 +12,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.deficit.worth import defect_volumes
 from amrepair.detect import Label, Region
 from amrepair.loop.decide import Action, Cover, Finding, judge
 from amrepair.repair import RepairPlan
@@ -124,7 +125,8 @@ def findings(
     end_line = job.layers[after].end_line if after is not None else line
     pieces = plan.deficit.excess.decompose() if not plan.deficit.excess.is_empty() else []
     found = []
-    for region in plan.deficit.regions:
+    regions = plan.deficit.regions
+    for region, whole_mm3 in zip(regions, _whole_defects(regions), strict=True):
         reach, hit = 1.0, 0.0
         if region.label is Label.MISSING:
             reach = reach_of(plan, region.box_mm)
@@ -138,6 +140,7 @@ def findings(
                 type=region.type,
                 confidence=float(region.confidence),
                 volume_mm3=float(region.volume_mm3),
+                defect_mm3=float(whole_mm3),
                 thickness_layers=thickness_mm(region) / plan.layer_height_mm,
                 height_layers=float(height_mm(region) / plan.layer_height_mm),
                 reachable_ratio=reach,
@@ -150,6 +153,16 @@ def findings(
     return tuple(found)
 
 
+def _whole_defects(regions: Sequence[Region]) -> Float[np.ndarray, " n"]:
+    """(n,) volume of the defect that each region is a piece of, mm³."""
+    whole_mm3 = np.zeros(len(regions))
+    for label in Label:
+        mine = [k for k, region in enumerate(regions) if region.label is label]
+        boxes = [np.asarray(regions[k].box_mm) for k in mine]
+        whole_mm3[mine] = defect_volumes(boxes, [regions[k].volume_mm3 for k in mine])
+    return whole_mm3
+
+
 def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int | None) -> Action:
     """What the table says of a missing region before anybody knows what can be reached of it."""
     layer_mm = setup.process.layer_height_mm
@@ -158,6 +171,7 @@ def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int |
         type=region.type,
         confidence=1.0,
         volume_mm3=float(region.volume_mm3),
+        defect_mm3=float(region.volume_mm3),
         thickness_layers=thickness_mm(region) / layer_mm,
         height_layers=float(height_mm(region) / layer_mm),
         reachable_ratio=1.0,

@@ -41,8 +41,10 @@ RISEN_SHARE = 0.5
 # Of a layer's beads: too little or too much flow over at least this share is the layer's own.
 LAYER_SHARE = 0.55
 CLOG_SHARE = (0.12, 0.9)
-# Before a clog, of what it takes away after its beginning.
+# Before a clog, of what it takes away after its beginning; and how deep that is at most: beads of
+# one layer, and noise. Layers below are whole, or all of this one would lack.
 BEFORE_CLOG = 0.4
+CLOG_LAYERS = 1.5
 # Longer along the beads than across them by this much: beads were skipped.
 SKIPPED_ASPECT = 2.2
 STRING_ASPECT, STRING_WIDTH_MM = 4.0, 2.2
@@ -256,6 +258,7 @@ def _flow(top: _Surface, job: Job, line: int, layer_mm: float) -> Kind | None:
         CLOG_SHARE[0] < share < CLOG_SHARE[1]
         and after[at] > SHORT
         and before[at] < BEFORE_CLOG * after[at]
+        and np.percentile(low[at + 1 :], 75) < CLOG_LAYERS
         and rest > LAYER_SHARE
     ):
         return Kind(DefectType.CLOG, min(1.0, rest))

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from amrepair.loop.decide import Decision, Situation, decide, gravest, judge
 from amrepair.loop.findings import findings
 from amrepair.loop.limits import Limits, beyond
-from amrepair.loop.looks import LEFT_RATIO, Look, Stop
+from amrepair.loop.looks import Look, Stop
 from amrepair.repair import RepairPlan, Site
 from gcode.reader import Job
 
 # A repair that leaves more than this share of what it found has met something else than noise.
 STUCK_RATIO = 0.8
+# Less than this share of what was found at a stop is not worth another pass.
+LITTLE_RATIO = 0.03
 
 
 def decide_look(
@@ -70,4 +72,4 @@ def _done(looks: Sequence[Look], plan: RepairPlan) -> bool:
     if not looks:
         return False
     left_mm3 = sum(region.volume_mm3 for region in plan.to_fill)
-    return left_mm3 <= LEFT_RATIO * looks[0].plan.deficit.missing_mm3
+    return left_mm3 <= LITTLE_RATIO * looks[0].plan.deficit.missing_mm3

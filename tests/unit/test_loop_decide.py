@@ -6,9 +6,10 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from amrepair.detect.anomaly import DefectType
+from amrepair.detect.anomaly import DefectType, Label, Region
 from amrepair.loop.decide import (
     FINDINGS,
     STOPS,
@@ -21,11 +22,12 @@ from amrepair.loop.decide import (
     judge,
     tables,
 )
+from amrepair.loop.findings import _whole_defects
 
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "decisions.md"
 VOID = Finding(
-    kind="missing", type=DefectType.VOID, confidence=0.99, volume_mm3=30.0, thickness_layers=3.0,
-    height_layers=4.0, reachable_ratio=0.9, cover=Cover.SOLID, hit_mm=0.0,
+    kind="missing", type=DefectType.VOID, confidence=0.99, volume_mm3=30.0, defect_mm3=30.0,
+    thickness_layers=3.0, height_layers=4.0, reachable_ratio=0.9, cover=Cover.SOLID, hit_mm=0.0,
     box_mm=((0.0, 0.0, 1.0), (5.0, 5.0, 1.8)),
 )  # fmt: skip
 BLOB = replace(VOID, kind="excess", type=DefectType.BLOB)
@@ -39,7 +41,7 @@ CASES = {
     "F5": replace(BLOB, type=DefectType.STRING),
     "F6": replace(BLOB, thickness_layers=0.8),
     "F7": BLOB,
-    "F8": replace(VOID, volume_mm3=0.5),
+    "F8": replace(VOID, volume_mm3=0.5, defect_mm3=0.8),
     "F9": replace(VOID, confidence=0.1),
     "F10": replace(VOID, confidence=0.1, seen_twice=True),
     "F11": THIN,
@@ -114,3 +116,18 @@ def test_the_page_has_the_tables_of_the_code(regenerate_golden: bool) -> None:
     found = part.search(text)
     assert found is not None
     assert found.group(1) == wanted
+
+
+def test_pieces_of_one_defect_are_worth_a_repair_together() -> None:
+    # regression: pieces of 1.5 mm³ side by side went on (F8), though the patch for both was planned
+    def piece(x_mm: float, volume_mm3: float) -> Region:
+        box = np.array([[x_mm, 0.0, 0.0], [x_mm + 1.0, 1.0, 0.4]])
+        return Region(Label.MISSING, DefectType.VOID, volume_mm3, 2.0, 0.2, box)
+
+    pieces = [piece(0.0, 0.6), piece(1.5, 0.6), piece(20.0, 0.6)]
+    assert _whole_defects(pieces).tolist() == pytest.approx([1.2, 1.2, 0.6])
+    rows = [
+        judge(replace(VOID, volume_mm3=0.6, defect_mm3=float(whole))).row
+        for whole in _whole_defects(pieces)
+    ]
+    assert rows == ["F14", "F14", "F8"]

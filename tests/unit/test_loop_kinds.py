@@ -16,6 +16,7 @@ from amrepair.detect.anomaly import DefectType
 from amrepair.frames import Transform
 from amrepair.loop import kinds, plan_stops
 from amrepair.loop.kinds import typed
+from amrepair.loop.shapes import last_beads
 from amrepair.loop.sites import sites
 from amrepair.repair import plan_repair
 from amrepair.template import MeshSdf
@@ -122,3 +123,23 @@ def test_a_curl_is_one() -> None:
     found = kinds._warped(top_of(lifted, xy, 0.1), 0.2)
     assert found is not None
     assert found.type is DefectType.WARP
+
+
+@pytest.mark.parametrize(("layers", "kind"), [(0.8, DefectType.CLOG), (6.0, None)])
+def test_what_broke_off_where_the_last_beads_end_is_no_clog(
+    scene,  # type: ignore[no-untyped-def]
+    layers: float,
+    kind: DefectType | None,
+) -> None:
+    # regression: a chip six layers deep, where the last beads of a part lie, ended the run
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    gone = np.arange(len(beads)) > 0.7 * len(beads)
+    top = kinds._Surface(
+        np.column_stack([beads[:, :2], np.full(len(beads), 3.0)]),
+        np.where(gone, -0.2 * layers, 0.0),
+        np.tile([0.0, 0.0, 1.0], (len(beads), 1)),
+        0.03,
+    )
+    found = kinds._flow(top, job, stop.line, 0.2)
+    assert (found.type if found is not None else None) == kind
