@@ -173,6 +173,9 @@ def pose_from_anywhere(
     if _explained(found[0][1], inlier_mm) > EXPLAINED:
         turned = _refined(_turns(found, clouds, template, rng), clouds, template)
         found = sorted(found + turned, key=_by_score)
+        best = found[0][1]
+        twins = [m for m in _twins(best, clouds, field, rng) if clouds.apart(m, best.matrix)]
+        found = sorted(found + _refined(twins, clouds, template), key=_by_score)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
     if not best.converged and best_score < PLAUSIBLE * clouds.cap_mm:

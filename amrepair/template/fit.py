@@ -14,11 +14,15 @@ from scipy import ndimage
 
 from amrepair.template.learned import Grid, LearnedSdf
 from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.signs import signed_grid, signs_in_blocks
 from amrepair.template.surface import sample_surface
 from gcode.progress import Progress, silent
 
-GRID_CELLS = 128  # along the longest side
-MARGIN_CELLS = 6.0
+GRID_CELLS = 128  # along the longest side, at least
+# Long and flat parts have flat boxes: as many nodes as a stocky part's, in smaller cells.
+STOCKY_RATIO = 0.5  # of the cube over the longest side
+MOST_DIVIDED = 4.0  # times as many cells along it
+MARGIN_RATIO = 6.0 / 128.0  # of the longest side, around the part
 FINE = 4  # a cell that bends is divided into so many along each edge
 SAMPLES = 300_000
 AT_ONCE = 100_000  # distances: a second of a large mesh
@@ -46,18 +50,27 @@ def fit_fast(
     """
     rng = np.random.default_rng(seed)
     low, high = exact.bounds_mm
-    cell = float((high - low).max()) / GRID_CELLS
-    origin = low - MARGIN_CELLS * cell
-    shape = np.ceil((high - low) / cell + 2 * MARGIN_CELLS).astype(int) + 1
+    margin = MARGIN_RATIO * float((high - low).max())
+    cell = _cell_mm(high - low, margin)
+    origin = low - margin
+    shape = np.ceil((high - low + 2 * margin) / cell).astype(int) + 1
     base = _base(exact, origin, cell, shape, progress)
     bare = Grid.bare(origin, cell, base)
     points = _samples(exact, SAMPLES, BAND_CELLS * cell, rng)
-    residual = np.abs(_measured(exact, points, "fit: compare", progress) - bare.distance(points))
+    residual = np.abs(_measured(exact, points, progress) - bare.distance(points))
     cells = _bent(bare, points, residual)
     grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, progress))
     held = _on_surface(exact, HELD_OUT, rng)
     bias_mm = float(np.quantile(np.abs(grid.distance(held)), 0.99))
     return LearnedSdf(grid=grid, mesh=exact.mesh, bias_mm=bias_mm, metadata=metadata or {})
+
+
+def _cell_mm(size_mm: Float[np.ndarray, " 3"], margin_mm: float) -> float:
+    """Edge of a cell: the longest side over its cells, or smaller where nodes are left."""
+    largest = float(size_mm.max()) / GRID_CELLS
+    nodes = STOCKY_RATIO * GRID_CELLS**3
+    as_stocky = float(np.cbrt(np.prod(size_mm + 2 * margin_mm) / nodes))
+    return min(largest, max(as_stocky, largest / MOST_DIVIDED))
 
 
 def _base(
@@ -75,20 +88,33 @@ def _base(
     for first in range(0, shape[0], step):
         xs = axes[0][first : first + step]
         nodes = np.column_stack([np.repeat(xs, len(plane)), np.tile(plane, (len(xs), 1))])
-        base[first : first + step] = exact.distance(nodes).reshape(len(xs), shape[1], shape[2])
+        size = exact.unsigned_distance(nodes)
+        base[first : first + step] = size.reshape(len(xs), shape[1], shape[2])
         progress("fit: grid", float(first + len(xs)), float(shape[0]))
-    return base
+    return signed_grid(base, origin, cell, exact.inside).astype(np.float32)
 
 
 def _measured(
-    exact: MeshSdf, points_mm: Float[np.ndarray, "n 3"], stage: str, progress: Progress
+    exact: MeshSdf, points_mm: Float[np.ndarray, "n 3"], progress: Progress
 ) -> Float[np.ndarray, " n"]:
     """(n,) exact distances, some at a time."""
     found = np.empty(len(points_mm))
     for first in range(0, len(points_mm), AT_ONCE):
         last = min(first + AT_ONCE, len(points_mm))
         found[first:last] = exact.distance(points_mm[first:last])
-        progress(stage, float(last), float(len(points_mm)))
+        progress("fit: compare", float(last), float(len(points_mm)))
+    return found
+
+
+def _sizes(
+    exact: MeshSdf, points_mm: Float[np.ndarray, "n 3"], progress: Progress
+) -> Float[np.ndarray, " n"]:
+    """(n,) exact distances without their signs, some at a time."""
+    found = np.empty(len(points_mm))
+    for first in range(0, len(points_mm), AT_ONCE):
+        last = min(first + AT_ONCE, len(points_mm))
+        found[first:last] = exact.unsigned_distance(points_mm[first:last])
+        progress("fit: details", float(last), float(len(points_mm)))
     return found
 
 
@@ -127,10 +153,17 @@ def _blocks(
     """(b, r+1, r+1, r+1) exact distances; nodes that blocks share are asked once."""
     inner = np.stack(np.meshgrid(*[np.arange(FINE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     nodes = (cells[:, None, :] * FINE + inner).reshape(-1, 3)
-    size = np.array(bare.base.shape) * FINE
-    key = (nodes[:, 0] * size[1] + nodes[:, 1]) * size[2] + nodes[:, 2]
-    different, first, back = np.unique(key, return_index=True, return_inverse=True)
-    del different
+    extent = np.array(bare.base.shape) * FINE
+    key = (nodes[:, 0] * extent[1] + nodes[:, 1]) * extent[2] + nodes[:, 2]
+    first, back = np.unique(key, return_index=True, return_inverse=True)[1:]
     where = bare.origin_mm + nodes[first] * (bare.cell_mm / FINE)
-    values = _measured(exact, where, "fit: details", progress).astype(np.float32)
-    return values[back].reshape(len(cells), *[FINE + 1] * 3)
+    size = _sizes(exact, where, progress).astype(np.float32)
+    blocks = size[back].reshape(len(cells), *[FINE + 1] * 3)
+    ends = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1)
+    corners = np.moveaxis(cells[:, None, None, None, :] + ends, -1, 0)
+    corner_sign = np.sign(bare.base[tuple(corners)]).astype(np.int8)
+    sign = signs_in_blocks(blocks, corner_sign, bare.cell_mm / FINE)
+    asked = np.unique(back[sign.ravel() == 0])
+    side = np.zeros(len(first), dtype=np.int8)
+    side[asked] = np.where(exact.inside(where[asked]), -1, 1)
+    return blocks * np.where(sign == 0, side[back].reshape(sign.shape), sign)

@@ -118,3 +118,16 @@ def test_the_larger_piece_of_a_bent_part_stands(share_of_base: float) -> None:
     for start in (np.eye(4), by_end):
         pose = standing_pose(points, plate, start, SIGMA_MM, np.random.default_rng(0))
         assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.01
+
+
+def test_what_the_search_missed_of_a_symmetric_part_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # regression: of a keyed disc one of the two ways to lay it was found, and the other not said
+    plate = box((0, 0, 0), (40, 24, 8))
+    points = sample_surface(plate.body, 0.8, seed=7)[0]
+    near = np.eye(4)
+    near[:3, 3] = 0.3
+    monkeypatch.setattr("amrepair.align.anywhere._worth_refining", lambda *_, **__: [near])
+    found = align(Scan(points, SIGMA_MM, "scanner", source="scan.ply"), plate)
+    assert len(found.symmetric_alternatives) == 3
