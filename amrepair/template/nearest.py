@@ -96,7 +96,7 @@ class TriangleTree:
         """What of the triangles is nearest to points."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         if len(points) < SORTED:
-            size, which, place, side = kernels.nearest(points, *self._numbers, self.sure)
+            size, which, place, side = kernels.nearest(points, self.sure, *self._numbers)
             return Nearest(size, side, self.face[which], place)
         low = points.min(axis=0)
         cell = (points.max(axis=0) - low) / CELLS + 1e-12
@@ -104,7 +104,7 @@ class TriangleTree:
         order = np.argsort((index[:, 0] * CELLS + index[:, 1]) * CELLS + index[:, 2], kind="stable")
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        size, which, place, side = kernels.nearest(points[order], *self._numbers, self.sure)
+        size, which, place, side = kernels.nearest(points[order], self.sure, *self._numbers)
         return Nearest(size[back], side[back], self.face[which[back]], place[back])
 
     def inside(self, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

@@ -113,7 +113,7 @@ def _above(x, y, z, t, size):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def nearest(points, corners, low, high, child, first, last, sure):
+def nearest(points, sure, corners, low, high, child, first, last):
     """(n,) distance, (n,) number of the nearest triangle in the tree's order, (n, 3) its point.
 
     And (n,) −1 inside, 1 outside where that point is within the triangle; 0 on an edge or a corner.
