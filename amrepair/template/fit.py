@@ -18,6 +18,7 @@ from amrepair.template.signs import signed_grid, signs_in_blocks
 from amrepair.template.surface import sample_surface
 from gcode.progress import Progress, silent
 
+FIT_VERSION = 2  # raised where the same mesh gives another template: cached ones are fitted again
 GRID_CELLS = 128  # along the longest side, at least
 # Long and flat parts have flat boxes: as many nodes as a stocky part's, in smaller cells.
 STOCKY_RATIO = 0.5  # of the cube over the longest side

@@ -14,7 +14,7 @@ import numpy as np
 import amrepair
 from amrepair.errors import TemplateError
 from amrepair.template.file import FORMAT_VERSION, read_template
-from amrepair.template.fit import fit_fast
+from amrepair.template.fit import FIT_VERSION, fit_fast
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh, require_mesh
 from amrepair.template.mesh_sdf import MeshSdf
@@ -132,7 +132,8 @@ def load_or_fit(
     closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
     progress("read mesh", 1.0, 1.0)
     folder = cache_dir or default_cache_dir()
-    key = json.dumps([mesh_sha256(closed), "fast", seed, FORMAT_VERSION, amrepair.__version__])
+    versions = [FIT_VERSION, FORMAT_VERSION, amrepair.__version__]
+    key = json.dumps([mesh_sha256(closed), "fast", seed, *versions])
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.safetensors"
     if path.is_file():
         try:
