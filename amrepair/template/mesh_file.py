@@ -17,7 +17,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
-from gcode.solids import SUFFIXES, as_manifold, first_closed, is_valid, unite_overlaps
+from gcode.solids import (
+    SUFFIXES,
+    as_manifold,
+    first_closed,
+    is_valid,
+    read_triangles,
+    unite_overlaps,
+)
 
 if TYPE_CHECKING:
     import trimesh
@@ -110,16 +117,16 @@ def _read(path: Path) -> trimesh.Trimesh:
             f"the mesh {path.name} ends in '{path.suffix}'; use one of {', '.join(SUFFIXES)}"
         )
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
+        vertices, faces = read_triangles(path)
     except _READ_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise TemplateError(
             f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} ({reason}); "
             "export it again"
         ) from error
-    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+    if len(faces) == 0:
         raise TemplateError(f"the mesh {path.name} has no triangles; export it again")
-    return loaded
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def edge_census(faces: Int[np.ndarray, "f 3"]) -> EdgeCensus:

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gcode.errors import InputError
-from gcode.solids import read_solid
+from gcode.solids import read_solid, weld
 
 
 def test_bodies_that_touch_along_an_edge_stay_apart(tmp_path: Path) -> None:
@@ -48,3 +50,37 @@ def test_a_hole_is_refused(tmp_path: Path) -> None:
     trimesh.Trimesh(box.vertices, box.faces[:-1], process=False).export(path)
     with pytest.raises(InputError, match="no closed surface"):
         read_solid(path)
+
+
+@given(
+    places=st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=3, max_size=30),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=50, deadline=None)
+def test_welding_joins_what_trimesh_joins(places: list[tuple[int, int, int]], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    grid = np.array(places, dtype=np.float64) / 3.0
+    vertices = np.repeat(grid, 2, axis=0) + rng.choice([0.0, 1e-12, -0.0], (2 * len(grid), 3))
+    faces = rng.integers(0, len(vertices), (len(grid), 3))
+    ours, ours_faces = weld(vertices, faces, 8)
+    peer = trimesh.Trimesh(vertices, faces, process=False)
+    peer.merge_vertices(merge_tex=True, merge_norm=True)
+    np.testing.assert_allclose(ours[ours_faces], vertices[faces], atol=1e-11)
+    assert len(ours) == len(np.unique(np.asarray(peer.faces)))
+    assert (
+        ours_faces == _by_first_use(np.asarray(peer.faces), np.asarray(peer.vertices), ours)
+    ).all()
+
+
+def _by_first_use(faces: np.ndarray, vertices: np.ndarray, ours: np.ndarray) -> np.ndarray:
+    """The peer's faces, with our numbers of the same places."""
+    number = {tuple(np.round(v, 8) + 0.0): k for k, v in enumerate(ours)}
+    return np.array([[number[tuple(np.round(vertices[v], 8) + 0.0)] for v in f] for f in faces])
+
+
+def test_two_places_with_one_key_stay_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gcode.solids.KEY_FACTORS", np.zeros(3, np.uint64))
+    vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    joined, faces = weld(vertices, np.array([[0, 1, 2], [0, 3, 2]]), 8)
+    np.testing.assert_array_equal(joined, vertices[:3])
+    np.testing.assert_array_equal(faces, [[0, 1, 2], [0, 1, 2]])

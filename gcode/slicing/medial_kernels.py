@@ -1,0 +1,225 @@
+"""The medial axis from Delaunay triangles of boundary samples: the loops under `medial`.
+
+A triangle's circumcentre is a node of the Voronoi diagram, so that a node has three links at most.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from gcode.slicing.infill_kernels import inside
+
+LEAF_RATIO = 1.2  # of a junction's radius: a shorter branch to a wall is its corner, not an axis
+FAR_MM = 1e9  # where a triangle without area has its centre
+
+
+@njit(cache=True, nogil=True)
+def samples(points: Any, starts: Any, apart: float) -> tuple[Any, Any, Any]:
+    """Points along closed contours, at most `apart` from each other, in mid-stretch.
+
+    Contours come flattened: points (n, 2) and the start of each (m + 1,). Returns (s, 2) points,
+    the contour of each, and its place along it.
+    """
+    number = np.empty(points.shape[0], np.int64)
+    total = 0
+    for c in range(starts.shape[0] - 1):
+        for k in range(starts[c], starts[c + 1]):
+            to = k + 1 if k + 1 < starts[c + 1] else starts[c]
+            long = np.hypot(points[to, 0] - points[k, 0], points[to, 1] - points[k, 1])
+            number[k] = max(1, int(np.ceil(long / apart)))
+            total += number[k]
+    found = np.empty((total, 2))
+    owner = np.empty(total, np.int64)
+    place = np.empty(total, np.int64)
+    n = 0
+    for c in range(starts.shape[0] - 1):
+        first = n
+        for k in range(starts[c], starts[c + 1]):
+            to = k + 1 if k + 1 < starts[c + 1] else starts[c]
+            for i in range(number[k]):
+                t = (i + 0.5) / number[k]
+                for axis in range(2):
+                    found[n, axis] = points[k, axis] + t * (points[to, axis] - points[k, axis])
+                owner[n] = c
+                place[n] = n - first
+                n += 1
+    return found, owner, place
+
+
+@njit(cache=True, nogil=True)
+def axis_paths(
+    samples_mm: Any,
+    owner: Any,
+    place: Any,
+    corners: Any,
+    across: Any,
+    points: Any,
+    starts: Any,
+    facing: float,
+) -> tuple[Any, Any, Any, Any]:
+    """Runs of the axis between its ends and junctions.
+
+    Parameters
+    ----------
+    samples_mm, owner, place
+        As `samples` gives them.
+    corners, across
+        (t, 3) triangles, and which of them lies across from each corner; -1 is none.
+    points, starts
+        The contours, flattened.
+    facing
+        Two walls face each other where their feet lie this many radii apart.
+
+    Returns
+    -------
+    tuple
+        (t, 2) nodes, (t,) distances to the walls, the runs' nodes one after the other, and where
+        each run starts (with the end). Spurs into corners are left out.
+    """
+    nodes, radius = _centres(samples_mm, corners)
+    within = inside(nodes[:, 0].copy(), nodes[:, 1].copy(), points, starts)
+    links, degree, order = _links(
+        samples_mm, owner, place, corners, across, nodes, within, starts, facing
+    )
+    seen = np.zeros((len(corners), 3), np.bool_)
+    runs = np.empty(2 * len(corners) + 2 * degree.sum() + 2, np.int64)
+    begins = np.empty(degree.sum() + 2, np.int64)
+    count, n = 0, 0
+    begins[0] = 0
+    for turn in range(2):
+        for begin in order:
+            if (degree[begin] != 2) != (turn == 0):
+                continue
+            for link in range(degree[begin]):
+                if seen[begin, link]:
+                    continue
+                first = n
+                runs[n] = begin
+                n += 1
+                here, way = begin, link
+                while True:
+                    there = links[here, way]
+                    back = _link_to(links, degree, there, here)
+                    seen[here, way] = True
+                    seen[there, back] = True
+                    runs[n] = there
+                    n += 1
+                    if degree[there] != 2 or seen[there, 1 - back]:
+                        break
+                    here, way = there, 1 - back
+                if _is_spur(nodes, radius, degree, runs[first:n]):
+                    n = first
+                else:
+                    count += 1
+                    begins[count] = n
+    return nodes, radius, runs[:n], begins[: count + 1]
+
+
+@njit(cache=True, nogil=True)
+def _centres(samples_mm: Any, corners: Any) -> tuple[Any, Any]:
+    """Circumcentres and circumradii."""
+    nodes = np.empty((len(corners), 2))
+    radius = np.empty(len(corners))
+    for t in range(len(corners)):
+        ax, ay = samples_mm[corners[t, 0]]
+        ux, uy = samples_mm[corners[t, 1], 0] - ax, samples_mm[corners[t, 1], 1] - ay
+        vx, vy = samples_mm[corners[t, 2], 0] - ax, samples_mm[corners[t, 2], 1] - ay
+        twice = 2.0 * (ux * vy - uy * vx)
+        uu, vv = ux * ux + uy * uy, vx * vx + vy * vy
+        x, y = FAR_MM, FAR_MM
+        if twice != 0.0:
+            x, y = (vy * uu - uy * vv) / twice, (ux * vv - vx * uu) / twice
+        if not (abs(x) < FAR_MM and abs(y) < FAR_MM):
+            x, y = FAR_MM, FAR_MM
+        nodes[t, 0], nodes[t, 1] = ax + x, ay + y
+        radius[t] = np.hypot(x, y)
+    return nodes, radius
+
+
+@njit(cache=True, nogil=True)
+def _links(
+    samples_mm: Any,
+    owner: Any,
+    place: Any,
+    corners: Any,
+    across: Any,
+    nodes: Any,
+    within: Any,
+    starts: Any,
+    facing: float,
+) -> tuple[Any, Any, Any]:
+    """Neighbours of each node along the axis, how many, and nodes in the order they came up."""
+    links = np.empty((len(corners), 3), np.int64)
+    degree = np.zeros(len(corners), np.int64)
+    order = np.empty(len(corners), np.int64)
+    ring = np.zeros(len(starts), np.int64)
+    for k in range(len(owner)):
+        ring[owner[k]] += 1
+    n = 0
+    for t in range(len(corners)):
+        for k in range(3):
+            to = np.int64(across[t, k])
+            if to <= t or not within[t] or not within[to]:
+                continue
+            p, q = corners[t, (k + 1) % 3], corners[t, (k + 2) % 3]
+            x = 0.5 * (nodes[t, 0] + nodes[to, 0]) - samples_mm[p, 0]
+            y = 0.5 * (nodes[t, 1] + nodes[to, 1]) - samples_mm[p, 1]
+            apart = np.hypot(
+                samples_mm[p, 0] - samples_mm[q, 0], samples_mm[p, 1] - samples_mm[q, 1]
+            )
+            if apart < facing * np.hypot(x, y):
+                continue
+            if owner[p] == owner[q]:
+                along = abs(place[p] - place[q])
+                if min(along, ring[owner[p]] - along) <= 1:
+                    continue  # next to each other on one wall
+            for node in (t, to):
+                if degree[node] == 0:
+                    order[n] = node
+                    n += 1
+            links[t, degree[t]] = to
+            links[to, degree[to]] = t
+            degree[t] += 1
+            degree[to] += 1
+    return links, degree, order[:n]
+
+
+@njit(cache=True, nogil=True)
+def _link_to(links: Any, degree: Any, node: int, other: int) -> int:
+    for k in range(degree[node]):
+        if links[node, k] == other:
+            return k
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _is_spur(nodes: Any, radius: Any, degree: Any, run: Any) -> bool:
+    """A branch that ends at a wall, hardly longer than the junction it leaves is wide."""
+    junction = 0.0
+    for node in (run[0], run[-1]):
+        if degree[node] > 2:
+            junction = max(junction, radius[node])
+    if junction == 0.0 or (degree[run[0]] != 1 and degree[run[-1]] != 1):
+        return False
+    long = 0.0
+    for k in range(len(run) - 1):
+        long += np.hypot(
+            nodes[run[k + 1], 0] - nodes[run[k], 0], nodes[run[k + 1], 1] - nodes[run[k], 1]
+        )
+    return bool(long < LEAF_RATIO * junction)
+
+
+@njit(cache=True, nogil=True)
+def apart_by(points: Any, least: float) -> Any:
+    """Which points of a chain to keep so that they lie at least so far apart; its ends stay."""
+    keep = np.zeros(len(points), np.bool_)
+    last = 0
+    for k in range(1, len(points) - 1):
+        if np.hypot(points[k, 0] - points[last, 0], points[k, 1] - points[last, 1]) >= least:
+            keep[k] = True
+            last = k
+    keep[0] = keep[-1] = True
+    return keep
