@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from amrepair.detect.holes import is_closed, spoken_of
 from amrepair.detect.rooms import Rooms, find_rooms
 from amrepair.detect.surfels import Surfels
+from amrepair.detect.turning import turned_down, turned_to_close
 from amrepair.detect.winding import Shell
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -42,7 +43,7 @@ NEAR_SPACINGS = 3.0
 SURE_WINDING = 0.05
 PROBE_MM = 0.5
 OPEN_WINDING = 0.3
-MOST_TURNS = 12
+STEP_SPACINGS = 2.0  # before a face and behind it, where the winding number is asked
 # A sign vector needs this mean agreement with the template before file normals are believed.
 NORMAL_AGREEMENT = 0.5
 
@@ -224,7 +225,17 @@ def find_faces(
         outward = np.where(flip[:, None], -plane[which], plane[which])
     else:
         side = rooms.open_side(place[which], plane[which])
-        outward = _turned(place, which, plane, area, neighbours, patches, present, spacing_mm, side)
+        outward = turned_down(
+            place,
+            which,
+            plane,
+            area,
+            neighbours,
+            present_mm=patches.place_mm[present],
+            present_mm2=patches.vector_mm2[present],
+            step_mm=STEP_SPACINGS * spacing_mm,
+            side=side,
+        )
     holes = np.flatnonzero(~present)
     spoken, looked_at = spoken_of(
         template, patches.place_mm[holes], place[which], outward, spacing_mm=spacing_mm
@@ -232,11 +243,14 @@ def find_faces(
     present[holes[~spoken]] = True
     seen_mm2 = patches.vector_mm2[present].sum(axis=0)
     whole_mm2 = patches.vector_mm2.sum(axis=0)
+    closed = is_closed(seen_mm2, whole_mm2, outward * area[which, None])
+    if given is None and not closed:
+        other = turned_to_close(
+            outward, area[which], side != 0, which, neighbours, seen_mm2=seen_mm2
+        )
+        closed = is_closed(seen_mm2, whole_mm2, other * area[which, None])
+        outward = other if closed else outward
     vectors = outward * area[which, None]
-    closed = is_closed(seen_mm2, whole_mm2, vectors)
-    if given is None and not closed and is_closed(seen_mm2, whole_mm2, -vectors):
-        # only the other way round do they close what was seen
-        outward, vectors, closed = -outward, -vectors, True
     normal = np.zeros((len(places), 3))
     normal[which] = outward
     deviations = np.concatenate([deviation, surfels.deviation_mm[rest]])
@@ -411,51 +425,6 @@ def _given(
     if abs(agreement) < NORMAL_AGREEMENT:
         return None
     return np.asarray(normals * np.sign(agreement))
-
-
-def _turned(
-    place_mm: Float[np.ndarray, "n 3"],
-    which: Int[np.ndarray, " q"],
-    plane: Float[np.ndarray, "n 3"],
-    area_mm2: Float[np.ndarray, " n"],
-    neighbours: Int[np.ndarray, "n k"],
-    patches: Patches,
-    present: Bool[np.ndarray, " m"],
-    spacing_mm: float,
-    side: Float[np.ndarray, " q"],
-) -> Float[np.ndarray, "q 3"]:
-    """Planes of the broken faces turned to the side known to be open, or down the winding number.
-
-    First the winding number of the template's surface where it is present, and of the faces whose
-    side is known: it falls toward the hole. Then with all faces, until none turns any more.
-    """
-    normal, place = np.where(side[:, None] < 0, -1.0, 1.0) * plane[which], place_mm[which]
-    sure = side != 0
-    known = np.concatenate([patches.place_mm[present], place[sure]])
-    known_vector = np.concatenate(
-        [patches.vector_mm2[present], normal[sure] * area_mm2[which[sure], None]]
-    )
-    shell = Shell.of(known, known_vector)
-    place, open_normal = place[~sure], normal[~sure]
-    which_open, area_open = which[~sure], area_mm2[which[~sure], None]
-    step_mm = 2.0 * spacing_mm
-    falls = np.zeros_like(place_mm)
-    falls[which[sure]] = normal[sure]
-    for turn in range(MOST_TURNS if len(place) else 0):
-        ahead, behind = place + step_mm * open_normal, place - step_mm * open_normal
-        drop = shell.winding(behind) - shell.winding(ahead)
-        falls[which_open] = drop[:, None] * open_normal
-        # a face is decided as a whole, not point by point
-        vote = (falls[neighbours[which_open]].sum(axis=1) * open_normal).sum(axis=1)
-        if turn and (vote >= 0).all():
-            break
-        open_normal = np.where(vote[:, None] < 0, -open_normal, open_normal)
-        shell = Shell.of(
-            np.concatenate([known, place]),
-            np.concatenate([known_vector, open_normal * area_open]),
-        )
-    normal[~sure] = open_normal
-    return np.asarray(normal)
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -193,7 +193,7 @@ def _due(
     wanted = np.where(below - model.wanted_below(z_mm - most_mm) > ROUNDING_MM, wanted, 0.0)
     gap = z_mm - model.surface_mm
     thick = np.clip(np.minimum(gap, wanted + AGREE_MM), 0.0, None)
-    last = model.top_mm <= z_mm + 1e-6
+    last = np.minimum(model.top_mm, following_mm) <= z_mm + ROUNDING_MM
     due = (following_mm - model.surface_mm > most_mm) | last
     active = here & due & (wanted > LEAST_THICK_MM / 2) & (thick >= LEAST_THICK_MM)
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer

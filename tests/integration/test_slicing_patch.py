@@ -244,6 +244,17 @@ def test_a_flat_top_between_two_layers_is_made_at_its_own_height() -> None:
     assert plan.beads_mm3 == pytest.approx((missing + higher).volume(), rel=0.03)
 
 
+def test_a_flat_top_is_one_however_its_height_was_rounded() -> None:
+    """Columns a hundredth of a micron over the median were put off to a pass that never came."""
+    block = m3.Manifold.cube((30.0, 30.0, 3.5)).translate((60.0, 60.0, 0.0))
+    wide = m3.Manifold.cube((8.0, 9.0, 0.5)).translate((66.0, 66.0, 3.0))
+    beside = m3.Manifold.cube((6.0, 9.0, 0.50001)).translate((74.0, 66.0, 3.0))
+    higher = m3.Manifold.cube((4.0, 4.0, 1.3)).translate((83.0, 83.0, 3.5))
+    missing = wide + beside + higher
+    plan, _ = plan_of(missing, block)
+    assert plan.beads_mm3 == pytest.approx(missing.volume(), rel=0.03)
+
+
 def test_overhangs_grow_as_far_along_a_diagonal_as_along_the_grid() -> None:
     """By one and the same distance a layer: a diamond of cells held diagonals back."""
     shares = []

@@ -133,8 +133,9 @@ def test_broken_faces_are_turned_so_that_they_close_what_was_seen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Turned the wrong way, they made a frame's lost corner 8 % of what it was."""
-    turned = faces._turned
-    monkeypatch.setattr(faces, "_turned", lambda *given: -turned(*given))
+    turned = faces.turned_down
+    monkeypatch.setattr(faces, "turned_down", lambda *a, **named: -turned(*a, **named))
+    monkeypatch.setattr(faces.Rooms, "open_side", lambda rooms, face, plane: np.zeros(len(face)))
     part = box(0, 0, 0, 30, 20, 6)
     field = field_of(part, box(20, -1, 4, 31, 21, 7), least_up=-2.0)
     assert heights(field, (21.0, 29.0), (1.0, 19.0)).max() < 4.3

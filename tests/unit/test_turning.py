@@ -1,57 +1,63 @@
-"""Ways to lay a part on the bed: a slot under a roof is open from the side."""
+"""Broken faces are turned whole until they close what was seen."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import manifold3d as m3
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
-from amrepair.errors import InputError
-from amrepair.turning import TURNS, Turn, rank_turns, turns_named
-from gcode.profiles import PrintSetup, load_setup
-from gcode.slicing.layers import LayerGrid
+from amrepair.detect.turning import turned_to_close
 
-SETUP = load_setup()
-
-
-def _ranked(
-    whole: m3.Manifold, missing: m3.Manifold, *names: str, setup: PrintSetup = SETUP
-) -> tuple[Turn, ...]:
-    grid = LayerGrid.from_setup(setup)
-    return rank_turns(missing, whole - missing, names, setup=setup, grid=grid)
-
-
-def test_a_slot_under_a_roof_is_reached_from_its_open_side() -> None:
-    whole = m3.Manifold.cube((30.0, 30.0, 30.0)).translate((50.0, 50.0, 0.0))
-    slot = m3.Manifold.cube((3.0, 30.0, 20.0)).translate((77.0, 50.0, 5.0))  # open to +X
-    ranked = _ranked(whole, slot, "x180", "z90", "y270")
-    by_name = {turn.name: turn for turn in ranked}
-    assert ranked[0].name == "y270"  # +X looks up
-    assert by_name["y270"].reachable_ratio > 0.7
-    assert by_name["x180"].reachable_ratio < 0.05
-    assert all(turn.stands for turn in ranked)
+APART_MM = 0.2
+# (origin, along, across, normal into the pit) of a floor and four walls of a pit 8 × 6 × 2 mm
+SIDES = {
+    "floor": ((0, 0, 0), (8, 0, 0), (0, 6, 0), (0, 0, 1)),
+    "west": ((0, 0, 0), (0, 6, 0), (0, 0, 2), (1, 0, 0)),
+    "east": ((8, 0, 0), (0, 6, 0), (0, 0, 2), (-1, 0, 0)),
+    "south": ((0, 0, 0), (8, 0, 0), (0, 0, 2), (0, 1, 0)),
+}
 
 
-def test_what_does_not_fit_the_printer_is_not_suggested() -> None:
-    whole = m3.Manifold.cube((20.0, 20.0, 60.0)).translate((50.0, 50.0, 0.0))
-    notch = m3.Manifold.cube((20.0, 20.0, 2.0)).translate((50.0, 50.0, 58.0))
-    low = replace(SETUP, printer=SETUP.printer.model_copy(update={"max_z_mm": 30.0}))
-    (standing,) = _ranked(whole, notch, "z180", setup=low)
-    assert standing.reachable_ratio == 0.0
-    assert not standing.stands
+def pit(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, outward normals with noise, and the number of the side of each."""
+    points, normals, side = [], [], []
+    for k, (origin, along, across, normal) in enumerate(SIDES.values()):
+        u, v = np.array(along, float), np.array(across, float)
+        n = int(np.linalg.norm(u) * np.linalg.norm(v) / APART_MM**2)
+        points.append(np.array(origin) + rng.random((n, 1)) * u + rng.random((n, 1)) * v)
+        askew = np.array(normal) + rng.normal(scale=0.12, size=(n, 3))
+        normals.append(askew / np.linalg.norm(askew, axis=1, keepdims=True))
+        side.append(np.full(n, k))
+    return np.concatenate(points), np.concatenate(normals), np.concatenate(side)
 
 
-def test_a_wedge_on_its_edge_does_not_stand() -> None:
-    wedge = m3.Manifold.cube((20.0, 20.0, 20.0)).rotate((45.0, 0.0, 0.0))
-    low = wedge.bounding_box()
-    wedge = wedge.translate((60.0, 60.0, -low[2]))
-    chip = m3.Manifold.cube((20.0, 60.0, 1.0)).translate((60.0, 40.0, wedge.bounding_box()[5] - 1))
-    (turn,) = _ranked(wedge, wedge ^ chip, "z90")
-    assert not turn.stands
+@given(wrong=st.sets(st.sampled_from((0, 1, 3))), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_faces_that_were_turned_the_wrong_way_close_the_pit_again(
+    wrong: set[int], seed: int
+) -> None:
+    """Two walls that face each other say nothing of each other: one of them is known."""
+    points, truth, side = pit(np.random.default_rng(seed))
+    area = np.full(len(points), APART_MM**2)
+    near = cKDTree(points).query(points, k=16)[1].astype(np.int64)
+    turned = turned_to_close(
+        np.where(np.isin(side, list(wrong))[:, None], -truth, truth),
+        area,
+        side == 2,
+        np.arange(len(points)),
+        near,
+        seen_mm2=-(truth * area[:, None]).sum(axis=0),
+    )
+    right = (turned * truth).sum(axis=1) > 0
+    assert right.mean() > 0.97
 
 
-def test_an_unknown_turn_is_refused() -> None:
-    with pytest.raises(InputError, match="--turn is 'w90'"):
-        turns_named(["w90"])
-    assert turns_named(["x90", "any", "x90"]) == ("x90", *(n for n in TURNS if n != "x90"))
+def test_what_closes_stays_as_it_is() -> None:
+    points, truth, side = pit(np.random.default_rng(0))
+    area = np.full(len(points), APART_MM**2)
+    near = cKDTree(points).query(points, k=16)[1].astype(np.int64)
+    seen = -(truth * area[:, None]).sum(axis=0)
+    turned = turned_to_close(truth, area, side < 0, np.arange(len(points)), near, seen_mm2=seen)
+    assert ((turned * truth).sum(axis=1) > 0).mean() == pytest.approx(1.0, abs=0.02)
