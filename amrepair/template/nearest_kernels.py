@@ -13,6 +13,7 @@ from numba import njit, prange
 
 LEAF = 4  # triangles
 DEEP = 64  # of the stack: halves of any mesh that fits into memory
+TINY = 1e-300  # of triangles without area
 WITHIN, UPRIGHT = 1e-6, 0.99  # of a triangle's weights; the cosine from its normal
 TOGETHER = 256  # points by one thread; each starts from the triangle of the one before
 
@@ -82,16 +83,16 @@ def _on_triangle(px, py, pz, t):
     elif d3 >= 0.0 and d4 <= d3:
         s = 1.0
     elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        s = d1 / (d1 - d3)
+        s = d1 / max(d1 - d3, TINY)
     elif d6 >= 0.0 and d5 <= d6:
         w = 1.0
     elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / (d2 - d6)
+        w = d2 / max(d2 - d6, TINY)
     elif va <= 0.0 and d4 >= d3 and d5 >= d6:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        w = (d4 - d3) / max((d4 - d3) + (d5 - d6), TINY)
         s = 1.0 - w
     else:
-        total = va + vb + vc
+        total = max(va + vb + vc, TINY)
         s, w = vb / total, vc / total
     dx = ax - s * ux - w * vx
     dy = ay - s * uy - w * vy

@@ -94,6 +94,17 @@ def test_a_fold_of_no_thickness_does_not_turn_the_part_inside_out() -> None:
     assert np.array_equal(tree.inside(points), points[:, 2] < 10.0)
 
 
+def test_triangles_without_area_are_no_trouble() -> None:
+    # regression: a corner that stands twice in a triangle divided by zero
+    corners = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [5, 0, 0], [20, 0, 0], [20, 5, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 1, 1], [0, 3, 1], [2, 2, 2], [0, 0, 1], [4, 5, 4]])
+    tree = TriangleTree.of(corners, faces)
+    assert (tree.nearest(corners).size_mm < 1e-12).all()
+    points = np.random.default_rng(0).uniform(0, 10, (500, 3))
+    above = points[points[:, 0] + points[:, 1] < 10]
+    assert tree.nearest(above).size_mm == pytest.approx(above[:, 2], abs=1e-12)
+
+
 def test_signs_from_few_rays_are_those_of_all(bracket: MeshSdf) -> None:
     low = bracket.bounds_mm[0] - 3.1
     cell_mm, shape = 2.3, (38, 25, 23)
