@@ -92,7 +92,7 @@ def queries(made: dict[str, Template], exact: MeshSdf) -> None:
     near = surface_of(exact.mesh, 500_000)[0] + rng.normal(0, 0.3, (500_000, 3))
     points = np.concatenate([near, rng.uniform(low - 5, high + 5, (500_000, 3))])
     print("\nA million points, half of them near the surface: median of three, s\n")
-    for name, template in {**made, "exact (Embree)": exact}.items():
+    for name, template in {**made, "exact": exact}.items():
         rounds = 1 if name == "paper" else 3
         spent = [timed(lambda t=template: t.distance(points))[1] for _ in range(rounds)]
         print(f"- {name}: {np.median(spent):.2f}", flush=True)

@@ -37,6 +37,8 @@ FALSE_ALARMS_PER_SCAN = 1e-3
 MAX_EXCESS_MM = 12.0
 # Bed, skirt and first-layer ooze: one thick layer above the lowest plane of the part.
 BED_BAND_MM = 0.35
+# So much of the underside seen, so far from its rim: nothing lies under the part, there is no bed.
+SEEN_UNDERSIDE, RIM_MM, FOOT_CELL_MM, MOST_FOOT = 0.3, 0.15, 1.0, 20_000
 # Fewer cells than this over the threshold are an outlier, not a surface.
 MIN_CORE_CELLS = 3
 SURFACE_SPACING_MM = 0.6
@@ -210,11 +212,34 @@ def _background(
     scan: Scan, template: Template, f_mm: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
+    if _shows_underside(scan, template, f_mm):
+        return np.asarray(f_mm > MAX_EXCESS_MM)
     low_z = float(template.bounds_mm[0, 2])
     bed = (scan.points_mm[:, 2] < low_z + BED_BAND_MM) & (f_mm > 0.02)
     inside_band = scan.points_mm[:, 2] > low_z - BED_BAND_MM
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
     return (bed & (f_mm > BED_BAND_MM / 2)) | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
+
+
+def _shows_underside(scan: Scan, template: Template, f_mm: Float[np.ndarray, " n"]) -> bool:
+    """Whether the part was seen from below: then what bulges there is no bed."""
+    low_z = float(template.bounds_mm[0, 2])
+    rim_mm = max(RIM_MM, 4.0 * scan.sigma_mm)
+    near = np.flatnonzero((np.abs(f_mm) < rim_mm) & (scan.points_mm[:, 2] < low_z + rim_mm))
+
+    def cells_within(points_mm: Float[np.ndarray, "k 3"]) -> set[tuple[int, int]]:
+        above = points_mm.copy()
+        above[:, 2] = low_z + rim_mm + RIM_MM
+        under = above[template.distance(above) < -rim_mm, :2] if len(above) else above[:, :2]
+        index = np.unique(np.floor(under / FOOT_CELL_MM).astype(np.int64), axis=0)
+        return {(int(x), int(y)) for x, y in index}
+
+    seen = cells_within(scan.points_mm[near[:: len(near) // MOST_FOOT + 1]])
+    if not seen:
+        return False
+    surface = template.surface_points(SURFACE_SPACING_MM)[0]
+    foot = cells_within(surface[surface[:, 2] < low_z + ON_PLANE_MM])
+    return len(seen & foot) > SEEN_UNDERSIDE * max(len(foot), 1)
 
 
 def _threshold(

@@ -1,11 +1,11 @@
-"""The false-alarm rate that detection states: counted on clean scans, at rates that can be seen."""
+"""What detection calls a defect: no more of the noise than it states, the bed not, bulges below."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from amrepair.detect import detect
+from amrepair.detect import Label, detect
 from amrepair.scans import Scan
 from tests.analytic import box, cylinder, difference, sample_surface
 
@@ -35,3 +35,37 @@ def test_the_rate_is_what_sets_the_limit() -> None:
     assert alarms(1e-3, 2, 1e-6) == 0.0
     assert alarms(300.0, 2, 1e-6) > 0.0  # so noise can raise alarms, and the limit holds them back
     assert alarms(300.0, 1, None) == 0.0  # the process's allowance is far above this noise
+
+
+def on_bed(bulge_mm: float, *, seen_from_below: bool) -> Scan:
+    """A plate of 40 × 30 × 6 mm whose foot sags in a spot; on a bed unless seen from below."""
+    plate = box((0, 0, 0), (40, 30, 6))
+    points = sample_surface(plate.body, 0.4, seed=2)[0]
+    below = points[:, 2] < 1e-6
+    if seen_from_below:
+        radius = np.linalg.norm(points[:, :2] - (20, 15), axis=1)
+        points[below, 2] -= bulge_mm * np.exp(-((radius[below] / 4.0) ** 2))
+    else:
+        bed = np.random.default_rng(3).uniform((-15, -15), (55, 45), (30_000, 2))
+        outside = (bed < (0, 0)).any(axis=1) | (bed > (40, 30)).any(axis=1)
+        flat = np.column_stack([bed[outside], np.full(int(outside.sum()), -0.05)])
+        points = np.concatenate([points[~below], flat])
+    noise = np.random.default_rng(4).normal(0, SIGMA_MM, points.shape)
+    return Scan(points + noise, SIGMA_MM, "template")
+
+
+@pytest.mark.parametrize("bulge_mm", [0.6, 2.5])
+def test_what_bulges_from_the_underside_is_no_bed(bulge_mm: float) -> None:
+    # regression: everything at and below the lowest plane was taken for the bed
+    plate = box((0, 0, 0), (40, 30, 6))
+    scan = on_bed(bulge_mm, seen_from_below=True)
+    found = detect(scan, plate)
+    assert [region.label for region in found.regions] == [Label.EXCESS]
+    assert found.regions[0].depth_mm == pytest.approx(bulge_mm, rel=0.25)
+    deep = found.deviation_mm > 0.4
+    assert (found.label[deep] == int(Label.EXCESS)).mean() > 0.95
+    assert detect(on_bed(0.0, seen_from_below=True), plate).regions == ()
+
+
+def test_a_bed_around_the_part_is_no_excess() -> None:
+    assert detect(on_bed(0.0, seen_from_below=False), box((0, 0, 0), (40, 30, 6))).regions == ()
