@@ -126,8 +126,8 @@ def pose_from_anywhere(
         Noise of the points, as was said; measured where that leaves them unexplained.
     """
     sigma_mm, inlier_mm = limits_mm(sigma_mm)
-    clouds, left_out_ratio = _clouds(points_mm, template, sigma_mm, rng), 0.0
-    part_mm = points_mm
+    scan = _clouds(points_mm, template, sigma_mm, rng)
+    clouds, part_mm, left_out_ratio = scan, points_mm, 0.0
     field = CoarseField.of(template)
     progress("align", 0.1, 1.0)
     found = _refined(_worth_refining(clouds, field, QUICK, rng), clouds, template)
@@ -169,6 +169,11 @@ def pose_from_anywhere(
         if extra:
             starts = [pose.matrix for pose in search(clouds.dense_mm, field, rng, only=extra)]
             found = sorted(found + _refined(starts, clouds, template), key=_by_score)
+    if left_out_ratio > 0.0:
+        whole = _refined([pose.matrix for _, pose in found[:FEW_TRIED]], scan, template)
+        if _explained(whole[0][1], inlier_mm) > CLEARED:
+            # what was left out lies on the part as well: it was no clutter
+            clouds, found, left_out_ratio, part_mm = scan, whole, 0.0, points_mm
     progress("align", 0.8, 1.0)
     if _explained(found[0][1], inlier_mm) > EXPLAINED:
         turned = _refined(_turns(found, clouds, template, rng), clouds, template)

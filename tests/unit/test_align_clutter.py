@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import Float
 
 from amrepair.align import Registration, align
-from amrepair.align.clutter import noise_across, without_clutter
+from amrepair.align.clutter import Kept, noise_across, without_clutter
 from amrepair.align.search import spread_rotations
 from amrepair.errors import AlignmentError
 from amrepair.scans import Scan
@@ -84,6 +84,32 @@ def test_a_scan_without_clutter_keeps_nearly_all_of_itself() -> None:
     kept = without_clutter(points + rng.normal(0, SIGMA_MM, points.shape), rng)
     # edges may look scattered and a face like a bed, never more
     assert all(one.left_out_ratio < 0.45 for one in kept)
+
+
+def test_what_lies_on_the_part_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    # regression: a view whose pose was found only on half of it (the rest was taken for a bed) was
+    # refused as a mirror image, because no more than that half was said to be explained
+    part = sample_surface(stepped().body, 0.6, seed=8)[0]
+    half = part[part[:, 2] > 3.0]
+    starts = iter([rotated_by_a_quarter(), np.eye(4)])
+    monkeypatch.setattr(
+        "amrepair.align.anywhere._worth_refining",
+        lambda *_, **__: [next(starts, rotated_by_a_quarter())],
+    )
+    monkeypatch.setattr(
+        "amrepair.align.anywhere.without_clutter",
+        lambda points, rng: [Kept(half, 1.0 - len(half) / len(part))],
+    )
+    found = align(Scan(part, SIGMA_MM, "scanner", source="scan.ply"), stepped())
+    assert found.clutter_ratio == 0.0
+    assert found.inlier_ratio > 0.99
+
+
+def rotated_by_a_quarter() -> Float[np.ndarray, "4 4"]:
+    start = np.eye(4)
+    start[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    start[:3, 3] = (30.0, 5.0, 4.0)
+    return start
 
 
 def test_the_other_hand_is_refused() -> None:
