@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 LEAST_POINTS = 2_000
 MAX_POINTS = 400_000  # of one scan; more add time, not accuracy
+# Of one point's noise: a template that follows what is finer is larger, slower, and no truer (4
+# scans of 200,000 points, noise 30 µm: 8.8 µm off, 8.2 so).
+FOLLOWED = 0.5
 SIZE_JUMP = 3.0  # scans of one part in one unit differ by less
 
 
@@ -106,6 +109,7 @@ def fit_from_scans(
     made = fit_fast(
         MeshSdf.from_mesh(closed),
         seed=seed,
+        least_residual_mm=FOLLOWED * cloud.sigma_mm,
         metadata=metadata,
         progress=progress,
     )

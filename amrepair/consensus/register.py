@@ -1,8 +1,7 @@
-"""Scans onto each other, without a template: features propose, point to plane disposes.
+"""Scans onto each other, without a template: `propose` places each, point to plane disposes.
 
-KISS-Matcher (H. Lim et al., ICRA 2025) and GICP (K. Koide, small_gicp, 2024) place each scan on
-what is placed already; then all poses are refined together. What cannot be placed is left out and
-named.
+Each scan is placed on what is placed already; then all poses are refined together. What cannot be
+placed is left out and named.
 """
 
 from __future__ import annotations
@@ -14,21 +13,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from amrepair.align.coarse import poses_between
 from amrepair.align.thinning import thin_out
-from amrepair.consensus.cloud import planes, spacing_of
+from amrepair.consensus.propose import applied, propose
 from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector
 from gcode.progress import Progress, silent
 
-COARSE_POINTS, FINE_POINTS, SCORE_POINTS = 15_000, 12_000, 4_000
+COARSE_POINTS, FINE_POINTS = 15_000, 12_000
 GOOD_OVERLAP, LEAST_OVERLAP = 0.6, 0.25
-# A point farther from the model than it lies overlaps by reach is above it, not beside it, where
-# this share of the way is along the normal; it counts this many times.
-ABOVE, CONTRADICTION = 0.8, 4.0
-# More than this against each point that agrees, and the pose is wrong: a plate on its other half
-# has 0.5, that plate in its place 0.16 (its edges), scans of a whole part under 0.05.
-MOST_AGAINST = 0.3
 ROUNDS = 12
 SHRINK = 0.6
 
@@ -93,12 +85,12 @@ def place_all(
     proposed: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
     bar = GOOD_OVERLAP
     while waiting:
-        model = np.concatenate([_apply(poses[k], thin[k]) for k in poses])
+        model = np.concatenate([applied(poses[k], thin[k]) for k in poses])
         size, found = len(poses), []
         for k in waiting:
             progress("align", float(len(poses)), float(len(pieces)))
             if (k, size) not in proposed:
-                proposed[k, size] = _propose(thin[k], model, diagonal_mm)
+                proposed[k, size] = propose(thin[k], model, diagonal_mm)
             if proposed[k, size][0] >= bar:
                 found.append(k)
         if bar < GOOD_OVERLAP:  # the best of the doubtful; then the model has grown: look again
@@ -124,86 +116,8 @@ def place_all(
     )
 
 
-def _apply(
-    pose: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    return points @ pose[:3, :3].T + pose[:3, 3]
-
-
 def _coverage(points_mm: Float[np.ndarray, "n 3"], voxel_mm: float) -> int:
     return len(np.unique(np.floor(points_mm / voxel_mm).astype(np.int64), axis=0))
-
-
-def _propose(
-    source_mm: Float[np.ndarray, "n 3"], model_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
-) -> tuple[float, Float[np.ndarray, "4 4"]]:
-    """The best pose of a scan on the model, and the share of it that lies there.
-
-    Overlap alone would lay one half of a part on the other. A point beside the model's rim says
-    nothing; one above or below its surface contradicts the pose.
-    """
-    best_overlap, best_score, best_pose = 0.0, -np.inf, np.eye(4)
-    tree = cKDTree(model_mm)
-    usual = float(np.median(tree.query(model_mm[:: max(1, len(model_mm) // 2000)], k=[2])[0]))
-    reach_mm = 3.0 * usual
-    model_plane = planes(model_mm, spacing_of(model_mm))[0]
-    source_plane = planes(source_mm, spacing_of(source_mm))[0]
-    source_tree = cKDTree(source_mm)
-    target, target_tree = _prepared(model_mm, diagonal_mm)
-    source, _ = _prepared(source_mm, diagonal_mm)
-    thinner = len(source_mm) // SCORE_POINTS + 1
-    for guess in poses_between(source_mm, model_mm, diagonal_mm):
-        pose = _gicp(target, source, target_tree, guess, 0.02 * diagonal_mm)
-        moved = _apply(pose, source_mm[::thinner])
-        forth = tree.query(moved, workers=-1)
-        overlap = float((forth[0] < reach_mm).mean())
-        against = _above(moved, model_mm, model_plane, forth, reach_mm)
-        returned = _apply(np.linalg.inv(pose), model_mm[:: len(model_mm) // SCORE_POINTS + 1])
-        back = source_tree.query(returned, workers=-1)
-        against += _above(returned, source_mm, source_plane, back, reach_mm)
-        score = overlap - CONTRADICTION * against
-        if score > best_score:
-            agrees = against <= MOST_AGAINST * overlap
-            best_overlap, best_score, best_pose = overlap if agrees else 0.0, score, pose
-        if best_score > 0.95:
-            break
-    return best_overlap, best_pose
-
-
-def _above(
-    points_mm: Float[np.ndarray, "n 3"],
-    surface_mm: Float[np.ndarray, "m 3"],
-    plane: Float[np.ndarray, "m 3"],
-    nearest: tuple[np.ndarray, np.ndarray],
-    reach_mm: float,
-) -> float:
-    """Share of points that lie off the other surface, above or below it and not beside it."""
-    distance, index = nearest
-    height = np.abs(((points_mm - surface_mm[index]) * plane[index]).sum(axis=1))
-    return float(((distance > reach_mm) & (height > ABOVE * distance)).mean())
-
-
-def _prepared(points_mm: Float[np.ndarray, "n 3"], diagonal_mm: float) -> tuple[object, object]:
-    import small_gicp
-
-    return small_gicp.preprocess_points(
-        np.ascontiguousarray(points_mm), downsampling_resolution=0.006 * diagonal_mm
-    )
-
-
-def _gicp(
-    target: object,
-    source: object,
-    tree: object,
-    guess: Float[np.ndarray, "4 4"],
-    reach_mm: float,
-) -> Float[np.ndarray, "4 4"]:
-    import small_gicp
-
-    answer = small_gicp.align(
-        target, source, tree, init_T_target_source=guess, max_correspondence_distance=reach_mm
-    )
-    return np.array(answer.T_target_source)
 
 
 def _together(
@@ -251,12 +165,12 @@ def _pairs(
     sample: np.ndarray,
 ) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
     """Points of a scan, and normals and heights over the planes of the other scans."""
-    own = _apply(poses[k], pieces[k].points_mm[sample])
+    own = applied(poses[k], pieces[k].points_mm[sample])
     points, normals, heights = [], [], []
     for r, piece in enumerate(pieces):
         if r == k:
             continue
-        local = _apply(np.linalg.inv(poses[r]), own)
+        local = applied(np.linalg.inv(poses[r]), own)
         distance, index = piece.tree.query(
             local, distance_upper_bound=4.0 * piece.spacing_mm, workers=-1
         )

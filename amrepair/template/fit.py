@@ -37,6 +37,7 @@ def fit_fast(
     exact: MeshSdf,
     *,
     seed: int = 0,
+    least_residual_mm: float = 0.0,
     metadata: dict[str, str] | None = None,
     progress: Progress = silent,
 ) -> LearnedSdf:
@@ -48,6 +49,9 @@ def fit_fast(
         The closed mesh's own field.
     seed
         Of the points where the grid is compared with it.
+    least_residual_mm
+        Cells where the grid is better than this, or than `LEAST_RESIDUAL_MM`, are not divided: for
+        meshes that are no truer than that themselves.
     """
     rng = np.random.default_rng(seed)
     low, high = exact.bounds_mm
@@ -59,7 +63,7 @@ def fit_fast(
     bare = Grid.bare(origin, cell, base)
     points = _samples(exact, SAMPLES, BAND_CELLS * cell, rng)
     residual = np.abs(_measured(exact, points, progress) - bare.distance(points))
-    cells = _bent(bare, points, residual)
+    cells = _bent(bare, points, residual, max(LEAST_RESIDUAL_MM, least_residual_mm))
     grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, progress))
     held = _on_surface(exact, HELD_OUT, rng)
     bias_mm = float(np.quantile(np.abs(grid.distance(held)), 0.99))
@@ -135,12 +139,15 @@ def _samples(
 
 
 def _bent(
-    bare: Grid, points: Float[np.ndarray, "n 3"], residual: Float[np.ndarray, " n"]
+    bare: Grid,
+    points: Float[np.ndarray, "n 3"],
+    residual: Float[np.ndarray, " n"],
+    least_mm: float,
 ) -> Int[np.ndarray, "b 3"]:
     """(b, 3) cells where the coarse grid is not good enough, and their neighbours."""
     worst = np.zeros(bare.block_of.shape)
     np.maximum.at(worst, tuple(bare.cell_of(points).T), residual)
-    wrong = ndimage.binary_dilation(worst > LEAST_RESIDUAL_MM)
+    wrong = ndimage.binary_dilation(worst > least_mm)
     cells = np.argwhere(wrong)
     if len(cells) > MAX_BLOCKS:
         around = ndimage.maximum_filter(worst, 3)[tuple(cells.T)]
