@@ -185,15 +185,10 @@ def _reason(
     iy, ix = np.unravel_index(int(np.argmax(stuck)), stuck.shape)
     iy, ix = int(iy) + cells[0].start, int(ix) + cells[1].start
     point = model.points_mm.reshape(*model.shape, 2)[iy, ix]
-    field = model.reach.field
-    row, column = (int(v) for v in field.cells_of(point[None])[0])
-    ny, nx = field.shape
     if model.floor_mm[iy, ix] > model.top_mm[iy, ix] + LEAST_THICK_MM:
-        return COVERED
-    if not (0 <= row < ny and 0 <= column < nx):
         return COVERED
     # the tip over the first bead that is lacking: the lowest, where a bridge was laid over it
     under_bridge = model.sunk_mm[iy, ix] > 0
     lies_mm = model.floor_mm[iy, ix] + (0.0 if under_bridge else model.laid_mm[iy, ix])
     tip_mm = min(lies_mm + model.most_mm, model.top_mm[iy, ix])
-    return model.reach.reason_at(row, column, float(tip_mm))
+    return model.reach.reason_at(point, float(tip_mm))

@@ -21,6 +21,7 @@ MARGIN_MM = 3.0
 # A bead thicker than this share of the bore no longer presses onto its floor.
 MOST_THICK_NOZZLES = 0.8
 SEAM_MM = 1.0  # around a loop's seam, as far as old material hides it
+TIP_CELLS = 2  # in one of the field, each way
 NEAR_MM = 1.0  # a travel as short as this needs no lift
 
 
@@ -65,6 +66,7 @@ class PatchModel:
         self._printer = setup.printer
         self._window_mm = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
         self.reach = self._reach(as_built)
+        self._tip_cells = self.reach.cells_of(self.points_mm)
 
     def reach_over(self, finished: Bool[np.ndarray, "ny nx"]) -> Reach:
         """Where the nozzle may be once the columns asked for are filled as planned."""
@@ -73,7 +75,13 @@ class PatchModel:
     def _reach(self, field: HeightField) -> Reach:
         # the lowest pass lies at most one thick bead above the deficit's floor
         lowest_mm = max(0.0, float(self.box[2]))
-        return Reach(field, self._printer, lowest_tip_mm=lowest_mm, window_mm=self._window_mm)
+        return Reach(
+            field,
+            self._printer,
+            lowest_tip_mm=lowest_mm,
+            window_mm=self._window_mm,
+            finer=TIP_CELLS,
+        )
 
     def _centres(self) -> Float[np.ndarray, "n 2"]:
         ny, nx = self.shape
@@ -92,7 +100,7 @@ class PatchModel:
 
     def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the nozzle may be, from an answer of `reach`."""
-        return self.reach.free_at_points(self.points_mm, reach).reshape(self.shape)
+        return self.reach.free_in_cells(self._tip_cells, reach).reshape(self.shape)
 
     def surface(self, finished: Bool[np.ndarray, "ny nx"] | bool = True) -> HeightField:
         """The as-built field with the patch on it, or with what of it is finished."""

@@ -126,7 +126,10 @@ def _flats(model: PatchModel, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndar
         if np.abs(np.array([*tops_mm, *found]) - z_mm).min() < LEAST_THICK_MM:
             continue
         # no rim or slope that passes through this height
-        flat = ndimage.binary_opening(np.abs(tops - z_mm) <= ON_FLAT_MM, least)
+        at = np.abs(tops - z_mm) <= ON_FLAT_MM
+        (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in at.nonzero())
+        flat = np.zeros_like(at)
+        flat[y0:y1, x0:x1] = ndimage.binary_opening(at[y0:y1, x0:x1], least)
         if flat.sum() * model.cell_mm**2 >= FLAT_MM2:
             found.append(float(np.median(tops[flat])))
     return np.array(found)

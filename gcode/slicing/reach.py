@@ -13,13 +13,9 @@ from jaxtyping import Bool, Float, Int
 from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
 
-# The flat may press this deep into the plastic beside it; with what a scan gets
-# wrong it stays under the checker's limit.
-TIP_PRESS_MM = 0.06
-# The noise of the field: half of what the checker allows.
-BODY_PRESS_MM = 0.05
-# The tip lies somewhere in its cell: half of a fine one.
-ASIDE_MM = 0.05
+# So deep the flat may press into the plastic beside it, and the body lie in the noise of the field;
+# with what a scan gets wrong it stays under the checker's limits, 0.2 and 0.1 mm.
+PRESS_MM = 0.08
 LEAST_TOLD_MM = 0.1
 
 
@@ -37,12 +33,22 @@ class Obstacle:
 
 
 def least_tip(
-    part: EnvelopeSlice, field: HeightField, window: tuple[slice, slice]
+    part: EnvelopeSlice, field: HeightField, window: tuple[slice, slice], finer: int = 1
 ) -> Float[np.ndarray, "ny nx"]:
-    """How high the tip must at least be, by column of the window, for a slice to clear all."""
-    press_mm = TIP_PRESS_MM if part.z_from_mm < 1e-9 else BODY_PRESS_MM
-    under_mm = field.max_within(part.polygon_mm, window, aside_mm=ASIDE_MM)
-    return np.asarray(under_mm - part.z_from_mm - press_mm)
+    """How high the tip must at least be for a slice to clear all, wherever in its cell it is.
+
+    By column of the window, each cut into `finer` × `finer`.
+    """
+    rows, columns = (finer * (w.stop - w.start) for w in window)
+    least = np.empty((rows, columns))
+    cell_mm = field.cell_mm / finer
+    for iy in range(finer):
+        for ix in range(finer):
+            dx, dy = ((k - 0.5 * (finer - 1)) * cell_mm for k in (ix, iy))
+            moved = [(x + dx, y + dy) for x, y in part.polygon_mm]
+            under_mm = field.max_within(moved, window, aside_mm=0.5 * cell_mm)
+            least[iy::finer, ix::finer] = under_mm - part.z_from_mm - PRESS_MM
+    return least
 
 
 class Reach:
@@ -56,6 +62,9 @@ class Reach:
         The tip is never asked about below this height.
     window_mm
         (x_min, y_min, x_max, y_max) where the tip is asked about; None is all of the field.
+    finer
+        Cells of the tip in one of the field, each way: the smaller they are, the less is lost to
+        not knowing where in its cell the tip is.
     """
 
     def __init__(
@@ -65,28 +74,31 @@ class Reach:
         *,
         lowest_tip_mm: float = 0.0,
         window_mm: tuple[float, float, float, float] | None = None,
+        finer: int = 1,
     ) -> None:
         window = field.window(window_mm or field.box_mm)
         self._top_mm = field.top_mm
         # a slice that stays above everything when the tip is lowest cannot touch
         high_mm = field.top_mm - lowest_tip_mm
         self.obstacles = tuple(
-            Obstacle(part, least_tip(part, field, window))
+            Obstacle(part, least_tip(part, field, window, finer))
             for part in printer.envelope
             if part.z_from_mm <= high_mm
         )
         self.field = field.crop(window_mm or field.box_mm)
+        self.cell_mm = field.cell_mm / finer
+        self.shape = (finer * self.field.shape[0], finer * self.field.shape[1])
 
     def least_over(self, way_mm: Float[np.ndarray, "n 2"]) -> float:
         """How high the tip must at least be to go along points; where unknown, over everything."""
-        index, inside = self._cells(way_mm)
+        index, inside = self.cells_of(way_mm)
         if not self.obstacles or not inside.all():
             return self._top_mm
         return max(float(o.least_tip_mm[index[:, 0], index[:, 1]].max()) for o in self.obstacles)
 
     def at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the tip may be at this height."""
-        free = np.ones(self.field.shape, dtype=bool)
+        free = np.ones(self.shape, dtype=bool)
         for obstacle in self.obstacles:
             free &= obstacle.least_tip_mm <= z_mm + 1e-9
         return free
@@ -95,20 +107,34 @@ class Reach:
         self, points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "ny nx"]
     ) -> Bool[np.ndarray, " n"]:
         """Values of an answer of `at` at points; outside the field nothing stands."""
-        index, inside = self._cells(points_mm)
+        return self.free_in_cells(self.cells_of(points_mm), free)
+
+    def free_in_cells(
+        self,
+        cells: tuple[Int[np.ndarray, "n 2"], Bool[np.ndarray, " n"]],
+        free: Bool[np.ndarray, "ny nx"],
+    ) -> Bool[np.ndarray, " n"]:
+        """The same for cells that `cells_of` gave, for those who ask again and again."""
+        index, inside = cells
         return np.asarray(~inside | np.asarray(free)[index[:, 0], index[:, 1]])
 
-    def _cells(
+    def cells_of(
         self, points_mm: Float[np.ndarray, "n 2"]
     ) -> tuple[Int[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
         """Cells of points, the first one for those outside, and which lie inside."""
-        index = self.field.cells_of(points_mm)
-        inside = np.asarray(((index >= 0) & (index < self.field.shape)).all(axis=1))
+        index = np.floor((points_mm - self.field.origin_mm) / self.cell_mm).astype(np.int64)[
+            :, ::-1
+        ]
+        inside = np.asarray(((index >= 0) & (index < self.shape)).all(axis=1))
         return np.where(inside[:, None], index, 0), inside
 
-    def reason_at(self, iy: int, ix: int, z_mm: float) -> str | None:
-        """What stands in the way of the tip at one column; None where nothing does."""
+    def reason_at(self, point_mm: Float[np.ndarray, " 2"], z_mm: float) -> str | None:
+        """What stands in the way of the tip at one place; None where nothing does."""
+        index, inside = self.cells_of(point_mm[None])
+        iy, ix = (int(v) for v in index[0])
         worst, part = 0.0, None
+        if not inside[0]:
+            return None
         for obstacle in self.obstacles:
             depth = float(obstacle.least_tip_mm[iy, ix]) - z_mm
             if depth > worst:

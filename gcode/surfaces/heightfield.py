@@ -6,7 +6,6 @@ description) and `.npy` (heights alone). It holds one height per column: undercu
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -366,23 +365,25 @@ def footprint_rows(
     reach = 0.5 + aside  # from a cell's centre to the far side of what it touches
     first = math.floor(outline[:, 1].min() - aside + 0.5)
     last = math.ceil(outline[:, 1].max() + aside - 0.5)
-    rows: list[tuple[int, int, int]] = []
-    for dy in range(first, last + 1):
-        # the polygon's reach in x over the whole band of the row, [dy − reach, dy + reach]
-        xs: list[float] = []
-        for (px, py), (qx, qy) in itertools.pairwise(closed):
-            low, high = max(min(py, qy), dy - reach), min(max(py, qy), dy + reach)
-            if low > high:
-                continue
-            if qy == py:
-                xs += [px, qx]
-            else:
-                xs += [px + (y - py) * (qx - px) / (qy - py) for y in (low, high)]
-        if xs:
-            low, high = min(xs) - aside, max(xs) + aside
-            rows.append((dy, math.floor(low + 0.5), math.ceil(high - 0.5)))
-    table = np.array(rows, np.int64).reshape(-1, 3)
-    return table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy()
+    dy = np.arange(first, last + 1)
+    # the polygon's reach in x over the whole band of each row, [dy − reach, dy + reach]
+    (px, py), (qx, qy) = closed[:-1].T, closed[1:].T
+    y = np.stack(
+        [
+            np.maximum(np.minimum(py, qy), dy[:, None] - reach),
+            np.minimum(np.maximum(py, qy), dy[:, None] + reach),
+        ]
+    )
+    level = qy == py
+    x = px + (y - py) * (qx - px) / np.where(level, 1.0, qy - py)
+    x = np.where(level, np.stack([px, qx])[:, None, :], x)
+    crossed = y[0] <= y[1]
+    low = np.where(crossed, x.min(axis=0), np.inf).min(axis=1) - aside
+    high = np.where(crossed, x.max(axis=0), -np.inf).max(axis=1) + aside
+    some = crossed.any(axis=1)
+    low_at = np.floor(low[some] + 0.5).astype(np.int64)
+    high_at = np.ceil(high[some] - 0.5).astype(np.int64)
+    return dy[some].astype(np.int64), low_at, high_at
 
 
 def _greatest_of_next(

@@ -110,27 +110,6 @@ def column_top(offset: Any, z: Any, empty: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def running_max(row: Any, low: int, reach: int, out: Any) -> None:
-    """out[i] = max(row[i+low : i+low+reach+1]) by a monotone queue; outside counts as −inf."""
-    n = row.shape[0]
-    queue = np.empty(n + 1, np.int64)
-    head = 0
-    tail = 0
-    entered = 0
-    for i in range(out.shape[0]):
-        last = min(n - 1, i + low + reach)
-        while entered <= last:
-            while tail > head and row[queue[tail - 1]] <= row[entered]:
-                tail -= 1
-            queue[tail] = entered
-            tail += 1
-            entered += 1
-        while tail > head and queue[head] < i + low:
-            head += 1
-        out[i] = row[queue[head]] if tail > head else -np.inf
-
-
-@njit(cache=True, nogil=True)
 def dilate_rows(
     z: Any, row_dy: Any, row_low: Any, row_high: Any, y0: int, y1: int, x0: int, x1: int
 ) -> Any:
@@ -140,18 +119,36 @@ def dilate_rows(
     """
     ny, nx = z.shape
     out = np.full((y1 - y0, x1 - x0), -np.inf)
-    line = np.empty(x1 - x0)
-    for r in range(row_dy.shape[0]):
-        low, high = row_low[r], row_high[r]
-        first = min(max(x0 + low, 0), nx)
-        last = max(min(x1 + high, nx), first)
-        for iy in range(y0, y1):
-            source = iy + row_dy[r]
-            if source < 0 or source >= ny or last == first:
+    if row_dy.shape[0] == 0:
+        return out
+    # maxima of 1, 2, 4 … cells from each cell on: two of them make any row of the footprint
+    top, left = y0 + row_dy.min(), x0 + row_low.min()
+    height, width = y1 + row_dy.max() - top, x1 + row_high.max() - left
+    spans = np.full((height, width), -np.inf)
+    for iy in range(max(0, -top), min(height, ny - top)):
+        for ix in range(max(0, -left), min(width, nx - left)):
+            spans[iy, ix] = z[iy + top, ix + left]
+    long, longest = 1, (row_high - row_low).max() + 1
+    while long <= longest:
+        for r in range(row_dy.shape[0]):
+            wide = row_high[r] - row_low[r] + 1
+            if wide < long or wide >= 2 * long:
                 continue
-            running_max(z[source, first:last], x0 + low - first, high - low, line)
-            for ix in range(x1 - x0):
-                out[iy - y0, ix] = max(out[iy - y0, ix], line[ix])
+            one = x0 + row_low[r] - left
+            other = one + wide - long
+            for iy in range(y1 - y0):
+                source = spans[iy + y0 + row_dy[r] - top]
+                into = out[iy]
+                for ix in range(x1 - x0):
+                    a, b = source[ix + one], source[ix + other]
+                    a = a if a > b else b
+                    into[ix] = a if a > into[ix] else into[ix]
+        for iy in range(height):
+            row = spans[iy]
+            for ix in range(width - long):
+                a, b = row[ix], row[ix + long]
+                row[ix] = a if a > b else b
+        long *= 2
     return out
 
 
