@@ -30,7 +30,7 @@ from amrepair.simulate.stage import DefectTruth, Stage
 from amrepair.simulate.world import World
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
-from gcode.firmware import EmulatedPrinterProcess
+from gcode.firmware import EmulatedPrinterProcess, MotionBatch
 from gcode.hosts import Printer, connect
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
@@ -189,6 +189,65 @@ def prepare_run(
     )
 
 
+def set_stage(
+    run: PreparedRun,
+    take_motion: Callable[[], MotionBatch],
+    *,
+    world: WorldParameters | None = None,
+    scanner: str = DEFAULT_SCANNER,
+) -> Stage:
+    """An empty world with its scanner, for a printer that tells its motion.
+
+    Parameters
+    ----------
+    take_motion
+        Hands over what the printer did since it was last asked; flow wanders here.
+    world, scanner
+        As for `simulate_run`.
+    """
+    printer = run.setup.printer
+    box = run.part.bounding_box()
+    centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
+    told = world or load_world()
+    model = told.scanner(scanner)
+    standing = World(
+        printer.bed_size_mm,
+        cell_mm=told.columns_mm,
+        nozzle_diameter_mm=printer.nozzle_diameter_mm,
+        filament_diameter_mm=printer.filament_diameter_mm,
+        bead=told.bead,
+        thermal=told.thermal,
+        middle_mm=centre,
+    )
+    rng = np.random.default_rng([run.seed, 2])
+    flow_rng = np.random.default_rng([run.seed, 3])
+    sensors_mm = default_sensors_mm(
+        centre,
+        distance_mm=max(300.0, 2.0 * float(box[5]) + 100.0),
+        oblique=model.oblique_views,
+    )
+    pose = seeded_pose(
+        rng,
+        centre_mm=centre,
+        offset_mm=model.offset_mm,
+        tilt_rad=float(np.deg2rad(model.tilt_deg)),
+    )
+    return Stage(
+        standing,
+        defects=run.defects,
+        scanner=SimulatedScanner(standing, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model),
+        take_motion=lambda: noisy_flow(take_motion(), flow_rng, told.flow),
+        layer_height_mm=run.setup.process.layer_height_mm,
+        part=run.part,
+        box_mm=(
+            box[0] - TRUTH_MARGIN_MM,
+            box[1] - TRUTH_MARGIN_MM,
+            box[3] + TRUTH_MARGIN_MM,
+            box[4] + TRUTH_MARGIN_MM,
+        ),
+    )
+
+
 def simulate_run(
     run: PreparedRun,
     *,
@@ -223,50 +282,9 @@ def simulate_run(
     """
     watch = watch or Stopwatch(clock)
     printer_profile = run.setup.printer
-    box = run.part.bounding_box()
-    centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
-    told = world or load_world()
-    model = told.scanner(scanner)
-    standing = World(
-        printer_profile.bed_size_mm,
-        cell_mm=told.columns_mm,
-        nozzle_diameter_mm=printer_profile.nozzle_diameter_mm,
-        filament_diameter_mm=printer_profile.filament_diameter_mm,
-        bead=told.bead,
-        thermal=told.thermal,
-        middle_mm=centre,
-    )
-    rng = np.random.default_rng([run.seed, 2])
-    flow_rng = np.random.default_rng([run.seed, 3])
-    sensors_mm = default_sensors_mm(
-        centre,
-        distance_mm=max(300.0, 2.0 * float(box[5]) + 100.0),
-        oblique=model.oblique_views,
-    )
-    pose = seeded_pose(
-        rng,
-        centre_mm=centre,
-        offset_mm=model.offset_mm,
-        tilt_rad=float(np.deg2rad(model.tilt_deg)),
-    )
     temperatures: list[tuple[float, float, float]] = []
     with EmulatedPrinterProcess(printer_profile.dialect, printer=printer_profile) as machine:
-        stage = Stage(
-            standing,
-            defects=run.defects,
-            scanner=SimulatedScanner(
-                standing, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model
-            ),
-            take_motion=lambda: noisy_flow(machine.take_motion(), flow_rng, told.flow),
-            layer_height_mm=run.setup.process.layer_height_mm,
-            part=run.part,
-            box_mm=(
-                box[0] - TRUTH_MARGIN_MM,
-                box[1] - TRUTH_MARGIN_MM,
-                box[3] + TRUTH_MARGIN_MM,
-                box[4] + TRUTH_MARGIN_MM,
-            ),
-        )
+        stage = set_stage(run, machine.take_motion, world=world, scanner=scanner)
         printer = connect(
             machine.port,
             dialect=printer_profile.dialect,
@@ -275,7 +293,7 @@ def simulate_run(
         )
         printer.connect()
         connected(printer)
-        tape = begun(pose.build_from_scanner_calibrated) if begun is not None else None
+        tape = begun(stage.build_from_scanner) if begun is not None else None
 
         def recorded(look: Look) -> None:
             now = printer.temperatures()

@@ -10,6 +10,7 @@ from gcode.moves import (
     FinishMoves,
     LayerChange,
     Prime,
+    Role,
     Script,
     SetBed,
     SetFan,
@@ -88,7 +89,7 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
     """Lay one pass; returns its plastic."""
     pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
     laid_mm3 = 0.0
-    for chain in _ordered(one.chains, pen.position_mm[:2]):
+    for chain in _walls_last(one.chains, pen.position_mm[:2]):
         target = np.array([*chain.xy_mm[0], one.z_mm])
         gap = target - pen.position_mm
         near = abs(gap[2]) < 1e-6 and float(np.hypot(gap[0], gap[1])) < NEAR_MM
@@ -114,8 +115,18 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
     return laid_mm3
 
 
+def _walls_last(chains: tuple[Chain, ...], start_mm: Float[np.ndarray, " 2"]) -> list[Chain]:
+    """What lies along the rim comes after the rest: its plastic can then go to the wall alone."""
+    rim = tuple(chain for chain in chains if chain.role is Role.PERIMETER)
+    inside = tuple(chain for chain in chains if chain.role is not Role.PERIMETER)
+    out = _ordered(inside, start_mm)
+    return out + _ordered(rim, out[-1].xy_mm[-1] if out else start_mm)
+
+
 def _ordered(chains: tuple[Chain, ...], start_mm: Float[np.ndarray, " 2"]) -> list[Chain]:
     """Greedy: the chain whose end is nearest comes next."""
+    if not chains:
+        return []
     heads = np.array([chain.xy_mm[0] for chain in chains])
     tails = np.array([chain.xy_mm[-1] for chain in chains])
     alive = np.ones(len(chains), dtype=bool)

@@ -39,6 +39,9 @@ LEAST_SECTION_MM2 = 0.004
 # From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which is
 # 2.5 bores across (E3D V6): not to its very rim.
 SPREAD_NOZZLES = 1.125
+# What is pressed out under the flat beside a wall goes on to the wall, where that is this near to
+# what it reaches: nowhere else has it to go.
+TO_WALL_MM = 0.2
 # Centre lines keep off the rim of where the tip may go: contours of cells are not exact.
 DRAWN_IN_CELLS = 0.75
 ROUNDING_MM = 2e-3  # more than the text's last digit
@@ -164,7 +167,7 @@ def _plan_pass(
     runs = [_begun_inside(run, model) for bead in beads for run in _free_runs(bead, reach, model)]
     if not runs:
         return None
-    chains, laid = _weighed(runs, thick, model, setup)
+    chains, laid = _weighed(runs, thick, _strips(thick, z_mm, model), model, setup)
     if not chains:
         return None
     lost_mm3 = lost_mm2 * height_mm
@@ -271,22 +274,37 @@ def surely_free(
     return np.asarray(reach.free_at_points(near, free).reshape(4, -1).all(axis=0))
 
 
+def _strips(
+    thick: Float[np.ndarray, "ny nx"], z_mm: float, model: PatchModel
+) -> Bool[np.ndarray, "ny nx"]:
+    """Columns to fill that lie along a wall: it stands up to the nozzle, or higher."""
+    walls = (model.surface_mm > z_mm - AGREE_MM) & (thick <= 0)
+    asked = thick > 0
+    return _beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked
+
+
 def _weighed(
-    runs: list[Bead], thick: Float[np.ndarray, "ny nx"], model: PatchModel, setup: PrintSetup
+    runs: list[Bead],
+    thick: Float[np.ndarray, "ny nx"],
+    strips: Bool[np.ndarray, "ny nx"],
+    model: PatchModel,
+    setup: PrintSetup,
 ) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
     """Cross-sections such that every column's thickness goes to the nearest piece of a bead.
 
     So plastic is the volume that is missing, to the column. Returns the chains, and the thickness
-    that columns get: none beyond where a bead can spread, less where a bead would be too wide.
+    that columns get: none beyond where a bead can spread (farther in `strips` along walls), less
+    where a bead would be too wide.
     """
     nozzle_mm = setup.printer.nozzle_diameter_mm
     middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
     lengths = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
     filled = np.flatnonzero(thick.ravel() > 0)
+    spread_mm = SPREAD_NOZZLES * nozzle_mm
     distance, nearest = cKDTree(middles).query(
-        model.points_mm[filled], distance_upper_bound=SPREAD_NOZZLES * nozzle_mm
+        model.points_mm[filled], distance_upper_bound=spread_mm + TO_WALL_MM
     )
-    near = np.isfinite(distance)
+    near = np.isfinite(distance) & ((distance < spread_mm) | strips.ravel()[filled])
     cell_mm3 = model.cell_mm**2 * model.weight
     volume = np.bincount(
         nearest[near], thick.ravel()[filled[near]] * cell_mm3, minlength=len(middles)
