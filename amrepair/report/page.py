@@ -28,7 +28,7 @@ def body(data: ReportData) -> str:
     sections = [
         ("scan", "Scan and repair", _inspect(data)),
         ("compare", "Before and after", _compare(data)),
-        ("volumes", "Volumes and temperatures", _volumes(data)),
+        ("volumes", _volumes_title(data), _volumes(data)),
         ("regions", "Defects", _regions(data)),
         ("decisions", "Decisions", _decisions(data)),
         ("run", "The run", _run(data)),
@@ -237,9 +237,15 @@ def _compare(data: ReportData) -> str:
     )
 
 
+def _volumes_title(data: ReportData) -> str:
+    if not data.temperatures:
+        return "Volumes"
+    return "Volumes and temperatures" if len(data.looks) > 1 else "Temperatures"
+
+
 def _volumes(data: ReportData) -> str:
     charts = []
-    if data.looks:
+    if len(data.looks) > 1:  # the summary has the volumes of one
         charts.append(
             '<figure class="chart"><figcaption><h3>Volume at each scan</h3></figcaption>'
             '<div id="volumes-chart" class="plot" role="img" aria-label="Bars of missing and '

@@ -148,6 +148,13 @@ def test_tables_are_on_the_page(data: ReportData, page: str) -> None:
         assert text in seen, text
 
 
+def test_one_scan_has_no_history(data: ReportData) -> None:
+    # regression: one bar as wide as the page, under "Volumes and temperatures" without any
+    page = render_report(replace(data, looks=data.looks[:1], temperatures=()))
+    assert "Volume at each scan" not in page
+    assert "Volumes" not in page
+
+
 def test_same_data_same_bytes(data: ReportData, tmp_path: Path) -> None:
     write_report(data, tmp_path / "a.html")
     write_report(example(20_000), tmp_path / "b.html")

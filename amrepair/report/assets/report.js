@@ -262,7 +262,7 @@
         annotations: inside ? [{ x: look.threshold, y: 1, yref: "paper", xanchor: "left", yanchor: "top", text: " limit ±" + number(look.threshold, 3) + " mm", showarrow: false, font: { size: 11.5 } }] : [],
         xaxis: line("Signed deviation, mm (negative: missing)", { range: [h.low, -h.low], showgrid: false }),
         yaxis: line("Points", { type: "log", dtick: 1, exponentformat: "none", tickformat: ",d" }) }));
-    $("histogram-note").textContent = "Every point counts, on a logarithmic scale. " + (h.beyond ? number(h.beyond, 0) + " points beyond the ends are in the outermost bars." : "");
+    $("histogram-note").textContent = "Every point counts, on a logarithmic scale. " + (h.beyond ? number(h.beyond, 0) + (h.beyond === 1 ? " point beyond the ends is" : " points beyond the ends are") + " in the outermost bars." : "");
   }
   function heights(look) {
     const h = look.heights, figure = $("heights-figure");
