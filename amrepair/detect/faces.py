@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from amrepair.detect.holes import is_closed, spoken_of
+from amrepair.detect.holes import is_backed, is_closed, spoken_of
 from amrepair.detect.rooms import Rooms, find_rooms
 from amrepair.detect.surfels import Surfels
-from amrepair.detect.turning import turned_down, turned_to_close
+from amrepair.detect.turning import side_by_view, turned_down, turned_to_close
 from amrepair.detect.winding import Shell
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -225,6 +225,8 @@ def find_faces(
         outward = np.where(flip[:, None], -plane[which], plane[which])
     else:
         side = rooms.open_side(place[which], plane[which])
+        by_view = side_by_view(plane[which], patches.vector_mm2, present)
+        side = np.where(side == 0, by_view, side)
         outward = turned_down(
             place,
             which,
@@ -236,6 +238,7 @@ def find_faces(
             step_mm=STEP_SPACINGS * spacing_mm,
             side=side,
         )
+    seen = present.copy()
     holes = np.flatnonzero(~present)
     spoken, looked_at = spoken_of(
         template, patches.place_mm[holes], place[which], outward, spacing_mm=spacing_mm
@@ -264,8 +267,18 @@ def find_faces(
 
     if closed:
         return faces_with(_standing(faces_with, template, patches, present, rooms))
+    backed = is_backed(
+        template,
+        patches.place_mm[holes := np.flatnonzero(~present)],
+        _unit(patches.vector_mm2[holes]),
+        seen_mm=patches.place_mm[seen],
+        face_mm=place[which],
+        spacing_mm=spacing_mm,
+    )
     lit = looked_at[spoken]
-    return faces_with(_standing_unless_faced(faces_with, template, patches, present, rooms, lit))
+    return faces_with(
+        _standing_unless_faced(faces_with, template, patches, present, rooms, lit, backed)
+    )
 
 
 def _around(
@@ -338,13 +351,14 @@ def _standing_unless_faced(
     present: Bool[np.ndarray, " m"],
     rooms: Rooms,
     lit: Bool[np.ndarray, " h"],
+    backed: Bool[np.ndarray, " h"],
 ) -> Bool[np.ndarray, " m"]:
     """The same of a scan that leaves more open than what is broken: views of a part.
 
     There a winding number of 0 tells nothing: all stands at first, and a patch goes where broken
     faces look at it, or the opening that those leave which went before. So what is gone grows from
     the faces on, as far as their openings are wide, and never to walls that nobody saw. `lit` are
-    the holes' patches that a face looks at along its normal.
+    the holes' patches that a face looks at along its normal; `backed` ones stay.
     """
     probes, f_mm, room = _probes(template, patches, holes := np.flatnonzero(~present), rooms)
     faces = faces_with(np.ones(len(present), dtype=bool))
@@ -352,13 +366,13 @@ def _standing_unless_faced(
     inside = 1.0 + faces_with(np.zeros(len(present), dtype=bool)).shell.winding(probes)
     gone = np.zeros(len(holes), dtype=bool)
     new = (_faced(faces, probes, f_mm) | (room > 0) | lit) & (inside < 1 - OPEN_WINDING / 3)
-    new |= inside < 1 - OPEN_WINDING
+    new = (new | (inside < 1 - OPEN_WINDING)) & ~backed
     while new.any():
         gone |= new
         went = Shell.of(patches.place_mm[holes[new]], patches.vector_mm2[holes[new]])
         rest = np.flatnonzero(~gone)
         inside[rest] -= went.winding(probes[rest])
-        new = ~gone & (inside < 1 - OPEN_WINDING)
+        new = ~gone & ~backed & (inside < 1 - OPEN_WINDING)
     keep = np.ones(len(present), dtype=bool)
     keep[holes[gone | (inside > 1 + OPEN_WINDING)]] = False  # gone, or covered
     return keep

@@ -54,6 +54,48 @@ def spoken_of(
     return spoken, np.isfinite(looked_at)
 
 
+def is_backed(
+    template: Template,
+    hole_mm: Float[np.ndarray, "h 3"],
+    outward: Float[np.ndarray, "h 3"],
+    *,
+    seen_mm: Float[np.ndarray, "m 3"],
+    face_mm: Float[np.ndarray, "q 3"],
+    spacing_mm: float,
+) -> Bool[np.ndarray, " h"]:
+    """(h,) patches of holes straight behind which stands surface that was seen, nothing between.
+
+    What a view sees of a wall's front stands; that nobody saw its back says nothing about it.
+
+    Parameters
+    ----------
+    hole_mm, outward
+        Places on the template's surface that no point lies on, and unit normals.
+    seen_mm
+        Places on it that were seen.
+    face_mm
+        Broken faces.
+    """
+    backed = np.zeros(len(hole_mm), dtype=bool)
+    if len(hole_mm) == 0 or len(seen_mm) == 0 or len(face_mm) == 0:
+        return backed
+    seen, faces = cKDTree(seen_mm), cKDTree(face_mm)
+    near_mm = max(LOOK_MM, 2.0 * spacing_mm)
+    left = np.arange(len(hole_mm))
+    reach_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    for step in range(1, int(reach_mm / LOOK_MM) + 2):
+        front = hole_mm[left] - step * LOOK_MM * outward[left]
+        out = template.distance(front) >= 0
+        backed[left[out]] = np.isfinite(
+            seen.query(front[out], distance_upper_bound=near_mm, workers=2)[0]
+        )
+        broken = np.isfinite(faces.query(front, distance_upper_bound=near_mm, workers=2)[0])
+        left = left[~out & ~broken]
+        if len(left) == 0:
+            break
+    return backed
+
+
 def is_closed(
     seen_mm2: Float[np.ndarray, " 3"],
     whole_mm2: Float[np.ndarray, " 3"],

@@ -1,7 +1,8 @@
 """Which side of a broken face is out, where a scan has neither rays nor normals.
 
-Down the winding number first; where what comes of it does not close what was seen, whole faces are
-turned until it does.
+The way that surface was seen to face, where surface that faces the other way was not; else down
+the winding number; where what comes of it does not close what was seen, whole faces are turned
+until it does.
 """
 
 from __future__ import annotations
@@ -22,6 +23,43 @@ CRUMB_COSINE, JOINING_ROUNDS = 0.7, 4
 LEAST_FACE_RATIO, MOST_FACES = 0.01, 12
 # Ways to turn them that close nearly as well, by this share of all area: the least turned is it.
 AS_WELL_RATIO = 0.05
+
+# So many directions, and the template's surface within 25° of each. One is the way that the scan
+# looks if this share of it was seen, and less than that of what faces the other way.
+DIRECTIONS, ALIKE_COSINE = 128, 0.9
+LOOKED_AT, LOOKED_AWAY_FROM = 0.5, 0.1
+
+
+def side_by_view(
+    plane: Float[np.ndarray, "q 3"],
+    patch_mm2: Float[np.ndarray, "m 3"],
+    present: Bool[np.ndarray, " m"],
+) -> Float[np.ndarray, " q"]:
+    """1 where a plane's normal points to the side that it was seen from, -1 where away, else 0.
+
+    A view shows what faces it: of two sides of a broken face it saw the one that faces as the
+    template's seen surface does, not as its unseen.
+
+    Parameters
+    ----------
+    plane
+        Unit normals, either way round.
+    patch_mm2, present
+        The template's surface as outward normals times area, and which of it was seen.
+    """
+    k = np.arange(DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
+    r = np.sqrt(1.0 - z**2)
+    way = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    area = np.linalg.norm(patch_mm2, axis=1)
+    alike = patch_mm2 @ way.T > ALIKE_COSINE * area[:, None]
+    seen_mm2, all_mm2 = (area * present) @ alike, area @ alike
+    seen = np.where(all_mm2 > 0, seen_mm2 / np.maximum(all_mm2, 1e-12), 0.0)
+    nearest = (plane @ way.T).argmax(axis=1), (plane @ way.T).argmin(axis=1)
+    ahead, behind = seen[nearest[0]], seen[nearest[1]]
+    toward = (ahead > LOOKED_AT) & (behind < LOOKED_AWAY_FROM)
+    away = (behind > LOOKED_AT) & (ahead < LOOKED_AWAY_FROM)
+    return np.asarray(toward.astype(np.float64) - away)
 
 
 def turned_down(
