@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from amrepair.align.clutter import noise_across, without_clutter
 from amrepair.align.coarse import by_features, cube_rotations
-from amrepair.align.families import best_turns, slides
+from amrepair.align.families import CLEAR_MM, CLEAR_SIGMAS, best_turns, slides
 from amrepair.align.refine import Refined, refine
 from amrepair.align.search import QUICK, THOROUGH, CoarseField, Effort, search
 from amrepair.align.thinning import thin_out
@@ -32,7 +32,6 @@ FEW_FACTOR, FEW_ITERATIONS, DENSE_ITERATIONS, MOST_FINISHED = 1.5, 30, 120, 3
 # lie on the part in the best pose and clearly off it in the other. Clearly: beyond the noise, and
 # beyond what prints of one part differ by.
 SAME_FIT, SAME_FIT_MM = 1.5, 0.005
-CLEAR_SIGMAS, CLEAR_MM = 4.0, 0.1
 CONTRADICTED_RATIO, CONTRADICTED_SIGMAS = 0.003, 4.0
 APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
 NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
@@ -176,11 +175,10 @@ def pose_from_anywhere(
             clouds, found, left_out_ratio, part_mm = scan, whole, 0.0, points_mm
     progress("align", 0.8, 1.0)
     if _explained(found[0][1], inlier_mm) > EXPLAINED:
+        found = _with_twins(found, clouds, field, template, rng)
         turned = _refined(_turns(found, clouds, template, rng), clouds, template)
         found = sorted(found + turned, key=_by_score)
-        best = found[0][1]
-        twins = [m for m in _twins(best, clouds, field, rng) if clouds.apart(m, best.matrix)]
-        found = sorted(found + _refined(twins, clouds, template), key=_by_score)
+        found = _with_twins(found, clouds, field, template, rng)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
     if not best.converged and best_score < PLAUSIBLE * clouds.cap_mm:
@@ -258,6 +256,19 @@ def _twins(
     poses = search(clouds.dense_mm, field, rng, only=tuple(turned))
     limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
     return [pose.matrix for pose in poses[:MOST_DOUBTFUL] if pose.score_mm <= limit_mm]
+
+
+def _with_twins(
+    found: list[tuple[float, Refined]],
+    clouds: _Clouds,
+    field: CoarseField,
+    template: Template,
+    rng: np.random.Generator,
+) -> list[tuple[float, Refined]]:
+    """The poses found, and the best one's twins."""
+    best = found[0][1]
+    twins = [m for m in _twins(best, clouds, field, rng) if clouds.apart(m, best.matrix)]
+    return sorted(found + _refined(twins, clouds, template), key=_by_score)
 
 
 def _by_score(one: tuple[float, Refined]) -> float:

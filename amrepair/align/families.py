@@ -18,7 +18,9 @@ from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
 
 STEP_RATIO = 0.01  # of the diagonal: what the farthest point moves from one pose to the next
-SWEPT_POINTS = 4_000
+SWEPT_POINTS, RADIUS_POINTS = 4_000, 1_500
+LEAST_JUDGES = 10  # fewer that are off are outliers
+CLEAR_SIGMAS, CLEAR_MM = 4.0, 0.1  # off: beyond the noise, and what prints of one part differ by
 MOST_FAMILIES = 6
 BEST_OF_EACH = 3
 SAME_STEPS = 4.0  # from the nearest pose of a family: the axis is known no better
@@ -116,8 +118,12 @@ def best_turns(
             if family is None:
                 continue
             known.append(family)
-            scores = np.array([_score(cloud, one, template, cap_mm) for one in family])
-            found += [family[k] for k in _lowest(scores)]
+            # a feature that decides is small: where it is seen its points lie off this pose
+            off = judged_mm[np.abs(pose.residual_mm) > max(CLEAR_MM, CLEAR_SIGMAS * sigma_mm)]
+            for judges in (cloud, off[:SWEPT_POINTS]):
+                if len(judges) >= LEAST_JUDGES:
+                    scores = np.array([_score(judges, one, template, cap_mm) for one in family])
+                    found += [family[k] for k in _lowest(scores)]
     return found
 
 
@@ -132,14 +138,14 @@ def _turned(
 
     `share` is of the points that resist, were all of them moved by as much as the farthest.
     """
-    placed = cloud_mm @ matrix[:3, :3].T + matrix[:3, 3]
-    centre = placed.mean(axis=0)
     rate = float(np.linalg.norm(motion.turn))
     if rate < 1e-9:
         return None
     axis = motion.turn / rate
+    centre = matrix[:3, :3] @ cloud_mm.mean(axis=0) + matrix[:3, 3]
     through = centre + np.cross(axis, motion.shift) / rate
-    away = placed - through
+    few = cloud_mm[:: len(cloud_mm) // RADIUS_POINTS + 1]  # a radius needs no more
+    away = few @ matrix[:3, :3].T + matrix[:3, 3] - through
     radius_mm = float(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1).max())
     in_part = LEAST_RADIUS * diagonal_mm < radius_mm < diagonal_mm
     if not in_part or share > MOST_RESISTING * (rate * radius_mm) ** 2:

@@ -131,3 +131,18 @@ def test_what_the_search_missed_of_a_symmetric_part_is_found(
     monkeypatch.setattr("amrepair.align.anywhere._worth_refining", lambda *_, **__: [near])
     found = align(Scan(points, SIGMA_MM, "scanner", source="scan.ply"), plate)
     assert len(found.symmetric_alternatives) == 3
+
+
+def test_a_small_mark_on_the_other_side_of_a_disc_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # regression: a ring was laid upside down, and turned all the way round only so
+    disc = union(cylinder((0, 0, 0), 20.0, 6.0), box((15, -1, 6), (17, 1, 7.2)))
+    points = sample_surface(disc.body, 1.1, seed=8)[0]
+    over = np.eye(4)
+    over[:3, :3] = rotation_from_vector(np.array([0.0, 0.0, 1.7])) @ np.diag([1.0, -1.0, -1.0])
+    over[2, 3] = 6.0
+    monkeypatch.setattr("amrepair.align.anywhere._worth_refining", lambda *_, **__: [over])
+    found = align(Scan(points, SIGMA_MM, "scanner", source="scan.ply"), disc)
+    assert np.abs(found.template_from_scan.apply(points) - points).max() < 0.1
+    assert not found.symmetric_alternatives
