@@ -7,7 +7,8 @@ A pose is a rotation and the place of the points' centroid; the points are about
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+
+from gcode.compiled import njit, prange
 
 CHOICES = 27  # low, middle, high along each axis
 TRIM = 0.02  # of the points at each end of the box: outliers

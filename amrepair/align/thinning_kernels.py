@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from numba import njit
+from gcode.compiled import njit
 
 _FIRST, _SECOND, _THIRD = 73_856_093, 19_349_663, 83_492_791  # Teschner et al. 2003
 

@@ -8,7 +8,8 @@ Points are sorted by cell; `start[c]` is the first of cell c, cells are numbered
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+
+from gcode.compiled import njit, prange
 
 # Most points that one fit looks at; denser clouds are thinned before.
 MAX_NEAR = 2048

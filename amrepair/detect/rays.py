@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numba import get_num_threads
 
 from amrepair.detect import range_kernels as kernels
 from amrepair.scans import Scan
+from gcode.compiled import get_num_threads
 
 MAX_PIXELS = 4_000_000
 LEAST_POINTS = 16

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+
+from gcode.compiled import njit, prange
 
 
 @njit(cache=True, nogil=True)

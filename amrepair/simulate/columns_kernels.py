@@ -10,7 +10,8 @@ the head of the list of freed ones. Nothing here knows beads, scanners or units 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from gcode.compiled import njit
 
 TOUCH_MM = 1e-9  # intervals this close are one: far below any layer, far above float64 rounding
 FRESH, FREE = 0, 1  # entries of `meta`

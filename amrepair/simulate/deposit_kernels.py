@@ -19,7 +19,6 @@ coordinates), so that a wall's mean position does not depend on where it falls i
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from amrepair.simulate.columns_kernels import FRESH, grown, insert, surface_below
 from amrepair.simulate.strand_kernels import (
@@ -35,6 +34,7 @@ from amrepair.simulate.strand_kernels import (
     run_ahead,
     strand_reach,
 )
+from gcode.compiled import njit
 
 # Entries of `state`, floats: what the nozzle carries along, and where it last was.
 CARRY, LAST_X, LAST_Y, LAST_Z, LOST, LAST_T = 0, 1, 2, 3, 4, 5

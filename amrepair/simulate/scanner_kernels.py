@@ -10,9 +10,9 @@ columns' staircase; edges are rounded by about half the box.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from amrepair.simulate.columns_kernels import TOUCH_MM
+from gcode.compiled import njit, prange
 
 HALF_COLUMNS = 1.5  # half the spot's width, in columns
 SEARCH_MM = 0.4  # how far along its ray a hit may move: the diagonal of the spot

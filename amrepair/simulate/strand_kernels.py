@@ -10,9 +10,9 @@ length), droops from the one that is (a cantilever), or falls onto what lies bel
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from amrepair.simulate.columns_kernels import surface_below
+from gcode.compiled import njit
 
 HELD_LAYERS = 1.5  # as deep below the nozzle as a layer's own underside, and half as much again
 HELD_SHARE = 0.15  # of the columns under the bore: an overhanging wall still lies on a sixth

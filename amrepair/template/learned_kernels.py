@@ -7,7 +7,8 @@ Layout of the arrays is `learned.Grid`'s.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+
+from gcode.compiled import njit, prange
 
 ON_BORDER = 1e-9
 

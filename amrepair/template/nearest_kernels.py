@@ -9,7 +9,8 @@ C. Ericson, Real-Time Collision Detection, 2005, section 5.1.5 (nearest point of
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+
+from gcode.compiled import njit, prange
 
 LEAF = 4  # triangles
 DEEP = 64  # of the stack: halves of any mesh that fits into memory

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+
+from gcode.compiled import njit, prange
 
 FAR, FAR2 = 1e4, 1e8  # voxels, and squared: nothing is so far
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from numba import njit, prange
+from gcode.compiled import njit, prange
 
 
 @njit(cache=True, nogil=True, parallel=True)

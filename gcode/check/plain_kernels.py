@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from gcode.compiled import njit
 
 # What the machine's state is, and what it may not pass.
 X, Y, Z, E, FEED, PULLED, SHORT_MM3, ABSOLUTE, ABSOLUTE_E, UNIT = range(10)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from gcode.compiled import njit
 
 # Columns of the table of words; the letters in this order.
 LETTERS = b"XYZEFIJRSP"

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from gcode.compiled import njit
 from gcode.slicing.infill_kernels import inside
 
 LEAF_RATIO = 1.2  # of a junction's radius: a shorter branch to a wall is its corner, not an axis

@@ -44,6 +44,7 @@ SPREAD_NOZZLES = 1.125
 TO_WALL_MM = 0.2
 # Centre lines keep off the rim of where the tip may go: contours of cells are not exact.
 DRAWN_IN_CELLS = 0.75
+ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 ROUNDING_MM = 2e-3  # more than the text's last digit
 NOT_LISTED_MM3 = 0.02
 # A flat top: as much area, as wide, within so little height.
@@ -349,14 +350,17 @@ def _split(chain: Chain) -> list[Chain]:
 
 def _contour(mask: Bool[np.ndarray, "ny nx"], model: PatchModel) -> Any:
     """A region of columns as polygons, corners of the grid rounded off."""
-    padded = np.pad(mask.astype(np.float64), 1)
-    smooth = ndimage.gaussian_filter(padded, 0.8)
+    if not mask.any():
+        return CrossSection()
+    (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in mask.nonzero())
+    around = np.pad(mask[y0:y1, x0:x1].astype(np.float64), ROUNDED_CELLS)
+    smooth = ndimage.gaussian_filter(around, 0.8)
+    corner = np.array([x0, y0]) + 0.5 - ROUNDED_CELLS
     polygons = []
     for line in measure.find_contours(smooth, 0.5):  # type: ignore[no-untyped-call]
         if len(line) < 4:
             continue
-        xy = (line[:-1, ::-1] - 0.5) * model.cell_mm + model.origin_mm
-        polygons.append(xy)
+        polygons.append((line[:-1, ::-1] + corner) * model.cell_mm + model.origin_mm)
     if not polygons:
         return CrossSection()
     return CrossSection(polygons, FillRule.EvenOdd).simplify(SIMPLIFY_MM)

@@ -16,6 +16,8 @@ from gcode.surfaces import HeightField
 # So deep the flat may press into the plastic beside it, and the body lie in the noise of the field;
 # with what a scan gets wrong it stays under the checker's limits, 0.2 and 0.1 mm.
 PRESS_MM = 0.08
+# A wall may stand this much nearer than its cells say.
+SIDE_MM = 0.02
 LEAST_TOLD_MM = 0.1
 
 
@@ -46,7 +48,7 @@ def least_tip(
         for ix in range(finer):
             dx, dy = ((k - 0.5 * (finer - 1)) * cell_mm for k in (ix, iy))
             moved = [(x + dx, y + dy) for x, y in part.polygon_mm]
-            under_mm = field.max_within(moved, window, aside_mm=0.5 * cell_mm)
+            under_mm = field.max_within(moved, window, aside_mm=0.5 * cell_mm + SIDE_MM)
             least[iy::finer, ix::finer] = under_mm - part.z_from_mm - PRESS_MM
     return least
 

@@ -1,0 +1,73 @@
+"""What is kept of compiled kernels is what was compiled, whoever else compiles meanwhile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba.core.caching import IndexDataCacheFile
+
+from gcode import compiled
+from gcode.slicing import infill_kernels
+
+STAMP = (1.0, 1)
+
+
+def kept_in(folder: Path, *, safely: bool) -> Any:
+    file = IndexDataCacheFile(str(folder), "kernel-1.py311", STAMP)
+    if safely:
+        compiled.keep_safely(file)
+    return file
+
+
+def loaded_after_a_race(folder: Path, monkeypatch: pytest.MonkeyPatch, *, safely: bool) -> object:
+    """One process has chosen its name, and writes after another one wrote and loads."""
+    one, other = (kept_in(folder, safely=safely) for _ in range(2))
+    late: list[tuple[str, object]] = []
+    monkeypatch.setattr(one, "_save_data", lambda name, data: late.append((name, data)))
+    # both look into the empty index before either writes it
+    monkeypatch.setattr(other, "_load_index", dict)
+    if safely:
+        monkeypatch.setattr(compiled.os, "getpid", lambda: 1)
+    one.save("contiguous", "code for contiguous arrays")
+    if safely:
+        monkeypatch.setattr(compiled.os, "getpid", lambda: 2)
+    other.save("strided", "code for strided arrays")
+    monkeypatch.undo()
+    for name, data in late:
+        kept_in(folder, safely=safely)._save_data(name, data)
+    return kept_in(folder, safely=safely).load("strided")
+
+
+def test_two_processes_that_compile_at_once_load_what_each_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """numba alone hands out the other one's machine code: a wrong height field, silently."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    alone = loaded_after_a_race(tmp_path / "a", monkeypatch, safely=False)
+    assert alone == "code for contiguous arrays"
+    ours = loaded_after_a_race(tmp_path / "b", monkeypatch, safely=True)
+    assert ours == "code for strided arrays"
+
+
+def test_a_kernel_is_compiled_anew_when_another_has_changed(tmp_path: Path) -> None:
+    before = kept_in(tmp_path, safely=True)
+    before.save("contiguous", "code")
+    assert kept_in(tmp_path, safely=True).load("contiguous") == "code"
+    changed = kept_in(tmp_path, safely=False)
+    changed._source_stamp = (*STAMP, (*compiled.kernels_stamp(), ("new_kernels.py", 1, 1)))
+    assert changed.load("contiguous") is None
+
+
+def test_every_kernel_is_kept_safely() -> None:
+    kept = infill_kernels.inside._cache._cache_file
+    assert compiled._TOKEN in kept._data_name(1)
+    assert kept._source_stamp[-1] == compiled.kernels_stamp()
+    names = {name for name, _, _ in compiled.kernels_stamp()}
+    assert {"infill_kernels.py", "nearest_kernels.py"} <= names
+    root = Path(compiled.__file__).parents[1]
+    for path in (p for k in ("gcode", "amrepair") for p in (root / k).rglob("*.py")):
+        if path.name != "compiled.py":
+            assert "from numba" not in path.read_text(), path
