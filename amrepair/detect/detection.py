@@ -212,9 +212,12 @@ def _background(
     scan: Scan, template: Template, f_mm: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
-    if _shows_underside(scan, template, f_mm):
-        return np.asarray(f_mm > MAX_EXCESS_MM)
     low_z = float(template.bounds_mm[0, 2])
+    if _shows_underside(scan, template, f_mm):
+        # what lies beside the part in its lowest plane is where it stood when seen from above
+        plane_mm = max(RIM_MM, 4.0 * scan.sigma_mm)
+        beside = (np.abs(scan.points_mm[:, 2] - low_z) < plane_mm) & (f_mm > BED_BAND_MM / 2)
+        return np.asarray((f_mm > MAX_EXCESS_MM) | (beside & (f_mm > plane_mm)))
     bed = (scan.points_mm[:, 2] < low_z + BED_BAND_MM) & (f_mm > 0.02)
     inside_band = scan.points_mm[:, 2] > low_z - BED_BAND_MM
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
