@@ -132,3 +132,9 @@ def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarra
     first = np.sinc(angle_rad / np.pi)
     second = 0.5 * np.sinc(angle_rad / (2 * np.pi)) ** 2
     return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
+
+
+def box_corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
+    """(8, 3) corners of a box, given its lowest and its highest corner."""
+    grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(bounds_mm[grid, np.arange(3)], dtype=np.float64)

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.coarse import poses_between
 from amrepair.consensus.cloud import planes, spacing_of
+from amrepair.frames import box_corners
 
 # Of the part's diagonal: voxels that leave about 1,500 and 15,000 points; how far pairs may be.
 ROUGH_VOXEL, FINE_VOXEL, PAIRS_WITHIN = 0.02, 0.006, 0.02
@@ -47,7 +48,7 @@ def propose(
     """
     pair = _Pair.of(source_mm, model_mm)
     trial = _Trial.of(source_mm, model_mm, ROUGH_VOXEL * diagonal_mm, PAIRS_WITHIN * diagonal_mm)
-    corners = _corners(source_mm)
+    corners = box_corners(np.array([source_mm.min(axis=0), source_mm.max(axis=0)]))
     rough: list[tuple[float, np.ndarray]] = []
     for guess in poses_between(source_mm, model_mm, diagonal_mm):
         pose = trial.refined(guess, ROUGH_ITERATIONS)
@@ -71,11 +72,6 @@ def applied(
 ) -> Float[np.ndarray, "n 3"]:
     """(n, 3) the points, moved by a (4, 4) pose."""
     return points_mm @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _corners(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "8 3"]:
-    box = np.array([points_mm.min(axis=0), points_mm.max(axis=0)])
-    return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 @dataclass(frozen=True, slots=True)

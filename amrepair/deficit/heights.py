@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from amrepair.frames import Transform
+from amrepair.frames import Transform, box_corners
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.slicing.layers import mesh_of
@@ -66,7 +66,7 @@ def as_built_heights(
         this much more.
     """
     points = build_from_template.apply(scan.points_mm)
-    corners = _corners(template.bounds_mm)
+    corners = box_corners(template.bounds_mm)
     box = build_from_template.apply(corners)
     low, high = box.min(axis=0) - AROUND_MM, box.max(axis=0) + AROUND_MM
     cell_mm = max(cell_mm, 1.2 * spacing_mm)
@@ -197,12 +197,6 @@ def _columns(
         ny,
     )
     return offset, z
-
-
-def _corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
-    """The eight corners of a box."""
-    grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.asarray(bounds_mm[grid, np.arange(3)], dtype=np.float64)
 
 
 def _tops(

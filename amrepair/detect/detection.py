@@ -215,19 +215,25 @@ def _background(
     low_z = float(template.bounds_mm[0, 2])
     if _shows_underside(scan, template, f_mm):
         # what lies beside the part in its lowest plane is where it stood when seen from above
-        plane_mm = max(RIM_MM, 4.0 * scan.sigma_mm)
-        beside = (np.abs(scan.points_mm[:, 2] - low_z) < plane_mm) & (f_mm > BED_BAND_MM / 2)
-        return np.asarray((f_mm > MAX_EXCESS_MM) | (beside & (f_mm > plane_mm)))
+        rim_mm = _rim_mm(scan)
+        in_plane = np.abs(scan.points_mm[:, 2] - low_z) < rim_mm
+        beside = in_plane & (f_mm > max(rim_mm, BED_BAND_MM / 2))
+        return np.asarray((f_mm > MAX_EXCESS_MM) | beside)
     bed = (scan.points_mm[:, 2] < low_z + BED_BAND_MM) & (f_mm > 0.02)
     inside_band = scan.points_mm[:, 2] > low_z - BED_BAND_MM
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
     return (bed & (f_mm > BED_BAND_MM / 2)) | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
 
 
+def _rim_mm(scan: Scan) -> float:
+    """How far from the lowest plane a point may lie that is on it."""
+    return max(RIM_MM, 4.0 * scan.sigma_mm)
+
+
 def _shows_underside(scan: Scan, template: Template, f_mm: Float[np.ndarray, " n"]) -> bool:
     """Whether the part was seen from below: then what bulges there is no bed."""
     low_z = float(template.bounds_mm[0, 2])
-    rim_mm = max(RIM_MM, 4.0 * scan.sigma_mm)
+    rim_mm = _rim_mm(scan)
     near = np.flatnonzero((np.abs(f_mm) < rim_mm) & (scan.points_mm[:, 2] < low_z + rim_mm))
 
     def cells_within(points_mm: Float[np.ndarray, "k 3"]) -> set[tuple[int, int]]:

@@ -9,6 +9,7 @@ to fit and to ask.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -66,7 +67,9 @@ def fit_fast(
     base = _base(exact, origin, cell, shape, progress)
     bare = Grid.bare(origin, cell, base)
     points = _samples(exact, SAMPLES, BAND_CELLS * cell, rng)
-    residual = np.abs(_measured(exact, points, progress) - bare.distance(points))
+    residual = np.abs(
+        _in_parts(exact.distance, points, "fit: compare", progress) - bare.distance(points)
+    )
     cells = _bent(bare, points, residual, max(LEAST_RESIDUAL_MM, least_residual_mm))
     grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, progress))
     held = _on_surface(exact, HELD_OUT, rng)
@@ -111,27 +114,18 @@ def _base(
     return signed_grid(base, origin, cell, exact.inside).astype(np.float32)
 
 
-def _measured(
-    exact: MeshSdf, points_mm: Float[np.ndarray, "n 3"], progress: Progress
+def _in_parts(
+    ask: Callable[[Float[np.ndarray, "k 3"]], Float[np.ndarray, " k"]],
+    points_mm: Float[np.ndarray, "n 3"],
+    what: str,
+    progress: Progress,
 ) -> Float[np.ndarray, " n"]:
-    """(n,) exact distances, some at a time."""
+    """(n,) answers at points, some at a time."""
     found = np.empty(len(points_mm))
     for first in range(0, len(points_mm), AT_ONCE):
         last = min(first + AT_ONCE, len(points_mm))
-        found[first:last] = exact.distance(points_mm[first:last])
-        progress("fit: compare", float(last), float(len(points_mm)))
-    return found
-
-
-def _sizes(
-    exact: MeshSdf, points_mm: Float[np.ndarray, "n 3"], progress: Progress
-) -> Float[np.ndarray, " n"]:
-    """(n,) exact distances without their signs, some at a time."""
-    found = np.empty(len(points_mm))
-    for first in range(0, len(points_mm), AT_ONCE):
-        last = min(first + AT_ONCE, len(points_mm))
-        found[first:last] = exact.unsigned_distance(points_mm[first:last])
-        progress("fit: details", float(last), float(len(points_mm)))
+        found[first:last] = ask(points_mm[first:last])
+        progress(what, float(last), float(len(points_mm)))
     return found
 
 
@@ -177,7 +171,7 @@ def _blocks(
     key = (nodes[:, 0] * extent[1] + nodes[:, 1]) * extent[2] + nodes[:, 2]
     first, back = np.unique(key, return_index=True, return_inverse=True)[1:]
     where = bare.origin_mm + nodes[first] * (bare.cell_mm / FINE)
-    size = _sizes(exact, where, progress).astype(np.float32)
+    size = _in_parts(exact.unsigned_distance, where, "fit: details", progress).astype(np.float32)
     blocks = size[back].reshape(len(cells), *[FINE + 1] * 3)
     ends = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1)
     corners = np.moveaxis(cells[:, None, None, None, :] + ends, -1, 0)
