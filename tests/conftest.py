@@ -30,6 +30,12 @@ class _KernelFinder:
         return None
 
 
+# Workers share the cores: threads of one that spin for their turn take the other's time.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    _share = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+    for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(_name, str(_share))
+
 # a shell that starts the tests in the background has them ignore what some of them send
 signal.signal(signal.SIGINT, signal.default_int_handler)
 install_import_hook(["amrepair", "gcode"], "beartype.beartype")

@@ -400,7 +400,7 @@ def _greatest_of_next(
         padded[tuple(inside)] = z_mm[tuple(source)]
     # scipy centres its window: shifted so that it begins at each cell
     greatest = ndimage.maximum_filter1d(
-        padded, size, axis=axis, mode="constant", cval=-np.inf, origin=-((size - 1) // 2)
+        padded, size, axis=axis, mode="constant", cval=-np.inf, origin=-(size // 2)
     )
     kept = [slice(None)] * 2
     kept[axis] = slice(0, count)

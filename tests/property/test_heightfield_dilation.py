@@ -1,0 +1,67 @@
+"""What lies under a slice of the head: against every cell that shapely says it touches."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+from shapely import affinity
+
+from gcode.surfaces import HeightField
+
+CELL_MM = 0.5
+BARELY_MM = 1e-6  # what touches by less may count or not
+side = st.integers(-12, 12).map(lambda n: 0.13 * n)
+corner = st.tuples(side, side)
+
+
+@given(
+    st.one_of(
+        st.tuples(corner, corner).map(
+            lambda ab: shapely.box(
+                min(ab[0][0], ab[1][0]),
+                min(ab[0][1], ab[1][1]),
+                max(ab[0][0], ab[1][0]) + 0.1,
+                max(ab[0][1], ab[1][1]) + 0.1,
+            )
+        ),
+        st.lists(corner, min_size=3, max_size=7).map(
+            lambda corners: shapely.MultiPoint(corners).convex_hull
+        ),
+    ).filter(lambda outline: outline.area > 0.01),
+    st.sampled_from([0.0, 0.045, 0.3]),
+    st.integers(0, 1000),
+)
+def test_the_greatest_height_under_an_outline(
+    outline: shapely.Polygon, aside_mm: float, seed: int
+) -> None:
+    field = HeightField(
+        np.array([3.0, -2.0]),
+        CELL_MM,
+        np.random.default_rng(seed).uniform(0.0, 9.0, (9, 7)),
+        np.ones((9, 7), dtype=bool),
+    )
+    around = shapely.box(-aside_mm, -aside_mm, aside_mm, aside_mm)
+    wide = shapely.MultiPoint(
+        [
+            (x + dx, y + dy)
+            for x, y in shapely.get_coordinates(outline)
+            for dx, dy in shapely.get_coordinates(around)
+        ]
+    ).convex_hull
+    polygon = [(float(x), float(y)) for x, y in outline.exterior.coords[:-1]]
+    got = field.max_within(polygon, aside_mm=aside_mm)
+    rows, columns = np.indices(field.shape)
+    cells = shapely.box(columns - 0.5, rows - 0.5, columns + 0.5, rows + 0.5)
+    cells = shapely.transform(cells, lambda at: at * CELL_MM)
+    surely, maybe = wide.buffer(-BARELY_MM), wide.buffer(BARELY_MM)
+    for iy in range(field.shape[0]):
+        for ix in range(field.shape[1]):
+            least, most = (
+                np.asarray(field.z_mm)[
+                    shapely.intersects(affinity.translate(w, ix * CELL_MM, iy * CELL_MM), cells)
+                ].max(initial=-np.inf)
+                for w in (surely, maybe)
+            )
+            assert least <= got[iy, ix] <= most
