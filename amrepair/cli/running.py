@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,9 @@ from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
 from gcode.cli import console
 from gcode.cli.options import job_of
+from gcode.errors import JournalError
 from gcode.hosts import connect
-from gcode.hosts.journal import default_path
+from gcode.hosts.journal import Journal, default_path
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job
 
@@ -272,7 +274,7 @@ def _print(
                 watch=watch,
                 progress=page.watching(bars),
             )
-        return report, warmth.series()
+        return report, warmth.series(_noted(setting.port))
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "
@@ -283,6 +285,18 @@ def _print(
     finally:
         machine.close()
         begun.tape.close()
+
+
+def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:
+    """Temperatures that the port's journal has; nothing where there is none, or none to read."""
+    path = default_path(port)
+    if path is None:
+        return ()
+    try:
+        with closing(Journal(path)) as journal:
+            return journal.temperatures()
+    except JournalError:
+        return ()
 
 
 def _tell(

@@ -1,9 +1,9 @@
-"""How warm nozzle and bed were at a run's looks, for its report."""
+"""How warm nozzle and bed were over a run, for its report."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -13,18 +13,18 @@ from gcode.hosts.port import Temperatures
 
 
 class ThermalLog:
-    """Asks a printer now and then.
+    """Asks a printer now and then, and takes what its journal noted in between.
 
     Parameters
     ----------
     ask
         Such as `Printer.temperatures`.
     clock
-        s; only differences count.
+        s since 1970, as the journal's.
     """
 
     def __init__(
-        self, ask: Callable[[], Temperatures], clock: Callable[[], float] = time.monotonic
+        self, ask: Callable[[], Temperatures], clock: Callable[[], float] = time.time
     ) -> None:
         self._ask, self._clock, self._start_s = ask, clock, clock()
         # time, then measured and target of the hotend and of the bed
@@ -40,13 +40,30 @@ class ThermalLog:
         when_s = self._clock() - self._start_s
         self._rows.append((when_s, now.hotend_c, now.hotend_target_c, bed[0], bed[1]))
 
-    def series(self) -> tuple[TemperatureSeries, ...]:
-        """What the report draws; nothing where nothing was measured."""
-        if not self._rows:
+    def series(
+        self, noted: Sequence[tuple[float, float, float | None]] = ()
+    ) -> tuple[TemperatureSeries, ...]:
+        """What the report draws; nothing where nothing was measured.
+
+        Parameters
+        ----------
+        noted
+            Of `Journal.temperatures`: it knows no targets, which are drawn where they were asked.
+        """
+        nan = float("nan")
+        rows = [
+            (when_s - self._start_s, hotend_c, nan, nan if bed_c is None else bed_c, nan)
+            for when_s, hotend_c, bed_c in noted
+            if when_s >= self._start_s  # a journal keeps earlier runs
+        ]
+        rows = sorted([*rows, *self._rows])
+        if not rows:
             return ()
-        time_s, *warm = np.array(self._rows, dtype=np.float64).T
-        found = (
-            TemperatureSeries("hotend", time_s, warm[0], warm[1]),
-            TemperatureSeries("bed", time_s, warm[2], warm[3]),
-        )
-        return tuple(series for series in found if np.isfinite(series.measured_c).all())
+        time_s, *warm = np.array(rows, dtype=np.float64).T
+        found = []
+        for name, measured_c, target_c in (("hotend", *warm[:2]), ("bed", *warm[2:])):
+            known = np.isfinite(measured_c)
+            if known.any():
+                told = target_c[known] if np.isfinite(target_c).any() else None
+                found.append(TemperatureSeries(name, time_s[known], measured_c[known], told))
+        return tuple(found)

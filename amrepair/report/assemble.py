@@ -14,6 +14,7 @@ from amrepair.repair import RepairPlan
 from amrepair.report.collect import (
     decision_of,
     decision_of_plan,
+    look_label,
     look_of,
     region_rows,
     solid_mesh,
@@ -98,7 +99,7 @@ def report_of_loop(
         outcome=outcome_of(result, within_tolerance=report.within_tolerance),
         figures=Figures.from_result(result),
         looks=tuple(
-            look_of(look.plan, f"{look.stop.label}, scan {look.number}", printed=look.printed)
+            look_of(look.plan, look_label(look), printed=look.printed, stop=look.stop.label)
             for look in report.looks
         ),
         setup={**_profiles(setup), **(about or {})},

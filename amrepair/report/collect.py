@@ -17,6 +17,7 @@ from amrepair.detect import Label
 from amrepair.detect.detection import BED_BAND_MM
 from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
+from amrepair.loop.decide import FINDINGS, STOPS
 from amrepair.loop.findings import reach_of
 from amrepair.repair import RepairPlan
 from amrepair.report.data import (
@@ -26,9 +27,10 @@ from amrepair.report.data import (
     HeightMap,
     Look,
     RegionRow,
+    Rule,
     SolidMesh,
 )
-from amrepair.report.text import plan_lines
+from amrepair.report.text import NEGLIGIBLE_MM3, kind_name, plan_lines, quantity
 from gcode.profiles import PrintSetup
 from gcode.slicing.layers import mesh_of
 
@@ -197,7 +199,7 @@ def plan_result(
     return dict(rounded(result))
 
 
-def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
+def look_of(plan: RepairPlan, label: str, *, printed: bool, stop: str = "") -> Look:
     """What the page shows of one scan."""
     build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
@@ -229,6 +231,7 @@ def look_of(plan: RepairPlan, label: str, *, printed: bool) -> Look:
             f"Top surface, {label}",
             outlines_mm(plan),
         ),
+        stop=stop,
     )
 
 
@@ -271,25 +274,42 @@ def decision_of(look: LoopLook) -> Decision:
     choice = str(decided.action)
     if look.declined:
         choice += ": the operator declined" if decided.action is Action.FILL_NOW else ": ended"
-    reasons = [f"{_sentence(decided.reason)} ({decided.row})"]
-    same: dict[tuple[str, str, str, str, str], list[float]] = {}
+    reasons = [_sentence(decided.reason)]
+    same: dict[tuple[str, str, str, str], list[float]] = {}
     for verdict in decided.verdicts:
         one = verdict.finding
-        key = (one.kind, str(one.type), str(verdict.action), verdict.reason, verdict.row)
+        key = (one.kind, str(one.type), str(verdict.action), verdict.reason)
         same.setdefault(key, []).append(one.volume_mm3)
-    for (kind, type_, action, reason, row), volumes in same.items():
+    for (kind, type_, action, reason), volumes in same.items():
         count = "" if len(volumes) == 1 else f"{len(volumes)} × "
-        reasons.append(
-            f"{count}{type_.replace('_', ' ')}, {sum(volumes):.1f} mm³ {kind}: {action}, {reason} "
-            f"({row})"
-        )
+        volume = f"{quantity(sum(volumes), 'mm³')} {'too much' if kind == 'excess' else kind}"
+        reasons.append(_sentence(f"{count}{kind_name(type_)}, {volume}: {action}; {reason}"))
     if plan.refused:
-        reasons.append(plan.refused)
+        reasons.append(_sentence(plan.refused))
     if decided.situation.beyond:
         reasons.append(_sentence(decided.situation.beyond))
-    if plan.unreachable_mm3 > 0:
-        reasons.append(f"The nozzle cannot reach {plan.unreachable_mm3:.1f} mm³.")
-    return Decision(f"{look.stop.label}, z = {look.stop.z_mm:.2f} mm", choice, tuple(reasons))
+    if plan.unreachable_mm3 > NEGLIGIBLE_MM3:
+        reasons.append(f"The nozzle cannot reach {quantity(plan.unreachable_mm3, 'mm³')}.")
+    where = f"{look_label(look)}, z = {look.stop.z_mm:.2f} mm"
+    rows = {decided.row, *(verdict.row for verdict in decided.verdicts)}
+    return Decision(where, choice, tuple(reasons), tuple(r for r in _RULES if r.id in rows))
+
+
+def look_label(look: LoopLook) -> str:
+    """`Layer 44, scan 3`, or `Finished part, scan 5`: scans are counted over the whole run."""
+    index = look.stop.layer_index
+    where = "Finished part" if index is None else f"Layer {index}"
+    return f"{where}, scan {look.number}"
+
+
+_RULES = tuple(
+    Rule(
+        row.id,
+        ", ".join(map(str, row.when)) or "in any other case",
+        f"{row.action}: {row.reason}",
+    )
+    for row in (*STOPS, *FINDINGS)
+)
 
 
 def decision_of_plan(plan: RepairPlan, *, enough: bool) -> Decision:
@@ -309,7 +329,7 @@ def decision_of_plan(plan: RepairPlan, *, enough: bool) -> Decision:
 
 
 def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + "."
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
 
 
 def wire_counters(report: LoopReport) -> tuple[Counter, ...]:

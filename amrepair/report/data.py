@@ -170,6 +170,15 @@ class RegionRow:
 
 
 @dataclass(frozen=True, slots=True)
+class Rule:
+    """One row of the decision table: its name there, when it holds, what follows."""
+
+    id: str
+    when: str
+    then: str
+
+
+@dataclass(frozen=True, slots=True)
 class Decision:
     """One decision with its reasons.
 
@@ -181,11 +190,14 @@ class Decision:
         Such as `fill now`.
     reasons
         Whole sentences.
+    rules
+        The rows of the decision table that led to it; none where no table was asked.
     """
 
     where: str
     choice: str
     reasons: tuple[str, ...]
+    rules: tuple[Rule, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +255,8 @@ class Look:
         Volumes at this look, as measured.
     height_map
         The top surface at this look, or None.
+    stop
+        What the looks at one stop of a job have in common; they are compared with each other.
     """
 
     label: str
@@ -260,6 +274,7 @@ class Look:
     excess_mm3: float = 0.0
     unseen_area_mm2: float = 0.0
     height_map: HeightMap | None = None
+    stop: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,8 +324,8 @@ class ReportData:
     looks
         Scans in the order they were taken.
     compare
-        Indices of the looks shown side by side at first; None picks the first look with
-        something missing and the last one.
+        Indices of the looks shown side by side at first; None picks the one with most missing
+        and the last at its stop.
     seconds
         Time spent by stage.
     provenance

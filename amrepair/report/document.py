@@ -12,8 +12,9 @@ from plotly.offline import get_plotlyjs
 
 from amrepair.errors import InputError
 from amrepair.report.data import ReportData
-from amrepair.report.page import body, escape
+from amrepair.report.page import body
 from amrepair.report.payload import payload
+from amrepair.report.tables import escape
 
 # The browser itself refuses every request, whatever a library may try.
 POLICY = (

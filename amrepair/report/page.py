@@ -1,17 +1,24 @@
-"""The page: sections, tables and words as HTML. It draws nothing; the script does.
+"""The page: sections and words as HTML. It draws nothing; the script does.
 
-Every text that comes from outside passes `html.escape` here.
+Every text that comes from outside passes `tables.escape`.
 """
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Iterable, Sequence
 
 from amrepair.report.data import Look, Outcome, ReportData
 from amrepair.report.payload import drawn_looks
-from amrepair.report.text import HEADLINES, duration, length, percent, quantity, summary_of
+from amrepair.report.tables import DASH, decisions, escape, regions, run
+from amrepair.report.text import (
+    HEADLINES,
+    duration,
+    length,
+    percent,
+    quantity,
+    summary_of,
+)
 
 _TONES = {
     Outcome.WITHIN_TOLERANCE: ("good", "✓"),
@@ -20,7 +27,6 @@ _TONES = {
     Outcome.NOT_WITHIN_TOLERANCE: ("warn", "!"),
     Outcome.STOPPED: ("warn", "■"),
 }
-_DASH = "–"
 
 
 def body(data: ReportData) -> str:
@@ -29,9 +35,9 @@ def body(data: ReportData) -> str:
         ("scan", "Scan and repair", _inspect(data)),
         ("compare", "Before and after", _compare(data)),
         ("volumes", _volumes_title(data), _volumes(data)),
-        ("regions", "Defects", _regions(data)),
-        ("decisions", "Decisions", _decisions(data)),
-        ("run", "The run", _run(data)),
+        ("regions", "Defects", regions(data)),
+        ("decisions", "Decisions", decisions(data)),
+        ("run", "The run", run(data)),
     ]
     shown = [(key, title, content) for key, title, content in sections if content]
     links = "".join(f'<li><a href="#{key}">{title}</a></li>' for key, title, _ in shown)
@@ -114,7 +120,7 @@ def _tiles(data: ReportData) -> Iterable[tuple[str, str, str]]:
 
 def _big(value: float | None, unit: str) -> str:
     if value is None or not math.isfinite(value):
-        return f'<span aria-label="not known">{_DASH}</span>'
+        return f'<span aria-label="not known">{DASH}</span>'
     return f"{quantity(value, '')} <small>{unit}</small>"
 
 
@@ -268,84 +274,6 @@ def _volumes_in_words(looks: Sequence[Look]) -> str:
     )
 
 
-def _regions(data: ReportData) -> str:
-    if not data.regions:
-        return '<p class="lead">No defect was found.</p>'
-    rows: list[tuple[str, ...]] = []
-    for number, region in enumerate(data.regions, start=1):
-        low, high = region.box_mm
-        size = " × ".join(f"{side:.1f}" for side in high - low)
-        centre = ", ".join(f"{value:.1f}" for value in (low + high) / 2)
-        reach = _DASH if region.reachable_ratio is None else percent(region.reachable_ratio)
-        rows.append(
-            (
-                str(number),
-                escape(region.type.replace("_", " ")),
-                quantity(region.volume_mm3, ""),
-                size,
-                centre,
-                reach,
-                escape(region.note),
-            )
-        )
-    heads: tuple[str, ...] = (
-        "#",
-        "Kind",
-        "Volume, mm³",
-        "Size X × Y × Z, mm",
-        "Centre on the bed, mm",
-        "In reach",
-        "Remark",
-    )
-    if not any(row[-1] for row in rows):
-        heads, rows = heads[:-1], [row[:-1] for row in rows]
-    return table("Defects that were found", heads, rows, numeric=(0, 2, 3, 4, 5))
-
-
-def _decisions(data: ReportData) -> str:
-    rows = [
-        (
-            escape(decision.where),
-            f"<strong>{escape(decision.choice)}</strong>",
-            "<br>".join(escape(reason) for reason in decision.reasons),
-        )
-        for decision in data.decisions
-    ]
-    return table("Decisions with their reasons", ("Where", "Decision", "Why"), rows)
-
-
-def _run(data: ReportData) -> str:
-    wire = table(
-        "What went over the wire",
-        ("Counter", "Value", "Meaning"),
-        [(escape(c.name), _counted(c.value), escape(c.meaning)) for c in data.wire],
-        numeric=(1,),
-    )
-    seconds = table(
-        "Time by stage",
-        ("Stage", "Time"),
-        [(escape(name), escape(duration(value))) for name, value in data.seconds.items()],
-        numeric=(1,),
-    )
-    provenance = table(
-        "What another person needs to repeat this run",
-        ("Item", "Value"),
-        [
-            (escape(name), f"<code>{escape(value)}</code>")
-            for name, value in data.provenance.items()
-        ],
-    )
-    blocks = [block for block in (wire, seconds, provenance) if block]
-    return f'<div class="columns">{"".join(blocks)}</div>' if blocks else ""
-
-
-def _counted(value: float) -> str:
-    """A counter, whole where it is whole, else to three digits; a dash where nobody knows."""
-    if not math.isfinite(value):
-        return _DASH
-    return f"{value:,.0f}" if value == round(value) else f"{value:.3g}"
-
-
 def _footer(data: ReportData) -> str:
     omitted = len(data.looks) - len(drawn_looks(data))
     note = f" {omitted} scans without events are left out of the drawings." if omitted else ""
@@ -355,31 +283,3 @@ def _footer(data: ReportData) -> str:
         f"thinned to keep this file small; figures and tables use every point.{note}</p>"
         "<p>This file holds everything it shows and asks nothing of the network.</p></footer>"
     )
-
-
-def table(
-    caption: str,
-    heads: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    numeric: Sequence[int] = (),
-) -> str:
-    """A table from cells that are HTML already; empty where there are no rows."""
-    if not rows:
-        return ""
-    kind = [' class="num"' if column in numeric else "" for column in range(len(heads))]
-    head = "".join(f'<th scope="col"{k}>{name}</th>' for k, name in zip(kind, heads, strict=True))
-    lines = "".join(
-        "<tr>" + "".join(f"<td{k}>{cell}</td>" for k, cell in zip(kind, row, strict=True)) + "</tr>"
-        for row in rows
-    )
-    return (
-        f'<div class="table" role="region" aria-label="{caption}" tabindex="0"><table>'
-        f"<caption>{caption}</caption><thead><tr>{head}</tr></thead><tbody>{lines}</tbody>"
-        "</table></div>"
-    )
-
-
-def escape(text: str) -> str:
-    """Text from outside, safe in content and in quoted attributes."""
-    return html.escape(text, quote=True)

@@ -79,6 +79,10 @@ def compared(data: ReportData, drawn: tuple[int, ...]) -> tuple[int, int]:
     if data.compare is not None and set(data.compare) <= set(drawn):
         return drawn.index(data.compare[0]), drawn.index(data.compare[1])
     worst = max(range(len(drawn)), key=lambda i: (data.looks[drawn[i]].missing_mm3, -i))
+    stop = data.looks[drawn[worst]].stop
+    after = max(i for i in range(len(drawn)) if data.looks[drawn[i]].stop == stop)
+    if after > worst:  # the same layers, before and after
+        return worst, after
     return worst if worst < len(drawn) - 1 else 0, len(drawn) - 1
 
 

@@ -24,7 +24,14 @@ _NAMES = {
     "void": ("void", "voids"),
     "under_extrusion": ("patch of thin extrusion", "patches of thin extrusion"),
     "chip": ("chip", "chips"),
+    "missing_beads": ("place without beads", "places without beads"),
+    "over_extrusion": ("patch of thick extrusion", "patches of thick extrusion"),
     "blob": ("blob", "blobs"),
+    "string": ("string", "strings"),
+    "layer_shift": ("shift of layers", "shifts of layers"),
+    "warp": ("warped place", "warped places"),
+    "detached": ("part off the bed", "parts off the bed"),
+    "clog": ("clog", "clogs"),
     "unknown": ("region of unknown kind", "regions of unknown kind"),
 }
 HEADLINES = {
@@ -108,12 +115,23 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
+def kind_name(name: str) -> str:
+    """One defect's kind in words: `patch of thin extrusion`.
+
+    Examples
+    --------
+    >>> kind_name("under_extrusion"), kind_name("scratch_mark")
+    ('patch of thin extrusion', 'scratch mark')
+    """
+    return _NAMES.get(name, (name.replace("_", " "),))[0]
+
+
 def kinds(regions: Sequence[RegionRow]) -> str:
     """`a void and 2 chips`; empty where there are no regions."""
     tally = Tally(region.type for region in regions)
     parts = []
     for name, count in tally.items():
-        one, many = _NAMES.get(name, (name.replace("_", " "), name.replace("_", " ") + "s"))
+        one, many = _NAMES.get(name, (kind_name(name), kind_name(name) + "s"))
         parts.append(f"{_article(one)} {one}" if count == 1 else f"{count} {many}")
     if len(parts) < 2:
         return "".join(parts)

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from loop_children import PRINTER, beads_of
 from amrepair.frames import Transform
 from amrepair.loop import Look, Tape
 from amrepair.loop.tape import read_events
-from amrepair.scans import write_ply
+from amrepair.scans import Scan, write_ply
 from amrepair.simulate.defects import parse_defect
 from amrepair.simulate.run import prepare_run, simulate_run
 from amrepair.template import MeshSdf
@@ -42,10 +42,12 @@ pytestmark = [
     pytest.mark.timeout(900),
     pytest.mark.skipif(bool(why_not()), reason=why_not()),
 ]
-SLOW = "always slow_reader s=0.01"  # long enough to see it print
+SLOW = "always slow_reader s=0.005"  # long enough to see it print
+SMALL = {"width": 700, "height": 560}  # drawn without a GPU, every pixel counts
 QUIET_S = 1.5  # a hundred times what a line takes
 PROGRAM = "from amrepair.cli import main; main()"
 AGAIN = "look again"
+EVERY_NTH = 8  # of the points: some ninety thousand, three at every 0.2 mm, are enough for a void
 SENSOR_S = 1.0  # a scan takes its time; one from before it was asked for would be no answer
 
 
@@ -84,7 +86,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     poses: list[Transform] = []
     simulate_run(run, record=looks.append, begun=lambda pose: [poses.append(pose), Tape()][1])
     for look in looks:  # the first of a stop is kept as broken, the last as whole
-        seen = look.scan.moved(poses[0])
+        seen = thinned(look.scan.moved(poses[0]))
         for which in ("broken", "whole"):
             path = here / f"{which}-{look.stop.label}.ply"
             if which == "whole" or not path.exists():
@@ -94,15 +96,25 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     return Prepared(here, layer)
 
 
+def thinned(scan: Scan) -> Scan:
+    """What a coarser sensor would have seen."""
+    normals, sensors = (
+        None if rows is None else rows[::EVERY_NTH] for rows in (scan.normals, scan.sensor_index)
+    )
+    return replace(
+        scan, points_mm=scan.points_mm[::EVERY_NTH], normals=normals, sensor_index=sensors
+    )
+
+
 class Command:
     """The command in its process, its printer, and a sensor that sees what stands there."""
 
-    def __init__(self, prepared: Prepared, folder: Path) -> None:
+    def __init__(self, prepared: Prepared, folder: Path, faults: str) -> None:
         self.prepared, self.out, self.drop = prepared, folder / "run", folder / "scans"
         self.drop.mkdir()
         self.record = folder / "executed"
         self.printer = EmulatedPrinterProcess(
-            "prusa", printer=load_printer(PRINTER), faults=SLOW, record=self.record
+            "prusa", printer=load_printer(PRINTER), faults=faults, record=self.record
         )
         self._stdout, self._stderr = folder / "stdout", folder / "stderr"
         words = [prepared.folder / "job.gcode", "--template", prepared.folder / "part.stl"]
@@ -187,9 +199,18 @@ class Command:
 
 
 @pytest.fixture
-def command(prepared: Prepared, tmp_path: Path) -> Iterator[Command]:
-    with Command(prepared, tmp_path) as made:
+def command(
+    prepared: Prepared, tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[Command]:
+    with Command(prepared, tmp_path, getattr(request, "param", "")) as made:
         yield made
+
+
+@pytest.fixture
+def opened(browser: Any, command: Command) -> Iterator[Watched]:
+    watched = Watched(browser, command.url(), viewport=SMALL)
+    yield watched
+    watched.page.close()
 
 
 def wait_for(page: Any, button: str) -> Any:
@@ -202,9 +223,8 @@ def wait_for(page: Any, button: str) -> Any:
     return page.get_by_role("button", name=button)
 
 
-def test_approve_prints_the_repair(browser: Any, command: Command, prepared: Prepared) -> None:
-    watched = Watched(browser, command.url())
-    wait_for(watched.page, "Approve").click()
+def test_approve_prints_the_repair(opened: Watched, command: Command, prepared: Prepared) -> None:
+    wait_for(opened.page, "Approve").click()
     code, result, said = command.ended()
     assert code == 0, said
     assert [stop["printed"] for stop in result["stops"]].count(True) == 1
@@ -216,9 +236,8 @@ def test_approve_prints_the_repair(browser: Any, command: Command, prepared: Pre
     assert "Traceback" not in said
 
 
-def test_skip_prints_the_job_alone(browser: Any, command: Command, prepared: Prepared) -> None:
-    watched = Watched(browser, command.url())
-    wait_for(watched.page, "Skip").click()
+def test_skip_prints_the_job_alone(opened: Watched, command: Command, prepared: Prepared) -> None:
+    wait_for(opened.page, "Skip").click()
     code, result, said = command.ended()
     assert code == 3, said
     assert [stop["declined"] for stop in result["stops"]].count(True) == 1
@@ -228,11 +247,11 @@ def test_skip_prints_the_job_alone(browser: Any, command: Command, prepared: Pre
     assert "leaked" not in said
 
 
+@pytest.mark.parametrize("command", [SLOW], indirect=True, ids=["slow printer"])
 def test_pause_holds_the_nozzle_until_it_is_told_to_go_on(
-    browser: Any, command: Command, prepared: Prepared
+    opened: Watched, command: Command, prepared: Prepared
 ) -> None:
-    watched = Watched(browser, command.url())
-    page = watched.page
+    page = opened.page
     until(lambda: command.laid() > 10)
     os.kill(command.printer.pid, signal.SIGSTOP)  # it prints, and waits for our click
     wait_for(page, "Pause").click()
@@ -252,4 +271,4 @@ def test_pause_holds_the_nozzle_until_it_is_told_to_go_on(
     assert code == 0, said
     patch = beads_of(Path(result["gcode"]).read_text().splitlines())
     assert command.laid() == len(job) + len(patch)  # nothing twice, nothing left out
-    assert watched.complaints == []
+    assert opened.complaints == []

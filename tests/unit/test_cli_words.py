@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import manifold3d as m3
+import numpy as np
 import pytest
 import typer
 from rich.console import Console
@@ -266,6 +267,22 @@ def test_a_run_knows_how_warm_it_was(bed_c: float | None, names: list[str]) -> N
     assert series[0].measured_c.tolist() == [205.0, 210.0]
     assert series[0].target_c is not None
     assert series[0].target_c.tolist() == [215.0, 215.0]
+
+
+def test_what_the_journal_noted_lies_between_the_looks() -> None:
+    # regression: two points of a run of hours, as many as it had looks
+    clock = iter([1000.0, 1003.0, 1010.0])
+    log = ThermalLog(lambda: Temperatures(210.0, 215.0, 60.0, 60.0), lambda: next(clock))
+    log.note()
+    log.note()
+    noted = [(900.0, 20.0, 20.0), (1001.0, 150.0, 40.0), (1005.0, 214.0, None)]
+    hotend, bed = log.series(noted)
+    assert hotend.time_s.tolist() == [1.0, 3.0, 5.0, 10.0]  # nothing of an earlier run
+    assert hotend.measured_c.tolist() == [150.0, 210.0, 214.0, 210.0]
+    assert hotend.target_c is not None
+    assert hotend.target_c[[1, 3]].tolist() == [215.0, 215.0]
+    assert np.isnan(hotend.target_c[[0, 2]]).all()  # nobody asked
+    assert bed.measured_c.tolist() == [40.0, 60.0, 60.0]
 
 
 def test_a_printer_without_temperatures_stops_no_run() -> None:

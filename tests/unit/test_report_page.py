@@ -16,6 +16,7 @@ import gcode
 from amrepair.errors import InputError
 from amrepair.report import (
     Counter,
+    Decision,
     Figures,
     Outcome,
     ReportData,
@@ -27,6 +28,7 @@ from amrepair.report import (
 from amrepair.report import document as document_module
 from amrepair.report.assemble import report_of_plan
 from amrepair.report.collect import look_of, plan_result
+from amrepair.report.data import Rule
 from amrepair.report.document import render_report
 from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
@@ -146,6 +148,30 @@ def test_tables_are_on_the_page(data: ReportData, page: str) -> None:
     seen = " ".join(Elements(page).visible)
     for text in ("Within tolerance", "48,213", "Prusa MK3S", "fill now", "chip", "9f0c"):
         assert text in seen, text
+
+
+def test_a_stop_is_compared_with_itself(data: ReportData) -> None:
+    # regression: the layer that broke worst stood beside the finished part
+    broken, whole = data.looks
+    looks = (
+        replace(broken, label="a1", stop="layer-016"),
+        replace(whole, label="a2", stop="layer-016"),
+        replace(whole, label="b", stop="final"),
+    )
+    several = replace(data, looks=looks, compare=None)
+    assert payload.compared(several, payload.drawn_looks(several)) == (0, 1)
+    alone = replace(data, looks=(looks[0], looks[2]), compare=None)  # declined, and gone on
+    assert payload.compared(alone, payload.drawn_looks(alone)) == (0, 1)
+
+
+def test_a_rule_that_decided_is_told_in_words(data: ReportData) -> None:
+    rule = Rule("S9", "gravest is fill now", "fill now: the patch has passed the checker")
+    decision = Decision("Layer 16, scan 1", "fill now", ("It fits.",), (rule,))
+    page = render_report(replace(data, decisions=(decision, decision)))
+    seen = " ".join(Elements(page).visible)
+    assert "By rule S9." in seen
+    assert seen.count(rule.then) == 1
+    assert "What these rules say" not in render_report(data)  # it names none
 
 
 def test_one_scan_has_no_history(data: ReportData) -> None:

@@ -293,13 +293,15 @@
   }
   function temperatures() {
     const colours = [css("--excess"), css("--missing"), css("--beads"), css("--unseen")], out = [];
+    const long = Math.max(...data.temperatures.map((s) => s.time[s.time.length - 1] || 0)) > 600;  // s
+    const when = (s) => long ? s.time.map((t) => t / 60) : s.time;
     data.temperatures.forEach((s, n) => {
       const colour = colours[n % colours.length];
-      if (s.target) out.push({ type: "scatter", mode: "lines", x: s.time, y: s.target, name: s.name + " target", line: { color: colour, width: 1.2, dash: "dot", shape: "hv" }, hovertemplate: "%{y:.0f} °C<extra>%{fullData.name}</extra>" });
-      out.push({ type: "scatter", mode: "lines", x: s.time, y: s.measured, name: s.name, line: { color: colour, width: 1.9 }, hovertemplate: "%{y:.1f} °C<extra>%{fullData.name}</extra>" });
+      if (s.target) out.push({ type: "scatter", mode: "lines", x: when(s), y: s.target, name: s.name + " target", connectgaps: true, line: { color: colour, width: 1.2, dash: "dot", shape: "hv" }, hovertemplate: "%{y:.0f} °C<extra>%{fullData.name}</extra>" });
+      out.push({ type: "scatter", mode: s.time.length < 40 ? "lines+markers" : "lines", x: when(s), y: s.measured, name: s.name, line: { color: colour, width: 1.9 }, hovertemplate: "%{y:.1f} °C<extra>%{fullData.name}</extra>" });
     });
     chart("temperatures", out, flat({ showlegend: true, legend: { orientation: "h", x: 0, y: 1.14 }, margin: { l: 58, r: 12, t: 34, b: 44 }, hovermode: "x unified",
-      xaxis: line("Printer's clock, s", { tickformat: "," }), yaxis: line("°C", { rangemode: "tozero" }) }));
+      xaxis: line(long ? "Minutes since the run began" : "Seconds since the run began", { tickformat: "," }), yaxis: line("°C", { rangemode: "tozero" }) }));
   }
 
   // ---- legend -------------------------------------------------------------------------------
