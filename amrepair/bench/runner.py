@@ -29,6 +29,7 @@ from amrepair.bench.synth import MANIFEST
 from amrepair.bench.tables import as_csv, as_json, as_markdown
 from amrepair.errors import InputError
 from amrepair.template.paper import PaperOptions
+from gcode.compiled import get_num_threads, set_num_threads
 from gcode.progress import Progress, silent
 
 DEFAULT_SEEDS = (0, 1, 2)
@@ -191,6 +192,7 @@ def _work(cells: Sequence[Cell], jobs: int, progress: Progress) -> Iterator[Row]
 def _limit_threads(count: int) -> None:
     """Libraries loaded from here on share the cores among the jobs."""
     os.environ["OMP_NUM_THREADS"] = str(count)
+    set_num_threads(min(count, get_num_threads()))
 
 
 def _write(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
+import numba
+import numpy as np
 import pytest
 from numba.core.caching import IndexDataCacheFile
 
+from amrepair.template import signs_kernels
 from gcode import compiled
 from gcode.slicing import infill_kernels
 
@@ -71,3 +75,11 @@ def test_every_kernel_is_kept_safely() -> None:
     for path in (p for k in ("gcode", "amrepair") for p in (root / k).rglob("*.py")):
         if path.name != "compiled.py":
             assert "from numba" not in path.read_text(), path
+
+
+def test_threads_are_those_that_sleep_while_they_wait() -> None:
+    """TBB's spin, beside other processes, and kept one that was done from ending."""
+    size = np.ones((1, 2, 2, 2), dtype=np.float32)
+    signs_kernels.spread(size, np.ones(size.shape, dtype=np.int8), 0.5)
+    assert numba.threading_layer() == "omp"
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
