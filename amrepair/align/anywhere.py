@@ -177,8 +177,10 @@ def pose_from_anywhere(
     if _explained(found[0][1], inlier_mm) > EXPLAINED:
         found = _with_twins(found, clouds, field, template, rng)
         turned = _refined(_turns(found, clouds, template, rng), clouds, template)
+        laid = found[0][1].matrix
         found = sorted(found + turned, key=_by_score)
-        found = _with_twins(found, clouds, field, template, rng)
+        if clouds.apart(found[0][1].matrix, laid):
+            found = _with_twins(found, clouds, field, template, rng)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
     if not best.converged and best_score < PLAUSIBLE * clouds.cap_mm:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align.refine_kernels import normal_equations
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
 
@@ -104,11 +105,8 @@ def refine(
         iterations += 1
         turned = local @ rotation.T
         f, gradient = template.distance_and_gradient(turned + place)
-        weight = (scale**2 / (f**2 + scale**2)) ** 2
-        jacobian = np.concatenate([np.cross(turned, gradient), gradient], axis=1)
-        weighted = jacobian * weight[:, None]
-        hessian = weighted.T @ jacobian / sigma_mm**2
-        slope = weighted.T @ f / sigma_mm**2
+        hessian, slope = normal_equations(turned, f, gradient, scale)
+        hessian, slope = hessian / sigma_mm**2, slope / sigma_mm**2
         # neighbouring points err alike (process, calibration): against a prior all of them
         # together count as one
         matrix6 = (hessian + 1e-9 * np.trace(hessian) / 6 * np.eye(6)) / len(points_mm)

@@ -42,9 +42,9 @@ class Stage:
     last_scale: float
     keep: int
 
-    def scales_mm(self, diagonal_mm: float) -> Float[np.ndarray, " s"]:
-        """(s,) from the first to the last, in equal ratios."""
-        return diagonal_mm * np.geomspace(self.first_scale, self.last_scale, self.steps)
+    def scales(self, diagonal: float) -> Float[np.ndarray, " s"]:
+        """(s,) from the first to the last, in equal ratios, in the diagonal's unit."""
+        return diagonal * np.geomspace(self.first_scale, self.last_scale, self.steps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,39 +149,46 @@ def search(
     only
         Poses to start from instead of all rotations.
     """
-    clouds = [thin_out(points_mm, stage.points, rng) for stage in effort.stages]
+    cell_mm = field.cell_mm
+    clouds = [thin_out(points_mm, stage.points, rng) / cell_mm for stage in effort.stages]
     centre = clouds[0].mean(axis=0)
-    grid = (field.origin_mm, field.cell_mm, field.values)
-    cap_mm = CAP_RATIO * field.diagonal_mm
+    diagonal = field.diagonal_mm / cell_mm
+    grid = (field.values.ravel() / np.float32(cell_mm), np.array(field.values.shape))
     if only is None:
         rotations = spread_rotations(effort.rotations)
         if turn is not None:
             rotations = np.ascontiguousarray(rotations @ turn)
-        places = kernels.starts(
-            clouds[0] - centre, rotations, field.box_mm, *grid, 0.1 * field.diagonal_mm
-        )
+        box = (field.box_mm - field.origin_mm) / cell_mm
+        places = kernels.starts(_rows(clouds[0] - centre), rotations, box, *grid, 0.1 * diagonal)
     else:
         rotations = np.array([matrix[:3, :3] for matrix in only])
-        places = np.array([matrix[:3, :3] @ centre + matrix[:3, 3] for matrix in only])
+        shifts = np.array([matrix[:3, 3] for matrix in only])
+        places = rotations @ centre + (shifts - field.origin_mm) / cell_mm
     scores = np.zeros(len(rotations))
     for stage, cloud in zip(effort.stages, clouds, strict=True):
         # about its own centroid each: turning and moving are then apart
         middle = cloud.mean(axis=0)
         places = places + rotations @ (middle - centre)
         centre = middle
-        local = np.ascontiguousarray(cloud - centre)
+        local = cloud - centre
         rotations, places = np.ascontiguousarray(rotations), np.ascontiguousarray(places)
-        scales = stage.scales_mm(field.diagonal_mm)
-        scores = kernels.descend(local, rotations, places, *grid, scales, cap_mm)
-        radius_mm = float(np.sqrt((local**2).sum(axis=1).mean()))
+        scales = stage.scales(diagonal)
+        scores = kernels.descend(
+            _rows(local), rotations, places, *grid, scales, CAP_RATIO * diagonal
+        )
+        radius = float(np.sqrt((local**2).sum(axis=1).mean()))
         order = np.argsort(scores, kind="stable")
-        apart_mm = SAME_RATIO * field.diagonal_mm
-        chosen = kernels.peaks(order, rotations, places, radius_mm, apart_mm, stage.keep)
+        apart = SAME_RATIO * diagonal
+        chosen = kernels.peaks(order, rotations, places, radius, apart, stage.keep)
         rotations, places, scores = rotations[chosen], places[chosen], scores[chosen]
     return [
-        Pose(_matrix(r, p - r @ centre), float(s))
+        Pose(_matrix(r, cell_mm * (p - r @ centre) + field.origin_mm), cell_mm * float(s))
         for r, p, s in zip(rotations, places, scores, strict=True)
     ]
+
+
+def _rows(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
+    return np.ascontiguousarray(points.T, dtype=np.float32)
 
 
 def spread_rotations(count: int) -> Float[np.ndarray, "k 3 3"]:

@@ -1,7 +1,9 @@
 # mypy: disable-error-code="no-untyped-def"
 """Many poses at once on a coarse field: where to start each, and its way down; compiled.
 
-A pose is a rotation and the place of the points' centroid; the points are about their centroid.
+A pose is a rotation and the place of the points' centroid; the points, (3, n) in single precision,
+are about their centroid. Lengths are in cells of the field, from its first node on; `values` is its
+nodes in one row.
 """
 
 from __future__ import annotations
@@ -14,75 +16,79 @@ CHOICES = 27  # low, middle, high along each axis
 TRIM = 0.02  # of the points at each end of the box: outliers
 DAMPING = 1e-4
 WIDEST_TURN_RAD = 0.35  # of one step
+SHORTEST = np.float32(1e-9)  # nothing is divided by less
+
+# What runs in vectors of single precision stores nothing but sums and branches nowhere; numbers of
+# nodes are computed as floats, which are exact below 2²⁴.
 
 
-@njit(cache=True, nogil=True, inline="always")
-def nearest_node(x, y, z, origin, cell, values):
-    """Distance at the node nearest to a point: enough to choose between places far apart."""
-    i = min(max(int((x - origin[0]) / cell + 0.5), 0), values.shape[0] - 1)
-    j = min(max(int((y - origin[1]) / cell + 0.5), 0), values.shape[1] - 1)
-    k = min(max(int((z - origin[2]) / cell + 0.5), 0), values.shape[2] - 1)
-    return values[i, j, k]
+@njit(cache=True, nogil=True)
+def _trimmed(along, trim, ends):
+    """The lowest and the highest but `trim` at each end, without sorting all of them."""
+    ends[0], ends[1] = np.inf, -np.inf
+    low, high = np.full(trim + 1, np.inf), np.full(trim + 1, -np.inf)
+    for n in range(len(along)):
+        value = along[n]
+        if value < low[trim]:
+            m = trim
+            while m > 0 and low[m - 1] > value:
+                low[m] = low[m - 1]
+                m -= 1
+            low[m] = value
+        if value > high[trim]:
+            m = trim
+            while m > 0 and high[m - 1] < value:
+                high[m] = high[m - 1]
+                m -= 1
+            high[m] = value
+    ends[0], ends[1] = low[trim], high[trim]
 
 
-@njit(cache=True, nogil=True, inline="always")
-def field_at(x, y, z, origin, cell, values):
-    """Distance and its gradient by trilinear interpolation; beyond the grid, to its border."""
-    gx, gy, gz = (x - origin[0]) / cell, (y - origin[1]) / cell, (z - origin[2]) / cell
-    cx = min(max(gx, 0.0), values.shape[0] - 1.001)
-    cy = min(max(gy, 0.0), values.shape[1] - 1.001)
-    cz = min(max(gz, 0.0), values.shape[2] - 1.001)
-    i, j, k = int(cx), int(cy), int(cz)
-    u, v, w = cx - i, cy - j, cz - k
-    a, b = values[i, j, k], values[i, j, k + 1]
-    c, d = values[i, j + 1, k], values[i, j + 1, k + 1]
-    e, f = values[i + 1, j, k], values[i + 1, j, k + 1]
-    g, h = values[i + 1, j + 1, k], values[i + 1, j + 1, k + 1]
-    ab, cd = a + (b - a) * w, c + (d - c) * w
-    ef, gh = e + (f - e) * w, g + (h - g) * w
-    front, back = ab + (cd - ab) * v, ef + (gh - ef) * v
-    value = front + (back - front) * u
-    dx, dy, dz = gx - cx, gy - cy, gz - cz
-    away = dx * dx + dy * dy + dz * dz
-    if away > 0.0:
-        away = np.sqrt(away)
-        return value + away * cell, dx / away, dy / away, dz / away
-    sx = (back - front) / cell
-    sy = ((cd - ab) * (1 - u) + (gh - ef) * u) / cell
-    low = (b - a) * (1 - v) + (d - c) * v
-    high = (f - e) * (1 - v) + (h - g) * v
-    sz = (low * (1 - u) + high * u) / cell
-    return value, sx, sy, sz
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _at_nodes(turned, px, py, pz, values, shape, cap):
+    """Sum of |f|, each up to the cap, at the nodes nearest to the points moved by p.
+
+    Enough to choose between places far apart.
+    """
+    half, none, most = np.float32(0.5), np.float32(0.0), np.float32(cap)
+    ny, nz = np.float32(shape[1]), np.float32(shape[2])
+    tx, ty, tz = np.float32(shape[0] - 1), np.float32(shape[1] - 1), np.float32(shape[2] - 1)
+    px, py, pz = np.float32(px) + half, np.float32(py) + half, np.float32(pz) + half
+    total = none
+    for n in range(turned.shape[1]):
+        i = np.floor(min(max(turned[0, n] + px, none), tx))
+        j = np.floor(min(max(turned[1, n] + py, none), ty))
+        k = np.floor(min(max(turned[2, n] + pz, none), tz))
+        total += min(abs(values[np.uint32((i * ny + j) * nz + k)]), most)
+    return total
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def starts(points, rotations, box, origin, cell, values, cap):
+def starts(points, rotations, box, values, shape, cap):
     """(k, 3) places: box on box, side on side or middle on middle, whichever fits best."""
     found = np.empty((len(rotations), 3))
-    n = len(points)
+    n = points.shape[1]
     trim = int(TRIM * n)
     for k in prange(len(rotations)):
-        turned = points @ rotations[k].T.copy()
-        shifts = np.empty((3, 3))
+        r = rotations[k]
+        turned = np.empty((3, n), np.float32)
+        shifts, ends = np.empty((3, 3)), np.empty(2)
         for a in range(3):
-            along = np.sort(turned[:, a].copy())
-            low, high = along[trim], along[n - 1 - trim]
-            shifts[a, 0] = 0.5 * (box[0, a] + box[1, a] - low - high)
-            shifts[a, 1] = box[0, a] - low
-            shifts[a, 2] = box[1, a] - high
+            for m in range(n):
+                turned[a, m] = (
+                    r[a, 0] * points[0, m] + r[a, 1] * points[1, m] + r[a, 2] * points[2, m]
+                )
+            _trimmed(turned[a], trim, ends)
+            shifts[a, 0] = 0.5 * (box[0, a] + box[1, a] - ends[0] - ends[1])
+            shifts[a, 1] = box[0, a] - ends[0]
+            shifts[a, 2] = box[1, a] - ends[1]
+        every_other = turned[:, ::2].copy()
         best = np.inf
         for choice in range(CHOICES):
             px = shifts[0, choice % 3]
             py = shifts[1, (choice // 3) % 3]
             pz = shifts[2, choice // 9]
-            total = 0.0
-            for i in range(0, n, 2):
-                f = nearest_node(
-                    turned[i, 0] + px, turned[i, 1] + py, turned[i, 2] + pz, origin, cell, values
-                )
-                total += min(abs(f), cap)
-                if total >= best:
-                    break
+            total = _at_nodes(every_other, px, py, pz, values, shape, cap)
             if total < best:
                 best = total
                 found[k, 0], found[k, 1], found[k, 2] = px, py, pz
@@ -127,47 +133,89 @@ def _turn(r, x, y, z):
         r[2, column] = d + s * cd + c * (x * cb - y * ca)
 
 
-@njit(cache=True, nogil=True)
-def _accumulate(points, r, p, origin, cell, values, scale, h, b):
-    """Normal equations of the Geman–McClure loss at a pose."""
-    h[:] = 0.0
-    b[:] = 0.0
-    jacobian = np.empty(6)
-    square = scale * scale
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        tx = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
-        ty = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
-        tz = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
-        f, gx, gy, gz = field_at(tx + p[0], ty + p[1], tz + p[2], origin, cell, values)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _accumulate(points, r, p, values, shape, scale, cap, h, b):
+    """Normal equations of the Geman–McClure loss at a pose, and the sum of |f|, each up to the cap.
+
+    The field and its gradient are trilinear; beyond the grid, as its border has it.
+    """
+    none, one, unit, edge = np.float32(0.0), np.float32(1.0), np.uint32(1), np.float32(1.001)
+    square, most, total = np.float32(scale * scale), np.float32(cap), np.float32(0.0)
+    nx, ny, nz = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
+    row, plane = np.uint32(shape[2]), np.uint32(shape[1] * shape[2])
+    r00, r01, r02 = np.float32(r[0, 0]), np.float32(r[0, 1]), np.float32(r[0, 2])
+    r10, r11, r12 = np.float32(r[1, 0]), np.float32(r[1, 1]), np.float32(r[1, 2])
+    r20, r21, r22 = np.float32(r[2, 0]), np.float32(r[2, 1]), np.float32(r[2, 2])
+    px, py, pz = np.float32(p[0]), np.float32(p[1]), np.float32(p[2])
+    # one name for each sum: what is stored in an array keeps the loop from being vectors
+    b0 = b1 = b2 = b3 = b4 = b5 = h00 = h10 = h11 = h20 = h21 = h22 = np.float32(0.0)
+    h30 = h31 = h32 = h33 = h40 = h41 = h42 = h43 = h44 = np.float32(0.0)
+    h50 = h51 = h52 = h53 = h54 = h55 = np.float32(0.0)
+    for n in range(points.shape[1]):
+        x, y, z = points[0, n], points[1, n], points[2, n]
+        tx = r00 * x + r01 * y + r02 * z
+        ty = r10 * x + r11 * y + r12 * z
+        tz = r20 * x + r21 * y + r22 * z
+        x, y, z = tx + px, ty + py, tz + pz
+        cx = min(max(x, none), nx - edge)
+        cy = min(max(y, none), ny - edge)
+        cz = min(max(z, none), nz - edge)
+        i, j, k = np.floor(cx), np.floor(cy), np.floor(cz)
+        at = np.uint32((i * ny + j) * nz + k)
+        u, v, w = cx - i, cy - j, cz - k
+        a, c = values[at], values[at + row]
+        e, g = values[at + plane], values[at + plane + row]
+        da, dc = values[at + unit] - a, values[at + row + unit] - c
+        de, dg = values[at + plane + unit] - e, values[at + plane + row + unit] - g
+        ab, cd, ef, gh = a + da * w, c + dc * w, e + de * w, g + dg * w
+        front, back = ab + (cd - ab) * v, ef + (gh - ef) * v
+        low, high = da + (dc - da) * v, de + (dg - de) * v
+        dx, dy, dz = x - cx, y - cy, z - cz
+        away = np.sqrt(dx * dx + dy * dy + dz * dz)
+        inside = away <= none
+        by = one / (away if away > SHORTEST else one)
+        f = front + (back - front) * u + away
+        gx = back - front if inside else dx * by
+        gy = (cd - ab) + (gh - ef - cd + ab) * u if inside else dy * by
+        gz = low + (high - low) * u if inside else dz * by
+        total += min(abs(f), most)
         weight = square / (f * f + square)
         weight *= weight
-        jacobian[0] = ty * gz - tz * gy
-        jacobian[1] = tz * gx - tx * gz
-        jacobian[2] = tx * gy - ty * gx
-        jacobian[3], jacobian[4], jacobian[5] = gx, gy, gz
-        for m in range(6):
-            wj = weight * jacobian[m]
-            b[m] -= wj * f
-            for q in range(m + 1):
-                h[m, q] += wj * jacobian[q]
+        rx, ry, rz = ty * gz - tz * gy, tz * gx - tx * gz, tx * gy - ty * gx
+        ux, uy, uz = weight * rx, weight * ry, weight * rz
+        vx, vy, vz = weight * gx, weight * gy, weight * gz
+        b0, b1, b2 = b0 - ux * f, b1 - uy * f, b2 - uz * f
+        b3, b4, b5 = b3 - vx * f, b4 - vy * f, b5 - vz * f
+        h00, h10, h11 = h00 + ux * rx, h10 + uy * rx, h11 + uy * ry
+        h20, h21, h22 = h20 + uz * rx, h21 + uz * ry, h22 + uz * rz
+        h30, h31, h32 = h30 + vx * rx, h31 + vx * ry, h32 + vx * rz
+        h40, h41, h42 = h40 + vy * rx, h41 + vy * ry, h42 + vy * rz
+        h50, h51, h52 = h50 + vz * rx, h51 + vz * ry, h52 + vz * rz
+        h33, h43, h44 = h33 + vx * gx, h43 + vy * gx, h44 + vy * gy
+        h53, h54, h55 = h53 + vz * gx, h54 + vz * gy, h55 + vz * gz
+    b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
+    h[0, 0], h[1, 0], h[1, 1], h[2, 0], h[2, 1], h[2, 2] = h00, h10, h11, h20, h21, h22
+    h[3, 0], h[3, 1], h[3, 2], h[3, 3] = h30, h31, h32, h33
+    h[4, 0], h[4, 1], h[4, 2], h[4, 3], h[4, 4] = h40, h41, h42, h43, h44
+    h[5, 0], h[5, 1], h[5, 2], h[5, 3], h[5, 4], h[5, 5] = h50, h51, h52, h53, h54, h55
+    return total
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def descend(points, rotations, places, origin, cell, values, scales, cap):
+def descend(points, rotations, places, values, shape, scales, cap):
     """Move every pose downhill, one Gauss–Newton step for each scale; in place.
 
     Returns (k,) the mean of |f|, each up to the cap.
     """
     scores = np.empty(len(rotations))
     reach = 0.0
-    for i in range(len(points)):
-        reach = max(reach, np.sqrt((points[i] ** 2).sum()))
+    for i in range(points.shape[1]):
+        reach = max(reach, np.sqrt((points[:, i] ** 2).sum()))
     for k in prange(len(rotations)):
         r, p = rotations[k], places[k]
         h, b = np.empty((6, 6)), np.empty(6)
         for step in range(len(scales)):
-            _accumulate(points, r, p, origin, cell, values, scales[step], h, b)
+            _accumulate(points, r, p, values, shape, scales[step], cap, h, b)
             turning = (h[0, 0] + h[1, 1] + h[2, 2]) / 3.0
             moving = (h[3, 3] + h[4, 4] + h[5, 5]) / 3.0
             for m in range(3):
@@ -181,19 +229,8 @@ def descend(points, rotations, places, origin, cell, values, scales, cap):
             _turn(r, share * b[0], share * b[1], share * b[2])
             for a in range(3):
                 p[a] += share * b[3 + a]
-        total = 0.0
-        for i in range(len(points)):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            f = field_at(
-                r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + p[0],
-                r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + p[1],
-                r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + p[2],
-                origin,
-                cell,
-                values,
-            )[0]
-            total += min(abs(f), cap)
-        scores[k] = total / len(points)
+        total = _accumulate(points, r, p, values, shape, scales[-1], cap, h, b)
+        scores[k] = total / points.shape[1]
     return scores
 
 
