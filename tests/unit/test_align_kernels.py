@@ -1,0 +1,61 @@
+"""The compiled kernels of the alignment against plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from amrepair.align import search_kernels
+from amrepair.align.refine_kernels import normal_equations
+from amrepair.frames import rotation_from_vector
+
+
+def plain(turned, f, gradient, scale):  # type: ignore[no-untyped-def]
+    weight = (scale**2 / (f**2 + scale**2)) ** 2
+    jacobian = np.concatenate([np.cross(turned, gradient), gradient], axis=1)
+    weighted = jacobian * weight[:, None]
+    return weighted.T @ jacobian, weighted.T @ f
+
+
+def test_normal_equations_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(0)
+    turned, gradient = rng.normal(size=(2, 77, 3))
+    f = rng.normal(size=77)
+    for made, asked in zip(
+        normal_equations(turned, f, gradient, 0.7), plain(turned, f, gradient, 0.7), strict=True
+    ):
+        assert np.allclose(made, asked, rtol=1e-12, atol=1e-12)
+
+
+def test_the_coarse_field_is_trilinear_and_goes_on_beyond_its_border() -> None:
+    rng = np.random.default_rng(1)
+    shape = np.array([9, 12, 7])
+    values = rng.normal(size=tuple(shape)).astype(np.float32)
+    points = rng.uniform(-9.0, 9.0, (101, 3)).astype(np.float32)  # some beyond the grid
+    turn, place = rotation_from_vector(np.array([0.3, -0.8, 0.5])), np.array([4.1, 5.2, 3.3])
+    turned = points.astype(np.float64) @ turn.T
+
+    def asked(at: np.ndarray) -> np.ndarray:
+        inside = np.clip(at, 0.0, shape - 1.001)
+        found = map_coordinates(values.astype(np.float64), inside.T, order=1)
+        return np.asarray(found + np.linalg.norm(at - inside, axis=1))
+
+    f = asked(turned + place)
+    step = 1e-5
+    gradient = np.stack(
+        [asked(turned + place + e) - asked(turned + place - e) for e in step * np.eye(3)], axis=1
+    ) / (2.0 * step)
+    # beyond the border the field is taken to rise straight away from it
+    clipped = np.clip(turned + place, 0.0, shape - 1.001)
+    away = turned + place - clipped
+    outside = np.linalg.norm(away, axis=1) > 0.0
+    assert 0 < outside.sum() < len(points)
+    gradient[outside] = away[outside] / np.linalg.norm(away[outside], axis=1, keepdims=True)
+    h, b = np.zeros((6, 6)), np.zeros(6)
+    total = search_kernels._accumulate(
+        np.ascontiguousarray(points.T), turn, place, values.ravel(), shape, 2.0, 1.0, h, b
+    )
+    hessian, slope = plain(turned, f, gradient, 2.0)
+    assert np.allclose(h, np.tril(hessian), rtol=1e-3, atol=1e-3 * np.abs(hessian).max())
+    assert np.allclose(b, -slope, rtol=1e-3, atol=1e-3 * np.abs(slope).max())
+    assert abs(total - np.minimum(np.abs(f), 1.0).sum()) < 1e-3 * len(points)
