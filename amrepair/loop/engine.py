@@ -241,7 +241,8 @@ class Run:
         if taped is None:
             self._record(look)
             self._tape.write("look", **look_to_json(look))
-        self._looks.append(settled(look, site))
+        last = stop.layer_index is None
+        self._looks.append(settled(look, site, compared=bool(here) or last))
         return look
 
     def _plan(

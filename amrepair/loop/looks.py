@@ -55,6 +55,8 @@ class Look:
         The plan's program was, or is about to be, printed.
     declined
         Somebody was asked, and said no.
+    scanned_points
+        How many points the scan had, where only some are kept; 0 where all are.
     """
 
     number: int
@@ -64,6 +66,7 @@ class Look:
     decision: Decision
     printed: bool
     declined: bool = False
+    scanned_points: int = 0
 
 
 @dataclass(frozen=True, slots=True)

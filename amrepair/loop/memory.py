@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Int
 
 from amrepair.deficit import Standing, as_built_heights
 from amrepair.loop.looks import Look
@@ -19,24 +20,33 @@ from gcode.surfaces import HeightField
 
 CLEAN_POINTS, FOUND_POINTS = 8_000, 120_000
 """Points that are kept of a look at which nothing was found, and of another."""
+AROUND_MM = 10.0
+"""So far beside the part a scan is kept; the bed beyond is most of it, and tells nothing."""
 
 
-def settled(look: Look, site: Site) -> Look:
+def settled(look: Look, site: Site, *, compared: bool = False) -> Look:
     """The look with its points thinned and its working data let go.
 
     Heights that nobody has asked for yet come from the points that are kept.
+
+    Parameters
+    ----------
+    compared
+        Somebody will hold it against an earlier look at the same stop, or it is the part's last:
+        kept as well as if something had been found.
     """
     plan, anomaly, deficit = look.plan, look.plan.anomaly, look.plan.deficit
-    most = FOUND_POINTS if deficit.regions else CLEAN_POINTS
-    every = max(1, -(-len(plan.scan) // most))
+    most = FOUND_POINTS if deficit.regions or compared else CLEAN_POINTS
+    chosen, every = _around_the_part(plan, most)
     apart = max(1, -(-len(anomaly.template_points_mm) // most))
-    thin = _thinned(plan.scan, every)
+    thin = _only(plan.scan, chosen)
     if plan.patch is None and anomaly.evidence is not None:
         spacing_mm = anomaly.evidence.spacing_mm * float(np.sqrt(every))
         deficit = replace(deficit, stands=Standing(_heights_later(plan, thin, site, spacing_mm)))
     return replace(
         look,
-        scan=_thinned(look.scan, every),
+        scan=_only(look.scan, chosen if len(look.scan) == len(plan.scan) else _some(look, most)),
+        scanned_points=len(look.scan),
         plan=replace(
             plan,
             scan=thin,
@@ -44,9 +54,9 @@ def settled(look: Look, site: Site) -> Look:
             anomaly=replace(
                 anomaly,
                 points_mm=thin.points_mm,
-                deviation_mm=anomaly.deviation_mm[::every].copy(),
-                score=anomaly.score[::every].copy(),
-                label=anomaly.label[::every].copy(),
+                deviation_mm=anomaly.deviation_mm[chosen],
+                score=anomaly.score[chosen],
+                label=anomaly.label[chosen],
                 template_points_mm=anomaly.template_points_mm[::apart].copy(),
                 template_label=anomaly.template_label[::apart].copy(),
                 evidence=None,
@@ -72,13 +82,32 @@ def _heights_later(
     )
 
 
-def _thinned(scan: Scan, every: int) -> Scan:
-    """Every so-many-th point of a scan; its own memory."""
-    if every == 1:
-        return scan
+def _around_the_part(plan: RepairPlan, most: int) -> tuple[Int[np.ndarray, " k"], int]:
+    """Indices of at most so many points, evenly out of those around the part; and one of how many.
+
+    All around it are as dense as each other: heights are read from them later.
+    """
+    expected_mm = plan.anomaly.template_points_mm
+    near = np.arange(len(plan.scan))
+    if len(expected_mm):
+        points_mm = plan.scan.points_mm  # in the template's frame, as planned
+        low, high = expected_mm.min(axis=0) - AROUND_MM, expected_mm.max(axis=0) + AROUND_MM
+        inside = np.flatnonzero(((points_mm >= low) & (points_mm <= high)).all(axis=1))
+        near = inside if len(inside) else near
+    every = max(1, -(-len(near) // most))
+    return near[::every], every
+
+
+def _some(look: Look, most: int) -> Int[np.ndarray, " k"]:
+    """Indices of at most so many points of a scan of which only a part was planned with."""
+    return np.arange(0, len(look.scan), max(1, -(-len(look.scan) // most)))
+
+
+def _only(scan: Scan, chosen: Int[np.ndarray, " k"]) -> Scan:
+    """Some points of a scan; their own memory."""
     return replace(
         scan,
-        points_mm=scan.points_mm[::every].copy(),
-        normals=None if scan.normals is None else scan.normals[::every].copy(),
-        sensor_index=None if scan.sensor_index is None else scan.sensor_index[::every].copy(),
+        points_mm=scan.points_mm[chosen],
+        normals=None if scan.normals is None else scan.normals[chosen],
+        sensor_index=None if scan.sensor_index is None else scan.sensor_index[chosen],
     )

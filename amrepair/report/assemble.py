@@ -99,7 +99,13 @@ def report_of_loop(
         outcome=outcome_of(result, within_tolerance=report.within_tolerance),
         figures=Figures.from_result(result),
         looks=tuple(
-            look_of(look.plan, look_label(look), printed=look.printed, stop=look.stop.label)
+            look_of(
+                look.plan,
+                look_label(look),
+                printed=look.printed,
+                stop=look.stop.label,
+                scanned_points=look.scanned_points,
+            )
             for look in report.looks
         ),
         setup={**_profiles(setup), **(about or {})},

@@ -104,6 +104,9 @@ def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None)
         "excess_mm3_before": sum(p.deficit.excess_mm3 for p in first),
         "excess_mm3_after": None if last is None else sum(p.deficit.excess_mm3 for p in last),
         "unreachable_mm3": sum(p.unreachable_mm3 for p in ends),
+        "unprintable_mm3": float(
+            sum(piece.volume_mm3 for p in ends if p.patch for piece in p.patch.unprintable)
+        ),
         "unseen_area_mm2": ends[-1].deficit.unseen_area_mm2 if ends else 0.0,
         "regions": [
             {
@@ -199,8 +202,18 @@ def plan_result(
     return dict(rounded(result))
 
 
-def look_of(plan: RepairPlan, label: str, *, printed: bool, stop: str = "") -> Look:
-    """What the page shows of one scan."""
+def look_of(
+    plan: RepairPlan, label: str, *, printed: bool, stop: str = "", scanned_points: int = 0
+) -> Look:
+    """What the page shows of one scan.
+
+    Parameters
+    ----------
+    printed
+        Whether its repair was printed.
+    stop, scanned_points
+        As in `Look`.
+    """
     build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
     shown = of_the_part(plan)
@@ -232,6 +245,7 @@ def look_of(plan: RepairPlan, label: str, *, printed: bool, stop: str = "") -> L
             outlines_mm(plan),
         ),
         stop=stop,
+        scanned_points=scanned_points or len(scan),
     )
 
 

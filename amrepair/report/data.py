@@ -24,6 +24,7 @@ class Outcome(StrEnum):
     NOT_WITHIN_TOLERANCE = "not_within_tolerance"
     NOTHING_TO_REPAIR = "nothing_to_repair"
     PLANNED = "planned"  # G-code was made; the part has not been scanned since
+    PLANNED_IN_PART = "planned_in_part"  # the same, and the program leaves something
     STOPPED = "stopped"
 
 
@@ -257,6 +258,8 @@ class Look:
         The top surface at this look, or None.
     stop
         What the looks at one stop of a job have in common; they are compared with each other.
+    scanned_points
+        How many points the scan had, where `points_mm` are only some; 0 where they are all.
     """
 
     label: str
@@ -275,6 +278,7 @@ class Look:
     unseen_area_mm2: float = 0.0
     height_map: HeightMap | None = None
     stop: str = ""
+    scanned_points: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,6 +295,7 @@ class Figures:
     iterations: int
     filament_mm: float
     print_time_s: float
+    unprintable_mm3: float = 0.0
 
     @classmethod
     def from_result(cls, result: Mapping[str, object]) -> Figures:
@@ -306,6 +311,7 @@ class Figures:
             iterations=int(_number(result, "iterations") or 0),
             filament_mm=_number(result, "filament_mm") or 0.0,
             print_time_s=_number(result, "print_time_s") or 0.0,
+            unprintable_mm3=_number(result, "unprintable_mm3") or 0.0,
         )
 
 

@@ -23,8 +23,8 @@ SIMPLIFY_STEPS = 7
 FEATURE_ANGLE_RAD = np.deg2rad(28.0)
 NORMAL_NEIGHBOURS = 10
 SHADE_LEVELS = 16
-# Head-high light from the front left, as drawings have it.
-LIGHT = np.array([-0.42, -0.54, 0.73])
+# Head-high light from where the first view looks, as drawings have it.
+LIGHT = np.array([0.42, 0.54, 0.73])
 # Where nobody knows which side is out, the side towards the light is drawn: as bright as a
 # look with normals shows it from the first view.
 UNORIENTED_SHADE = 0.5 * np.array([1.0, 0.42, 0.54, 0.73])
@@ -94,9 +94,17 @@ def thinned(
 
 
 def shading(
-    points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"] | None
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"] | None,
+    side: tuple[int, int] = (-1, -1),
 ) -> Int[np.ndarray, " n"]:
-    """(n,) brightness 0..15 of each point under a fixed light, so that a cloud shows its form."""
+    """(n,) brightness 0..15 of each point under a fixed light, so that a cloud shows its form.
+
+    Parameters
+    ----------
+    side
+        Signs of X and Y of the corner that the light stands at.
+    """
     if len(points_mm) < NORMAL_NEIGHBOURS:
         return np.full(len(points_mm), SHADE_LEVELS - 1)
     if normals is None:
@@ -106,7 +114,8 @@ def shading(
         # which side is out is not known, so the two sides of a face must look the same
         brightness = UNORIENTED_SHADE[0] + np.abs(axes) @ UNORIENTED_SHADE[1:]
     else:
-        brightness = 0.5 + 0.5 * (normals @ (LIGHT / np.linalg.norm(LIGHT)))
+        light = LIGHT * (*side, 1) / np.linalg.norm(LIGHT)
+        brightness = 0.5 + 0.5 * (normals @ light)
     return np.rint(np.clip(brightness, 0.0, 1.0) * (SHADE_LEVELS - 1)).astype(np.int64)
 
 

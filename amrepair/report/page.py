@@ -13,6 +13,7 @@ from amrepair.report.payload import drawn_looks
 from amrepair.report.tables import DASH, decisions, escape, regions, run
 from amrepair.report.text import (
     HEADLINES,
+    NEGLIGIBLE_MM3,
     duration,
     length,
     percent,
@@ -24,6 +25,7 @@ _TONES = {
     Outcome.WITHIN_TOLERANCE: ("good", "✓"),
     Outcome.NOTHING_TO_REPAIR: ("good", "✓"),
     Outcome.PLANNED: ("plan", "→"),
+    Outcome.PLANNED_IN_PART: ("warn", "→"),
     Outcome.NOT_WITHIN_TOLERANCE: ("warn", "!"),
     Outcome.STOPPED: ("warn", "■"),
 }
@@ -108,7 +110,12 @@ def _tiles(data: ReportData) -> Iterable[tuple[str, str, str]]:
             ),
             f"{quantity(figures.excess_mm3_before, 'mm³')} before",
         )
-    yield "Out of reach", _big(figures.unreachable_mm3, "mm³"), "for this nozzle"
+    if figures.unprintable_mm3 > NEGLIGIBLE_MM3:
+        left_mm3 = figures.unreachable_mm3 + figures.unprintable_mm3
+        reached = f"{quantity(figures.unreachable_mm3, 'mm³')} out of reach, the rest holds no bead"
+        yield "Left out", _big(left_mm3, "mm³"), reached
+    else:
+        yield "Out of reach", _big(figures.unreachable_mm3, "mm³"), "for this nozzle"
     yield "Not seen", _big(figures.unseen_area_mm2, "mm²"), "unknown, never filled"
     if figures.filament_mm > 0:
         yield (
@@ -279,7 +286,8 @@ def _footer(data: ReportData) -> str:
     note = f" {omitted} scans without events are left out of the drawings." if omitted else ""
     return (
         "<footer><p>Coordinates are millimetres on the bed: origin at its front left corner, Z up. "
-        "Negative deviation lies inside the expected part, where material is missing. Drawings are "
-        f"thinned to keep this file small; figures and tables use every point.{note}</p>"
+        "Negative deviation lies inside the expected part, where material is missing. Drawings of "
+        "large scans are thinned to keep this file small; volumes and decisions use every point."
+        f"{note}</p>"
         "<p>This file holds everything it shows and asks nothing of the network.</p></footer>"
     )

@@ -27,6 +27,7 @@ CELLS_TOTAL = 400_000
 SAMPLES_PER_SERIES = 2_000
 LOOKS_DRAWN = 12
 HISTOGRAM_BINS = 80
+ASIDE_RATIO = 0.1  # of the part's side: a defect so far off its middle is seen from there
 OK, MISSING, EXCESS = 0, 1, 2
 
 Json = dict[str, object]
@@ -38,12 +39,14 @@ def payload(data: ReportData) -> Json:
     share = max(len(drawn), 1)
     scales_mm = colour_scales(data)
     box_mm = bounds(data)
+    side = facing(data, drawn, box_mm)
     return {
         "bounds": [[round(float(v), 4) for v in row] for row in box_mm],
+        "facing": list(side),
         "scales": scales_mm,
         "expected": None if data.expected is None else _expected(data.expected),
         "looks": [
-            _look(near_part(data.looks[index], box_mm), index, share, scales_mm[1])
+            _look(near_part(data.looks[index], box_mm), index, share, scales_mm[1], side)
             for index in drawn
         ],
         "compare": list(compared(data, drawn)),
@@ -84,6 +87,22 @@ def compared(data: ReportData, drawn: tuple[int, ...]) -> tuple[int, int]:
     if after > worst:  # the same layers, before and after
         return worst, after
     return worst if worst < len(drawn) - 1 else 0, len(drawn) - 1
+
+
+def facing(data: ReportData, drawn: tuple[int, ...], box_mm: np.ndarray) -> tuple[int, int]:
+    """From which corner the first view looks, as signs of X and Y: from where the defect is seen.
+
+    The front left one, unless most of what is missing (or too much) lies clearly away from it.
+    """
+    if not drawn:
+        return -1, -1
+    look = data.looks[drawn[compared(data, drawn)[0]]]
+    defect = look.missing or look.excess
+    if defect is None or len(defect.vertices_mm) == 0:
+        return -1, -1
+    away = defect.vertices_mm.mean(axis=0) - box_mm.mean(axis=0)
+    x, y = (1 if away[axis] > ASIDE_RATIO * np.ptp(box_mm[:, axis]) else -1 for axis in (0, 1))
+    return x, y
 
 
 def bounds(data: ReportData) -> np.ndarray:
@@ -141,7 +160,7 @@ def nice_ceiling(value: float) -> float:
     return float(f"{10 * power:.6g}")
 
 
-def _look(look: Look, index: int, share: int, scale_mm: float) -> Json:
+def _look(look: Look, index: int, share: int, scale_mm: float, side: tuple[int, int]) -> Json:
     budget = min(POINTS_PER_LOOK, POINTS_TOTAL // share)
     kept = encode.thinned(look.points_mm, look.label_of_point != OK, budget=budget)
     points_mm = look.points_mm[kept]
@@ -151,12 +170,12 @@ def _look(look: Look, index: int, share: int, scale_mm: float) -> Json:
         "index": index,
         "label": html.escape(look.label),
         "threshold": _rounded(look.threshold_mm),
-        "total": len(look.points_mm),
+        "total": max(look.scanned_points, len(look.points_mm)),
         "shown": len(kept),
         "flagged": int((look.label_of_point != OK).sum()),
         "points": encode.quantised(points_mm),
         "deviation": encode.quantised(look.deviation_mm[kept]),
-        "shade": encode.integers(encode.shading(points_mm, normals)),
+        "shade": encode.integers(encode.shading(points_mm, normals, side)),
         "missing": _solid(look.missing, faces),
         "excess": _solid(look.excess, faces),
         "unseen": _unseen(look.unseen_mm),

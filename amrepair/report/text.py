@@ -39,6 +39,7 @@ HEADLINES = {
     Outcome.NOT_WITHIN_TOLERANCE: "Not within tolerance",
     Outcome.NOTHING_TO_REPAIR: "Nothing to repair",
     Outcome.PLANNED: "Repair ready to print",
+    Outcome.PLANNED_IN_PART: "Repair ready to print, but it does not mend all",
     Outcome.STOPPED: "Stopped",
 }
 
@@ -165,8 +166,11 @@ def outcome_of(result: Mapping[str, object], *, within_tolerance: bool) -> Outco
         return Outcome.STOPPED
     if not figures.missing_mm3_before > NEGLIGIBLE_MM3 and figures.filament_mm <= 0:
         return Outcome.NOTHING_TO_REPAIR if within_tolerance else Outcome.NOT_WITHIN_TOLERANCE
-    if figures.missing_mm3_after is None and figures.repaired_ratio is None and within_tolerance:
-        return Outcome.PLANNED
+    if figures.missing_mm3_after is None and figures.repaired_ratio is None:
+        if within_tolerance:
+            return Outcome.PLANNED
+        if figures.filament_mm > 0:
+            return Outcome.PLANNED_IN_PART
     return Outcome.WITHIN_TOLERANCE if within_tolerance else Outcome.NOT_WITHIN_TOLERANCE
 
 
@@ -235,9 +239,12 @@ def _left(outcome: Outcome, figures: Figures) -> str:
         parts.append(f"{quantity(figures.excess_mm3_after, 'mm³')} too much")
     if figures.unreachable_mm3 > NEGLIGIBLE_MM3:
         parts.append(f"the nozzle cannot reach {quantity(figures.unreachable_mm3, 'mm³')}")
+    if figures.unprintable_mm3 > NEGLIGIBLE_MM3:
+        parts.append(f"{quantity(figures.unprintable_mm3, 'mm³')} can hold no bead")
     if figures.unseen_area_mm2 >= 0.5:
         parts.append(
-            f"no sensor saw {quantity(figures.unseen_area_mm2, 'mm²')}, which nobody can vouch for"
+            f"no sensor saw {quantity(figures.unseen_area_mm2, 'mm²')} of the surface, for which "
+            "nobody can vouch"
         )
     text = "; ".join(parts)
     return text[0].upper() + text[1:] + "."
@@ -265,7 +272,7 @@ def plan_lines(plan: RepairPlan) -> list[str]:
         )
     elif regions:
         lines.append("no repair can be printed here")
-    lines += [f"out of reach: {line}" for line in left_out_lines(plan)]
+    lines += [f"left out: {line}" for line in left_out_lines(plan)]
     if plan.refused:
         lines.append(f"the checker refuses it: {plan.refused}")
     return lines

@@ -248,7 +248,7 @@ def test_buttons_are_dead_until_a_question_is_asked(view: LiveView, plan: Repair
     assert re.search(
         r"missing: (8[89]|9\d)\.\d mm³ in 1 region, at X 12\d\.\d to 130\.0, ", view._found.content
     )
-    assert re.search(r"out of reach: 1\d\.\d mm³: the nozzle would touch", view._found.content)
+    assert re.search(r"left out: 1\d\.\d mm³: the nozzle would touch", view._found.content)
     assert {"scan", "missing", "repair"} <= set(view._handles)
     operator.decide(Verdict.APPROVE)
     thread.join(WAIT_S)

@@ -14,20 +14,23 @@ import pytest
 import amrepair
 import gcode
 from amrepair.errors import InputError
+from amrepair.repair import RepairPlan
 from amrepair.report import (
     Counter,
     Decision,
     Figures,
     Outcome,
     ReportData,
+    SolidMesh,
     encode,
+    outcome_of,
     payload,
     summary,
     write_report,
 )
 from amrepair.report import document as document_module
 from amrepair.report.assemble import report_of_plan
-from amrepair.report.collect import look_of, plan_result
+from amrepair.report.collect import look_of, of_the_part, plan_result
 from amrepair.report.data import Rule
 from amrepair.report.document import render_report
 from amrepair.scans import Scan
@@ -164,6 +167,29 @@ def test_a_stop_is_compared_with_itself(data: ReportData) -> None:
     assert payload.compared(alone, payload.drawn_looks(alone)) == (0, 1)
 
 
+def test_the_first_view_looks_from_where_the_defect_is_seen(data: ReportData) -> None:
+    # regression: a chip at the far side of a knob hid behind it
+    assert values_of(render_report(data))["facing"] == [-1, -1]  # front left, as it lies
+    box_mm = payload.bounds(data)
+    pocket = data.looks[0].missing
+    assert pocket is not None
+    across = pocket.vertices_mm * (-1, -1, 1) + box_mm.sum(axis=0) * (1, 1, 0)
+    looks = (replace(data.looks[0], missing=SolidMesh(across, pocket.faces)), data.looks[1])
+    assert payload.facing(replace(data, looks=looks), (0, 1), box_mm) == (1, 1)
+
+
+def test_a_repair_that_leaves_something_is_headed_so() -> None:
+    result = {"missing_mm3_before": 188.0, "filament_mm": 71.0, "unprintable_mm3": 29.7}
+    outcome = outcome_of(result, within_tolerance=False)
+    assert outcome is Outcome.PLANNED_IN_PART  # not "not within tolerance": nothing was printed
+    assert outcome_of(result, within_tolerance=True) is Outcome.PLANNED
+    page = render_report(empty(outcome=outcome, figures=Figures.from_result(result)))
+    seen = " ".join(Elements(page).visible)
+    assert "does not mend all" in seen
+    assert "29.7 mm³ can hold no bead" in seen
+    assert "Left out" in seen
+
+
 def test_a_rule_that_decided_is_told_in_words(data: ReportData) -> None:
     rule = Rule("S9", "gravest is fill now", "fill now: the patch has passed the checker")
     decision = Decision("Layer 16, scan 1", "fill now", ("It fits.",), (rule,))
@@ -278,16 +304,34 @@ def test_a_scan_without_normals_is_drawn_as_bright_as_one_with() -> None:
         assert abs(told.mean() - untold.mean()) < 0.7
 
 
-def test_a_look_of_a_plan_carries_normals_and_outlines(example_files: Path) -> None:
+@pytest.fixture(scope="module")
+def planned(example_files: Path) -> RepairPlan:
+    """A repair of a broken part on a piece of its bed."""
     site = amrepair.Site.of_part(
         amrepair.open_template(example_files / "part.safetensors"), gcode.load_setup()
     )
     scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
-    plan = amrepair.plan_repair(scan, site, title="repair")
+    x, y = np.meshgrid(np.arange(95.0, 99.0, 0.3), np.arange(75.0, 105.0, 0.3))
+    bed_mm = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    up = np.tile([0.0, 0.0, 1.0], (len(bed_mm), 1))
+    both = Scan(
+        np.vstack([scan.points_mm, bed_mm]),
+        0.03,
+        "build",
+        np.vstack([np.asarray(scan.normals), up]),
+    )
+    return amrepair.plan_repair(both, site, title="repair")
+
+
+def test_a_look_of_a_plan_carries_normals_and_outlines(
+    planned: RepairPlan, example_files: Path
+) -> None:
+    plan = planned
+    scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
     shown = look_of(plan, "as scanned", printed=False)
     assert shown.normals is not None
-    assert scan.normals is not None
-    assert np.abs(shown.normals - scan.normals).max() < 0.02  # both in the build frame
+    kept = of_the_part(plan)[: len(scan)]
+    assert np.abs(shown.normals - np.asarray(scan.normals)[kept]).max() < 0.02  # both in the bed's
     assert shown.height_map is not None
     (outline,) = shown.height_map.outlines_mm
     low, high = outline.min(axis=0), outline.max(axis=0)
@@ -297,12 +341,18 @@ def test_a_look_of_a_plan_carries_normals_and_outlines(example_files: Path) -> N
     # and its page says what is to be done, and why
     setup = gcode.load_setup()
     result = plan_result(plan, gcode="r.gcode", seed=0, seconds={}, setup=setup)
-    data = report_of_plan(plan, result, title="r", setup=setup, template=site.template)
+    data = report_of_plan(
+        plan,
+        result,
+        title="r",
+        setup=setup,
+        template=amrepair.open_template(example_files / "part.safetensors"),
+    )
     (decision,) = data.decisions
     assert decision.choice == "print the repair: it does not fill all"
     told = " ".join(decision.reasons)
     assert re.search(r"Missing: \d+\.\d mm³ in 1 region, at X 12\d", told)
-    assert "Out of reach: 1" in told
+    assert "Left out: 1" in told
     assert "passed the checker" in told
     assert "Decisions" in "".join(Elements(render_report(data)).visible)
 
@@ -313,16 +363,11 @@ def test_counters_are_told_in_figures_that_people_read(data: ReportData) -> None
     assert {"42,483", "1.1"} <= set(visible)
 
 
-def test_the_bed_beside_the_part_is_not_drawn_as_excess(example_files: Path) -> None:
-    site = amrepair.Site.of_part(
-        amrepair.open_template(example_files / "part.safetensors"), gcode.load_setup()
-    )
+def test_the_bed_beside_the_part_is_not_drawn_as_excess(
+    planned: RepairPlan, example_files: Path
+) -> None:
     scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
-    x, y = np.meshgrid(np.arange(95.0, 99.0, 0.3), np.arange(75.0, 105.0, 0.3))
-    bed = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    both = Scan(np.vstack([scan.points_mm, bed]), 0.03, "build")
-    plan = amrepair.plan_repair(both, site, title="repair")
-    shown = look_of(plan, "as scanned", printed=False)
+    shown = look_of(planned, "as scanned", printed=False)
     assert len(shown.points_mm) == len(shown.deviation_mm) == len(shown.label_of_point)
     assert shown.points_mm[:, 0].min() > 99.0  # nothing of the bed
     kept = len(shown.points_mm) / len(scan.points_mm)

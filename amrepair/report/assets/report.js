@@ -93,7 +93,7 @@
 
   // ---- traces -------------------------------------------------------------------------------
   const LIGHTING = { ambient: 0.62, diffuse: 0.55, specular: 0.12, roughness: 0.7, fresnel: 0.1, facenormalsepsilon: 0, vertexnormalsepsilon: 0 };
-  const LIGHT = { x: -4000, y: -6000, z: 9000 };
+  const LIGHT = { x: 4000 * data.facing[0], y: 6000 * data.facing[1], z: 9000 };
   const ORDER = ["scan", "ghost", "edges", "missing", "excess", "past", "now", "unseen"];
   const solid = (name, colour, mesh, opacity, extra) => Object.assign({
     type: "mesh3d", name, color: colour, opacity, flatshading: true, lighting: LIGHTING, lightposition: LIGHT,
@@ -134,7 +134,7 @@
 
   // ---- a scene ------------------------------------------------------------------------------
   const VIEWS = {  // direction to the eye, and which way is up
-    overview: { eye: [-0.88, -1.22, 0.82], up: [0, 0, 1] },
+    overview: { eye: [0.88 * data.facing[0], 1.22 * data.facing[1], 0.82], up: [0, 0, 1] },
     top: { eye: [0, -0.0005, 1], up: [0, 1, 0] },
     front: { eye: [0, -1, 0], up: [0, 0, 1] },
     right: { eye: [1, 0, 0], up: [0, 0, 1] },
@@ -262,7 +262,7 @@
         annotations: inside ? [{ x: look.threshold, y: 1, yref: "paper", xanchor: "left", yanchor: "top", text: " limit ±" + number(look.threshold, 3) + " mm", showarrow: false, font: { size: 11.5 } }] : [],
         xaxis: line("Signed deviation, mm (negative: missing)", { range: [h.low, -h.low], showgrid: false }),
         yaxis: line("Points", { type: "log", dtick: 1, exponentformat: "none", tickformat: ",d" }) }));
-    $("histogram-note").textContent = "Every point counts, on a logarithmic scale. " + (h.beyond ? number(h.beyond, 0) + (h.beyond === 1 ? " point beyond the ends is" : " points beyond the ends are") + " in the outermost bars." : "");
+    $("histogram-note").textContent = number(h.counts.reduce((a, b) => a + b, 0), 0) + " points of the part, on a logarithmic scale. " + (h.beyond ? number(h.beyond, 0) + (h.beyond === 1 ? " point beyond the ends is" : " points beyond the ends are") + " in the outermost bars." : "");
   }
   function heights(look) {
     const h = look.heights, figure = $("heights-figure");
@@ -374,7 +374,7 @@
     main.layer = beads ? beads.tops.length - 1 : 0;
     boxes(); layerText(); legend(); histogram(look); heights(look);
     $("scene-note").textContent = look.shown < look.total
-      ? "Drawn: " + number(look.shown, 0) + " of " + number(look.total, 0) + " points" + (look.flagged ? ", those beyond the limit (" + number(look.flagged, 0) + ") first." : ".")
+      ? "Drawn: " + number(look.shown, 0) + " of the scan's " + number(look.total, 0) + " points" + (look.flagged ? ", those beyond the limit first." : ".") + " The others show the bed, or are left out to keep this file small; volumes and decisions use every point."
       : "All " + number(look.total, 0) + " points are drawn.";
     main.draw();
   }
