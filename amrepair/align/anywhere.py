@@ -64,6 +64,8 @@ class Found:
         Share of the points that was taken for clutter.
     sigma_mm, inlier_mm
         How well points were taken to agree with the template, and how near explained ones lie.
+    field
+        The template's, that was searched; None where nothing was.
     """
 
     best: Refined
@@ -73,6 +75,7 @@ class Found:
     left_out_ratio: float
     sigma_mm: float
     inlier_mm: float
+    field: CoarseField | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +202,7 @@ def pose_from_anywhere(
     sample = part_mm[rng.permutation(len(part_mm))[:DENSE_POINTS]]
     residual = template.distance(sample @ best.matrix[:3, :3].T + best.matrix[:3, 3])
     ratio = float((np.abs(residual) <= inlier_mm).mean())
-    return Found(best, tuple(others), ratio, part_mm, left_out_ratio, sigma_mm, inlier_mm)
+    return Found(best, tuple(others), ratio, part_mm, left_out_ratio, sigma_mm, inlier_mm, field)
 
 
 def explained_if_mirrored(
@@ -207,7 +210,8 @@ def explained_if_mirrored(
 ) -> float:
     """Share of the points that lie on the part where they are mirrored first."""
     clouds = _clouds(points_mm * np.array([-1.0, 1.0, 1.0]), template, found.sigma_mm, rng)
-    starts = _worth_refining(clouds, CoarseField.of(template), QUICK, rng)
+    field = found.field if found.field is not None else CoarseField.of(template)
+    starts = _worth_refining(clouds, field, QUICK, rng)
     return _explained(_refined(starts[:FEW_TRIED], clouds, template)[0][1], found.inlier_mm)
 
 

@@ -39,7 +39,7 @@ def opened(parts: dict[str, MeshSdf]) -> list[tuple[str, Callable[[], Template]]
 
 
 def scan_of(part: MeshSdf, seed: int) -> Scan:
-    points = np.asarray(trimesh.sample.sample_surface(part.mesh, 20_000, seed=seed)[0])
+    points = np.asarray(trimesh.sample.sample_surface(part.mesh, 4_000, seed=seed)[0])
     points = points + np.random.default_rng(seed).normal(0, 0.03, points.shape)
     turn = rotation_from_vector(np.array([0.4, -1.0, 1.7]))
     return Scan(points @ turn.T + 30.0, 0.03, "scanner", source="scan.ply")
