@@ -90,7 +90,8 @@ def region_rows(plan: RepairPlan) -> tuple[RegionRow, ...]:
         elif plan.patch is not None:
             reach = reach_of(plan, region.box_mm)
             if reach < 0.999:
-                note = "; ".join(sorted({u.reason for u in plan.patch.unreachable}))
+                why = {u.reason for u in plan.patch.unreachable}
+                note = "; ".join(sorted(why or {u.reason for u in plan.patch.unprintable}))
         rows.append(RegionRow(str(region.type), region.volume_mm3, region.box_mm, reach, note))
     return tuple(rows)
 

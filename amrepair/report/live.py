@@ -5,6 +5,7 @@ It draws what it is handed and hands on what is pressed; it decides nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from amrepair.loop import Decision, Look
 from amrepair.repair import RepairPlan
 from amrepair.report import guarded
-from amrepair.report.collect import of_the_part
+from amrepair.report.collect import decision_of, look_label, of_the_part
 from amrepair.report.operator import Operator, Verdict
 from amrepair.report.text import plan_lines
 from gcode.errors import GcodeError
@@ -93,7 +94,17 @@ class LiveView:
             self._skip.on_click(lambda _: operator.decide(Verdict.SKIP))
             self._pause.on_click(lambda _: self._toggle_pause(operator))
             operator.changed = self._show_operator
-        self._folder = gui.add_folder("Shown")
+        self._folder = gui.add_folder("Shown", expand_by_default=False)  # a phone has no room
+        with self._folder:
+            dark = gui.add_checkbox("dark page", False, order=float("inf"))
+        dark.on_update(lambda _: self._dress(dark=dark.value))
+        self._dress(dark=False)
+
+    def _dress(self, *, dark: bool) -> None:
+        """Colours of the page; viser's button that puts it on a public server is not shown."""
+        self.server.gui.configure_theme(
+            dark_mode=dark, show_logo=False, show_share_button=False, control_width="medium"
+        )
 
     @property
     def url(self) -> str:
@@ -241,7 +252,7 @@ class LiveView:
             self._grown -= 1
             steps[self._grown][1].visible = False
 
-    def show_plan(self, plan: RepairPlan, label: str) -> None:
+    def show_plan(self, plan: RepairPlan, label: str, why: Sequence[str] = ()) -> None:
         """Draw a scan with its deviations, what is missing, what is too much, and the patch."""
         if not self._open:
             return
@@ -260,7 +271,7 @@ class LiveView:
             self.show_toolpath("repair", plan.patch.toolpath)
         else:
             self._remove("repair")
-        found = [f"- {line}" for line in plan_lines(plan)]
+        found = [f"- {line}" for line in (*why, *plan_lines(plan))]
         self._found.content = "\n".join([f"**{label}**", *found])
 
     def approve(self, plan: RepairPlan) -> bool:
@@ -281,8 +292,8 @@ class LiveView:
 
     def record(self, look: Look) -> None:
         """Show a look with its outcome (the `record` of `run_loop`)."""
-        outcome = "repaired" if look.printed else "skipped" if look.declined else "went on"
-        self.show_plan(look.plan, f"{look.stop.label}: {outcome}")
+        decision = decision_of(look)
+        self.show_plan(look.plan, f"{look_label(look)}: {decision.choice}", decision.reasons)
         if self._operator is not None:
             self._operator.wait_while_paused()
 

@@ -42,7 +42,7 @@ def regions(data: ReportData) -> str:
         "Volume, mm³",
         "Size X × Y × Z, mm",
         "Centre on the bed, mm",
-        "In reach",
+        "Can be filled",
         "Remark",
     )
     if not any(row[-1] for row in rows):

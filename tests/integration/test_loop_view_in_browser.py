@@ -48,6 +48,7 @@ QUIET_S = 1.5  # a hundred times what a line takes
 PROGRAM = "from amrepair.cli import main; main()"
 AGAIN = "look again"
 EVERY_NTH = 8  # of the points: some ninety thousand, three at every 0.2 mm, are enough for a void
+START_S = 200.0  # a process that compiles its kernels first, on a busy machine
 SENSOR_S = 1.0  # a scan takes its time; one from before it was asked for would be no answer
 
 
@@ -185,7 +186,10 @@ class Command:
             found.extend(re.findall(r"http://\S+?(?=:? )", self._stderr.read_text()))
             return bool(found)
 
-        until(said)
+        end_s = time.monotonic() + START_S
+        while not said():
+            assert time.monotonic() < end_s, self._stderr.read_text()
+            time.sleep(0.1)
         return found[0]
 
     def laid(self) -> int:

@@ -136,11 +136,20 @@ def test_dark_and_print(browser: Any, report: Path) -> None:
     page = watched.page
     assert pixels(page, ".top").mean() < 80
     assert pixels(page, "#viewer .plot").mean() < 110
-    page.emulate_media(media="print", color_scheme="light")
+    page.set_viewport_size({"width": 690, "height": 980})  # A4 less its margins
+    page.emulate_media(media="print", color_scheme="dark")  # paper is white all the same
     page.evaluate(SETTLED)
     assert page.locator(".player").is_hidden()
     assert page.locator(".index").is_hidden()
     assert page.locator("#regions table").is_visible()
+    # regression: drawings kept the window's size, and lay over each other on paper
+    for frame in page.locator(".view, .chart").all():
+        outer = frame.bounding_box()
+        inner = frame.locator(".svg-container").bounding_box()
+        assert inner["width"] > 100, frame
+        assert inner["x"] >= outer["x"] - 1, frame
+        assert inner["x"] + inner["width"] <= outer["x"] + outer["width"] + 1, frame
+        assert inner["y"] + inner["height"] <= outer["y"] + outer["height"] + 1, frame
     assert page.evaluate("() => getComputedStyle(document.body).backgroundColor").startswith(
         "rgb(255, 255, 255"
     )

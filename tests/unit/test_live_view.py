@@ -20,7 +20,10 @@ import amrepair
 import gcode
 from amrepair.cli.app import app
 from amrepair.cli.live import ShownRun, show_file
+from amrepair.detect.anomaly import DefectType
 from amrepair.errors import InputError, MissingDependencyError
+from amrepair.loop import Look, Stop
+from amrepair.loop.decide import Action, Cover, Finding, Situation, decide, judge
 from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.guarded import Guard
@@ -254,6 +257,19 @@ def test_buttons_are_dead_until_a_question_is_asked(view: LiveView, plan: Repair
     thread.join(WAIT_S)
     assert found == [True]
     assert view._approve.disabled
+
+
+def test_a_look_is_told_with_its_decision(view: LiveView, plan: RepairPlan) -> None:
+    finding = Finding(
+        "missing", DefectType.CHIP, 0.9, 89.0, 89.0, 4.0, 9.0, 1.0, Cover.NOTHING, 0.0,
+        ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+    )  # fmt: skip
+    decision = decide([judge(finding)], Situation(Action.FILL_NOW))
+    view.record(Look(3, Stop(11, 0, 2.4), plan.scan, plan, decision, printed=True))
+    told = view._found.content
+    assert told.startswith("**Layer 11, scan 3: fill now**")
+    assert "- The patch has passed the checker." in told
+    assert "- Chip, 89.0 mm³ missing: fill now; a bead fits, and the nozzle reaches it." in told
 
 
 def test_a_pause_before_there_is_a_printer_holds_the_run_at_once(view: LiveView) -> None:

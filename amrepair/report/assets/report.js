@@ -181,6 +181,16 @@
     return Math.min(Math.max(1.9 * apart * scale, 1.8), 7);
   }
   const pending = [];
+  // Paper has another width than the window, and nothing is drawn anew for it: what is drawn is
+  // scaled there, by the style sheet.
+  function scalable(div) {
+    const fit = () => {
+      const { width, height } = div._fullLayout;
+      div.style.setProperty("--aspect", width + " / " + height);
+      div.querySelectorAll(".main-svg").forEach((svg) => svg.setAttribute("viewBox", "0 0 " + width + " " + height));
+    };
+    if (!div.scalable && div.on) { div.scalable = true; div.on("plotly_afterplot", fit); fit(); }
+  }
   class Scene {
     constructor(id) {
       this.pane = $(id); this.div = this.pane.querySelector(".plot");
@@ -208,6 +218,7 @@
       this.pane.append(note); console.warn(error);
     }
     listen() {
+      scalable(this.div);
       if (this.listening || !this.div.on) return;
       this.listening = true;
       const moved = (change) => {
@@ -250,7 +261,7 @@
     hoverlabel: { font: { family: css("--sans"), size: 12 } } }, extra);
   const line = (title, extra) => Object.assign({ title: { text: title, font: { size: 12 }, standoff: 8 }, gridcolor: css("--line-soft"),
     linecolor: css("--line"), zeroline: false, ticks: "outside", tickcolor: css("--line"), ticklen: 4, automargin: true }, extra || {});
-  const chart = (id, traceList, layout) => { if ($(id)) pending.push(Plotly.react(id, traceList, layout, { displayModeBar: false, responsive: true })); };
+  const chart = (id, traceList, layout) => { if ($(id)) pending.push(Plotly.react(id, traceList, layout, { displayModeBar: false, responsive: true }).then(scalable)); };
   const FLAT_HUE = (t) => "rgb(" + hue(t).map(Math.round).join(",") + ")";
   function histogram(look) {
     const h = look.histogram, x = h.counts.map((_, n) => h.low + (n + 0.5) * h.step);
@@ -421,6 +432,9 @@
     if ($("temperatures")) temperatures();
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", theme);
     matchMedia("print").addEventListener("change", theme);
+    const folds = document.querySelectorAll("details");
+    addEventListener("beforeprint", () => folds.forEach((fold) => { fold.was = fold.open; fold.open = true; }));
+    addEventListener("afterprint", () => folds.forEach((fold) => { fold.open = fold.was; }));
   }
   start();
   // For tests and for pages that embed this one: resolves when every drawing so far is done.
