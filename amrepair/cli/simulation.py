@@ -266,7 +266,7 @@ def _say(run: SimulatedRun, result: dict[str, Any], folder: RunFolder, within: b
         table.add_row(t.kind, t.label, f"{t.missing_mm3:.1f}", f"{t.filled_mm3:.1f}", ratio)
     if run.truth:
         console.out.print(table)
+    console.out.print(f"Simulated {result['speed_up']:g} times as fast as the printer prints.\n")
     for line in summary_of_result(result, within_tolerance=within):
         console.out.print(line)
-    console.out.print(f"Printed {result['speed_up']:g} times as fast as the printer's own clock.")
     console.out.print(f"Report: {folder.file('report.html')}")

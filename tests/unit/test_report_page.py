@@ -33,6 +33,7 @@ from amrepair.report.assemble import report_of_plan
 from amrepair.report.collect import look_of, of_the_part, plan_result
 from amrepair.report.data import Rule
 from amrepair.report.document import render_report
+from amrepair.report.live import STOPS
 from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
 
@@ -188,6 +189,39 @@ def test_a_repair_that_leaves_something_is_headed_so() -> None:
     assert "does not mend all" in seen
     assert "29.7 mm³ can hold no bead" in seen
     assert "Left out" in seen
+
+
+# Machado, Oliveira and Fernandes (2009), severity 1.0, on linear RGB.
+SEEN_BY = {
+    "protanope": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+    "deuteranope": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+    "tritanope": [[1.256, -0.077, -0.179], [-0.078, 0.931, 0.148], [0.005, 0.691, 0.304]],
+}
+
+
+@pytest.mark.parametrize("eye", SEEN_BY)
+def test_missing_and_too_much_are_told_apart_by_every_eye(eye: str) -> None:
+    script = document_module._asset("report.js")
+    found = re.search(r"const STOPS = (\[\[.*?\]\]);", script)
+    assert found
+    stops = np.array(json.loads(found.group(1)), dtype=np.float64)
+    assert np.array_equal(stops, STOPS)  # one scale, in the report and in the live view
+    linear = np.where(stops <= 10.31, stops / 3294.6, ((stops / 255 + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ np.array(SEEN_BY[eye]).T, 0.0, 1.0)
+    xyz = seen @ np.array(
+        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    ).T  # fmt: skip
+    root = np.cbrt(np.maximum(xyz / [0.9505, 1.0, 1.089], 0.0))
+    lab = np.stack(
+        [116 * root[:, 1] - 16, 500 * (root[:, 0] - root[:, 1]), 200 * (root[:, 1] - root[:, 2])],
+        axis=1,
+    )
+    middle = len(lab) // 2
+    for near in range(1, middle + 1):  # a ΔE of 20 is seen at a glance; 2.3 just so
+        missing, excess = lab[middle - near], lab[middle + near]
+        assert np.linalg.norm(missing - excess) > 20.0
+        assert np.linalg.norm(missing - lab[middle]) > 10.0
+        assert np.linalg.norm(excess - lab[middle]) > 10.0
 
 
 def test_a_rule_that_decided_is_told_in_words(data: ReportData) -> None:
