@@ -191,7 +191,7 @@ class RepairPlan:
     @property
     def unreachable_mm3(self) -> float:
         """Missing volume that the nozzle cannot get to."""
-        return sum(u.volume_mm3 for u in self.patch.unreachable) if self.patch else 0.0
+        return float(sum(u.volume_mm3 for u in self.patch.unreachable)) if self.patch else 0.0
 
 
 def plan_repair(

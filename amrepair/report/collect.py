@@ -35,6 +35,7 @@ from gcode.profiles import PrintSetup
 from gcode.slicing.layers import mesh_of
 
 DIGITS = 6  # of every figure in a result: beyond what any scan can tell
+STRAY_LIMITS = 3.0  # so many limits outside, and no excess: it hangs in the air
 OUTLINE_MM = 0.05  # finer than a pixel of the drawing
 _LIBRARIES = (
     "amrepair",
@@ -251,10 +252,10 @@ def look_of(
 
 
 def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
-    """(n,) points of the scan that show the part: detection's own word on what is bed and skirt.
+    """(n,) points of the scan that show the part: detection's own word on bed, skirt and strays.
 
-    The bed beside the part lies outside of it, and is no excess: drawn in its colour, it would be
-    taken for some.
+    The bed beside the part lies outside of it, and is no excess; nor are reflections in mid-air.
+    Drawn in its colour, they would be taken for some.
     """
     anomaly = plan.anomaly
     foot_mm = (
@@ -262,7 +263,8 @@ def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
     )
     flat = plan.scan.points_mm[:, 2] < foot_mm + BED_BAND_MM
     outside = anomaly.deviation_mm > anomaly.threshold_mm
-    return ~(flat & outside & (anomaly.label == int(Label.OK)))
+    far = anomaly.deviation_mm > STRAY_LIMITS * anomaly.threshold_mm
+    return ~(((flat & outside) | far) & (anomaly.label == int(Label.OK)))
 
 
 def outlines_mm(plan: RepairPlan) -> tuple[Float[np.ndarray, "_ 2"], ...]:

@@ -174,7 +174,7 @@ def test_the_first_view_looks_from_where_the_defect_is_seen(data: ReportData) ->
     box_mm = payload.bounds(data)
     pocket = data.looks[0].missing
     assert pocket is not None
-    across = pocket.vertices_mm * (-1, -1, 1) + box_mm.sum(axis=0) * (1, 1, 0)
+    across = pocket.vertices_mm * (-1, -1, 1) + box_mm.sum(axis=0) * (1, 1, 0) + (8.0, 8.0, 0.0)
     looks = (replace(data.looks[0], missing=SolidMesh(across, pocket.faces)), data.looks[1])
     assert payload.facing(replace(data, looks=looks), (0, 1), box_mm) == (1, 1)
 
@@ -347,6 +347,9 @@ def planned(example_files: Path) -> RepairPlan:
     scan = amrepair.read_scan(example_files / "scan.ply", frame="build")
     x, y = np.meshgrid(np.arange(95.0, 99.0, 0.3), np.arange(75.0, 105.0, 0.3))
     bed_mm = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    bed_mm = np.vstack(
+        [bed_mm, [(110.0, 90.0, 25.0), (90.0, 78.0, 14.0)]]
+    )  # reflections in the air
     up = np.tile([0.0, 0.0, 1.0], (len(bed_mm), 1))
     both = Scan(
         np.vstack([scan.points_mm, bed_mm]),
@@ -404,5 +407,6 @@ def test_the_bed_beside_the_part_is_not_drawn_as_excess(
     shown = look_of(planned, "as scanned", printed=False)
     assert len(shown.points_mm) == len(shown.deviation_mm) == len(shown.label_of_point)
     assert shown.points_mm[:, 0].min() > 99.0  # nothing of the bed
+    assert shown.points_mm[:, 2].max() < 9.5  # nor of what hangs in the air
     kept = len(shown.points_mm) / len(scan.points_mm)
     assert kept == pytest.approx(1.0, abs=0.002)  # and all of the part

@@ -385,7 +385,7 @@
     main.layer = beads ? beads.tops.length - 1 : 0;
     boxes(); layerText(); legend(); histogram(look); heights(look);
     $("scene-note").textContent = look.shown < look.total
-      ? "Drawn: " + number(look.shown, 0) + " of the scan's " + number(look.total, 0) + " points" + (look.flagged ? ", those beyond the limit first." : ".") + " The others show the bed, or are left out to keep this file small; volumes and decisions use every point."
+      ? "Drawn: " + number(look.shown, 0) + " of the scan's " + number(look.total, 0) + " points" + (look.flagged ? ", those beyond the limit first." : ".") + " The others show the bed or stray reflections, or are left out to keep this file small; volumes and decisions use every point."
       : "All " + number(look.total, 0) + " points are drawn.";
     main.draw();
   }
