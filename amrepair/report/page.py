@@ -112,8 +112,10 @@ def _tiles(data: ReportData) -> Iterable[tuple[str, str, str]]:
         )
     if figures.unprintable_mm3 > NEGLIGIBLE_MM3:
         left_mm3 = figures.unreachable_mm3 + figures.unprintable_mm3
-        reached = f"{quantity(figures.unreachable_mm3, 'mm³')} out of reach, the rest holds no bead"
-        yield "Left out", _big(left_mm3, "mm³"), reached
+        why = "too small for a bead, or nothing holds one"
+        if figures.unreachable_mm3 > NEGLIGIBLE_MM3:
+            why = f"{quantity(figures.unreachable_mm3, 'mm³')} out of reach, the rest holds no bead"
+        yield "Left out", _big(left_mm3, "mm³"), why
     else:
         yield "Out of reach", _big(figures.unreachable_mm3, "mm³"), "for this nozzle"
     yield "Not seen", _big(figures.unseen_area_mm2, "mm²"), "unknown, never filled"

@@ -27,7 +27,7 @@ CELLS_TOTAL = 400_000
 SAMPLES_PER_SERIES = 2_000
 LOOKS_DRAWN = 12
 HISTOGRAM_BINS = 80
-ASIDE_RATIO = 0.25  # of the part's side: a defect so far off its middle is seen from there
+ASIDE_RATIO = 0.15  # of the part's side: a defect so far off its middle is seen from there
 OK, MISSING, EXCESS = 0, 1, 2
 
 Json = dict[str, object]
