@@ -169,6 +169,7 @@ class ProcessProfile(_Profile):
     acceleration_mm_s2: Positive
     infill_overlap_ratio: Ratio = 0.15
     max_gap_layers: Annotated[float, Field(ge=1, le=4)] = 2.0
+    nonplanar_top: bool = False  # patches end along gentle slopes instead of in steps
     surface_allowance_mm: Annotated[float, Field(ge=0, le=1)] = 0.05
     unasked_max_mm3: Positive = 500.0  # the most that a repair may be printed of without asking
     unasked_max_s: Positive = 1800.0

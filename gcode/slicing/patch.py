@@ -20,10 +20,11 @@ from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.job import Unprintable
 from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch_beads import LEAST_THICK_MM
 from gcode.slicing.patch_laying import begin, emit, end
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_order import stages_of
-from gcode.slicing.patch_passes import AGREE_MM, LEAST_THICK_MM, NOT_LISTED_MM3, plan_passes
+from gcode.slicing.patch_passes import AGREE_MM, NOT_LISTED_MM3, plan_passes
 from gcode.surfaces import HeightField
 
 COVERED = "covered by what stands above it"

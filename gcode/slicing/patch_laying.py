@@ -18,8 +18,9 @@ from gcode.moves import (
 )
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import width_of
+from gcode.slicing.patch_beads import Chain, surely_free
 from gcode.slicing.patch_model import NEAR_MM
-from gcode.slicing.patch_passes import Chain, Pass, surely_free
+from gcode.slicing.patch_passes import Pass
 from gcode.slicing.pen import Pen
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
@@ -89,8 +90,11 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
     """Lay one pass; returns its plastic."""
     pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
     laid_mm3 = 0.0
-    for chain in _walls_last(one.chains, pen.position_mm[:2]):
-        target = np.array([*chain.xy_mm[0], one.z_mm])
+    planar = isinstance(one.tip_mm, float)
+    # along a surface they are in order: the lowest first
+    chains = _walls_last(one.chains, pen.position_mm[:2]) if planar else one.chains
+    for chain in chains:
+        target = np.array([*chain.xy_mm[0], chain.z_mm[0]])
         gap = target - pen.position_mm
         near = abs(gap[2]) < 1e-6 and float(np.hypot(gap[0], gap[1])) < NEAR_MM
         samples = 2 + int(np.ceil(3 * np.hypot(gap[0], gap[1]) / reach.field.cell_mm))
@@ -104,7 +108,7 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
         lengths = np.hypot(*np.diff(chain.xy_mm, axis=0).T)
         width_mm = float(chain.section_mm2.mean()) / one.height_mm
         pen.extrude(
-            np.column_stack([chain.xy_mm, np.full(len(chain.xy_mm), one.z_mm)]),
+            np.column_stack([chain.xy_mm, chain.z_mm]),
             chain.section_mm2,
             speed_mm_s=setup.process.repair_speed_mm_s,
             role=chain.role,

@@ -54,6 +54,7 @@ class PatchModel:
         # columns sample the solid; its own volume is exact
         self.weight = float(deficit.volume()) / columns_mm3 if columns_mm3 > 0 else 1.0
         self.top_mm = kernels.column_top(offsets, self._z, -np.inf).reshape(self.shape)
+        self.planar_top_mm = self.top_mm  # lower where another pass ends the column
         self.points_mm = self._centres()
         floor_mm = as_built.sample(self.points_mm).reshape(self.shape)
         self.floor_mm = floor_mm
@@ -65,14 +66,15 @@ class PatchModel:
         self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
         self._printer = setup.printer
         self._window_mm = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
-        self.reach = self._reach(as_built)
+        self.reach = self.reach_of(as_built)
         self._tip_cells = self.reach.cells_of(self.points_mm)
 
     def reach_over(self, finished: Bool[np.ndarray, "ny nx"]) -> Reach:
         """Where the nozzle may be once the columns asked for are filled as planned."""
-        return self._reach(self.surface(finished))
+        return self.reach_of(self.surface(finished))
 
-    def _reach(self, field: HeightField) -> Reach:
+    def reach_of(self, field: HeightField) -> Reach:
+        """Where the nozzle may be over what stands there, around the patch."""
         # the lowest pass lies at most one thick bead above the deficit's floor
         lowest_mm = max(0.0, float(self.box[2]))
         return Reach(
@@ -104,10 +106,15 @@ class PatchModel:
 
     def surface(self, finished: Bool[np.ndarray, "ny nx"] | bool = True) -> HeightField:
         """The as-built field with the patch on it, or with what of it is finished."""
+        return self.raised((self.laid_mm > 0) & finished, self.surface_mm)
+
+    def raised(
+        self, columns: Bool[np.ndarray, "ny nx"], to_mm: Float[np.ndarray, "ny nx"]
+    ) -> HeightField:
+        """The as-built field, at least as high as `to_mm` over some columns."""
         cells = self.as_built.cells_of(self.points_mm)
         ny, nx = self.as_built.shape
-        laid = (self.laid_mm > 0) & finished
-        ok = ((cells >= 0) & (cells < (ny, nx))).all(axis=1) & laid.ravel()
+        ok = ((cells >= 0) & (cells < (ny, nx))).all(axis=1) & columns.ravel()
         z_mm = self.as_built.z_mm.astype(np.float64).copy()
-        np.maximum.at(z_mm, (cells[ok, 0], cells[ok, 1]), self.surface_mm.ravel()[ok])
+        np.maximum.at(z_mm, (cells[ok, 0], cells[ok, 1]), to_mm.ravel()[ok])
         return self.as_built.raised(z_mm)

@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from gcode.slicing.beads import divided
+from gcode.slicing.patch_beads import Chain, surely_free
 from gcode.slicing.patch_model import NEAR_MM, PatchModel
-from gcode.slicing.patch_passes import Chain, Pass, surely_free
+from gcode.slicing.patch_passes import Pass
 from gcode.slicing.reach import Reach
 
 
@@ -94,11 +95,11 @@ def _sorted(
 
 def _all_free(laid: list[tuple[Pass, Chain]], reach: Reach) -> bool:
     """Whether the nozzle may be all along every bead."""
-    free: dict[float, Bool[np.ndarray, "ny nx"]] = {}
+    free: dict[int, Bool[np.ndarray, "ny nx"]] = {}
     for one, chain in laid:
-        if one.z_mm not in free:
-            free[one.z_mm] = reach.at(one.z_mm)
-        if not surely_free(_along(chain, reach), free[one.z_mm], reach).all():
+        if one.index not in free:
+            free[one.index] = reach.at(one.tip_mm)
+        if not surely_free(_along(chain, reach), free[one.index], reach).all():
             return False
     return True
 
@@ -121,5 +122,5 @@ def _of_regions(
     for one in passes:
         chains = tuple(chain for chain in one.chains if id(chain) in own)
         if chains:
-            out.append(replace(one, chains=chains, reach=reach.at(one.z_mm)))
+            out.append(replace(one, chains=chains, reach=one.reach & reach.at(one.tip_mm)))
     return tuple(out)

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from manifold3d import CrossSection, FillRule
 from scipy import ndimage
-from scipy.spatial import cKDTree
-from skimage import measure
 
-from gcode.moves import Role
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress
-from gcode.slicing.beads import Bead, divided, spacing_of
-from gcode.slicing.infill import SOLID_ANGLES_RAD, ring_beads, solid_fill
-from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES, Unprintable
+from gcode.slicing.infill import SOLID_ANGLES_RAD
+from gcode.slicing.job import Unprintable
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.medial import fill_thin
+from gcode.slicing.patch_beads import (
+    LEAST_THICK_MM,
+    ROUNDING_MM,
+    TO_WALL_MM,
+    Chain,
+    begun_inside,
+    draw,
+    free_between,
+    free_runs,
+    weighed,
+)
 from gcode.slicing.patch_model import PatchModel
-from gcode.slicing.reach import Reach
-from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
+from gcode.slicing.patch_skin import Skin, skin_of
 
-# Thinner than this no bead holds together; it is filled with the next pass, or is the tolerance.
-LEAST_THICK_MM = 0.06
 # The floor was measured, the deficit computed from it: they agree within this.
 AGREE_MM = 0.04
 # A gap of more than this share of the thickest bead is not filled from above: up to there a strand
@@ -33,19 +35,7 @@ AGREE_MM = 0.04
 # head keeps the tip this far off.
 DEEP_RATIO = 1.6
 HOLD_MM = 0.45  # a line's width: how far a bead may hang over a hole beside what holds it
-STEP_MM = 0.4  # along a bead, between two samples of the gap
-LEAST_RUN_MM = 0.4
-LEAST_SECTION_MM2 = 0.004
-# From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which is
-# 2.5 bores across (E3D V6): not to its very rim.
-SPREAD_NOZZLES = 1.125
-# What is pressed out under the flat beside a wall goes on to the wall, where that is this near to
-# what it reaches: nowhere else has it to go.
-TO_WALL_MM = 0.2
-# Centre lines keep off the rim of where the tip may go: contours of cells are not exact.
-DRAWN_IN_CELLS = 0.75
-ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
-ROUNDING_MM = 2e-3  # more than the text's last digit
+SKIN_MM = 0.2  # about as thick as it gets
 NOT_LISTED_MM3 = 0.02
 # A flat top: as much area, as wide, within so little height.
 FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
@@ -53,31 +43,23 @@ ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
-    """A bead of a pass: (n, 2) points and (n-1,) cross-sections, mm²."""
-
-    xy_mm: Float[np.ndarray, "n 2"]
-    section_mm2: Float[np.ndarray, " m"]
-    role: Role
-
-    def reversed(self) -> Chain:
-        """The same from its other end."""
-        return Chain(
-            np.ascontiguousarray(self.xy_mm[::-1]),
-            np.ascontiguousarray(self.section_mm2[::-1]),
-            self.role,
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class Pass:
-    """Beads at one nozzle height."""
+    """Beads laid together, between all of which `reach` says where the tip may go directly.
+
+    Attributes
+    ----------
+    z_mm
+        Height of the tip, or its greatest.
+    tip_mm
+        The same wherever it may go: on the cells of `Reach` where it follows a surface.
+    """
 
     z_mm: float
     height_mm: float
     index: int
     chains: tuple[Chain, ...]
     reach: Bool[np.ndarray, "ny nx"]
+    tip_mm: float | Float[np.ndarray, "ny nx"]
 
 
 def plan_passes(
@@ -97,6 +79,10 @@ def plan_passes(
     for flat_mm in flats:
         ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
     heights = np.sort(np.concatenate([tops, flats]))
+    skin = skin_of(model, ~np.isfinite(ends)) if setup.process.nonplanar_top else None
+    skin = _served(model, skin, setup)
+    if skin is not None:
+        model.planar_top_mm = skin.planar_top_mm(model, tops)
     passes: list[Pass] = []
     for k, z_mm in enumerate(heights):
         on_grid = not (np.abs(flats - z_mm) < ROUNDING_MM).any()
@@ -109,6 +95,9 @@ def plan_passes(
         if one is not None:
             passes.append(one)
         progress("slice patch", float(k + 1), float(len(heights)))
+    if skin is not None:
+        one = _plan_skin(model, skin, most_mm, len(heights), setup)
+        passes += [one] if one is not None else []
     return passes
 
 
@@ -154,31 +143,75 @@ def _plan_pass(
     if not thick.any():
         return None
     reach = model.reach.at(z_mm)
-    centres = offset(
-        _contour((thick > 0) & model.free_at(reach), model), -DRAWN_IN_CELLS * model.cell_mm
-    )
-    if centres.is_empty():
+    drawn = draw(thick, model.free_at(reach), SOLID_ANGLES_RAD[index % 2], model, setup)
+    if drawn is None:
         return None
-    wanted_region = _contour(thick > 0, model)
-    height_mm = float(thick[thick > 0].mean())
-    share_mm = spacing_of(max(setup.process.line_width_mm, 1.05 * height_mm), height_mm)
-    # centres may go as far as the nozzle is free; the fill reaches half a line beyond them
-    region = offset(centres, 0.5 * share_mm) ^ wanted_region
-    beads, lost_mm2 = _fill(region, share_mm, index, setup)
-    runs = [_begun_inside(run, model) for bead in beads for run in _free_runs(bead, reach, model)]
+    runs = [
+        begun_inside(run, model)
+        for bead in drawn.beads
+        for run in free_runs(bead, lambda a, b: free_between(a, b, reach, model.reach))
+    ]
     if not runs:
         return None
-    chains, laid = _weighed(runs, thick, _strips(thick, z_mm, model), model, setup)
+    tips_mm = [np.full(len(run.xy_mm), z_mm) for run in runs]
+    chains, laid = weighed(runs, tips_mm, thick, _strips(thick, z_mm, model), model, setup)
     if not chains:
         return None
-    lost_mm3 = lost_mm2 * height_mm
+    lost_mm3 = drawn.lost_mm2 * drawn.height_mm
     if lost_mm3 > NOT_LISTED_MM3:
-        model.lost.append(_thin(region, z_mm, height_mm, lost_mm3))
+        model.lost.append(_thin(drawn.region, z_mm, drawn.height_mm, lost_mm3))
     # over a bridge the surface is the nozzle's height, whatever lies open below
     bridged = (laid > 0) & (z_mm - model.surface_mm > DEEP_RATIO * most_mm)
     model.surface_mm = np.where(bridged, z_mm, model.surface_mm + laid)
     model.laid_mm = model.laid_mm + laid
-    return Pass(z_mm, height_mm, index, tuple(chains), reach)
+    return Pass(z_mm, drawn.height_mm, index, tuple(chains), reach, z_mm)
+
+
+def _plan_skin(
+    model: PatchModel, skin: Skin, most_mm: float, index: int, setup: PrintSetup
+) -> Pass | None:
+    """The last pass, along the surface, where the planar ones left room for it."""
+    wanted = model.wanted_below(np.inf) - model.laid_mm - model.sunk_mm
+    thick = np.minimum(model.top_mm - model.surface_mm, wanted + AGREE_MM)
+    due = skin.columns & (thick >= LEAST_THICK_MM) & (thick <= DEEP_RATIO * most_mm)
+    thick = np.where(due, thick, 0.0)
+    chains, laid = _along_skin(model, skin, thick, setup)
+    if not chains:
+        return None
+    model.surface_mm = model.surface_mm + laid
+    model.laid_mm = model.laid_mm + laid
+    nowhere = np.zeros(model.reach.shape, dtype=bool)  # the next bead is begun from above
+    top_mm = float(max(chain.z_mm.max() for chain in chains))
+    height_mm = float(thick[due].mean())
+    return Pass(top_mm, height_mm, index, tuple(chains), nowhere, skin.tip.z_mm)
+
+
+def _served(model: PatchModel, skin: Skin | None, setup: PrintSetup) -> Skin | None:
+    """A skin of the columns that its beads would get to."""
+    if skin is None:
+        return None
+    thick = np.where(skin.columns, SKIN_MM, 0.0)
+    _, laid = _along_skin(model, skin, thick, setup)
+    return replace(skin, columns=laid > 0) if laid.any() else None
+
+
+def _along_skin(
+    model: PatchModel,
+    skin: Skin,
+    thick: Float[np.ndarray, "ny nx"],
+    setup: PrintSetup,
+) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
+    """Beads across the slope from the lowest up: the flat then reaches over what is still open."""
+    drawn = draw(thick, skin.columns, skin.across_rad, model, setup, rings=0)
+    beads = drawn.beads if drawn is not None else []
+    runs = [run for bead in beads for run in free_runs(bead, skin.free_between)]
+    if not runs:
+        return [], np.zeros(model.shape)
+    tips_mm = [skin.tip.sample(run.xy_mm, smooth=True) for run in runs]
+    strips = _strips(thick, model.top_mm, model)
+    chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
+    upward = [c if c.z_mm[-1] >= c.z_mm[0] else c.reversed() for c in chains]
+    return sorted(upward, key=lambda c: float(c.z_mm[0])), laid
 
 
 def _due(
@@ -200,11 +233,11 @@ def _due(
     wanted = np.where(below - model.wanted_below(z_mm - most_mm) > ROUNDING_MM, wanted, 0.0)
     gap = z_mm - model.surface_mm
     thick = np.clip(np.minimum(gap, wanted + AGREE_MM), 0.0, None)
-    last = np.minimum(model.top_mm, following_mm) <= z_mm + ROUNDING_MM
+    last = np.minimum(model.planar_top_mm, following_mm) <= z_mm + ROUNDING_MM
     due = (following_mm - model.surface_mm > most_mm) | last
     active = here & due & (wanted > LEAST_THICK_MM / 2) & (thick >= LEAST_THICK_MM)
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
-    active &= model.top_mm > z_mm - 0.5 * layer_mm
+    active &= model.planar_top_mm > z_mm - 0.5 * layer_mm
     deep = active & (gap > DEEP_RATIO * most_mm)
     if deep.any():
         held = _beside((active & ~deep) | (gap < most_mm), deep, HOLD_MM, model.cell_mm)
@@ -232,165 +265,13 @@ def _beside(
     return beside
 
 
-def _free_runs(bead: Bead, reach: Bool[np.ndarray, "ny nx"], model: PatchModel) -> list[Bead]:
-    """The stretches of a bead along which the nozzle may be."""
-    xy = bead.xy_mm
-    lengths = np.hypot(*np.diff(xy, axis=0).T)
-    count = np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
-    points, owner = divided(xy, count)
-    closer = 2 + int(np.ceil(3 * STEP_MM / model.reach.field.cell_mm))
-    # closer than the checker's own steps of half a cell
-    share = np.linspace(0.0, 1.0, closer)[:, None, None]
-    between = points[:-1] + (points[1:] - points[:-1]) * share
-    ok = surely_free(between.reshape(-1, 2), reach, model.reach).reshape(closer, -1).all(axis=0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
-    pieces_mm = (lengths / count)[owner]
-    return [
-        Bead(
-            points[a : b + 1],
-            np.ones(b - a),
-            bead.role,
-            closed=bool(bead.closed and b - a == len(owner)),
-        )
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-        if pieces_mm[a:b].sum() >= LEAST_RUN_MM
-    ]
-
-
-def _begun_inside(run: Bead, model: PatchModel) -> Bead:
-    """A loop whose seam has most old material around it, where it does not show."""
-    if not run.closed:
-        return run
-    cells = np.floor((run.xy_mm[:-1] - model.origin_mm) / model.cell_mm).astype(np.int64)
-    cells = np.clip(cells, 0, np.array(model.shape[::-1]) - 1)
-    return run.started_at(int(np.argmax(model.beside_mm[cells[:, 1], cells[:, 0]])))
-
-
-def surely_free(
-    points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "_ry _rx"], reach: Reach
-) -> Bool[np.ndarray, " n"]:
-    """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
-    little = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    near = (points_mm + little[:, None, :]).reshape(-1, 2)
-    return np.asarray(reach.free_at_points(near, free).reshape(4, -1).all(axis=0))
-
-
 def _strips(
-    thick: Float[np.ndarray, "ny nx"], z_mm: float, model: PatchModel
+    thick: Float[np.ndarray, "ny nx"], z_mm: float | Float[np.ndarray, "ny nx"], model: PatchModel
 ) -> Bool[np.ndarray, "ny nx"]:
     """Columns to fill that lie along a wall: it stands up to the nozzle, or higher."""
     walls = (model.surface_mm > z_mm - AGREE_MM) & (thick <= 0)
     asked = thick > 0
     return _beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked
-
-
-def _weighed(
-    runs: list[Bead],
-    thick: Float[np.ndarray, "ny nx"],
-    strips: Bool[np.ndarray, "ny nx"],
-    model: PatchModel,
-    setup: PrintSetup,
-) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
-    """Cross-sections such that every column's thickness goes to the nearest piece of a bead.
-
-    So plastic is the volume that is missing, to the column. Returns the chains, and the thickness
-    that columns get: none beyond where a bead can spread (farther in `strips` along walls), less
-    where a bead would be too wide.
-    """
-    nozzle_mm = setup.printer.nozzle_diameter_mm
-    middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
-    lengths = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
-    filled = np.flatnonzero(thick.ravel() > 0)
-    spread_mm = SPREAD_NOZZLES * nozzle_mm
-    distance, nearest = cKDTree(middles).query(
-        model.points_mm[filled], distance_upper_bound=spread_mm + TO_WALL_MM
-    )
-    near = np.isfinite(distance) & ((distance < spread_mm) | strips.ravel()[filled])
-    cell_mm3 = model.cell_mm**2 * model.weight
-    volume = np.bincount(
-        nearest[near], thick.ravel()[filled[near]] * cell_mm3, minlength=len(middles)
-    )
-    reach = np.bincount(nearest[near], thick.ravel()[filled[near]], minlength=len(middles))
-    number = np.bincount(nearest[near], minlength=len(middles))
-    depth = reach / np.maximum(number, 1)
-    chains: list[Chain] = []
-    given = np.zeros(len(middles))  # share of what its columns want that a piece lays
-    at = 0
-    for run in runs:
-        n = len(run.xy_mm) - 1
-        own = slice(at, at + n)
-        at += n
-        section = _smooth(volume[own] / np.maximum(lengths[own], 1e-9), closed=run.closed)
-        most = np.maximum(depth[own], LEAST_THICK_MM) * MOST_NOZZLES * nozzle_mm
-        most = np.minimum(most, setup.printer.max_bead_section_mm2)
-        given[own] = np.minimum(1.0, most / np.maximum(section, 1e-9))
-        section = np.minimum(section, most)
-        chains += _split(Chain(run.xy_mm, section, run.role))
-    laid = np.zeros(thick.size)
-    laid[filled[near]] = thick.ravel()[filled[near]] * given[nearest[near]]
-    return chains, laid.reshape(thick.shape)
-
-
-def _smooth(values: Float[np.ndarray, " n"], *, closed: bool) -> Float[np.ndarray, " n"]:
-    """Means over three pieces: which of two pieces a column goes to is chance."""
-    if len(values) < 3:
-        return np.full(len(values), values.mean())
-    return np.asarray(ndimage.uniform_filter1d(values, 3, mode="wrap" if closed else "nearest"))
-
-
-def _split(chain: Chain) -> list[Chain]:
-    """Drop the pieces where there is nothing to lay."""
-    keep = np.concatenate([[False], chain.section_mm2 > LEAST_SECTION_MM2, [False]])
-    edges = np.flatnonzero(np.diff(keep.astype(np.int8)))
-    return [
-        Chain(chain.xy_mm[a : b + 1], chain.section_mm2[a:b], chain.role)
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
-
-
-def _contour(mask: Bool[np.ndarray, "ny nx"], model: PatchModel) -> Any:
-    """A region of columns as polygons, corners of the grid rounded off."""
-    if not mask.any():
-        return CrossSection()
-    (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in mask.nonzero())
-    around = np.pad(mask[y0:y1, x0:x1].astype(np.float64), ROUNDED_CELLS)
-    smooth = ndimage.gaussian_filter(around, 0.8)
-    corner = np.array([x0, y0]) + 0.5 - ROUNDED_CELLS
-    polygons = []
-    for line in measure.find_contours(smooth, 0.5):  # type: ignore[no-untyped-call]
-        if len(line) < 4:
-            continue
-        polygons.append((line[:-1, ::-1] + corner) * model.cell_mm + model.origin_mm)
-    if not polygons:
-        return CrossSection()
-    return CrossSection(polygons, FillRule.EvenOdd).simplify(SIMPLIFY_MM)
-
-
-def _fill(region: Any, share_mm: float, index: int, setup: PrintSetup) -> tuple[list[Bead], float]:
-    """One perimeter, then solid lines; along the medial axis where it is thin."""
-    nozzle_mm = setup.printer.nozzle_diameter_mm
-    least_mm, most_mm = LEAST_NOZZLES * nozzle_mm, MOST_NOZZLES * nozzle_mm
-    beads: list[Bead] = []
-    lost_mm2 = 0.0
-    for island in pieces(region):
-        peeled = peel(island, share_mm, 1)
-        for ring in peeled.rings:
-            beads += ring_beads(ring.centre, ring.area_mm2, share_mm, Role.PERIMETER)
-        for part in peeled.thin:
-            thin = fill_thin(part, least_mm=least_mm, most_mm=most_mm)
-            beads += thin.beads
-            lost_mm2 += thin.lost_mm2
-        fills, left_mm2 = solid_fill(
-            peeled.core,
-            spacing_mm=share_mm,
-            angle_rad=SOLID_ANGLES_RAD[index % 2],
-            role=Role.SOLID_INFILL,
-            least_mm=least_mm,
-            most_mm=most_mm,
-        )
-        beads += fills
-        lost_mm2 += left_mm2
-    return beads, lost_mm2
 
 
 def _thin(region: Any, z_mm: float, height_mm: float, volume_mm3: float) -> Unprintable:

@@ -85,8 +85,11 @@ class Pen:
         width_mm: float,
         height_mm: float,
     ) -> None:
-        """Lay a chain of beads from the present place, as fast as the melt allows."""
+        """Lay a chain of beads from the present place, as fast as the melt and the Z axis allow."""
         fastest = self._setup.max_volumetric_mm3_s / max(float(section_mm2.max()), 1e-9)
+        step = np.abs(np.diff(points_mm, axis=0))
+        climb = float((step[:, 2] / np.maximum(np.linalg.norm(step, axis=1), 1e-9)).max())
+        fastest = min(fastest, self._setup.printer.z_speed_mm_s / max(climb, 1e-9))
         self.unretract()
         self.add(
             Extrude(points_mm, section_mm2, min(speed_mm_s, fastest), role, width_mm, height_mm)

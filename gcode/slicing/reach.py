@@ -5,6 +5,7 @@ A column is out of reach at a height where any slice of the envelope, placed the
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,7 +99,20 @@ class Reach:
             return self._top_mm
         return max(float(o.least_tip_mm[index[:, 0], index[:, 1]].max()) for o in self.obstacles)
 
-    def at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
+    @functools.cached_property
+    def need_mm(self) -> Float[np.ndarray, "ny nx"]:
+        """How high the tip must at least be, by column."""
+        need = np.full(self.shape, -np.inf)
+        for obstacle in self.obstacles:
+            np.maximum(need, obstacle.least_tip_mm, out=need)
+        return need
+
+    def centres_mm(self) -> Float[np.ndarray, "n 2"]:
+        """Middles of its cells, row by row."""
+        y, x = ((np.arange(n) + 0.5) * self.cell_mm for n in self.shape)
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) + self.field.origin_mm
+
+    def at(self, z_mm: float | Float[np.ndarray, "ny nx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the tip may be at this height."""
         free = np.ones(self.shape, dtype=bool)
         for obstacle in self.obstacles:

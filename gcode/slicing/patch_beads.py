@@ -1,0 +1,264 @@
+"""Beads of a patch: drawn into a region of columns, kept where the nozzle may be, and weighed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from manifold3d import CrossSection, FillRule
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from skimage import measure
+
+from gcode.moves import Role
+from gcode.profiles import PrintSetup
+from gcode.slicing.beads import Bead, divided, spacing_of
+from gcode.slicing.infill import ring_beads, solid_fill
+from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES
+from gcode.slicing.medial import fill_thin
+from gcode.slicing.patch_model import PatchModel
+from gcode.slicing.reach import Reach
+from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
+
+# Thinner than this no bead holds together; it is filled with the next pass, or is the tolerance.
+LEAST_THICK_MM = 0.06
+STEP_MM = 0.4  # along a bead, between two samples of the gap
+LEAST_RUN_MM = 0.4
+LEAST_SECTION_MM2 = 0.004
+# From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which is
+# 2.5 bores across (E3D V6): not to its very rim.
+SPREAD_NOZZLES = 1.125
+# What is pressed out under the flat beside a wall goes on to the wall, where that is this near to
+# what it reaches: nowhere else has it to go.
+TO_WALL_MM = 0.2
+# Centre lines keep off the rim of where the tip may go: contours of cells are not exact.
+DRAWN_IN_CELLS = 0.75
+ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
+ROUNDING_MM = 2e-3  # more than the text's last digit
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """A bead of a pass: (n, 2) points, (n,) heights of the tip, (n-1,) cross-sections, mm²."""
+
+    xy_mm: Float[np.ndarray, "n 2"]
+    z_mm: Float[np.ndarray, " n"]
+    section_mm2: Float[np.ndarray, " m"]
+    role: Role
+
+    def reversed(self) -> Chain:
+        """The same from its other end."""
+        return Chain(
+            np.ascontiguousarray(self.xy_mm[::-1]),
+            np.ascontiguousarray(self.z_mm[::-1]),
+            np.ascontiguousarray(self.section_mm2[::-1]),
+            self.role,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """Centre lines in a region of columns; what is too thin for one, mm²; how thick they are."""
+
+    beads: list[Bead]
+    region: Any
+    lost_mm2: float
+    height_mm: float
+
+
+def draw(
+    thick_mm: Float[np.ndarray, "ny nx"],
+    free: Bool[np.ndarray, "ny nx"],
+    angle_rad: float,
+    model: PatchModel,
+    setup: PrintSetup,
+    *,
+    rings: int = 1,
+) -> Drawn | None:
+    """Centre lines for the columns to fill, over those where the nozzle may be; None: nowhere.
+
+    Within `rings` perimeters the lines go at an angle.
+    """
+    drawn_in = offset(contour((thick_mm > 0) & free, model), -DRAWN_IN_CELLS * model.cell_mm)
+    if drawn_in.is_empty():
+        return None
+    height_mm = float(thick_mm[thick_mm > 0].mean())
+    share_mm = spacing_of(max(setup.process.line_width_mm, 1.05 * height_mm), height_mm)
+    # centres may go as far as the nozzle is free; the fill reaches half a line beyond them
+    region = offset(drawn_in, 0.5 * share_mm) ^ contour(thick_mm > 0, model)
+    return Drawn(*fill(region, share_mm, angle_rad, setup, rings=rings), height_mm)
+
+
+def begun_inside(run: Bead, model: PatchModel) -> Bead:
+    """A loop whose seam has most old material around it, where it does not show."""
+    if not run.closed:
+        return run
+    cells = np.floor((run.xy_mm[:-1] - model.origin_mm) / model.cell_mm).astype(np.int64)
+    cells = np.clip(cells, 0, np.array(model.shape[::-1]) - 1)
+    return run.started_at(int(np.argmax(model.beside_mm[cells[:, 1], cells[:, 0]])))
+
+
+def free_runs(
+    bead: Bead,
+    is_free: Callable[[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]], Bool[np.ndarray, " m"]],
+) -> list[Bead]:
+    """The stretches of a bead along which the nozzle may be; asked from point to point."""
+    xy = bead.xy_mm
+    lengths = np.hypot(*np.diff(xy, axis=0).T)
+    count = np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
+    points, owner = divided(xy, count)
+    ok = is_free(points[:-1], points[1:])
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
+    pieces_mm = (lengths / count)[owner]
+    return [
+        Bead(
+            points[a : b + 1],
+            np.ones(b - a),
+            bead.role,
+            closed=bool(bead.closed and b - a == len(owner)),
+        )
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+        if pieces_mm[a:b].sum() >= LEAST_RUN_MM
+    ]
+
+
+def free_between(
+    start_mm: Float[np.ndarray, "m 2"],
+    end_mm: Float[np.ndarray, "m 2"],
+    free: Bool[np.ndarray, "_ry _rx"],
+    reach: Reach,
+) -> Bool[np.ndarray, " m"]:
+    """Whether the nozzle may be all the way from one point to the next, at one height."""
+    between = start_mm + (end_mm - start_mm) * shares_of_step(reach)[:, None, None]
+    ok = surely_free(between.reshape(-1, 2), free, reach)
+    return np.asarray(ok.reshape(between.shape[:2]).all(axis=0))
+
+
+def shares_of_step(reach: Reach) -> Float[np.ndarray, " k"]:
+    """Where between two samples to look: closer than the checker's own steps of half a cell."""
+    return np.linspace(0.0, 1.0, 2 + int(np.ceil(3 * STEP_MM / reach.field.cell_mm)))
+
+
+def surely_free(
+    points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "_ry _rx"], reach: Reach
+) -> Bool[np.ndarray, " n"]:
+    """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
+    little = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    near = (points_mm + little[:, None, :]).reshape(-1, 2)
+    return np.asarray(reach.free_at_points(near, free).reshape(4, -1).all(axis=0))
+
+
+def weighed(
+    runs: list[Bead],
+    tips_mm: list[Float[np.ndarray, " _n"]],
+    thick: Float[np.ndarray, "ny nx"],
+    strips: Bool[np.ndarray, "ny nx"],
+    model: PatchModel,
+    setup: PrintSetup,
+) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
+    """Cross-sections such that every column's thickness goes to the nearest piece of a bead.
+
+    So plastic is the volume that is missing, to the column. The tip is as high along each run as
+    `tips_mm` says. Returns the chains, and the thickness
+    that columns get: none beyond where a bead can spread (farther in `strips` along walls), less
+    where a bead would be too wide.
+    """
+    nozzle_mm = setup.printer.nozzle_diameter_mm
+    middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
+    lengths = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
+    filled = np.flatnonzero(thick.ravel() > 0)
+    spread_mm = SPREAD_NOZZLES * nozzle_mm
+    distance, nearest = cKDTree(middles).query(
+        model.points_mm[filled], distance_upper_bound=spread_mm + TO_WALL_MM
+    )
+    near = np.isfinite(distance) & ((distance < spread_mm) | strips.ravel()[filled])
+    cell_mm3 = model.cell_mm**2 * model.weight
+    volume = np.bincount(
+        nearest[near], thick.ravel()[filled[near]] * cell_mm3, minlength=len(middles)
+    )
+    reach = np.bincount(nearest[near], thick.ravel()[filled[near]], minlength=len(middles))
+    number = np.bincount(nearest[near], minlength=len(middles))
+    depth = reach / np.maximum(number, 1)
+    chains: list[Chain] = []
+    given = np.zeros(len(middles))  # share of what its columns want that a piece lays
+    at = 0
+    for run, tip_mm in zip(runs, tips_mm, strict=True):
+        n = len(run.xy_mm) - 1
+        own = slice(at, at + n)
+        at += n
+        section = _smooth(volume[own] / np.maximum(lengths[own], 1e-9), closed=run.closed)
+        most = np.maximum(depth[own], LEAST_THICK_MM) * MOST_NOZZLES * nozzle_mm
+        most = np.minimum(most, setup.printer.max_bead_section_mm2)
+        given[own] = np.minimum(1.0, most / np.maximum(section, 1e-9))
+        section = np.minimum(section, most)
+        chains += _split(Chain(run.xy_mm, tip_mm, section, run.role))
+    laid = np.zeros(thick.size)
+    laid[filled[near]] = thick.ravel()[filled[near]] * given[nearest[near]]
+    return chains, laid.reshape(thick.shape)
+
+
+def _smooth(values: Float[np.ndarray, " n"], *, closed: bool) -> Float[np.ndarray, " n"]:
+    """Means over three pieces: which of two pieces a column goes to is chance."""
+    if len(values) < 3:
+        return np.full(len(values), values.mean())
+    return np.asarray(ndimage.uniform_filter1d(values, 3, mode="wrap" if closed else "nearest"))
+
+
+def _split(chain: Chain) -> list[Chain]:
+    """Drop the pieces where there is nothing to lay."""
+    keep = np.concatenate([[False], chain.section_mm2 > LEAST_SECTION_MM2, [False]])
+    edges = np.flatnonzero(np.diff(keep.astype(np.int8)))
+    return [
+        Chain(chain.xy_mm[a : b + 1], chain.z_mm[a : b + 1], chain.section_mm2[a:b], chain.role)
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def contour(mask: Bool[np.ndarray, "ny nx"], model: PatchModel) -> Any:
+    """A region of columns as polygons, corners of the grid rounded off."""
+    if not mask.any():
+        return CrossSection()
+    (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in mask.nonzero())
+    around = np.pad(mask[y0:y1, x0:x1].astype(np.float64), ROUNDED_CELLS)
+    smooth = ndimage.gaussian_filter(around, 0.8)
+    corner = np.array([x0, y0]) + 0.5 - ROUNDED_CELLS
+    polygons = []
+    for line in measure.find_contours(smooth, 0.5):  # type: ignore[no-untyped-call]
+        if len(line) < 4:
+            continue
+        polygons.append((line[:-1, ::-1] + corner) * model.cell_mm + model.origin_mm)
+    if not polygons:
+        return CrossSection()
+    return CrossSection(polygons, FillRule.EvenOdd).simplify(SIMPLIFY_MM)
+
+
+def fill(
+    region: Any, share_mm: float, angle_rad: float, setup: PrintSetup, *, rings: int
+) -> tuple[list[Bead], Any, float]:
+    """Perimeters, then solid lines; along the medial axis where it is thin."""
+    nozzle_mm = setup.printer.nozzle_diameter_mm
+    least_mm, most_mm = LEAST_NOZZLES * nozzle_mm, MOST_NOZZLES * nozzle_mm
+    beads: list[Bead] = []
+    lost_mm2 = 0.0
+    for island in pieces(region):
+        peeled = peel(island, share_mm, rings)
+        for ring in peeled.rings:
+            beads += ring_beads(ring.centre, ring.area_mm2, share_mm, Role.PERIMETER)
+        for part in peeled.thin:
+            thin = fill_thin(part, least_mm=least_mm, most_mm=most_mm)
+            beads += thin.beads
+            lost_mm2 += thin.lost_mm2
+        fills, left_mm2 = solid_fill(
+            peeled.core,
+            spacing_mm=share_mm,
+            angle_rad=angle_rad,
+            role=Role.SOLID_INFILL,
+            least_mm=least_mm,
+            most_mm=most_mm,
+        )
+        beads += fills
+        lost_mm2 += left_mm2
+    return beads, region, lost_mm2
