@@ -57,7 +57,10 @@ def test_every_command_and_option_says_what_it_is(name: str, command: click.Comm
         ("amrepair template ", {"fit", "mesh"}),
         ("amrepair simulate --printer prusa_mk", {"prusa_mk3s", "prusa_mk4"}),
         ("gcode est", {"estimate"}),
-        ("gcode slice --process repair_", {"repair_0.10", "repair_0.20", "repair_0.20_nonplanar", "repair_0.30"}),
+        (
+            "gcode slice --process repair_",
+            {"repair_0.10", "repair_0.20", "repair_0.20_nonplanar", "repair_0.30"},
+        ),
     ],
 )
 def test_bash_completes(typed: str, offered: set[str]) -> None:
