@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := $(VENV)/.extras
 
-.PHONY: demo test lint suite slow chromium docs pictures peers clean help
+.PHONY: demo test lint suite slow chromium examples docs pictures peers clean help
 
 help: ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -43,6 +43,9 @@ chromium: $(EXTRAS) ## report and live view as a person sees and drives them
 peers: $(EXTRAS) ## print through and beside OctoPrint, Moonraker and Printrun, each in its own environment
 	$(BIN)/python tests/peers/environments.py
 	$(BIN)/python -m pytest -m peers tests/peers
+
+examples: $(EXTRAS) ## run all eight examples, and hold what they print against the truth
+	$(BIN)/python -m pytest -m "slow or not slow" --durations=8 tests/integration/test_examples.py
 
 docs: $(EXTRAS) ## the documentation, into out/site; nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
