@@ -45,6 +45,7 @@ WELL_EXPLAINED, MOSTLY_EXPLAINED, EXPLAINED = 0.97, 0.95, 0.7
 BETWEEN = rotation_from_vector(np.array([0.15, -0.1, 0.08]))  # half the gap between rotations
 FEW_TRIED = 3  # poses refined of what is left without clutter, and of the mirror image
 CLEARED = 0.85  # with fewer on the part clutter is looked for, until so many are
+LEAST_HALF = 100  # points; of fewer a half says nothing
 PLAUSIBLE = 0.6  # a mean distance above this share of the cap is no fit that more points would mend
 
 
@@ -160,6 +161,7 @@ def pose_from_anywhere(
         progress("align", 0.4, 1.0)
         starts = _twins(found[0][1], clouds, field, rng)
         if share < MOSTLY_EXPLAINED:
+            starts += _by_halves(found[0][1], clouds, field, rng)
             starts += _worth_refining(clouds, field, THOROUGH, rng)
         else:
             starts += _worth_refining(clouds, field, QUICK, rng, turn=BETWEEN)
@@ -262,6 +264,24 @@ def _twins(
     poses = search(clouds.dense_mm, field, rng, only=tuple(turned))
     limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
     return [pose.matrix for pose in poses[:MOST_DOUBTFUL] if pose.score_mm <= limit_mm]
+
+
+def _by_halves(
+    best: Refined, clouds: _Clouds, field: CoarseField, rng: np.random.Generator
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The pose as each half of the scan alone would have it.
+
+    A bent part may be laid between its pieces, where neither lies well; one half is of one piece.
+    On the coarse field, since between the two sides of a thin wall the exact one has a trap.
+    """
+    local = clouds.dense_mm - clouds.dense_mm.mean(axis=0)
+    axes = np.linalg.eigh(local.T @ local)[1]
+    halves = [clouds.dense_mm[way * (local @ axes[:, k]) > 0] for k in (2, 1) for way in (1, -1)]
+    return [
+        search(half, field, rng, only=(best.matrix,))[0].matrix
+        for half in halves
+        if len(half) >= LEAST_HALF
+    ]
 
 
 def _with_twins(

@@ -22,6 +22,7 @@ STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
 MAX_ITERATIONS = 60
 HASTE = 15  # iterations with whole steps
 SLOWEST = 1.0 / 32  # of a step
+FREE_RATIO = 0.1  # of the limit: distances that change by less do not hinder the motion
 INLIER_SIGMAS = 4.0
 
 
@@ -127,7 +128,12 @@ def refine(
         rotation = rotation_from_vector(step[:3]) @ rotation
         place = place + step[3:]
         moved_mm = float(np.linalg.norm(step[3:])) + reach_mm * float(np.linalg.norm(step[:3]))
-        if scale <= end_scale_mm * (1 + 1e-9) and moved_mm < max(STEP_MM, STEP_SIGMAS * sigma_mm):
+        limit_mm = max(STEP_MM, STEP_SIGMAS * sigma_mm)
+        still = moved_mm < limit_mm
+        if iterations > HASTE:  # a rod turns on for ever: what counts is what its points would see
+            changed_mm = sigma_mm * float(np.sqrt(step @ hessian @ step / len(points_mm)))
+            still |= changed_mm < FREE_RATIO * limit_mm
+        if scale <= end_scale_mm * (1 + 1e-9) and still:
             converged = True
             break
         if moved_mm < 0.25 * scale:
