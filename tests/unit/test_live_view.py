@@ -259,6 +259,17 @@ def test_buttons_are_dead_until_a_question_is_asked(view: LiveView, plan: Repair
     assert view._approve.disabled
 
 
+def test_no_button_shares_the_page_with_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    # regression: viser's own button asks a public server for an address of this very page
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr("viser.GuiApi.configure_theme", lambda _, **theme: asked.append(theme))
+    shown = LiveView(title="test")
+    shown._dress(dark=True)
+    shown.close()
+    assert [theme["show_share_button"] for theme in asked] == [False, False]
+    assert [theme["dark_mode"] for theme in asked] == [False, True]
+
+
 def test_a_look_is_told_with_its_decision(view: LiveView, plan: RepairPlan) -> None:
     finding = Finding(
         "missing", DefectType.CHIP, 0.9, 89.0, 89.0, 4.0, 9.0, 1.0, Cover.NOTHING, 0.0,
