@@ -99,6 +99,16 @@ class LiveView:
             dark = gui.add_checkbox("dark page", False, order=float("inf"))
         dark.on_update(lambda _: self._dress(dark=dark.value))
         self._dress(dark=False)
+        self.server.on_client_connect(self._stand_back)
+
+    def _stand_back(self, client: Any) -> None:
+        """A window that is higher than wide sees all of the part from farther away."""
+        camera, first = client.camera, self.server.initial_camera
+        if self._centre is None or camera.aspect >= 1:
+            return
+        look_at = np.asarray(first.look_at)
+        camera.position = look_at + (np.asarray(first.position) - look_at) / camera.aspect
+        camera.look_at = look_at  # viser moves it along with the position
 
     def _dress(self, *, dark: bool) -> None:
         """Colours of the page; viser's button that puts it on a public server is not shown."""

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -268,6 +269,20 @@ def test_no_button_shares_the_page_with_the_world(monkeypatch: pytest.MonkeyPatc
     shown.close()
     assert [theme["show_share_button"] for theme in asked] == [False, False]
     assert [theme["dark_mode"] for theme in asked] == [False, True]
+
+
+def test_a_phone_sees_the_whole_part(view: LiveView) -> None:
+    # regression: on a window higher than wide the part lay beyond both sides
+    corners = np.array([[0.0, 0, 0], [30, 0, 0], [0, 20, 0], [0, 0, 9]])
+    view.show_mesh("part", corners, np.array([[0, 1, 2], [0, 1, 3]]), (1, 2, 3))
+    first = view.server.initial_camera
+    for aspect, farther in ((0.5, 2.0), (1.6, 1.0)):
+        camera = SimpleNamespace(aspect=aspect, position=first.position, look_at=first.look_at)
+        view._stand_back(SimpleNamespace(camera=camera))
+        assert np.allclose(camera.look_at, first.look_at)
+        away_mm = np.linalg.norm(np.subtract(camera.position, camera.look_at))
+        before_mm = np.linalg.norm(np.subtract(first.position, first.look_at))
+        assert away_mm == pytest.approx(farther * before_mm)
 
 
 def test_a_look_is_told_with_its_decision(view: LiveView, plan: RepairPlan) -> None:
