@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 from amrepair.frames import Transform
 
+FREE_RATIO = 1e-12  # of the best known motion's information: a motion with less is free
+
 
 @dataclass(frozen=True, slots=True)
 class Registration:
@@ -26,7 +28,7 @@ class Registration:
         Share of the scan that is not taken for the part: scattered points, bed, other pieces.
     information
         (6, 6) Gauss–Newton Hessian JᵀWJ / σ², order (rotation x y z about the scan's centroid in
-        rad, translation x y z in mm); its inverse is the covariance.
+        rad, translation x y z in mm), along the template's axes.
     symmetric_alternatives
         Other poses (template_from_scan) that fit as well, within noise.
     method, iterations
@@ -41,3 +43,13 @@ class Registration:
     method: str
     iterations: int
     clutter_ratio: float = 0.0
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "6 6"]:
+        """(6, 6) inverse of the information: what the points' noise alone leaves open.
+
+        Very large, never infinite, along motions that nothing hinders.
+        """
+        values, vectors = np.linalg.eigh(self.information)
+        least = FREE_RATIO * max(float(values[-1]), np.finfo(float).tiny / FREE_RATIO)
+        return np.asarray((vectors / np.maximum(values, least)) @ vectors.T)

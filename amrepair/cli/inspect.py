@@ -107,6 +107,7 @@ def align(
         "rmse_mm": found.rmse_mm,
         "inlier_ratio": found.inlier_ratio,
         "clutter_ratio": found.clutter_ratio,
+        "covariance": found.covariance.tolist(),
         "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
         "method": found.method,
         "iterations": found.iterations,

@@ -191,6 +191,11 @@ def test_align_and_detect_write_what_the_contract_says(
     assert {"template_from_scan", "rmse_mm", "inlier_ratio", "symmetric_alternatives",
             "seconds"} <= set(result)  # fmt: skip
     assert np.array(result["template_from_scan"]).shape == (4, 4)
+    # 0.02 mm of noise on some thousand points that determine the pose
+    spread = np.sqrt(np.diag(result["covariance"]))
+    assert (spread > 1e-7).all()
+    assert (spread[:3] < 1e-3).all()
+    assert (spread[3:] < 0.02).all()
     detected = call("detect", *words, "--out", tmp_path / "d")
     assert detected.returncode == 0, detected.stderr
     archive = np.load(tmp_path / "d" / "anomaly.npz")

@@ -1,13 +1,13 @@
-"""The compiled kernels of the alignment against plain numpy."""
+"""The numbers of the alignment against plain numpy: compiled kernels, covariance."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from amrepair.align import search_kernels
+from amrepair.align import Registration, search_kernels
 from amrepair.align.refine_kernels import normal_equations
-from amrepair.frames import rotation_from_vector
+from amrepair.frames import Transform, rotation_from_vector
 
 
 def plain(turned, f, gradient, scale):  # type: ignore[no-untyped-def]
@@ -59,3 +59,16 @@ def test_the_coarse_field_is_trilinear_and_goes_on_beyond_its_border() -> None:
     assert np.allclose(h, np.tril(hessian), rtol=1e-3, atol=1e-3 * np.abs(hessian).max())
     assert np.allclose(b, -slope, rtol=1e-3, atol=1e-3 * np.abs(slope).max())
     assert abs(total - np.minimum(np.abs(f), 1.0).sum()) < 1e-3 * len(points)
+
+
+def test_the_covariance_is_the_informations_inverse_and_finite_where_motion_is_free() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    stay = Transform.identity("template", "scanner")
+    known = Registration(stay, 0.0, 1.0, root @ root.T, (), "robust", 1)
+    assert np.allclose(known.covariance @ known.information, np.eye(6))
+    free = Registration(stay, 0.0, 1.0, np.diag([1e6, 1e6, 0.0, 1e4, 1e4, 1e4]), (), "robust", 1)
+    assert free.covariance[2, 2] >= 1e5
+    assert np.allclose(np.diag(free.covariance)[[0, 3]], [1e-6, 1e-4])
+    nothing = Registration(stay, 0.0, 1.0, np.zeros((6, 6)), (), "robust", 1)
+    assert np.isfinite(nothing.covariance).all()
