@@ -210,7 +210,9 @@ def descend(points, rotations, places, values, shape, scales, cap):
     scores = np.empty(len(rotations))
     reach = 0.0
     for i in range(points.shape[1]):
-        reach = max(reach, np.sqrt((points[:, i] ** 2).sum()))
+        # by hand: an expression on arrays would be a task for all threads, point by point
+        x, y, z = points[0, i], points[1, i], points[2, i]
+        reach = max(reach, np.sqrt(x * x + y * y + z * z))
     for k in prange(len(rotations)):
         r, p = rotations[k], places[k]
         h, b = np.empty((6, 6)), np.empty(6)
