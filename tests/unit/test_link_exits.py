@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -165,16 +166,23 @@ def test_an_emergency_stop_of_a_printer_that_says_nothing_ends_the_job(
     # regression: who waited for an answer waited for ever
     monkeypatch.setattr(supervisor, "ANSWER_S", 0.01)
     lines = [*HEAD, *moves(60)]
-    with bench(tmp_path, faults="line 40 dead") as it:
-        printer = SerialPrinter(it.emulator.port, supervise=False)
-        printer.connect()
+    with (
+        bench(tmp_path, faults="line 40 dead") as it,
+        SerialPrinter(it.emulator.port, supervise=False) as printer,
+    ):
         before = len(it.told())
-        thread = it.once(lines[20], printer.emergency_stop)
+
+        def stop_once_it_is_dead() -> None:
+            told = -1
+            while told != (told := len(it.told())):
+                time.sleep(0.2)
+            printer.emergency_stop()
+
+        thread = it.once(lines[20], stop_once_it_is_dead)
         with pytest.raises(LinkLostError, match="an emergency stop was asked for") as caught:
             printer.print(program(lines))
         thread.join(10)
         printed = [line for line in it.told()[before:] if line in lines]
-        printer.close()
     assert caught.value.last_executed_line < len(printed) <= caught.value.last_sent_line + 1
 
 
