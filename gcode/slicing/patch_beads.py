@@ -38,6 +38,7 @@ TO_WALL_MM = 0.2
 DRAWN_IN_CELLS = 0.75
 ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 ROUNDING_MM = 2e-3  # more than the text's last digit
+ROUNDED_MM = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # whichever way it goes
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +147,7 @@ def surely_free(
     points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "_ry _rx"], reach: Reach
 ) -> Bool[np.ndarray, " n"]:
     """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
-    little = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    near = (points_mm + little[:, None, :]).reshape(-1, 2)
+    near = (points_mm + ROUNDED_MM[:, None, :]).reshape(-1, 2)
     return np.asarray(reach.free_at_points(near, free).reshape(4, -1).all(axis=0))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from gcode.slicing.patch_beads import ROUNDING_MM, STEP_MM, shares_of_step
+from gcode.slicing.patch_beads import ROUNDED_MM, ROUNDING_MM, STEP_MM, shares_of_step
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
@@ -76,7 +76,7 @@ class Skin:
         low, high = (self.tip.sample(at, smooth=True) for at in (start_mm, end_mm))
         tip_mm = (low + (high - low) * share[:, :, 0]).reshape(-1)
         free = np.ones(len(way), dtype=bool)
-        for little in ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]):
+        for little in ROUNDED_MM:
             cells, inside = self.reach.cells_of(way + little)
             free &= ~inside | (self.reach.need_mm[cells[:, 0], cells[:, 1]] <= tip_mm + GIVE_MM)
         return np.asarray(free.reshape(share.shape[0], -1).all(axis=0))

@@ -97,7 +97,7 @@ class Reach:
         index, inside = self.cells_of(way_mm)
         if not self.obstacles or not inside.all():
             return self._top_mm
-        return max(float(o.least_tip_mm[index[:, 0], index[:, 1]].max()) for o in self.obstacles)
+        return float(self.need_mm[index[:, 0], index[:, 1]].max())
 
     @functools.cached_property
     def need_mm(self) -> Float[np.ndarray, "ny nx"]:
@@ -114,10 +114,7 @@ class Reach:
 
     def at(self, z_mm: float | Float[np.ndarray, "ny nx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the tip may be at this height."""
-        free = np.ones(self.shape, dtype=bool)
-        for obstacle in self.obstacles:
-            free &= obstacle.least_tip_mm <= z_mm + 1e-9
-        return free
+        return self.need_mm <= z_mm + 1e-9
 
     def free_at_points(
         self, points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "ny nx"]
