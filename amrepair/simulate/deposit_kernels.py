@@ -3,10 +3,12 @@
 
 Per short step of the path the nozzle's flat planes off what stands a little above it, and that
 and the volume pushed out (1) level the columns under the nozzle's bore, lowest first, up to the
-nozzle's height; (2) what is left fills further columns in order of distance. What finds no room
-rides along with the nozzle and, once it is more than `carry_limit`, (3) is pressed into the voids
-right under the strand, (4) spreads farther, (5) rises as a ridge around the nozzle's flat. Volume
-is conserved to rounding.
+nozzle's height; (2) what is left fills further columns in order of distance. A strand is as wide
+as its section says: where no neighbour is, the columns that its edges cross get their share of the
+layer, after the others (`edge_span`); else a wall of a few lines would be laid wider than its
+plastic suffices for, and sink. What finds no room rides along with the nozzle and, once it is more
+than `carry_limit`, (3) is pressed into the voids right under the strand, (4) spreads farther, (5)
+rises as a ridge around the nozzle's flat. Volume is conserved to rounding.
 A groove below the layer that is narrower than `bridges` columns is not filled without pressure:
 the strand spans it and bulges in by a meniscus, and a void stays. So a layer with less plastic
 than fills it stands at the nozzle's height all the same, and what it lacks lies between its beads;
@@ -56,6 +58,8 @@ LEAST_VOID_MM = 0.03
 MENISCUS = np.pi / 8  # mean depth of half a circle over a groove, in groove widths
 LEAST_RIDGE_MM = 0.005  # what stands less above the nozzle is not planed off
 FREE_COLUMNS = 0.5  # a column that the strand's edge crosses is its own
+NARROWEST_BORES = 0.45  # half width: with less plastic a strand is lower, not narrower
+BESIDE_COLUMNS = 1.5  # from a column at a strand's edge to what lies beside the strand
 PRESSED_SHARE = 0.25  # of what rides along before it rises: from here on it is pressed into voids
 OPEN_LAYERS = 1.5  # a void is under the strand if its roof is no more than this below the nozzle
 
@@ -105,6 +109,44 @@ def floor_under(
             if spanned > surface + LEAST_VOID_MM:
                 surface = spanned
     return surface
+
+
+@njit(cache=True, nogil=True, inline="always")
+def share_of(axis, iy, ix):
+    """Share of a column that lies within a strand's width; above 1 well inside, below 0 beside it.
+
+    `axis` is (x, y, across it x, y, half width, half the bore) of the strand in columns, which the
+    dither leaves alone.
+    """
+    return axis[4] + 0.5 - abs((ix + 0.5 - axis[0]) * axis[2] + (iy + 0.5 - axis[1]) * axis[3])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def edge_span(
+    hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness, gap_limit
+):
+    """From where to where a strand's edge fills a column; (0, inf): it has no edge there.
+
+    Plastic is as wide as its section says where nothing lies beside it: the column that its edge
+    crosses gets its share of the layer, on what lies not far below, or hanging. Towards a
+    neighbour it has no edge: it fills the groove between them.
+    """
+    across = (ix + 0.5 - axis[0]) * axis[2] + (iy + 0.5 - axis[1]) * axis[3]
+    away = BESIDE_COLUMNS if across > 0.0 else -BESIDE_COLUMNS
+    x = int(np.floor(ix + 0.5 + away * axis[2]))
+    y = int(np.floor(iy + 0.5 + away * axis[3]))
+    beside = hi[y, x] if 0 <= x < hi.shape[1] and 0 <= y < hi.shape[0] else 0.0
+    bottom, top = 0.0, np.inf
+    if beside < z - 0.5 * thickness:
+        floor = before[iy, ix]
+        if stamp[iy, ix] != layer or floor > z:
+            floor = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
+        underside = z - thickness - LEAST_VOID_MM
+        if floor >= underside or beside < underside:
+            deep = max(share_of(axis, iy, ix), 0.0) * thickness
+            bottom = floor if z - floor <= gap_limit else z - deep
+            top = min(z, bottom + deep)
+    return bottom, top
 
 
 @njit(cache=True, nogil=True)
@@ -170,7 +212,8 @@ def level_of(floors, count, amount, z):
 @njit(cache=True, nogil=True)
 def lay(
     hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases, grid, state,
-    floors, chosen, x, y, z, amount, thickness, gap_limit, bridges, planes, carry_limit, flush,
+    floors, sunk, chosen, axis, x, y, z, amount, thickness, gap_limit, bridges, planes, carry_limit,
+    flush,
 ):  # fmt: skip
     """One step: place `amount` (mm of column) from the nozzle at (x, y, z)."""
     ny, nx = hi.shape
@@ -191,23 +234,48 @@ def lay(
         amount += planed(hi, lo, near, phase, flat, cx, cy, z, planes * thickness)
     found = 0
     capacity = 0.0
-    for k in range(bore):  # columns under the bore, kept sorted by floor
+    # the corners of its edges on this step, give or take the dither
+    farthest = axis[5] ** 2 + (axis[4] + 1.0) ** 2
+    for k in range(reach):  # under the bore, and at the strand's edges; kept sorted by floor
         iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
-        bottom = floor_under(
-            hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit,
-            bridges, cell,
-        )  # fmt: skip
-        if bottom >= z:
+        share, top = share_of(axis, iy, ix), np.inf
+        if k >= bore:
+            if (ix + 0.5 - gx) ** 2 + (iy + 0.5 - gy) ** 2 > farthest:
+                break
+            if share >= 1.0 or share <= 0.0:
+                continue
+        if share < 1.0:
+            bottom, top = edge_span(
+                hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness,
+                gap_limit,
+            )  # fmt: skip
+        if top < np.inf:
+            along = (iy + 0.5 - axis[1]) * axis[2] - (ix + 0.5 - axis[0]) * axis[3]
+            if abs(along) > axis[5]:
+                continue
+            bottom = max(bottom, surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z))
+        elif k >= bore:
             continue
+        else:
+            top = z
+            bottom = floor_under(
+                hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness,
+                gap_limit, bridges, cell,
+            )  # fmt: skip
+        if bottom >= top:
+            continue
+        bottom += z - top  # an edge is thin: the last to be filled
         at = found
         while at > 0 and floors[at - 1] > bottom:
             floors[at] = floors[at - 1]
+            sunk[at] = sunk[at - 1]
             chosen[at, 0] = chosen[at - 1, 0]
             chosen[at, 1] = chosen[at - 1, 1]
             at -= 1
         floors[at] = bottom
+        sunk[at] = z - top
         chosen[at, 0] = iy
         chosen[at, 1] = ix
         found += 1
@@ -218,7 +286,7 @@ def lay(
             if floors[k] < level:
                 stack(
                     hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, chosen[k, 0],
-                    chosen[k, 1], floors[k], level,
+                    chosen[k, 1], floors[k] - sunk[k], level - sunk[k],
                 )  # fmt: skip
         amount = amount - capacity if capacity <= amount else 0.0
     wide = False
@@ -235,10 +303,20 @@ def lay(
             break
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
+        foot, top = 0.0, np.inf
+        if share_of(axis, iy, ix) < 1.0:
+            foot, top = edge_span(
+                hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness,
+                gap_limit,
+            )  # fmt: skip
+        if top < np.inf and not wide:
+            continue
         bottom = floor_under(
             hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit,
             bridges, cell,
         )  # fmt: skip
+        if top < np.inf:
+            bottom = max(bottom, foot)
         if bottom < z:
             level = min(z, bottom + amount)
             stack(hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level)
@@ -343,6 +421,10 @@ def deposit(
     room = 4 * near.shape[1] + 64  # more pool nodes than one step can take
     floors = np.empty(near.shape[1])
     chosen = np.empty((near.shape[1], 2), dtype=np.int64)
+    sunk = np.empty(near.shape[1])
+    least_half = NARROWEST_BORES * strand[3]  # strand[3]: the bore
+    axis = np.zeros(6)
+    axis[5] = 0.5 * strand[3] / cell
     for s in range(len(volume)):
         chained = (
             volume[s] > 0.0
@@ -355,16 +437,22 @@ def deposit(
             state[RUN_LENGTH] = 0.0
         if not chained and state[CARRY] > 0.0:
             pool, pool_next = grown(pool, pool_next, meta, room)
+            axis[4] = np.inf
             lay(
                 hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
-                grid, state, floors, chosen, state[LAST_X], state[LAST_Y], state[LAST_Z], 0.0,
-                state[LAST_T], state[LAST_GAP], bridges, planes, carry_limit, True,
+                grid, state, floors, sunk, chosen, axis, state[LAST_X], state[LAST_Y],
+                state[LAST_Z], 0.0, state[LAST_T], state[LAST_GAP], bridges, planes, carry_limit,
+                True,
             )  # fmt: skip
         dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if volume[s] > 0.0:
             half = 0.5 * volume[s] / max(length * thickness[s], LEAST_MM)
+            half = max(half, least_half)
             state[FREE] = half / cell + FREE_COLUMNS
+            flat = max(np.sqrt(dx * dx + dy * dy), LEAST_MM)
+            axis[2], axis[3] = -dy / flat, dx / flat
+            axis[4] = half / cell if flat > LEAST_MM else np.inf
             steps = max(1, int(np.ceil(length / step_mm)))
             share = volume[s] / steps
             seed = np.abs(np.sin(12.9898 * start[s, 0] + 78.233 * start[s, 1]) * 43758.5453)
@@ -381,6 +469,7 @@ def deposit(
                 if amount <= 0.0 and state[CARRY] <= 0.0:
                     continue
                 pushed += amount
+                axis[0], axis[1] = (x - grid[0]) / cell, (y - grid[1]) / cell
                 if abs(z - state[LAID_Z]) > NEW_LAYER_MM:
                     state[LAID_Z] = z
                     state[LAYER] += 1.0
@@ -393,8 +482,9 @@ def deposit(
                 )  # fmt: skip
                 lay(
                     hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
-                    grid, state, floors, chosen, x + (jx - 0.5) * cell, y + (jy - 0.5) * cell,
-                    laid_z, amount / area, thickness[s], gap, bridges, planes, carry_limit,
+                    grid, state, floors, sunk, chosen, axis, x + (jx - 0.5) * cell,
+                    y + (jy - 0.5) * cell, laid_z, amount / area, thickness[s], gap, bridges,
+                    planes, carry_limit,
                     amount <= 0.0,
                 )  # fmt: skip
         state[LAST_X], state[LAST_Y], state[LAST_Z] = end[s, 0], end[s, 1], end[s, 2]
