@@ -279,6 +279,7 @@ def plan_repair(
                 printed_z_mm=site.printed_z_mm,
                 cell_mm=AS_BUILT_CELL_MM,
                 unseen_margin_mm=OPEN_CELL_MARGIN_MM,
+                images=evidence.images,
             )
 
         deficit = compute_deficit(

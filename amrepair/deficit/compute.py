@@ -186,6 +186,7 @@ def compute_deficit(
             build_from_template=build_from_template,
             printed_z_mm=printed_z_mm,
             cell_mm=cell_mm,
+            images=evidence.images,
         )
         expected: Any = template.solid()
         return standing_heights(seen, expected.transform(matrix), missing, excess)

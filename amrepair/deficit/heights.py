@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from amrepair.detect.rays import RangeImage
 from amrepair.frames import Transform, box_corners
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -43,6 +44,7 @@ FILM_MM = 0.4
 LEAST_FILM_MM = 0.1  # that the scan can tell from nothing
 FIN_CELLS, UNSEEN_FIN_CELLS = 2, 4
 CHANCE_CELLS = 5
+MOST_STEPS = 64  # by which what nobody saw is followed down
 
 
 def as_built_heights(
@@ -54,6 +56,7 @@ def as_built_heights(
     printed_z_mm: float | None,
     cell_mm: float,
     unseen_margin_mm: float = UNSEEN_MARGIN_MM,
+    images: tuple[RangeImage, ...] = (),
 ) -> HeightField:
     """Height field of the scan, build frame.
 
@@ -64,6 +67,9 @@ def as_built_heights(
     unseen_margin_mm
         What nobody saw is solid up to the printed height, or without rays up to the template, and
         this much more.
+    images
+        The scan's range images, template frame: what nobody saw, as the bottom of a deep hole, is
+        solid no higher than rays crossed it.
     """
     points = build_from_template.apply(scan.points_mm)
     corners = box_corners(template.bounds_mm)
@@ -85,12 +91,41 @@ def as_built_heights(
     z, closed = _close_gaps(z, known, cell_mm)
     seen = seen | (closed & ~known)
     known = closed
+    if images:
+        solid_z = _crossed(solid_z, ~known, low, cell_mm, build_from_template.inverse(), images)
     return HeightField(
         origin_mm=low[:2].copy(),
         cell_mm=cell_mm,
         z_mm=np.where(known, np.maximum(z, 0.0), solid_z),
         seen=seen,
     )
+
+
+def _crossed(
+    solid_z_mm: Float[np.ndarray, "ny nx"],
+    unseen: Bool[np.ndarray, "ny nx"],
+    low_mm: Float[np.ndarray, " 3"],
+    cell_mm: float,
+    template_from_build: Transform,
+    images: tuple[RangeImage, ...],
+) -> Float[np.ndarray, "ny nx"]:
+    """Heights lowered, column by column from above, as far as rays went through them."""
+    iy, ix = unseen.nonzero()
+    z_mm = solid_z_mm.copy()
+    step_mm = max(cell_mm, (float(z_mm.max()) - max(float(low_mm[2]), 0.0)) / MOST_STEPS)
+    while len(iy):
+        down_mm = np.maximum(z_mm[iy, ix] - step_mm, 0.0)
+        xy_mm = low_mm[:2] + (np.stack([ix, iy], axis=1) + 0.5) * cell_mm
+        points = template_from_build.apply(np.column_stack([xy_mm, down_mm]))
+        best, least = (np.full(len(points), -np.inf) for _ in range(2))
+        for image in images:
+            image.raise_clearance(points, best, least)
+        empty = least > NOISE_MM
+        iy, ix = iy[empty], ix[empty]
+        z_mm[iy, ix] = down_mm[empty]
+        further = down_mm[empty] > 0
+        iy, ix = iy[further], ix[further]
+    return z_mm
 
 
 def standing_heights(

@@ -234,3 +234,44 @@ def test_duplicate_points_do_not_crash() -> None:
     scan = cloud(BLOCK.body)
     twice = Scan(np.repeat(scan.points_mm, 2, axis=0), SIGMA_MM, "template")
     assert detect(twice, BLOCK).regions == ()
+
+
+ASLANT = np.array([[-100.0, 15, 250], [150, 15, 250], [20.0, -120, 250], [20.0, 160, 250]])
+
+
+def test_a_deep_hole_whose_bottom_nobody_saw_is_open_where_rays_entered_it() -> None:
+    """It stood a millimetre above the part's top, and the head kept off a chip beside it."""
+    hole = cube((3.0, 3.0, 30.0), (26.0, 13.5, -1.0))
+    tall = analytic.difference(
+        analytic.box((0, 0, 0), (40, 30, 20)), analytic.box((26, 13.5, -1), (29, 16.5, 29))
+    )
+    built = tall.body - cube((9.0, 12.0, 2.0), (32.0, 9.0, 18.5))
+    found = deficit_of(rays(built - hole, ASLANT), tall)
+    grid = np.stack(np.meshgrid(np.arange(26.4, 28.7, 0.1), np.arange(13.9, 16.2, 0.1)), -1)
+    z_mm = found.as_built.sample(grid.reshape(-1, 2))
+    assert z_mm.max() < 18.5  # the floor of the bite: the tip may hang over the hole there
+    assert z_mm.min() >= 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_stands_higher_than_the_as_built_field_where_nobody_saw(seed: int) -> None:
+    """Pins that nobody expects, in holes that nobody looks into far enough."""
+    rng = np.random.default_rng(seed)
+    tall = analytic.box((0, 0, 0), (40, 30, 20))
+    standing, pins = tall.body, []
+    for x in (6.0, 20.0, 34.0):
+        wide = float(rng.uniform(1.5, 4.0))
+        hole = cube((wide, wide, 30.0), (x - wide / 2, 15 - wide / 2, 1.0))
+        thin = float(rng.uniform(0.3, 0.6)) * wide
+        top = float(rng.uniform(2.0, 19.0))
+        pin = cube((thin, thin, top), (x - thin / 2, 15 - thin / 2, 0.0))
+        standing = standing - hole + pin
+        pins.append((x, thin, top))
+    found = deficit_of(rays(standing, ASLANT, seed=seed), tall)
+    for x, thin, top in pins:
+        half = max(thin / 2 - 0.1, 0.05)
+        grid = np.stack(
+            np.meshgrid(np.linspace(x - half, x + half, 9), np.linspace(15 - half, 15 + half, 9)),
+            -1,
+        )
+        assert found.as_built.sample(grid.reshape(-1, 2)).min() > top - 0.25
