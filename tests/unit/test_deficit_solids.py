@@ -198,8 +198,16 @@ def test_unseen_cells_are_solid_for_the_nozzle() -> None:
     scan = rays(BLOCK.body, ABOVE)
     found = deficit_of(scan, BLOCK)
     assert found.as_built.sample(np.array([[20.0, 15.0]]))[0] == pytest.approx(10.0, abs=0.05)
-    dark = ~found.as_built.seen
-    assert (found.as_built.z_mm[dark] >= 10.0).all()
+    field = found.as_built
+    x, y = np.meshgrid(*field.centres_mm())
+    # the block's shadow: a line from the sensor leaves the block at this share of its way
+    leaves = 1.0 / np.maximum(np.abs(x - 20.0) / 20.0, np.abs(y - 15.0) / 15.0)
+    shadow_mm = np.clip(300.0 - 290.0 / leaves, 0.0, 10.0)
+    dark = ~field.seen
+    assert dark.any()
+    assert (field.z_mm[dark] >= shadow_mm[dark] - 0.05).all()
+    around = (x < -7.9) | (x > 47.9) | (y < -7.9) | (y > 37.9)  # no ray came there
+    assert (field.z_mm[dark & around] >= 10.0).all()
 
 
 def test_the_same_scan_gives_the_same_solid() -> None:
