@@ -85,7 +85,10 @@ def zero_level(
 def band_field(
     template: Template, voxel_mm: float, *, level_mm: float
 ) -> tuple[Float[np.ndarray, "nx ny nz"], Float[np.ndarray, " 3"]]:
-    """(nx, ny, nz) float32 of f − level, exact in the band, of the right sign elsewhere."""
+    """(nx, ny, nz) float32 of f − level, exact in the band, of the right sign elsewhere.
+
+    The outermost nodes are outside, whatever the template says.
+    """
     if not voxel_mm > 0:
         raise TemplateError(f"the voxel is {voxel_mm} mm; it must be above 0")
     margin_mm = max(level_mm, 0.0) + 2.0 * voxel_mm
@@ -115,4 +118,7 @@ def band_field(
         values = template.distance(nodes_mm.reshape(-1, 3)) - level_mm
         i, j, k = some.T
         cells[i, :, j, :, k, :] = values.reshape(-1, *[BLOCK_CELLS] * 3)
+    for face in (field[0], field[-1], field[:, 0], field[:, -1], field[:, :, 0], field[:, :, -1]):
+        # a network that was taught too little has its zero level beyond the part's box
+        np.maximum(face, np.float32(voxel_mm), out=face)
     return field, low_mm

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +11,7 @@ import trimesh
 from amrepair.errors import TemplateError
 from amrepair.template.extract import extract_mesh
 from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.port import Template
 from gcode.solids import as_manifold, is_valid
 
 
@@ -42,6 +45,28 @@ def test_a_surface_on_the_grid_is_closed(shape: trimesh.Trimesh, voxel_mm: float
     assert solid.genus() == 0
     # edges are cut off by a chord of a voxel
     assert solid.volume() == pytest.approx(float(shape.volume), rel=0.01)
+
+
+class Leaking:
+    """A ball that says it is smaller than it is, as a network does that was taught too little."""
+
+    bounds_mm = np.array([[-5.0, -5.0, -3.0], [5.0, 5.0, 5.0]])
+
+    def distance(self, points_mm: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm(points_mm, axis=1) - 5.0)
+
+
+def test_what_reaches_beyond_the_box_is_closed_there() -> None:
+    # regression: a shortened network's surface left the part's box and no mesh of it was closed
+    made = extract_mesh(cast(Template, Leaking()), 0.5)
+    solid = as_manifold(np.asarray(made.vertices), np.asarray(made.faces))
+    assert is_valid(solid)
+    # the ball but for a cap 2 mm high, of which the grid's margin shows two voxels and a half
+    low_mm = made.vertices[:, 2].min()
+    assert -4.0 <= low_mm <= -3.0
+    cap_mm = 5.0 + low_mm
+    truth_mm3 = 4 / 3 * np.pi * 5.0**3 - np.pi * cap_mm**2 * (5.0 - cap_mm / 3)
+    assert solid.volume() == pytest.approx(truth_mm3, rel=0.02)  # chords of a voxel
 
 
 def test_a_layer_is_cut_flat(ball: MeshSdf) -> None:
