@@ -17,7 +17,7 @@ from amrepair.align.checks import refuse_repeated
 from amrepair.align.pam import PAPER, PamOptions, align_paper
 from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
-from amrepair.align.thinning import thin_out
+from amrepair.align.thinning import in_order, thin_out
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -209,7 +209,7 @@ def _from_guess(
             f"the scan {scan.source} has {len(points)} points where the part should stand; check "
             "the scanner's calibration and the part's pose"
         )
-    points = thin_out(points, FINE_POINTS, rng)
+    points = in_order(thin_out(points, FINE_POINTS, rng))
     wide = Prior(np.full(3, np.deg2rad(bound_deg)), np.full(3, bound_mm))
     prior = bed_prior(np.deg2rad(bound_deg), bound_mm) if on_bed else wide
     found = refine(

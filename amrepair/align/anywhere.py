@@ -7,6 +7,7 @@ asked as well. All poses that fit alike are returned: the caller must not guess.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from amrepair.align.coarse import by_features, cube_rotations
 from amrepair.align.families import CLEAR_MM, CLEAR_SIGMAS, best_turns, slides
 from amrepair.align.refine import Refined, refine
 from amrepair.align.search import QUICK, THOROUGH, CoarseField, Effort, search
-from amrepair.align.thinning import thin_out
+from amrepair.align.thinning import in_order, thin_out
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -25,9 +26,12 @@ from gcode.progress import Progress, silent
 DENSE_POINTS, FEW_POINTS = 15_000, 2_000
 FEATURE_POINTS = 30_000  # of the template's surface
 # The coarse field rounds edges: a right pose may look worse than a wrong one by this factor.
-COARSE_FACTOR, MOST_REFINED, MOST_DOUBTFUL = 1.8, 40, 5
+COARSE_FACTOR, MOST_REFINED, MOST_DOUBTFUL, MOST_TWINS = 1.8, 40, 5, 10
 GOOD_CELLS = 0.2  # what the coarse field is off by, at most, on a scan that fits
 FEW_FACTOR, FEW_ITERATIONS, DENSE_ITERATIONS, MOST_FINISHED = 1.5, 30, 120, 3
+# After so many iterations scores change little: a pose worse than the best by this factor is left
+# as it is. On few points nothing is gained by steps below this share of the noise.
+FIRST_ITERATIONS, LEFT_FACTOR, ENOUGH_SIGMAS = 10, 1.6, 0.05
 # Another pose fits as well if its score is of the best one's size, and no more than a few points
 # lie on the part in the best pose and clearly off it in the other. Clearly: beyond the noise, and
 # beyond what prints of one part differ by.
@@ -93,6 +97,11 @@ class _Clouds:
     def cap_mm(self) -> float:
         """Farther off is as bad: ten times the noise, or a millimetre."""
         return max(1.0, 10.0 * self.sigma_mm)
+
+    @property
+    def scale_mm(self) -> float:
+        """The loss's, where a pose is at its end."""
+        return max(0.1, 3.0 * self.sigma_mm)
 
     def score(self, residual_mm: Float[np.ndarray, " k"]) -> float:
         """Mean of |f|, each up to the cap."""
@@ -165,14 +174,16 @@ def pose_from_anywhere(
             starts += _worth_refining(clouds, field, THOROUGH, rng)
         else:
             starts += _worth_refining(clouds, field, QUICK, rng, turn=BETWEEN)
-        found = sorted(found + _refined(starts, clouds, template), key=_by_score)
+        more = _refined(starts, clouds, template, known=found[0][0])
+        found = sorted(found + more, key=_by_score)
     if _explained(found[0][1], inlier_mm) < EXPLAINED:
         progress("align", 0.6, 1.0)
         surface = template.surface_points(np.sqrt(clouds.diagonal_mm**2 / FEATURE_POINTS))[0]
         extra = tuple(by_features(clouds.dense_mm, surface, clouds.diagonal_mm))
         if extra:
             starts = [pose.matrix for pose in search(clouds.dense_mm, field, rng, only=extra)]
-            found = sorted(found + _refined(starts, clouds, template), key=_by_score)
+            more = _refined(starts, clouds, template, known=found[0][0])
+            found = sorted(found + more, key=_by_score)
     if left_out_ratio > 0.0:
         whole = _refined([pose.matrix for _, pose in found[:FEW_TRIED]], scan, template)
         if _explained(whole[0][1], inlier_mm) > CLEARED:
@@ -181,18 +192,19 @@ def pose_from_anywhere(
     progress("align", 0.8, 1.0)
     if _explained(found[0][1], inlier_mm) > EXPLAINED:
         found = _with_twins(found, clouds, field, template, rng)
-        turned = _refined(_turns(found, clouds, template, rng), clouds, template)
         laid = found[0][1].matrix
-        found = sorted(found + turned, key=_by_score)
+        starts = _turns(found, clouds, field, template, rng)
+        more = _refined(starts, clouds, template, known=found[0][0])
+        found = sorted(found + more, key=_by_score)
         if clouds.apart(found[0][1].matrix, laid):
             found = _with_twins(found, clouds, field, template, rng)
     progress("align", 0.9, 1.0)
     best_score, best = found[0]
     if not best.converged and best_score < PLAUSIBLE * clouds.cap_mm:
-        best = _finished(best, clouds, template, True)
+        best = _finished(best, clouds, template, DENSE_ITERATIONS)
     beside = slides(best, clouds.dense_mm, 1.5 * APART_RATIO * clouds.diagonal_mm)
     slid = _refined(beside, clouds, template, finish=False)
-    slid = [(score, _finished(moved, clouds, template, False)) for score, moved in slid]
+    slid = [(score, _finished(moved, clouds, template, 0)) for score, moved in slid]
     others: list[Float[np.ndarray, "4 4"]] = []
     for score, other in sorted(found[1:] + slid, key=_by_score):
         if score > SAME_FIT * best_score + SAME_FIT_MM:
@@ -223,12 +235,12 @@ def _clouds(
     sigma_mm: float,
     rng: np.random.Generator,
 ) -> _Clouds:
-    dense = thin_out(points_mm, DENSE_POINTS, rng)
+    dense = in_order(thin_out(points_mm, DENSE_POINTS, rng))
     low, high = dense.min(axis=0), dense.max(axis=0)
     pick = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
     return _Clouds(
         dense,
-        thin_out(dense, FEW_POINTS, rng),
+        in_order(thin_out(dense, FEW_POINTS, rng)),
         np.where(pick == 0, low, high),
         float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0))),
         sigma_mm,
@@ -253,17 +265,23 @@ def _worth_refining(
 def _twins(
     best: Refined, clouds: _Clouds, field: CoarseField, rng: np.random.Generator
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """The pose turned in its template as a box can be: a nearly symmetric part's others."""
-    centre = field.box_mm.mean(axis=0)
+    """The pose turned in its template as a box can be, and laid on the box's other sides.
+
+    A nearly symmetric part's other poses; a view of one side fits the other one from within, too.
+    """
+    middle = field.box_mm.mean(axis=0)
+    centre = clouds.dense_mm.mean(axis=0)
+    place = best.matrix[:3, :3] @ centre + best.matrix[:3, 3] - middle
     turned = []
     for turn in cube_rotations():
-        matrix = np.eye(4)
-        matrix[:3, :3] = turn @ best.matrix[:3, :3]
-        matrix[:3, 3] = turn @ (best.matrix[:3, 3] - centre) + centre
-        turned.append(matrix)
+        for sides in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.eye(4)
+            matrix[:3, :3] = turn @ best.matrix[:3, :3]
+            matrix[:3, 3] = middle + np.array(sides) * (turn @ place) - matrix[:3, :3] @ centre
+            turned.append(matrix)
     poses = search(clouds.dense_mm, field, rng, only=tuple(turned))
     limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
-    return [pose.matrix for pose in poses[:MOST_DOUBTFUL] if pose.score_mm <= limit_mm]
+    return [pose.matrix for pose in poses[:MOST_TWINS] if pose.score_mm <= limit_mm]
 
 
 def _by_halves(
@@ -294,7 +312,8 @@ def _with_twins(
     """The poses found, and the best one's twins."""
     best = found[0][1]
     twins = [m for m in _twins(best, clouds, field, rng) if clouds.apart(m, best.matrix)]
-    return sorted(found + _refined(twins, clouds, template), key=_by_score)
+    more = _refined(twins, clouds, template, known=found[0][0])
+    return sorted(found + more, key=_by_score)
 
 
 def _by_score(one: tuple[float, Refined]) -> float:
@@ -311,46 +330,71 @@ def _refined(
     template: Template,
     *,
     finish: bool = True,
+    known: float = np.inf,
 ) -> list[tuple[float, Refined]]:
-    """Scores and poses, best first: on few points, the best of them on all."""
+    """Scores and poses, best first: on few points, the best of them on all.
+
+    `known` is the score of a pose that they are held against.
+    """
+    first_mm = max(0.005 * clouds.diagonal_mm, 3.0 * clouds.sigma_mm)
+    found = _on_few(starts, clouds, template, first_mm, FIRST_ITERATIONS)
+    if found:
+        limit = LEFT_FACTOR * min(found[0][0], known) + SAME_FIT_MM
+        begun = [(s, p) for s, p in found if s <= limit and not p.converged]
+        ended = [(s, p) for s, p in found if s > limit or p.converged]
+        again = [pose.matrix for _, pose in begun]
+        found = ended + _on_few(again, clouds, template, clouds.scale_mm, FEW_ITERATIONS)
+    found.sort(key=_by_score)
+    if not finish or not found:
+        return found
+    limit = FEW_FACTOR * min(found[0][0], known) + SAME_FIT_MM
+    finished: list[tuple[float, Refined]] = []
+    for score, rough in found:
+        if score > limit:
+            break
+        iterations = 0
+        if len(finished) < MOST_FINISHED and score < PLAUSIBLE * clouds.cap_mm:
+            iterations = DENSE_ITERATIONS if not finished else FEW_ITERATIONS
+        moved = _finished(rough, clouds, template, iterations)
+        finished.append((clouds.score(moved.residual_mm), moved))
+    return sorted(finished, key=_by_score)
+
+
+def _on_few(
+    starts: list[Float[np.ndarray, "4 4"]],
+    clouds: _Clouds,
+    template: Template,
+    start_scale_mm: float,
+    max_iterations: int,
+) -> list[tuple[float, Refined]]:
+    """Scores and poses, best first, moved on few points."""
     found = []
     for matrix in starts:
         moved = refine(
             clouds.few_mm,
             template,
             matrix,
-            start_scale_mm=max(0.005 * clouds.diagonal_mm, 3.0 * clouds.sigma_mm),
-            end_scale_mm=max(0.1, 3.0 * clouds.sigma_mm),
+            start_scale_mm=start_scale_mm,
+            end_scale_mm=clouds.scale_mm,
             sigma_mm=clouds.sigma_mm,
-            max_iterations=FEW_ITERATIONS,
+            max_iterations=max_iterations,
+            enough_mm=ENOUGH_SIGMAS * clouds.sigma_mm,
         )
         found.append((clouds.score(moved.residual_mm), moved))
-    found.sort(key=_by_score)
-    if not finish or not found:
-        return found
-    limit = FEW_FACTOR * found[0][0] + SAME_FIT_MM
-    finished: list[tuple[float, Refined]] = []
-    for score, rough in found:
-        if score > limit:
-            break
-        worth = len(finished) < MOST_FINISHED and score < PLAUSIBLE * clouds.cap_mm
-        moved = _finished(rough, clouds, template, worth)
-        finished.append((clouds.score(moved.residual_mm), moved))
-    return sorted(finished, key=_by_score)
+    return sorted(found, key=_by_score)
 
 
-def _finished(rough: Refined, clouds: _Clouds, template: Template, move: bool) -> Refined:
+def _finished(rough: Refined, clouds: _Clouds, template: Template, iterations: int) -> Refined:
     """A pose on all points: moved, or only judged there."""
-    scale_mm = max(0.1, 3.0 * clouds.sigma_mm)
-    if move:
+    if iterations:
         return refine(
             clouds.dense_mm,
             template,
             rough.matrix,
-            start_scale_mm=scale_mm,
-            end_scale_mm=scale_mm,
+            start_scale_mm=clouds.scale_mm,
+            end_scale_mm=clouds.scale_mm,
             sigma_mm=clouds.sigma_mm,
-            max_iterations=DENSE_ITERATIONS,
+            max_iterations=iterations,
         )
     placed = clouds.dense_mm @ rough.matrix[:3, :3].T + rough.matrix[:3, 3]
     return Refined(
@@ -365,6 +409,7 @@ def _finished(rough: Refined, clouds: _Clouds, template: Template, move: bool) -
 def _turns(
     found: list[tuple[float, Refined]],
     clouds: _Clouds,
+    field: CoarseField,
     template: Template,
     rng: np.random.Generator,
 ) -> list[Float[np.ndarray, "4 4"]]:
@@ -374,6 +419,7 @@ def _turns(
         [pose for score, pose in found if score <= limit],
         clouds.dense_mm,
         template,
+        field,
         diagonal_mm=clouds.diagonal_mm,
         sigma_mm=clouds.sigma_mm,
         cap_mm=clouds.cap_mm,

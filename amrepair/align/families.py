@@ -13,16 +13,18 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.align.refine import Refined
-from amrepair.align.thinning import thin_out
+from amrepair.align.search import CoarseField, misfits_mm
+from amrepair.align.thinning import in_order, thin_out
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
 
 STEP_RATIO = 0.01  # of the diagonal: what the farthest point moves from one pose to the next
-SWEPT_POINTS, RADIUS_POINTS = 4_000, 1_500
+SWEPT_POINTS, COARSE_POINTS, RADIUS_POINTS = 4_000, 1_500, 1_500
 LEAST_JUDGES = 10  # fewer that are off are outliers
 CLEAR_SIGMAS, CLEAR_MM = 4.0, 0.1  # off: beyond the noise, and what prints of one part differ by
 MOST_FAMILIES = 6
 BEST_OF_EACH = 3
+MOST_ASKED = 12  # dips of the coarse field, that the exact one puts in order
 SAME_STEPS = 4.0  # from the nearest pose of a family: the axis is known no better
 MOST_RESISTING = 0.02  # share of the points that a motion may press against the surface
 LEAST_RADIUS = 0.02  # of the diagonal, about the axis: less turns nothing
@@ -82,6 +84,7 @@ def best_turns(
     poses: Sequence[Refined],
     judged_mm: Float[np.ndarray, "n 3"],
     template: Template,
+    field: CoarseField,
     *,
     diagonal_mm: float,
     sigma_mm: float,
@@ -96,6 +99,8 @@ def best_turns(
         Best first, refined on the points in `judged_mm`.
     judged_mm
         (n, 3) in the scan's frame.
+    field
+        The template's: where around the circle it is worth asking.
     diagonal_mm
         Of the template.
     sigma_mm
@@ -104,7 +109,7 @@ def best_turns(
         Farther off is as bad.
     """
     step_mm = STEP_RATIO * diagonal_mm
-    cloud = thin_out(judged_mm, SWEPT_POINTS, rng)
+    cloud = in_order(thin_out(judged_mm, SWEPT_POINTS, rng))
     known: list[Float[np.ndarray, "k 4 4"]] = []
     found: list[Float[np.ndarray, "4 4"]] = []
     for pose in poses:
@@ -120,11 +125,25 @@ def best_turns(
             known.append(family)
             # a feature that decides is small: where it is seen its points lie off this pose
             off = judged_mm[np.abs(pose.residual_mm) > max(CLEAR_MM, CLEAR_SIGMAS * sigma_mm)]
-            for judges in (cloud, off[:SWEPT_POINTS]):
+            for judges in (cloud, off[:: len(off) // SWEPT_POINTS + 1]):
                 if len(judges) >= LEAST_JUDGES:
-                    scores = np.array([_score(judges, one, template, cap_mm) for one in family])
-                    found += [family[k] for k in _lowest(scores)]
+                    found += _best_of(family, judges, template, field, cap_mm)
     return found
+
+
+def _best_of(
+    family: Float[np.ndarray, "k 4 4"],
+    judges_mm: Float[np.ndarray, "n 3"],
+    template: Template,
+    field: CoarseField,
+    cap_mm: float,
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The best poses of a family but for its first, which is known."""
+    few = judges_mm[:: len(judges_mm) // COARSE_POINTS + 1]
+    dips = _lowest(misfits_mm(few, family, field, cap_mm))
+    asked = [family[k] for k in dips[:MOST_ASKED] if k > 0]
+    scores = np.array([_score(judges_mm, one, template, cap_mm) for one in asked])
+    return [asked[k] for k in np.argsort(scores, kind="stable")[:BEST_OF_EACH]]
 
 
 def _turned(
@@ -151,11 +170,12 @@ def _turned(
     if not in_part or share > MOST_RESISTING * (rate * radius_mm) ** 2:
         return None
     count = int(np.ceil(2.0 * np.pi * radius_mm / (STEP_RATIO * diagonal_mm)))
+    angles = 2.0 * np.pi * np.arange(count)[:, None, None] / count
+    along, across = np.outer(axis, axis), np.cross(axis, np.eye(3)).T
+    turns = np.cos(angles) * (np.eye(3) - along) + np.sin(angles) * across + along  # Rodrigues
     family = np.tile(np.eye(4), (count, 1, 1))
-    for k in range(count):
-        turn = rotation_from_vector(2.0 * np.pi * k / count * axis)
-        family[k, :3, :3] = turn @ matrix[:3, :3]
-        family[k, :3, 3] = turn @ (matrix[:3, 3] - through) + through
+    family[:, :3, :3] = turns @ matrix[:3, :3]
+    family[:, :3, 3] = turns @ (matrix[:3, 3] - through) + through
     return family
 
 
@@ -167,7 +187,7 @@ def _among(
 ) -> bool:
     few = cloud_mm[:: max(1, len(cloud_mm) // 50)]
     placed = few @ matrix[:3, :3].T + matrix[:3, 3]
-    others = np.einsum("kab,nb->kna", family[:, :3, :3], few) + family[:, None, :3, 3]
+    others = few @ np.swapaxes(family[:, :3, :3], 1, 2) + family[:, None, :3, 3]
     return bool(np.linalg.norm(others - placed, axis=2).max(axis=1).min() < SAME_STEPS * step_mm)
 
 
@@ -182,7 +202,7 @@ def _score(
 
 
 def _lowest(scores: Float[np.ndarray, " k"]) -> list[int]:
-    """The deepest local minima around the circle."""
+    """The local minima around the circle, deepest first."""
     dips = (scores <= np.roll(scores, 1)) & (scores < np.roll(scores, -1))
     order = np.flatnonzero(dips)
-    return [int(k) for k in order[np.argsort(scores[order], kind="stable")][:BEST_OF_EACH]]
+    return [int(k) for k in order[np.argsort(scores[order], kind="stable")]]

@@ -80,6 +80,7 @@ def refine(
     sigma_mm: float,
     prior: Prior | None = None,
     max_iterations: int = MAX_ITERATIONS,
+    enough_mm: float = 0.0,
 ) -> Refined:
     """Move a pose to the nearest minimum of Σ ρ(f(T x)).
 
@@ -93,6 +94,8 @@ def refine(
         Scale of the Geman–McClure loss ρ(r) = r²/(r² + s²), first and last.
     sigma_mm
         Noise of a point, for the information.
+    enough_mm
+        Stop where the next step would be smaller, converged or not.
     """
     centre = points_mm.mean(axis=0)
     reach_mm = float(np.linalg.norm(points_mm - centre, axis=1).max())
@@ -133,8 +136,8 @@ def refine(
         if iterations > HASTE:  # a rod turns on for ever: what counts is what its points would see
             changed_mm = sigma_mm * float(np.sqrt(step @ hessian @ step / len(points_mm)))
             still |= changed_mm < FREE_RATIO * limit_mm
-        if scale <= end_scale_mm * (1 + 1e-9) and still:
-            converged = True
+        if scale <= end_scale_mm * (1 + 1e-9) and (still or moved_mm < enough_mm):
+            converged = bool(still)
             break
         if moved_mm < 0.25 * scale:
             scale = max(end_scale_mm, scale * SHRINK)

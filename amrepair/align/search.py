@@ -187,6 +187,33 @@ def search(
     ]
 
 
+def misfits_mm(
+    points_mm: Float[np.ndarray, "n 3"],
+    matrices: Float[np.ndarray, "k 4 4"],
+    field: CoarseField,
+    cap_mm: float,
+) -> Float[np.ndarray, " k"]:
+    """(k,) the mean of |f|, each up to the cap, of points in many poses; edges are rounded.
+
+    Parameters
+    ----------
+    points_mm, matrices
+        In the scan's frame; template from scan.
+    """
+    centre = points_mm.mean(axis=0)
+    rotations = np.ascontiguousarray(matrices[:, :3, :3])
+    places = (rotations @ centre + matrices[:, :3, 3] - field.origin_mm) / field.cell_mm
+    scores = kernels.misfits(
+        _rows((points_mm - centre) / field.cell_mm),
+        rotations,
+        places,
+        field.values.ravel() / np.float32(field.cell_mm),
+        np.array(field.values.shape),
+        cap_mm / field.cell_mm,
+    )
+    return np.asarray(field.cell_mm * scores)
+
+
 def _rows(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
     return np.ascontiguousarray(points.T, dtype=np.float32)
 

@@ -95,6 +95,50 @@ def starts(points, rotations, box, values, shape, cap):
     return found
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _between_nodes(points, r, p, values, shape, cap):
+    """Sum of |f|, each up to the cap; the field is `_accumulate`'s."""
+    none, edge, unit = np.float32(0.0), np.float32(1.001), np.uint32(1)
+    most, total = np.float32(cap), np.float32(0.0)
+    nx, ny, nz = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
+    row, plane = np.uint32(shape[2]), np.uint32(shape[1] * shape[2])
+    r00, r01, r02 = np.float32(r[0, 0]), np.float32(r[0, 1]), np.float32(r[0, 2])
+    r10, r11, r12 = np.float32(r[1, 0]), np.float32(r[1, 1]), np.float32(r[1, 2])
+    r20, r21, r22 = np.float32(r[2, 0]), np.float32(r[2, 1]), np.float32(r[2, 2])
+    px, py, pz = np.float32(p[0]), np.float32(p[1]), np.float32(p[2])
+    for n in range(points.shape[1]):
+        x, y, z = points[0, n], points[1, n], points[2, n]
+        tx = r00 * x + r01 * y + r02 * z + px
+        ty = r10 * x + r11 * y + r12 * z + py
+        tz = r20 * x + r21 * y + r22 * z + pz
+        cx = min(max(tx, none), nx - edge)
+        cy = min(max(ty, none), ny - edge)
+        cz = min(max(tz, none), nz - edge)
+        i, j, k = np.floor(cx), np.floor(cy), np.floor(cz)
+        at = np.uint32((i * ny + j) * nz + k)
+        u, v, w = cx - i, cy - j, cz - k
+        a, c = values[at], values[at + row]
+        e, g = values[at + plane], values[at + plane + row]
+        ab, cd = a + (values[at + unit] - a) * w, c + (values[at + row + unit] - c) * w
+        ef = e + (values[at + plane + unit] - e) * w
+        gh = g + (values[at + plane + row + unit] - g) * w
+        front, back = ab + (cd - ab) * v, ef + (gh - ef) * v
+        dx, dy, dz = tx - cx, ty - cy, tz - cz
+        f = front + (back - front) * u + np.sqrt(dx * dx + dy * dy + dz * dz)
+        total += min(abs(f), most)
+    return total
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def misfits(points, rotations, places, values, shape, cap):
+    """(k,) the mean of |f|, each up to the cap, in every pose."""
+    found = np.empty(len(rotations))
+    for k in prange(len(rotations)):
+        total = _between_nodes(points, rotations[k], places[k], values, shape, cap)
+        found[k] = total / points.shape[1]
+    return found
+
+
 @njit(cache=True, nogil=True)
 def _solve(h, b):
     """Solve a symmetric positive system of six by Cholesky, in place."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.align.thinning_kernels import first_of_voxels
+from amrepair.align.thinning_kernels import first_of_voxels, morton_keys
 
 MOST_LOOKED_AT = 200_000
 ROUNDS, CLOSE_ENOUGH = 12, 0.95
+ORDER_BITS = 7  # 128 cubes along the longest side
 
 
 def thin_out(
@@ -44,3 +45,11 @@ def thin_out(
     if not len(best):
         return shuffled[:count]
     return np.ascontiguousarray(shuffled[np.sort(best)])
+
+
+def in_order(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The points so that near ones follow each other: a field is asked in half the time."""
+    low = points_mm.min(axis=0)
+    edge_mm = max(float((points_mm.max(axis=0) - low).max()), 1e-9) / (1 << ORDER_BITS)
+    keys = morton_keys(points_mm, low, edge_mm, ORDER_BITS)
+    return np.ascontiguousarray(points_mm[np.argsort(keys, kind="stable")])

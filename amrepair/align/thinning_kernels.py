@@ -1,7 +1,9 @@
 # mypy: disable-error-code="no-untyped-def"
-"""The first point of each voxel; compiled."""
+"""The first point of each voxel, and an order in which near points follow each other; compiled."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from gcode.compiled import njit
 
@@ -41,3 +43,16 @@ def first_of_voxels(points, low, voxel, most, slots, chosen):
         chosen[found] = i
         found += 1
     return found
+
+
+@njit(cache=True, nogil=True)
+def morton_keys(points, low, edge, bits):
+    """(n,) numbers of the cubes that hold the points, along a Z-order curve (Morton 1966)."""
+    keys = np.zeros(len(points), np.int64)
+    most = (1 << bits) - 1
+    for n in range(len(points)):
+        for a in range(3):
+            cell = min(int((points[n, a] - low[a]) / edge), most)
+            for b in range(bits):
+                keys[n] |= ((cell >> b) & 1) << (3 * b + a)
+    return keys

@@ -59,6 +59,15 @@ def test_the_coarse_field_is_trilinear_and_goes_on_beyond_its_border() -> None:
     assert np.allclose(h, np.tril(hessian), rtol=1e-3, atol=1e-3 * np.abs(hessian).max())
     assert np.allclose(b, -slope, rtol=1e-3, atol=1e-3 * np.abs(slope).max())
     assert abs(total - np.minimum(np.abs(f), 1.0).sum()) < 1e-3 * len(points)
+    means = search_kernels.misfits(
+        np.ascontiguousarray(points.T),
+        np.stack([turn, turn]),
+        np.stack([place, place + 100.0]),
+        values.ravel(),
+        shape,
+        1.0,
+    )
+    assert np.allclose(means, [np.minimum(np.abs(f), 1.0).mean(), 1.0], atol=1e-3)
 
 
 def test_the_covariance_is_the_informations_inverse_and_finite_where_motion_is_free() -> None:

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import Registration, align
 from amrepair.align.search import QUICK, spread_rotations
-from amrepair.align.thinning import thin_out
+from amrepair.align.thinning import in_order, thin_out
 from amrepair.bench.bodies import standing_pose
 from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector
@@ -67,6 +67,16 @@ def test_thinning_is_even_and_never_more() -> None:
     assert all(tuple(row) in given for row in thin.tolist())
     assert len(thin_out(points[:70], 1_000, rng)) == 70
     assert len(thin_out(np.zeros((500, 3)), 100, rng)) <= 100
+
+
+def test_ordered_points_are_the_same_points_with_near_ones_in_a_row() -> None:
+    points = np.random.default_rng(0).uniform(-3, 40, (5_000, 3))
+    ordered = in_order(points)
+    assert {tuple(row) for row in ordered.tolist()} == {tuple(row) for row in points.tolist()}
+    steps = np.linalg.norm(np.diff(ordered, axis=0), axis=1)
+    # random pairs in a cube are 0.66 of its edge apart, neighbours of 5,000 points about 0.03
+    assert np.median(steps) < 0.1 * 43
+    assert len(in_order(np.ones((3, 3)))) == 3
 
 
 def test_a_small_notch_decides_between_poses() -> None:
