@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -25,7 +27,7 @@ from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
 METHODS = ("robust", "paper")
-FINE_POINTS, MOST_LOOKED_AT = 15_000, 150_000
+FINE_POINTS, MOST_LOOKED_AT, SEEN_POINTS = 15_000, 150_000, 4_000
 LEAST_POINTS = 50
 # A guess from a calibration is good to this; what is farther is not the part that was meant.
 BOUND_MM, BOUND_DEG = 3.0, 3.0
@@ -129,6 +131,7 @@ def _from_anywhere(
     found = pose_from_anywhere(
         scan.points_mm, template, sigma_mm=scan.sigma_mm, rng=rng, progress=progress
     )
+    found = _as_it_was_seen(scan, template, found, rng)
     ratio = found.explained_ratio
     progress("align", 1.0, 1.0)
     if not part_is_known:
@@ -141,6 +144,43 @@ def _from_anywhere(
     sizes = _other_size(scan, template)
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
     return _registration(scan, found)
+
+
+def _as_it_was_seen(
+    scan: Scan, template: Template, found: Found, rng: np.random.Generator
+) -> Found:
+    """Without the poses in which the sensors would have looked from within the part.
+
+    A view of one side of a plate fits the other side as well; where the sensors stood decides.
+    """
+    if scan.sensors_mm is None or scan.sensor_index is None or not found.others:
+        return found
+    some = rng.permutation(len(scan))[:SEEN_POINTS]
+    points = scan.points_mm[some]
+    to_sensor = scan.sensors_mm[scan.sensor_index[some]] - points
+
+    def is_possible(matrix: Float[np.ndarray, "4 4"]) -> bool:
+        placed = points @ matrix[:3, :3].T + matrix[:3, 3]
+        distance, outward = template.distance_and_gradient(placed)
+        near = np.abs(distance) <= found.inlier_mm
+        facing = np.einsum("ni,ni->n", outward, to_sensor @ matrix[:3, :3].T) > 0.0
+        return bool(near.any() and facing[near].mean() > 0.5)
+
+    others = [other for other in found.others if is_possible(other)]
+    best, ratio = found.best, found.explained_ratio
+    if not is_possible(best.matrix):
+        if not others:  # then it is the sensors' places that are wrong
+            return found
+        best = refine(
+            in_order(thin_out(found.part_mm, FINE_POINTS, rng)),
+            template,
+            others.pop(0),
+            start_scale_mm=max(0.1, 3.0 * found.sigma_mm),
+            end_scale_mm=max(0.1, 3.0 * found.sigma_mm),
+            sigma_mm=found.sigma_mm,
+        )
+        ratio = float((np.abs(best.residual_mm) <= found.inlier_mm).mean())
+    return replace(found, best=best, others=tuple(others), explained_ratio=ratio)
 
 
 def _refuse_mirrored(

@@ -95,7 +95,16 @@ class CoarseField:
 
     @classmethod
     def of(cls, template: Template) -> CoarseField:
-        """Ask the template at every node."""
+        """Ask the template at every node; the last one's answers are kept for its next scan."""
+        for known, field in _latest:
+            if known is template:
+                return field
+        field = cls._asked(template)
+        _latest[:] = [(template, field)]
+        return field
+
+    @classmethod
+    def _asked(cls, template: Template) -> CoarseField:
         box = template.bounds_mm
         size = box[1] - box[0]
         cell_mm = float(size.max()) / CELLS
@@ -127,6 +136,9 @@ class Pose:
 
     matrix: Float[np.ndarray, "4 4"]
     score_mm: float
+
+
+_latest: list[tuple[Template, CoarseField]] = []  # one: templates do not change
 
 
 def search(

@@ -23,13 +23,15 @@ from amrepair.bench.house import class_template, repair_distance, top_mean
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
 from amrepair.template import MeshSdf
-from amrepair.template.paper import PAPER as PAPER_RECIPE
+from amrepair.template.paper import CODE as CODE_RECIPE
 from amrepair.template.paper import PaperOptions
 from amrepair.template.port import Template
 from amrepair.template.surface import sample_surface
 
-# 1,000 steps of 8,192 instead of 2.4 million of 16; the rate is raised with the batch.
-BENCH_PAPER = replace(PAPER_RECIPE, batch=8_192, rate=5e-4, epochs=500)
+# 1,000 steps of 8,192 instead of 2.4 million of 16; the rate is raised with the batch. Without
+# dropout, as released: in so few steps it leaves f = 0 within 0.3 mm of the surface (knob), and the
+# published system found nothing.
+BENCH_PAPER = replace(CODE_RECIPE, batch=8_192, rate=5e-4, epochs=500)
 TOP_SCORES = 1_000
 TARGET_POINTS = 20_000  # of the template's cloud: as many as the largest test clouds need
 

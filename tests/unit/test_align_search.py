@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -89,6 +91,26 @@ def test_a_small_notch_decides_between_poses() -> None:
     corner = (np.abs(points - (20, 12, 4)) > (16, 8, 1)).all(axis=1)
     found, _ = aligned(template, points[~corner])
     assert len(found.symmetric_alternatives) == 3
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_sensor_tells_on_which_side_of_a_plate_a_view_lies(side: float) -> None:
+    plate = difference(box((0, 0, 0), (40, 24, 4)), cylinder((31, 7, -1), 4.0, 6.0))
+    rng = np.random.default_rng(11)
+    flat = rng.uniform((0, 0), (40, 24), (9_000, 2))
+    flat = flat[np.hypot(*(flat - (31, 7)).T) > 4.0]
+    points = np.column_stack([flat, np.full(len(flat), 2.0 + 2.0 * side)])
+    points += rng.normal(0, SIGMA_MM, points.shape)
+    turn, shift = spread_rotations(500)[77], np.array([20.0, -30.0, 9.0])
+    sensor = np.array([[20.0, 12.0, side * 300.0]]) @ turn.T + shift
+    moved = points @ turn.T + shift
+    blind = Scan(moved, SIGMA_MM, "scanner", source="scan.ply")
+    assert align(blind, plate).symmetric_alternatives
+    index = np.zeros(len(moved), dtype=np.int64)
+    seen = replace(blind, sensors_mm=sensor, sensor_index=index)
+    found = align(seen, plate)
+    assert not found.symmetric_alternatives
+    assert np.abs(found.template_from_scan.apply(moved) - points).max() < 0.1
 
 
 def test_a_turn_that_nothing_hinders_is_reported() -> None:
