@@ -20,6 +20,7 @@ from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
 from amrepair.deficit import Deficit, as_built_heights, compute_deficit, worth
 from amrepair.detect import AnomalyMap, Label, Region, detect
+from amrepair.detect.skipped import PlannedBeads
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -97,6 +98,8 @@ class Site:
         What the process may leave (half a layer for a CAD template, 0 for planned beads).
     on_fixture
         Somebody said that a finished part's foot is above the bed.
+    beads
+        What the job has laid so far, template frame: lines that were skipped are looked for.
 
     Examples
     --------
@@ -116,6 +119,7 @@ class Site:
     allowance_mm: float = 0.1
     planned: Template | None = None
     on_fixture: bool = False
+    beads: PlannedBeads | None = None
 
     @classmethod
     def of_part(
@@ -168,7 +172,11 @@ class RepairPlan:
     def to_fill(self) -> tuple[Region, ...]:
         """Missing regions that are worth a repair: alone, or with those beside them."""
         missing = [region for region in self.deficit.regions if region.label is Label.MISSING]
-        keep = worth.worth_mending([r.box_mm for r in missing], [r.volume_mm3 for r in missing])
+        keep = worth.worth_mending(
+            [r.box_mm for r in missing],
+            [r.volume_mm3 for r in missing],
+            [r.skipped for r in missing],
+        )
         return tuple(region for region, kept in zip(missing, keep, strict=True) if kept)
 
     @property
@@ -289,6 +297,7 @@ def plan_repair(
             build_from_template=placed,
             printed_z_mm=site.printed_z_mm,
             as_built=None if site.planned is None else stands,
+            beads=site.beads,
             progress=progress,
         )
         _refuse_ambiguity(scan, site, registration, deficit)
@@ -404,9 +413,10 @@ def _fillable(deficit: Deficit, wanted: Callable[[Region], bool]) -> manifold3d.
     """The missing pieces that are worth a repair, and wanted in it."""
     pieces = deficit.missing.decompose()
     boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
-    keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces])
-    pieces = [piece for piece, kept in zip(pieces, keep, strict=True) if kept]
     regions = [region for region in deficit.regions if region.label is Label.MISSING]
+    lines = [bool(regions) and _region_of(piece, regions).skipped for piece in pieces]
+    keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces], lines)
+    pieces = [piece for piece, kept in zip(pieces, keep, strict=True) if kept]
     pieces = [piece for piece in pieces if not regions or wanted(_region_of(piece, regions))]
     if not pieces:
         return manifold3d.Manifold()

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from amrepair.detect.skipped import PlannedBeads
 from amrepair.frames import Transform
 from amrepair.repair import Site, plan_repair
 from amrepair.scans import ScanRequest
@@ -141,12 +142,13 @@ def site_of(job: Job, layer: int, setup: PrintSetup) -> Site:
     """The planned beads after a layer, in the build frame."""
     beads = job.beads
     done = (beads.layer >= 0) & (beads.layer <= layer)
-    planned = PlannedSdf.from_beads(
-        beads.start_mm[done], beads.end_mm[done], beads.section_mm2[done], beads.height_mm[done]
-    )
+    start, end = beads.start_mm[done], beads.end_mm[done]
+    section, height = beads.section_mm2[done], beads.height_mm[done]
+    planned = PlannedSdf.from_beads(start, end, section, height)
+    lines = PlannedBeads(start, end, section / np.maximum(height, 1e-6), height).recent()
     tops = [one.z_mm for one in job.layers]
     grid = LayerGrid.from_tops(tops, layer_height_mm=setup.process.layer_height_mm)
-    return Site(planned, setup, grid, HERE, tops[layer], planned=planned)
+    return Site(planned, setup, grid, HERE, tops[layer], planned=planned, beads=lines)
 
 
 def run_job(

@@ -22,6 +22,7 @@ from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.detection import ON_PLANE_MM
 from amrepair.detect.evidence import Evidence
 from amrepair.detect.regions import classify, group_points
+from amrepair.detect.skipped import PlannedBeads, skipped
 from amrepair.errors import DeficitError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -114,6 +115,7 @@ def compute_deficit(
     printed_z_mm: float | None = None,
     cell_mm: float = 0.25,
     as_built: Callable[[], HeightField] | None = None,
+    beads: PlannedBeads | None = None,
     progress: Progress = silent,
 ) -> Deficit:
     """Solids of what is missing and in excess.
@@ -134,6 +136,9 @@ def compute_deficit(
         Cell of what the scan alone says of heights.
     as_built
         Makes what stands on the bed, where the caller knows; None has it made of scan and solids.
+    beads
+        What the job has laid there, template frame: lines of it that rays went through are missing,
+        however near to the template's surface they lie.
 
     Raises
     ------
@@ -148,10 +153,12 @@ def compute_deficit(
     evidence = anomaly.evidence
     if evidence is None:
         raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
+    lines = None if beads is None else skipped(beads, evidence, template)
     solids: dict[Label, list[manifold3d.Manifold]] = {Label.MISSING: [], Label.EXCESS: []}
     regions: list[Region] = []
     for label, found in solids.items():
-        boxes = _boxes(anomaly, evidence, template, label)
+        gone = lines if label is Label.MISSING else None
+        boxes = _boxes(anomaly, evidence, template, label, gone)
         finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
         for i, (low, high, depth) in enumerate(boxes):
             progress(f"deficit: {label.name.lower()}", float(i), float(len(boxes)))
@@ -164,11 +171,13 @@ def compute_deficit(
                 high,
                 depth_mm=min(depth, finest_mm),
                 tau_mm=tau_mm,
+                gone=gone,
             )
             for piece in solid.decompose():
                 if piece.volume() >= CRUMB_MM3:
                     found.append(piece)
-                    regions.append(_region(piece, label, template, build_from_template))
+                    region = _region(piece, label, template, build_from_template)
+                    regions.append(replace(region, skipped=_is_skipped(piece, gone)))
     matrix = build_from_template.matrix[:3]
     missing, excess = (
         manifold3d.Manifold.batch_boolean(found, manifold3d.OpType.Add).transform(matrix)
@@ -202,7 +211,11 @@ def compute_deficit(
 
 
 def _boxes(
-    anomaly: AnomalyMap, evidence: Evidence, template: Template, label: Label
+    anomaly: AnomalyMap,
+    evidence: Evidence,
+    template: Template,
+    label: Label,
+    lines: PlannedBeads | None,
 ) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
     """Low corner, high corner and depth of each group of labelled cells and template points."""
     s = evidence.surfels
@@ -227,6 +240,10 @@ def _boxes(
             continue
         thick = float(np.percentile(known, 90)) if len(known) else 2.0
         found.append((mine.min(axis=0) - BOX_MARGIN_MM, mine.max(axis=0) + BOX_MARGIN_MM, thick))
+    if lines is not None:
+        for a, b, high in zip(lines.start_mm, lines.end_mm, lines.height_mm, strict=True):
+            low, top = np.minimum(a, b) - BOX_MARGIN_MM, np.maximum(a, b) + BOX_MARGIN_MM
+            found.append((low, top, float(high)))
     return _merge(found)
 
 
@@ -294,6 +311,7 @@ def _solid_in_box(
     *,
     depth_mm: float,
     tau_mm: float,
+    gone: PlannedBeads | None,
 ) -> manifold3d.Manifold:
     """Erode, subtract, grow back, clip: all on one grid of signed distances."""
     s = evidence.surfels
@@ -332,6 +350,9 @@ def _solid_in_box(
     ask = np.flatnonzero(can_be & ~core & (sign * f > thin_mm) & (clip < 0))
     nearest = evidence.tree.query(samples[ask], workers=2)[1]
     core[ask[labels[nearest] == int(label)]] = True
+    if gone is not None and len(gone.width_mm):
+        maybe = np.flatnonzero(clip < 0)
+        core[maybe[gone.holds(samples[maybe])]] = True
     if label is Label.EXCESS:
         # one reflection in mid-air is a plane, too, but none that stands out by its label
         found = np.flatnonzero(core)
@@ -411,6 +432,16 @@ def _region(
         box_mm=np.asarray(moved.bounding_box()).reshape(2, 3),
     )
     return replace(region, below_bead=volume < BEAD_MM3)
+
+
+def _is_skipped(piece: manifold3d.Manifold, gone: PlannedBeads | None) -> bool:
+    """Whether the middle of a line that is gone lies in a piece's box, template frame."""
+    if gone is None:
+        return False
+    box = np.asarray(piece.bounding_box()).reshape(2, 3)
+    middle = 0.5 * (gone.start_mm + gone.end_mm)
+    middle[:, 2] -= 0.5 * gone.height_mm
+    return bool(((middle >= box[0]) & (middle <= box[1])).all(axis=1).any())
 
 
 def _unseen_area(anomaly: AnomalyMap, count: int) -> float:

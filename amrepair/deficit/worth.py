@@ -19,17 +19,22 @@ ONE_DEFECT_MM = 1.0
 
 
 def defect_volumes(
-    boxes_mm: Sequence[Float[np.ndarray, "2 3"]], volumes_mm3: Sequence[float]
+    boxes_mm: Sequence[Float[np.ndarray, "2 3"]],
+    volumes_mm3: Sequence[float],
+    skipped: Sequence[bool],
 ) -> Float[np.ndarray, " n"]:
     """Volume of the defect that each piece belongs to.
 
-    Skipped beads that cross leave several pieces side by side: one defect. Crumbs below what a
-    bead fills join nothing.
+    Skipped beads that cross leave several pieces side by side: one defect. Those that rays went
+    through have one cause, wherever they lie: the extruder slipped. Crumbs below what a bead fills
+    join nothing.
 
     Parameters
     ----------
     boxes_mm, volumes_mm3
         Box and volume of each piece.
+    skipped
+        Whether lines of the job are gone in it.
 
     Returns
     -------
@@ -44,13 +49,17 @@ def defect_volumes(
     box = np.stack([np.asarray(boxes_mm[int(k)]) for k in bead])
     low, high = box[:, 0], box[:, 1] + ONE_DEFECT_MM
     near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
+    line = np.asarray(skipped, dtype=bool)[bead]
+    near |= line[:, None] & line[None]
     groups, group = connected_components(csr_matrix(near), directed=False)
     whole[bead] = np.bincount(group, weights=volume[bead], minlength=groups)[group]
     return whole
 
 
 def worth_mending(
-    boxes_mm: Sequence[Float[np.ndarray, "2 3"]], volumes_mm3: Sequence[float]
+    boxes_mm: Sequence[Float[np.ndarray, "2 3"]],
+    volumes_mm3: Sequence[float],
+    skipped: Sequence[bool],
 ) -> Bool[np.ndarray, " n"]:
     """(n,) pieces that belong to a defect of at least `MIN_REPAIR_MM3`; see `defect_volumes`."""
-    return np.asarray(defect_volumes(boxes_mm, volumes_mm3) >= MIN_REPAIR_MM3)
+    return np.asarray(defect_volumes(boxes_mm, volumes_mm3, skipped) >= MIN_REPAIR_MM3)

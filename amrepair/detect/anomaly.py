@@ -53,6 +53,8 @@ class Region:
         Too small for one bead to fix.
     confidence
         That it is there and is of that type, 0 to 1; 1 where nobody has judged it.
+    skipped
+        Lines of the job are gone in it (`detect.skipped`).
     """
 
     label: Label
@@ -63,6 +65,7 @@ class Region:
     box_mm: Float[np.ndarray, "2 3"]
     below_bead: bool = False
     confidence: float = 1.0
+    skipped: bool = False
 
 
 @dataclass(frozen=True, slots=True)

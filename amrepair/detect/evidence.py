@@ -90,6 +90,10 @@ class Evidence:
             return self._by_surface(points_mm, f_mm)
         return self._by_rays(points_mm)[1]
 
+    def rays_say(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """The best estimate of `clearance` by rays alone; cheap, and noisy by a pixel."""
+        return self._by_rays(points_mm)[0]
+
     def _by_surface(
         self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:

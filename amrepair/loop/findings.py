@@ -159,7 +159,9 @@ def _whole_defects(regions: Sequence[Region]) -> Float[np.ndarray, " n"]:
     for label in Label:
         mine = [k for k, region in enumerate(regions) if region.label is label]
         boxes = [np.asarray(regions[k].box_mm) for k in mine]
-        whole_mm3[mine] = defect_volumes(boxes, [regions[k].volume_mm3 for k in mine])
+        whole_mm3[mine] = defect_volumes(
+            boxes, [regions[k].volume_mm3 for k in mine], [regions[k].skipped for k in mine]
+        )
     return whole_mm3
 
 

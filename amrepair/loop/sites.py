@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from amrepair.detect.skipped import PlannedBeads
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop
 from amrepair.repair import Site
@@ -39,17 +40,17 @@ def sites(
         if stop.layer_index is None:
             return Site(template, setup, grid, build_from_template)
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
-        planned = None
-        if by_beads:
-            beads = job.beads
-            done = (beads.line < stop.line) & (beads.layer >= 0)
-            planned = PlannedSdf.from_beads(
-                template_from_build.apply(beads.start_mm[done]),
-                template_from_build.apply(beads.end_mm[done]),
-                beads.section_mm2[done],
-                beads.height_mm[done],
-            )
+        beads = job.beads
+        done = (beads.line < stop.line) & (beads.layer >= 0)
+        start, end = (
+            template_from_build.apply(place[done]) for place in (beads.start_mm, beads.end_mm)
+        )
+        section, height = beads.section_mm2[done], beads.height_mm[done]
+        planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
+        lines = PlannedBeads(start, end, section / np.maximum(height, 1e-6), height).recent()
         below = template.below_z(z_mm)
-        return Site(below, setup, grid, build_from_template, stop.z_mm, planned=planned)
+        return Site(
+            below, setup, grid, build_from_template, stop.z_mm, planned=planned, beads=lines
+        )
 
     return at

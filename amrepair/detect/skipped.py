@@ -1,0 +1,143 @@
+"""Skipped beads: stretches of the job's own lines where rays say that no plastic is.
+
+A line one bead wide beside a wall lies so near to the template's surface that no distance to it
+tells that it is gone; along the line, looks at its own middle do. What follows is for the deficit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from amrepair.detect.evidence import SOLID_MM, Evidence
+from amrepair.template.port import Template
+
+STEP_MM = 0.25
+LOOKS = 5  # along a line that are judged together: a millimetre and a quarter
+LEAST_MM = 1.5  # shorter stretches are seams, corners and curves
+# How far the middle of a bead lies in the open where it is gone, as a share of half its height.
+# Half of its plastic would put it at the surface, and noise is averaged over a stretch.
+GONE_SHARE = 0.4
+RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedBeads:
+    """Lines that should lie where a scan looks, template frame.
+
+    Attributes
+    ----------
+    start_mm, end_mm
+        (n, 3) nozzle positions; a bead hangs below them by its height.
+    width_mm, height_mm
+        (n,) of its section, a rectangle.
+    """
+
+    start_mm: Float[np.ndarray, "n 3"]
+    end_mm: Float[np.ndarray, "n 3"]
+    width_mm: Float[np.ndarray, " n"]
+    height_mm: Float[np.ndarray, " n"]
+
+    def recent(self) -> PlannedBeads:
+        """Those near the highest."""
+        high_mm = np.maximum(self.start_mm[:, 2], self.end_mm[:, 2])
+        near = high_mm > high_mm.max(initial=-np.inf) - RECENT_MM
+        return self.some(near)
+
+    def some(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> PlannedBeads:
+        """Some of them."""
+        return PlannedBeads(
+            self.start_mm[which], self.end_mm[which], self.width_mm[which], self.height_mm[which]
+        )
+
+    def holds(self, points_mm: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
+        """Which points lie in any of them."""
+        inside = np.zeros(len(points_mm), dtype=bool)
+        for a, b, wide, high in zip(
+            self.start_mm, self.end_mm, self.width_mm, self.height_mm, strict=True
+        ):
+            low = np.minimum(a, b) - np.array([0.5 * wide, 0.5 * wide, high])
+            top = np.maximum(a, b) + np.array([0.5 * wide, 0.5 * wide, 0.0])
+            ask = np.flatnonzero(((points_mm >= low) & (points_mm <= top)).all(axis=1))
+            along, away = b[:2] - a[:2], points_mm[ask, :2] - a[:2]
+            share = np.clip(away @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+            inside[ask] |= np.linalg.norm(away - share[:, None] * along, axis=1) <= 0.5 * wide
+        return inside
+
+
+def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> PlannedBeads:
+    """Stretches of beads that are not there.
+
+    Parameters
+    ----------
+    beads
+        What the job has laid, template frame.
+    evidence
+        Of a scan whose sensors are known; without rays nothing is said.
+    """
+    lines = beads.recent()
+    length_mm = np.linalg.norm(lines.end_mm - lines.start_mm, axis=1)
+    lines, length_mm = lines.some(length_mm >= LEAST_MM), length_mm[length_mm >= LEAST_MM]
+    if not evidence.has_rays or not len(length_mm):
+        return lines.some(np.zeros(len(length_mm), dtype=bool))
+    count = np.ceil(length_mm / STEP_MM).astype(np.int64)
+    line = np.repeat(np.arange(len(count)), count)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    share = (np.arange(len(line)) - first[line] + 0.5) / count[line]
+    half_mm = 0.5 * lines.height_mm[line]
+    middle = lines.start_mm[line] + share[:, None] * (lines.end_mm - lines.start_mm)[line]
+    middle[:, 2] -= half_mm
+    # rays alone cost little; where they say "open", surfaces tell how far
+    open_mm = evidence.rays_say(middle)
+    ask = np.flatnonzero(open_mm > 0)
+    open_mm = np.minimum(open_mm, 0.0)
+    if len(ask):
+        open_mm[ask] = evidence.clearance(middle[ask], template.distance(middle[ask]))[0]
+    # what nobody looked into is there
+    open_share = np.where(open_mm <= SOLID_MM + 1e-6, -1.0, np.clip(open_mm / half_mm, -1.0, 1.0))
+    gone = _together(open_share, line) >= GONE_SHARE
+    return _stretches(lines, line, share, gone, length_mm / count)
+
+
+def _together(
+    value: Float[np.ndarray, " m"], line: Int[np.ndarray, " m"]
+) -> Float[np.ndarray, " m"]:
+    """(m,) the best mean of `LOOKS` neighbours on one line that each belongs to."""
+    m = len(value)
+    whole = np.full(m, -np.inf)
+    if m < LOOKS:
+        return whole
+    total = np.concatenate([[0.0], np.cumsum(value)])
+    mean = (total[LOOKS:] - total[:-LOOKS]) / LOOKS
+    mean[line[LOOKS - 1 :] != line[: m - LOOKS + 1]] = -np.inf
+    for k in range(LOOKS):
+        np.maximum(whole[k : k + len(mean)], mean, out=whole[k : k + len(mean)])
+    return np.where(value > 0, whole, -np.inf)  # an end that is there does not belong to it
+
+
+def _stretches(
+    lines: PlannedBeads,
+    line: Int[np.ndarray, " m"],
+    share: Float[np.ndarray, " m"],
+    gone: Bool[np.ndarray, " m"],
+    step_mm: Float[np.ndarray, " n"],
+) -> PlannedBeads:
+    """Neighbouring looks that say so, as one bead each."""
+    at = np.flatnonzero(gone)
+    if not len(at):
+        return lines.some(np.zeros(len(step_mm), dtype=bool))
+    begins = np.concatenate([[True], (np.diff(at) > 1) | (np.diff(line[at]) != 0)])
+    a, b = at[begins], at[np.append(begins[1:], True)]
+    long_ = (b - a + 1) * step_mm[line[a]] >= LEAST_MM
+    a, b = a[long_], b[long_]
+    which = line[a]
+    over = lines.end_mm[which] - lines.start_mm[which]
+    half = 0.5 * step_mm[which] / np.maximum(np.linalg.norm(over, axis=1), 1e-9)
+    return PlannedBeads(
+        lines.start_mm[which] + (share[a] - half)[:, None] * over,
+        lines.start_mm[which] + (share[b] + half)[:, None] * over,
+        lines.width_mm[which],
+        lines.height_mm[which],
+    )

@@ -1,0 +1,113 @@
+"""Lines of the job that were skipped, seen by the rays that went through them."""
+
+from __future__ import annotations
+
+import manifold3d as m3
+import numpy as np
+import pytest
+
+from amrepair.deficit import Deficit, compute_deficit
+from amrepair.detect import detect
+from amrepair.detect.skipped import PlannedBeads, skipped
+from amrepair.frames import Transform
+from amrepair.scans import Scan
+from tests import analytic
+
+SIGMA_MM = 0.03
+TOP_MM, WIDE_MM, HIGH_MM = 6.0, 0.42, 0.2
+BLOCK = analytic.box((0, 0, 0), (24, 18, TOP_MM))
+SENSORS = np.array([[-90.0, 9, 260], [114, 9, 260], [12.0, -100, 260], [12.0, 118, 260]])
+HERE = Transform.identity("build", "template")
+
+
+def lines(x0: float = 0.0, x1: float = 24.0) -> PlannedBeads:
+    """Three lines side by side along the block's front, in its last two layers."""
+    y = np.array([(k + 0.5) * WIDE_MM for k in range(3)] * 2)
+    z = np.repeat([TOP_MM, TOP_MM - HIGH_MM], 3)
+    start = np.stack([np.full(6, x0), y, z], axis=1)
+    end = np.stack([np.full(6, x1), y, z], axis=1)
+    return PlannedBeads(start, end, np.full(6, WIDE_MM), np.full(6, HIGH_MM))
+
+
+def without(x0: float, x1: float, line: int, deep_mm: float) -> m3.Manifold:
+    """The block without a stretch of one of the lines."""
+    gone = m3.Manifold.cube((x1 - x0, WIDE_MM, deep_mm + 1.0))
+    return BLOCK.body - gone.translate((x0, line * WIDE_MM, TOP_MM - deep_mm))
+
+
+def scan_of(solid: m3.Manifold, seed: int) -> Scan:
+    points, who = analytic.ray_scan(solid, SENSORS, spacing_mm=0.25, sigma_mm=SIGMA_MM, seed=seed)
+    return Scan(points, SIGMA_MM, "template", None, SENSORS.copy(), who)
+
+
+def deficit_of(scan: Scan, beads: PlannedBeads | None) -> Deficit:
+    anomaly = detect(scan, BLOCK, allowance_mm=0.1, top_z_mm=TOP_MM)
+    return compute_deficit(scan, BLOCK, anomaly, build_from_template=HERE, beads=beads)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_skipped_line_beside_a_wall_is_missing(seed: int) -> None:
+    """So near to the wall that its floor was no farther from the template than noise."""
+    scan = scan_of(without(8.0, 12.0, 0, 2 * HIGH_MM), seed)
+    assert deficit_of(scan, None).missing_mm3 == 0.0
+    found = deficit_of(scan, lines())
+    true_mm3 = 4.0 * WIDE_MM * 2 * HIGH_MM
+    assert found.missing_mm3 == pytest.approx(true_mm3, rel=0.35)
+    assert any(region.skipped for region in found.regions)
+    # in place: little of it lies elsewhere
+    around = m3.Manifold.cube((4.6, WIDE_MM + 0.6, 1.0))
+    around = around.translate((7.7, -0.3, TOP_MM - 2 * HIGH_MM - 0.15))
+    assert (found.missing - around).volume() < 0.2 * true_mm3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lines_that_lie_where_they_should_are_not_skipped(seed: int) -> None:
+    scan = scan_of(BLOCK.body, seed)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    assert len(skipped(lines(), anomaly.evidence, BLOCK).width_mm) == 0
+
+
+def test_a_line_with_half_of_its_plastic_is_not_skipped() -> None:
+    scan = scan_of(without(2.0, 22.0, 1, 0.5 * HIGH_MM), 0)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    assert len(skipped(lines(), anomaly.evidence, BLOCK).width_mm) == 0
+
+
+def test_the_stretch_that_is_gone_is_told_where_it_is() -> None:
+    scan = scan_of(without(8.0, 12.0, 1, 2 * HIGH_MM), 0)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    gone = skipped(lines(), anomaly.evidence, BLOCK)
+    mine = gone.start_mm[:, 1] == 1.5 * WIDE_MM
+    assert gone.start_mm[mine, 0].min() == pytest.approx(8.0, abs=0.5)
+    assert gone.end_mm[mine, 0].max() == pytest.approx(12.0, abs=0.5)
+    # of those beside it at most the stretch that is open to the side
+    length_mm = gone.end_mm[:, 0] - gone.start_mm[:, 0]
+    assert length_mm[mine].sum() > length_mm[~mine].sum()
+
+
+def test_without_rays_nothing_is_said_of_lines() -> None:
+    points, normals = analytic.noisy_scan_points(
+        without(8.0, 12.0, 1, 2 * HIGH_MM), spacing_mm=0.2, sigma_mm=SIGMA_MM, seed=0
+    )
+    scan = Scan(points, SIGMA_MM, "template", normals)
+    anomaly = detect(scan, BLOCK)
+    assert anomaly.evidence is not None
+    assert len(skipped(lines(), anomaly.evidence, BLOCK).width_mm) == 0
+
+
+def test_a_point_is_in_a_line_by_its_section() -> None:
+    one = lines(2.0, 8.0).some(np.array([1]))
+    middle = 1.5 * WIDE_MM
+    points = np.array(
+        [
+            [5.0, middle, TOP_MM - 0.1],
+            [5.0, middle + 0.2, TOP_MM - 0.19],
+            [5.0, middle + 0.22, TOP_MM - 0.1],
+            [5.0, middle, TOP_MM - 0.21],
+            [8.3, middle, TOP_MM - 0.1],
+        ]
+    )
+    assert one.holds(points).tolist() == [True, True, False, False, False]
