@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from amrepair.deficit.heights import as_built_heights, standing_heights
+from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.detection import ON_PLANE_MM
@@ -198,7 +198,9 @@ def compute_deficit(
             images=evidence.images,
         )
         expected: Any = template.solid()
-        return standing_heights(seen, expected.transform(matrix), missing, excess)
+        solid = standing_heights(seen, expected.transform(matrix), missing, excess)
+        points_mm = build_from_template.apply(scan.points_mm)
+        return with_what_stands_out(solid, points_mm, scan.sigma_mm, evidence.spacing_mm)
 
     return Deficit(
         missing=missing,

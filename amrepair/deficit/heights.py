@@ -7,6 +7,7 @@ part stands as it was designed, and that margin; where it was designed open, not
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -14,6 +15,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from amrepair.detect.rays import RangeImage
 from amrepair.frames import Transform, box_corners
@@ -38,13 +40,17 @@ TRUST_MM = 0.3
 NOISE_MM = 0.1
 # What a cell with a single point may be off: of some thousand under the head one is so far.
 CHANCE_MM = 0.2
-STEEP_MM = 1.0  # between the highest and the lowest beside a wall
 # Two layers: thinner material over a void is the solids' own rounding at its rim.
 FILM_MM = 0.4
 LEAST_FILM_MM = 0.1  # that the scan can tell from nothing
-FIN_CELLS, UNSEEN_FIN_CELLS = 2, 4
+# In fine cells: thinner than a bead, and than two, of which points would have been seen.
+FIN_CELLS, UNSEEN_FIN_CELLS = 2, 8
 CHANCE_CELLS = 5
 MOST_STEPS = 64  # by which what nobody saw is followed down
+# In the scan's noise: how far a point is off upwards or aside, and tells of nothing.
+OFF_SIGMA = 2.0
+# On any surface so many others lie within so many spacings: 4 π are expected on a flat one.
+OTHERS, BESIDE_SPACINGS = 2, 2.0
 
 
 def as_built_heights(
@@ -170,7 +176,8 @@ def standing_heights(
     z_mm = np.where(beside, _without_fins(z_mm, FIN_CELLS), z_mm)
     # nor is one there that no wall is thin enough for, and of which no point was seen
     near = ndimage.binary_dilation(~untouched, np.ones((2 * UNSEEN_FIN_CELLS - 1,) * 2))
-    unseen = near & ~ndimage.binary_dilation(seen.seen & (seen.z_mm > 0.0))[at]
+    seen_mm = ndimage.maximum_filter(np.where(seen.seen, seen.z_mm, -np.inf), 3)[at]
+    unseen = near & (seen_mm < z_mm - TRUST_MM)
     z_mm = np.where(unseen, _without_fins(z_mm, UNSEEN_FIN_CELLS), z_mm)
     if not excess.is_empty():
         z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
@@ -179,17 +186,6 @@ def standing_heights(
     around = 2 * math.ceil(BY_WALL_CELLS * seen.cell_mm / cell_mm) + 1
     highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
     by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
-    # but a lip that they round off stands as high as it was seen
-    lip = (z_mm > (highest + lowest) / 2) & (np.abs(seen.z_mm[at] - highest) < TRUST_MM)
-    over_mm = seen.z_mm[at] - highest
-    lip_mm = np.where(over_mm < CHANCE_MM, np.minimum(seen.z_mm[at], highest), seen.z_mm[at])
-    z_mm = np.where(by_wall & lip, np.maximum(z_mm, lip_mm), z_mm)
-    # over a wall, points on it have drawn its cell down: what nothing was taken from ends it
-    plane_mm = ndimage.maximum_filter(np.where(untouched, z_mm, 0.0), around)
-    drawn = by_wall & lip & (np.minimum(plane_mm, highest) - lowest > STEEP_MM)
-    drawn &= np.abs(seen.z_mm[at] - plane_mm) < TRUST_MM
-    raised_mm = np.minimum(seen.z_mm[at] + 0.5 * TOP_BAND_MM, plane_mm)
-    z_mm = np.where(drawn, np.maximum(z_mm, raised_mm), z_mm)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
     off_mm = seen.z_mm[at] - z_mm
     agrees = untouched & ((np.abs(off_mm) < NOISE_MM) | _by_chance(off_mm, around))
@@ -201,6 +197,56 @@ def standing_heights(
     rim = ndimage.binary_dilation(~untouched, np.ones((around, around)))
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
+
+
+def with_what_stands_out(
+    field: HeightField, points_mm: Float[np.ndarray, "n 3"], sigma_mm: float, spacing_mm: float
+) -> HeightField:
+    """Raised to the points that its surface does not explain by the scan's noise.
+
+    Solids round off lips, and cells average what is in them: a crest, a splinter or a burr thinner
+    than the scan's spacing reads low, by up to its height. No bead can be laid on it, but the head
+    may run into it. A point is explained if the field, as near to it as noise moves points aside,
+    is as high. One that is alone is a reflection in mid-air.
+
+    Parameters
+    ----------
+    points_mm
+        What was seen, build frame.
+    spacing_mm
+        Mean distance between neighbouring points.
+    """
+    off_mm = OFF_SIGMA * sigma_mm
+    high = points_mm[points_mm[:, 2] - off_mm > field.sample(points_mm[:, :2])]
+    around_mm = np.full(len(high), -np.inf)
+    for aside in itertools.product((-off_mm, 0.0, off_mm), repeat=2):
+        np.maximum(around_mm, field.sample(high[:, :2] + np.array(aside)), out=around_mm)
+    out = high[high[:, 2] - off_mm > around_mm]
+    out = out[_in_company(out, points_mm, BESIDE_SPACINGS * spacing_mm)]
+    index = field.cells_of(out[:, :2])
+    inside = ((index >= 0) & (index < field.shape)).all(axis=1)
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    np.maximum.at(z_mm, tuple(index[inside].T), out[inside, 2] - off_mm)
+    return field.raised(z_mm)
+
+
+def _in_company(
+    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "n 3"], within_mm: float
+) -> Bool[np.ndarray, " k"]:
+    """Which of a cloud's points have others of it within a distance."""
+    if len(asked_mm) == 0:
+        return np.zeros(0, dtype=bool)
+    # the tree is built of what is near: columns as wide as the distance, and those around them
+    low = asked_mm[:, :2].min(axis=0) - 2 * within_mm
+    shape = ((np.ptp(asked_mm[:, :2], axis=0) + 4 * within_mm) / within_mm).astype(np.int64) + 1
+    near = np.zeros(shape, dtype=bool)
+    near[tuple(((asked_mm[:, :2] - low) / within_mm).astype(np.int64).T)] = True
+    near = ndimage.binary_dilation(near, np.ones((3, 3)))
+    column = np.floor((points_mm[:, :2] - low) / within_mm).astype(np.int64)
+    inside = ((column >= 0) & (column < shape)).all(axis=1)
+    column = np.where(inside[:, None], column, 0)
+    tree = cKDTree(points_mm[inside & near[column[:, 0], column[:, 1]]])
+    return np.asarray(tree.query(asked_mm, k=1 + OTHERS)[0][:, -1] <= within_mm)
 
 
 def _without_fins(z_mm: Float[np.ndarray, "ny nx"], cells: int) -> Float[np.ndarray, "ny nx"]:

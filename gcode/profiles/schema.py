@@ -15,7 +15,7 @@ Positive = Annotated[float, Field(gt=0)]
 Ratio = Annotated[float, Field(ge=0, le=1)]
 Xy = tuple[float, float]
 Xyz = tuple[float, float, float]
-_ROUND_SIDES = 16  # a circumscribed 16-gon is at most 2 % wider than the circle
+_ROUND_SIDES = 48  # 0.2 % beyond the circle
 
 
 class _Profile(BaseModel):

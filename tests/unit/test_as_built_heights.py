@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from amrepair.deficit import compute_deficit
-from amrepair.deficit.heights import _without_fins
+from amrepair.deficit.heights import _without_fins, standing_heights
 from amrepair.detect import faces
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -97,6 +97,43 @@ def test_a_stray_point_is_no_pole_and_a_pole_is_one() -> None:
     field = field_of(part, gone, np.array(strays + pole))
     assert heights(field, (3.6, 8.4), (3.6, 6.4)).max() < 2.3
     assert heights(field, (9.9, 10.5), (4.9, 5.5)).max() > 4.5
+
+
+def test_what_is_thinner_than_the_scan_is_fine_stands_as_high_as_it_was_seen() -> None:
+    """Cells took the mean of a crest and what lies beside it: the tip went 0.21 mm into one."""
+    part = box(0, 0, 0, 40, 30, 4)
+    splinter = box(15, 4.9, 0, 25, 5.1, 3.25)
+    field = field_of(part, box(15, -1, 3, 25, 10, 7) - splinter)
+    along = heights(field, (15.5, 24.5), (4.6, 5.5)).reshape(-1, 90).max(axis=0)
+    # a flat that comes over it is 1 mm across: five points of the scan lie on each such stretch
+    under = np.array([along[k : k + 10].max() for k in range(0, 90, 10)])
+    assert under.min() > 3.25 - 2.5 * 0.03
+    # while the flats around it stay where they are
+    for y in ((0.5, 3.5), (6.5, 9.0)):
+        assert heights(field, (16.5, 23.5), y).max() < 3.1
+
+
+def test_a_horn_that_is_left_is_no_reflection() -> None:
+    """A wedge between a pit and the part's side: what stood out by more than noise was dropped."""
+    part, pit = box(0, 0, 0, 30, 20, 6), m3.Manifold.cylinder(9.0, 8.0, 8.0, 128)
+    field = field_of(part, pit.translate((15.0, 7.85, 3.0)) ^ box(0, -1, 0, 31, 21, 9))
+    for x in (8.4, 21.4):  # 0.2 to 0.3 mm thick, 3 mm high, at the rim below y = 0.3
+        assert heights(field, (x, x + 0.2), (0.05, 0.2)).max() > 5.7
+
+
+def test_what_hangs_on_over_a_floor_that_was_seen_has_points_on_it_or_is_gone() -> None:
+    """The edge of a roof thinner than the erosion hung on, and kept the head from half a notch."""
+    part = box(0, 0, 0, 20, 20, 4) + box(8, 8, 4, 12, 12, 8)
+    edge = box(8, 9.8, 7.5, 12, 10.1, 8)
+    gone = box(8, 8, 4, 12, 12, 8) - edge
+    floor = HeightField.flat((20.0, 20.0), 0.25, z_mm=4.0)
+    left = standing_heights(floor, part, gone, m3.Manifold())
+    assert heights(left, (8.1, 11.9), (8.1, 11.9)).max() < 4.3
+    points_on_it = floor.z_mm.copy()
+    points_on_it[39:41, 32:48] = 7.9
+    seen = floor.raised(points_on_it)
+    stands = standing_heights(seen, part, gone, m3.Manifold())
+    assert heights(stands, (8.1, 11.9), (9.85, 10.05)).min() > 7.4
 
 
 def test_the_roof_of_a_hollow_goes_with_what_held_it() -> None:
