@@ -241,7 +241,9 @@ def _from_guess(
     bound_deg: float,
     rng: np.random.Generator,
 ) -> Refined:
-    levelled, on_bed = level_on_bed(scan.points_mm, template, guess.matrix)
+    levelled, on_bed = guess.matrix, False
+    if not getattr(template, "off_bed", False):  # a planned one is cut: its foot is in mid-air
+        levelled, on_bed = level_on_bed(scan.points_mm, template, guess.matrix)
     step = max(1, len(scan) // MOST_LOOKED_AT)
     points = _part_only(scan.points_mm[::step], template, levelled)
     if len(points) < LEAST_POINTS:

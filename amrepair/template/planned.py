@@ -37,6 +37,8 @@ class PlannedSdf:
         Corner of the grid and edge of a voxel.
     bounds_mm
         (2, 3) box of the beads within reach.
+    off_bed
+        Beads lie below them: its foot is not the bed's height.
     """
 
     origin_mm: Float[np.ndarray, " 3"]
@@ -44,6 +46,7 @@ class PlannedSdf:
     bounds_mm: Float[np.ndarray, "2 3"]
     _field: Float[np.ndarray, "x y z"] = field(repr=False)
     _solid: Bool[np.ndarray, "x y z"] = field(repr=False)
+    off_bed: bool = False
 
     @classmethod
     def from_beads(
@@ -104,7 +107,9 @@ class PlannedSdf:
             solid,
         )
         bounds = np.array([[low[0], low[1], foot_mm], [high[0], high[1], top_mm]])
-        return cls(origin, voxel_mm, bounds, _signed(solid, voxel_mm), solid)
+        return cls(
+            origin, voxel_mm, bounds, _signed(solid, voxel_mm), solid, off_bed=not near.all()
+        )
 
     @property
     def bias_mm(self) -> float:

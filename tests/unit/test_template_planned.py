@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from amrepair.align import align
+from amrepair.frames import Transform
 from amrepair.loop import plan_stops
 from amrepair.loop.sites import sites
 from amrepair.repair import plan_repair
+from amrepair.scans import Scan
 from amrepair.template import PlannedSdf
 from amrepair.template import planned_kernels as kernels
 from tests.unit.loop_bench import LAYER, Small, scan_of
@@ -103,3 +106,33 @@ def test_a_thick_bead_higher_up_does_not_lower_the_foot() -> None:
     planned = PlannedSdf.from_beads(start, end, 0.4 * height, height)
     assert planned.bounds_mm[0, 2] == pytest.approx(0.0, abs=1e-9)
     assert planned.bounds_mm[1, 2] == pytest.approx(0.8)
+
+
+def test_a_flange_below_a_cut_template_is_not_the_bed() -> None:
+    # regression: the foot of the last millimetres of beads lies in mid-air; a plate within a
+    # millimetre of that height was laid on it, and a clean screw 0.6 mm too high
+    layers, flange_mm = 30, 1.2
+    planned = beads_of_a_block(layers)
+    assert planned.off_bed
+    assert not beads_of_a_block(5).off_bed
+    assert abs(planned.bounds_mm[0, 2] - flange_mm) > 0.3
+    rng = np.random.default_rng(0)
+    top_mm = 0.2 * layers
+    low, high = planned.bounds_mm[0, :2], planned.bounds_mm[1, :2]
+    xy = np.stack(np.meshgrid(np.arange(-15.0, 25.0, 0.25), np.arange(-15.0, 21.0, 0.25)), -1)
+    xy = xy.reshape(-1, 2)
+    on_block = ((xy > low) & (xy < high)).all(axis=1)
+    z_mm = np.where(on_block, top_mm, flange_mm)
+    faces = [np.column_stack([xy, z_mm])]
+    up = np.arange(flange_mm, top_mm, 0.25)
+    for axis in (0, 1):
+        along = np.arange(low[1 - axis], high[1 - axis], 0.25)
+        side = np.zeros((len(along) * len(up), 3))
+        side[:, 1 - axis], side[:, 2] = np.repeat(along, len(up)), np.tile(up, len(along))
+        for at in (low[axis], high[axis]):
+            side[:, axis] = at
+            faces.append(side.copy())
+    points = np.concatenate(faces)
+    scan = Scan(points + rng.normal(0, 0.02, points.shape), 0.02, "build")
+    found = align(scan, planned, guess=Transform.identity("template", "build"), rng=rng)
+    assert found.template_from_scan.translation_mm[2] == pytest.approx(0.0, abs=0.05)
