@@ -114,7 +114,7 @@ def test_what_is_thinner_than_the_scan_is_fine_stands_as_high_as_it_was_seen() -
 
 
 def test_a_horn_that_is_left_is_no_reflection() -> None:
-    """A wedge between a pit and the part's side: what stood out by more than noise was dropped."""
+    """A wedge between a pit and the part's side, thinner than a cell, stands at its height."""
     part, pit = box(0, 0, 0, 30, 20, 6), m3.Manifold.cylinder(9.0, 8.0, 8.0, 128)
     field = field_of(part, pit.translate((15.0, 7.85, 3.0)) ^ box(0, -1, 0, 31, 21, 9))
     for x in (8.4, 21.4):  # 0.2 to 0.3 mm thick, 3 mm high, at the rim below y = 0.3
