@@ -145,7 +145,7 @@ def site_of(job: Job, layer: int, setup: PrintSetup) -> Site:
     start, end = beads.start_mm[done], beads.end_mm[done]
     section, height = beads.section_mm2[done], beads.height_mm[done]
     planned = PlannedSdf.from_beads(start, end, section, height)
-    lines = PlannedBeads(start, end, section / np.maximum(height, 1e-6), height).recent()
+    lines = PlannedBeads.recent(start, end, section, height)
     tops = [one.z_mm for one in job.layers]
     grid = LayerGrid.from_tops(tops, layer_height_mm=setup.process.layer_height_mm)
     return Site(planned, setup, grid, HERE, tops[layer], planned=planned, beads=lines)

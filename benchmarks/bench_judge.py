@@ -37,6 +37,7 @@ from amrepair.template import load_mesh, load_or_fit
 from gcode.errors import GcodeError
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
+from gcode.surfaces import HeightField
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.judge import judge
@@ -110,8 +111,6 @@ def solid_of(mesh: trimesh.Trimesh) -> Any:
 
 def tops_of(solid: Any) -> tuple[np.ndarray, np.ndarray]:
     """(ny, nx) tops of a solid by column, and the corner of the grid."""
-    from gcode.surfaces import HeightField
-
     field = HeightField.from_manifold(solid, CELL_MM, margin_mm=2.0)
     return field.z_mm, field.origin_mm
 

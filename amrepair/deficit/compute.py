@@ -8,7 +8,7 @@ averages say so. Empty space counts only where a ray crossed it or scanned surfa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import manifold3d
@@ -176,8 +176,7 @@ def compute_deficit(
             for piece in solid.decompose():
                 if piece.volume() >= CRUMB_MM3:
                     found.append(piece)
-                    region = _region(piece, label, template, build_from_template)
-                    regions.append(replace(region, skipped=_is_skipped(piece, gone)))
+                    regions.append(_region(piece, label, template, build_from_template, gone))
     matrix = build_from_template.matrix[:3]
     missing, excess = (
         manifold3d.Manifold.batch_boolean(found, manifold3d.OpType.Add).transform(matrix)
@@ -416,7 +415,11 @@ def _limits(
 
 
 def _region(
-    piece: manifold3d.Manifold, label: Label, template: Template, build_from_template: Transform
+    piece: manifold3d.Manifold,
+    label: Label,
+    template: Template,
+    build_from_template: Transform,
+    gone: PlannedBeads | None,
 ) -> Region:
     """Measures of one piece; its box in the build frame."""
     bounds = np.asarray(piece.bounding_box()).reshape(2, 3)
@@ -425,15 +428,16 @@ def _region(
     depth = min(float(np.ptp(bounds, axis=0).min()), 2 * volume / max(area, 1e-9))
     kind = classify(label, depth_mm=depth, area_mm2=area, box_mm=bounds, template=template)
     moved = piece.transform(build_from_template.matrix[:3])
-    region = Region(
+    return Region(
         label=label,
         type=kind,
         volume_mm3=volume,
         area_mm2=area,
         depth_mm=depth,
         box_mm=np.asarray(moved.bounding_box()).reshape(2, 3),
+        below_bead=volume < BEAD_MM3,
+        skipped=_is_skipped(piece, gone),
     )
-    return replace(region, below_bead=volume < BEAD_MM3)
 
 
 def _is_skipped(piece: manifold3d.Manifold, gone: PlannedBeads | None) -> bool:

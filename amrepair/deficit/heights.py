@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from amrepair.detect.rays import RangeImage
+from amrepair.detect.rays import RangeImage, clearances
 from amrepair.frames import Transform, box_corners
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -123,10 +123,7 @@ def _crossed(
         down_mm = np.maximum(z_mm[iy, ix] - step_mm, 0.0)
         xy_mm = low_mm[:2] + (np.stack([ix, iy], axis=1) + 0.5) * cell_mm
         points = template_from_build.apply(np.column_stack([xy_mm, down_mm]))
-        best, least = (np.full(len(points), -np.inf) for _ in range(2))
-        for image in images:
-            image.raise_clearance(points, best, least)
-        empty = least > NOISE_MM
+        empty = clearances(images, points, -np.inf)[1] > NOISE_MM
         iy, ix = iy[empty], ix[empty]
         z_mm[iy, ix] = down_mm[empty]
         further = down_mm[empty] > 0

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
-from amrepair.detect.rays import RangeImage, range_images
+from amrepair.detect.rays import RangeImage, clearances, range_images
 from amrepair.detect.surfels import Surfels
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -106,11 +106,7 @@ class Evidence:
         self, points_mm: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """The emptiest of what the range images say, and of their cautious answers."""
-        best = np.full(len(points_mm), SOLID_MM)
-        least = best.copy()
-        for image in self.images:
-            image.raise_clearance(points_mm, best, least)
-        return best, least
+        return clearances(self.images, points_mm, SOLID_MM)
 
     def _sharpened(
         self,

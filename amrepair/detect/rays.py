@@ -86,6 +86,19 @@ def range_images(scan: Scan) -> tuple[RangeImage, ...]:
         return tuple(image for image in found if image is not None)
 
 
+def clearances(
+    images: tuple[RangeImage, ...], points_mm: Float[np.ndarray, "n 3"], unseen_mm: float
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The emptiest of what the range images say of points, and of their cautious answers, mm.
+
+    `unseen_mm` is the answer where none of them saw anything.
+    """
+    best, least = (np.full(len(points_mm), unseen_mm) for _ in range(2))
+    for image in images:
+        image.raise_clearance(points_mm, best, least)
+    return best, least
+
+
 def _image(scan: Scan, k: int) -> RangeImage | None:
     """Bin one sensor's points by direction; None where it saw next to nothing."""
     assert scan.sensors_mm is not None

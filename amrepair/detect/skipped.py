@@ -40,11 +40,19 @@ class PlannedBeads:
     width_mm: Float[np.ndarray, " n"]
     height_mm: Float[np.ndarray, " n"]
 
-    def recent(self) -> PlannedBeads:
-        """Those near the highest."""
-        high_mm = np.maximum(self.start_mm[:, 2], self.end_mm[:, 2])
-        near = high_mm > high_mm.max(initial=-np.inf) - RECENT_MM
-        return self.some(near)
+    @classmethod
+    def recent(
+        cls,
+        start_mm: Float[np.ndarray, "n 3"],
+        end_mm: Float[np.ndarray, "n 3"],
+        section_mm2: Float[np.ndarray, " n"],
+        height_mm: Float[np.ndarray, " n"],
+    ) -> PlannedBeads:
+        """Those near the highest, of beads as a job tells them: as wide as section over height."""
+        high_mm = np.maximum(start_mm[:, 2], end_mm[:, 2])
+        width_mm = section_mm2 / np.maximum(height_mm, 1e-6)
+        every = cls(start_mm, end_mm, width_mm, height_mm)
+        return every.some(high_mm > high_mm.max(initial=-np.inf) - RECENT_MM)
 
     def some(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> PlannedBeads:
         """Some of them."""
@@ -73,13 +81,12 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     Parameters
     ----------
     beads
-        What the job has laid, template frame.
+        What the job has laid last, template frame.
     evidence
         Of a scan whose sensors are known; without rays nothing is said.
     """
-    lines = beads.recent()
-    length_mm = np.linalg.norm(lines.end_mm - lines.start_mm, axis=1)
-    lines, length_mm = lines.some(length_mm >= LEAST_MM), length_mm[length_mm >= LEAST_MM]
+    length_mm = np.linalg.norm(beads.end_mm - beads.start_mm, axis=1)
+    lines, length_mm = beads.some(length_mm >= LEAST_MM), length_mm[length_mm >= LEAST_MM]
     if not evidence.has_rays or not len(length_mm):
         return lines.some(np.zeros(len(length_mm), dtype=bool))
     count = np.ceil(length_mm / STEP_MM).astype(np.int64)
@@ -126,10 +133,9 @@ def _stretches(
 ) -> PlannedBeads:
     """Neighbouring looks that say so, as one bead each."""
     at = np.flatnonzero(gone)
-    if not len(at):
-        return lines.some(np.zeros(len(step_mm), dtype=bool))
-    begins = np.concatenate([[True], (np.diff(at) > 1) | (np.diff(line[at]) != 0)])
-    a, b = at[begins], at[np.append(begins[1:], True)]
+    begins = np.ones(len(at), dtype=bool)
+    begins[1:] = (np.diff(at) > 1) | (np.diff(line[at]) != 0)
+    a, b = at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
     long_ = (b - a + 1) * step_mm[line[a]] >= LEAST_MM
     a, b = a[long_], b[long_]
     which = line[a]

@@ -114,8 +114,7 @@ def typed(
     regions = []
     for region in plan.deficit.regions:
         # of a line that is gone many looks have told, not its depth
-        sure = 1.0 if region.skipped else 0.0
-        there = max(sure, _there(region.depth_mm, plan.deficit.tolerance_mm))
+        there = 1.0 if region.skipped else _there(region.depth_mm, plan.deficit.tolerance_mm)
         rim = _at_rim(plan, site, np.asarray(region.box_mm))
         kind = whole or _of_region(
             region, pieces[region.label], flow, job, line, at_rim=rim, layer_mm=layer_mm

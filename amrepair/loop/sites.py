@@ -47,7 +47,7 @@ def sites(
         )
         section, height = beads.section_mm2[done], beads.height_mm[done]
         planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
-        lines = PlannedBeads(start, end, section / np.maximum(height, 1e-6), height).recent()
+        lines = PlannedBeads.recent(start, end, section, height)
         below = template.below_z(z_mm)
         return Site(
             below, setup, grid, build_from_template, stop.z_mm, planned=planned, beads=lines
