@@ -303,9 +303,9 @@ def lay(
             break
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
-        foot, top = 0.0, np.inf
+        top = np.inf
         if share_of(axis, iy, ix) < 1.0:
-            foot, top = edge_span(
+            _, top = edge_span(
                 hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness,
                 gap_limit,
             )  # fmt: skip
@@ -315,8 +315,8 @@ def lay(
             hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit,
             bridges, cell,
         )  # fmt: skip
-        if top < np.inf:
-            bottom = max(bottom, foot)
+        if top < np.inf:  # pressed out sideways it hangs, as thick as the strand
+            bottom = max(bottom, z - thickness)
         if bottom < z:
             level = min(z, bottom + amount)
             stack(hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level)
@@ -437,7 +437,10 @@ def deposit(
             state[RUN_LENGTH] = 0.0
         if not chained and state[CARRY] > 0.0:
             pool, pool_next = grown(pool, pool_next, meta, room)
-            axis[4] = np.inf
+            if s == 0:  # of the strand before nothing is known
+                axis[4] = np.inf
+            axis[0] = (state[LAST_X] - grid[0]) / cell
+            axis[1] = (state[LAST_Y] - grid[1]) / cell
             lay(
                 hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
                 grid, state, floors, sunk, chosen, axis, state[LAST_X], state[LAST_Y],
