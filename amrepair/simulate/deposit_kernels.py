@@ -303,20 +303,17 @@ def lay(
             break
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
-        top = np.inf
-        if share_of(axis, iy, ix) < 1.0:
+        if not wide and share_of(axis, iy, ix) < 1.0:
             _, top = edge_span(
                 hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness,
                 gap_limit,
             )  # fmt: skip
-        if top < np.inf and not wide:
-            continue
+            if top < np.inf:
+                continue  # it has its share
         bottom = floor_under(
             hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit,
             bridges, cell,
         )  # fmt: skip
-        if top < np.inf:  # pressed out sideways it hangs, as thick as the strand
-            bottom = max(bottom, z - thickness)
         if bottom < z:
             level = min(z, bottom + amount)
             stack(hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level)
