@@ -132,7 +132,7 @@ class World:
         if len(motion) == 0:
             return 0.0
         volume_mm3 = self._pushed_mm(motion.filament_mm) * self.filament_mm2
-        thickness_mm = self._thickness_mm(motion, volume_mm3)
+        thickness_mm = self._thickness_mm(motion, volume_mm3, onto_cold=onto_cold)
         if onto_cold:
             self._state[LAYER] += 1.0  # at the height of the layer before it, but not of it
         none = np.zeros((0, 9))
@@ -262,16 +262,18 @@ class World:
         return np.diff(front)
 
     def _thickness_mm(
-        self, motion: MotionBatch, volume_mm3: Float[np.ndarray, " n"]
+        self, motion: MotionBatch, volume_mm3: Float[np.ndarray, " n"], *, onto_cold: bool
     ) -> Float[np.ndarray, " n"]:
         """Layer thickness of each move: the step to the highest layer laid below its height.
 
-        Bounded by what its own cross-section can fill, for moves that follow no layers.
+        Bounded by what its own cross-section can fill, for moves that follow no layers. A repair
+        follows the job's layers: it may lie between two of them, but makes none.
         """
         z_mm = motion.end_mm[:, 2]
         laid = volume_mm3 > 0
-        tops = np.union1d(self._layer_tops_mm, np.round(z_mm[laid], 3))
-        self._layer_tops_mm = tops
+        if not onto_cold or not len(self._layer_tops_mm):
+            self._layer_tops_mm = np.union1d(self._layer_tops_mm, np.round(z_mm[laid], 3))
+        tops = self._layer_tops_mm
         floor_mm = np.concatenate([[0.0], tops])
         below = floor_mm[np.searchsorted(tops, z_mm - 0.02, side="right")]
         length_mm = np.linalg.norm(motion.end_mm - motion.start_mm, axis=1)

@@ -152,6 +152,24 @@ def test_over_extrusion_is_conserved_and_rises_only_where_it_finds_no_room() -> 
     assert solid.top_mm().max() > 6 * HEIGHT_MM
 
 
+def test_a_repair_between_two_layers_makes_no_layer_of_its_own() -> None:
+    laid = []
+    for heights in ((2.0,), (1.92, 2.0)):
+        world, nozzle = World((60.0, 60.0)), Nozzle()
+        world.deposit(block((20.0, 20.0), 8, 9))  # the tenth layer is lacking
+        nozzle.at = np.array([0.0, 0.0, 5.0])
+        for z in heights:  # one bead beside another, far apart
+            y = 20.25 if z == 2.0 else 22.5
+            nozzle.go(20.5, y, z)
+            nozzle.go(23.0, y, z, 1.2 * SECTION_MM2)
+            nozzle.go(23.0, y, z + 3.0)
+        world.deposit(nozzle.batch(), onto_cold=True)
+        window = world.columns.box_window((21.0, 19.0), (22.5, 21.0))
+        laid.append(world.snapshot(window).thickness_mm())
+    # as wide as what it fills says, whatever lies at other heights beside it
+    assert np.abs(laid[1] - laid[0]).max() < 1e-9
+
+
 def test_bridge_hangs_at_its_own_thickness() -> None:
     world, nozzle = World((60.0, 60.0)), Nozzle()
     world.add(m3.Manifold.cube((5, 5, 4.0)).translate((10, 20, 0)))
