@@ -8,6 +8,9 @@ Results are lines of JSON in `--results`, one per case, so the table can be made
 parts are ours, three real (named by `AMREPAIR_DATA`); they are scaled so that a case takes seconds
 to a minute. Truth is the world against a reference printed by the same motion without the defect.
 
+A look follows the last layer of a defect, as if it had been found late; `--each` takes one after
+each of its layers (`amrepair loop --every 1`), where what fell is not yet covered.
+
 The loop prints on the emulated firmware, fed in this process, and the job ends where the defect has
 been repaired: a case takes a tenth of the time. `--wire` prints all of it through the serial
 adapter and a pseudo-terminal; figures differ by no more than what wandering flow makes of them.
@@ -20,11 +23,12 @@ import json
 import os
 import statistics
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from amrepair.loop import LoopReport, Stop, run_loop
+from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.simulate.defects import parse_defect
 from amrepair.simulate.run import PreparedRun, prepare_run, set_stage, simulate_run
@@ -119,11 +123,18 @@ class CorePrinter(FilePrinter):
         return motion
 
 
-def run_without_wire(prepared: PreparedRun) -> tuple[LoopReport, DefectTruth]:
-    """The loop up to the stop at which the defect is seen."""
-    layer = prepared.defects[0].last_layer
-    stop = next(stop for stop in prepared.stops if stop.layer_index == layer)
-    printer = CorePrinter(prepared, stop)
+def stops_of(prepared: PreparedRun, *, each: bool) -> tuple[Stop, ...]:
+    """Where the loop looks: after the defect's last layer, or after each of its layers."""
+    defect = prepared.defects[0]
+    if each and defect.layers:
+        return plan_stops(prepared.job, defect.layers, final=False)
+    return (next(stop for stop in prepared.stops if stop.layer_index == defect.last_layer),)
+
+
+def run_without_wire(prepared: PreparedRun, *, each: bool) -> tuple[LoopReport, DefectTruth]:
+    """The loop up to the last stop at which the defect is seen."""
+    stops = stops_of(prepared, each=each)
+    printer = CorePrinter(prepared, stops[-1])
     stage = set_stage(prepared, printer.take_motion)
     report = run_loop(
         prepared.job,
@@ -137,14 +148,14 @@ def run_without_wire(prepared: PreparedRun) -> tuple[LoopReport, DefectTruth]:
             prepared.setup,
             by_beads=prepared.by_beads,
         ),
-        stops=(stop,),
+        stops=stops,
         max_iterations=MAX_ITERATIONS,
         seed=prepared.seed,
     )
     return report, stage.truth[0]
 
 
-def run_case(case: Case, process: str, *, wire: bool) -> dict[str, Any]:
+def run_case(case: Case, process: str, *, wire: bool, each: bool = False) -> dict[str, Any]:
     """Print, break and mend one part; what became of it."""
     part, kind, seed = case
     began = time.perf_counter()
@@ -156,32 +167,36 @@ def run_case(case: Case, process: str, *, wire: bool) -> dict[str, Any]:
         run = simulate_run(prepared, max_iterations=MAX_ITERATIONS)
         report, truth = run.report, run.truth[0]
     else:
-        report, truth = run_without_wire(prepared)
+        report, truth = run_without_wire(prepared, each=each)
     return (
         {"part": part, "defect": kind, "seed": seed, "process": process}
-        | figures(report, truth)
+        | figures(report, truth, prepared.defects[0].layers)
         | {"seconds": round(time.perf_counter() - began, 1)}
     )
 
 
-def figures(report: LoopReport, truth: DefectTruth) -> dict[str, Any]:
-    """What the table needs of one run with one defect."""
-    looks = [look for look in report.looks if look.stop.label == truth.label]
-    elsewhere = [look for look in report.looks if look.stop.label != truth.label]
-    first = looks[0].plan
+def figures(report: LoopReport, truth: DefectTruth, layers: Sequence[int]) -> dict[str, Any]:
+    """What the table needs of one run with one defect in some layers."""
+    looks, elsewhere = [], []
+    for look in report.looks:
+        here = look.stop.label == truth.label or look.stop.layer_index in layers
+        (looks if here else elsewhere).append(look)
+    first = {look.stop.label: look.plan for look in reversed(looks)}.values()
+    passes = Counter(look.stop.label for look in looks if look.printed)
     return {
         "missing_mm3": round(truth.missing_mm3, 2),
-        "deficit_mm3": round(first.deficit.missing_mm3, 2),
+        "deficit_mm3": round(sum(plan.deficit.missing_mm3 for plan in first), 2),
         "beads_mm3": round(
             sum(k.plan.patch.beads_mm3 for k in looks if k.printed and k.plan.patch), 2
         ),
-        "unreachable_mm3": round(first.unreachable_mm3, 2),
+        "unreachable_mm3": round(sum(plan.unreachable_mm3 for plan in first), 2),
         "filled_ratio": round(truth.filled_mm3 / truth.missing_mm3, 4),
         "added_ratio": round(truth.added_mm3 / truth.missing_mm3, 4),
         "surface_ratio": round(truth.surface_ratio, 4),
-        "iterations": sum(look.printed for look in looks),
+        "iterations": max(passes.values(), default=0),
         "elsewhere": sum(look.printed for look in elsewhere),
-        "refused": first.refused,
+        "refused": "; ".join(plan.refused for plan in first if plan.refused),
+        "ended": report.stopped,
     }
 
 
@@ -217,6 +232,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--process", default="repair_0.20")
     parser.add_argument("--results", type=Path, default=Path("out/closed-loop.jsonl"))
+    parser.add_argument("--each", action="store_true", help="a look after each layer of a defect")
     parser.add_argument("--wire", action="store_true", help="through the serial adapter, all of it")
     parser.add_argument("--table", action="store_true")
     args = parser.parse_args()
@@ -228,7 +244,7 @@ def main() -> None:
     if args.case:
         todo = [(args.case[0], args.case[1], int(args.case[2]))]
     for case in todo:
-        row = run_case(case, args.process, wire=args.wire)
+        row = run_case(case, args.process, wire=args.wire, each=args.each)
         rows.append(row)
         with args.results.open("a") as file:
             file.write(json.dumps(row) + "\n")

@@ -158,10 +158,7 @@ def standing_heights(
     )
     columns = [_columns(solid, fine) for solid in (expected, missing)]
     z_mm = raster_kernels.column_rest(*columns[0], *columns[1], FILM_MM, 0.0).reshape(ny, nx)
-    x, y = fine.centres_mm()
-    cells = seen.cells_of(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    cells = np.clip(cells, 0, np.array(seen.shape) - 1)
-    at = (cells[:, 0].reshape(fine.shape), cells[:, 1].reshape(fine.shape))
+    at = _cells_over(seen, fine)
     # a film that the scan sees, around there too, is what is left of the part
     films = raster_kernels.column_rest(*columns[0], *columns[1], LEAST_FILM_MM, 0.0).reshape(ny, nx)
     # a few cells without a point on it among others are chance
@@ -172,7 +169,7 @@ def standing_heights(
     beside = ~ndimage.binary_erosion(untouched, np.ones((3, 3)), border_value=1)
     z_mm = np.where(beside, _without_fins(z_mm, FIN_CELLS), z_mm)
     # nor is one there that no wall is thin enough for, and of which no point was seen
-    near = ndimage.binary_dilation(~untouched, np.ones((2 * UNSEEN_FIN_CELLS - 1,) * 2))
+    near = ndimage.maximum_filter(~untouched, 2 * UNSEEN_FIN_CELLS - 1)
     seen_mm = ndimage.maximum_filter(np.where(seen.seen, seen.z_mm, -np.inf), 3)[at]
     unseen = near & (seen_mm < z_mm - TRUST_MM)
     z_mm = np.where(unseen, _without_fins(z_mm, UNSEEN_FIN_CELLS), z_mm)
@@ -191,9 +188,20 @@ def standing_heights(
     known = seen.seen[at]
     # where something is missing it was seen to be; below it there is what was expected, and at
     # its rim, where columns and cells do not end alike
-    rim = ndimage.binary_dilation(~untouched, np.ones((around, around)))
+    rim = ndimage.maximum_filter(~untouched, around)
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
+
+
+def _cells_over(
+    coarse: HeightField, fine: HeightField
+) -> tuple[Int[np.ndarray, "ny 1"], Int[np.ndarray, "1 nx"]]:
+    """Indices of the coarse field's cells under every cell of the fine one."""
+    x, y = fine.centres_mm()
+    ny, nx = coarse.shape
+    iy = np.floor((y - coarse.origin_mm[1]) / coarse.cell_mm).astype(np.int64)
+    ix = np.floor((x - coarse.origin_mm[0]) / coarse.cell_mm).astype(np.int64)
+    return np.clip(iy, 0, ny - 1)[:, None], np.clip(ix, 0, nx - 1)[None, :]
 
 
 def with_what_stands_out(
@@ -239,10 +247,13 @@ def _in_company(
     near = np.zeros(shape, dtype=bool)
     near[tuple(((asked_mm[:, :2] - low) / within_mm).astype(np.int64).T)] = True
     near = ndimage.binary_dilation(near, np.ones((3, 3)))
-    column = np.floor((points_mm[:, :2] - low) / within_mm).astype(np.int64)
-    inside = ((column >= 0) & (column < shape)).all(axis=1)
-    column = np.where(inside[:, None], column, 0)
-    tree = cKDTree(points_mm[inside & near[column[:, 0], column[:, 1]]])
+    lowest, highest = asked_mm[:, 2].min() - within_mm, asked_mm[:, 2].max() + within_mm
+    z = points_mm[:, 2]
+    others = points_mm[(z > lowest) & (z < highest)]
+    column = ((others[:, :2] - low) / within_mm).astype(np.int64)
+    inside = ((others[:, :2] >= low) & (column < shape)).all(axis=1)
+    others, column = others[inside], column[inside]
+    tree = cKDTree(others[near[column[:, 0], column[:, 1]]])
     return np.asarray(tree.query(asked_mm, k=1 + OTHERS)[0][:, -1] <= within_mm)
 
 

@@ -56,6 +56,8 @@ class Finding:
         How deep the head would run into it on the job's next moves; 0 if it clears it.
     box_mm
         Lowest and highest corner, build frame.
+    skipped
+        A line of the job that is not there lies in it: its room is a bead's.
     """
 
     kind: str
@@ -70,6 +72,7 @@ class Finding:
     hit_mm: float
     box_mm: tuple[tuple[float, float, float], tuple[float, float, float]]
     seen_twice: bool = False
+    skipped: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +145,7 @@ _NAMES = {
     "cover": "covered next by",
     "hit_mm": "in the head's way by",
     "seen_twice": "looked at twice",
+    "skipped": "where a line was skipped",
     "last_pass": "it was the last pass allowed",
     "stuck": "the last pass changed little",
     "little_left": "little is left",
@@ -182,6 +186,8 @@ ONE_LAYER = 1.75
 """What is lower than this, noise and all, lies within one layer."""
 LEAST_LAYERS = 0.2
 """Less than this is within what a layer's beads differ by themselves."""
+LEAST_HIT_MM3 = 0.1
+"""A drop 0.6 mm across: less bends away, or melts under the nozzle."""
 ENDS = (DefectType.DETACHED, DefectType.LAYER_SHIFT)
 BEYOND_MENDING = (*ENDS, DefectType.WARP, DefectType.CLOG)
 """What adding material cannot mend."""
@@ -209,7 +215,7 @@ FINDINGS: tuple[Row, ...] = (
         "a false alarm would cost the print"),
     Row("F3", Action.PAUSE, (_is("type", BEYOND_MENDING),),
         "adding material cannot mend it; somebody has to look"),
-    Row("F4", Action.PAUSE, (_EXCESS, _from("hit_mm", 1e-6)),
+    Row("F4", Action.PAUSE, (_EXCESS, _from("volume_mm3", LEAST_HIT_MM3), _from("hit_mm", 1e-6)),
         "the head would hit it on its next moves; cut it off, or end the print"),
     Row("F5", Action.GO_ON, (_EXCESS, _is("type", (DefectType.STRING,))),
         "strings come off by hand, and the nozzle melts through them"),
@@ -227,7 +233,8 @@ FINDINGS: tuple[Row, ...] = (
         "it hardly stands out from the noise"),
     Row("F10", Action.GO_ON, (_MISSING, _below("confidence", DOUBTFUL)),
         "two looks do not make it stand out from the noise"),
-    Row("F11", Action.FILL_WITH_NEXT, (_MISSING, _below("thickness_layers", THIN_LAYERS),
+    Row("F11", Action.FILL_WITH_NEXT, (_MISSING, _is("skipped", False),
+                                       _below("thickness_layers", THIN_LAYERS),
                                        _from("thickness_layers", LEAST_LAYERS),
                                        _below("height_layers", ONE_LAYER),
                                        _is("cover", Cover.SOLID)),

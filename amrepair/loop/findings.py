@@ -148,6 +148,7 @@ def findings(
                 hit_mm=hit,
                 box_mm=_corners(region.box_mm),
                 seen_twice=seen_twice,
+                skipped=region.skipped,
             )
         )
     return tuple(found)
@@ -180,6 +181,7 @@ def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int |
         cover=cover_of(job, layer_index, np.asarray(region.box_mm)),
         hit_mm=0.0,
         box_mm=_corners(region.box_mm),
+        skipped=region.skipped,
     )
     return judge(finding).action
 

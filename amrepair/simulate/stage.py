@@ -38,11 +38,11 @@ class DefectTruth:
     kind
         void, under_extrusion, chip, blob.
     label
-        The stop at which it was scanned.
+        The stop at which it was scanned, the last of them.
     missing_mm3
-        Volume that it took away, measured against the reference at that stop.
+        Volume that it took away, measured against the reference at the stops that saw it happen.
     filled_mm3
-        Of that volume, what is solid after the last repair of that stop.
+        Of that volume, what is solid after the last repair.
     excess_mm3
         Volume that it added.
     added_mm3
@@ -64,11 +64,11 @@ class DefectTruth:
 
 @dataclass(slots=True)
 class _Wound:
-    """A defect that has happened."""
+    """A defect that has happened; what it took away, by the stops at which it was first seen."""
 
     defect: PlacedDefect
     label: str
-    missing: IntervalMap
+    missing: list[IntervalMap]
     standing_out: IntervalMap
     excess_mm3: float
     filled_mm3: float = 0.0
@@ -128,6 +128,7 @@ class Stage:
             self._design = design.snapshot(self._window())
         self._wounds: list[_Wound] = []
         self._stops: list[str] = []
+        self._printed = -1.0  # layers of the job, up to this one
 
     @property
     def build_from_scanner(self) -> Transform:
@@ -141,7 +142,7 @@ class Stage:
             DefectTruth(
                 kind=str(wound.defect.kind),
                 label=wound.label,
-                missing_mm3=wound.missing.volume_mm3,
+                missing_mm3=sum(missing.volume_mm3 for missing in wound.missing),
                 filled_mm3=wound.filled_mm3,
                 excess_mm3=wound.excess_mm3,
                 added_mm3=wound.added_mm3,
@@ -176,7 +177,14 @@ class Stage:
 
     def _break(self, request: ScanRequest) -> None:
         """Let the defects of this stop happen, and take their measure."""
-        due = [d for d in self._defects if d.last_layer == request.layer_index]
+        printed = np.inf if request.layer_index is None else float(request.layer_index)
+        due = [
+            d
+            for d in self._defects
+            if d.last_layer == request.layer_index
+            or any(self._printed < layer <= printed for layer in d.layers)
+        ]
+        self._printed = printed
         for defect in due:
             if defect.removed is not None:
                 self.world.remove(defect.removed)
@@ -186,12 +194,19 @@ class Stage:
         mine, other = self.world.snapshot(window), self.reference.snapshot(window)
         missing, excess = other.minus(mine), mine.minus(other)
         for wound in self._wounds:
-            missing = missing.minus(wound.missing)
+            for earlier in wound.missing:
+                missing = missing.minus(earlier)
         for defect in due:
             own = missing.clipped(defect.box_mm)
             missing = missing.minus(own)
             extra_mm3 = excess.clipped(defect.box_mm).volume_mm3
-            self._wounds.append(_Wound(defect, request.label, own, excess, extra_mm3))
+            begun = next((wound for wound in self._wounds if wound.defect is defect), None)
+            if begun is None:
+                wound = _Wound(defect, request.label, [own], excess, extra_mm3)
+                self._wounds.append(wound)
+            else:
+                begun.label = request.label
+                begun.missing.append(own)
 
     def _measure(self, label: str) -> None:
         """How much of this stop's missing volume is solid now, and how well it sits."""
@@ -206,10 +221,11 @@ class Stage:
         even = _even(standing, wanted, 0.5 * self._layer_height_mm)
         around = np.array([[-1.0], [1.0]]) * AROUND_MM
         for wound in wounds:
-            wound.filled_mm3 = wound.missing.common(standing).volume_mm3
+            wound.filled_mm3 = sum(m.common(standing).volume_mm3 for m in wound.missing)
             added = extra.minus(wound.standing_out).clipped(wound.defect.box_mm + around)
             wound.added_mm3 = added.volume_mm3
-            over = wound.missing.thickness_mm() > LEAST_MISSING_MM
+            thickness_mm = sum(missing.thickness_mm() for missing in wound.missing)
+            over = np.asarray(thickness_mm) > LEAST_MISSING_MM
             wound.surface_ratio = float(even[over].mean()) if over.any() else 1.0
 
     def _window(self) -> Window:

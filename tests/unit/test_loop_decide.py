@@ -97,6 +97,16 @@ def test_the_gravest_counts_and_the_thin_waits_for_the_next_layer() -> None:
     assert {v.row for v in decision.changes_next} == {"F11", "F6"}
 
 
+def test_a_speck_in_the_heads_way_does_not_end_a_print() -> None:
+    # regression: 0.02 mm³ above the top, a reflection, asked for somebody at the printer
+    assert judge(replace(CASES["F4"], volume_mm3=0.02)).action is Action.GO_ON
+
+
+def test_where_a_line_was_skipped_a_bead_has_room_however_thin_the_scan_makes_it() -> None:
+    assert judge(THIN).action is Action.FILL_WITH_NEXT
+    assert judge(replace(THIN, skipped=True)).action is Action.FILL_NOW
+
+
 def test_a_decision_goes_to_the_record_with_all_that_it_rests_on() -> None:
     said = decide([judge(VOID)], Situation(Action.FILL_NOW)).to_json()
     assert said["action"] == "fill now"
