@@ -175,3 +175,43 @@ def test_truth_says_how_even_a_repair_is_and_what_it_added() -> None:
     assert truth.filled_mm3 == pytest.approx(12.0)
     assert truth.added_mm3 == pytest.approx(12 * 0.05)
     assert truth.surface_ratio == pytest.approx(3 / 4, abs=0.08)
+
+
+def test_truth_counts_what_each_layer_of_a_defect_took_away() -> None:
+    def lines(z: float) -> MotionBatch:
+        y = 20.0 + 0.4 * np.arange(20)
+        start = np.column_stack([np.full(20, 20.0), y, np.full(20, z)])
+        end = start + np.array([10.0, 0.0, 0.0])
+        pushed = np.full(20, 10.0 * 0.4 * 0.2 / (np.pi / 4 * 1.75**2))
+        return MotionBatch(start, end, pushed, np.full(20, 50.0), np.arange(20) * 1.0)
+
+    world = World((60.0, 60.0))
+    hole = np.array([[25.0, 24.0, 1.0, 0.0, 2.0, 2.0, -1.0, 1.0, 0.0]])
+    box = np.array([[22.5, 21.5, -1.0], [27.5, 26.5, 1.0]])
+    defect = PlacedDefect(DefectKind.VOID, (0, 1), hole, None, None, box)
+    identity = Transform.identity("build", "scanner")
+    waiting = [lines(0.2), MotionBatch.concatenate([]), lines(0.4)]
+    stage = Stage(
+        world,
+        defects=[defect],
+        scanner=SimulatedScanner(
+            world,
+            pose=ScannerPose(identity, identity),
+            sensors_mm=np.array([[30.0, 30.0, 200.0]]),
+            rng=np.random.default_rng(0),
+        ),
+        take_motion=lambda: waiting.pop(0),
+        box_mm=(17.0, 17.0, 33.0, 33.0),
+    )
+    one_layer_mm3 = np.pi * 2.0**2 * 0.2
+    stage.scan(ScanRequest("layer-000", 0, 0.2))
+    world.add(m3.Manifold.cylinder(0.2, 3.0, 3.0, 64).translate((25, 24, 0)))  # a perfect repair
+    stage.scan(ScanRequest("layer-000", 0, 0.2))
+    (first,) = stage.truth
+    assert first.missing_mm3 == pytest.approx(one_layer_mm3, rel=0.1)
+    assert first.filled_mm3 == pytest.approx(first.missing_mm3)
+    stage.scan(ScanRequest("layer-001", 1, 0.4))
+    (both,) = stage.truth
+    assert both.label == "layer-001"
+    assert both.missing_mm3 == pytest.approx(2 * one_layer_mm3, rel=0.1)
+    assert both.filled_mm3 == pytest.approx(first.filled_mm3)  # the second is still open
