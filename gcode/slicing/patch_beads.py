@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from manifold3d import CrossSection, FillRule
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -34,8 +34,12 @@ SPREAD_NOZZLES = 1.125
 # What is pressed out under the flat beside a wall goes on to the wall, where that is this near to
 # what it reaches: nowhere else has it to go.
 TO_WALL_MM = 0.2
-# Centre lines keep off the rim of where the tip may go: contours of cells are not exact.
-DRAWN_IN_CELLS = 0.75
+# Centre lines keep off the rim of where the tip may go: outlines round off the corners of its
+# cells, by about so much.
+DRAWN_MM = 0.035
+# A point that is not free is moved by no more than this; stretches between points that are free,
+# and are not so themselves, are halved so often.
+ASIDE_MM, HALVINGS = 0.15, 2
 ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 ROUNDING_MM = 2e-3  # more than the text's last digit
 ROUNDED_MM = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # whichever way it goes
@@ -72,7 +76,7 @@ class Drawn:
 
 def draw(
     thick_mm: Float[np.ndarray, "ny nx"],
-    free: Bool[np.ndarray, "ny nx"],
+    free: Bool[np.ndarray, "_ry _rx"],
     angle_rad: float,
     model: PatchModel,
     setup: PrintSetup,
@@ -81,15 +85,16 @@ def draw(
 ) -> Drawn | None:
     """Centre lines for the columns to fill, over those where the nozzle may be; None: nowhere.
 
-    Within `rings` perimeters the lines go at an angle.
+    Within `rings` perimeters the lines go at an angle. `free` is an answer of the model's reach.
     """
-    drawn_in = offset(contour((thick_mm > 0) & free, model), -DRAWN_IN_CELLS * model.cell_mm)
+    wanted = contour(thick_mm > 0, model)
+    drawn_in = offset(_free_over(wanted, free, model.reach) ^ wanted, -DRAWN_MM)
     if drawn_in.is_empty():
         return None
     height_mm = float(thick_mm[thick_mm > 0].mean())
     share_mm = spacing_of(max(setup.process.line_width_mm, 1.05 * height_mm), height_mm)
     # centres may go as far as the nozzle is free; the fill reaches half a line beyond them
-    region = offset(drawn_in, 0.5 * share_mm) ^ contour(thick_mm > 0, model)
+    region = offset(drawn_in, 0.5 * share_mm) ^ wanted
     return Drawn(*fill(region, share_mm, angle_rad, setup, rings=rings), height_mm)
 
 
@@ -102,15 +107,79 @@ def begun_inside(run: Bead, model: PatchModel) -> Bead:
     return run.started_at(int(np.argmax(model.beside_mm[cells[:, 1], cells[:, 0]])))
 
 
+def eased(beads: list[Bead], free: Bool[np.ndarray, "ry rx"], reach: Reach) -> list[Bead]:
+    """Beads moved a little aside wherever that brings them to where the nozzle may be.
+
+    Lines are drawn along rounded outlines of cells; dropped where they leave the cells themselves,
+    they would end at every corner.
+    """
+    if not beads:
+        return beads
+    nearest = _Nearest(np.concatenate([bead.xy_mm for bead in beads]), free, reach)
+    return [_eased(bead, nearest, free, reach) for bead in beads]
+
+
+def _eased(bead: Bead, nearest: _Nearest, free: Bool[np.ndarray, "ry rx"], reach: Reach) -> Bead:
+    xy, owner = divided(bead.xy_mm, _steps(bead))
+    xy, share = nearest.moved(xy), bead.share_mm[owner]
+    for _ in range(HALVINGS):
+        stuck = np.flatnonzero(~free_between(xy[:-1], xy[1:], free, reach))
+        if not len(stuck):
+            break
+        middles = nearest.moved(0.5 * (xy[stuck] + xy[stuck + 1]))
+        xy, share = np.insert(xy, stuck + 1, middles, axis=0), np.insert(share, stuck, share[stuck])
+    return Bead(xy, share, bead.role, bead.closed)
+
+
+class _Nearest:
+    """The cells where the tip may be that are nearest to places where it may not.
+
+    Parameters
+    ----------
+    points_mm
+        All that will be asked about lies in their box.
+    """
+
+    def __init__(
+        self, points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "ry rx"], reach: Reach
+    ) -> None:
+        self._free, self._reach = free, reach
+        margin = int(np.ceil(ASIDE_MM / reach.cell_mm)) + 1
+        at = (points_mm - reach.field.origin_mm) / reach.cell_mm
+        first = np.maximum(np.floor(at.min(axis=0)).astype(np.int64) - margin, 0)
+        last = np.maximum(np.ceil(at.max(axis=0)).astype(np.int64) + margin, 0)
+        near = free[first[1] : last[1], first[0] : last[0]]
+        self._corner_mm = reach.field.origin_mm + first * reach.cell_mm
+        self._index = None
+        if near.any() and not near.all():
+            self._index = ndimage.distance_transform_edt(
+                ~near, return_distances=False, return_indices=True
+            )
+
+    def moved(self, points_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Points; those that are not free in the middle of the nearest free cell, if it is near."""
+        stuck = np.flatnonzero(~surely_free(points_mm, self._free, self._reach))
+        if self._index is None or not len(stuck):
+            return points_mm
+        cell_mm = self._reach.cell_mm
+        cell = np.floor((points_mm[stuck] - self._corner_mm) / cell_mm).astype(np.int64)
+        cell = np.clip(cell, 0, np.array(self._index.shape[:0:-1]) - 1)
+        to = self._index[::-1, cell[:, 1], cell[:, 0]].T
+        to_mm = (to + 0.5) * cell_mm + self._corner_mm
+        near = np.hypot(*(to_mm - points_mm[stuck]).T) <= ASIDE_MM
+        moved_mm = points_mm.copy()
+        moved_mm[stuck[near]] = to_mm[near]
+        return moved_mm
+
+
 def free_runs(
     bead: Bead,
     is_free: Callable[[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]], Bool[np.ndarray, " m"]],
 ) -> list[Bead]:
     """The stretches of a bead along which the nozzle may be; asked from point to point."""
-    xy = bead.xy_mm
-    lengths = np.hypot(*np.diff(xy, axis=0).T)
-    count = np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
-    points, owner = divided(xy, count)
+    lengths = np.hypot(*np.diff(bead.xy_mm, axis=0).T)
+    count = _steps(bead)
+    points, owner = divided(bead.xy_mm, count)
     ok = is_free(points[:-1], points[1:])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
     pieces_mm = (lengths / count)[owner]
@@ -124,6 +193,12 @@ def free_runs(
         for a, b in zip(edges[::2], edges[1::2], strict=True)
         if pieces_mm[a:b].sum() >= LEAST_RUN_MM
     ]
+
+
+def _steps(bead: Bead) -> Int[np.ndarray, " m"]:
+    """How many steps each of a bead's pieces takes."""
+    lengths = np.hypot(*np.diff(bead.xy_mm, axis=0).T)
+    return np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
 
 
 def free_between(
@@ -189,7 +264,7 @@ def weighed(
         n = len(run.xy_mm) - 1
         own = slice(at, at + n)
         at += n
-        section = _smooth(volume[own] / np.maximum(lengths[own], 1e-9), closed=run.closed)
+        section = _smooth(volume[own], lengths[own], closed=run.closed)
         most = np.maximum(depth[own], LEAST_THICK_MM) * MOST_NOZZLES * nozzle_mm
         most = np.minimum(most, setup.printer.max_bead_section_mm2)
         given[own] = np.minimum(1.0, most / np.maximum(section, 1e-9))
@@ -200,11 +275,19 @@ def weighed(
     return chains, laid.reshape(thick.shape)
 
 
-def _smooth(values: Float[np.ndarray, " n"], *, closed: bool) -> Float[np.ndarray, " n"]:
-    """Means over three pieces: which of two pieces a column goes to is chance."""
-    if len(values) < 3:
-        return np.full(len(values), values.mean())
-    return np.asarray(ndimage.uniform_filter1d(values, 3, mode="wrap" if closed else "nearest"))
+def _smooth(
+    volume_mm3: Float[np.ndarray, " n"], length_mm: Float[np.ndarray, " n"], *, closed: bool
+) -> Float[np.ndarray, " n"]:
+    """Cross-sections, means over three pieces: which of two pieces a column goes to is chance.
+
+    The volume stays what it is, however long the pieces are.
+    """
+    mode = "wrap" if closed else "nearest"
+    volume, length = (
+        ndimage.uniform_filter1d(v, min(3, len(v)), mode=mode) for v in (volume_mm3, length_mm)
+    )
+    section = volume / np.maximum(length, 1e-9)
+    return np.asarray(section * volume_mm3.sum() / max(float(section @ length_mm), 1e-9))
 
 
 def _split(chain: Chain) -> list[Chain]:
@@ -219,6 +302,30 @@ def _split(chain: Chain) -> list[Chain]:
 
 def contour(mask: Bool[np.ndarray, "ny nx"], model: PatchModel) -> Any:
     """A region of columns as polygons, corners of the grid rounded off."""
+    return _outline(mask, model.origin_mm, model.cell_mm)
+
+
+def _free_over(wanted: Any, free: Bool[np.ndarray, "ry rx"], reach: Reach) -> Any:
+    """Where the tip may be, over a region and a little around it."""
+    if wanted.is_empty():
+        return wanted
+    box = np.array(wanted.bounds()).reshape(2, 2)
+    low, high = (box - reach.field.origin_mm) / reach.cell_mm
+    first = np.floor(low).astype(np.int64) - ROUNDED_CELLS
+    last = np.ceil(high).astype(np.int64) + ROUNDED_CELLS
+    a, b = np.maximum(first, 0), np.minimum(last, free.shape[::-1])
+    near = np.ones((last - first)[::-1], dtype=bool)  # outside the field nothing stands
+    if (a < b).all():
+        (x0, y0), (x1, y1) = a - first, b - first
+        near[y0:y1, x0:x1] = free[a[1] : b[1], a[0] : b[0]]
+    if near.all():
+        return wanted
+    return _outline(near, reach.field.origin_mm + first * reach.cell_mm, reach.cell_mm)
+
+
+def _outline(
+    mask: Bool[np.ndarray, "ay ax"], origin_mm: Float[np.ndarray, " 2"], cell_mm: float
+) -> Any:
     if not mask.any():
         return CrossSection()
     (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in mask.nonzero())
@@ -229,7 +336,7 @@ def contour(mask: Bool[np.ndarray, "ny nx"], model: PatchModel) -> Any:
     for line in measure.find_contours(smooth, 0.5):  # type: ignore[no-untyped-call]
         if len(line) < 4:
             continue
-        polygons.append((line[:-1, ::-1] + corner) * model.cell_mm + model.origin_mm)
+        polygons.append((line[:-1, ::-1] + corner) * cell_mm + origin_mm)
     if not polygons:
         return CrossSection()
     return CrossSection(polygons, FillRule.EvenOdd).simplify(SIMPLIFY_MM)

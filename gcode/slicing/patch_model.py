@@ -100,6 +100,13 @@ class PatchModel:
         )
         return np.maximum(below.reshape(self.shape), 0.0)
 
+    @property
+    def need_mm(self) -> Float[np.ndarray, "ny nx"]:
+        """How high the tip must at least be over each column."""
+        index, inside = self._tip_cells
+        need = np.where(inside, self.reach.need_mm[index[:, 0], index[:, 1]], -np.inf)
+        return need.reshape(self.shape)
+
     def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the nozzle may be, from an answer of `reach`."""
         return self.reach.free_in_cells(self._tip_cells, reach).reshape(self.shape)

@@ -21,6 +21,7 @@ from gcode.slicing.patch_beads import (
     Chain,
     begun_inside,
     draw,
+    eased,
     free_between,
     free_runs,
     weighed,
@@ -37,6 +38,8 @@ DEEP_RATIO = 1.6
 HOLD_MM = 0.45  # a line's width: how far a bead may hang over a hole beside what holds it
 SKIN_MM = 0.2  # about as thick as it gets
 NOT_LISTED_MM3 = 0.02
+# Of columns over a hollow, as many as open to the head at one height are worth a pass there.
+OPENING_MM2 = 1.0
 # A flat top: as much area, as wide, within so little height.
 FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
 ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
@@ -78,7 +81,8 @@ def plan_passes(
     ends = np.full(model.shape, np.inf)  # where a flat top lies, off the job's layers
     for flat_mm in flats:
         ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
-    heights = np.sort(np.concatenate([tops, flats]))
+    openings = _openings(model, np.concatenate([tops, flats]), most_mm)
+    heights = np.sort(np.concatenate([tops, flats, openings]))
     skin = skin_of(model, ~np.isfinite(ends)) if setup.process.nonplanar_top else None
     skin = _served(model, skin, setup)
     if skin is not None:
@@ -89,6 +93,8 @@ def plan_passes(
         later = tops[tops > z_mm + ROUNDING_MM]
         following = np.minimum(ends, float(later[0]) if len(later) else np.inf)
         here = ends > z_mm + ROUNDING_MM if on_grid else ends == z_mm
+        if (np.abs(openings - z_mm) < ROUNDING_MM).any():
+            here &= z_mm - model.surface_mm > DEEP_RATIO * most_mm
         one = _plan_pass(
             model, float(z_mm), here, following, most_mm, k, grid.layer_height_mm, setup
         )
@@ -128,6 +134,29 @@ def _flats(model: PatchModel, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndar
     return np.array(found)
 
 
+def _openings(
+    model: PatchModel, tops_mm: Float[np.ndarray, " n"], most_mm: float
+) -> Float[np.ndarray, " m"]:
+    """Heights between other passes at which the head first gets in over much that is hollow.
+
+    There beads grow out from what holds them by one more line before the next layer of the job:
+    what lies under them is lost, and up to a layer less of it.
+    """
+    need_mm = model.need_mm
+    hollow = need_mm - model.floor_mm > DEEP_RATIO * most_mm
+    hollow &= np.isfinite(model.top_mm) & (need_mm < model.top_mm)
+    steps = np.ceil(need_mm[hollow] / FLAT_MM).astype(np.int64)
+    if not len(steps):
+        return np.zeros(0)
+    area_mm2 = np.bincount(steps - steps.min()) * model.cell_mm**2
+    found: list[float] = []
+    for step in np.flatnonzero(area_mm2 >= OPENING_MM2)[::-1] + steps.min():
+        z_mm = float(step * FLAT_MM)
+        if np.abs(np.array([*tops_mm, *found]) - z_mm).min() >= LEAST_THICK_MM:
+            found.append(z_mm)
+    return np.array(found)
+
+
 def _plan_pass(
     model: PatchModel,
     z_mm: float,
@@ -143,12 +172,12 @@ def _plan_pass(
     if not thick.any():
         return None
     reach = model.reach.at(z_mm)
-    drawn = draw(thick, model.free_at(reach), SOLID_ANGLES_RAD[index % 2], model, setup)
+    drawn = draw(thick, reach, SOLID_ANGLES_RAD[index % 2], model, setup)
     if drawn is None:
         return None
     runs = [
         begun_inside(run, model)
-        for bead in drawn.beads
+        for bead in eased(drawn.beads, reach, model.reach)
         for run in free_runs(bead, lambda a, b: free_between(a, b, reach, model.reach))
     ]
     if not runs:
@@ -202,7 +231,8 @@ def _along_skin(
     setup: PrintSetup,
 ) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
     """Beads across the slope from the lowest up: the flat then reaches over what is still open."""
-    drawn = draw(thick, skin.columns, skin.across_rad, model, setup, rings=0)
+    anywhere = np.ones(model.reach.shape, dtype=bool)  # among the skin's columns
+    drawn = draw(thick, anywhere, skin.across_rad, model, setup, rings=0)
     beads = drawn.beads if drawn is not None else []
     runs = [run for bead in beads for run in free_runs(bead, skin.free_between)]
     if not runs:
@@ -240,7 +270,9 @@ def _due(
     active &= model.planar_top_mm > z_mm - 0.5 * layer_mm
     deep = active & (gap > DEEP_RATIO * most_mm)
     if deep.any():
-        held = _beside((active & ~deep) | (gap < most_mm), deep, HOLD_MM, model.cell_mm)
+        # from the edge of what holds it, not from the middle of its last column
+        hang_mm = HOLD_MM + 0.5 * model.cell_mm
+        held = _beside((active & ~deep) | (gap < most_mm), deep, hang_mm, model.cell_mm)
         lidded = np.minimum(thick, layer_mm)
         model.sunk_mm = np.where(deep & held, model.sunk_mm + thick - lidded, model.sunk_mm)
         thick = np.where(deep & held, lidded, thick)

@@ -99,8 +99,9 @@ def judge(
     welled = lost.sum()
     laid = state >= 2
     hanging = state == 3
+    # by what stands there, or by a bead that lies on something
     held = (
-        ndimage.binary_dilation(state == 2, iterations=round(bead_mm / cell))
+        ndimage.binary_dilation(before | (state == 2), iterations=round(bead_mm / cell))
         if hanging.any()
         else hanging
     )
