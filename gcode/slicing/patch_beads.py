@@ -15,6 +15,7 @@ from skimage import measure
 
 from gcode.moves import Role
 from gcode.profiles import PrintSetup
+from gcode.slicing import reach_kernels
 from gcode.slicing.beads import Bead, divided, spacing_of
 from gcode.slicing.infill import ring_beads, solid_fill
 from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES
@@ -115,8 +116,18 @@ def eased(beads: list[Bead], free: Bool[np.ndarray, "ry rx"], reach: Reach) -> l
     """
     if not beads:
         return beads
-    nearest = _Nearest(np.concatenate([bead.xy_mm for bead in beads]), free, reach)
-    return [_eased(bead, nearest, free, reach) for bead in beads]
+    walked = [divided(bead.xy_mm, _steps(bead))[0] for bead in beads]
+    starts, ends = (np.concatenate([xy[k] for xy in walked]) for k in (slice(-1), slice(1, None)))
+    ok = np.split(
+        free_between(starts, ends, free, reach), np.cumsum([len(xy) - 1 for xy in walked])[:-1]
+    )
+    if all(each.all() for each in ok):
+        return beads
+    nearest = _Nearest(np.concatenate(walked), free, reach)
+    return [
+        bead if each.all() else _eased(bead, nearest, free, reach)
+        for bead, each in zip(beads, ok, strict=True)
+    ]
 
 
 def _eased(bead: Bead, nearest: _Nearest, free: Bool[np.ndarray, "ry rx"], reach: Reach) -> Bead:
@@ -208,9 +219,24 @@ def free_between(
     reach: Reach,
 ) -> Bool[np.ndarray, " m"]:
     """Whether the nozzle may be all the way from one point to the next, at one height."""
-    between = start_mm + (end_mm - start_mm) * shares_of_step(reach)[:, None, None]
-    ok = surely_free(between.reshape(-1, 2), free, reach)
-    return np.asarray(ok.reshape(between.shape[:2]).all(axis=0))
+    return _free_along(start_mm, end_mm, shares_of_step(reach), free, reach)
+
+
+def _free_along(
+    start_mm: Float[np.ndarray, "m 2"],
+    end_mm: Float[np.ndarray, "m 2"],
+    shares: Float[np.ndarray, " k"],
+    free: Bool[np.ndarray, "_ry _rx"],
+    reach: Reach,
+) -> Bool[np.ndarray, " m"]:
+    start_mm, end_mm = (np.ascontiguousarray(xy, dtype=np.float64) for xy in (start_mm, end_mm))
+    corner_mm = np.asarray(reach.field.origin_mm, dtype=np.float64)
+    return np.asarray(
+        reach_kernels.free_along(
+            start_mm, end_mm, shares, np.ascontiguousarray(free), corner_mm, reach.cell_mm,
+            ROUNDING_MM,
+        )
+    )  # fmt: skip
 
 
 def shares_of_step(reach: Reach) -> Float[np.ndarray, " k"]:
@@ -222,8 +248,7 @@ def surely_free(
     points_mm: Float[np.ndarray, "n 2"], free: Bool[np.ndarray, "_ry _rx"], reach: Reach
 ) -> Bool[np.ndarray, " n"]:
     """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
-    near = (points_mm + ROUNDED_MM[:, None, :]).reshape(-1, 2)
-    return np.asarray(reach.free_at_points(near, free).reshape(4, -1).all(axis=0))
+    return _free_along(points_mm, points_mm, np.zeros(1), free, reach)
 
 
 def weighed(
