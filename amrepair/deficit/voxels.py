@@ -78,10 +78,10 @@ def solid_from_field(box: VoxelBox, field_mm: Float[np.ndarray, "x y z"]) -> man
     DeficitError
         If the surface is not a valid manifold.
     """
-    if not (field_mm < 0).any():
-        return manifold3d.Manifold()
     # exact zeros make triangles without area; a nanometre is far below any tolerance here
     field_mm = np.where(np.abs(field_mm) < 1e-6, 1e-6, field_mm)
+    if not (field_mm < 0).any():
+        return manifold3d.Manifold()
     limit = float(box.step_mm.max()) * 4
     padded = np.pad(np.clip(field_mm, -limit, limit), 1, constant_values=limit)
     extract: Any = measure.marching_cubes

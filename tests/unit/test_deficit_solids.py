@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from amrepair.deficit import Deficit, compute_deficit
+from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.detect import Label, detect
 from amrepair.errors import InputError
 from amrepair.frames import Transform, rotation_from_vector
@@ -283,3 +284,11 @@ def test_nothing_stands_higher_than_the_as_built_field_where_nobody_saw(seed: in
             -1,
         )
         assert found.as_built.sample(grid.reshape(-1, 2)).min() > top - 0.25
+
+
+def test_a_field_that_touches_zero_by_less_than_a_nanometre_is_no_solid() -> None:
+    # regression: a look at a clean layer ended with "surface level must be within data range"
+    box = VoxelBox.around(np.zeros(3), np.full(3, 2.0), thickness_mm=0.5, across=2)
+    field = np.full(box.shape, 0.3)
+    field[2, 2, 2] = -4e-7
+    assert solid_from_field(box, field).is_empty()
