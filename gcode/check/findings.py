@@ -35,7 +35,8 @@ class Refusal:
     def __str__(self) -> str:
         text = self.text.strip()
         shown = text if len(text) <= MOST_SHOWN else text[: MOST_SHOWN - 1] + "…"
-        return f"line {self.line} ({shown!r}): {self.what}: {self.value}, limit {self.limit}"
+        where = f"line {self.line} ({shown!r})" if shown else f"line {self.line}"
+        return f"{where}: {self.what}: {self.value}, limit {self.limit}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -147,9 +147,12 @@ class Judge:
         self._line, self._text = number, raw
         if not self._alone:
             return
-        for what, value_c in (("hotend", self._hotend_c), ("bed", self._bed_c)):
+        heaters = (("hotend", self._hotend_c, "M104 S0"), ("bed", self._bed_c, "M140 S0"))
+        for what, value_c, off in heaters:
             if value_c > 0:
-                self._refuse(f"{what} left on at the end", f"{value_c:g} °C", "0 °C")
+                self._refuse(
+                    f"{what} left on at the end, {off} is lacking", f"{value_c:g} °C", "0 °C"
+                )
 
     def _refuse(self, what: str, value: str, limit: str) -> None:
         self.refusals.append(Refusal(self._line, self._text, what, value, limit))

@@ -371,8 +371,8 @@ class SerialPrinter(GuardedConversation):
         )
         return LinkLostError(
             f"The link to {self.port} is lost: {why}; program lines up to "
-            f"{executed + 1} are acknowledged, {doubt}; find out where the printer is "
-            f"before going on.",
+            f"{executed + 1} are acknowledged, {doubt}; its heaters may be on: find out where the "
+            f"printer is before going on.",
             executed,
             last_sent,
             why=why,
