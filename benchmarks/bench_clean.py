@@ -6,7 +6,8 @@
 
 Every job is printed into the simulated world of `world.toml` (wandering flow, shrinkage, curl,
 noise, dropouts, outliers), scanned after every `--every` layers, and judged by its own planned
-beads, as the loop judges layers with sparse infill; a look that wants a repair is a false alarm.
+beads, as the loop judges layers with sparse infill; a look that wants a repair, or halts the job,
+is a false alarm.
 Jobs are the files of `--jobs`, those that `--slice` made of a part, and `PART:PROCESS` sliced by
 us. Lines of JSON in `--results`, one per job and call; a job goes on after the layers that it has
 there, and a call ends after `--minutes`.
@@ -30,6 +31,9 @@ import numpy as np
 
 from amrepair.detect.skipped import PlannedBeads
 from amrepair.frames import Transform
+from amrepair.loop.decide import Action, judge
+from amrepair.loop.findings import findings
+from amrepair.loop.kinds import typed
 from amrepair.repair import Site, plan_repair
 from amrepair.scans import ScanRequest
 from amrepair.simulate.flow import noisy_flow
@@ -53,6 +57,8 @@ FILES = ("cura_slicer", "orca_slicer", "plant-sign", "screw")
 PRUSA_PATTERNS = ("rectilinear", "grid", "gyroid", "honeycomb")
 # Cura's lines lie as many line widths apart as its own formulas say for 15 % (fdmprinter.def.json).
 CURA_PATTERNS = {"lines": 2.667, "grid": 5.333, "triangles": 8.0, "gyroid": 2.667}
+# A clean print that is stopped, or looked at twice, is as false an alarm as one that is repaired.
+HALTS = (Action.STOP, Action.PAUSE, Action.LOOK_AGAIN)
 MOST_CURL_MM = 0.05  # a quarter of a layer; by the world's parabola ends of 130 mm rise by 0.34
 HERE = Transform.identity("build", "template")
 FILAMENT_MM2 = float(np.pi / 4 * 1.75**2)
@@ -221,6 +227,11 @@ def run_job(
         looks += 1
         if plan.to_fill:
             alarms.append([layer, round(sum(r.volume_mm3 for r in plan.to_fill), 2)])
+        line = job.layers[layer].end_line
+        plan = typed(plan, job, site, line, scanner.build_from_scanner)
+        found = findings(plan, job, setup, layer_index=layer, line=line)
+        halting = [v for v in map(judge, found) if v.action in HALTS]
+        alarms += [[layer, f"{v.action}: {v.finding.type}, {v.row}"] for v in halting]
     return {
         "job": name,
         "layers": [after + 1, done],

@@ -338,6 +338,10 @@ def _solid_in_box(
         best[near] = evidence.surface_clearance(samples[near], f[near])
         # SOLID means "nobody knows": for excess the cautious answer is that nothing is there
         best[near] = np.where(best[near] <= -4.999, 10.0, best[near])
+        if evidence.has_rays:
+            # a slanting plane goes on beyond its points; what rays crossed is empty all the same
+            crossed = evidence.cautious(samples[near], f[near])
+            best[near] = np.maximum(best[near], crossed)
         cautious = best
     # solid = both negative: inside the template and outside the as-built part (or the reverse)
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)

@@ -262,6 +262,22 @@ def test_a_deep_hole_whose_bottom_nobody_saw_is_open_where_rays_entered_it() -> 
     assert z_mm.min() >= 0.0
 
 
+@pytest.mark.parametrize(("long_mm", "high_mm"), [(4.0, 3.0), (1.5, 4.5)])
+def test_excess_ends_where_rays_went_through(long_mm: float, high_mm: float) -> None:
+    """What droops into a pocket: its slope went on in mid-air, above the part's top and all."""
+    pocketed = analytic.difference(
+        analytic.box((0, 0, 0), (40, 30, 8)), analytic.box((10, 8, 2), (24, 22, 9))
+    )
+    outline = manifold3d.CrossSection([[(10, 2), (10 + long_mm, 2), (10 + long_mm, 2 + high_mm)]])
+    ramp = outline.extrude(12.0).rotate((90, 0, 0)).translate((0, 21, 0))
+    found = deficit_of(rays(pocketed.body + ramp, ASLANT), pocketed)
+    assert found.excess_mm3 == pytest.approx(abs(ramp.volume()), rel=0.2)
+    low, high = np.array(ramp.bounding_box()).reshape(2, 3)
+    box = np.array(found.excess.bounding_box()).reshape(2, 3)
+    assert (box[0] > low - 0.5).all()
+    assert (box[1] < high + 0.5).all()
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_stands_higher_than_the_as_built_field_where_nobody_saw(seed: int) -> None:
     """Pins that nobody expects, in holes that nobody looks into far enough."""
