@@ -358,12 +358,9 @@ def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Sca
 
 def _in_view(scan: Scan, site: Site) -> Scan:
     """What a planned template can judge: its own last millimetres; all of it otherwise."""
-    if site.planned is None:
-        return scan
-    low_mm = float(site.planned.bounds_mm[0, 2])
-    if low_mm < float(site.template.bounds_mm[0, 2]) + PLANNED_EDGE_MM:
+    if site.planned is None or not getattr(site.planned, "off_bed", False):
         return scan  # it reaches down to the bed: nothing was cut off
-    low_mm += PLANNED_EDGE_MM
+    low_mm = float(site.planned.bounds_mm[0, 2]) + PLANNED_EDGE_MM
     return _subset(scan, scan.points_mm[:, 2] > low_mm)
 
 

@@ -10,10 +10,12 @@ from amrepair.align import align
 from amrepair.frames import Transform
 from amrepair.loop import plan_stops
 from amrepair.loop.sites import sites
-from amrepair.repair import plan_repair
+from amrepair.repair import PLANNED_EDGE_MM, Site, _in_view, plan_repair
 from amrepair.scans import Scan
 from amrepair.template import PlannedSdf
 from amrepair.template import planned_kernels as kernels
+from gcode.profiles import load_setup
+from gcode.slicing.layers import LayerGrid
 from tests.unit.loop_bench import LAYER, Small, scan_of
 
 
@@ -136,3 +138,17 @@ def test_a_flange_below_a_cut_template_is_not_the_bed() -> None:
     scan = Scan(points + rng.normal(0, 0.02, points.shape), 0.02, "build")
     found = align(scan, planned, guess=Transform.identity("template", "build"), rng=rng)
     assert found.template_from_scan.translation_mm[2] == pytest.approx(0.0, abs=0.05)
+
+
+def test_points_below_a_cut_template_are_not_judged_whatever_stands_beside_it() -> None:
+    # regression: where the planned beads are all that is known of the part, a slope below their
+    # cut was judged, and a clean part stopped for a shifted layer
+    planned, setup = beads_of_a_block(30), load_setup()
+    site = Site(planned, setup, LayerGrid.from_setup(setup), planned=planned)
+    low_mm = float(planned.bounds_mm[0, 2])
+    z_mm = np.arange(0.1, 6.0, 0.1)
+    scan = Scan(np.column_stack([np.zeros_like(z_mm), np.zeros_like(z_mm), z_mm]), 0.02, "template")
+    seen_mm = _in_view(scan, site).points_mm[:, 2]
+    assert seen_mm.min() == pytest.approx(low_mm + PLANNED_EDGE_MM, abs=0.11)
+    whole = beads_of_a_block(5)
+    assert _in_view(scan, Site(whole, setup, site.grid, planned=whole)) is scan
