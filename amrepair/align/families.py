@@ -158,7 +158,8 @@ def _turned(
     `share` is of the points that resist, were all of them moved by as much as the farthest.
     """
     rate = float(np.linalg.norm(motion.turn))
-    if rate < 1e-9:
+    # the radius is no more than the diagonal
+    if rate < 1e-9 or share > MOST_RESISTING * (rate * diagonal_mm) ** 2:
         return None
     axis = motion.turn / rate
     centre = matrix[:3, :3] @ cloud_mm.mean(axis=0) + matrix[:3, 3]

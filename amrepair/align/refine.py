@@ -7,23 +7,16 @@ what the scan does not determine where the guess had it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from amrepair.align.refine_kernels import normal_equations
-from amrepair.frames import rotation_from_vector
-from amrepair.template.port import Template
+from amrepair.align import refine_kernels as kernels
+from amrepair.template.port import OnGrid, Template
 
-SHRINK = 0.6  # of the loss's scale, from one iteration to the next
-STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
-STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
 MAX_ITERATIONS = 60
-HASTE = 15  # iterations with whole steps
-SLOWEST = 1.0 / 32  # of a step
-FREE_RATIO = 0.1  # of the limit: distances that change by less do not hinder the motion
-INLIER_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,60 +90,88 @@ def refine(
     enough_mm
         Stop where the next step would be smaller, converged or not.
     """
+    return refine_all(
+        points_mm,
+        template,
+        [matrix],
+        start_scale_mm=start_scale_mm,
+        end_scale_mm=end_scale_mm,
+        sigma_mm=sigma_mm,
+        prior=prior,
+        max_iterations=max_iterations,
+        enough_mm=enough_mm,
+    )[0]
+
+
+def refine_all(
+    points_mm: Float[np.ndarray, "n 3"],
+    template: Template,
+    matrices: Sequence[Float[np.ndarray, "4 4"]],
+    *,
+    start_scale_mm: float,
+    end_scale_mm: float,
+    sigma_mm: float,
+    prior: Prior | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+    enough_mm: float = 0.0,
+) -> list[Refined]:
+    """`refine` from several poses, in their order; all steps at once where the field is a grid."""
+    if not len(matrices):
+        return []
     centre = points_mm.mean(axis=0)
-    reach_mm = float(np.linalg.norm(points_mm - centre, axis=1).max())
-    rotation, place = matrix[:3, :3].copy(), matrix[:3, :3] @ centre + matrix[:3, 3]
-    first_rotation, first_place = rotation.copy(), place.copy()
-    local = points_mm - centre
-    scale, converged, hessian = start_scale_mm, False, np.zeros((6, 6))
-    f = np.zeros(len(points_mm))
-    iterations, last, pace = 0, np.zeros(6), 1.0
-    while iterations < max_iterations:
-        iterations += 1
-        turned = local @ rotation.T
-        f, gradient = template.distance_and_gradient(turned + place)
-        hessian, slope = normal_equations(turned, f, gradient, scale)
-        hessian, slope = hessian / sigma_mm**2, slope / sigma_mm**2
-        # neighbouring points err alike (process, calibration): against a prior all of them
-        # together count as one
-        matrix6 = (hessian + 1e-9 * np.trace(hessian) / 6 * np.eye(6)) / len(points_mm)
-        slope = slope / len(points_mm)
-        if prior is not None:
-            offset = np.concatenate([_vector(rotation @ first_rotation.T), place - first_place])
-            matrix6 = matrix6 + np.diag(prior.information)
-            slope = slope + prior.information * offset
-        step = -np.linalg.solve(matrix6, slope)
-        turn = float(np.linalg.norm(step[:3]))
-        if turn > 0.2:  # a step this wide has left the linear range
-            step *= 0.2 / turn
-        if iterations > HASTE:
-            # to and fro across an edge of the field, where its gradient turns at once
-            pace = max(SLOWEST, 0.5 * pace) if float(step @ last) < 0.0 else min(1.0, 2.0 * pace)
-        last = step
-        step = pace * step
-        rotation = rotation_from_vector(step[:3]) @ rotation
-        place = place + step[3:]
-        moved_mm = float(np.linalg.norm(step[3:])) + reach_mm * float(np.linalg.norm(step[:3]))
-        limit_mm = max(STEP_MM, STEP_SIGMAS * sigma_mm)
-        still = moved_mm < limit_mm
-        if iterations > HASTE:  # a rod turns on for ever: what counts is what its points would see
-            changed_mm = sigma_mm * float(np.sqrt(step @ hessian @ step / len(points_mm)))
-            still |= changed_mm < FREE_RATIO * limit_mm
-        if scale <= end_scale_mm * (1 + 1e-9) and (still or moved_mm < enough_mm):
-            converged = bool(still)
-            break
-        if moved_mm < 0.25 * scale:
-            scale = max(end_scale_mm, scale * SHRINK)
-    u, _, vt = np.linalg.svd(rotation)
-    rotation = u @ vt
-    found = np.eye(4)
-    found[:3, :3] = rotation
-    found[:3, 3] = place - rotation @ centre
-    residual = template.distance(local @ rotation.T + place)
-    return Refined(found, hessian, residual, converged, iterations)
+    local = np.ascontiguousarray(points_mm - centre, dtype=np.float64)
+    reach_mm = float(np.linalg.norm(local, axis=1).max())
+    rotations = np.array([matrix[:3, :3] for matrix in matrices], dtype=np.float64)
+    places = np.array([m[:3, :3] @ centre + m[:3, 3] for m in matrices], dtype=np.float64)
+    known = np.zeros(6) if prior is None else prior.information
+    # neighbouring points err alike (process, calibration): against a prior all of them together
+    # count as one
+    limits = (float(len(local)), reach_mm, sigma_mm, end_scale_mm, enough_mm)
+    asked = (known, start_scale_mm, max_iterations, limits)
+    if isinstance(template, OnGrid):
+        hessians, residuals, ends = kernels.refine_all(
+            local, rotations, places, *asked, template.grid_numbers
+        )
+    else:
+        hessians, residuals, ends = _refine_by_asking(local, rotations, places, *asked, template)
+    u, _, vt = np.linalg.svd(rotations)
+    rotations = u @ vt
+    found = []
+    for k, (rotation, place) in enumerate(zip(rotations, places, strict=True)):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation, place - rotation @ centre
+        information = hessians[k] / sigma_mm**2
+        iterations, converged = ends[k]
+        found.append(Refined(matrix, information, residuals[k], bool(converged), int(iterations)))
+    return found
 
 
-def _vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
-    """Axis-angle vector of a small rotation."""
-    skew = 0.5 * (rotation - rotation.T)
-    return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+def _refine_by_asking(
+    local: Float[np.ndarray, "n 3"],
+    rotations: Float[np.ndarray, "k 3 3"],
+    places: Float[np.ndarray, "k 3"],
+    known: Float[np.ndarray, " 6"],
+    start_scale_mm: float,
+    max_iterations: int,
+    limits: tuple[float, float, float, float, float],
+    template: Template,
+) -> tuple[Float[np.ndarray, "k 6 6"], Float[np.ndarray, "k n"], Int[np.ndarray, "k 2"]]:
+    """As `refine_kernels.refine_all`, of any template."""
+    hessians = np.zeros((len(rotations), 6, 6))
+    residuals = np.empty((len(rotations), len(local)))
+    ends = np.empty((len(rotations), 2), dtype=np.int64)
+    for k, (rotation, place) in enumerate(zip(rotations, places, strict=True)):
+        first = np.column_stack([rotation, place])
+        last, pace, scale, iterations, ended = np.zeros(6), 1.0, start_scale_mm, 0, kernels.GO_ON
+        while iterations < max_iterations and ended == kernels.GO_ON:
+            iterations += 1
+            turned = local @ rotation.T
+            f, gradient = template.distance_and_gradient(turned + place)
+            hessians[k], slope = kernels.normal_equations(turned, f, gradient, scale)
+            ended, pace, scale = kernels.step(
+                hessians[k], slope, known, first, rotation, place, last, pace, scale, iterations,
+                limits,
+            )  # fmt: skip
+        residuals[k] = template.distance(local @ rotation.T + place)
+        ends[k] = iterations, ended == kernels.CONVERGED
+    return hessians, residuals, ends

@@ -1,11 +1,27 @@
 # mypy: disable-error-code="no-untyped-def"
-"""Normal equations of a pose on the field, in one pass over the points; compiled."""
+"""Gauss–Newton on the field: normal equations, one step, and all steps of many poses; compiled.
+
+A pose is a rotation and the place of the points' centroid; the points are about their centroid.
+`step` is the same for any template; `refine_all` asks a grid's numbers (`learned.Grid`) itself.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gcode.compiled import njit
+from amrepair.align.pose_kernels import solve, turn
+from amrepair.template.learned_kernels import field_at
+from gcode.compiled import njit, prange
+
+SHRINK = 0.6  # of the loss's scale, from one iteration to the next
+STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
+STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
+HASTE = 15  # iterations with whole steps
+SLOWEST = 1.0 / 32  # of a step
+FREE_RATIO = 0.1  # of the limit: distances that change by less do not hinder the motion
+WIDEST_TURN_RAD = 0.2  # a step this wide has left the linear range
+DAMPING = 1e-9
+GO_ON, CONVERGED, ENOUGH = 0, 1, 2  # how a step may end
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -46,3 +62,126 @@ def normal_equations(turned, f, gradient, scale):
         for column in range(row):
             half[row, column] = half[column, row]
     return half, np.array([b0, b1, b2, b3, b4, b5])
+
+
+@njit(cache=True, nogil=True)
+def step(hessian, slope, known, first, rotation, place, last, pace, scale, iteration, limits):
+    """One damped step of a pose, in place; how it ended, and the next pace and scale.
+
+    Parameters
+    ----------
+    hessian, slope
+        Of `normal_equations`.
+    known
+        (6,) inverse variances of the first guess; 0 where nothing is known.
+    first
+        (3, 4) the guess, rotation and place.
+    last
+        (6,) the step before; takes this one.
+    limits
+        Points, their reach, their noise, the last scale, and the step that is small enough.
+    """
+    count, reach, sigma, last_scale, enough = limits
+    h, b = np.empty((6, 6)), np.empty(6)
+    share = 1.0 / (sigma * sigma * count)
+    trace = 0.0
+    for a in range(6):
+        trace += hessian[a, a]
+    for a in range(6):
+        for c in range(6):
+            h[a, c] = share * hessian[a, c]
+        h[a, a] += share * DAMPING * trace / 6.0 + known[a]
+        b[a] = -share * slope[a]
+    for a in range(3):
+        # the axis-angle vector of the small rotation away from the guess
+        i, j = (a + 1) % 3, (a + 2) % 3
+        away = 0.0
+        for c in range(3):
+            away += 0.5 * (rotation[j, c] * first[i, c] - rotation[i, c] * first[j, c])
+        b[a] -= known[a] * away
+        b[3 + a] -= known[3 + a] * (place[a] - first[a, 3])
+    solve(h, b)
+    angle = np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
+    if angle > WIDEST_TURN_RAD:
+        for a in range(6):
+            b[a] *= WIDEST_TURN_RAD / angle
+    if iteration > HASTE:
+        # to and fro across an edge of the field, where its gradient turns at once
+        along = 0.0
+        for a in range(6):
+            along += b[a] * last[a]
+        pace = max(SLOWEST, 0.5 * pace) if along < 0.0 else min(1.0, 2.0 * pace)
+    for a in range(6):
+        last[a] = b[a]
+        b[a] *= pace
+    turn(rotation, b[0], b[1], b[2])
+    for a in range(3):
+        place[a] += b[3 + a]
+    moved = np.sqrt(b[3] ** 2 + b[4] ** 2 + b[5] ** 2)
+    moved += reach * np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
+    limit = max(STEP_MM, STEP_SIGMAS * sigma)
+    still = moved < limit
+    if iteration > HASTE:  # a rod turns on for ever: what counts is what its points would see
+        square = 0.0
+        for a in range(6):
+            for c in range(6):
+                square += b[a] * hessian[a, c] * b[c]
+        still |= np.sqrt(max(square, 0.0) / count) < FREE_RATIO * limit
+    if scale <= last_scale * (1 + 1e-9) and (still or moved < enough):
+        return CONVERGED if still else ENOUGH, pace, scale
+    if moved < 0.25 * scale:
+        scale = max(last_scale, scale * SHRINK)
+    return GO_ON, pace, scale
+
+
+@njit(cache=True, nogil=True)
+def _asked(local, rotation, place, grid, turned, f, gradient):
+    """The points turned, the grid's field at their places, and its gradient there."""
+    origin, cell, base, block_of, blocks = grid
+    r, p = rotation, place
+    for m in range(len(local)):
+        x, y, z = local[m, 0], local[m, 1], local[m, 2]
+        tx = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
+        ty = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
+        tz = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+        turned[m, 0], turned[m, 1], turned[m, 2] = tx, ty, tz
+        f[m], gradient[m, 0], gradient[m, 1], gradient[m, 2] = field_at(
+            tx + p[0], ty + p[1], tz + p[2], origin, cell, base, block_of, blocks
+        )
+
+
+@njit(cache=True, nogil=True)
+def _to_its_end(local, rotation, place, known, scale, most, limits, grid, hessian, residual):
+    """All steps of one pose, in place: iterations, and whether it converged."""
+    n = len(local)
+    turned, gradient = np.empty((n, 3)), np.empty((n, 3))
+    first, last, pace = np.empty((3, 4)), np.zeros(6), 1.0
+    first[:, :3], first[:, 3] = rotation, place
+    iterations, ended = 0, GO_ON
+    while iterations < most and ended == GO_ON:
+        iterations += 1
+        _asked(local, rotation, place, grid, turned, residual, gradient)
+        h, slope = normal_equations(turned, residual, gradient, scale)
+        hessian[:] = h
+        ended, pace, scale = step(
+            h, slope, known, first, rotation, place, last, pace, scale, iterations, limits
+        )
+    _asked(local, rotation, place, grid, turned, residual, gradient)
+    return iterations, ended == CONVERGED
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def refine_all(local, rotations, places, known, scale, most, limits, grid):
+    """Every pose moved to its minimum on a grid's field, in place.
+
+    Returns (k, 6, 6) hessians, (k, n) residuals, (k, 2) iterations and whether it converged.
+    """
+    count = len(rotations)
+    hessians, residuals = np.zeros((count, 6, 6)), np.empty((count, len(local)))
+    ends = np.empty((count, 2), np.int64)
+    for k in prange(count):
+        ends[k, 0], ends[k, 1] = _to_its_end(
+            local, rotations[k], places[k], known, scale, most, limits, grid,
+            hessians[k], residuals[k],
+        )  # fmt: skip
+    return hessians, residuals, ends

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.align import search_kernels as kernels
-from amrepair.align.thinning import thin_out
+from amrepair.align.thinning import Thinned
 from amrepair.template.port import Template
 
 CELLS = 56  # of the coarse field, along the longest side of the part
@@ -70,6 +70,15 @@ THOROUGH = Effort(
         Stage(160, 7, 0.10, 0.03, 480),
         Stage(400, 10, 0.03, 0.01, 80),
         Stage(1_500, 8, 0.01, 0.005, 40),
+    ),
+)
+# Of poses that are nearly known.
+TWINS = Effort(
+    192,
+    (
+        Stage(120, 6, 0.10, 0.03, 48),
+        Stage(300, 8, 0.03, 0.01, 16),
+        Stage(1_000, 6, 0.01, 0.005, 16),
     ),
 )
 CAP_RATIO = 0.03  # of the diagonal: farther off is as bad
@@ -142,9 +151,8 @@ _latest: list[tuple[Template, CoarseField]] = []  # one: templates do not change
 
 
 def search(
-    points_mm: Float[np.ndarray, "n 3"],
+    cloud: Thinned,
     field: CoarseField,
-    rng: np.random.Generator,
     *,
     effort: Effort = QUICK,
     turn: Float[np.ndarray, "3 3"] | None = None,
@@ -154,15 +162,16 @@ def search(
 
     Parameters
     ----------
-    points_mm
-        (n, 3) evenly spread over what was scanned, scan's frame.
+    cloud
+        Evenly spread over what was scanned, scan's frame.
     turn
         A rotation of all that are tried: between those of another search.
     only
         Poses to start from instead of all rotations.
     """
     cell_mm = field.cell_mm
-    clouds = [thin_out(points_mm, stage.points, rng) / cell_mm for stage in effort.stages]
+    # the densest first: thinner ones are made of it
+    clouds = [cloud.to(stage.points) / cell_mm for stage in effort.stages[::-1]][::-1]
     centre = clouds[0].mean(axis=0)
     diagonal = field.diagonal_mm / cell_mm
     grid = (field.values.ravel() / np.float32(cell_mm), np.array(field.values.shape))
@@ -177,12 +186,12 @@ def search(
         shifts = np.array([matrix[:3, 3] for matrix in only])
         places = rotations @ centre + (shifts - field.origin_mm) / cell_mm
     scores = np.zeros(len(rotations))
-    for stage, cloud in zip(effort.stages, clouds, strict=True):
+    for stage, points in zip(effort.stages, clouds, strict=True):
         # about its own centroid each: turning and moving are then apart
-        middle = cloud.mean(axis=0)
+        middle = points.mean(axis=0)
         places = places + rotations @ (middle - centre)
         centre = middle
-        local = cloud - centre
+        local = points - centre
         rotations, places = np.ascontiguousarray(rotations), np.ascontiguousarray(places)
         scales = stage.scales(diagonal)
         scores = kernels.descend(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from amrepair.align.pose_kernels import solve, turn
 from gcode.compiled import njit, prange
 
 CHOICES = 27  # low, middle, high along each axis
@@ -139,44 +140,6 @@ def misfits(points, rotations, places, values, shape, cap):
     return found
 
 
-@njit(cache=True, nogil=True)
-def _solve(h, b):
-    """Solve a symmetric positive system of six by Cholesky, in place."""
-    for i in range(6):
-        for j in range(i + 1):
-            total = h[i, j]
-            for k in range(j):
-                total -= h[i, k] * h[j, k]
-            if i == j:
-                h[i, i] = np.sqrt(max(total, 1e-30))
-            else:
-                h[i, j] = total / h[j, j]
-    for i in range(6):
-        for k in range(i):
-            b[i] -= h[i, k] * b[k]
-        b[i] /= h[i, i]
-    for i in range(5, -1, -1):
-        for k in range(i + 1, 6):
-            b[i] -= h[k, i] * b[k]
-        b[i] /= h[i, i]
-
-
-@njit(cache=True, nogil=True)
-def _turn(r, x, y, z):
-    """Turn a rotation further by an axis-angle vector, in place (Rodrigues)."""
-    angle = np.sqrt(x * x + y * y + z * z)
-    if angle < 1e-12:
-        return
-    x, y, z = x / angle, y / angle, z / angle
-    s, c = np.sin(angle), 1.0 - np.cos(angle)
-    for column in range(3):
-        a, b, d = r[0, column], r[1, column], r[2, column]
-        ca, cb, cd = y * d - z * b, z * a - x * d, x * b - y * a
-        r[0, column] = a + s * ca + c * (y * cd - z * cb)
-        r[1, column] = b + s * cb + c * (z * ca - x * cd)
-        r[2, column] = d + s * cd + c * (x * cb - y * ca)
-
-
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _accumulate(points, r, p, values, shape, scale, cap, h, b):
     """Normal equations of the Geman–McClure loss at a pose, and the sum of |f|, each up to the cap.
@@ -267,12 +230,12 @@ def descend(points, rotations, places, values, shape, scales, cap):
             for m in range(3):
                 h[m, m] += DAMPING * turning + 1e-12
                 h[m + 3, m + 3] += DAMPING * moving + 1e-12
-            _solve(h, b)
-            turn = np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-            share = min(1.0, WIDEST_TURN_RAD / max(turn, 1e-12))
+            solve(h, b)
+            angle = np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
+            share = min(1.0, WIDEST_TURN_RAD / max(angle, 1e-12))
             shift = np.sqrt(b[3] ** 2 + b[4] ** 2 + b[5] ** 2)
             share = min(share, WIDEST_TURN_RAD * reach / max(shift, 1e-12))
-            _turn(r, share * b[0], share * b[1], share * b[2])
+            turn(r, share * b[0], share * b[1], share * b[2])
             for a in range(3):
                 p[a] += share * b[3 + a]
         total = _accumulate(points, r, p, values, shape, scales[-1], cap, h, b)
@@ -293,12 +256,12 @@ def peaks(order, rotations, places, radius, apart, most):
         near = False
         for m in range(count):
             other = kept[m]
-            turn = 0.0
+            turned = 0.0
             for a in range(3):
                 for b in range(3):
-                    turn += (rotations[k, a, b] - rotations[other, a, b]) ** 2
+                    turned += (rotations[k, a, b] - rotations[other, a, b]) ** 2
             shift = ((places[k] - places[other]) ** 2).sum()
-            if turn * radius * radius / 3.0 + shift < limit:
+            if turned * radius * radius / 3.0 + shift < limit:
                 near = True
                 break
         if near:

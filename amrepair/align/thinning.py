@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 from jaxtyping import Float
 
@@ -45,6 +47,29 @@ def thin_out(
     if not len(best):
         return shuffled[:count]
     return np.ascontiguousarray(shuffled[np.sort(best)])
+
+
+@dataclass(frozen=True, slots=True)
+class Thinned:
+    """A cloud, and thinner ones of it, each made once: from the thinnest that has enough points.
+
+    Attributes
+    ----------
+    points_mm
+        (n, 3) in any frame.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    rng: np.random.Generator
+    _made: dict[int, Float[np.ndarray, "_m 3"]] = field(default_factory=dict)
+
+    def to(self, count: int) -> Float[np.ndarray, "m 3"]:
+        """About `count` points, never more, in an order in which near ones follow each other."""
+        if count not in self._made:
+            enough = [made for most, made in self._made.items() if most > 2 * count]
+            source = min(enough, key=len, default=self.points_mm)
+            self._made[count] = in_order(thin_out(source, count, self.rng))
+        return self._made[count]
 
 
 def in_order(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

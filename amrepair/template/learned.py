@@ -101,18 +101,19 @@ class Grid:
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) signed distance, mm."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        return np.asarray(kernels.evaluate(points, *self._numbers))
+        return np.asarray(kernels.evaluate(points, *self.numbers))
 
     def distance_and_gradient(
         self, points_mm: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
         """(n,) signed distance, mm, and (n, 3) its gradient within the cell."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        distance, gradient = kernels.evaluate_with_gradient(points, *self._numbers)
+        distance, gradient = kernels.evaluate_with_gradient(points, *self.numbers)
         return np.asarray(distance), np.asarray(gradient)
 
     @property
-    def _numbers(self) -> tuple[Any, ...]:
+    def numbers(self) -> tuple[Any, ...]:
+        """What compiled code asks the field with (`learned_kernels.field_at`)."""
         return self.origin_mm, self.cell_mm, self.base, self.block_of, self.blocks
 
 
@@ -179,6 +180,11 @@ class LearnedSdf:
     def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) standard deviation between normal parts, 0 where none is known."""
         return np.zeros(len(points_mm)) if self.tolerance is None else self.tolerance.at(points_mm)
+
+    @property
+    def grid_numbers(self) -> tuple[Any, ...]:
+        """The field as compiled code asks it (`OnGrid`)."""
+        return self.grid.numbers
 
     def below_z(self, z_mm: float) -> Template:
         """The part printed so far."""

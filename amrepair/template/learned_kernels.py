@@ -14,7 +14,7 @@ ON_BORDER = 1e-9
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _field(px, py, pz, origin, cell, base, block_of, blocks):
+def field_at(px, py, pz, origin, cell, base, block_of, blocks):
     """Signed distance, mm, and its gradient by trilinear interpolation.
 
     Beyond the grid: to the surface point that is nearest to the grid's nearest point. That is the
@@ -69,7 +69,7 @@ def evaluate(points, origin, cell, base, block_of, blocks):
     """(n,) signed distance, mm."""
     out = np.empty(len(points), np.float64)
     for p in prange(len(points)):
-        out[p] = _field(
+        out[p] = field_at(
             points[p, 0], points[p, 1], points[p, 2], origin, cell, base, block_of, blocks
         )[0]
     return out
@@ -80,7 +80,7 @@ def evaluate_with_gradient(points, origin, cell, base, block_of, blocks):
     """(n,) signed distance, mm, and (n, 3) its gradient within the cell."""
     out, gradient = np.empty(len(points), np.float64), np.empty((len(points), 3), np.float64)
     for p in prange(len(points)):
-        out[p], gradient[p, 0], gradient[p, 1], gradient[p, 2] = _field(
+        out[p], gradient[p, 0], gradient[p, 1], gradient[p, 2] = field_at(
             points[p, 0], points[p, 1], points[p, 2], origin, cell, base, block_of, blocks
         )
     return out, gradient

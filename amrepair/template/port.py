@@ -6,7 +6,7 @@ those who ask never know whether the field was learned, exact or planned from G-
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -48,4 +48,14 @@ class Template(Protocol):
 
     def solid(self) -> object:
         """The interior as a `manifold3d.Manifold`, template frame, checked watertight."""
+        ...
+
+
+@runtime_checkable
+class OnGrid(Protocol):
+    """A template whose field compiled code can ask by itself."""
+
+    @property
+    def grid_numbers(self) -> tuple[Any, ...]:
+        """What `learned_kernels.field_at` takes after a point."""
         ...

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.ndimage import map_coordinates
 
 from amrepair.align import Registration, search_kernels
+from amrepair.align.refine import Prior, refine_all
 from amrepair.align.refine_kernels import normal_equations
 from amrepair.frames import Transform, rotation_from_vector
+from amrepair.template import fit_template
+from tests.analytic import box, noisy_scan_points, to_trimesh
 
 
 def plain(turned, f, gradient, scale):  # type: ignore[no-untyped-def]
@@ -25,6 +29,39 @@ def test_normal_equations_are_those_of_numpy() -> None:
         normal_equations(turned, f, gradient, 0.7), plain(turned, f, gradient, 0.7), strict=True
     ):
         assert np.allclose(made, asked, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("known", [None, Prior(np.full(3, 2e-3), np.full(3, 0.05))])
+def test_steps_on_a_grid_are_those_of_any_template(known: Prior | None) -> None:
+    solid = box((0, 0, 0), (30, 20, 8))
+    fitted = fit_template(to_trimesh(solid.body))
+    rng = np.random.default_rng(3)
+    points = noisy_scan_points(solid.body, spacing_mm=1.0, sigma_mm=0.03, seed=3)[0]
+    starts = []
+    for size in (0.0, 0.3, 1.0, 40.0):  # the last one beyond the grid
+        start = np.eye(4)
+        start[:3, :3] = rotation_from_vector(0.05 * size * rng.normal(size=3))
+        start[:3, 3] = size * rng.normal(size=3)
+        starts.append(start)
+    made, asked = (
+        refine_all(
+            points,
+            template,
+            starts,
+            start_scale_mm=0.5,
+            end_scale_mm=0.1,
+            sigma_mm=0.03,
+            prior=known,
+        )
+        for template in (fitted, fitted.below_z(1e3))  # a cut one answers from no grid
+    )
+    for one, other in zip(made, asked, strict=True):
+        assert (one.iterations, one.converged) == (other.iterations, other.converged)
+        assert np.allclose(one.matrix, other.matrix, atol=1e-6)
+        assert np.allclose(one.residual_mm, other.residual_mm, atol=1e-6)
+        assert np.allclose(one.information, other.information, rtol=1e-4, atol=1.0)
+    assert made[1].converged
+    assert np.abs(made[1].matrix - np.eye(4)).max() < (0.1 if known is None else 1.0)
 
 
 def test_the_coarse_field_is_trilinear_and_goes_on_beyond_its_border() -> None:

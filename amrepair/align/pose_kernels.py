@@ -1,0 +1,46 @@
+# mypy: disable-error-code="no-untyped-def"
+"""A step of a pose: six equations solved, a rotation turned further; compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gcode.compiled import njit
+
+
+@njit(cache=True, nogil=True)
+def solve(h, b):
+    """Solve a symmetric positive system of six by Cholesky, in place."""
+    for i in range(6):
+        for j in range(i + 1):
+            total = h[i, j]
+            for k in range(j):
+                total -= h[i, k] * h[j, k]
+            if i == j:
+                h[i, i] = np.sqrt(max(total, 1e-30))
+            else:
+                h[i, j] = total / h[j, j]
+    for i in range(6):
+        for k in range(i):
+            b[i] -= h[i, k] * b[k]
+        b[i] /= h[i, i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            b[i] -= h[k, i] * b[k]
+        b[i] /= h[i, i]
+
+
+@njit(cache=True, nogil=True)
+def turn(r, x, y, z):
+    """Turn a rotation further by an axis-angle vector, in place (Rodrigues)."""
+    angle = np.sqrt(x * x + y * y + z * z)
+    if angle < 1e-12:
+        return
+    x, y, z = x / angle, y / angle, z / angle
+    s, c = np.sin(angle), 1.0 - np.cos(angle)
+    for column in range(3):
+        a, b, d = r[0, column], r[1, column], r[2, column]
+        ca, cb, cd = y * d - z * b, z * a - x * d, x * b - y * a
+        r[0, column] = a + s * ca + c * (y * cd - z * cb)
+        r[1, column] = b + s * cb + c * (z * ca - x * cd)
+        r[2, column] = d + s * cd + c * (x * cb - y * ca)
