@@ -128,8 +128,14 @@ def _from_anywhere(
     progress: Progress,
 ) -> Registration:
     """From any pose; a mirror image and too little of the part are refused."""
+    least = LEAST_OF_KNOWN if part_is_known else LEAST_FROM_ANYWHERE
     found = pose_from_anywhere(
-        scan.points_mm, template, sigma_mm=scan.sigma_mm, rng=rng, progress=progress
+        scan.points_mm,
+        template,
+        sigma_mm=scan.sigma_mm,
+        rng=rng,
+        least_ratio=least,
+        progress=progress,
     )
     found = _as_it_was_seen(scan, template, found, rng)
     ratio = found.explained_ratio
@@ -140,7 +146,6 @@ def _from_anywhere(
         if found.left_out_ratio > 0.0:  # what was left out may be half of the other hand
             whole = ratio * (1.0 - found.left_out_ratio)
             _refuse_mirrored(scan, template, found, scan.points_mm, whole, rng)
-    least = LEAST_OF_KNOWN if part_is_known else LEAST_FROM_ANYWHERE
     sizes = _other_size(scan, template)
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
     return _registration(scan, found)

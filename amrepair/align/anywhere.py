@@ -33,7 +33,7 @@ from amrepair.align.poses import (
     refined,
 )
 from amrepair.align.refine import Refined
-from amrepair.align.search import QUICK, THOROUGH, TWINS, CoarseField, Effort, search
+from amrepair.align.search import PIECE, QUICK, THOROUGH, TWINS, CoarseField, Effort, search
 from amrepair.align.thinning import Thinned
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
@@ -54,11 +54,13 @@ INLIER_SIGMAS = 3.0
 # Fewer explained, and the noise is measured (taken where it is more than was said, up to what a
 # thin wall's two sides could pretend), and the mirror image tried.
 DOUBTFUL, NOISIER, MOST_NOISE_MM = 0.93, 1.5, 0.25
-# With fewer points on the part the search goes on, is made thorough, and features are asked too.
+# With fewer points on the part the search goes on, and is made thorough; with more than the last
+# the pose is worth turning.
 WELL_EXPLAINED, MOSTLY_EXPLAINED, EXPLAINED = 0.97, 0.95, 0.7
 BETWEEN = rotation_from_vector(np.array([0.15, -0.1, 0.08]))  # half the gap between rotations
 FEW_TRIED = 3  # poses refined of what is left without clutter, and of the mirror image
 CLEARED = 0.85  # with fewer on the part clutter is looked for, until so many are
+PIECE_RATIO = 0.6  # of the part's diagonal: a smaller scan is a piece, that may lie anywhere in it
 HALVED_POINTS, LEAST_HALF = 2_000, 100  # of fewer points a half says nothing
 
 
@@ -153,6 +155,7 @@ def pose_from_anywhere(
     *,
     sigma_mm: float,
     rng: np.random.Generator,
+    least_ratio: float = EXPLAINED,
     noise_is_measured: bool = False,
     progress: Progress = silent,
 ) -> Found:
@@ -164,6 +167,8 @@ def pose_from_anywhere(
         (n, 3) in the scan's frame.
     sigma_mm
         Noise of the points, as was said; measured where that leaves them unexplained.
+    least_ratio
+        Of the points that must lie on the part: where fewer do, features are asked as well.
     """
     sigma_mm, inlier_mm = limits_mm(sigma_mm)
     clouds, field = Clouds.of(points_mm, template, sigma_mm, rng), CoarseField.of(template)
@@ -178,6 +183,7 @@ def pose_from_anywhere(
                 template,
                 sigma_mm=measured_mm,
                 rng=rng,
+                least_ratio=least_ratio,
                 noise_is_measured=True,
                 progress=progress,
             )
@@ -187,7 +193,10 @@ def pose_from_anywhere(
     if hunt.share < WELL_EXPLAINED:
         progress("align", 0.4, 1.0)
         _search_on(hunt)
-    if hunt.share < EXPLAINED:
+    if clouds.size_mm < PIECE_RATIO * clouds.diagonal_mm:
+        progress("align", 0.5, 1.0)
+        hunt.take(_worth_refining(hunt.clouds, field, PIECE))
+    if hunt.share < least_ratio:
         progress("align", 0.6, 1.0)
         _ask_features(hunt)
     if hunt.left_out_ratio > 0.0:

@@ -52,6 +52,15 @@ class Clouds:
         return cls(dense, Thinned(dense, rng), box_corners(box), diagonal_mm, sigma_mm)
 
     @property
+    def size_mm(self) -> float:
+        """Length of the scan, between the farthest corners of its box.
+
+        In the frame of its main axes: a long thin scan that stands askew is no larger.
+        """
+        local = self.dense_mm - self.dense_mm.mean(axis=0)
+        return float(np.linalg.norm(np.ptp(local @ np.linalg.eigh(local.T @ local)[1], axis=0)))
+
+    @property
     def cap_mm(self) -> float:
         """Farther off is as bad: ten times the noise, or a millimetre."""
         return max(1.0, 10.0 * self.sigma_mm)

@@ -49,10 +49,20 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How many rotations are tried (spread evenly over SO(3)), and the rounds that follow."""
+    """How many rotations are tried (spread evenly over SO(3)), and the rounds that follow.
+
+    Attributes
+    ----------
+    places
+        Where each rotation is tried.
+    gap_ratio
+        Of the diagonal, between the places among which those are chosen.
+    """
 
     rotations: int
     stages: tuple[Stage, ...]
+    places: int = 1
+    gap_ratio: float = np.inf
 
 
 # About 23° apart; of 120 scans of our own parts, whole and single views, none was lost.
@@ -71,6 +81,17 @@ THOROUGH = Effort(
         Stage(400, 10, 0.03, 0.01, 80),
         Stage(1_500, 8, 0.01, 0.005, 40),
     ),
+)
+# Of a scan that shows a piece of the part, which may lie anywhere in it.
+PIECE = Effort(
+    2_400,
+    (
+        Stage(160, 7, 0.07, 0.02, 600),
+        Stage(400, 10, 0.02, 0.01, 120),
+        Stage(1_500, 8, 0.01, 0.005, 40),
+    ),
+    places=4,
+    gap_ratio=0.1,
 )
 # Of poses that are nearly known.
 TWINS = Effort(
@@ -180,7 +201,11 @@ def search(
         if turn is not None:
             rotations = np.ascontiguousarray(rotations @ turn)
         box = (field.box_mm - field.origin_mm) / cell_mm
-        places = kernels.starts(_rows(clouds[0] - centre), rotations, box, *grid, 0.1 * diagonal)
+        gap = effort.gap_ratio * diagonal
+        places = kernels.starts(
+            _rows(clouds[0] - centre), rotations, box, *grid, 0.1 * diagonal, gap, effort.places
+        ).reshape(-1, 3)
+        rotations = np.repeat(rotations, effort.places, axis=0)
     else:
         rotations = np.array([matrix[:3, :3] for matrix in only])
         shifts = np.array([matrix[:3, 3] for matrix in only])

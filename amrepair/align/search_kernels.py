@@ -13,7 +13,7 @@ import numpy as np
 from amrepair.align.pose_kernels import solve, turn
 from gcode.compiled import njit, prange
 
-CHOICES = 27  # low, middle, high along each axis
+LEAST_ALONG, MOST_ALONG = 3, 8  # places along an axis
 TRIM = 0.02  # of the points at each end of the box: outliers
 DAMPING = 1e-4
 WIDEST_TURN_RAD = 0.35  # of one step
@@ -65,34 +65,46 @@ def _at_nodes(turned, px, py, pz, values, shape, cap):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def starts(points, rotations, box, values, shape, cap):
-    """(k, 3) places: box on box, side on side or middle on middle, whichever fits best."""
-    found = np.empty((len(rotations), 3))
+def starts(points, rotations, box, values, shape, cap, gap, most):
+    """(k, most, 3) the places that fit best, box in box: from side on side to side on side.
+
+    Along each axis three places are tried, or more where they would be farther than `gap` apart.
+    """
+    found = np.empty((len(rotations), most, 3))
     n = points.shape[1]
     trim = int(TRIM * n)
     for k in prange(len(rotations)):
         r = rotations[k]
         turned = np.empty((3, n), np.float32)
-        shifts, ends = np.empty((3, 3)), np.empty(2)
+        ends, low, pace = np.empty(2), np.empty(3), np.empty(3)
+        count = np.empty(3, np.int64)
         for a in range(3):
             for m in range(n):
                 turned[a, m] = (
                     r[a, 0] * points[0, m] + r[a, 1] * points[1, m] + r[a, 2] * points[2, m]
                 )
             _trimmed(turned[a], trim, ends)
-            shifts[a, 0] = 0.5 * (box[0, a] + box[1, a] - ends[0] - ends[1])
-            shifts[a, 1] = box[0, a] - ends[0]
-            shifts[a, 2] = box[1, a] - ends[1]
+            low[a] = box[0, a] - ends[0]
+            way = box[1, a] - ends[1] - low[a]
+            count[a] = max(LEAST_ALONG, min(MOST_ALONG, 1 + int(np.ceil(abs(way) / gap))))
+            pace[a] = way / (count[a] - 1)
         every_other = turned[:, ::2].copy()
-        best = np.inf
-        for choice in range(CHOICES):
-            px = shifts[0, choice % 3]
-            py = shifts[1, (choice // 3) % 3]
-            pz = shifts[2, choice // 9]
-            total = _at_nodes(every_other, px, py, pz, values, shape, cap)
-            if total < best:
-                best = total
-                found[k, 0], found[k, 1], found[k, 2] = px, py, pz
+        scores = np.full(most, np.inf)
+        for i in range(count[0]):
+            for j in range(count[1]):
+                for m in range(count[2]):
+                    px, py, pz = low[0] + i * pace[0], low[1] + j * pace[1], low[2] + m * pace[2]
+                    total = _at_nodes(every_other, px, py, pz, values, shape, cap)
+                    at = most
+                    while at > 0 and scores[at - 1] > total:
+                        at -= 1
+                    if at == most:
+                        continue
+                    for other in range(most - 1, at, -1):
+                        scores[other] = scores[other - 1]
+                        found[k, other] = found[k, other - 1]
+                    scores[at] = total
+                    found[k, at, 0], found[k, at, 1], found[k, at, 2] = px, py, pz
     return found
 
 

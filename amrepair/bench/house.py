@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align import align
+from amrepair.align.thinning import order_of
 from amrepair.bench.bodies import standing_pose
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
@@ -157,14 +158,19 @@ def smoothed_score(
 ) -> Float[np.ndarray, " n"]:
     """(n,) |mean of the signed offset over near neighbours|, with some of the wider context."""
     limit_mm = MAX_OFFSET_RATIO * float(np.linalg.norm(np.ptp(points_mm, axis=0)))
-    offset = np.clip(offset_mm, -limit_mm, limit_mm)
-    count = min(NEAR_NEIGHBOURS, len(points_mm))
-    index = cKDTree(points_mm).query(points_mm, k=[*range(1, count + 1)], workers=-1)[1]
+    order = order_of(points_mm)  # near points in a row are found sooner
+    points = points_mm[order]
+    offset = np.clip(offset_mm[order], -limit_mm, limit_mm)
+    count = min(NEAR_NEIGHBOURS, len(points))
+    tree = cKDTree(points, balanced_tree=False)
+    index = tree.query(points, k=[*range(1, count + 1)], workers=-1)[1]
     near = np.abs(offset[index].mean(axis=1))
     wide = near
     for _ in range(WIDE_PASSES):
         wide = wide[index].mean(axis=1)
-    return np.asarray(near + WIDE_WEIGHT * wide)
+    score = np.empty(len(points))
+    score[order] = near + WIDE_WEIGHT * wide
+    return score
 
 
 def top_mean(score: Float[np.ndarray, " n"], count: int) -> float:

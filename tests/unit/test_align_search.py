@@ -123,6 +123,24 @@ def test_a_turn_that_nothing_hinders_is_reported() -> None:
     assert not found.symmetric_alternatives
 
 
+@pytest.mark.slow
+def test_a_piece_of_a_long_part_is_found_wherever_it_lies() -> None:
+    # 20 mm of a part of 170 mm: with three places along each axis it was laid 55 mm off
+    part = box((0, 0, 0), (160, 60, 5))
+    for x, y, length, width, height in (
+        (10, 8, 12, 20, 14), (40, 30, 25, 8, 19), (84, 10, 8, 30, 11),
+        (112, 38, 30, 10, 16), (130, 6, 16, 16, 23),
+    ):  # fmt: skip
+        part = union(part, box((x, y, 0), (x + length, y + width, height)))
+    points = sample_surface(part.body, 0.5, seed=0)[0]
+    rng = np.random.default_rng(18)
+    middle = points[int(rng.integers(len(points)))]
+    piece = points[np.linalg.norm(points - middle, axis=1) < 13.0]
+    found, off_mm = aligned(part, piece[rng.permutation(len(piece))[:2_000]])
+    assert off_mm < 0.1
+    assert not found.symmetric_alternatives
+
+
 def test_clutter_does_not_mislead() -> None:
     template = notched()
     points = sample_surface(template.body, 0.6, seed=3)[0]
