@@ -22,6 +22,8 @@ from gcode.progress import Progress, silent
 SUFFIXES = (".safetensors", ".stl", ".obj", ".3mf", ".ply")
 # Below this the two best parts fit nearly alike, and which it is would be a guess.
 LEAST_CONFIDENCE = 0.2
+# Views of the right part have up to 0.2, since half of it is unseen; of other parts 0.27 and more.
+MOST_MISFIT = 0.25
 POINTS = 20_000
 # Distances count up to this share of the part's diagonal: a lost piece is not another part.
 CAP_RATIO = 0.02
@@ -130,6 +132,14 @@ def recognise(
         raise AlignmentError(
             f"the scan {scan.source} fits none of the {len(rated)} parts of the library ({reasons})"
         )
+    part_ratio = 1.0 - best.registration.clutter_ratio
+    least = misfit(scan, opened[best.name], best.registration, part_ratio=part_ratio)
+    if least > MOST_MISFIT:
+        raise AlignmentError(
+            f"the scan {scan.source} fits none of the {len(rated)} parts of the library well: "
+            f"nearest is {best.name}, with a misfit of {least:.2f} (at most "
+            f"{MOST_MISFIT:g}); if it is that part, name its template"
+        )
     confidence = 1.0
     if len(rated) > 1:
         confidence = 1.0 - best.misfit_ratio / max(rated[1].misfit_ratio, 1e-12)
@@ -144,13 +154,19 @@ def recognise(
     )
 
 
-def misfit(scan: Scan, template: Template, found: Registration) -> float:
-    """0…1: capped distance of the points to the part, and of the part to the points."""
+def misfit(
+    scan: Scan, template: Template, found: Registration, *, part_ratio: float = 1.0
+) -> float:
+    """0…1: capped distance of the points to the part, and of the part to the points.
+
+    `part_ratio` is the share of the points that are counted, the nearest ones.
+    """
     step = max(1, len(scan) // POINTS)
     placed = found.template_from_scan.apply(scan.points_mm[::step])
     diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
     cap_mm = CAP_RATIO * diagonal_mm
-    off = float(np.minimum(np.abs(template.distance(placed)), cap_mm).mean())
+    distance = np.sort(np.minimum(np.abs(template.distance(placed)), cap_mm))
+    off = float(distance[: max(1, round(part_ratio * len(distance)))].mean())
     surface = template.surface_points(diagonal_mm / 60.0)[0]
     gap = np.asarray(cKDTree(placed).query(surface, distance_upper_bound=2 * cap_mm)[0])
     unseen = float(np.minimum(gap, cap_mm).mean())

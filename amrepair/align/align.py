@@ -34,6 +34,9 @@ BOUND_MM, BOUND_DEG = 3.0, 3.0
 # From a guess much of what is seen may be bed. From any pose less than this is another part: views
 # of other parts lay up to two thirds of themselves on one; then nearly every printed defect passes.
 LEAST_INLIERS, LEAST_FROM_ANYWHERE, LEAST_OF_KNOWN = 0.5, 0.7, 0.35
+# Where so much of the scan is taken for what surrounds the part, the rest must lie on it well: of
+# views of other parts some tenth always fits (up to 92 % of it did), of a part on its bed all.
+MUCH_LEFT_OUT, LEAST_OF_REST = 0.4, 0.95
 MIRRORED_BETTER = 0.4  # of what is left unexplained, where the mirror image is meant
 # Sizes that differ by more are another unit, or too little of the part; large scans hold the bed.
 SMALLEST_RATIO, LARGEST_RATIO = 0.15, 20.0
@@ -147,6 +150,9 @@ def _from_anywhere(
             whole = ratio * (1.0 - found.left_out_ratio)
             _refuse_mirrored(scan, template, found, scan.points_mm, whole, rng)
     sizes = _other_size(scan, template)
+    if found.left_out_ratio > MUCH_LEFT_OUT and not part_is_known:
+        least = LEAST_OF_REST
+        sizes = f" ({found.left_out_ratio:.0%} of the scan are taken for its surroundings){sizes}"
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
     return _registration(scan, found)
 

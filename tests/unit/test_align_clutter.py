@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
+
 import numpy as np
 import pytest
 from jaxtyping import Float
 
 from amrepair.align import Registration, align
+from amrepair.align.anywhere import Found
 from amrepair.align.clutter import Kept, noise_across, without_clutter
+from amrepair.align.refine import Refined
 from amrepair.align.search import spread_rotations
 from amrepair.errors import AlignmentError
 from amrepair.scans import Scan
@@ -154,3 +158,23 @@ def test_a_flat_view_of_a_keyed_disc_is_ambiguous_and_holds_the_true_pose(
     # turned over, or as if seen from within: a scan without sensors does not tell
     assert len(off_mm) >= 2
     assert min(off_mm) < 0.2
+
+
+@pytest.mark.parametrize(("fits", "refused"), [(0.9, True), (0.97, False)])
+def test_where_most_of_a_scan_is_left_out_the_rest_must_fit(
+    monkeypatch: pytest.MonkeyPatch, fits: float, refused: bool
+) -> None:
+    part = stepped()
+    points = sample_surface(part.body, 0.8, seed=0)[0]
+    residual = np.where(np.arange(len(points)) < fits * len(points), 0.0, 5.0)
+    pose = Refined(np.eye(4), np.eye(6), residual, converged=True, iterations=3)
+    found = Found(pose, (), fits, points, 0.6, SIGMA_MM, 0.3)
+    module = importlib.import_module("amrepair.align.align")  # the name is the function's, too
+    monkeypatch.setattr(module, "pose_from_anywhere", lambda *_, **__: found)
+    monkeypatch.setattr(module, "_refuse_mirrored", lambda *_: None)
+    scan = Scan(points, SIGMA_MM, "scanner", source="scan.ply")
+    if refused:
+        with pytest.raises(AlignmentError, match=r"95% are needed.*60% of the scan"):
+            align(scan, part)
+    else:
+        assert align(scan, part).inlier_ratio == fits

@@ -78,6 +78,14 @@ def test_a_part_that_is_not_there_is_refused(parts: dict[str, MeshSdf]) -> None:
         recognise(scan_of(parts["short"], 1), [])
 
 
+def test_what_fits_the_nearest_part_badly_is_refused(parts: dict[str, MeshSdf]) -> None:
+    # the short part with a tower on it: aligned well, and yet another part
+    tower = trimesh.creation.box(bounds=((14, 9, 3), (26, 22, 20)))
+    other = trimesh.boolean.union([parts["short"].mesh, tower], engine="manifold")
+    with pytest.raises(AlignmentError, match="none of the 1 parts of the library well: nearest is"):
+        recognise(scan_of(MeshSdf.from_mesh(other), 5), opened({"short": parts["short"]}))
+
+
 def test_misfit_is_nothing_on_the_part_and_grows_off_it(parts: dict[str, MeshSdf]) -> None:
     part = parts["short"]
     points = np.asarray(trimesh.sample.sample_surface(part.mesh, 20_000, seed=5)[0])
