@@ -24,7 +24,7 @@ from amrepair.detect.skipped import PlannedBeads
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
-from amrepair.template.port import Template
+from amrepair.template.port import Template, is_off_bed
 from gcode.check import CheckedProgram, check
 from gcode.errors import CheckRefusedError
 from gcode.estimate import Estimate, estimate
@@ -358,7 +358,7 @@ def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Sca
 
 def _in_view(scan: Scan, site: Site) -> Scan:
     """What a planned template can judge: its own last millimetres; all of it otherwise."""
-    if site.planned is None or not getattr(site.planned, "off_bed", False):
+    if site.planned is None or not is_off_bed(site.planned):
         return scan  # it reaches down to the bed: nothing was cut off
     low_mm = float(site.planned.bounds_mm[0, 2]) + PLANNED_EDGE_MM
     return _subset(scan, scan.points_mm[:, 2] > low_mm)
@@ -411,13 +411,17 @@ def _fillable(deficit: Deficit, wanted: Callable[[Region], bool]) -> manifold3d.
     pieces = deficit.missing.decompose()
     boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
     regions = [region for region in deficit.regions if region.label is Label.MISSING]
-    lines = [bool(regions) and _region_of(piece, regions).skipped for piece in pieces]
+    of_piece = [_region_of(piece, regions) if regions else None for piece in pieces]
+    lines = [region is not None and region.skipped for region in of_piece]
     keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces], lines)
-    pieces = [piece for piece, kept in zip(pieces, keep, strict=True) if kept]
-    pieces = [piece for piece in pieces if not regions or wanted(_region_of(piece, regions))]
-    if not pieces:
+    filled = [
+        piece
+        for piece, region, kept in zip(pieces, of_piece, keep, strict=True)
+        if kept and (region is None or wanted(region))
+    ]
+    if not filled:
         return manifold3d.Manifold()
-    return manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add)
+    return manifold3d.Manifold.batch_boolean(filled, manifold3d.OpType.Add)
 
 
 def _region_of(piece: manifold3d.Manifold, regions: list[Region]) -> Region:

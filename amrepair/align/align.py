@@ -23,7 +23,7 @@ from amrepair.align.thinning import in_order, thin_out
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
-from amrepair.template.port import Template
+from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
 
 METHODS = ("robust", "paper")
@@ -253,7 +253,7 @@ def _from_guess(
     rng: np.random.Generator,
 ) -> Refined:
     levelled, on_bed = guess.matrix, False
-    if not getattr(template, "off_bed", False):  # a planned one is cut: its foot is in mid-air
+    if not is_off_bed(template):  # a planned one is cut: its foot is in mid-air
         levelled, on_bed = level_on_bed(scan.points_mm, template, guess.matrix)
     step = max(1, len(scan) // MOST_LOOKED_AT)
     points = _part_only(scan.points_mm[::step], template, levelled)

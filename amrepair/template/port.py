@@ -59,3 +59,8 @@ class OnGrid(Protocol):
     def grid_numbers(self) -> tuple[Any, ...]:
         """What `learned_kernels.field_at` takes after a point."""
         ...
+
+
+def is_off_bed(template: Template) -> bool:
+    """Whether its foot is a cut in mid-air, as that of planned beads, and not the bed's height."""
+    return bool(getattr(template, "off_bed", False))

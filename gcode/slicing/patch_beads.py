@@ -24,10 +24,10 @@ from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
 
-# Thinner than this no bead holds together; it is filled with the next pass, or is the tolerance.
 # A patch presses into pores and roughness that no scan resolves, and printers push a per cent
 # less than they are asked to: what is too little stays a void, what is too much is planed.
 BOND_RATIO = 1.015
+# Thinner than this no bead holds together; it is filled with the next pass, or is the tolerance.
 LEAST_THICK_MM = 0.06
 STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4

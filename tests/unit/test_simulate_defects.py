@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import manifold3d as m3
 import numpy as np
 import pytest
@@ -143,15 +145,12 @@ def test_skipped_beads_lie_on_the_jobs_own_lines() -> None:
         place(defect, part, tops(part), np.random.default_rng(1))
 
 
-def test_truth_says_how_even_a_repair_is_and_what_it_added() -> None:
-    world = World((60.0, 60.0))
-    block = m3.Manifold.cube((16, 16, 2)).translate((20, 20, 0))
-    hole = m3.Manifold.cube((4, 4, 1)).translate((26, 26, 1))
-    box = np.array([[26.0, 26, 1], [30, 30, 2]])
-    defect = PlacedDefect(DefectKind.CHIP, (), np.zeros((0, 9)), hole, None, box)
-    none = MotionBatch.concatenate([])
+def stage_of(
+    world: World, defect: PlacedDefect, take_motion: Callable[[], MotionBatch], *, size_mm: float
+) -> Stage:
+    """A stage of one defect, looked at from straight above; truth is compared from (17, 17) on."""
     identity = Transform.identity("build", "scanner")
-    stage = Stage(
+    return Stage(
         world,
         defects=[defect],
         scanner=SimulatedScanner(
@@ -160,9 +159,19 @@ def test_truth_says_how_even_a_repair_is_and_what_it_added() -> None:
             sensors_mm=np.array([[30.0, 30.0, 200.0]]),
             rng=np.random.default_rng(0),
         ),
-        take_motion=lambda: none,
-        box_mm=(17.0, 17.0, 39.0, 39.0),
+        take_motion=take_motion,
+        box_mm=(17.0, 17.0, 17.0 + size_mm, 17.0 + size_mm),
     )
+
+
+def test_truth_says_how_even_a_repair_is_and_what_it_added() -> None:
+    world = World((60.0, 60.0))
+    block = m3.Manifold.cube((16, 16, 2)).translate((20, 20, 0))
+    hole = m3.Manifold.cube((4, 4, 1)).translate((26, 26, 1))
+    box = np.array([[26.0, 26, 1], [30, 30, 2]])
+    defect = PlacedDefect(DefectKind.CHIP, (), np.zeros((0, 9)), hole, None, box)
+    none = MotionBatch.concatenate([])
+    stage = stage_of(world, defect, lambda: none, size_mm=22.0)
     for one in (stage.world, stage.reference):
         one.add(block)
     request = ScanRequest("final", None, 2.0)
@@ -189,20 +198,8 @@ def test_truth_counts_what_each_layer_of_a_defect_took_away() -> None:
     hole = np.array([[25.0, 24.0, 1.0, 0.0, 2.0, 2.0, -1.0, 1.0, 0.0]])
     box = np.array([[22.5, 21.5, -1.0], [27.5, 26.5, 1.0]])
     defect = PlacedDefect(DefectKind.VOID, (0, 1), hole, None, None, box)
-    identity = Transform.identity("build", "scanner")
     waiting = [lines(0.2), MotionBatch.concatenate([]), lines(0.4)]
-    stage = Stage(
-        world,
-        defects=[defect],
-        scanner=SimulatedScanner(
-            world,
-            pose=ScannerPose(identity, identity),
-            sensors_mm=np.array([[30.0, 30.0, 200.0]]),
-            rng=np.random.default_rng(0),
-        ),
-        take_motion=lambda: waiting.pop(0),
-        box_mm=(17.0, 17.0, 33.0, 33.0),
-    )
+    stage = stage_of(world, defect, lambda: waiting.pop(0), size_mm=16.0)
     one_layer_mm3 = np.pi * 2.0**2 * 0.2
     stage.scan(ScanRequest("layer-000", 0, 0.2))
     world.add(m3.Manifold.cylinder(0.2, 3.0, 3.0, 64).translate((25, 24, 0)))  # a perfect repair
