@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
+from amrepair.deficit.walls import with_even_crests, with_sharp_walls
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.detection import ON_PLANE_MM
 from amrepair.detect.evidence import Evidence
@@ -199,7 +200,9 @@ def compute_deficit(
         expected: Any = template.solid()
         solid = standing_heights(seen, expected.transform(matrix), missing, excess)
         points_mm = build_from_template.apply(scan.points_mm)
-        return with_what_stands_out(solid, points_mm, scan.sigma_mm, evidence.spacing_mm)
+        sharp = with_sharp_walls(solid, missing, points_mm, scan.sigma_mm)
+        even = with_even_crests(sharp, missing)
+        return with_what_stands_out(even, points_mm, scan.sigma_mm, evidence.spacing_mm)
 
     return Deficit(
         missing=missing,

@@ -156,7 +156,7 @@ def standing_heights(
     fine = HeightField(
         np.array(box[:2]), cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool)
     )
-    columns = [_columns(solid, fine) for solid in (expected, missing)]
+    columns = [columns_of(solid, fine) for solid in (expected, missing)]
     z_mm = raster_kernels.column_rest(*columns[0], *columns[1], FILM_MM, 0.0).reshape(ny, nx)
     at = _cells_over(seen, fine)
     # a film that the scan sees, around there too, is what is left of the part
@@ -270,7 +270,7 @@ def _by_chance(off_mm: Float[np.ndarray, "ny nx"], around: int) -> Bool[np.ndarr
     return np.asarray((np.abs(off_mm) < CHANCE_MM) & (np.abs(together) < 0.5 * NOISE_MM))
 
 
-def _columns(
+def columns_of(
     solid: manifold3d.Manifold, field: HeightField
 ) -> tuple[Int[np.ndarray, " cells1"], Float[np.ndarray, " crossings"]]:
     """Crossings of a solid with the field's columns: where each column's begin, and heights."""

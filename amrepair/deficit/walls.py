@@ -1,0 +1,118 @@
+"""Walls beside what is missing, as sharp as the scan has them.
+
+The solids' walls there come from cells of the scan, whose planes round off corners and waver by
+some hundredths of a millimetre: whether a column of the field is wall or not is left to chance by
+that, and one too many in a row keeps the nozzle's cone away all along. A plane through the points
+of the wall itself, column by column, knows better.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from amrepair.deficit import walls_kernels as kernels
+from amrepair.deficit.heights import columns_of
+from gcode.surfaces import HeightField
+
+# A step from column to column that is a wall, not a slope.
+STEP_MM = 0.3
+# Around what is missing, so many cells: there the solids' walls are the scan's.
+BESIDE_CELLS = 3
+# Around a column; a round wall of 4 mm across leaves its plane by no more than noise within it.
+RADIUS_MM = 0.4
+# Points so near to a wall's ends, in the scan's noise, belong to what lies above or below it.
+BELOW_TOP_SIGMA, OVER_FOOT_SIGMA = 2.5, 4.0
+# What lies farther from its plane than noise alone, on average, is more than one wall.
+MOST_SPREAD_SIGMA = 1.75
+MOST_SLANT = 0.25  # cosine: steeper than 75°
+# Thinner than a bead; and along it, as far as between two points that were seen.
+CREST_CELLS, CREST_REACH_CELLS = 4, 2
+
+
+def with_sharp_walls(
+    field: HeightField, missing: Any, points_mm: Float[np.ndarray, "n 3"], sigma_mm: float
+) -> HeightField:
+    """The as-built field, columns beside walls high or low as their middles lie to the wall.
+
+    Parameters
+    ----------
+    missing
+        `manifold3d.Manifold`, build frame: only walls beside it are looked at.
+    points_mm
+        What was seen, build frame.
+    """
+    window = _around(missing, field, BESIDE_CELLS + int(np.ceil(RADIUS_MM / field.cell_mm)))
+    if window is None or sigma_mm <= 0:
+        return field
+    touched, rows, columns = window
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    near = z_mm[rows, columns]
+    beside = ndimage.maximum_filter(touched[rows, columns], 2 * BESIDE_CELLS + 1)
+    step_mm = ndimage.maximum_filter(near, 3) - ndimage.minimum_filter(near, 3)
+    iy, ix = (beside & (step_mm > STEP_MM)).nonzero()
+    corner_mm = field.origin_mm + np.array([columns.start, rows.start]) * field.cell_mm
+    sorted_mm, start = _by_cell(points_mm, corner_mm, field.cell_mm, near.shape)
+    near[iy, ix] = kernels.sharpened(
+        near.copy(), iy, ix, start, sorted_mm, corner_mm, field.cell_mm, RADIUS_MM,
+        BELOW_TOP_SIGMA * sigma_mm, OVER_FOOT_SIGMA * sigma_mm, MOST_SPREAD_SIGMA * sigma_mm,
+        MOST_SLANT,
+    )  # fmt: skip
+    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+
+
+def with_even_crests(field: HeightField, missing: Any) -> HeightField:
+    """The as-built field, what is thinner than a bead beside what is missing as high as near by.
+
+    A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
+    what lies between two of its columns that were seen is no lower than the higher of them.
+    """
+    window = _around(missing, field, CREST_CELLS + BESIDE_CELLS)
+    if window is None:
+        return field
+    touched, rows, columns = window
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    near = z_mm[rows, columns]
+    beside = ndimage.maximum_filter(touched[rows, columns], 2 * BESIDE_CELLS + 1)
+    reach = 2 * CREST_REACH_CELLS + 1
+    # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
+    thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, CREST_CELLS), reach)
+    crest = beside & (near - thick_mm > STEP_MM)
+    highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
+    near[crest] = highest_mm[crest]
+    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+
+
+def _around(
+    missing: Any, field: HeightField, margin: int
+) -> tuple[Bool[np.ndarray, "ny nx"], slice, slice] | None:
+    """Columns that a solid lies over, and the window of the field around them; None: nowhere."""
+    offset, _ = columns_of(missing, field)
+    touched = (offset[1:] != offset[:-1]).reshape(field.shape)
+    if not touched.any():
+        return None
+    rows, columns = (
+        slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in touched.nonzero()
+    )
+    return touched, rows, columns
+
+
+def _by_cell(
+    points_mm: Float[np.ndarray, "n 3"],
+    corner_mm: Float[np.ndarray, " 2"],
+    cell_mm: float,
+    shape: tuple[int, int],
+) -> tuple[Float[np.ndarray, "kept 3"], Int[np.ndarray, "ny nx1"]]:
+    """Points over a grid sorted by its cells, and where those of each cell begin, by row."""
+    ny, nx = shape
+    high_mm = corner_mm + cell_mm * np.array([nx, ny])
+    xy = points_mm[:, :2]
+    own = points_mm[((xy >= corner_mm) & (xy < high_mm)).all(axis=1)]
+    index = np.floor((own[:, :2] - corner_mm) / cell_mm).astype(np.int64)
+    cell = np.minimum(index[:, 1], ny - 1) * nx + np.minimum(index[:, 0], nx - 1)
+    ends = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=ny * nx))])
+    start = np.lib.stride_tricks.sliding_window_view(ends, nx + 1)[::nx]
+    return own[np.argsort(cell, kind="stable")], np.ascontiguousarray(start)

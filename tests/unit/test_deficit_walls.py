@@ -1,0 +1,122 @@
+"""Walls of the as-built field beside what is missing: as sharp as the points of the wall say."""
+
+from __future__ import annotations
+
+import manifold3d
+import numpy as np
+import pytest
+import trimesh
+from scipy import ndimage
+
+from amrepair.deficit.walls import with_even_crests, with_sharp_walls
+from gcode.slicing.layers import mesh_of
+from gcode.surfaces import HeightField
+
+Solid = manifold3d.Manifold
+CELL_MM, SIGMA_MM, SPACING_MM = 0.1, 0.04, 0.2
+# A column whose middle is so near to a wall may go either way: three standard deviations of the
+# mean of some twenty points.
+UNDECIDED_MM = 0.03
+
+
+def scanned(solid: manifold3d.Manifold, seed: int) -> np.ndarray:
+    """Points of a solid's surface with noise."""
+    vertices, faces = mesh_of(solid)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / SPACING_MM**2), seed=seed)
+    noise = np.random.default_rng(seed).normal(scale=SIGMA_MM, size=points.shape)
+    return np.asarray(points) + noise
+
+
+def wavering(field: HeightField, seed: int) -> HeightField:
+    """Every third column beside a step as high, or as low, as its neighbours."""
+    rng = np.random.default_rng(seed)
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    high, low = ndimage.maximum_filter(z_mm, 3), ndimage.minimum_filter(z_mm, 3)
+    wrong = (high - low > 1.0) & (rng.random(z_mm.shape) < 1 / 3)
+    wrong_mm = np.where(z_mm > 0.5 * (high + low), low, high)
+    return HeightField(field.origin_mm, field.cell_mm, np.where(wrong, wrong_mm, z_mm), field.seen)
+
+
+def broken(shape: str, turned: float) -> tuple[manifold3d.Manifold, manifold3d.Manifold]:
+    """What is left of a block, and the piece that is gone, at no round place of the grid."""
+    block = Solid.cube((24.0, 20.0, 6.0))
+    tool = {
+        "notch": Solid.cube((9.0, 30.0, 4.0), True).rotate((0.0, 0.0, turned)),
+        "pit": Solid.cube((8.0, 9.0, 4.0), True).rotate((0.0, 0.0, turned)),
+        "bore": Solid.cylinder(4.0, 4.3, 4.3, 96, True),
+    }[shape].translate((12.037, 10.071, 6.0))
+    return block - tool, block ^ tool
+
+
+@pytest.mark.parametrize(
+    ("shape", "turned"), [("notch", 0.0), ("notch", 17.0), ("pit", 31.0), ("bore", 0.0)]
+)
+def test_columns_beside_walls_are_told_by_the_walls_own_points(shape: str, turned: float) -> None:
+    rest, piece = broken(shape, turned)
+    truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
+    rough = wavering(truth, 0)
+    sharp = with_sharp_walls(rough, piece, scanned(rest, 1), SIGMA_MM)
+    x, y = truth.centres_mm()
+    inside = (np.abs(x - 12.0) < 11.0)[None, :] & (np.abs(y - 10.0) < 9.0)[:, None]
+    off_before = inside & (np.abs(rough.z_mm - truth.z_mm) > 0.5)
+    off_after = inside & (np.abs(sharp.z_mm - truth.z_mm) > 0.5)
+    assert off_before.sum() > 100
+    # corners of a pit, where two walls lie within reach, are left as they are
+    assert off_after.sum() < 0.2 * off_before.sum()
+    made_wrong = off_after & ~off_before
+    # the wall's place to a fiftieth of a millimetre
+    fine = HeightField.from_manifold(piece, CELL_MM / 5, box_mm=truth.box_mm).z_mm > 1.0
+    to_wall_mm = _distance_to_edge(fine, CELL_MM / 5)
+    for row, column in np.argwhere(made_wrong):
+        assert to_wall_mm[5 * row + 2, 5 * column + 2] < UNDECIDED_MM + CELL_MM / 5
+    assert made_wrong.sum() <= 0.05 * off_before.sum()
+
+
+def _distance_to_edge(inside: np.ndarray, cell_mm: float) -> np.ndarray:
+    """Of every cell to where a region begins or ends."""
+    within = ndimage.distance_transform_edt(inside)
+    without = ndimage.distance_transform_edt(~inside)
+    return np.asarray(np.maximum(within, without) * cell_mm)
+
+
+def test_slopes_and_what_is_not_broken_stay_as_they_are() -> None:
+    block = Solid.cube((24.0, 20.0, 6.0))
+    wedge = Solid.cube((10.0, 8.0, 6.0), True).rotate((0.0, 40.0, 0.0)).translate((12.0, 10.0, 7.0))
+    rest = block - wedge
+    truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
+    sharp = with_sharp_walls(truth, block ^ wedge, scanned(rest, 2), SIGMA_MM)
+    changed = np.abs(sharp.z_mm - truth.z_mm) > 0.2
+    # the two steep ends of the groove may differ by a column whose middle is on the wall
+    assert changed.sum() < 20
+    outside = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    assert with_sharp_walls(outside, Solid(), scanned(rest, 2), SIGMA_MM) is outside
+
+
+def test_a_crest_between_two_columns_that_were_seen_is_as_high_as_they() -> None:
+    """A horn read 0.8 mm low in the middle: the flat went 0.4 mm into it."""
+    block = Solid.cube((24.0, 20.0, 6.0))
+    tools = [
+        Solid.cube((30.0, 9.9, 4.0), True).translate((12.0, y, 6.0)) for y in (4.9, 15.05)
+    ]  # a fin of 0.25 mm is left between them
+    piece = block ^ (tools[0] + tools[1])
+    truth = HeightField.from_manifold(block - piece, CELL_MM, margin_mm=1.0)
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    fin = z_mm > 5.0
+    assert 0 < fin.sum() < 3 * z_mm.shape[1]
+    low = fin & (np.random.default_rng(3).random(z_mm.shape) < 0.3)
+    z_mm[low] -= 0.8
+    even = with_even_crests(HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen), piece)
+    assert (even.z_mm[fin] > 5.9).mean() > 0.99
+    assert (even.z_mm[~fin] == z_mm[~fin]).all()
+
+
+def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
+    rest, piece = broken("notch", 0.0)
+    truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    beside = (ndimage.maximum_filter(z_mm, 3) > 5.9) & (np.abs(z_mm - 4.0) < 0.1)
+    z_mm[beside] += 0.9
+    even = with_even_crests(HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen), piece)
+    assert beside.sum() > 300
+    assert (even.z_mm == z_mm).all()
