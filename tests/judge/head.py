@@ -19,13 +19,15 @@ class HeadSlice:
 
 
 # An E3D V6 nozzle of 0.4 mm (1 mm flat, cone, 7 mm hexagon across the corners), its block, and the
-# fan duct of a Prusa MK3S, off the published drawings.
+# fan duct of a Prusa MK3S, off the published drawings; the extruder over them as Cura's definition
+# of the machine has it, from the height on that PrusaSlicer keeps clear of other parts.
 MK3S_HEAD = (
     HeadSlice(0.0, radius_mm=0.5),
     HeadSlice(0.8, radius_mm=1.6),
     HeadSlice(2.0, radius_mm=4.2),
     HeadSlice(4.5, box_mm=(-9.0, -18.0, 14.0, 9.0)),
     HeadSlice(6.0, box_mm=(-24.0, -32.0, 24.0, 22.0)),
+    HeadSlice(20.0, box_mm=(-31.0, -40.0, 34.0, 31.0)),
 )
 
 

@@ -21,7 +21,7 @@ MARGIN_MM = 3.0
 MOST_GAP_MM = 0.55
 HANGING_MM = 0.2
 # The head may stand beside the part and touch it.
-BESIDE_MM = 32.0
+BESIDE_MM = 40.0
 
 
 @dataclass

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gcode.profiles import load_setup
 from gcode.slicing import reach_kernels
+from gcode.slicing.reach import Reach
+from gcode.surfaces import HeightField
 
 
 @settings(max_examples=40, deadline=None)
@@ -26,3 +30,33 @@ def test_a_piece_is_free_where_all_that_rounding_makes_of_it_is(seed: int) -> No
                 ix, iy = (int(v) for v in np.floor(place))
                 stuck |= 0 <= ix < nx and 0 <= iy < ny and not free[iy, ix]
         assert ok == (not stuck)
+
+
+@pytest.mark.parametrize(
+    ("printer", "tall_mm", "away_mm", "free"),
+    [
+        # the MK3S's rods, 28 mm over the tip, reach 31 mm behind it and across the bed
+        ("prusa_mk3s", 40.0, (70.0, 25.0), False),
+        ("prusa_mk3s", 40.0, (70.0, 40.0), True),
+        ("prusa_mk3s", 27.0, (70.0, 25.0), True),
+        # its extruder, 20 mm over the tip, 40 mm to the front and 34 to the side
+        ("prusa_mk3s", 24.0, (0.0, -36.0), False),
+        ("prusa_mk3s", 24.0, (0.0, -46.0), True),
+        ("prusa_mk3s", 24.0, (38.0, 0.0), True),
+        # an Ender's gantry, 25 mm over the tip
+        ("ender_3", 30.0, (80.0, 0.0), False),
+        ("ender_3", 24.0, (80.0, 0.0), True),
+    ],
+)
+def test_a_tower_beside_a_low_place_keeps_off_what_would_hit_it(
+    printer: str, tall_mm: float, away_mm: tuple[float, float], free: bool
+) -> None:
+    """A gantry said to be 60 mm over the tip would have gone through a part of 40."""
+    here = np.array([125.0, 105.0])
+    field = HeightField.flat((250.0, 210.0), 1.0)
+    x, y = here + np.array(away_mm)
+    z_mm = np.array(field.z_mm)
+    z_mm[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2] = tall_mm
+    window = (here[0] - 1.0, here[1] - 1.0, here[0] + 1.0, here[1] + 1.0)
+    reach = Reach(field.raised(z_mm), load_setup(printer).printer, window_mm=window)
+    assert bool(reach.at(0.2).all()) == free
