@@ -307,11 +307,13 @@ def plan_repair(
         return RepairPlan(
             registration, anomaly, deficit, None, None, None, build_from_scan, layer_mm, moved
         )
+    with watch("deficit"):
+        as_built = deficit.as_built  # made where it is needed: a clean layer has no use for it
     with watch("slice"):
         patch = slice_patch(
             fillable,
             site.setup,
-            as_built=deficit.as_built,
+            as_built=as_built,
             grid=site.grid,
             standalone=interruption is None,
             start_mm=_start_of(interruption),
@@ -324,7 +326,7 @@ def plan_repair(
     with watch("check"):
         program = write(patch.toolpath, site.setup, title=title, resume=interruption, restore=False)
         try:
-            checked = check(program, site.setup, as_built=deficit.as_built, initial=interruption)
+            checked = check(program, site.setup, as_built=as_built, initial=interruption)
         except CheckRefusedError as error:
             if strict:
                 raise

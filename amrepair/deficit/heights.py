@@ -15,8 +15,8 @@ import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
+from amrepair.deficit import heights_kernels as kernels
 from amrepair.detect.rays import RangeImage, clearances
 from amrepair.frames import Transform, box_corners
 from amrepair.scans import Scan
@@ -227,34 +227,14 @@ def with_what_stands_out(
     for aside in itertools.product((-off_mm, 0.0, off_mm), repeat=2):
         np.maximum(around_mm, field.sample(high[:, :2] + np.array(aside)), out=around_mm)
     out = high[high[:, 2] - off_mm > around_mm]
-    out = out[_in_company(out, points_mm, BESIDE_SPACINGS * spacing_mm)]
+    if len(out) == 0:
+        return field
+    out = out[kernels.in_company(out, points_mm, BESIDE_SPACINGS * spacing_mm, OTHERS)]
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)
     np.maximum.at(z_mm, tuple(index[inside].T), out[inside, 2] - off_mm)
     return field.raised(z_mm)
-
-
-def _in_company(
-    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "n 3"], within_mm: float
-) -> Bool[np.ndarray, " k"]:
-    """Which of a cloud's points have others of it within a distance."""
-    if len(asked_mm) == 0:
-        return np.zeros(0, dtype=bool)
-    # the tree is built of what is near: columns as wide as the distance, and those around them
-    low = asked_mm[:, :2].min(axis=0) - 2 * within_mm
-    shape = ((np.ptp(asked_mm[:, :2], axis=0) + 4 * within_mm) / within_mm).astype(np.int64) + 1
-    near = np.zeros(shape, dtype=bool)
-    near[tuple(((asked_mm[:, :2] - low) / within_mm).astype(np.int64).T)] = True
-    near = ndimage.binary_dilation(near, np.ones((3, 3)))
-    lowest, highest = asked_mm[:, 2].min() - within_mm, asked_mm[:, 2].max() + within_mm
-    z = points_mm[:, 2]
-    others = points_mm[(z > lowest) & (z < highest)]
-    column = ((others[:, :2] - low) / within_mm).astype(np.int64)
-    inside = ((others[:, :2] >= low) & (column < shape)).all(axis=1)
-    others, column = others[inside], column[inside]
-    tree = cKDTree(others[near[column[:, 0], column[:, 1]]])
-    return np.asarray(tree.query(asked_mm, k=1 + OTHERS)[0][:, -1] <= within_mm)
 
 
 def _without_fins(z_mm: Float[np.ndarray, "ny nx"], cells: int) -> Float[np.ndarray, "ny nx"]:

@@ -6,9 +6,13 @@ import manifold3d as m3
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from amrepair.deficit import compute_deficit
 from amrepair.deficit.heights import _without_fins, standing_heights
+from amrepair.deficit.heights_kernels import in_company
 from amrepair.detect import faces
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -54,6 +58,19 @@ def field_of(
 def heights(field: HeightField, x: tuple[float, float], y: tuple[float, float]) -> np.ndarray:
     grid = np.stack(np.meshgrid(np.arange(*x, 0.1), np.arange(*y, 0.1)), axis=-1)
     return field.sample(grid.reshape(-1, 2))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), spread_mm=st.sampled_from([0.3, 3.0, 40.0]))
+def test_points_in_company_are_those_that_a_tree_finds(seed: int, spread_mm: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-spread_mm, spread_mm, (400, 3)) * [1.0, 1.0, 0.2]
+    asked = points[rng.random(400) < 0.2]
+    if len(asked) == 0:
+        return
+    found = in_company(asked, points, 0.4, 2)
+    truth = cKDTree(points).query(asked, k=3)[0][:, -1] <= 0.4
+    assert (found == truth).all()
 
 
 def test_a_slot_that_was_designed_stays_open() -> None:
