@@ -99,7 +99,6 @@ def slice_solid(
     from gcode.estimate import estimate as estimate_program
     from gcode.profiles import load_setup
     from gcode.slicing.job import slice_part
-    from gcode.slicing.patch import slice_patch
     from gcode.solids import read_solid
     from gcode.writer import write
 
@@ -114,6 +113,8 @@ def slice_solid(
             field = None
             toolpath = slice_part(shape, setup, progress=bars)
         else:
+            from gcode.slicing.patch import slice_patch
+
             field = _as_built(as_built)
             plan = slice_patch(
                 shape,
