@@ -132,8 +132,9 @@ def recognise(
         raise AlignmentError(
             f"the scan {scan.source} fits none of the {len(rated)} parts of the library ({reasons})"
         )
-    part_ratio = 1.0 - best.registration.clutter_ratio
-    least = misfit(scan, opened[best.name], best.registration, part_ratio=part_ratio)
+    least, part_ratio = best.misfit_ratio, 1.0 - best.registration.clutter_ratio
+    if part_ratio < 1.0:
+        least = misfit(scan, opened[best.name], best.registration, part_ratio=part_ratio)
     if least > MOST_MISFIT:
         raise AlignmentError(
             f"the scan {scan.source} fits none of the {len(rated)} parts of the library well: "

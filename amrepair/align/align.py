@@ -40,7 +40,7 @@ MUCH_LEFT_OUT, LEAST_OF_REST = 0.4, 0.95
 MIRRORED_BETTER = 0.4  # of what is left unexplained, where the mirror image is meant
 # Sizes that differ by more are another unit, or too little of the part; large scans hold the bed.
 SMALLEST_RATIO, LARGEST_RATIO = 0.15, 20.0
-UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3, "mils": 0.0254}
+UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3}
 UNIT_SLACK = 1.8  # a view may show less than the part, a turned box more
 SIZE_JUMP = 1.6  # sizes that differ by more are worth a word
 
@@ -317,6 +317,11 @@ def _refuse_other_size(scan: Scan, template: Template) -> None:
     if SMALLEST_RATIO <= ratio <= LARGEST_RATIO:
         return
     near = [unit for unit, mm in UNITS.items() if 1 / UNIT_SLACK < ratio * mm < UNIT_SLACK]
+    near += [  # no drawing is in micrometres
+        f"a template in {unit}"
+        for unit, mm in UNITS.items()
+        if mm > 1.0 and 1 / UNIT_SLACK < ratio / mm < UNIT_SLACK
+    ]
     hint = f" ({' or '.join(near)} for millimetres?)" if near else ""
     raise AlignmentError(
         f"the scan {scan.source} is {size:.3g} mm across, its template {other:.3g} mm: they cannot "

@@ -52,8 +52,10 @@ NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
 INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
 INLIER_SIGMAS = 3.0
 # Fewer explained, and the noise is measured (taken where it is more than was said, up to what a
-# thin wall's two sides could pretend), and the mirror image tried.
-DOUBTFUL, NOISIER, MOST_NOISE_MM = 0.93, 1.5, 0.25
+# thin wall's two sides could pretend, or of the diagonal: sensors for large parts see them from
+# afar), and the mirror image tried.
+DOUBTFUL, NOISIER, MOST_NOISE_MM, MOST_NOISE_RATIO = 0.93, 1.5, 0.25, 0.001
+BIAS_SIGMAS = 2.6  # a template's bias is the 99th percentile of its error
 # With fewer points on the part the search goes on, and is made thorough; with more than the last
 # the pose is worth turning.
 WELL_EXPLAINED, MOSTLY_EXPLAINED, EXPLAINED = 0.97, 0.95, 0.7
@@ -94,9 +96,13 @@ class Found:
     field: CoarseField | None = None
 
 
-def limits_mm(noise_mm: float) -> tuple[float, float]:
-    """How well points can agree with the template, and how near explained ones lie."""
-    sigma_mm = float(np.hypot(max(noise_mm, 1e-3), NOISE_FLOOR_MM))
+def limits_mm(noise_mm: float, bias_mm: float = 0.0) -> tuple[float, float]:
+    """How well points can agree with the template, and how near explained ones lie.
+
+    A good guess needs no `bias_mm` of the template: hardly more than half of the points must fit.
+    """
+    floor_mm = np.hypot(NOISE_FLOOR_MM, bias_mm / BIAS_SIGMAS)
+    sigma_mm = float(np.hypot(max(noise_mm, 1e-3), floor_mm))
     return sigma_mm, max(INLIER_MM, INLIER_SIGMAS * sigma_mm)
 
 
@@ -170,13 +176,14 @@ def pose_from_anywhere(
     least_ratio
         Of the points that must lie on the part: where fewer do, features are asked as well.
     """
-    sigma_mm, inlier_mm = limits_mm(sigma_mm)
+    sigma_mm, inlier_mm = limits_mm(sigma_mm, template.bias_mm)
     clouds, field = Clouds.of(points_mm, template, sigma_mm, rng), CoarseField.of(template)
     hunt = _Hunt(template, field, clouds, points_mm, sigma_mm, inlier_mm)
     progress("align", 0.1, 1.0)
     hunt.take(_worth_refining(clouds, field, QUICK))
     if hunt.share < DOUBTFUL and not noise_is_measured:
-        measured_mm = min(noise_across(points_mm, rng), MOST_NOISE_MM)
+        most_mm = max(MOST_NOISE_MM, MOST_NOISE_RATIO * clouds.diagonal_mm)
+        measured_mm = min(noise_across(points_mm, rng), most_mm)
         if measured_mm > NOISIER * sigma_mm:
             return pose_from_anywhere(
                 points_mm,

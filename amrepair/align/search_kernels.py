@@ -108,13 +108,42 @@ def starts(points, rotations, box, values, shape, cap, gap, most):
     return found
 
 
+@njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _field(x, y, z, values, nx, ny, nz):
+    """f and its gradient at a place: trilinear; beyond the grid, as its border has it.
+
+    Numbers of nodes are given as floats. Inlined, so a gradient that is not asked costs nothing.
+    """
+    none, one, edge = np.float32(0.0), np.float32(1.0), np.float32(1.001)
+    unit, row, plane = np.uint32(1), np.uint32(nz), np.uint32(ny * nz)
+    cx = min(max(x, none), nx - edge)
+    cy = min(max(y, none), ny - edge)
+    cz = min(max(z, none), nz - edge)
+    i, j, k = np.floor(cx), np.floor(cy), np.floor(cz)
+    at = np.uint32((i * ny + j) * nz + k)
+    u, v, w = cx - i, cy - j, cz - k
+    a, c = values[at], values[at + row]
+    e, g = values[at + plane], values[at + plane + row]
+    da, dc = values[at + unit] - a, values[at + row + unit] - c
+    de, dg = values[at + plane + unit] - e, values[at + plane + row + unit] - g
+    ab, cd, ef, gh = a + da * w, c + dc * w, e + de * w, g + dg * w
+    front, back = ab + (cd - ab) * v, ef + (gh - ef) * v
+    low, high = da + (dc - da) * v, de + (dg - de) * v
+    dx, dy, dz = x - cx, y - cy, z - cz
+    away = np.sqrt(dx * dx + dy * dy + dz * dz)
+    inside = away <= none
+    by = one / (away if away > SHORTEST else one)
+    gx = back - front if inside else dx * by
+    gy = (cd - ab) + (gh - ef - cd + ab) * u if inside else dy * by
+    gz = low + (high - low) * u if inside else dz * by
+    return front + (back - front) * u + away, gx, gy, gz
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _between_nodes(points, r, p, values, shape, cap):
-    """Sum of |f|, each up to the cap; the field is `_accumulate`'s."""
-    none, edge, unit = np.float32(0.0), np.float32(1.001), np.uint32(1)
+    """Sum of |f|, each up to the cap."""
     most, total = np.float32(cap), np.float32(0.0)
     nx, ny, nz = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
-    row, plane = np.uint32(shape[2]), np.uint32(shape[1] * shape[2])
     r00, r01, r02 = np.float32(r[0, 0]), np.float32(r[0, 1]), np.float32(r[0, 2])
     r10, r11, r12 = np.float32(r[1, 0]), np.float32(r[1, 1]), np.float32(r[1, 2])
     r20, r21, r22 = np.float32(r[2, 0]), np.float32(r[2, 1]), np.float32(r[2, 2])
@@ -124,21 +153,7 @@ def _between_nodes(points, r, p, values, shape, cap):
         tx = r00 * x + r01 * y + r02 * z + px
         ty = r10 * x + r11 * y + r12 * z + py
         tz = r20 * x + r21 * y + r22 * z + pz
-        cx = min(max(tx, none), nx - edge)
-        cy = min(max(ty, none), ny - edge)
-        cz = min(max(tz, none), nz - edge)
-        i, j, k = np.floor(cx), np.floor(cy), np.floor(cz)
-        at = np.uint32((i * ny + j) * nz + k)
-        u, v, w = cx - i, cy - j, cz - k
-        a, c = values[at], values[at + row]
-        e, g = values[at + plane], values[at + plane + row]
-        ab, cd = a + (values[at + unit] - a) * w, c + (values[at + row + unit] - c) * w
-        ef = e + (values[at + plane + unit] - e) * w
-        gh = g + (values[at + plane + row + unit] - g) * w
-        front, back = ab + (cd - ab) * v, ef + (gh - ef) * v
-        dx, dy, dz = tx - cx, ty - cy, tz - cz
-        f = front + (back - front) * u + np.sqrt(dx * dx + dy * dy + dz * dz)
-        total += min(abs(f), most)
+        total += min(abs(_field(tx, ty, tz, values, nx, ny, nz)[0]), most)
     return total
 
 
@@ -154,14 +169,9 @@ def misfits(points, rotations, places, values, shape, cap):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _accumulate(points, r, p, values, shape, scale, cap, h, b):
-    """Normal equations of the Geman–McClure loss at a pose, and the sum of |f|, each up to the cap.
-
-    The field and its gradient are trilinear; beyond the grid, as its border has it.
-    """
-    none, one, unit, edge = np.float32(0.0), np.float32(1.0), np.uint32(1), np.float32(1.001)
+    """Normal equations of the Geman–McClure loss at a pose, and the sum of |f| up to the cap."""
     square, most, total = np.float32(scale * scale), np.float32(cap), np.float32(0.0)
     nx, ny, nz = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
-    row, plane = np.uint32(shape[2]), np.uint32(shape[1] * shape[2])
     r00, r01, r02 = np.float32(r[0, 0]), np.float32(r[0, 1]), np.float32(r[0, 2])
     r10, r11, r12 = np.float32(r[1, 0]), np.float32(r[1, 1]), np.float32(r[1, 2])
     r20, r21, r22 = np.float32(r[2, 0]), np.float32(r[2, 1]), np.float32(r[2, 2])
@@ -176,27 +186,7 @@ def _accumulate(points, r, p, values, shape, scale, cap, h, b):
         ty = r10 * x + r11 * y + r12 * z
         tz = r20 * x + r21 * y + r22 * z
         x, y, z = tx + px, ty + py, tz + pz
-        cx = min(max(x, none), nx - edge)
-        cy = min(max(y, none), ny - edge)
-        cz = min(max(z, none), nz - edge)
-        i, j, k = np.floor(cx), np.floor(cy), np.floor(cz)
-        at = np.uint32((i * ny + j) * nz + k)
-        u, v, w = cx - i, cy - j, cz - k
-        a, c = values[at], values[at + row]
-        e, g = values[at + plane], values[at + plane + row]
-        da, dc = values[at + unit] - a, values[at + row + unit] - c
-        de, dg = values[at + plane + unit] - e, values[at + plane + row + unit] - g
-        ab, cd, ef, gh = a + da * w, c + dc * w, e + de * w, g + dg * w
-        front, back = ab + (cd - ab) * v, ef + (gh - ef) * v
-        low, high = da + (dc - da) * v, de + (dg - de) * v
-        dx, dy, dz = x - cx, y - cy, z - cz
-        away = np.sqrt(dx * dx + dy * dy + dz * dz)
-        inside = away <= none
-        by = one / (away if away > SHORTEST else one)
-        f = front + (back - front) * u + away
-        gx = back - front if inside else dx * by
-        gy = (cd - ab) + (gh - ef - cd + ab) * u if inside else dy * by
-        gz = low + (high - low) * u if inside else dz * by
+        f, gx, gy, gz = _field(x, y, z, values, nx, ny, nz)
         total += min(abs(f), most)
         weight = square / (f * f + square)
         weight *= weight

@@ -133,13 +133,40 @@ def test_noise_that_was_not_said_is_measured() -> None:
     assert found.inlier_ratio > 0.95
 
 
+@pytest.mark.parametrize("noise_mm", [0.05, 1.5])
+def test_a_part_of_metres_is_aligned(noise_mm: float) -> None:
+    # regression: no noise over 0.25 mm was believed, so that a scan of a part of 4 m, as good for
+    # its size as any, did not fit; nor did one of a template that is itself good to half a
+    # millimetre
+    small = stepped()
+    wavy = AnalyticTemplate(
+        lambda p: 100.0 * small.field(p / 100.0) + 0.4 * np.sin(p.sum(axis=1)),
+        small.body.scale((100.0, 100.0, 100.0)),
+        bias_mm=0.4,
+    )
+    part = 100.0 * sample_surface(small.body, 0.55, seed=4)[0]
+    found, off_mm = aligned(wavy, part, part[:0], sigma_mm=noise_mm)
+    assert len(off_mm) == 1
+    assert off_mm[0] < 0.2
+    assert found.inlier_ratio > 0.95
+    assert found.clutter_ratio == 0.0
+
+
 @pytest.mark.parametrize(
     ("mm", "hint"),
-    [(1e3, "metres"), (25.4, "inches"), (10.0, "centimetres"), (1e-3, "micrometres"), (40.0, "")],
+    [
+        (1e3, r"\(metres for millimetres\?"),
+        (25.4, r"\(inches for"),
+        (10.0, r"\(centimetres for"),
+        (1 / 25.4, r"\(a template in inches for"),  # regression: "mils for millimetres?"
+        (1e-3, r"\(micrometres or a template in metres for"),
+        (100.0, "or it shows too little"),
+        (0.005, "same unit$"),
+    ],
 )
 def test_the_unit_is_guessed_from_the_size(mm: float, hint: str) -> None:
     part = sample_surface(stepped().body, 1.0, seed=5)[0] / mm
-    with pytest.raises(AlignmentError, match=rf"same unit.*{hint}"):
+    with pytest.raises(AlignmentError, match=rf"same unit.*{hint}" if hint[0] != "s" else hint):
         align(Scan(part, SIGMA_MM / mm, "scanner", source="scan.ply"), stepped())
 
 
