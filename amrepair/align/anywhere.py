@@ -33,7 +33,16 @@ from amrepair.align.poses import (
     refined,
 )
 from amrepair.align.refine import Refined
-from amrepair.align.search import PIECE, QUICK, THOROUGH, TWINS, CoarseField, Effort, search
+from amrepair.align.search import (
+    PIECE,
+    PIECE_AGAIN,
+    QUICK,
+    THOROUGH,
+    TWINS,
+    CoarseField,
+    Effort,
+    search,
+)
 from amrepair.align.thinning import Thinned
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
@@ -203,6 +212,8 @@ def pose_from_anywhere(
     if clouds.size_mm < PIECE_RATIO * clouds.diagonal_mm:
         progress("align", 0.5, 1.0)
         hunt.take(_worth_refining(hunt.clouds, field, PIECE))
+        if hunt.share < WELL_EXPLAINED:
+            hunt.take(_worth_refining(hunt.clouds, field, PIECE_AGAIN, turn=BETWEEN))
     if hunt.share < least_ratio:
         progress("align", 0.6, 1.0)
         _ask_features(hunt)

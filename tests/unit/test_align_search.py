@@ -6,17 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align import Registration, align
-from amrepair.align.search import QUICK, spread_rotations
-from amrepair.align.thinning import in_order, thin_out
+from amrepair.align.search import PIECE, QUICK, CoarseField, search, spread_rotations
+from amrepair.align.thinning import Thinned, in_order, thin_out
 from amrepair.bench.bodies import standing_pose
 from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan
-from amrepair.template import MeshSdf
+from amrepair.simulate.part_files import part_path
+from amrepair.template import MeshSdf, load_mesh
 from tests.analytic import (
     AnalyticTemplate,
     box,
@@ -139,6 +141,24 @@ def test_a_piece_of_a_long_part_is_found_wherever_it_lies() -> None:
     found, off_mm = aligned(part, piece[rng.permutation(len(piece))[:2_000]])
     assert off_mm < 0.1
     assert not found.symmetric_alternatives
+
+
+def test_a_corner_of_a_part_is_found_wherever_it_lies() -> None:
+    # regression: with four places for each rotation none of these three searches found it
+    part = MeshSdf.from_mesh(load_mesh(part_path("bracket")))
+    points = np.asarray(trimesh.sample.sample_surface(part.mesh, 40_000, seed=0)[0])
+    rng = np.random.default_rng(5)
+    away = np.linalg.norm(points - points[rng.integers(len(points))], axis=1)
+    piece = points[away <= np.quantile(away, 0.1)]
+    piece = piece + rng.normal(0, 0.05, piece.shape)
+    field = CoarseField.of(part)
+    found = 0
+    for seed in (1, 2, 3):
+        turn = rotation_from_vector(np.random.default_rng(seed).normal(size=3))
+        cloud = Thinned(piece, np.random.default_rng(seed))
+        there = search(cloud, field, effort=PIECE, only=(np.eye(4),))[0]
+        found += search(cloud, field, effort=PIECE, turn=turn)[0].score_mm < 1.1 * there.score_mm
+    assert found >= 2
 
 
 def test_clutter_does_not_mislead() -> None:
