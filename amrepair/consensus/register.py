@@ -106,7 +106,8 @@ def place_all(
         raise AlignmentError(
             f"{len(waiting)} of {len(pieces)} scans overlap the others by less than "
             f"{LEAST_OVERLAP:.0%}, or contradict them, in every pose that was tried ({names}); "
-            "check that they show the same part in the same unit, or scan with more overlap"
+            "check that they show the same part in the same unit, scan with more overlap, or give "
+            "the part's mesh beside them"
         )
     which = sorted(poses)
     refined, rmse_mm = _together([pieces[k] for k in which], [poses[k] for k in which], rng)
