@@ -43,6 +43,9 @@ def test_a_piece_is_free_where_all_that_rounding_makes_of_it_is(seed: int) -> No
         ("prusa_mk3s", 24.0, (0.0, -36.0), False),
         ("prusa_mk3s", 24.0, (0.0, -46.0), True),
         ("prusa_mk3s", 24.0, (38.0, 0.0), True),
+        # the MK4's extruder is not the MK3S's: more room is kept for it
+        ("prusa_mk4", 24.0, (38.0, 0.0), False),
+        ("prusa_mini", 24.0, (38.0, 0.0), False),
         # an Ender's gantry, 25 mm over the tip
         ("ender_3", 30.0, (80.0, 0.0), False),
         ("ender_3", 24.0, (80.0, 0.0), True),
