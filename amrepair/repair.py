@@ -31,6 +31,7 @@ from gcode.estimate import Estimate, estimate
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
+from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.surfaces import HeightField
@@ -100,6 +101,8 @@ class Site:
         Somebody said that a finished part's foot is above the bed.
     beads
         What the job has laid so far, template frame: lines that were skipped are looked for.
+    lines
+        The same, all of it, build frame: a patch is laid along them.
 
     Examples
     --------
@@ -120,6 +123,7 @@ class Site:
     planned: Template | None = None
     on_fixture: bool = False
     beads: PlannedBeads | None = None
+    lines: JobLines | None = None
 
     @classmethod
     def of_part(
@@ -317,6 +321,7 @@ def plan_repair(
             grid=site.grid,
             standalone=interruption is None,
             start_mm=_start_of(interruption),
+            lines=_lines_of(site, deficit, placed),
             progress=progress,
         )
     if not patch.toolpath.extrusions:
@@ -424,6 +429,14 @@ def _fillable(deficit: Deficit, wanted: Callable[[Region], bool]) -> manifold3d.
     if not filled:
         return manifold3d.Manifold()
     return manifold3d.Manifold.batch_boolean(filled, manifold3d.OpType.Add)
+
+
+def _lines_of(site: Site, deficit: Deficit, placed: Transform) -> JobLines | None:
+    """The job's lines, and which stretches of them the deficit says are gone, build frame."""
+    if site.lines is None or deficit.gone is None:
+        return site.lines
+    ends = [placed.apply(ends_mm) for ends_mm in (deficit.gone.start_mm, deficit.gone.end_mm)]
+    return replace(site.lines, gone_mm=np.stack(ends, axis=1))
 
 
 def _region_of(piece: manifold3d.Manifold, regions: list[Region]) -> Region:

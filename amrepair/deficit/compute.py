@@ -81,6 +81,8 @@ class Deficit:
         Template surface that nothing is known of.
     stands
         Makes `as_built`, when that is first asked for.
+    gone
+        Stretches of planned lines that are not there, template frame.
     """
 
     missing: manifold3d.Manifold
@@ -89,6 +91,7 @@ class Deficit:
     tolerance_mm: float
     unseen_area_mm2: float
     stands: Standing
+    gone: PlannedBeads | None = None
 
     @property
     def as_built(self) -> HeightField:
@@ -211,6 +214,7 @@ def compute_deficit(
         tolerance_mm=tau_mm,
         unseen_area_mm2=_unseen_area(anomaly, int(unseen.sum())),
         stands=Standing(as_built or stands),
+        gone=lines,
     )
 
 

@@ -20,6 +20,9 @@ LEAST_MM = 1.5  # shorter stretches are seams, corners and curves
 # How far the middle of a bead lies in the open where it is gone, as a share of half its height.
 # Half of its plastic would put it at the surface, and noise is averaged over a stretch.
 GONE_SHARE = 0.4
+# Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel beside
+# a silhouette lets rays run past a wall: by both together, rays bounded.
+GONE_BY_BOTH, MOST_SHARE = 0.5, 1.5
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
 
 
@@ -96,15 +99,19 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     half_mm = 0.5 * lines.height_mm[line]
     middle = lines.start_mm[line] + share[:, None] * (lines.end_mm - lines.start_mm)[line]
     middle[:, 2] -= half_mm
-    # rays alone cost little; where they say "open", surfaces tell how far
-    open_mm = evidence.rays_say(middle)
-    ask = np.flatnonzero(open_mm > 0)
-    open_mm = np.minimum(open_mm, 0.0)
+    # rays alone cost little; only where they say "open" surfaces are asked, too
+    rays_mm = evidence.rays_say(middle)
+    ask = np.flatnonzero(rays_mm > 0)
+    by_surface = np.full(len(middle), -1.0)  # what nobody looked into is there
+    by_both = by_surface.copy()
     if len(ask):
-        open_mm[ask] = evidence.clearance(middle[ask], template.distance(middle[ask]))[0]
-    # what nobody looked into is there
-    open_share = np.where(open_mm <= SOLID_MM + 1e-6, -1.0, np.clip(open_mm / half_mm, -1.0, 1.0))
-    gone = _together(open_share, line) >= GONE_SHARE
+        told_mm = evidence.clearance(middle[ask], template.distance(middle[ask]))[0]
+        known = ask[told_mm > SOLID_MM + 1e-6]
+        surface = np.clip(told_mm[told_mm > SOLID_MM + 1e-6] / half_mm[known], -1.0, 1.0)
+        rays = np.clip(rays_mm[known] / half_mm[known], -1.0, MOST_SHARE)
+        by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
+    gone = _together(by_surface, line) >= GONE_SHARE
+    gone |= _together(by_both, line) >= GONE_BY_BOTH
     return _stretches(lines, line, share, gone, length_mm / count)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Bool
 
 from amrepair.detect.skipped import PlannedBeads
 from amrepair.frames import Transform
@@ -14,7 +15,10 @@ from amrepair.template import PlannedSdf
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
+from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
+
+RIMS = ("perimeter", "wall")  # what slicers call it
 
 
 def sites(
@@ -38,7 +42,8 @@ def sites(
 
     def at(stop: Stop) -> Site:
         if stop.layer_index is None:
-            return Site(template, setup, grid, build_from_template)
+            whole = _lines(job, job.beads.layer >= 0)
+            return Site(template, setup, grid, build_from_template, lines=whole)
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
         done = (beads.line < stop.line) & (beads.layer >= 0)
@@ -47,10 +52,30 @@ def sites(
         )
         section, height = beads.section_mm2[done], beads.height_mm[done]
         planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
-        lines = PlannedBeads.recent(start, end, section, height)
+        recent = PlannedBeads.recent(start, end, section, height)
         below = template.below_z(z_mm)
         return Site(
-            below, setup, grid, build_from_template, stop.z_mm, planned=planned, beads=lines
+            below,
+            setup,
+            grid,
+            build_from_template,
+            stop.z_mm,
+            planned=planned,
+            beads=recent,
+            lines=_lines(job, done),
         )
 
     return at
+
+
+def _lines(job: Job, which: Bool[np.ndarray, " n"]) -> JobLines:
+    """Some of a job's beads as lines that a patch may follow."""
+    beads = job.beads
+    rim = np.array([any(word in role.lower() for word in RIMS) for role in beads.roles])
+    return JobLines(
+        beads.start_mm[which],
+        beads.end_mm[which],
+        beads.section_mm2[which],
+        beads.height_mm[which],
+        rim[beads.role[which]],
+    )

@@ -19,6 +19,7 @@ from gcode.moves import Toolpath
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.job import Unprintable
+from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch_beads import LEAST_THICK_MM
 from gcode.slicing.patch_laying import begin, emit, end
@@ -28,6 +29,7 @@ from gcode.slicing.patch_passes import AGREE_MM, NOT_LISTED_MM3, plan_passes
 from gcode.surfaces import HeightField
 
 COVERED = "covered by what stands above it"
+STEP_MM = 0.15  # of a job's staircase: half a layer, and what the scan gets wrong
 TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
 Box = tuple[float, float, float, float, float, float]
 
@@ -81,6 +83,7 @@ def slice_patch(
     grid: LayerGrid,
     standalone: bool,
     start_mm: tuple[float, float, float] | None = None,
+    lines: JobLines | None = None,
     progress: Progress = silent,
 ) -> PatchPlan:
     """Slice a deficit.
@@ -97,6 +100,9 @@ def slice_patch(
         True: a whole program for a part that stands on a machine whose Z is still true: X and Y
         are homed, Z never. False: in mid-job, hot, parked at `start_mm` with the filament pulled
         back by the profile's retraction; the patch ends there likewise.
+    lines
+        What the job laid there, where that is known: the patch follows it, step by step of its
+        staircase, with as much of each line's plastic as is missing.
 
     Raises
     ------
@@ -124,7 +130,7 @@ def slice_patch(
         raise SliceError("The deficit is empty (0 mm³); there is nothing to print.")
     if not standalone and start_mm is None:
         raise SliceError("A patch in mid-job needs the place where the nozzle is parked.")
-    model = PatchModel(deficit, setup, as_built)
+    model = PatchModel(deficit, setup, as_built, lines)
     passes = plan_passes(model, grid, setup, progress)
     pen = begin(setup, as_built, start_mm)
     laid_mm3 = 0.0
@@ -151,6 +157,9 @@ def _left_over(model: PatchModel) -> tuple[tuple[Unreachable, ...], tuple[PatchR
     left = np.clip(wanted - model.laid_mm, 0.0, None)
     # a film below the thinnest bead is the tolerance, not out of reach
     left = np.where(left > LEAST_THICK_MM + AGREE_MM, left, 0.0)
+    # nor is what lies under a step of the job's staircase, or over it
+    done = (model.surface_mm >= model.done_mm - AGREE_MM) & (model.done_mm > model.top_mm - STEP_MM)
+    left = np.where(done, 0.0, left)
     unreachable: list[Unreachable] = []
     regions: list[PatchRegion] = []
     for piece in model.deficit.decompose():

@@ -19,6 +19,7 @@ from gcode.slicing import reach_kernels
 from gcode.slicing.beads import Bead, divided, spacing_of
 from gcode.slicing.infill import ring_beads, solid_fill
 from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES
+from gcode.slicing.job_lines import JobPieces, gathered
 from gcode.slicing.medial import fill_thin
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
@@ -44,6 +45,7 @@ DRAWN_MM = 0.035
 # A point that is not free is moved by no more than this; stretches between points that are free,
 # and are not so themselves, are halved so often.
 ASIDE_MM, HALVINGS = 0.15, 2
+ON_LINE_MM, FINELY_MM = 0.02, 0.1
 ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 ROUNDING_MM = 2e-3  # more than the text's last digit
 ROUNDED_MM = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # whichever way it goes
@@ -119,7 +121,7 @@ def eased(beads: list[Bead], free: Bool[np.ndarray, "ry rx"], reach: Reach) -> l
     """
     if not beads:
         return beads
-    walked = [divided(bead.xy_mm, _steps(bead))[0] for bead in beads]
+    walked = [divided(bead.xy_mm, steps_of(bead))[0] for bead in beads]
     starts, ends = (np.concatenate([xy[k] for xy in walked]) for k in (slice(-1), slice(1, None)))
     ok = np.split(
         free_between(starts, ends, free, reach), np.cumsum([len(xy) - 1 for xy in walked])[:-1]
@@ -134,7 +136,7 @@ def eased(beads: list[Bead], free: Bool[np.ndarray, "ry rx"], reach: Reach) -> l
 
 
 def _eased(bead: Bead, nearest: _Nearest, free: Bool[np.ndarray, "ry rx"], reach: Reach) -> Bead:
-    xy, owner = divided(bead.xy_mm, _steps(bead))
+    xy, owner = divided(bead.xy_mm, steps_of(bead))
     xy, share = nearest.moved(xy), bead.share_mm[owner]
     for _ in range(HALVINGS):
         stuck = np.flatnonzero(~free_between(xy[:-1], xy[1:], free, reach))
@@ -192,7 +194,7 @@ def free_runs(
 ) -> list[Bead]:
     """The stretches of a bead along which the nozzle may be; asked from point to point."""
     lengths = np.hypot(*np.diff(bead.xy_mm, axis=0).T)
-    count = _steps(bead)
+    count = steps_of(bead)
     points, owner = divided(bead.xy_mm, count)
     ok = is_free(points[:-1], points[1:])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
@@ -209,10 +211,10 @@ def free_runs(
     ]
 
 
-def _steps(bead: Bead) -> Int[np.ndarray, " m"]:
+def steps_of(bead: Bead, step_mm: float = STEP_MM) -> Int[np.ndarray, " m"]:
     """How many steps each of a bead's pieces takes."""
     lengths = np.hypot(*np.diff(bead.xy_mm, axis=0).T)
-    return np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
+    return np.maximum(1, np.ceil(lengths / step_mm).astype(np.int64))
 
 
 def free_between(
@@ -261,13 +263,15 @@ def weighed(
     strips: Bool[np.ndarray, "ny nx"],
     model: PatchModel,
     setup: PrintSetup,
+    *,
+    job: JobPieces | None = None,
 ) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
     """Cross-sections such that every column's thickness goes to the nearest piece of a bead.
 
     So plastic is the volume that is missing, to the column. The tip is as high along each run as
-    `tips_mm` says. Returns the chains, and the thickness
-    that columns get: none beyond where a bead can spread (farther in `strips` along walls), less
-    where a bead would be too wide.
+    `tips_mm` says; where the runs are the job's own lines, `job` tells of their pieces. Returns
+    the chains, and the thickness that columns get: none beyond where a bead can spread (farther in
+    `strips` along walls), less where a bead would be too wide.
     """
     nozzle_mm = setup.printer.nozzle_diameter_mm
     middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
@@ -281,26 +285,72 @@ def weighed(
     cell_mm3 = model.cell_mm**2 * model.weight
     volume = np.bincount(
         nearest[near], thick.ravel()[filled[near]] * cell_mm3, minlength=len(middles)
-    )
+    ).astype(np.float64)  # of nothing it makes integers
+    if job is not None:
+        volume = _by_lines(volume, runs, job, filled, near, nearest, thick, lengths, model)
     reach = np.bincount(nearest[near], thick.ravel()[filled[near]], minlength=len(middles))
     number = np.bincount(nearest[near], minlength=len(middles))
     depth = reach / np.maximum(number, 1)
+    told_mm3, own = volume, np.zeros(len(middles))
+    if job is not None:
+        own = job.section_mm2
+        volume = gathered(volume, depth, job, lengths, middles, setup.process.line_width_mm)
     chains: list[Chain] = []
     given = np.zeros(len(middles))  # share of what its columns want that a piece lays
     at = 0
     for run, tip_mm in zip(runs, tips_mm, strict=True):
         n = len(run.xy_mm) - 1
-        own = slice(at, at + n)
+        mine = slice(at, at + n)
         at += n
-        section = BOND_RATIO * _smooth(volume[own], lengths[own], closed=run.closed)
-        most = np.maximum(depth[own], LEAST_THICK_MM) * MOST_NOZZLES * nozzle_mm
+        section = BOND_RATIO * _smooth(volume[mine], lengths[mine], closed=run.closed)
+        most = np.maximum(depth[mine], LEAST_THICK_MM) * MOST_NOZZLES * nozzle_mm
+        most = np.maximum(most, BOND_RATIO * own[mine])
         most = np.minimum(most, setup.printer.max_bead_section_mm2)
-        given[own] = np.minimum(1.0, most / np.maximum(section, 1e-9))
+        given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9))
+        given[mine] *= np.minimum(1.0, volume[mine] / np.maximum(told_mm3[mine], 1e-9))
         section = np.minimum(section, most)
         chains += _split(Chain(run.xy_mm, tip_mm, section, run.role))
     laid = np.zeros(thick.size)
     laid[filled[near]] = thick.ravel()[filled[near]] * given[nearest[near]]
     return chains, laid.reshape(thick.shape)
+
+
+def _by_lines(
+    volume_mm3: Float[np.ndarray, " n"],
+    runs: list[Bead],
+    job: JobPieces,
+    filled: Int[np.ndarray, " c"],
+    near: Bool[np.ndarray, " c"],
+    nearest: Int[np.ndarray, " c"],
+    thick: Float[np.ndarray, "ny nx"],
+    length_mm: Float[np.ndarray, " n"],
+    model: PatchModel,
+) -> Float[np.ndarray, " n"]:
+    """Volumes by how deep the floor lies under each piece on average, times its own width.
+
+    One line has four columns across it, the next one five: that is no reason to lay less of it.
+    The total stays what it is. What lies beside the lines is added to the nearest as it is.
+    """
+    asked = np.flatnonzero(job.over)
+    middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
+    under = asked[off_runs(runs, model.points_mm[asked]) <= job.half_mm + ON_LINE_MM]
+    of_piece = cKDTree(middles).query(model.points_mm[under])[1]
+    number = np.bincount(of_piece, minlength=len(middles))
+    deep = np.bincount(of_piece, thick.ravel()[under], minlength=len(middles))
+    own = job.section_mm2 * length_mm * deep / np.maximum(number, 1) / job.height_mm
+    cell_mm3 = model.cell_mm**2 * model.weight
+    beside = near & ~np.isin(filled, under)
+    extra = np.bincount(
+        nearest[beside], thick.ravel()[filled[beside]] * cell_mm3, minlength=len(middles)
+    )
+    whole_mm3 = float((own + extra).sum())
+    return (own + extra) * (float(volume_mm3.sum()) / whole_mm3 if whole_mm3 > 0 else 1.0)
+
+
+def off_runs(runs: list[Bead], points_mm: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, " p"]:
+    """How far points lie from the nearest run, to half a step."""
+    places = np.concatenate([divided(run.xy_mm, steps_of(run, FINELY_MM))[0] for run in runs])
+    return np.asarray(cKDTree(places).query(points_mm)[0])
 
 
 def _smooth(

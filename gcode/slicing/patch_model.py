@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from gcode.profiles import PrintSetup
 from gcode.slicing.job import Unprintable
+from gcode.slicing.job_lines import JobColumns, JobLines
 from gcode.slicing.layers import mesh_of
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
@@ -22,13 +23,20 @@ MARGIN_MM = 3.0
 MOST_THICK_NOZZLES = 0.8
 SEAM_MM = 1.0  # around a loop's seam, as far as old material hides it
 TIP_CELLS = 2  # in one of the field, each way
+JOB_LAYER_MM = 0.5  # a job's layer may end so far above the deficit that it belongs to
 NEAR_MM = 1.0  # a travel as short as this needs no lift
 
 
 class PatchModel:
     """Columns over the deficit: what is wanted, what is there, what has been laid."""
 
-    def __init__(self, deficit: Any, setup: PrintSetup, as_built: HeightField) -> None:
+    def __init__(
+        self,
+        deficit: Any,
+        setup: PrintSetup,
+        as_built: HeightField,
+        lines: JobLines | None = None,
+    ) -> None:
         self.deficit = deficit
         self.as_built = as_built
         self.box = deficit.bounding_box()
@@ -63,6 +71,16 @@ class PatchModel:
         self.laid_mm = np.zeros(self.shape)
         self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
         self.lost: list[Unprintable] = []
+        self.job: JobColumns | None = None
+        self.done_mm = np.full(
+            self.shape, -np.inf
+        )  # up to where the job's own lines are laid again
+        if lines is not None and len(lines.rim):
+            wanted = np.isfinite(self.top_mm)
+            low_mm, high_mm = float(self.box[2]), float(self.box[5])
+            self.job = JobColumns(
+                lines, wanted, self.points_mm, self.cell_mm, low_mm, high_mm + JOB_LAYER_MM
+            )
         self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
         self._printer = setup.printer
         self._window_mm = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)

@@ -13,8 +13,10 @@ from gcode.profiles import PrintSetup
 from gcode.progress import Progress
 from gcode.slicing.infill import SOLID_ANGLES_RAD
 from gcode.slicing.job import Unprintable
+from gcode.slicing.job_lines import runs_of
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch_beads import (
+    BOND_RATIO,
     LEAST_THICK_MM,
     ROUNDING_MM,
     TO_WALL_MM,
@@ -24,6 +26,7 @@ from gcode.slicing.patch_beads import (
     eased,
     free_between,
     free_runs,
+    off_runs,
     weighed,
 )
 from gcode.slicing.patch_model import PatchModel
@@ -35,9 +38,13 @@ AGREE_MM = 0.04
 # of one line width, round (π/4 d² = width × gap), still reaches its floor. On a steep slope the
 # head keeps the tip this far off.
 DEEP_RATIO = 1.6
+ROUNDED_OFF_MM = 0.02  # more than the mean of a scan's noise
 HOLD_MM = 0.45  # a line's width: how far a bead may hang over a hole beside what holds it
 SKIN_MM = 0.2  # about as thick as it gets
 NOT_LISTED_MM3 = 0.02
+LEAST_OF_GAP = 0.9  # where the gap is more than the deficit: both are right to about as much
+FAR_MM = 0.3  # from a line: more than half of it
+SERVED = 0.95  # share of what is due; where the job's own lines serve less, others may serve more
 # Of columns over a hollow, as many as open to the head at one height are worth a pass there.
 OPENING_MM2 = 1.0
 # A flat top: as much area, as wide, within so little height.
@@ -74,17 +81,18 @@ def plan_passes(
     tops = tops[tops > low_mm + 1e-6]
     if len(tops) == 0 or tops[-1] < high_mm - 1e-6:
         tops = np.append(tops, high_mm)
-    # the last pass ends with the deficit, not above it
-    tops[-1] = min(tops[-1], high_mm)
+    # the last pass ends with the deficit, not above it, unless the job has a layer there
+    if model.job is None or model.job.at(float(tops[-1])) is None:
+        tops[-1] = min(tops[-1], high_mm)
     most_mm = min(model.most_mm, setup.process.max_gap_layers * grid.layer_height_mm)
-    flats = _flats(model, tops)
+    flats = _flats(model, tops) if model.job is None else np.zeros(0)
     ends = np.full(model.shape, np.inf)  # where a flat top lies, off the job's layers
     for flat_mm in flats:
         ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
     openings = _openings(model, np.concatenate([tops, flats]), most_mm)
     heights = np.sort(np.concatenate([tops, flats, openings]))
     skin = skin_of(model, ~np.isfinite(ends)) if setup.process.nonplanar_top else None
-    skin = _served(model, skin, setup)
+    skin = _skin_served(model, skin, setup)
     if skin is not None:
         model.planar_top_mm = skin.planar_top_mm(model, tops)
     passes: list[Pass] = []
@@ -167,12 +175,57 @@ def _plan_pass(
     layer_mm: float,
     setup: PrintSetup,
 ) -> Pass | None:
-    """Fill what is due at this height, among the columns that are filled at it."""
-    thick = _due(model, z_mm, here, following_mm, most_mm, layer_mm)
+    """Fill what is due at this height, among the columns that are filled at it.
+
+    Along the job's own lines where there are any and they serve; else along lines of our own.
+    """
+    planned = model.job.at(z_mm) if model.job is not None else None
+    if planned is None:
+        thick = _due(model, z_mm, here, following_mm, most_mm, layer_mm)
+    else:
+        thick = _due_of_job(model, z_mm, planned, following_mm, most_mm, layer_mm)
     if not thick.any():
         return None
     reach = model.reach.at(z_mm)
-    drawn = draw(thick, reach, SOLID_ANGLES_RAD[index % 2], model, setup)
+    laying = _along_job(model, z_mm, planned, thick, reach, setup) if planned is not None else None
+    if laying is None or laying.served < SERVED:
+        own = _along_own(model, z_mm, thick, reach, SOLID_ANGLES_RAD[index % 2], setup)
+        if laying is None or (own is not None and own.served > laying.served):
+            laying = own
+    if laying is None or not laying.chains:
+        return None
+    model.lost += laying.lost
+    laid = laying.laid_mm
+    # over a bridge the surface is the nozzle's height, whatever lies open below
+    bridged = (laid > 0) & (z_mm - model.surface_mm > DEEP_RATIO * most_mm)
+    model.surface_mm = np.where(bridged, z_mm, model.surface_mm + laid)
+    model.laid_mm = model.laid_mm + laid
+    if planned is not None:
+        model.done_mm = np.where((laid > 0) & planned, z_mm, model.done_mm)
+    return Pass(z_mm, laying.height_mm, index, tuple(laying.chains), reach, z_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class _Laying:
+    """Beads of one height, the thickness that columns get, and the share of it that they want."""
+
+    chains: list[Chain]
+    laid_mm: Float[np.ndarray, "ny nx"]
+    served: float
+    height_mm: float
+    lost: list[Unprintable]
+
+
+def _along_own(
+    model: PatchModel,
+    z_mm: float,
+    thick: Float[np.ndarray, "ny nx"],
+    reach: Bool[np.ndarray, "ry rx"],
+    angle_rad: float,
+    setup: PrintSetup,
+) -> _Laying | None:
+    """Along lines drawn into the columns."""
+    drawn = draw(thick, reach, angle_rad, model, setup)
     if drawn is None:
         return None
     runs = [
@@ -184,16 +237,51 @@ def _plan_pass(
         return None
     tips_mm = [np.full(len(run.xy_mm), z_mm) for run in runs]
     chains, laid = weighed(runs, tips_mm, thick, _strips(thick, z_mm, model), model, setup)
-    if not chains:
-        return None
     lost_mm3 = drawn.lost_mm2 * drawn.height_mm
+    lost = []
     if lost_mm3 > NOT_LISTED_MM3:
-        model.lost.append(_thin(drawn.region, z_mm, drawn.height_mm, lost_mm3))
-    # over a bridge the surface is the nozzle's height, whatever lies open below
-    bridged = (laid > 0) & (z_mm - model.surface_mm > DEEP_RATIO * most_mm)
-    model.surface_mm = np.where(bridged, z_mm, model.surface_mm + laid)
-    model.laid_mm = model.laid_mm + laid
-    return Pass(z_mm, drawn.height_mm, index, tuple(chains), reach, z_mm)
+        lost.append(_thin(drawn.region, z_mm, drawn.height_mm, lost_mm3))
+    return _Laying(chains, laid, _served(chains, thick, model), drawn.height_mm, lost)
+
+
+def _along_job(
+    model: PatchModel,
+    z_mm: float,
+    planned: Bool[np.ndarray, "ny nx"],
+    thick: Float[np.ndarray, "ny nx"],
+    reach: Bool[np.ndarray, "ry rx"],
+    setup: PrintSetup,
+) -> _Laying | None:
+    """Along what the job laid there, with as much of each line's plastic as is missing.
+
+    Where walls keep the head off, so that lines end before them, none of them goes along the wall:
+    less is served.
+    """
+    assert model.job is not None
+    runs, job = runs_of(
+        model.job.lines_at(z_mm),
+        lambda bead: free_runs(bead, lambda a, b: free_between(a, b, reach, model.reach)),
+    )
+    if not runs:
+        return None
+    job = replace(job, over=planned & model.job.near)
+    tips_mm = [np.full(len(run.xy_mm), z_mm) for run in runs]
+    strips = _strips(thick, z_mm, model)
+    height_mm = float(thick[thick > 0].mean())
+    wanted = model.wanted_below(z_mm) - model.laid_mm - model.sunk_mm
+    share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), LEAST_OF_GAP, 1.0))
+    chains, laid = weighed(runs, tips_mm, share * thick, strips, model, setup, job=job)
+    columns = np.flatnonzero(thick)
+    near = off_runs(runs, model.points_mm[columns]) < FAR_MM
+    served = float(thick.ravel()[columns] @ near) / float(thick.sum())
+    return _Laying(chains, laid, served, height_mm, [])
+
+
+def _served(chains: list[Chain], thick: Float[np.ndarray, "ny nx"], model: PatchModel) -> float:
+    """Share of what is due that beads lay."""
+    beads_mm3 = sum(float(np.hypot(*np.diff(c.xy_mm, axis=0).T) @ c.section_mm2) for c in chains)
+    due_mm3 = float(thick.sum()) * model.cell_mm**2 * model.weight
+    return beads_mm3 / (BOND_RATIO * due_mm3)
 
 
 def _plan_skin(
@@ -215,7 +303,7 @@ def _plan_skin(
     return Pass(top_mm, height_mm, index, tuple(chains), nowhere, skin.tip.z_mm)
 
 
-def _served(model: PatchModel, skin: Skin | None, setup: PrintSetup) -> Skin | None:
+def _skin_served(model: PatchModel, skin: Skin | None, setup: PrintSetup) -> Skin | None:
     """A skin of the columns that its beads would get to."""
     if skin is None:
         return None
@@ -269,6 +357,49 @@ def _due(
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
     active &= model.planar_top_mm > z_mm - 0.5 * layer_mm
     deep = active & (gap > DEEP_RATIO * most_mm)
+    return _lidded(model, thick, active, deep, gap, most_mm, layer_mm)
+
+
+def _due_of_job(
+    model: PatchModel,
+    z_mm: float,
+    planned: Bool[np.ndarray, "ny nx"],
+    following_mm: Float[np.ndarray, "ny nx"],
+    most_mm: float,
+    layer_mm: float,
+) -> Float[np.ndarray, "ny nx"]:
+    """Thickness to lay now where the job laid something at this height: up to it, as the job did.
+
+    On a slope the job's steps are what was there, not the smooth surface that the deficit has.
+    """
+    assert model.job is not None
+    gap = z_mm - model.surface_mm
+    wanted = model.wanted_below(z_mm) - model.laid_mm - model.sunk_mm
+    deep = gap > DEEP_RATIO * most_mm
+    thick = np.where(deep, np.minimum(gap, np.maximum(wanted + AGREE_MM, layer_mm)), gap)
+    thick = np.clip(thick, 0.0, None)
+    after = np.unique(following_mm[np.isfinite(following_mm)])
+    again = model.job.at(float(after[0])) if len(after) else None
+    last = ~again if again is not None else np.ones_like(planned)
+    due = last | (following_mm - model.surface_mm > most_mm)
+    # the shallow rim of what a scan rounded off counts: line by line it makes up a bead; beside
+    # it noise would
+    least_mm = np.where(wanted > ROUNDING_MM, ROUNDED_OFF_MM, LEAST_THICK_MM)
+    active = planned & model.job.near & due & (thick >= least_mm)
+    active &= ~deep | (wanted > LEAST_THICK_MM / 2)  # beside the part all is deep
+    return _lidded(model, thick, active, deep & active, gap, most_mm, layer_mm)
+
+
+def _lidded(
+    model: PatchModel,
+    thick: Float[np.ndarray, "ny nx"],
+    active: Bool[np.ndarray, "ny nx"],
+    deep: Bool[np.ndarray, "ny nx"],
+    gap: Float[np.ndarray, "ny nx"],
+    most_mm: float,
+    layer_mm: float,
+) -> Float[np.ndarray, "ny nx"]:
+    """Over what is too deep a layer is drawn, as far as a bead holds on to what stands beside."""
     if deep.any():
         # from the edge of what holds it, not from the middle of its last column
         hang_mm = HOLD_MM + 0.5 * model.cell_mm
@@ -276,7 +407,7 @@ def _due(
         lidded = np.minimum(thick, layer_mm)
         model.sunk_mm = np.where(deep & held, model.sunk_mm + thick - lidded, model.sunk_mm)
         thick = np.where(deep & held, lidded, thick)
-        active &= ~deep | held
+        active = active & (~deep | held)
     return np.where(active, thick, 0.0)
 
 

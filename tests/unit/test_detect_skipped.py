@@ -52,12 +52,12 @@ def test_a_skipped_line_beside_a_wall_is_missing(seed: int) -> None:
     assert deficit_of(scan, None).missing_mm3 == 0.0
     found = deficit_of(scan, lines())
     true_mm3 = 4.0 * WIDE_MM * 2 * HIGH_MM
-    assert found.missing_mm3 == pytest.approx(true_mm3, rel=0.35)
+    assert found.missing_mm3 == pytest.approx(true_mm3, rel=0.2)
     assert any(region.skipped for region in found.regions)
     # in place: little of it lies elsewhere
     around = m3.Manifold.cube((4.6, WIDE_MM + 0.6, 1.0))
     around = around.translate((7.7, -0.3, TOP_MM - 2 * HIGH_MM - 0.15))
-    assert (found.missing - around).volume() < 0.2 * true_mm3
+    assert (found.missing - around).volume() < 0.25 * true_mm3
 
 
 @pytest.mark.parametrize("seed", range(4))

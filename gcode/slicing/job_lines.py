@@ -1,0 +1,276 @@
+"""The job's own lines: a patch laid along them is what the job would have printed there.
+
+Between lines of one's own drawing and those of the layers around them lie grooves and ridges; a
+staircase on a slope has other steps. Whoever knows what the job lays need not guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from gcode.moves import Role
+from gcode.slicing.beads import Bead
+
+LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
+# Beside the deficit's columns: its rim is as uncertain as the scan's noise and spacing make it.
+RIM_MM = 0.3
+ON_MM = 0.05  # of a line's middle
+SAMPLED_MM = 0.05  # along a line, to tell which columns lie in it, and how exactly
+EXACTLY_MM = 0.01
+# A scanner's spot rounds off what is gone: a little beside a lot is the lot's own. Shares of what
+# the job lays in a piece of a line: from here on it lacks a lot, up to there a little, and less is
+# nothing.
+LOT, LITTLE, NOTHING = 0.4, 0.35, 0.1
+BESIDE_WIDTHS = 1.4  # from a line to its neighbour
+
+
+@dataclass(frozen=True, slots=True)
+class JobLines:
+    """Lines that a job laid, build frame.
+
+    Attributes
+    ----------
+    start_mm, end_mm
+        (n, 3) nozzle positions, in the order in which they were laid.
+    section_mm2, height_mm
+        (n,) plastic cross-section, and the layer's height.
+    rim
+        (n,) whether it is a perimeter.
+    gone_mm
+        (g, 2, 3) stretches of them, from where to where, that were seen not to be there at all.
+    """
+
+    start_mm: Float[np.ndarray, "n 3"]
+    end_mm: Float[np.ndarray, "n 3"]
+    section_mm2: Float[np.ndarray, " n"]
+    height_mm: Float[np.ndarray, " n"]
+    rim: Bool[np.ndarray, " n"]
+    gone_mm: Float[np.ndarray, "g 2 3"] = field(default_factory=lambda: np.zeros((0, 2, 3)))
+
+    def some(self, which: Bool[np.ndarray, " n"]) -> JobLines:
+        """Some of them."""
+        return replace(
+            self,
+            start_mm=self.start_mm[which],
+            end_mm=self.end_mm[which],
+            section_mm2=self.section_mm2[which],
+            height_mm=self.height_mm[which],
+            rim=self.rim[which],
+        )
+
+    def near(self, low_mm: Float[np.ndarray, " 3"], high_mm: Float[np.ndarray, " 3"]) -> JobLines:
+        """Level lines that pass through a box."""
+        low, high = np.minimum(self.start_mm, self.end_mm), np.maximum(self.start_mm, self.end_mm)
+        through = ((high >= low_mm) & (low <= high_mm)).all(axis=1)
+        return self.some(through & (high[:, 2] - low[:, 2] < LEVEL_MM))
+
+    def at(self, z_mm: float) -> JobLines:
+        """Those at one height."""
+        return self.some(np.abs(self.end_mm[:, 2] - z_mm) < LEVEL_MM)
+
+    def chains(self) -> list[tuple[Bead, Float[np.ndarray, " _m"]]]:
+        """Lines that go on from one another as one bead, and the sections of its pieces."""
+        n = len(self.rim)
+        if n == 0:
+            return []
+        off = np.abs(self.start_mm[1:, :2] - self.end_mm[:-1, :2]).max(axis=1) > LEVEL_MM
+        begins = np.flatnonzero(np.concatenate([[True], off | (self.rim[1:] != self.rim[:-1])]))
+        found = []
+        for a, b in zip(begins, [*begins[1:], n], strict=True):
+            xy = np.concatenate([self.start_mm[a : a + 1, :2], self.end_mm[a:b, :2]])
+            role = Role.PERIMETER if self.rim[a] else Role.SOLID_INFILL
+            share_mm = self.section_mm2[a:b] / self.height_mm[a:b]
+            found.append((Bead(xy, share_mm, role, closed=False), self.section_mm2[a:b]))
+        return found
+
+
+class JobColumns:
+    """Which columns of a patch the job's lines lie over, layer by layer.
+
+    Parameters
+    ----------
+    lines
+        Of the job.
+    asked
+        Columns that something is missing in; their neighbours are asked about as well.
+    points_mm
+        (ny · nx, 2) their middles.
+    low_mm, high_mm
+        Heights between which they are asked about.
+    """
+
+    def __init__(
+        self,
+        lines: JobLines,
+        asked: Bool[np.ndarray, "ny nx"],
+        points_mm: Float[np.ndarray, "k 2"],
+        cell_mm: float,
+        low_mm: float,
+        high_mm: float,
+    ) -> None:
+        away_mm = ndimage.distance_transform_edt(~asked) * cell_mm
+        self.near = np.asarray(away_mm <= RIM_MM)
+        self._points_mm = points_mm[self.near.ravel()]
+        low, high = self._points_mm.min(axis=0), self._points_mm.max(axis=0)
+        wide_mm = float((lines.section_mm2 / np.maximum(lines.height_mm, 1e-6)).max(initial=0.0))
+        self._cell_mm = cell_mm
+        self._lines = lines.near(
+            np.array([*(low - wide_mm), low_mm - LEVEL_MM]),
+            np.array([*(high + wide_mm), high_mm + LEVEL_MM]),
+        )
+        self._masks: dict[float, Bool[np.ndarray, "ny nx"] | None] = {}
+
+    def lines_at(self, z_mm: float) -> JobLines:
+        """The job's lines near the patch at one height."""
+        return self._lines.at(z_mm)
+
+    def at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"] | None:
+        """Columns that lines at one height lie over; None where the job has none there."""
+        key = round(z_mm, 4)
+        if key not in self._masks:
+            self._masks[key] = self._over(self.lines_at(z_mm))
+        return self._masks[key]
+
+    def _over(self, lines: JobLines) -> Bool[np.ndarray, "ny nx"] | None:
+        if len(lines.rim) == 0:
+            return None
+        length_mm = np.linalg.norm(lines.end_mm - lines.start_mm, axis=1)
+        count = 1 + np.ceil(length_mm / SAMPLED_MM).astype(np.int64)
+        line = np.repeat(np.arange(len(count)), count)
+        step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
+        share = (step / np.maximum(count - 1, 1)[line])[:, None]
+        samples = (lines.start_mm[line] + share * (lines.end_mm - lines.start_mm)[line])[:, :2]
+        half_mm = (0.5 * lines.section_mm2 / lines.height_mm)[line]
+        # the nearest line is not always the widest, but lines are about as wide as each other
+        distance, nearest = cKDTree(samples).query(
+            self._points_mm, distance_upper_bound=float(half_mm.max()) + 2 * EXACTLY_MM
+        )
+        found = np.isfinite(distance)
+        inside = np.zeros(len(found), dtype=bool)
+        inside[found] = distance[found] <= half_mm[nearest[found]] + EXACTLY_MM
+        mask = np.zeros(self.near.shape, dtype=bool)
+        mask[self.near] = inside
+        return mask
+
+
+@dataclass(frozen=True, slots=True)
+class JobPieces:
+    """What the job laid in each piece of some runs.
+
+    Attributes
+    ----------
+    section_mm2
+        (n,) cross-section.
+    height_mm
+        Of their layer.
+    half_mm
+        Half their width.
+    gone
+        (n,) seen not to be there at all.
+    over
+        Columns that the job's lines lie over, whether something is missing there or not.
+    """
+
+    section_mm2: Float[np.ndarray, " n"]
+    height_mm: float
+    half_mm: float
+    gone: Bool[np.ndarray, " n"]
+    over: Bool[np.ndarray, "ny nx"] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+
+
+def gathered(
+    volume_mm3: Float[np.ndarray, " n"],
+    deep_mm: Float[np.ndarray, " n"],
+    job: JobPieces,
+    length_mm: Float[np.ndarray, " n"],
+    middle_mm: Float[np.ndarray, "n 2"],
+    width_mm: float,
+) -> Float[np.ndarray, " n"]:
+    """What is missing, piece by piece of the job's lines, a little beside a lot given to the lot.
+
+    Parameters
+    ----------
+    volume_mm3, deep_mm
+        (n,) missing, as the scan told it, and how deep on average where it is.
+    job
+        What lay there: no piece is given more than that, on as deep a floor, and what was seen to
+        be gone gets no less.
+    length_mm, middle_mm
+        (n,) and (n, 2) of the pieces.
+    """
+    own_mm3 = np.maximum(job.section_mm2 * length_mm, 1e-9)
+    most_mm3 = own_mm3 * np.maximum(1.0, deep_mm / job.height_mm)
+    gone = job.gone & (volume_mm3 > LITTLE * own_mm3)
+    volume = np.where(gone, np.maximum(volume_mm3, own_mm3), volume_mm3)
+    share = volume / own_mm3
+    little = np.flatnonzero((share < LITTLE) & (share > 0))
+    lot = np.flatnonzero(share >= LOT)
+    if len(little) and len(lot):
+        beside = cKDTree(middle_mm[lot]).query_ball_point(
+            middle_mm[little], BESIDE_WIDTHS * width_mm
+        )
+        for k, others in zip(little, beside, strict=True):
+            near = lot[others][np.argsort(-share[lot[others]])]
+            for other in near:
+                moved = min(volume[k], max(most_mm3[other] - volume[other], 0.0))
+                volume[other] += moved
+                volume[k] -= moved
+            if gone[near].any():
+                volume[k] = 0.0  # it was the gone line's own, which has it already
+    return np.where(volume < NOTHING * own_mm3, 0.0, volume)
+
+
+def runs_of(lines: JobLines, cut: Callable[[Bead], list[Bead]]) -> tuple[list[Bead], JobPieces]:
+    """Lines as beads, cut into runs by `cut`, and what the job laid in the runs' pieces."""
+    runs: list[Bead] = []
+    sections: list[Float[np.ndarray, " _m"]] = []
+    for bead, section in lines.chains():
+        tree = cKDTree(0.5 * (bead.xy_mm[1:] + bead.xy_mm[:-1]))
+        for run in cut(bead):
+            middles = 0.5 * (run.xy_mm[1:] + run.xy_mm[:-1])
+            runs.append(run)
+            sections.append(section[_piece_of(middles, bead, tree)])
+    section_mm2 = np.concatenate([np.zeros(0), *sections])
+    gone = np.zeros(len(section_mm2), dtype=bool)
+    if runs and len(lines.gone_mm):
+        middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
+        high_mm = float(lines.end_mm[0, 2])
+        for a, b in lines.gone_mm[np.abs(lines.gone_mm[:, 0, 2] - high_mm) < LEVEL_MM]:
+            gone |= _on(middles, a[:2], b[:2])
+    height_mm = float(np.median(lines.height_mm)) if runs else 0.0
+    half_mm = 0.5 * float(np.median(section_mm2)) / height_mm if runs else 0.0
+    return runs, JobPieces(section_mm2, height_mm, half_mm, gone)
+
+
+def _on(
+    points_mm: Float[np.ndarray, "p 2"],
+    a_mm: Float[np.ndarray, " 2"],
+    b_mm: Float[np.ndarray, " 2"],
+) -> Bool[np.ndarray, " p"]:
+    """Which points lie on a stretch."""
+    along = b_mm - a_mm
+    t = (points_mm - a_mm) @ along / max(float(along @ along), 1e-12)
+    off = points_mm - a_mm - t[:, None] * along
+    return np.asarray((t >= 0) & (t <= 1) & (np.hypot(*off.T) < ON_MM))
+
+
+def _piece_of(
+    points_mm: Float[np.ndarray, "p 2"], bead: Bead, tree: cKDTree
+) -> Int[np.ndarray, " p"]:
+    """Which piece of a bead each point lies on, among those whose middles are nearest."""
+    m = len(bead.xy_mm) - 1
+    if m == 1:
+        return np.zeros(len(points_mm), dtype=np.int64)
+    asked = tree.query(points_mm, k=min(m, 8))[1].reshape(len(points_mm), -1)
+    a, b = bead.xy_mm[:-1][asked], bead.xy_mm[1:][asked]
+    along = b - a
+    t = ((points_mm[:, None] - a) * along).sum(axis=2) / np.maximum((along**2).sum(axis=2), 1e-12)
+    off = points_mm[:, None] - a - np.clip(t, 0.0, 1.0)[..., None] * along
+    best = np.argmin((off**2).sum(axis=2), axis=1)
+    return np.asarray(asked[np.arange(len(asked)), best], dtype=np.int64)

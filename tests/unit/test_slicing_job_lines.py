@@ -1,0 +1,182 @@
+"""A patch along the job's own lines: what is gone comes back as the job laid it."""
+
+from __future__ import annotations
+
+import manifold3d as m3
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import Float
+
+from gcode.moves import Extrude
+from gcode.profiles import load_setup
+from gcode.slicing.job_lines import LITTLE, NOTHING, JobLines, JobPieces, gathered
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import PatchPlan, slice_patch
+from gcode.slicing.patch_beads import BOND_RATIO
+from gcode.surfaces import HeightField
+
+SETUP = load_setup()
+PARK = (10.0, 200.0, 20.0)
+WIDE_MM, HIGH_MM = 0.45, 0.2
+X0, Y0, LONG_MM = 60.0, 60.0, 20.0
+TOP_MM = 2.0
+
+
+def hatch(z_mm: float, count: int = 40) -> JobLines:
+    """Lines along X, side by side in Y."""
+    y = Y0 + (np.arange(count) + 0.5) * WIDE_MM
+    start = np.column_stack([np.full(count, X0), y, np.full(count, z_mm)])
+    return JobLines(
+        start,
+        start + np.array([LONG_MM, 0.0, 0.0]),
+        np.full(count, WIDE_MM * HIGH_MM),
+        np.full(count, HIGH_MM),
+        np.zeros(count, dtype=bool),
+    )
+
+
+def stacked(*layers: JobLines) -> JobLines:
+    """Several layers of them."""
+    names = ("start_mm", "end_mm", "section_mm2", "height_mm", "rim")
+    return JobLines(*(np.concatenate([getattr(one, name) for one in layers]) for name in names))
+
+
+def field_of(missing: m3.Manifold) -> HeightField:
+    """What is left of a block without it."""
+    block = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, TOP_MM)).translate((X0, Y0, 0.0))
+    return HeightField.from_manifold(block - missing, 0.1, margin_mm=15.0)
+
+
+def slab(x: tuple[float, float], lines: tuple[int, int], low_mm: float) -> m3.Manifold:
+    """Some lines, from a height up to the top, as long as is said."""
+    size = (x[1] - x[0], (lines[1] - lines[0]) * WIDE_MM, TOP_MM - low_mm)
+    return m3.Manifold.cube(size).translate((X0 + x[0], Y0 + lines[0] * WIDE_MM, low_mm))
+
+
+def patched(missing: m3.Manifold, field: HeightField, lines: JobLines) -> PatchPlan:
+    """The patch of it, in mid-job."""
+    return slice_patch(
+        missing,
+        SETUP,
+        as_built=field,
+        grid=LayerGrid.from_setup(SETUP),
+        standalone=False,
+        start_mm=PARK,
+        lines=lines,
+    )
+
+
+def beads_of(plan: PatchPlan) -> Float[np.ndarray, "n 4"]:
+    """(n, 4) middles of the pieces of all beads, and their volumes."""
+    found = []
+    for move in plan.toolpath:
+        if isinstance(move, Extrude):
+            a, b = move.points_mm[:-1], move.points_mm[1:]
+            volume = np.linalg.norm(b - a, axis=1) * move.section_mm2
+            found.append(np.column_stack([0.5 * (a + b), volume]))
+    return np.concatenate(found)
+
+
+def off_line_mm(beads: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
+    """How far each piece lies from the nearest line of the hatch."""
+    at = (beads[:, 1] - Y0) / WIDE_MM - 0.5
+    return np.asarray(np.abs(at - np.round(at)) * WIDE_MM)
+
+
+def test_beads_lie_where_the_job_laid_them():
+    missing = slab((5.0, 15.0), (10, 16), TOP_MM - 2 * HIGH_MM)
+    lines = stacked(*(hatch(z) for z in (TOP_MM - HIGH_MM, TOP_MM)))
+    plan = patched(missing, field_of(missing), lines)
+    top = beads_of(plan)
+    top = top[np.abs(top[:, 2] - TOP_MM) < 1e-6]
+    assert off_line_mm(top).max() < 1e-3
+    assert {round((y - Y0) / WIDE_MM - 0.5) for y in top[:, 1]} == set(range(10, 16))
+    # below, the head has no room beside the walls for all of them: other lines serve there
+    assert plan.beads_mm3 == pytest.approx(BOND_RATIO * missing.volume(), rel=0.03)
+    assert sum(u.volume_mm3 for u in plan.unreachable) < 0.02 * missing.volume()
+
+
+def test_a_line_that_a_scan_rounded_off_is_laid_whole():
+    line = slab((4.0, 16.0), (20, 21), TOP_MM - HIGH_MM)
+    wide = slab((3.8, 16.2), (19, 22), TOP_MM - 0.06)  # as a scanner's spot tells it
+    field = field_of(wide)
+    x, y = field.centres_mm()
+    lies = (np.abs(y[:, None] - Y0 - 20.5 * WIDE_MM) < WIDE_MM / 2) & (
+        np.abs(x[None, :] - X0 - 10.0) < 6.0
+    )
+    z_mm = np.where(lies, np.minimum(field.z_mm, TOP_MM - 0.09), field.z_mm)
+    field = HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+    told = wide + slab((4.0, 16.0), (20, 21), TOP_MM - 0.09)
+    lines = hatch(TOP_MM)
+    gone = np.array(
+        [[[X0 + 4.0, Y0 + 20.5 * WIDE_MM, TOP_MM], [X0 + 16.0, Y0 + 20.5 * WIDE_MM, TOP_MM]]]
+    )
+    known = JobLines(
+        lines.start_mm, lines.end_mm, lines.section_mm2, lines.height_mm, lines.rim, gone
+    )
+    beads = beads_of(patched(told, field, known))
+    assert beads[:, 3].sum() == pytest.approx(BOND_RATIO * line.volume(), rel=0.04)
+    assert np.abs(beads[:, 1] - Y0 - 20.5 * WIDE_MM).max() < 1e-3
+
+
+def test_on_a_slope_the_jobs_steps_come_back():
+    """The deficit is smooth; what was printed was a staircase, and is one again."""
+    steps = 5
+    lines = stacked(
+        *(hatch(TOP_MM - k * HIGH_MM).some(np.arange(40) < 20 + 4 * k) for k in range(steps))
+    )
+    wedge = m3.Manifold.cube((40.0, 40.0, 5.0)).rotate(
+        (-float(np.degrees(np.arctan(HIGH_MM / (4 * WIDE_MM)))), 0.0, 0.0)
+    )
+    # the slope goes through the middles of the steps
+    smooth = wedge.translate((X0 - 5.0, Y0 + 18 * WIDE_MM, TOP_MM))
+    block = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, TOP_MM)).translate((X0, Y0, 0.0)) - smooth
+    low_mm = TOP_MM - steps * HIGH_MM
+    floor = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, low_mm)).translate((X0, Y0, 0.0))
+    missing = block - floor
+    plan = patched(missing, HeightField.from_manifold(floor, 0.1, margin_mm=15.0), lines)
+    beads = beads_of(plan)
+    assert off_line_mm(beads).max() < 1e-3
+    for k in range(steps):
+        mine = beads[np.abs(beads[:, 2] - TOP_MM + k * HIGH_MM) < 1e-6]
+        last = int(np.round((mine[:, 1].max() - Y0) / WIDE_MM - 0.5))
+        assert last == 20 + 4 * k - 1
+    laid = len(lines.rim) * LONG_MM * WIDE_MM * HIGH_MM
+    assert plan.beads_mm3 == pytest.approx(BOND_RATIO * laid, rel=0.03)
+    # as much along one line as along the next, however they lie to the columns
+    line = np.round((beads[:, 1] - Y0) / WIDE_MM - 0.5).astype(int)
+    top = np.abs(beads[:, 2] - TOP_MM) < 1e-6
+    by_line = np.bincount(line[top], beads[top, 3])
+    assert by_line.max() < 1.05 * by_line.min()
+
+
+def test_without_lines_there_it_draws_its_own():
+    missing = slab((5.0, 15.0), (10, 16), TOP_MM - 2 * HIGH_MM)
+    elsewhere = hatch(0.4)
+    field = field_of(missing)
+    with_them, without = (
+        patched(missing, field, lines) for lines in (elsewhere, elsewhere.some(elsewhere.rim))
+    )
+    assert with_them.beads_mm3 == pytest.approx(without.beads_mm3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(0.0, 1.2), min_size=1, max_size=12),
+    st.integers(0, 2**31 - 1),
+)
+def test_gathering_moves_plastic_and_makes_none(shares, seed):
+    n = len(shares)
+    rng = np.random.default_rng(seed)
+    own = rng.uniform(0.02, 0.09, n)
+    volume = np.array(shares) * own
+    middles = np.column_stack([np.arange(n) * 0.4, rng.integers(0, 3, n) * 0.45])
+    job = JobPieces(own, 0.2, 0.225, np.zeros(n, dtype=bool))
+    out = gathered(volume, np.full(n, 0.2), job, np.ones(n), middles, 0.45)
+    assert out.sum() <= volume.sum() + 1e-12
+    assert volume.sum() - out.sum() <= NOTHING * own.sum() + 1e-12
+    assert (out <= np.maximum(volume, own) + 1e-12).all()
+    lot = np.array(shares) >= LITTLE
+    assert (out[lot] >= np.where(volume < NOTHING * own, 0.0, volume)[lot] - 1e-12).all()
