@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := $(VENV)/.extras
+# Tests wait for wires and for killed processes: one worker more than there are cores.
+WORKERS := $(shell $(PYTHON) -c "import os; print(1 + (os.cpu_count() or 1))")
 
 .PHONY: demo test lint suite slow chromium examples docs pictures peers clean help
 
@@ -31,7 +33,7 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 suite: $(EXTRAS)
-	$(BIN)/python -m pytest -n auto --dist loadscope
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope
 
 slow: $(EXTRAS) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
