@@ -72,10 +72,10 @@ class PatchModel:
         self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
         self.lost: list[Unprintable] = []
         self.job: JobColumns | None = None
-        self.done_mm = np.full(
-            self.shape, -np.inf
-        )  # up to where the job's own lines are laid again
-        if lines is not None and len(lines.rim):
+        # up to where the job's own lines are laid again
+        self.done_mm = np.full(self.shape, -np.inf)
+        # along the surface itself it is not as the job had it
+        if lines is not None and len(lines.rim) and not setup.process.nonplanar_top:
             wanted = np.isfinite(self.top_mm)
             low_mm, high_mm = float(self.box[2]), float(self.box[5])
             self.job = JobColumns(
