@@ -106,8 +106,9 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     by_both = by_surface.copy()
     if len(ask):
         told_mm = evidence.clearance(middle[ask], template.distance(middle[ask]))[0]
-        known = ask[told_mm > SOLID_MM + 1e-6]
-        surface = np.clip(told_mm[told_mm > SOLID_MM + 1e-6] / half_mm[known], -1.0, 1.0)
+        looked_into = told_mm > SOLID_MM + 1e-6
+        known = ask[looked_into]
+        surface = np.clip(told_mm[looked_into] / half_mm[known], -1.0, 1.0)
         rays = np.clip(rays_mm[known] / half_mm[known], -1.0, MOST_SHARE)
         by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
     gone = _together(by_surface, line) >= GONE_SHARE

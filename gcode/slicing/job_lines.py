@@ -181,7 +181,7 @@ class JobPieces:
     height_mm: float
     half_mm: float
     gone: Bool[np.ndarray, " n"]
-    over: Bool[np.ndarray, "ny nx"] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    over: Bool[np.ndarray, "ny nx"]
 
 
 def gathered(
@@ -226,26 +226,32 @@ def gathered(
     return np.where(volume < NOTHING * own_mm3, 0.0, volume)
 
 
-def runs_of(lines: JobLines, cut: Callable[[Bead], list[Bead]]) -> tuple[list[Bead], JobPieces]:
-    """Lines as beads, cut into runs by `cut`, and what the job laid in the runs' pieces."""
+def runs_of(
+    lines: JobLines,
+    over: Bool[np.ndarray, "ny nx"],
+    cut: Callable[[Bead], list[Bead]],
+) -> tuple[list[Bead], JobPieces]:
+    """Lines as beads, cut into runs by `cut`, and what the job laid in the runs' pieces.
+
+    `over` are the columns that the lines lie over.
+    """
     runs: list[Bead] = []
-    sections: list[Float[np.ndarray, " _m"]] = []
+    places, sections = [np.zeros((0, 2))], [np.zeros(0)]
     for bead, section in lines.chains():
         tree = cKDTree(0.5 * (bead.xy_mm[1:] + bead.xy_mm[:-1]))
         for run in cut(bead):
-            middles = 0.5 * (run.xy_mm[1:] + run.xy_mm[:-1])
             runs.append(run)
-            sections.append(section[_piece_of(middles, bead, tree)])
-    section_mm2 = np.concatenate([np.zeros(0), *sections])
+            places.append(0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]))
+            sections.append(section[_piece_of(places[-1], bead, tree)])
+    middles, section_mm2 = np.concatenate(places), np.concatenate(sections)
     gone = np.zeros(len(section_mm2), dtype=bool)
     if runs and len(lines.gone_mm):
-        middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
         high_mm = float(lines.end_mm[0, 2])
         for a, b in lines.gone_mm[np.abs(lines.gone_mm[:, 0, 2] - high_mm) < LEVEL_MM]:
             gone |= _on(middles, a[:2], b[:2])
     height_mm = float(np.median(lines.height_mm)) if runs else 0.0
     half_mm = 0.5 * float(np.median(section_mm2)) / height_mm if runs else 0.0
-    return runs, JobPieces(section_mm2, height_mm, half_mm, gone)
+    return runs, JobPieces(section_mm2, height_mm, half_mm, gone, over)
 
 
 def _on(

@@ -60,6 +60,11 @@ class Chain:
     section_mm2: Float[np.ndarray, " m"]
     role: Role
 
+    @property
+    def volume_mm3(self) -> float:
+        """Plastic in it."""
+        return float(np.hypot(*np.diff(self.xy_mm, axis=0).T) @ self.section_mm2)
+
     def reversed(self) -> Chain:
         """The same from its other end."""
         return Chain(
@@ -278,7 +283,8 @@ def weighed(
     lengths = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
     filled = np.flatnonzero(thick.ravel() > 0)
     spread_mm = SPREAD_NOZZLES * nozzle_mm
-    distance, nearest = cKDTree(middles).query(
+    pieces_of = cKDTree(middles)
+    distance, nearest = pieces_of.query(
         model.points_mm[filled], distance_upper_bound=spread_mm + TO_WALL_MM
     )
     near = np.isfinite(distance) & ((distance < spread_mm) | strips.ravel()[filled])
@@ -287,7 +293,9 @@ def weighed(
         nearest[near], thick.ravel()[filled[near]] * cell_mm3, minlength=len(middles)
     ).astype(np.float64)  # of nothing it makes integers
     if job is not None:
-        volume = _by_lines(volume, runs, job, filled, near, nearest, thick, lengths, model)
+        volume = _by_lines(
+            volume, runs, pieces_of, job, filled, near, nearest, thick, lengths, model
+        )
     reach = np.bincount(nearest[near], thick.ravel()[filled[near]], minlength=len(middles))
     number = np.bincount(nearest[near], minlength=len(middles))
     depth = reach / np.maximum(number, 1)
@@ -318,6 +326,7 @@ def weighed(
 def _by_lines(
     volume_mm3: Float[np.ndarray, " n"],
     runs: list[Bead],
+    pieces_of: cKDTree,
     job: JobPieces,
     filled: Int[np.ndarray, " c"],
     near: Bool[np.ndarray, " c"],
@@ -332,16 +341,15 @@ def _by_lines(
     The total stays what it is. What lies beside the lines is added to the nearest as it is.
     """
     asked = np.flatnonzero(job.over)
-    middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
     under = asked[off_runs(runs, model.points_mm[asked]) <= job.half_mm + ON_LINE_MM]
-    of_piece = cKDTree(middles).query(model.points_mm[under])[1]
-    number = np.bincount(of_piece, minlength=len(middles))
-    deep = np.bincount(of_piece, thick.ravel()[under], minlength=len(middles))
+    of_piece = pieces_of.query(model.points_mm[under])[1]
+    number = np.bincount(of_piece, minlength=pieces_of.n)
+    deep = np.bincount(of_piece, thick.ravel()[under], minlength=pieces_of.n)
     own = job.section_mm2 * length_mm * deep / np.maximum(number, 1) / job.height_mm
     cell_mm3 = model.cell_mm**2 * model.weight
     beside = near & ~np.isin(filled, under)
     extra = np.bincount(
-        nearest[beside], thick.ravel()[filled[beside]] * cell_mm3, minlength=len(middles)
+        nearest[beside], thick.ravel()[filled[beside]] * cell_mm3, minlength=pieces_of.n
     )
     whole_mm3 = float((own + extra).sum())
     return (own + extra) * (float(volume_mm3.sum()) / whole_mm3 if whole_mm3 > 0 else 1.0)

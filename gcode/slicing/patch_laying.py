@@ -105,7 +105,6 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
             # what this stage has laid stands no higher than this pass
             over_mm = max(reach.least_over(way), one.z_mm) + CLEAR_MM
             pen.hop_to(target, over_mm=min(over_mm, setup.printer.max_z_mm))
-        lengths = np.hypot(*np.diff(chain.xy_mm, axis=0).T)
         width_mm = float(chain.section_mm2.mean()) / one.height_mm
         pen.extrude(
             np.column_stack([chain.xy_mm, chain.z_mm]),
@@ -115,7 +114,7 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
             width_mm=width_of(width_mm, one.height_mm),
             height_mm=one.height_mm,
         )
-        laid_mm3 += float(lengths @ chain.section_mm2)
+        laid_mm3 += chain.volume_mm3
     return laid_mm3
 
 

@@ -118,6 +118,10 @@ class PatchModel:
         )
         return np.maximum(below.reshape(self.shape), 0.0)
 
+    def left_below(self, z_mm: float) -> Float[np.ndarray, "ny nx"]:
+        """The same, less what has been laid or given up; negative where more was laid."""
+        return self.wanted_below(z_mm) - self.laid_mm - self.sunk_mm
+
     @property
     def need_mm(self) -> Float[np.ndarray, "ny nx"]:
         """How high the tip must at least be over each column."""

@@ -260,15 +260,15 @@ def _along_job(
     assert model.job is not None
     runs, job = runs_of(
         model.job.lines_at(z_mm),
+        planned,
         lambda bead: free_runs(bead, lambda a, b: free_between(a, b, reach, model.reach)),
     )
     if not runs:
         return None
-    job = replace(job, over=planned & model.job.near)
     tips_mm = [np.full(len(run.xy_mm), z_mm) for run in runs]
     strips = _strips(thick, z_mm, model)
     height_mm = float(thick[thick > 0].mean())
-    wanted = model.wanted_below(z_mm) - model.laid_mm - model.sunk_mm
+    wanted = model.left_below(z_mm)
     share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), LEAST_OF_GAP, 1.0))
     chains, laid = weighed(runs, tips_mm, share * thick, strips, model, setup, job=job)
     columns = np.flatnonzero(thick)
@@ -279,7 +279,7 @@ def _along_job(
 
 def _served(chains: list[Chain], thick: Float[np.ndarray, "ny nx"], model: PatchModel) -> float:
     """Share of what is due that beads lay."""
-    beads_mm3 = sum(float(np.hypot(*np.diff(c.xy_mm, axis=0).T) @ c.section_mm2) for c in chains)
+    beads_mm3 = sum(chain.volume_mm3 for chain in chains)
     due_mm3 = float(thick.sum()) * model.cell_mm**2 * model.weight
     return beads_mm3 / (BOND_RATIO * due_mm3)
 
@@ -288,7 +288,7 @@ def _plan_skin(
     model: PatchModel, skin: Skin, most_mm: float, index: int, setup: PrintSetup
 ) -> Pass | None:
     """The last pass, along the surface, where the planar ones left room for it."""
-    wanted = model.wanted_below(np.inf) - model.laid_mm - model.sunk_mm
+    wanted = model.left_below(np.inf)
     thick = np.minimum(model.top_mm - model.surface_mm, wanted + AGREE_MM)
     due = skin.columns & (thick >= LEAST_THICK_MM) & (thick <= DEEP_RATIO * most_mm)
     thick = np.where(due, thick, 0.0)
@@ -374,7 +374,7 @@ def _due_of_job(
     """
     assert model.job is not None
     gap = z_mm - model.surface_mm
-    wanted = model.wanted_below(z_mm) - model.laid_mm - model.sunk_mm
+    wanted = model.left_below(z_mm)
     deep = gap > DEEP_RATIO * most_mm
     thick = np.where(deep, np.minimum(gap, np.maximum(wanted + AGREE_MM, layer_mm)), gap)
     thick = np.clip(thick, 0.0, None)
@@ -385,7 +385,7 @@ def _due_of_job(
     # the shallow rim of what a scan rounded off counts: line by line it makes up a bead; beside
     # it noise would
     least_mm = np.where(wanted > ROUNDING_MM, ROUNDED_OFF_MM, LEAST_THICK_MM)
-    active = planned & model.job.near & due & (thick >= least_mm)
+    active = planned & due & (thick >= least_mm)
     active &= ~deep | (wanted > LEAST_THICK_MM / 2)  # beside the part all is deep
     return _lidded(model, thick, active, deep & active, gap, most_mm, layer_mm)
 

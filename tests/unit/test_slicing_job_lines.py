@@ -173,7 +173,7 @@ def test_gathering_moves_plastic_and_makes_none(shares, seed):
     own = rng.uniform(0.02, 0.09, n)
     volume = np.array(shares) * own
     middles = np.column_stack([np.arange(n) * 0.4, rng.integers(0, 3, n) * 0.45])
-    job = JobPieces(own, 0.2, 0.225, np.zeros(n, dtype=bool))
+    job = JobPieces(own, 0.2, 0.225, np.zeros(n, dtype=bool), np.zeros((1, 1), dtype=bool))
     out = gathered(volume, np.full(n, 0.2), job, np.ones(n), middles, 0.45)
     assert out.sum() <= volume.sum() + 1e-12
     assert volume.sum() - out.sum() <= NOTHING * own.sum() + 1e-12
