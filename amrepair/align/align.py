@@ -21,7 +21,7 @@ from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.thinning import in_order, thin_out
 from amrepair.errors import AlignmentError, InputError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, moved
 from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
@@ -293,8 +293,10 @@ def _part_only(
 ) -> Float[np.ndarray, "m 3"]:
     """Points that can lie on the part: in its box, and above the bed."""
     low, high = template.bounds_mm
-    placed = points_mm @ matrix[:3, :3].T + matrix[:3, 3]
-    near = ((placed > low - 3.0) & (placed < high + 3.0)).all(axis=1)
+    placed = moved(points_mm, matrix)
+    near = np.ones(len(placed), dtype=bool)
+    for axis in range(3):
+        near &= (placed[:, axis] > low[axis] - 3.0) & (placed[:, axis] < high[axis] + 3.0)
     above = placed[:, 2] > low[2] + 0.35
     # a flat part seen from below has no other points: then all of the box count
     keep = near & above if (near & above).sum() >= LEAST_POINTS else near

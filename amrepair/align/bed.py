@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.align.refine import Prior
-from amrepair.frames import rotation_from_vector
+from amrepair.frames import moved, rotation_from_vector
 from amrepair.template.port import Template
 
 MOST_LOOKED_AT = 80_000  # points: the bed is a plane
@@ -38,8 +38,7 @@ def level_on_bed(
     The corrected guess, and whether enough bed was seen to correct it.
     """
     low, high = template.bounds_mm
-    points_mm = points_mm[:: max(1, len(points_mm) // MOST_LOOKED_AT)]
-    placed = points_mm @ matrix[:3, :3].T + matrix[:3, 3]
+    placed = moved(points_mm[:: max(1, len(points_mm) // MOST_LOOKED_AT)], matrix)
     height = placed[:, 2] - low[2]
     beside = np.maximum(low[:2] - placed[:, :2], placed[:, :2] - high[:2]).max(axis=1)
     near = np.flatnonzero((np.abs(height) < BAND_MM) & (beside > -1e9))

@@ -201,10 +201,10 @@ def compute_deficit(
             images=evidence.images,
         )
         expected: Any = template.solid()
-        solid = standing_heights(seen, expected.transform(matrix), missing, excess)
+        solid, gone = standing_heights(seen, expected.transform(matrix), missing, excess)
         points_mm = build_from_template.apply(scan.points_mm)
-        sharp = with_sharp_walls(solid, missing, points_mm, scan.sigma_mm)
-        even = with_even_crests(sharp, missing)
+        sharp = with_sharp_walls(solid, gone, points_mm, scan.sigma_mm)
+        even = with_even_crests(sharp, gone)
         return with_what_stands_out(even, points_mm, scan.sigma_mm, evidence.spacing_mm)
 
     return Deficit(

@@ -7,7 +7,6 @@ part stands as it was designed, and that margin; where it was designed open, not
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any
 
@@ -17,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.deficit import heights_kernels as kernels
+from amrepair.detect.near import has_near
 from amrepair.detect.rays import RangeImage, clearances
 from amrepair.frames import Transform, box_corners
 from amrepair.scans import Scan
@@ -136,8 +136,8 @@ def standing_heights(
     expected: manifold3d.Manifold,
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
-) -> HeightField:
-    """The as-built field with sharp walls.
+) -> tuple[HeightField, Bool[np.ndarray, "ny nx"]]:
+    """The as-built field with sharp walls, and the columns that something is missing from.
 
     What was expected, less what is missing, with what is too much, gives heights on a fine grid.
     They stand beside walls, where the scan saw nothing higher; elsewhere the scan itself decides.
@@ -190,7 +190,8 @@ def standing_heights(
     # its rim, where columns and cells do not end alike
     rim = ndimage.maximum_filter(~untouched, around)
     sharp = np.where(known, by_wall | agrees | beneath, rim)
-    return HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
+    field = HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
+    return field, ~untouched
 
 
 def _cells_over(
@@ -222,14 +223,13 @@ def with_what_stands_out(
         Mean distance between neighbouring points.
     """
     off_mm = OFF_SIGMA * sigma_mm
-    high = points_mm[points_mm[:, 2] - off_mm > field.sample(points_mm[:, :2])]
-    around_mm = np.full(len(high), -np.inf)
-    for aside in itertools.product((-off_mm, 0.0, off_mm), repeat=2):
-        np.maximum(around_mm, field.sample(high[:, :2] + np.array(aside)), out=around_mm)
-    out = high[high[:, 2] - off_mm > around_mm]
+    points_mm = np.ascontiguousarray(points_mm)
+    higher = kernels.standing_out(points_mm, field.z_mm, field.origin_mm, field.cell_mm, off_mm)
+    out = points_mm[higher]
     if len(out) == 0:
         return field
-    out = out[kernels.in_company(out, points_mm, BESIDE_SPACINGS * spacing_mm, OTHERS)]
+    # itself is one of them
+    out = out[has_near(out, points_mm, BESIDE_SPACINGS * spacing_mm, enough=OTHERS + 1)]
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)
@@ -279,31 +279,18 @@ def _tops(
     A point alone above the others of its cell, which no neighbouring cell has anything as high as,
     is none: a scanner's stray would keep the nozzle away from all around it.
     """
-    index = np.floor((points_mm[:, :2] - low_mm) / cell_mm).astype(np.int64)
-    ok = ((index >= 0) & (index < shape[::-1])).all(axis=1)
-    flat = index[ok, 1] * shape[1] + index[ok, 0]
-    z = points_mm[ok, 2]
-    top, mean, count = _topmost(flat, z, shape)
-    around = ndimage.maximum_filter(top, footprint=AROUND_CELL, mode="constant", cval=-np.inf)
-    all_of = np.bincount(flat, minlength=top.size).reshape(shape)
-    alone = (count == 1) & (all_of > 1) & (around < top - TOP_BAND_MM)
+    points_mm = np.ascontiguousarray(points_mm)
+    at = kernels.cells_under(points_mm, low_mm, cell_mm, *shape)
+    top, mean, count, among = kernels.topmost(at, points_mm, TOP_BAND_MM, shape[0] * shape[1])
+    around = ndimage.maximum_filter(
+        top.reshape(shape), footprint=AROUND_CELL, mode="constant", cval=-np.inf
+    )
+    alone = (count == 1) & (among > 1) & (around.ravel() < top - TOP_BAND_MM)
     if alone.any():
-        stray = alone.ravel()[flat] & (z == top.ravel()[flat])
-        _, mean, count = _topmost(flat[~stray], z[~stray], shape)
-    return mean, count > 0
-
-
-def _topmost(
-    flat: Int[np.ndarray, " n"], z: Float[np.ndarray, " n"], shape: tuple[int, int]
-) -> tuple[Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"], Int[np.ndarray, "ny nx"]]:
-    """By cell: the highest point, and the mean and number of those on one surface with it."""
-    top = np.full(shape[0] * shape[1], -np.inf)
-    np.maximum.at(top, flat, z)
-    near = z >= top[flat] - TOP_BAND_MM
-    total = np.bincount(flat[near], weights=z[near], minlength=len(top))
-    count = np.bincount(flat[near], minlength=len(top))
-    mean = np.where(count > 0, total / np.maximum(count, 1), 0.0)
-    return top.reshape(shape), mean.reshape(shape), count.reshape(shape)
+        stray = (at >= 0) & alone[at] & (points_mm[:, 2] == top[at])
+        at = np.where(stray, -1, at)
+        _, mean, count, _ = kernels.topmost(at, points_mm, TOP_BAND_MM, shape[0] * shape[1])
+    return mean.reshape(shape), count.reshape(shape) > 0
 
 
 def _close_gaps(

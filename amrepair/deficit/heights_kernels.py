@@ -1,4 +1,4 @@
-"""Which points have others beside them, for `heights`; compiled."""
+"""Heights of a cloud by column, and points that stand out of them; compiled, for `heights`."""
 
 from __future__ import annotations
 
@@ -10,44 +10,61 @@ from gcode.compiled import njit
 
 
 @njit(cache=True, nogil=True)
-def in_company(asked: Any, points: Any, within: float, others: int) -> Any:
-    """(k,) whether `others` more of the points lie within a distance of each that is asked about.
+def cells_under(points: Any, low: Any, cell: float, ny: int, nx: int) -> Any:
+    """(n,) number of the column that holds each point, by rows; −1 outside."""
+    out = np.full(len(points), -1, np.int64)
+    for p in range(len(points)):
+        ix = int(np.floor((points[p, 0] - low[0]) / cell))
+        iy = int(np.floor((points[p, 1] - low[1]) / cell))
+        if 0 <= ix < nx and 0 <= iy < ny:
+            out[p] = iy * nx + ix
+    return out
 
-    `asked` (k, 3) are points themselves. Only columns as wide as the distance around them are
-    filled: the rest of a large cloud is passed by.
+
+@njit(cache=True, nogil=True)
+def topmost(at: Any, points: Any, band: float, cells: int) -> Any:
+    """By column: the highest point, the mean and number of those within a band of it, and of all.
+
+    `at` (n,) are columns of points, −1 for those left out.
     """
-    low = np.array((asked[:, 0].min() - 2 * within, asked[:, 1].min() - 2 * within))
-    nx = int((asked[:, 0].max() + 2 * within - low[0]) / within) + 1
-    ny = int((asked[:, 1].max() + 2 * within - low[1]) / within) + 1
-    lowest, highest = asked[:, 2].min() - within, asked[:, 2].max() + within
-    wanted = np.zeros((ny, nx), np.bool_)
-    for k in range(len(asked)):
-        i, j = int((asked[k, 1] - low[1]) / within), int((asked[k, 0] - low[0]) / within)
-        wanted[i - 1 : i + 2, j - 1 : j + 2] = True
-    start = np.zeros(ny * nx + 1, np.int64)
-    column = np.full(len(points), -1, np.int64)
+    top = np.full(cells, -np.inf)
+    for p in range(len(at)):
+        if at[p] >= 0:
+            top[at[p]] = max(top[at[p]], points[p, 2])
+    mean = np.zeros(cells)
+    count, among = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
+    for p in range(len(at)):
+        c = at[p]
+        if c >= 0:
+            among[c] += 1
+            if points[p, 2] >= top[c] - band:
+                count[c] += 1
+                mean[c] += points[p, 2]
+    for c in range(cells):
+        if count[c] > 0:
+            mean[c] /= count[c]
+    return top, mean, count, among
+
+
+@njit(cache=True, nogil=True)
+def standing_out(points: Any, z: Any, low: Any, cell: float, off: float) -> Any:
+    """(n,) whether a point is higher than a field by more than noise, as near as noise moves it.
+
+    Beyond the field is the bed.
+    """
+    out = np.zeros(len(points), np.bool_)
+    ny, nx = z.shape
     for p in range(len(points)):
-        if points[p, 2] <= lowest or points[p, 2] >= highest:
-            continue
-        x, y = (points[p, 0] - low[0]) / within, (points[p, 1] - low[1]) / within
-        if x < 0 or y < 0 or x >= nx or y >= ny or not wanted[int(y), int(x)]:
-            continue
-        column[p] = int(y) * nx + int(x)
-        start[column[p] + 1] += 1
-    start = np.cumsum(start)
-    order, filled = np.empty(start[-1], np.int64), start[:-1].copy()
-    for p in range(len(points)):
-        if column[p] >= 0:
-            order[filled[column[p]]] = p
-            filled[column[p]] += 1
-    found = np.zeros(len(asked), np.bool_)
-    for k in range(len(asked)):
-        i, j = int((asked[k, 1] - low[1]) / within), int((asked[k, 0] - low[0]) / within)
-        count = -1  # itself
-        for row in range(i - 1, i + 2):
-            for p in order[start[row * nx + j - 1] : start[row * nx + j + 2]]:
-                d = points[p] - asked[k]
-                if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= within * within:
-                    count += 1
-        found[k] = count >= others
-    return found
+        least = points[p, 2] - off
+        found = True
+        for k in range(9):
+            # its own column first: most points lie on it
+            side = (k + 4) % 9
+            x, y = points[p, 0] + (side // 3 - 1) * off, points[p, 1] + (side % 3 - 1) * off
+            ix, iy = int(np.floor((x - low[0]) / cell)), int(np.floor((y - low[1]) / cell))
+            height = z[iy, ix] if 0 <= ix < nx and 0 <= iy < ny else 0.0
+            if not least > height:
+                found = False
+                break
+        out[p] = found
+    return out

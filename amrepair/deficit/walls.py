@@ -8,14 +8,11 @@ of the wall itself, column by column, knows better.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.deficit import walls_kernels as kernels
-from amrepair.deficit.heights import columns_of
 from gcode.surfaces import HeightField
 
 # A step from column to column that is a wall, not a slope.
@@ -34,24 +31,26 @@ CREST_CELLS, CREST_REACH_CELLS = 4, 2
 
 
 def with_sharp_walls(
-    field: HeightField, missing: Any, points_mm: Float[np.ndarray, "n 3"], sigma_mm: float
+    field: HeightField,
+    gone: Bool[np.ndarray, "ny nx"],
+    points_mm: Float[np.ndarray, "n 3"],
+    sigma_mm: float,
 ) -> HeightField:
     """The as-built field, columns beside walls high or low as their middles lie to the wall.
 
     Parameters
     ----------
-    missing
-        `manifold3d.Manifold`, build frame: only walls beside it are looked at.
+    gone
+        Columns that something is missing from: only walls beside them are looked at.
     points_mm
         What was seen, build frame.
     """
-    window = _around(missing, field, BESIDE_CELLS + int(np.ceil(RADIUS_MM / field.cell_mm)))
-    if window is None or sigma_mm <= 0:
+    if not gone.any() or sigma_mm <= 0:
         return field
-    touched, rows, columns = window
+    rows, columns = _around(gone, BESIDE_CELLS + int(np.ceil(RADIUS_MM / field.cell_mm)))
     z_mm = np.array(field.z_mm, dtype=np.float64)
     near = z_mm[rows, columns]
-    beside = ndimage.maximum_filter(touched[rows, columns], 2 * BESIDE_CELLS + 1)
+    beside = ndimage.maximum_filter(gone[rows, columns], 2 * BESIDE_CELLS + 1)
     step_mm = ndimage.maximum_filter(near, 3) - ndimage.minimum_filter(near, 3)
     iy, ix = (beside & (step_mm > STEP_MM)).nonzero()
     corner_mm = field.origin_mm + np.array([columns.start, rows.start]) * field.cell_mm
@@ -64,19 +63,18 @@ def with_sharp_walls(
     return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
 
 
-def with_even_crests(field: HeightField, missing: Any) -> HeightField:
+def with_even_crests(field: HeightField, gone: Bool[np.ndarray, "ny nx"]) -> HeightField:
     """The as-built field, what is thinner than a bead beside what is missing as high as near by.
 
     A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
     what lies between two of its columns that were seen is no lower than the higher of them.
     """
-    window = _around(missing, field, CREST_CELLS + BESIDE_CELLS)
-    if window is None:
+    if not gone.any():
         return field
-    touched, rows, columns = window
+    rows, columns = _around(gone, CREST_CELLS + BESIDE_CELLS)
     z_mm = np.array(field.z_mm, dtype=np.float64)
     near = z_mm[rows, columns]
-    beside = ndimage.maximum_filter(touched[rows, columns], 2 * BESIDE_CELLS + 1)
+    beside = ndimage.maximum_filter(gone[rows, columns], 2 * BESIDE_CELLS + 1)
     reach = 2 * CREST_REACH_CELLS + 1
     # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
     thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, CREST_CELLS), reach)
@@ -86,18 +84,12 @@ def with_even_crests(field: HeightField, missing: Any) -> HeightField:
     return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
 
 
-def _around(
-    missing: Any, field: HeightField, margin: int
-) -> tuple[Bool[np.ndarray, "ny nx"], slice, slice] | None:
-    """Columns that a solid lies over, and the window of the field around them; None: nowhere."""
-    offset, _ = columns_of(missing, field)
-    touched = (offset[1:] != offset[:-1]).reshape(field.shape)
-    if not touched.any():
-        return None
+def _around(gone: Bool[np.ndarray, "ny nx"], margin: int) -> tuple[slice, slice]:
+    """Rows and columns of the window around those that something is missing from."""
     rows, columns = (
-        slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in touched.nonzero()
+        slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in gone.nonzero()
     )
-    return touched, rows, columns
+    return rows, columns
 
 
 def _by_cell(

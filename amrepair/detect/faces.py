@@ -15,7 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.detect import faces_kernels as kernels
 from amrepair.detect.holes import is_backed, is_closed, spoken_of
+from amrepair.detect.near import has_near
 from amrepair.detect.rooms import Rooms, find_rooms
 from amrepair.detect.surfels import Surfels
 from amrepair.detect.turning import side_by_view, turned_down, turned_to_close
@@ -34,6 +36,10 @@ NEIGHBOURS = 6
 STRIP_COSINE, STRIP_MM = 0.77, 0.03
 # The template's surface is there where a point of the scan lies this near (in spacings).
 PRESENT_SPACINGS = 1.6
+# Nearer than this share of that, a patch needs no even samples around it.
+SURE_RATIO = 0.4
+# No sample of those around a patch lies farther from it (in the same reach).
+OFF_REACHES = 4.0
 # Samples on one side only: a patch beside a rim (0 amid even samples, 1 far outside).
 SURROUND_POINTS, LOPSIDED = 8, 0.6
 # A face answers for what lies over it: sideways within a spacing and this share of the height.
@@ -288,12 +294,9 @@ def _around(
     patches: Patches,
 ) -> Bool[np.ndarray, " s"]:
     """Surfels near what lies off the template, or near template that no point lies on."""
-    reach_mm = PRESENT_SPACINGS * surfels.spacing_mm
-    raw = cKDTree(points_mm, compact_nodes=False, balanced_tree=False)
-    gap = np.isinf(raw.query(patches.place_mm, distance_upper_bound=reach_mm, workers=2)[0])
-    lost = np.concatenate([surfels.place_mm[off], patches.place_mm[gap]])
-    distance = cKDTree(lost).query(surfels.place_mm, distance_upper_bound=AROUND_MM, workers=2)[0]
-    return np.asarray(np.isfinite(distance))
+    seen = has_near(patches.place_mm, points_mm, PRESENT_SPACINGS * surfels.spacing_mm)
+    lost = np.concatenate([surfels.place_mm[off], patches.place_mm[~seen]])
+    return has_near(surfels.place_mm, lost, AROUND_MM)
 
 
 def _present(
@@ -304,17 +307,20 @@ def _present(
     reach_mm: Float[np.ndarray, " k"],
 ) -> Bool[np.ndarray, " m"]:
     """Patches of the template's surface amid scanned surface, not beside its rim."""
+    first, nearest = tree.query(patches.place_mm, workers=2)
+    near = np.asarray(first < SURE_RATIO * reach_mm[nearest])
+    # broken faces are looked for among the samples only where there are any
+    rim = has_near(patches.place_mm, places_mm[off], OFF_REACHES * float(reach_mm.max()))
+    asked = np.flatnonzero((~near & (first < reach_mm[nearest])) | (near & rim))
     k = min(SURROUND_POINTS, len(places_mm))
-    distance, index = tree.query(patches.place_mm, k=k, workers=2)
-    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    offset = places_mm[index] - patches.place_mm[:, None, :]
-    normal = _unit(patches.vector_mm2)
+    index = tree.query(patches.place_mm[asked], k=k, workers=2)[1].reshape(-1, k)
+    offset = places_mm[index] - patches.place_mm[asked, None, :]
+    normal = _unit(patches.vector_mm2[asked])
     offset -= np.einsum("mki,mi->mk", offset, normal)[:, :, None] * normal[:, None, :]
     sideways = np.linalg.norm(offset, axis=2).mean(axis=1)
     lopsided = np.linalg.norm(offset.mean(axis=1), axis=1) / np.maximum(sideways, 1e-9)
-    near = distance[:, 0] / reach_mm[index[:, 0]]
-    near = (near < 0.4) | ((near < 1.0) & (lopsided < LOPSIDED))
-    return np.asarray(near & (off[index].mean(axis=1) < 0.5))
+    near[asked] = (near[asked] | (lopsided < LOPSIDED)) & (off[index].mean(axis=1) < 0.5)
+    return near
 
 
 def _standing(
@@ -408,23 +414,9 @@ def _planes(
     k = min(PLANE_POINTS, len(points_mm))
     distance, index = cKDTree(points_mm).query(points_mm, k=k, workers=2)
     distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    around = points_mm[index]
-    weight = np.ones(index.shape)
-    spread_mm = spacing_mm
-    for _ in range(PLANE_ROUNDS):
-        total = weight.sum(axis=1)
-        mean = np.einsum("nk,nki->ni", weight, around) / total[:, None]
-        centred = around - mean[:, None, :]
-        second = np.einsum("nk,nki,nkj->nij", weight, centred, centred)
-        normal = np.linalg.eigh(second)[1][:, :, 0]
-        # at an edge one of the two planes wins: what lies far from it counts less and less
-        height = np.einsum("nki,ni->nk", centred, normal)
-        height -= np.einsum("ni,ni->n", points_mm - mean, normal)[:, None]
-        spread_mm = max(spread_mm / 2, 2 * sigma_mm)
-        weight = np.exp(-((height / spread_mm) ** 2)) + 1e-6
-    above = np.einsum("ni,ni->n", points_mm - mean, normal)
+    place, normal = kernels.smoothed(points_mm, index, PLANE_ROUNDS, spacing_mm, 2 * sigma_mm)
     area = np.pi * distance[:, -1] ** 2 / max(k - 1, 1)
-    return points_mm - above[:, None] * normal, np.ascontiguousarray(normal), area, index
+    return place, normal, area, index
 
 
 def _given(

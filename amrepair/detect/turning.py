@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from amrepair.detect import turning_kernels as kernels
 from amrepair.detect.winding import Shell
 
 MOST_TURNS = 12
@@ -51,9 +52,9 @@ def side_by_view(
     z, angle = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
     r = np.sqrt(1.0 - z**2)
     way = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-    area = np.linalg.norm(patch_mm2, axis=1)
-    alike = patch_mm2 @ way.T > ALIKE_COSINE * area[:, None]
-    seen_mm2, all_mm2 = (area * present) @ alike, area @ alike
+    all_mm2, seen_mm2 = kernels.area_by_way(
+        np.ascontiguousarray(patch_mm2), present, way, ALIKE_COSINE
+    ).T
     seen = np.where(all_mm2 > 0, seen_mm2 / np.maximum(all_mm2, 1e-12), 0.0)
     nearest = (plane @ way.T).argmax(axis=1), (plane @ way.T).argmin(axis=1)
     ahead, behind = seen[nearest[0]], seen[nearest[1]]

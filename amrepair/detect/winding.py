@@ -48,8 +48,7 @@ class Shell:
         """Build the tree over patches."""
         area = np.linalg.norm(vector_mm2, axis=1)
         low = place_mm.min(axis=0) if len(place_mm) else np.zeros(3)
-        index = np.floor((place_mm - low) / LEAF_MM).astype(np.int64)
-        code = kernels.codes_of(index)
+        code = kernels.codes_of(np.ascontiguousarray(place_mm), low, LEAF_MM)
         order = np.argsort(code, kind="stable")
         code = code[order]
         place, vector = place_mm[order], np.ascontiguousarray(vector_mm2[order])
@@ -62,18 +61,17 @@ class Shell:
         while len(code):
             first = np.flatnonzero(np.r_[True, code[1:] != code[:-1]])
             end = np.r_[first[1:], len(code)]
-            w = np.add.reduceat(below_weight, first)
-            c = np.add.reduceat(below_place * below_weight[:, None], first, axis=0) / w[:, None]
-            far = np.linalg.norm(below_place - np.repeat(c, end - first, axis=0), axis=1)
+            w, c, t, r = kernels.joined(
+                first, end, below_place, below_weight, below_vector, below_radius
+            )
             child.append(np.stack([first, end], axis=1) + below_start)
             centre.append(c)
-            total.append(np.add.reduceat(below_vector, first, axis=0))
-            radius.append(np.maximum.reduceat(far + below_radius, first))
+            total.append(t)
+            radius.append(r)
             leaf.append(np.full(len(first), len(leaf) == 0))
             # the next level joins these nodes
             below_start = sum(len(c) for c in centre[:-1])
-            below_place, below_weight, below_vector = c, w, total[-1]
-            below_radius = radius[-1]
+            below_place, below_weight, below_vector, below_radius = c, w, t, r
             code = code[first] >> 3
             if len(first) <= 8:
                 break

@@ -20,16 +20,40 @@ def spread_bits(v):
 
 
 @njit(cache=True, nogil=True)
-def codes_of(index):
-    """(n,) Morton codes of (n, 3) cell indices."""
-    codes = np.empty(len(index), np.int64)
-    for i in range(len(index)):
+def codes_of(places, low, cell):
+    """(n,) Morton codes of the cells that hold some places."""
+    codes = np.empty(len(places), np.int64)
+    for i in range(len(places)):
         codes[i] = (
-            spread_bits(index[i, 0])
-            | (spread_bits(index[i, 1]) << 1)
-            | (spread_bits(index[i, 2]) << 2)
+            spread_bits(int((places[i, 0] - low[0]) / cell))
+            | (spread_bits(int((places[i, 1] - low[1]) / cell)) << 1)
+            | (spread_bits(int((places[i, 2] - low[2]) / cell)) << 2)
         )
     return codes
+
+
+@njit(cache=True, nogil=True)
+def joined(first, end, place, weight, vector, radius):
+    """Nodes over those from `first` to `end`: weights, centres, vector areas and radii."""
+    n = len(first)
+    w, far = np.zeros(n), np.zeros(n)
+    centre, total = np.zeros((n, 3)), np.zeros((n, 3))
+    for k in range(n):
+        for i in range(first[k], end[k]):
+            w[k] += weight[i]
+            for a in range(3):
+                centre[k, a] += weight[i] * place[i, a]
+                total[k, a] += vector[i, a]
+        for a in range(3):
+            centre[k, a] /= w[k]
+        for i in range(first[k], end[k]):
+            x, y, z = (
+                place[i, 0] - centre[k, 0],
+                place[i, 1] - centre[k, 1],
+                place[i, 2] - centre[k, 2],
+            )
+            far[k] = max(far[k], np.sqrt(x * x + y * y + z * z) + radius[i])
+    return w, centre, total, far
 
 
 @njit(cache=True, nogil=True, parallel=True)

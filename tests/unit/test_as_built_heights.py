@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from amrepair.deficit import compute_deficit
 from amrepair.deficit.heights import _without_fins, standing_heights
-from amrepair.deficit.heights_kernels import in_company
 from amrepair.detect import faces
+from amrepair.detect.near import has_near
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
@@ -68,7 +68,7 @@ def test_points_in_company_are_those_that_a_tree_finds(seed: int, spread_mm: flo
     asked = points[rng.random(400) < 0.2]
     if len(asked) == 0:
         return
-    found = in_company(asked, points, 0.4, 2)
+    found = has_near(asked, points, 0.4, enough=3)
     truth = cKDTree(points).query(asked, k=3)[0][:, -1] <= 0.4
     assert (found == truth).all()
 
@@ -144,12 +144,12 @@ def test_what_hangs_on_over_a_floor_that_was_seen_has_points_on_it_or_is_gone() 
     edge = box(8, 9.8, 7.5, 12, 10.1, 8)
     gone = box(8, 8, 4, 12, 12, 8) - edge
     floor = HeightField.flat((20.0, 20.0), 0.25, z_mm=4.0)
-    left = standing_heights(floor, part, gone, m3.Manifold())
+    left, _ = standing_heights(floor, part, gone, m3.Manifold())
     assert heights(left, (8.1, 11.9), (8.1, 11.9)).max() < 4.3
     points_on_it = floor.z_mm.copy()
     points_on_it[39:41, 32:48] = 7.9
     seen = floor.raised(points_on_it)
-    stands = standing_heights(seen, part, gone, m3.Manifold())
+    stands, _ = standing_heights(seen, part, gone, m3.Manifold())
     assert heights(stands, (8.1, 11.9), (9.85, 10.05)).min() > 7.4
 
 

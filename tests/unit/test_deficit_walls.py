@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy import ndimage
 
+from amrepair.deficit.heights import columns_of
 from amrepair.deficit.walls import with_even_crests, with_sharp_walls
 from gcode.slicing.layers import mesh_of
 from gcode.surfaces import HeightField
@@ -26,6 +27,12 @@ def scanned(solid: manifold3d.Manifold, seed: int) -> np.ndarray:
     points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / SPACING_MM**2), seed=seed)
     noise = np.random.default_rng(seed).normal(scale=SIGMA_MM, size=points.shape)
     return np.asarray(points) + noise
+
+
+def gone_from(field: HeightField, piece: manifold3d.Manifold) -> np.ndarray:
+    """Columns of a field that a piece lies over."""
+    offset, _ = columns_of(piece, field)
+    return np.asarray((offset[1:] != offset[:-1]).reshape(field.shape))
 
 
 def wavering(field: HeightField, seed: int) -> HeightField:
@@ -56,7 +63,7 @@ def test_columns_beside_walls_are_told_by_the_walls_own_points(shape: str, turne
     rest, piece = broken(shape, turned)
     truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
     rough = wavering(truth, 0)
-    sharp = with_sharp_walls(rough, piece, scanned(rest, 1), SIGMA_MM)
+    sharp = with_sharp_walls(rough, gone_from(rough, piece), scanned(rest, 1), SIGMA_MM)
     x, y = truth.centres_mm()
     inside = (np.abs(x - 12.0) < 11.0)[None, :] & (np.abs(y - 10.0) < 9.0)[:, None]
     off_before = inside & (np.abs(rough.z_mm - truth.z_mm) > 0.5)
@@ -85,12 +92,14 @@ def test_slopes_and_what_is_not_broken_stay_as_they_are() -> None:
     wedge = Solid.cube((10.0, 8.0, 6.0), True).rotate((0.0, 40.0, 0.0)).translate((12.0, 10.0, 7.0))
     rest = block - wedge
     truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
-    sharp = with_sharp_walls(truth, block ^ wedge, scanned(rest, 2), SIGMA_MM)
+    gone = gone_from(truth, block ^ wedge)
+    sharp = with_sharp_walls(truth, gone, scanned(rest, 2), SIGMA_MM)
     changed = np.abs(sharp.z_mm - truth.z_mm) > 0.2
     # the two steep ends of the groove may differ by a column whose middle is on the wall
     assert changed.sum() < 20
     outside = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
-    assert with_sharp_walls(outside, Solid(), scanned(rest, 2), SIGMA_MM) is outside
+    nothing = np.zeros(outside.shape, dtype=bool)
+    assert with_sharp_walls(outside, nothing, scanned(rest, 2), SIGMA_MM) is outside
 
 
 def test_a_crest_between_two_columns_that_were_seen_is_as_high_as_they() -> None:
@@ -106,7 +115,8 @@ def test_a_crest_between_two_columns_that_were_seen_is_as_high_as_they() -> None
     assert 0 < fin.sum() < 3 * z_mm.shape[1]
     low = fin & (np.random.default_rng(3).random(z_mm.shape) < 0.3)
     z_mm[low] -= 0.8
-    even = with_even_crests(HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen), piece)
+    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    even = with_even_crests(rough, gone_from(truth, piece))
     assert (even.z_mm[fin] > 5.9).mean() > 0.99
     assert (even.z_mm[~fin] == z_mm[~fin]).all()
 
@@ -117,6 +127,7 @@ def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
     z_mm = np.array(truth.z_mm, dtype=np.float64)
     beside = (ndimage.maximum_filter(z_mm, 3) > 5.9) & (np.abs(z_mm - 4.0) < 0.1)
     z_mm[beside] += 0.9
-    even = with_even_crests(HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen), piece)
+    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    even = with_even_crests(rough, gone_from(truth, piece))
     assert beside.sum() > 300
     assert (even.z_mm == z_mm).all()

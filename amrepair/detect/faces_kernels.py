@@ -1,0 +1,67 @@
+"""Points moved onto the planes through their neighbours; compiled, for `faces`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from amrepair.eigen_kernels import least_axis
+from gcode.compiled import njit, prange
+
+
+@njit(cache=True, nogil=True)
+def plane_through(points: Any, index: Any, weight: Any, mean: Any, normal: Any) -> None:
+    """Mean of some points by weight, and normal of the plane through them, into the last two."""
+    total = 0.0
+    mean[:] = 0.0
+    for k in range(len(index)):
+        total += weight[k]
+        for a in range(3):
+            mean[a] += weight[k] * points[index[k], a]
+    for a in range(3):
+        mean[a] /= total
+    xx = xy = xz = yy = yz = zz = 0.0
+    for k in range(len(index)):
+        x, y, z = (
+            points[index[k], 0] - mean[0],
+            points[index[k], 1] - mean[1],
+            points[index[k], 2] - mean[2],
+        )
+        xx += weight[k] * x * x
+        xy += weight[k] * x * y
+        xz += weight[k] * x * z
+        yy += weight[k] * y * y
+        yz += weight[k] * y * z
+        zz += weight[k] * z * z
+    least_axis(xx, xy, xz, yy, yz, zz, normal)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def smoothed(points: Any, index: Any, rounds: int, spread: float, least_spread: float) -> Any:
+    """(n, 3) points on the planes through their neighbours, (n, 3) those planes' normals.
+
+    At an edge one of two planes wins: in each round what lies far from the plane counts less.
+    `index` (n, k) are the neighbours.
+    """
+    place, normals = np.empty_like(points), np.empty_like(points)
+    for i in prange(len(points)):
+        weight, mean = np.ones(index.shape[1]), np.zeros(3)
+        normal = np.zeros(3)
+        width = spread
+        above = 0.0
+        for _ in range(rounds):
+            plane_through(points, index[i], weight, mean, normal)
+            above = 0.0
+            for a in range(3):
+                above += (points[i, a] - mean[a]) * normal[a]
+            width = max(width / 2, least_spread)
+            for k in range(len(weight)):
+                height = -above
+                for a in range(3):
+                    height += (points[index[i, k], a] - mean[a]) * normal[a]
+                weight[k] = np.exp(-((height / width) ** 2)) + 1e-6
+        for a in range(3):
+            place[i, a] = points[i, a] - above * normal[a]
+            normals[i, a] = normal[a]
+    return place, normals

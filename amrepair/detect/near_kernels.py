@@ -1,0 +1,88 @@
+"""Which places have points beside them; compiled, for `near`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gcode.compiled import njit, prange
+
+
+@njit(cache=True, nogil=True)
+def by_cell(points: Any, low: Any, cell: float, shape: Any) -> Any:
+    """Where the points of each cell begin and the last one's end, and the points in that order.
+
+    Cells are numbered x-major in a box of `shape` cells; points outside it are left out.
+    """
+    start = np.zeros(shape[0] * shape[1] * shape[2] + 2, np.int32)
+    at = np.full(len(points), -1, np.int32)
+    for i in range(len(points)):
+        x = (points[i, 0] - low[0]) / cell
+        y = (points[i, 1] - low[1]) / cell
+        z = (points[i, 2] - low[2]) / cell
+        if x >= 0 and y >= 0 and z >= 0 and x < shape[0] and y < shape[1] and z < shape[2]:
+            at[i] = (int(x) * shape[1] + int(y)) * shape[2] + int(z)
+            start[at[i] + 1] += 1
+    for c in range(1, len(start)):
+        start[c] += start[c - 1]
+    ordered = np.empty((start[-1], 3))
+    for i in range(len(points) - 1, -1, -1):
+        if at[i] >= 0:
+            start[at[i] + 1] -= 1
+            for a in range(3):
+                ordered[start[at[i] + 1], a] = points[i, a]
+    return start[1:], ordered
+
+
+@njit(cache=True, nogil=True)
+def reaches(
+    place: Any,
+    start: Any,
+    ordered: Any,
+    low: Any,
+    cell: float,
+    shape: Any,
+    within: float,
+    enough: int,
+) -> bool:
+    """Whether so many of the points lie within a distance of a place, at most a cell's edge."""
+    ix = int((place[0] - low[0]) / cell)
+    iy = int((place[1] - low[1]) / cell)
+    iz = int((place[2] - low[2]) / cell)
+    count = 0
+    for x in range(ix - 1, ix + 2):
+        for y in range(iy - 1, iy + 2):
+            first = (x * shape[1] + y) * shape[2] + iz - 1
+            for p in range(start[first], start[first + 3]):
+                dx, dy, dz = (
+                    ordered[p, 0] - place[0],
+                    ordered[p, 1] - place[1],
+                    ordered[p, 2] - place[2],
+                )
+                if dx * dx + dy * dy + dz * dz <= within * within:
+                    count += 1
+                    if count >= enough:
+                        return True
+    return False
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def has_enough(
+    asked: Any,
+    start: Any,
+    ordered: Any,
+    low: Any,
+    cell: float,
+    shape: Any,
+    within: float,
+    enough: int,
+) -> Any:
+    """(k,) `reaches` of each place; `start` and `ordered` are of `by_cell`.
+
+    Its box has an empty layer around all places.
+    """
+    found = np.zeros(len(asked), np.bool_)
+    for k in prange(len(asked)):
+        found[k] = reaches(asked[k], start, ordered, low, cell, shape, within, enough)
+    return found

@@ -1,0 +1,114 @@
+"""Compiled loops of detection and heights against the plain formulas that they stand for."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from amrepair.deficit import heights_kernels
+from amrepair.detect import faces_kernels, turning_kernels
+from amrepair.detect.winding import Shell
+from gcode.surfaces import HeightField
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def plainly_smoothed(
+    points: np.ndarray, index: np.ndarray, rounds: int, spread: float, least: float
+) -> tuple[np.ndarray, np.ndarray]:
+    around, weight = points[index], np.ones(index.shape)
+    for _ in range(rounds):
+        mean = np.einsum("nk,nki->ni", weight, around) / weight.sum(axis=1)[:, None]
+        centred = around - mean[:, None, :]
+        normal = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, centred, centred))[1][:, :, 0]
+        above = np.einsum("ni,ni->n", points - mean, normal)
+        height = np.einsum("nki,ni->nk", centred, normal) - above[:, None]
+        spread = max(spread / 2, least)
+        weight = np.exp(-((height / spread) ** 2)) + 1e-6
+    return points - above[:, None] * normal, normal
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, turned=st.floats(0.0, 3.0))
+def test_points_are_moved_onto_the_planes_through_their_neighbours(
+    seed: int, turned: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    flat = np.column_stack([rng.uniform(0.0, 4.0, (300, 2)), rng.normal(0.0, 0.04, 300)])
+    cosine, sine = np.cos(turned), np.sin(turned)
+    turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    points = np.concatenate([flat, flat[:, [0, 2, 1]]]) @ turn.T  # two walls that meet
+    index = cKDTree(points).query(points, k=16)[1]
+    place, normal = faces_kernels.smoothed(points, index, 4, 0.2, 0.08)
+    true_place, true_normal = plainly_smoothed(points, index, 4, 0.2, 0.08)
+    # a hair of weight may tip an edge's point from one wall's plane to the other's
+    alike = np.abs((normal * true_normal).sum(axis=1)) > 1.0 - 1e-6
+    assert alike.mean() > 0.99
+    np.testing.assert_allclose(place[alike], true_place[alike], atol=1e-4)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_area_by_way_is_what_faces_each_way(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vectors, seen = rng.normal(size=(200, 3)), rng.random(200) < 0.5
+    ways = rng.normal(size=(16, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    area = np.linalg.norm(vectors, axis=1)
+    alike = vectors @ ways.T > 0.9 * area[:, None]
+    found = turning_kernels.area_by_way(vectors, seen, ways, 0.9)
+    np.testing.assert_allclose(found, np.stack([area @ alike, (area * seen) @ alike], axis=1))
+
+
+def test_the_winding_number_of_a_closed_ball_tells_its_sides() -> None:
+    k = np.arange(4000) + 0.5
+    z, angle = 1.0 - k / 2000, np.pi * (1.0 + 5.0**0.5) * k
+    r = np.sqrt(1.0 - z**2)
+    normal = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    shell = Shell.of(6.0 * normal, normal * 4 * np.pi * 36.0 / 4000)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-9.0, 9.0, (2000, 3))
+    off_mm = np.linalg.norm(points, axis=1) - 6.0
+    clear = np.abs(off_mm) > 0.5
+    inside = np.where(off_mm < 0, 1.0, 0.0)
+    # one dipole beyond two radii; what is decided by it is decided at 0.3 and 0.5
+    np.testing.assert_allclose(shell.winding(points)[clear], inside[clear], atol=0.1)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, off_mm=st.floats(0.01, 0.3))
+def test_points_stand_out_where_no_column_as_near_as_noise_is_as_high(
+    seed: int, off_mm: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    z_mm = rng.choice([0.0, 0.2, 2.0], (30, 40))
+    field = HeightField(np.array([1.0, 2.0]), 0.1, z_mm, np.ones(z_mm.shape, dtype=bool))
+    points = rng.uniform([0.0, 1.0, -0.5], [6.0, 6.0, 2.5], (500, 3))
+    found = heights_kernels.standing_out(points, z_mm, field.origin_mm, 0.1, off_mm)
+    around = [
+        field.sample(points[:, :2] + np.array(aside))
+        for aside in itertools.product((-off_mm, 0.0, off_mm), repeat=2)
+    ]
+    assert (found == (points[:, 2] - off_mm > np.max(around, axis=0))).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_columns_are_as_high_as_their_topmost_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-0.5, -0.5, 0.0], [3.5, 2.5, 2.0], (300, 3))
+    at = heights_kernels.cells_under(points, np.zeros(2), 0.5, 4, 6)
+    top, mean, count, among = heights_kernels.topmost(at, points, 0.3, 24)
+    assert ((at >= 0) == ((points[:, :2] >= 0) & (points[:, :2] < (3.0, 2.0))).all(axis=1)).all()
+    for cell in range(24):
+        own = points[at == cell, 2]
+        assert among[cell] == len(own)
+        if len(own):
+            near = own[own >= own.max() - 0.3]
+            assert top[cell] == own.max()
+            assert count[cell] == len(near)
+            np.testing.assert_allclose(mean[cell], near.mean())
