@@ -86,6 +86,37 @@ class Surfels:
             )
         )
 
+    def level_deviation(
+        self, pick: Bool[np.ndarray, " s"], *, window_mm: float, least: float, most_mm: float
+    ) -> Float[np.ndarray, " s"]:
+        """(s,) mean deviation of the picked cells in a square window, seen from above.
+
+        NaN for cells not picked, and where picked ones cover less than `least` of the window. No
+        cell counts for more than `most_mm`: a few deep ones are no low plane.
+        """
+        from scipy.ndimage import uniform_filter
+
+        found = np.full(len(self), np.nan)
+        if not pick.any():
+            return found
+        xy_mm = self.place_mm[pick, :2]
+        cell = np.floor((xy_mm - xy_mm.min(axis=0)) / self.cell_mm).astype(np.int64)
+        shape = tuple(cell.max(axis=0) + 1)
+        flat = np.ravel_multi_index(tuple(cell.T), shape)
+        size, wide = int(np.prod(shape)), 2 * int(0.5 * window_mm / self.cell_mm) + 1
+        held = np.clip(self.deviation_mm[pick], -most_mm, most_mm)
+        count, total = (
+            wide**2 * uniform_filter(np.reshape(sums, shape), wide, mode="constant")
+            for sums in (
+                np.bincount(flat, minlength=size).astype(np.float64),
+                np.bincount(flat, weights=held, minlength=size),
+            )
+        )
+        enough = count.ravel()[flat] > least * wide**2
+        mean_mm = total.ravel()[flat] / np.maximum(count.ravel()[flat], 1.0)
+        found[pick] = np.where(enough, mean_mm, np.nan)
+        return found
+
     def grow(
         self, seeds: Bool[np.ndarray, " s"], through: Bool[np.ndarray, " s"]
     ) -> Bool[np.ndarray, " s"]:

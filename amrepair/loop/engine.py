@@ -273,7 +273,14 @@ class Run:
             progress=self._progress,
         )
         with self._watch("decide"):
-            plan = typed(plan, self._job, site, stop.line, self._scanner.build_from_scanner)
+            plan = typed(
+                plan,
+                self._job,
+                site,
+                stop.line,
+                self._scanner.build_from_scanner,
+                repaired=passes > 0,
+            )
             decision = decide_look(
                 plan,
                 self._job,

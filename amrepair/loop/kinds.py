@@ -88,7 +88,13 @@ class Kind:
 
 
 def typed(
-    plan: RepairPlan, job: Job, site: Site, line: int, build_from_scanner: Transform
+    plan: RepairPlan,
+    job: Job,
+    site: Site,
+    line: int,
+    build_from_scanner: Transform,
+    *,
+    repaired: bool = False,
 ) -> RepairPlan:
     """The plan with every region typed.
 
@@ -98,6 +104,9 @@ def typed(
         The job's first line that is not yet printed.
     build_from_scanner
         Where the scanner's calibration says that the scan lies.
+    repaired
+        A patch lies on the layer by now: its beads no longer tell, in the order in which the job
+        laid them, how much came out.
     """
     layer_mm = plan.layer_height_mm
     seen = _surfaces(plan, site)
@@ -105,7 +114,7 @@ def typed(
     if whole is None and seen is not None:
         found = (_shifted(seen[1], layer_mm), _warped(seen[0], layer_mm))
         whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
-    if whole is None and seen is not None and plan.deficit.regions:
+    if whole is None and seen is not None and plan.deficit.regions and not repaired:
         flow = _flow(seen[0], job, line, layer_mm)
     pieces = {
         Label.MISSING: _pieces(plan.deficit.missing),

@@ -63,6 +63,14 @@ def test_a_layer_too_low_is_missing_by_its_depth_and_no_more_beside_walls(
     assert found.missing_mm3 == pytest.approx((PRINTED - low).volume(), rel=0.03)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_half_a_layer_that_lacks_everywhere_is_missing_whole(template: MeshSdf, seed: int) -> None:
+    # regression: at half of a 0.2 mm layer, the limit of a window as wide as a bead, chance decided
+    low = WHOLE.trim_by_plane((0.0, 0.0, -1.0), -(TOP_MM - 0.09))
+    found = deficit_of(template, low, seed)
+    assert found.missing_mm3 == pytest.approx((PRINTED - low).volume(), rel=0.08)
+
+
 def test_a_strip_one_layer_deep_and_four_beads_wide_is_found_to_its_ends(
     template: MeshSdf,
 ) -> None:
