@@ -28,6 +28,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command lines have it
+
 from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.simulate.defects import parse_defect

@@ -21,7 +21,7 @@ from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.thinning import in_order, thin_out
 from amrepair.errors import AlignmentError, InputError
-from amrepair.frames import Transform, moved
+from amrepair.frames import Transform, in_box, moved
 from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
@@ -262,6 +262,7 @@ def _from_guess(
             f"the scan {scan.source} has {len(points)} points where the part should stand; check "
             "the scanner's calibration and the part's pose"
         )
+    points = points[:: max(1, len(points) // (4 * FINE_POINTS))]
     points = in_order(thin_out(points, FINE_POINTS, rng))
     wide = Prior(np.full(3, np.deg2rad(bound_deg)), np.full(3, bound_mm))
     prior = bed_prior(np.deg2rad(bound_deg), bound_mm) if on_bed else wide
@@ -294,9 +295,7 @@ def _part_only(
     """Points that can lie on the part: in its box, and above the bed."""
     low, high = template.bounds_mm
     placed = moved(points_mm, matrix)
-    near = np.ones(len(placed), dtype=bool)
-    for axis in range(3):
-        near &= (placed[:, axis] > low[axis] - 3.0) & (placed[:, axis] < high[axis] + 3.0)
+    near = in_box(placed, low - 3.0, high + 3.0)
     above = placed[:, 2] > low[2] + 0.35
     # a flat part seen from below has no other points: then all of the box count
     keep = near & above if (near & above).sum() >= LEAST_POINTS else near

@@ -16,6 +16,7 @@ MOST_LOOKED_AT = 80_000  # points: the bed is a plane
 BAND_MM = 1.0  # how far off the guess may have the bed
 BESIDE_MM = 2.0  # bed points this near to the part may be its skirt or its foot
 LEAST_POINTS = 300
+LEAST_SPREAD_MM = 3.0  # root mean square, across the bed that is seen
 # What the bed leaves open: a few micrometres of height, and tilt over a part's length.
 HEIGHT_SIGMA_MM = 0.01
 TILT_SIGMA_RAD = 2e-4
@@ -37,11 +38,9 @@ def level_on_bed(
     -------
     The corrected guess, and whether enough bed was seen to correct it.
     """
-    low, high = template.bounds_mm
+    low = template.bounds_mm[0]
     placed = moved(points_mm[:: max(1, len(points_mm) // MOST_LOOKED_AT)], matrix)
-    height = placed[:, 2] - low[2]
-    beside = np.maximum(low[:2] - placed[:, :2], placed[:, :2] - high[:2]).max(axis=1)
-    near = np.flatnonzero((np.abs(height) < BAND_MM) & (beside > -1e9))
+    near = np.flatnonzero(np.abs(placed[:, 2] - low[2]) < BAND_MM)
     if len(near) < LEAST_POINTS:
         return matrix, False
     near = near[:: max(1, len(near) // 20_000)]
@@ -51,8 +50,8 @@ def level_on_bed(
         return matrix, False
     centre = bed.mean(axis=0)
     local = bed - centre
-    spread = np.linalg.svd(local[:, :2] / np.sqrt(len(local)), compute_uv=False)
-    if spread[-1] < 3.0:  # a strip of bed does not tell its tilt
+    spread_mm2 = np.linalg.eigvalsh(local[:, :2].T @ local[:, :2] / len(local))
+    if spread_mm2[0] < LEAST_SPREAD_MM**2:  # a strip of bed does not tell its tilt
         return matrix, False
     design = np.column_stack([local[:, :2], np.ones(len(local))])
     target = bed[:, 2] - low[2]
@@ -60,7 +59,8 @@ def level_on_bed(
     for _ in range(12):
         residual = target - design @ fit
         weight = (scale**2 / (residual**2 + scale**2)) ** 2
-        fit = np.linalg.lstsq(design * weight[:, None], target * weight, rcond=None)[0]
+        weighted = design.T * weight**2
+        fit = np.linalg.solve(weighted @ design, weighted @ target)
         scale = max(0.1, scale * 0.6)
     normal = np.array([-fit[0], -fit[1], 1.0])
     normal /= np.linalg.norm(normal)

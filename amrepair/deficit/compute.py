@@ -25,7 +25,7 @@ from amrepair.detect.evidence import Evidence
 from amrepair.detect.regions import classify, group_points
 from amrepair.detect.skipped import PlannedBeads, skipped
 from amrepair.errors import DeficitError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, in_box
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -324,7 +324,7 @@ def _solid_in_box(
     """Erode, subtract, grow back, clip: all on one grid of signed distances."""
     s = evidence.surfels
     labels = np.asarray(anomaly.surfel_label)
-    inside = ((s.place_mm >= low_mm) & (s.place_mm <= high_mm)).all(axis=1) & (labels == int(label))
+    inside = in_box(s.place_mm, low_mm, high_mm) & (labels == int(label))
     across = int(np.argmax(np.abs(evidence.normal[inside]).sum(axis=0))) if inside.any() else 2
     box = VoxelBox.around(low_mm, high_mm, thickness_mm=depth_mm, across=across)
     samples = box.samples_mm()

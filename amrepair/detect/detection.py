@@ -7,6 +7,7 @@ is thinner than one point's noise, and hysteresis follows it to its rim.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from amrepair.detect.anomaly import AnomalyMap, Label
 from amrepair.detect.evidence import Evidence, gather, with_stubs
 from amrepair.detect.faces import PLANE_POINTS
 from amrepair.detect.normal_variation import forgiven
+from amrepair.detect.rays import range_images
 from amrepair.detect.regions import find_regions
 from amrepair.detect.surfels import Surfels, make_surfels
 from amrepair.errors import InputError
@@ -135,14 +137,17 @@ def detect(
         )
     _refuse_wrong_scale(scan, template)
     progress("detect", 0.0, 4.0)
-    f_mm = template.distance(scan.points_mm)
-    keep = ~_background(scan, template, f_mm)
-    if not keep.any():
-        raise InputError(
-            f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the template; "
-            "check its frame, its unit and that it shows this part"
-        )
-    surfels = make_surfels(scan.points_mm, f_mm, keep)
+    with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
+        seen = beside.submit(range_images, scan)
+        f_mm = template.distance(scan.points_mm)
+        keep = ~_background(scan, template, f_mm)
+        if not keep.any():
+            raise InputError(
+                f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the "
+                "template; check its frame, its unit and that it shows this part"
+            )
+        surfels = make_surfels(scan.points_mm, f_mm, keep)
+        images = seen.result()
     limit, source = _threshold(
         scan, template, surfels, threshold_mm, allowance_mm, registration_sigma_mm, false_alarms
     )
@@ -156,6 +161,7 @@ def detect(
         template,
         surfels,
         missing | excess,
+        images,
         threshold_mm=float(limit.low_mm(np.array([PLANE_POINTS]))[0]),
     )
     progress("detect", 2.0, 4.0)

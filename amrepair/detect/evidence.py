@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
-from amrepair.detect.rays import RangeImage, clearances, range_images
+from amrepair.detect.rays import RangeImage, clearances
 from amrepair.detect.surfels import Surfels
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -162,14 +162,14 @@ def gather(
     template: Template,
     surfels: Surfels,
     off: Bool[np.ndarray, " s"],
+    images: tuple[RangeImage, ...],
     *,
     threshold_mm: float,
 ) -> Evidence:
-    """Collect the evidence of a scan whose off-template surfels are known."""
+    """Collect the evidence of a scan whose off-template surfels and range images are known."""
     off = off | _strips(template, surfels, off)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
-    images = range_images(scan)
     tree = cKDTree(surfels.place_mm, compact_nodes=False, balanced_tree=False)
     faces = None
     facing = surfels.toward_sensors(which, scan)

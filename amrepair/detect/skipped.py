@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.detect.evidence import SOLID_MM, Evidence
+from amrepair.frames import in_box
 from amrepair.template.port import Template
 
 STEP_MM = 0.25
@@ -71,7 +72,7 @@ class PlannedBeads:
         ):
             low = np.minimum(a, b) - np.array([0.5 * wide, 0.5 * wide, high])
             top = np.maximum(a, b) + np.array([0.5 * wide, 0.5 * wide, 0.0])
-            ask = np.flatnonzero(((points_mm >= low) & (points_mm <= top)).all(axis=1))
+            ask = np.flatnonzero(in_box(points_mm, low, top))
             along, away = b[:2] - a[:2], points_mm[ask, :2] - a[:2]
             share = np.clip(away @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
             inside[ask] |= np.linalg.norm(away - share[:, None] * along, axis=1) <= 0.5 * wide

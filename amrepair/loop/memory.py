@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from amrepair.deficit import Standing, as_built_heights
+from amrepair.frames import in_box
 from amrepair.loop.looks import Look
 from amrepair.repair import AS_BUILT_CELL_MM, RepairPlan, Site
 from amrepair.scans import Scan
@@ -92,7 +93,7 @@ def _around_the_part(plan: RepairPlan, most: int) -> tuple[Int[np.ndarray, " k"]
     if len(expected_mm):
         points_mm = plan.scan.points_mm  # in the template's frame, as planned
         low, high = expected_mm.min(axis=0) - AROUND_MM, expected_mm.max(axis=0) + AROUND_MM
-        inside = np.flatnonzero(((points_mm >= low) & (points_mm <= high)).all(axis=1))
+        inside = np.flatnonzero(in_box(points_mm, low, high))
         near = inside if len(inside) else near
     every = max(1, -(-len(near) // most))
     return near[::every], every

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from amrepair.frames import in_box
 from amrepair.report import encode
 from amrepair.report.data import BeadPath, HeightMap, Look, ReportData, SolidMesh
 
@@ -122,7 +123,7 @@ def bounds(data: ReportData) -> np.ndarray:
 
 def near_part(look: Look, box_mm: np.ndarray) -> Look:
     """The look without what lies outside the box: the bed around the part, clutter."""
-    inside = ((look.points_mm >= box_mm[0]) & (look.points_mm <= box_mm[1])).all(axis=1)
+    inside = in_box(look.points_mm, box_mm[0], box_mm[1])
     if inside.all():
         return look
     return replace(
