@@ -11,6 +11,7 @@ is. Filament is compared by the G-code's own sum.
 from __future__ import annotations
 
 import argparse
+import resource
 import shutil
 import subprocess
 import sys
@@ -57,14 +58,16 @@ def peers(part: Path, out: Path) -> dict[str, list[str]]:
     return {name: [*line, str(part)] for name, line in lines.items() if shutil.which(name)}
 
 
-def least_s(command: list[str], rounds: int) -> float:
-    """Least of `rounds` runs."""
-    spent = []
+def least_s(command: list[str], rounds: int) -> tuple[float, float]:
+    """Least of `rounds` runs: by the wall's clock, and of processor time."""
+    spent, busy = [], []
     for _ in range(rounds):
-        start = time.perf_counter()
+        start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run(command, check=True, capture_output=True)
         spent.append(time.perf_counter() - start)
-    return min(spent)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        busy.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(spent), min(busy)
 
 
 def main() -> None:
@@ -99,14 +102,16 @@ def main() -> None:
             str(out),
         ]
         ours += ["--process", str(process), "--printer", setup.printer.id]
-        own_s = least_s(ours, args.rounds)
+        own_s, own_busy_s = least_s(ours, args.rounds)
         laid = read_job(out.read_text()).beads.volume_mm3
-        print(f"ours: {own_s:.1f} s, {laid / solid.volume():.4f} of the volume")
+        share = laid / solid.volume()
+        print(f"ours: {own_s:.1f} s (processor {own_busy_s:.1f}), {share:.4f} of the volume")
         for name, command in peers(placed, out).items():
-            seconds = least_s(command, args.rounds)
+            seconds, busy_s = least_s(command, args.rounds)
             theirs = read_job(out.read_text()).beads.volume_mm3
             print(
-                f"{name}: {seconds:.1f} s, ratio {seconds / own_s:.2f}, "
+                f"{name}: {seconds:.1f} s, ratio {seconds / own_s:.2f} "
+                f"(processor {busy_s:.1f}, ratio {busy_s / own_busy_s:.2f}), "
                 f"{theirs / solid.volume():.4f} of the volume"
             )
 

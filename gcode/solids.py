@@ -9,23 +9,21 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gcode.errors import InputError
-
-if TYPE_CHECKING:
-    import trimesh
+from gcode.solids_kernels import first_of_each
 
 _log = logging.getLogger(__name__)
 
 SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
 WELD_RATIO = 1e-6  # of the extent: STL holds single precision
 EQUAL_DIGITS = 8  # of mm
-# Odd numbers without pattern: products spread over all bits of a key.
-KEY_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+STL_HEAD = 84
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("of_colour", "<u2")])
 _READ_ERRORS = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, EOFError,
     NotImplementedError, RuntimeError,
@@ -65,7 +63,7 @@ def read_solid(path: Path) -> Any:
     extent = float(np.ptp(vertices, axis=0).max())
     if extent <= 0:
         raise InputError(f"{path}: the mesh has no extent; export it again.")
-    solid, _ = first_closed(vertices, faces)
+    solid = first_closed(vertices, faces)[0]
     if solid is None:
         raise InputError(
             f"{path}: the mesh is no closed surface (NotManifold), nor when vertices within "
@@ -84,18 +82,26 @@ def read_solid(path: Path) -> Any:
 
 def read_triangles(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Vertices and faces of a file, as they are in it; none where it holds no mesh."""
-    import trimesh
-    from trimesh.exchange.stl import load_stl
-
     if path.suffix.lower() == ".stl":
-        with path.open("rb") as file:
-            held = load_stl(file)
-        if "faces" in held:  # one body: no scene to be made of it, which takes longer than reading
-            return np.asarray(held["vertices"], dtype=np.float64), np.asarray(held["faces"])
+        corners = _binary_stl(path)
+        if corners is not None:
+            return corners, np.arange(len(corners)).reshape(-1, 3)
+    import trimesh  # as long as half of what is to be read: only where it must be
+
     mesh = trimesh.load(path, force="mesh", process=False)
     if not isinstance(mesh, trimesh.Trimesh):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+
+
+def _binary_stl(path: Path) -> Float[np.ndarray, "v 3"] | None:
+    """Corners of a binary STL file's triangles; None where it is not as long as it says."""
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) != STL_HEAD + STL_TRIANGLE.itemsize * count:
+        return None
+    triangles = np.frombuffer(data, STL_TRIANGLE, offset=STL_HEAD)
+    return np.ascontiguousarray(triangles["corners"].reshape(-1, 3), dtype=np.float64)
 
 
 def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
@@ -120,33 +126,30 @@ def is_valid(solid: Any) -> bool:
 
 def first_closed(
     vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Any, trimesh.Trimesh]:
+) -> tuple[Any, Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The first closed solid among the file's own triangles, welded ever more; None if none is.
 
-    With it come the triangles as they were welded last, for those who mend.
+    With it come vertices and faces as they were welded last, for those who mend.
 
     As they are: a file that shares vertices means it, and bodies that touch stay apart. Then equal
     vertices are one, as STL needs; then those that single precision may have parted.
     """
-    import trimesh
-
     extent = float(np.ptp(vertices_mm, axis=0).max())
     if len(vertices_mm) < 3 * len(faces):
         solid = as_manifold(vertices_mm, faces)
         if is_valid(solid):
-            return solid, trimesh.Trimesh(vertices_mm, faces, process=False)
+            return solid, vertices_mm, faces
     for digits in (EQUAL_DIGITS, int(np.floor(-np.log10(extent * WELD_RATIO)))):
         vertices_mm, faces = weld(vertices_mm, faces, digits)
         solid = as_manifold(vertices_mm, faces)
         if is_valid(solid):
-            return solid, trimesh.Trimesh(vertices_mm, faces, process=False)
+            return solid, vertices_mm, faces
+    import trimesh
+
     # slivers without area may hold a surface together, so they go last
-    welded = trimesh.Trimesh(vertices_mm, faces, process=False)
-    welded.update_faces(welded.nondegenerate_faces())
-    solid = as_manifold(welded.vertices, welded.faces)
-    if is_valid(solid):
-        return solid, welded
-    return None, welded
+    faces = faces[trimesh.Trimesh(vertices_mm, faces, process=False).nondegenerate_faces()]
+    solid = as_manifold(vertices_mm, faces)
+    return solid if is_valid(solid) else None, vertices_mm, faces
 
 
 def weld(
@@ -154,23 +157,16 @@ def weld(
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]]:
     """Vertices that are equal when rounded to so many digits as one: the first of them.
 
-    What `trimesh.Trimesh.merge_vertices` does, sorting one key instead of three numbers.
+    What `trimesh.Trimesh.merge_vertices` does, without sorting.
     """
     used = np.zeros(len(vertices_mm), dtype=bool)
     used[faces.ravel()] = True
     old = np.flatnonzero(used)
     rounded = np.round(vertices_mm[old] * 10.0**digits).astype(np.int64)
-    key = rounded.view(np.uint64) * KEY_FACTORS
-    mixed = key[:, 0] ^ (key[:, 1] >> np.uint64(17)) ^ (key[:, 2] << np.uint64(13)) ^ key[:, 1]
-    _, first, group = np.unique(mixed, return_index=True, return_inverse=True)
-    if not (rounded[first[group]] == rounded).all():  # two places with one key
-        _, first, group = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    by_first = np.argsort(first)
-    rank = np.empty_like(by_first)
-    rank[by_first] = np.arange(len(by_first))
+    first, same = first_of_each(rounded)
     new = np.full(len(vertices_mm), -1, np.int64)
-    new[old] = rank[group.ravel()]
-    return np.ascontiguousarray(vertices_mm[old[first[by_first]]]), new[faces]
+    new[old] = same
+    return np.ascontiguousarray(vertices_mm[old[first]]), new[faces]
 
 
 def unite_overlaps(solid: Any) -> tuple[Any, float]:

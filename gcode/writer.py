@@ -34,6 +34,7 @@ from gcode.moves import (
 )
 from gcode.profiles import PrintSetup
 from gcode.units import filament_area_mm2, mm_min_from_mm_s
+from gcode.writer_kernels import bead_lines
 
 XYZ_DIGITS = 3
 E_DIGITS = 5
@@ -175,35 +176,26 @@ class _Text:
         self._tag("TYPE", str(move.role))
         self._tag("WIDTH", number(move.width_mm, 3))
         self._tag("HEIGHT", number(move.height_mm, 3))
-        lengths_mm = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        filament_mm = lengths_mm * move.section_mm2 * self._e_per_mm3
-        # in steps of what is written; what is shorter goes with the next
-        places = np.rint(np.concatenate([[self._place], points[1:]]) * 10**XYZ_DIGITS)
-        moved = places[1:] != places[:-1]
-        going = moved.any(axis=1)
-        feed = self._feed_word(move.speed_mm_s) if going.any() else ""
-        pushed_mm = self._owed_mm + np.concatenate([[0.0], np.cumsum(filament_mm)[going]])
-        pushed = np.rint(pushed_mm * 10**E_DIGITS)
-        pushed[0] = 0.0
-        self._owed_mm += float(filament_mm.sum()) - float(pushed[-1]) / 10**E_DIGITS
-        for (x, y, z), (to_x, to_y, to_z), e in zip(
-            (places[1:] / 10**XYZ_DIGITS + 0.0)[going].tolist(),  # no minus zero
-            moved[going].tolist(),
-            (np.diff(pushed) / 10**E_DIGITS).tolist(),
-            strict=True,
-        ):
-            line = "G1"
-            if to_x:
-                line += f" X{x!r}".removesuffix(".0")
-            if to_y:
-                line += f" Y{y!r}".removesuffix(".0")
-            if to_z:
-                line += f" Z{z!r}".removesuffix(".0")
-            if e:
-                line += f" E{number(e, E_DIGITS)}"
-            self.lines.append(line + feed)
-            feed = ""
-        self._place = (places[-1] / 10**XYZ_DIGITS).tolist()
+        going = self._goes(points)
+        feed = self._feed_word(move.speed_mm_s) if going else ""
+        lines, place, self._owed_mm = bead_lines(
+            points,
+            np.asarray(move.section_mm2, dtype=np.float64),
+            np.array(self._place),
+            self._e_per_mm3,
+            self._owed_mm,
+            np.frombuffer(feed.encode(), np.uint8),
+            XYZ_DIGITS,
+            E_DIGITS,
+        )
+        if going:
+            self.lines.append(lines.tobytes().decode("ascii"))
+        self._place = place.tolist()
+
+    def _goes(self, points_mm: Float[np.ndarray, "n 3"]) -> bool:
+        """Whether a chain leaves the place where the nozzle is, in steps of what is written."""
+        here = np.rint(np.array(self._place) * 10**XYZ_DIGITS)
+        return bool((np.rint(points_mm[1:] * 10**XYZ_DIGITS) != here).any())
 
     def _tag(self, name: str, value: str) -> None:
         if self._tags.get(name) != value:

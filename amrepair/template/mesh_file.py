@@ -160,12 +160,12 @@ def close_mesh(mesh: trimesh.Trimesh, *, source: str) -> tuple[trimesh.Trimesh, 
     _refuse_bad_numbers(vertices, source)
     notes: list[str] = []
     extent_mm = float(np.ptp(vertices, axis=0).max())
-    solid, welded = first_closed(vertices, np.asarray(mesh.faces))
+    solid, vertices, faces = first_closed(vertices, np.asarray(mesh.faces))
     if solid is None:
-        if len(welded.faces) == 0:
+        if len(faces) == 0:
             what = "only triangles without area"
             raise TemplateError(f"the mesh {source} has {what}; export it again")
-        solid = _mend(welded, source, notes)
+        solid = _mend(trimesh.Trimesh(vertices, faces, process=False), source, notes)
     solid = _orient(solid, notes)
     solid, overlap_mm3 = unite_overlaps(solid)
     if overlap_mm3 > 0:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gcode.moves import Role
+from gcode.slicing import order_kernels as kernels
 
 ROUND_LOSS = 1.0 - math.pi / 4.0  # of h: what a rounded edge lacks beside a square one
 
@@ -52,7 +53,7 @@ class Bead:
     @property
     def area_mm2(self) -> float:
         """Area that the bead stands for."""
-        return float(np.hypot(*np.diff(self.xy_mm, axis=0).T) @ self.share_mm)
+        return float(kernels.area_along(self.xy_mm, self.share_mm))
 
     def scaled(self, factor: float) -> Bead:
         """The same line with `factor` times the plastic."""

@@ -8,10 +8,7 @@ thin for a bead is listed with its volume. Supports are not made.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -115,14 +112,12 @@ def plan_part(
     lost: list[Unprintable] = []
     _begin(pen, setup, float(solid.bounding_box()[5]))
     seam_mm = np.array([-1e3, 1e3])
-    # triangulation, the half of it, runs without the interpreter: layers are planned side by side
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        layers = pool.map(_plan_layer, sections, solid_masks, slabs, repeat(setup))
-        for slab, section, layer in zip(slabs, sections, layers, strict=True):
-            lost += _listed(layer, slab)
-            _weigh(layer, slab, section)
-            seam_mm = _emit(pen, layer, section, slab, seam_mm, setup)
-            progress("slice", float(slab.index + 1), float(len(slabs)))
+    for slab, section, mask in zip(slabs, sections, solid_masks, strict=True):
+        layer = _plan_layer(section, mask, slab, setup)
+        lost += _listed(layer, slab)
+        _weigh(layer, slab, section)
+        seam_mm = _emit(pen, layer, section, slab, seam_mm, setup)
+        progress("slice", float(slab.index + 1), float(len(slabs)))
     pen.retract()
     pen.move_to(np.array([*pen.position_mm[:2], slabs[-1].top_mm + setup.printer.z_hop_mm + 1.0]))
     for thing in lost:
@@ -307,7 +302,7 @@ def _emit(
             beads = [_seamed(bead, seam) for bead in group]
             if beads and beads[0].role is Role.EXTERNAL_PERIMETER:
                 seam = beads[0].xy_mm[0]
-            for bead in nearest_first(beads, pen.position_mm[:2], keep_seams=True):
+            for bead in nearest_first(beads, pen.position_mm[:2]):
                 _lay(pen, bead, slab, outline, setup)
     return seam
 

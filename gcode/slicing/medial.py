@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import Delaunay, QhullError
 
 from gcode.moves import Role
 from gcode.slicing import medial_kernels as kernels
@@ -26,7 +25,6 @@ from gcode.slicing.regions import flattened
 
 FACING_RATIO = 1.5  # feet further apart than 1.5 r: walls meeting at less than 97° face each other
 END_INSET_RATIO = 0.5  # of r: an open bead ends r/2 short of the wall, its round cap fills the rest
-_LEAST_SAMPLES = 8
 ASIDE_MM = 1e-5
 APART_MM = 0.15  # points of a bead
 Chain = tuple[Float[np.ndarray, "_k 2"], Float[np.ndarray, " _k"]]  # points, distances to walls
@@ -93,28 +91,14 @@ def _stroke(region: Any, area_mm2: float, *, least_mm: float, most_mm: float) ->
 def _axis(region: Any, sample_mm: float) -> list[Chain]:
     """Chains of the medial axis: points and distances to the walls.
 
-    From the Delaunay triangles: `scipy.spatial.Voronoi` takes two to five times as long. Samples
-    on one circle, of which parallel walls have many, slow qhull down, so they are moved by far
-    less than a contour is known.
+    From Delaunay triangles. Which samples make one is undecided where many lie on one circle, as
+    between parallel walls: they are moved by far less than a contour is known.
     """
     points, starts = flattened(region)
-    samples, owner, place = kernels.samples(points, starts, sample_mm)
-    if len(samples) < _LEAST_SAMPLES:
+    if len(points) < 3:
         return []
-    samples += np.random.default_rng(0).uniform(-ASIDE_MM, ASIDE_MM, samples.shape)
-    try:
-        triangles = Delaunay(samples)
-    except (QhullError, ValueError):
-        return []
-    nodes, radius, runs, starts_at = kernels.axis_paths(
-        samples,
-        owner,
-        place,
-        triangles.simplices,
-        triangles.neighbors,
-        points,
-        starts,
-        FACING_RATIO,
+    nodes, radius, runs, starts_at = kernels.axis_of(
+        points, starts, sample_mm, ASIDE_MM, FACING_RATIO
     )
     paths = [run.tolist() for run in np.split(runs, starts_at[1:-1]) if len(run)]
     return [(nodes[path], radius[path]) for path in _joined(paths, nodes) if len(path) > 1]

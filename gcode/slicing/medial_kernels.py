@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gcode.compiled import njit
+from gcode.slicing.delaunay_kernels import triangles
 from gcode.slicing.infill_kernels import inside
 
 LEAF_RATIO = 1.2  # of a junction's radius: a shorter branch to a wall is its corner, not an axis
@@ -47,6 +48,28 @@ def samples(points: Any, starts: Any, apart: float) -> tuple[Any, Any, Any]:
                 place[n] = n - first
                 n += 1
     return found, owner, place
+
+
+@njit(cache=True, nogil=True)
+def move_aside(places: Any, most: float) -> None:
+    """Move places by so much at most, each time alike: no four are left on one circle."""
+    state = np.uint64(0x9E3779B97F4A7C15)
+    for i in range(len(places)):
+        for a in range(2):
+            # xorshift64 (Marsaglia 2003)
+            state ^= state << np.uint64(13)
+            state ^= state >> np.uint64(7)
+            state ^= state << np.uint64(17)
+            places[i, a] += most * (2.0 * (np.float64(state >> np.uint64(11)) / 2.0**53) - 1.0)
+
+
+@njit(cache=True, nogil=True)
+def axis_of(points: Any, starts: Any, apart: float, aside: float, facing: float) -> Any:
+    """`axis_paths` of contours, from samples so far apart that are moved aside by so little."""
+    samples_mm, owner, place = samples(points, starts, apart)
+    move_aside(samples_mm, aside)
+    corners, across = triangles(samples_mm)
+    return axis_paths(samples_mm, owner, place, corners, across, points, starts, facing)
 
 
 @njit(cache=True, nogil=True)

@@ -9,9 +9,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from gcode.slicing import order_kernels as kernels
 from gcode.slicing.beads import Bead
 
 CORNER_RAD = 0.6  # turns sharper than this hide a seam
+# Millimetres that a corner is worth: an inward one hides the seam best.
+INWARD_MM, OTHER_MM = 3.0, 1.5
 
 
 def seam_index(
@@ -24,41 +27,18 @@ def seam_index(
     aim_mm
         Where the seam should be near (the seam below).
     """
-    ahead = np.roll(loop, -1, axis=0) - loop
-    behind = loop - np.roll(loop, 1, axis=0)
-    turn = np.arctan2(
-        behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0], (behind * ahead).sum(axis=1)
-    )
-    distance = np.hypot(*(loop - aim_mm).T)
-    # millimetres that a corner is worth: an inward one hides the seam best
-    worth = np.where(turn < -CORNER_RAD, 3.0 if inward else 1.5, 0.0)
-    worth = np.where(turn > CORNER_RAD, 1.5, worth)
-    return int(np.argmin(distance - worth))
+    x, y = float(aim_mm[0]), float(aim_mm[1])
+    return int(kernels.seam_at(loop, x, y, CORNER_RAD, INWARD_MM if inward else OTHER_MM, OTHER_MM))
 
 
-def nearest_first(
-    beads: list[Bead], start_mm: Float[np.ndarray, " 2"], *, keep_seams: bool = False
-) -> list[Bead]:
-    """Greedy order: the next bead is the one whose end is nearest; loops open there."""
-    left = list(range(len(beads)))
-    out: list[Bead] = []
-    here = np.asarray(start_mm, float)
+def nearest_first(beads: list[Bead], start_mm: Float[np.ndarray, " 2"]) -> list[Bead]:
+    """Greedy order: the next bead is the one whose end is nearest; loops begin where they do."""
     heads = np.array([bead.xy_mm[0] for bead in beads]).reshape(-1, 2)
     tails = np.array([bead.xy_mm[-1] for bead in beads]).reshape(-1, 2)
-    alive = np.ones(len(beads), bool)
-    while left:
-        to_head = np.where(alive, ((heads - here) ** 2).sum(axis=1), np.inf)
-        to_tail = np.where(alive, ((tails - here) ** 2).sum(axis=1), np.inf)
-        i = int(np.argmin(np.minimum(to_head, to_tail)))
-        bead = beads[i]
-        if bead.closed:
-            if not keep_seams:
-                ring = bead.xy_mm[:-1]
-                bead = bead.started_at(int(np.argmin(((ring - here) ** 2).sum(axis=1))))
-        elif to_tail[i] < to_head[i]:
-            bead = bead.reversed()
-        out.append(bead)
-        here = bead.xy_mm[-1]
-        alive[i] = False
-        left.pop()
-    return out
+    closed = np.array([bead.closed for bead in beads], dtype=bool)
+    x, y = float(start_mm[0]), float(start_mm[1])
+    order, backward = kernels.nearest_next(heads, tails, closed, x, y)
+    return [
+        beads[k].reversed() if turned else beads[k]
+        for k, turned in zip(order.tolist(), backward.tolist(), strict=True)
+    ]

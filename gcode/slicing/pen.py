@@ -87,9 +87,11 @@ class Pen:
     ) -> None:
         """Lay a chain of beads from the present place, as fast as the melt and the Z axis allow."""
         fastest = self._setup.max_volumetric_mm3_s / max(float(section_mm2.max()), 1e-9)
-        step = np.abs(np.diff(points_mm, axis=0))
-        climb = float((step[:, 2] / np.maximum(np.linalg.norm(step, axis=1), 1e-9)).max())
-        fastest = min(fastest, self._setup.printer.z_speed_mm_s / max(climb, 1e-9))
+        z_mm = points_mm[:, 2]
+        if (z_mm != z_mm[0]).any():
+            step = np.abs(np.diff(points_mm, axis=0))
+            climb = float((step[:, 2] / np.maximum(np.linalg.norm(step, axis=1), 1e-9)).max())
+            fastest = min(fastest, self._setup.printer.z_speed_mm_s / max(climb, 1e-9))
         self.unretract()
         self.add(
             Extrude(points_mm, section_mm2, min(speed_mm_s, fastest), role, width_mm, height_mm)
@@ -98,7 +100,8 @@ class Pen:
 
     def lay(self, bead: Bead, *, z_mm: float, height_mm: float, speed_mm_s: float) -> None:
         """Lay a plane bead of one layer."""
-        points = np.column_stack([bead.xy_mm, np.full(len(bead.xy_mm), z_mm)])
+        points = np.empty((len(bead.xy_mm), 3))
+        points[:, :2], points[:, 2] = bead.xy_mm, z_mm
         self.extrude(
             points,
             bead.share_mm * height_mm,

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import tifffile
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 
 from gcode.errors import InputError
 from gcode.surfaces import raster_kernels as kernels
@@ -390,6 +389,8 @@ def _greatest_of_next(
     z_mm: Float[np.ndarray, "ny nx"], first: int, count: int, size: int, *, axis: int
 ) -> Float[np.ndarray, "_my _mx"]:
     """Greatest of cells [i, i + size) along an axis, for `count` cells i from `first` on."""
+    from scipy import ndimage  # half a second to load, and a job without what stands has no use
+
     shape = list(z_mm.shape)
     shape[axis] = count + size - 1
     padded = np.full(shape, -np.inf)

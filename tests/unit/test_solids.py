@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcode.errors import InputError
-from gcode.solids import read_solid, weld
+from gcode.solids import read_solid, read_triangles, weld
 
 
 def test_bodies_that_touch_along_an_edge_stay_apart(tmp_path: Path) -> None:
@@ -78,9 +78,25 @@ def _by_first_use(faces: np.ndarray, vertices: np.ndarray, ours: np.ndarray) -> 
     return np.array([[number[tuple(np.round(vertices[v], 8) + 0.0)] for v in f] for f in faces])
 
 
-def test_two_places_with_one_key_stay_two(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gcode.solids.KEY_FACTORS", np.zeros(3, np.uint64))
-    vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    joined, faces = weld(vertices, np.array([[0, 1, 2], [0, 3, 2]]), 8)
-    np.testing.assert_array_equal(joined, vertices[:3])
-    np.testing.assert_array_equal(faces, [[0, 1, 2], [0, 1, 2]])
+def test_places_of_one_slot_stay_two() -> None:
+    """So many that a table of any size has several in each slot."""
+    rng = np.random.default_rng(0)
+    vertices = rng.integers(-40, 40, (50_000, 3)).astype(np.float64)
+    faces = np.arange(len(vertices) // 3 * 3).reshape(-1, 3)
+    joined, new = weld(vertices, faces, 8)
+    np.testing.assert_array_equal(joined[new], vertices[faces])
+    assert len(joined) == len(np.unique(vertices[faces.ravel()], axis=0))
+
+
+def test_a_binary_stl_file_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(2, 3.0).export(path)
+    vertices, faces = read_triangles(path)
+    peer = trimesh.load_mesh(path, process=False)
+    np.testing.assert_array_equal(vertices[faces], peer.triangles)
+
+
+def test_an_stl_file_of_text_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((2.0, 3.0, 4.0)).export(path, file_type="stl_ascii")
+    assert read_solid(path).volume() == pytest.approx(24.0)
