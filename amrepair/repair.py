@@ -37,7 +37,7 @@ from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
 
-MIN_REPAIR_MM3 = worth.MIN_REPAIR_MM3
+MIN_REPAIR_MM3, MIN_SKIPPED_MM3 = worth.MIN_REPAIR_MM3, worth.MIN_SKIPPED_MM3
 # Nothing can take so little away; a seam or two are as much.
 MIN_EXCESS_MM3 = 2.0
 # Material standing out less than two layers is ploughed by the layers after it, or is a bump.

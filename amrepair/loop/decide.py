@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any
 
 from amrepair.detect.anomaly import DefectType
-from amrepair.repair import EXCESS_LAYERS, MIN_EXCESS_MM3, MIN_REPAIR_MM3
+from amrepair.repair import EXCESS_LAYERS, MIN_EXCESS_MM3, MIN_REPAIR_MM3, MIN_SKIPPED_MM3
 
 
 class Action(StrEnum):
@@ -226,8 +226,11 @@ FINDINGS: tuple[Row, ...] = (
         "the next layer's beads have less room there"),
     Row("F7", Action.GO_ON, (_EXCESS,),
         "printing cannot take excess away"),
-    Row("F8", Action.GO_ON, (_MISSING, _below("defect_mm3", MIN_REPAIR_MM3)),
+    Row("F8a", Action.GO_ON, (_MISSING, _is("skipped", False),
+                              _below("defect_mm3", MIN_REPAIR_MM3)),
         "smaller than is worth a repair"),
+    Row("F8b", Action.GO_ON, (_MISSING, _below("defect_mm3", MIN_SKIPPED_MM3)),
+        "less of the job's lines is gone than is worth a repair"),
     Row("F9", Action.LOOK_AGAIN, (_MISSING, _below("confidence", DOUBTFUL),
                                   _is("seen_twice", False)),
         "it hardly stands out from the noise"),

@@ -126,3 +126,13 @@ def test_pieces_side_by_side_are_one_defect_and_crumbs_join_nothing() -> None:
     kept = worth_mending([box(0.0), box(1.5), box(3.0), box(20.0)], [share] * 4, [False] * 4)
     assert kept.tolist() == [True, True, True, False]
     assert not worth_mending([box(0.1 * k) for k in range(100)], [0.03] * 100, [False] * 100).any()
+
+
+def test_lines_gone_here_and_there_are_one_defect_and_a_rough_layer_is_none() -> None:
+    # regression: four lines of 3.5 mm gone in as many tabs were not filled in their own layer;
+    # eleven crumbs of a clean one (0.9 mm³ in all) nearly were
+    boxes = [np.array([[5.0 * k, 0.0, 0.0], [5.0 * k + 3.0, 0.4, 0.2]]) for k in range(11)]
+    tabs, rough = [0.33, 0.29, 0.18, 0.17], [0.14] * 11
+    assert worth_mending(boxes[:4], tabs, [True] * 4).all()
+    assert not worth_mending(boxes[:4], tabs, [False] * 4).any()
+    assert not worth_mending(boxes, rough, [True] * 11).any()
