@@ -106,7 +106,7 @@ class PlannedSdf:
             voxel_mm,
             solid,
         )
-        bounds = np.array([[low[0], low[1], foot_mm], [high[0], high[1], top_mm]])
+        bounds = np.array([low, [high[0], high[1], top_mm]])
         return cls(
             origin, voxel_mm, bounds, _signed(solid, voxel_mm), solid, off_bed=not near.all()
         )

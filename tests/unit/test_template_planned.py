@@ -110,6 +110,21 @@ def test_a_thick_bead_higher_up_does_not_lower_the_foot() -> None:
     assert planned.bounds_mm[1, 2] == pytest.approx(0.8)
 
 
+@pytest.mark.parametrize(("first_mm", "layer_mm"), [(0.3, 0.3), (0.35, 0.2), (0.2, 0.28)])
+def test_layers_that_are_no_whole_voxels_do_not_lower_the_foot(
+    first_mm: float, layer_mm: float
+) -> None:
+    # regression: a sign and a screw in layers of 0.3 mm, voxels of 0.25, had their foot up to
+    # 0.2 mm in the bed, the alignment laid them so deep, and their last layer was all missing
+    height = np.array([first_mm] + [layer_mm] * 5)
+    top = np.cumsum(height)
+    start = np.column_stack([np.zeros(6), np.zeros(6), top])
+    end = start + np.array([10.0, 0.0, 0.0])
+    planned = PlannedSdf.from_beads(start, end, 0.45 * height, height)
+    assert planned.bounds_mm[0, 2] == pytest.approx(0.0, abs=1e-9)
+    assert planned.bounds_mm[1, 2] == pytest.approx(top[-1])
+
+
 def test_a_flange_below_a_cut_template_is_not_the_bed() -> None:
     # regression: the foot of the last millimetres of beads lies in mid-air; a plate within a
     # millimetre of that height was laid on it, and a clean screw 0.6 mm too high
