@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from amrepair.detect.evidence import SOLID_MM, Evidence
 from amrepair.frames import in_box
@@ -24,6 +25,10 @@ GONE_SHARE = 0.4
 # Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel beside
 # a silhouette lets rays run past a wall: by both together, rays bounded.
 GONE_BY_BOTH, MOST_SHARE = 0.5, 1.5
+# The walls that tell how far in a line stands: so far below the last layer and so deep, upright, as
+# far off as a part shrinks and no farther; of so many cells near a line those of the nearest wall.
+BELOW_LINE_MM, WALL_MM, MOST_SHIFT_MM, UPRIGHT = 0.3, 2.0, 0.35, 0.4
+WALL_CELLS, BESIDE_WALL_MM, SAME_WALL = 12, 1.5, 0.7
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
 
 
@@ -100,6 +105,7 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     half_mm = 0.5 * lines.height_mm[line]
     middle = lines.start_mm[line] + share[:, None] * (lines.end_mm - lines.start_mm)[line]
     middle[:, 2] -= half_mm
+    middle += _wall_shift(middle, evidence, template)
     # rays alone cost little; only where they say "open" surfaces are asked, too
     rays_mm = evidence.rays_say(middle)
     ask = np.flatnonzero(rays_mm > 0)
@@ -115,6 +121,44 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     gone = _together(by_surface, line) >= GONE_SHARE
     gone |= _together(by_both, line) >= GONE_BY_BOTH
     return _stretches(lines, line, share, gone, length_mm / count)
+
+
+def _wall_shift(
+    middle_mm: Float[np.ndarray, "m 3"], evidence: Evidence, template: Template
+) -> Float[np.ndarray, "m 3"]:
+    """How much farther in than planned the walls below and beside each look stand.
+
+    A part that has shrunk, or is laid a little aside, shows each wall farther in: its outermost
+    lines are there, that much farther in too. The wall below tells; a line that is gone does not
+    move it.
+    """
+    s = evidence.surfels
+    shift = np.zeros_like(middle_mm)
+    low_mm = float(middle_mm[:, 2].max()) - BELOW_LINE_MM
+    which = np.flatnonzero(
+        (s.place_mm[:, 2] < low_mm)
+        & (s.place_mm[:, 2] > low_mm - WALL_MM)
+        & (np.abs(s.deviation_mm) < MOST_SHIFT_MM)
+    )
+    if not len(which):
+        return shift
+    outward = template.distance_and_gradient(s.place_mm[which])[1]
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    wall = np.abs(outward[:, 2]) < UPRIGHT
+    which, outward = which[wall], outward[wall, :2]
+    if len(which) < WALL_CELLS:
+        return shift
+    distance, near = cKDTree(s.place_mm[which, :2]).query(
+        middle_mm[:, :2], k=WALL_CELLS, distance_upper_bound=BESIDE_WALL_MM
+    )
+    ask = np.flatnonzero(np.isfinite(distance).all(axis=1))
+    along = outward[near[ask]]
+    same = np.einsum("akx,ax->ak", along, along[:, 0]) > SAME_WALL
+    farther_mm = np.ma.median(
+        np.ma.masked_array(s.deviation_mm[which][near[ask]], ~same), axis=1
+    ).filled(0.0)
+    shift[ask, :2] = np.minimum(farther_mm, 0.0)[:, None] * along[:, 0]
+    return shift
 
 
 def _together(

@@ -68,6 +68,34 @@ def test_lines_that_lie_where_they_should_are_not_skipped(seed: int) -> None:
     assert len(skipped(lines(), anomaly.evidence, BLOCK).width_mm) == 0
 
 
+def shrunk(solid: m3.Manifold, by_mm: float) -> m3.Manifold:
+    """Drawn together about its middle, as plastic that cools is: each wall by so much."""
+    x, y = 1.0 - by_mm / 12.0, 1.0 - by_mm / 9.0
+    return solid.translate((-12.0, -9.0, 0.0)).scale((x, y, 1.0)).translate((12.0, 9.0, 0.0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("by_mm", [0.06, 0.12])
+def test_a_wall_that_stands_farther_in_lacks_no_line(by_mm: float, seed: int) -> None:
+    # regression: clean prints, shrunken by a few hundredths of their length, had 0.8 mm³ of their
+    # outermost lines "skipped"
+    scan = scan_of(shrunk(BLOCK.body, by_mm), seed)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    assert len(skipped(lines(), anomaly.evidence, BLOCK).width_mm) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_line_that_is_gone_is_told_where_walls_stand_farther_in(seed: int) -> None:
+    scan = scan_of(shrunk(without(8.0, 12.0, 0, HIGH_MM), 0.12), seed)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    gone = skipped(lines(), anomaly.evidence, BLOCK)
+    mine = (gone.start_mm[:, 1] == 0.5 * WIDE_MM) & (gone.start_mm[:, 2] == TOP_MM)
+    length_mm = gone.end_mm[mine, 0] - gone.start_mm[mine, 0]
+    assert length_mm.sum() == pytest.approx(4.0, abs=1.0)
+
+
 def test_a_line_with_half_of_its_plastic_is_not_skipped() -> None:
     scan = scan_of(without(2.0, 22.0, 1, 0.5 * HIGH_MM), 0)
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
