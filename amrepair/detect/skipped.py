@@ -105,10 +105,12 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     half_mm = 0.5 * lines.height_mm[line]
     middle = lines.start_mm[line] + share[:, None] * (lines.end_mm - lines.start_mm)[line]
     middle[:, 2] -= half_mm
-    middle += _wall_shift(middle, evidence, template)
-    # rays alone cost little; only where they say "open" surfaces are asked, too
+    # rays alone cost little; only where they say "open" walls and surfaces are asked, too
     rays_mm = evidence.rays_say(middle)
     ask = np.flatnonzero(rays_mm > 0)
+    middle[ask] += _wall_shift(middle[ask], evidence, template)
+    rays_mm[ask] = evidence.rays_say(middle[ask])
+    ask = ask[rays_mm[ask] > 0]
     by_surface = np.full(len(middle), -1.0)  # what nobody looked into is there
     by_both = by_surface.copy()
     if len(ask):
@@ -134,6 +136,8 @@ def _wall_shift(
     """
     s = evidence.surfels
     shift = np.zeros_like(middle_mm)
+    if not len(middle_mm):
+        return shift
     low_mm = float(middle_mm[:, 2].max()) - BELOW_LINE_MM
     which = np.flatnonzero(
         (s.place_mm[:, 2] < low_mm)

@@ -130,7 +130,7 @@ def test_the_page_has_the_tables_of_the_code(regenerate_golden: bool) -> None:
 
 
 def test_pieces_of_one_defect_are_worth_a_repair_together() -> None:
-    # regression: pieces of 1.5 mm³ side by side went on (F8a), though the patch for both was planned
+    # regression: pieces of 1.5 mm³ side by side went on (F8a); the patch for both was planned
     def piece(x_mm: float, volume_mm3: float) -> Region:
         box = np.array([[x_mm, 0.0, 0.0], [x_mm + 1.0, 1.0, 0.4]])
         return Region(Label.MISSING, DefectType.VOID, volume_mm3, 2.0, 0.2, box)
