@@ -29,6 +29,8 @@ GONE_BY_BOTH, MOST_SHARE = 0.5, 1.5
 # far off as a part shrinks and no farther; of so many cells near a line those of the nearest wall.
 BELOW_LINE_MM, WALL_MM, MOST_SHIFT_MM, UPRIGHT = 0.3, 2.0, 0.35, 0.4
 WALL_CELLS, BESIDE_WALL_MM, SAME_WALL = 12, 1.5, 0.7
+# Cells about a look that are asked for its line's top; how near to it, as a share of half a line.
+ABOUT, TOP_SHARE = 6, 0.7
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
 
 
@@ -120,6 +122,8 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
         surface = np.clip(told_mm[looked_into] / half_mm[known], -1.0, 1.0)
         rays = np.clip(rays_mm[known] / half_mm[known], -1.0, MOST_SHARE)
         by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
+        by_both[known[_topped(middle[known], half_mm[known], lines.width_mm[line[known]],
+                              evidence)]] = -1.0  # fmt: skip
     gone = _together(by_surface, line) >= GONE_SHARE
     gone |= _together(by_both, line) >= GONE_BY_BOTH
     return _stretches(lines, line, share, gone, length_mm / count)
@@ -158,11 +162,24 @@ def _wall_shift(
     ask = np.flatnonzero(np.isfinite(distance).all(axis=1))
     along = outward[near[ask]]
     same = np.einsum("akx,ax->ak", along, along[:, 0]) > SAME_WALL
-    farther_mm = np.ma.median(
-        np.ma.masked_array(s.deviation_mm[which][near[ask]], ~same), axis=1
-    ).filled(0.0)
-    shift[ask, :2] = np.minimum(farther_mm, 0.0)[:, None] * along[:, 0]
+    told = np.where(same, s.deviation_mm[which][near[ask]], np.nan)
+    shift[ask, :2] = np.minimum(np.nanmedian(told, axis=1), 0.0)[:, None] * along[:, 0]
     return shift
+
+
+def _topped(
+    middle_mm: Float[np.ndarray, "m 3"],
+    half_mm: Float[np.ndarray, " m"],
+    width_mm: Float[np.ndarray, " m"],
+    evidence: Evidence,
+) -> Bool[np.ndarray, " m"]:
+    """Looks at which something was seen at the line's own top: there it is, however rounded."""
+    top_mm = middle_mm + half_mm[:, None] * np.array([0.0, 0.0, 1.0])
+    distance, near = evidence.tree.query(top_mm, k=ABOUT)
+    height_mm = np.append(evidence.surfels.place_mm[:, 2], np.inf)[near]  # inf: no such neighbour
+    low_mm = np.abs(top_mm[:, 2:] - height_mm)
+    at_top = (distance < 0.5 * width_mm[:, None]) & (low_mm < TOP_SHARE * half_mm[:, None])
+    return np.asarray(at_top.any(axis=1))
 
 
 def _together(
