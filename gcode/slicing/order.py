@@ -17,9 +17,7 @@ CORNER_RAD = 0.6  # turns sharper than this hide a seam
 INWARD_MM, OTHER_MM = 3.0, 1.5
 
 
-def seam_index(
-    loop: Float[np.ndarray, "n 2"], aim_mm: Float[np.ndarray, " 2"], *, inward: bool = True
-) -> int:
+def seam_index(loop: Float[np.ndarray, "n 2"], aim_mm: Float[np.ndarray, " 2"]) -> int:
     """Vertex of an open-ended loop (first point not repeated) at which to begin.
 
     Parameters
@@ -28,7 +26,7 @@ def seam_index(
         Where the seam should be near (the seam below).
     """
     x, y = float(aim_mm[0]), float(aim_mm[1])
-    return int(kernels.seam_at(loop, x, y, CORNER_RAD, INWARD_MM if inward else OTHER_MM, OTHER_MM))
+    return int(kernels.seam_at(loop, x, y, CORNER_RAD, INWARD_MM, OTHER_MM))
 
 
 def nearest_first(beads: list[Bead], start_mm: Float[np.ndarray, " 2"]) -> list[Bead]:
