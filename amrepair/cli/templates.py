@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from amrepair.cli.files import sort_inputs, write_mesh
-from amrepair.cli.options import SeedOption, with_settings
+from amrepair.cli.options import SeedOption, sensors, with_settings
 from amrepair.errors import InputError
 from gcode.cli import console
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from amrepair.template import LearnedSdf, NetworkSdf
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
@@ -28,6 +30,7 @@ def add_to(app: typer.Typer) -> None:
     epilog=console.examples(
         "amrepair template fit part.stl -o part.safetensors",
         "amrepair template fit part.3mf -o part.safetensors --device cpu --seed 1",
+        "amrepair template fit view*.ply -o part.safetensors --sensor-at 0,0,400",
     ),
 )
 def fit(
@@ -49,6 +52,15 @@ def fit(
     device: Annotated[
         str, typer.Option(help="Where the recipe paper trains: auto, cpu or cuda.")
     ] = "auto",
+    sensor_at: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sensor-at",
+            help="X,Y,Z of the scanner in the scans' frames, mm: once for all scans (a turntable "
+            "before a fixed scanner), or once for each, in their order. Partial views need it to "
+            "find each other surely; PLY and PCD files may carry it.",
+        ),
+    ] = None,
     seed: SeedOption = 0,
 ) -> None:
     """Fit the signed distance field that scans are held against."""
@@ -64,12 +76,14 @@ def fit(
     console.writable(output)
     bars = console.Bars()
     meshes, scans = sort_inputs(inputs)
+    if sensor_at and not scans:
+        raise InputError("--sensor-at belongs to scans, only meshes are given")
     if scans and recipe == "paper" and not meshes:
         raise InputError("the recipe paper needs a mesh; fit the scans with --recipe fast")
     template: LearnedSdf | NetworkSdf
     with bars.shown():
         if scans and recipe == "fast":
-            template = _from_scans(scans, meshes, seed, bars)
+            template = _from_scans(scans, meshes, sensors(sensor_at), seed, bars)
         else:
             template = fit_template(
                 meshes, recipe=recipe, paper=settings, device=device, seed=seed, progress=bars
@@ -80,14 +94,31 @@ def fit(
         console.errors.print(f"  {note}")
 
 
-def _from_scans(scans: list[Path], meshes: list[Path], seed: int, bars: console.Bars) -> LearnedSdf:
+def _from_scans(
+    scans: list[Path],
+    meshes: list[Path],
+    places: np.ndarray | None,
+    seed: int,
+    bars: console.Bars,
+) -> LearnedSdf:
+    import numpy as np
+
     from amrepair.consensus import fit_from_scans
     from amrepair.scans import read_scan
     from amrepair.template import load_mesh
 
     if len(meshes) > 1:
         raise InputError(f"a template has one nominal mesh, {len(meshes)} were given")
-    clouds = [read_scan(path, frame="scanner") for path in scans]
+    if places is not None and len(places) not in (1, len(scans)):
+        raise InputError(
+            f"--sensor-at is given {len(places)} times for {len(scans)} scans; give it once, or "
+            "once for each"
+        )
+    each = [None] * len(scans) if places is None else np.broadcast_to(places, (len(scans), 3))
+    clouds = [
+        read_scan(path, frame="scanner", sensor_at=place)
+        for path, place in zip(scans, each, strict=True)
+    ]
     mesh = load_mesh(meshes[0]) if meshes else None
     return fit_from_scans(clouds, mesh=mesh, seed=seed, progress=bars).template
 

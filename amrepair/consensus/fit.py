@@ -17,6 +17,7 @@ from amrepair.align import align
 from amrepair.consensus.cloud import outward, planes, spacing_of
 from amrepair.consensus.fuse import Cloud, Fused, fuse
 from amrepair.consensus.register import Piece, Placed, place_all
+from amrepair.consensus.views import towards_sensors
 from amrepair.errors import AlignmentError, InputError
 from amrepair.scans import Scan
 from amrepair.template import LearnedSdf, MeshSdf
@@ -149,18 +150,20 @@ def _refuse(scans: Sequence[Scan]) -> None:
 
 
 def _piece(scan: Scan, rng: np.random.Generator) -> Piece:
-    points = scan.points_mm
-    if len(points) > MAX_POINTS:
-        points = points[np.sort(rng.permutation(len(points))[:MAX_POINTS])]
-    distinct = np.unique(points, axis=0)
+    chosen = np.arange(len(scan))
+    if len(chosen) > MAX_POINTS:
+        chosen = np.sort(rng.permutation(len(chosen))[:MAX_POINTS])
+    distinct, first = np.unique(scan.points_mm[chosen], axis=0, return_index=True)
     if len(distinct) < LEAST_POINTS:
         raise InputError(
             f"the scan {scan.source} has only {len(distinct)} different points among "
-            f"{len(points)}; check the export"
+            f"{len(chosen)}; check the export"
         )
     spacing_mm = spacing_of(distinct)
     normals, sigma_mm = planes(distinct, spacing_mm)
-    return Piece(scan.source, distinct, normals, spacing_mm, sigma_mm, cKDTree(distinct))
+    index = None if scan.sensor_index is None else scan.sensor_index[chosen][first]
+    return Piece(scan.source, distinct, normals, spacing_mm, sigma_mm, cKDTree(distinct),
+                 scan.sensors_mm, index)  # fmt: skip
 
 
 def _on_mesh(scans: Sequence[Scan], nominal: MeshSdf, rng: np.random.Generator) -> Placed:
@@ -196,15 +199,22 @@ def _joined(pieces: Sequence[Piece], scans: Sequence[Scan], placed: Placed) -> C
     # where the scans overlap little, the joint cloud is no denser than one of them
     spacing_mm = max(spacing_mm, spacing_of(points))
     sigma_mm = max(p.sigma_mm for p in pieces)
-    return Cloud(points, outward(points, normals, spacing_mm), scan, len(pieces), spacing_mm,
-                 sigma_mm)  # fmt: skip
+    out = outward(points, normals, spacing_mm)
+    for k, (number, pose) in enumerate(zip(placed.which, placed.poses, strict=True)):
+        if number in placed.views:
+            own = scan == k
+            looks = placed.views[number].looks
+            facing = towards_sensors(pieces[k].points_mm, pieces[k].normals, looks)
+            sure = facing.sure | ~looks.guessed
+            out[own] = np.where(sure[:, None], facing.normals @ pose[:3, :3].T, out[own])
+    return Cloud(points, out, scan, len(pieces), spacing_mm, sigma_mm)
 
 
 def _notes(scans: Sequence[Scan], placed: Placed, fused: Fused, used: int) -> tuple[str, ...]:
     notes = [f"consensus of {used} of {len(scans)} scans"]
-    notes += [
-        f"{scans[k].source} fits none of the others and was left out" for k in placed.left_out
-    ]
+    for k in placed.left_out:
+        reason = placed.reasons.get(k, "fits none of the others")
+        notes.append(f"{scans[k].source} {reason}, and was left out")
     if fused.unseen_ratio > 0.002:
         notes.append(f"{fused.unseen_ratio:.1%} of the surface was seen by no scan and is a guess")
     if used > 1 and fused.single_ratio > 0.05:

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.coarse import poses_between
 from amrepair.consensus.cloud import planes, spacing_of
+from amrepair.consensus.views import applied
 from amrepair.frames import box_corners
 
 # Of the part's diagonal: voxels that leave about 1,500 and 15,000 points; how far pairs may be.
@@ -65,13 +66,6 @@ def propose(
             if score > best_score:
                 best_score, best_overlap, best_pose = score, overlap, pose
     return best_overlap, best_pose
-
-
-def applied(
-    pose: Float[np.ndarray, "4 4"], points_mm: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """(n, 3) the points, moved by a (4, 4) pose."""
-    return points_mm @ pose[:3, :3].T + pose[:3, 3]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,17 +6,18 @@ placed is left out and named.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.align.thinning import thin_out
-from amrepair.consensus.propose import applied, propose
+from amrepair.consensus.assemble import Poses, assemble, contradicted
+from amrepair.consensus.propose import propose
+from amrepair.consensus.views import VagueError, View, applied, moved_to_planes, views_of
 from amrepair.errors import AlignmentError
-from amrepair.frames import rotation_from_vector
 from gcode.progress import Progress, silent
 
 COARSE_POINTS, FINE_POINTS = 15_000, 12_000
@@ -35,6 +36,9 @@ class Piece:
         (n, 3) unit normals of either sign.
     tree
         Of the points.
+    sensors_mm, sensor_index
+        (k, 3) and (n,): where the sensors stood, and which saw each point; None where the file
+        does not say.
     """
 
     name: str
@@ -43,6 +47,8 @@ class Piece:
     spacing_mm: float
     sigma_mm: float
     tree: cKDTree
+    sensors_mm: Float[np.ndarray, "k 3"] | None = None
+    sensor_index: Int[np.ndarray, " n"] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +65,18 @@ class Placed:
         Point-to-plane, over what overlaps.
     left_out
         Numbers of the scans that fit nowhere.
+    reasons
+        By number of a scan that was left out, why; where more is known than that.
+    views
+        By number: what is known of where a scan's sensors stood.
     """
 
     which: tuple[int, ...]
     poses: tuple[Float[np.ndarray, "4 4"], ...]
     rmse_mm: float
     left_out: tuple[int, ...]
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    views: Mapping[int, View] = field(default_factory=dict)
 
 
 def place_all(
@@ -77,6 +89,9 @@ def place_all(
     AlignmentError
         If most of them do not fit each other.
     """
+    sighted = _by_sight(pieces, rng, progress)
+    if sighted is not None:
+        return sighted
     thin = [thin_out(piece.points_mm, COARSE_POINTS, rng) for piece in pieces]
     diagonal_mm = max(float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in thin)
     root = int(np.argmax([_coverage(cloud, diagonal_mm / 100) for cloud in thin]))
@@ -117,6 +132,68 @@ def place_all(
     )
 
 
+def _by_sight(
+    pieces: Sequence[Piece], rng: np.random.Generator, progress: Progress
+) -> Placed | None:
+    """Views by what their sensors saw through; None where a scan is no view of told sensors or one.
+
+    Raises
+    ------
+    AlignmentError
+        If most of the poses are not sure.
+    """
+    diagonal_mm = max(float(np.linalg.norm(np.ptp(p.points_mm, axis=0))) for p in pieces)
+    views: list[View] = []
+    reasons: dict[int, str] = {}
+    for k, p in enumerate(pieces):
+        try:
+            own = views_of(
+                k, p.points_mm, p.sensors_mm, p.sensor_index, diagonal_mm, p.sigma_mm, rng
+            )
+        except VagueError as error:
+            reasons[k] = str(error)
+            continue
+        if not own:
+            return None
+        views += own
+    found = assemble(views, diagonal_mm, progress)
+    reasons |= found.reasons
+    poses, rmse_mm = _refined(pieces, found.poses, rng)
+    for k, reason in contradicted(found.views, poses).items():
+        reasons[k] = reason
+        del poses[k]
+    if 2 * len(poses) <= len(pieces):
+        same: dict[str, list[str]] = {}
+        for k, reason in sorted(reasons.items()):
+            same.setdefault(reason, []).append(pieces[k].name)
+        said = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in same.items())
+        raise AlignmentError(
+            f"{len(pieces) - len(poses)} of {len(pieces)} views cannot be placed ({said}); scan "
+            "with more overlap, tell where the sensors stood (--sensor-at, or in the files), "
+            "export the views in one frame, or give the part's mesh beside them"
+        )
+    which = sorted(poses)
+    home = np.linalg.inv(poses[which[0]])
+    return Placed(
+        tuple(which),
+        tuple(home @ poses[k] for k in which),
+        rmse_mm,
+        tuple(sorted(set(range(len(pieces))) - set(which))),
+        reasons,
+        {k: found.views[k] for k in which},
+    )
+
+
+def _refined(
+    pieces: Sequence[Piece], poses: Poses, rng: np.random.Generator
+) -> tuple[Poses, float]:
+    which = sorted(poses)
+    if not which:
+        return {}, 0.0
+    refined, rmse_mm = _together([pieces[k] for k in which], [poses[k] for k in which], rng)
+    return dict(zip(which, refined, strict=True)), rmse_mm
+
+
 def _coverage(points_mm: Float[np.ndarray, "n 3"], voxel_mm: float) -> int:
     return len(np.unique(np.floor(points_mm / voxel_mm).astype(np.int64), axis=0))
 
@@ -136,20 +213,11 @@ def _together(
             points, normal, height = _pairs(pieces, found, k, sample[k])
             if len(points) < 100:
                 continue
-            weight = (scale_mm**2 / (height**2 + scale_mm**2)) ** 2
-            centre = points.mean(axis=0)
-            jacobian = np.concatenate([np.cross(points - centre, normal), normal], axis=1)
-            weighted = jacobian * weight[:, None]
-            damping = 1e-9 * np.trace(weighted.T @ jacobian) * np.eye(6)
-            step = -np.linalg.solve(weighted.T @ jacobian + damping, weighted.T @ height)
-            turn = np.eye(4)
-            turn[:3, :3] = rotation_from_vector(step[:3])
-            turn[:3, 3] = centre + step[3:] - turn[:3, :3] @ centre
+            turn = moved_to_planes(points, normal, height, scale_mm)
             found[k] = turn @ found[k]
-            reach = float(np.linalg.norm(points - centre, axis=1).max())
-            moved_mm = max(
-                moved_mm, float(np.linalg.norm(step[3:]) + reach * np.linalg.norm(step[:3]))
-            )
+            moved = applied(turn, points) - points
+            moved_mm = max(moved_mm, float(np.linalg.norm(moved, axis=1).max()))
+            weight = (scale_mm**2 / (height**2 + scale_mm**2)) ** 2
             squares += float((weight * height**2).sum())
             weights += float(weight.sum())
         rmse_mm = float(np.sqrt(squares / max(weights, 1e-12)))

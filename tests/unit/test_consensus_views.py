@@ -1,0 +1,215 @@
+"""Partial views without a mesh: free space, where a sensor stood, views placed or left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from manifold3d import Manifold
+from typer.testing import CliRunner
+
+from amrepair.bench.synth_views import Rays, Shape, sample_shape
+from amrepair.cli.app import app
+from amrepair.consensus.cloud import planes, spacing_of
+from amrepair.consensus.fit import _piece
+from amrepair.consensus.looks import guess_directions, guessed, told
+from amrepair.consensus.register import Placed, place_all
+from amrepair.consensus.views import towards_sensors
+from amrepair.errors import AlignmentError, InputError
+from amrepair.frames import rotation_from_vector
+from amrepair.scans import Scan, write_ply
+from tests.analytic import box, cylinder, difference, to_trimesh, union
+
+SIGMA_MM = 0.03
+FAR_MM = 200.0
+
+
+@pytest.fixture(scope="module")
+def bracket() -> Shape:
+    """A plate with a tower and a through hole: no symmetry, every kind of edge."""
+    body = union(box((0, 0, 0), (40, 25, 8)), cylinder((30, 15, 4), 6, 14))
+    return shape_of(difference(body, cylinder((10, 9, -1), 4, 12)).body)
+
+
+def shape_of(body: Manifold) -> Shape:
+    mesh = to_trimesh(body)
+    return Shape(np.array(mesh.vertices), np.array(mesh.faces), np.zeros((len(mesh.faces), 3)))
+
+
+def view_of(
+    shape: Shape, towards: tuple[float, float, float], seed: int, *, moves: bool, tells: bool = True
+) -> tuple[Scan, np.ndarray]:
+    """What one sensor sees, in a pose of its own; and (4, 4) scan from part."""
+    rng = np.random.default_rng(seed)
+    middle = 0.5 * (shape.vertices_mm.min(axis=0) + shape.vertices_mm.max(axis=0))
+    sensor = middle + FAR_MM * np.array(towards) / np.linalg.norm(towards)
+    cloud = sample_shape(shape, 60_000, rng)
+    cloud = cloud.take(Rays(shape).seen(cloud, sensor[None]))
+    points = cloud.points_mm + rng.normal(0.0, SIGMA_MM, cloud.points_mm.shape)
+    pose = np.eye(4)
+    if moves:
+        axis = rng.normal(size=3)
+        pose[:3, :3] = rotation_from_vector(2.0 * axis / np.linalg.norm(axis))
+        pose[:3, 3] = rng.normal(0.0, 60.0, 3)
+    sensors = (sensor @ pose[:3, :3].T + pose[:3, 3])[None] if tells else None
+    scan = Scan(
+        points @ pose[:3, :3].T + pose[:3, 3],
+        SIGMA_MM,
+        "scanner",
+        sensors_mm=sensors,
+        sensor_index=np.zeros(len(points), np.int64) if tells else None,
+        source=f"view{seed}",
+    )
+    return scan, pose
+
+
+def placed(scans: list[Scan]) -> Placed:
+    rng = np.random.default_rng(0)
+    return place_all([_piece(scan, rng) for scan in scans], rng)
+
+
+def farthest_off_mm(found: Placed, poses: list[np.ndarray], shape: Shape) -> float:
+    """How far the part's corners lie apart, as the placed scans have them."""
+    corners = [
+        shape.vertices_mm @ (m @ poses[k])[:3, :3].T + (m @ poses[k])[:3, 3]
+        for k, m in zip(found.which, found.poses, strict=True)
+    ]
+    return max(float(np.abs(one - corners[0]).max()) for one in corners)
+
+
+def test_what_a_sensor_saw_through_is_free() -> None:
+    """A ball of 10 mm: before it and beside it free, on it and behind it not."""
+    shape = shape_of(Manifold.sphere(10.0, 128))
+    scan, _ = view_of(shape, (0.0, 0.0, 1.0), 0, moves=False)
+    assert scan.sensors_mm is not None
+    assert scan.sensor_index is not None
+    looks = told(scan.points_mm, scan.sensors_mm, scan.sensor_index)
+    rng = np.random.default_rng(1)
+    places = rng.uniform(-16.0, 16.0, (20_000, 3))
+    # the ray from the sensor, against the ball: the truth
+    way = places - scan.sensors_mm[0]
+    length = np.linalg.norm(way, axis=1)
+    along = -(scan.sensors_mm[0] * way).sum(axis=1) / length
+    passes = np.linalg.norm(scan.sensors_mm[0] + (along / length)[:, None] * way, axis=1)
+    enters = along - np.sqrt(np.maximum(100.0 - passes**2, 0.0))
+    free = (passes > 10.0) | (length < enters)
+    found = looks.free(places, 1.0)
+    # the sensor sees no more than 80° of incidence: the rim, 1 - sin 80° of the radius
+    assert not (found & ~free & (passes < 9.8)).any()
+    # a pixel's and the tolerance's width away; towards the rim the ball falls off too steeply
+    clear = (passes > 12.5) | ((passes < 7.0) & (length < enters - 3.0))
+    assert found[free & clear].all()
+
+
+def test_surface_edge_on_to_a_ray_contradicts_nothing() -> None:
+    shape = shape_of(Manifold.cube((20.0, 20.0, 4.0)))
+    scan, _ = view_of(shape, (0.0, 0.0, 1.0), 0, moves=False)
+    assert scan.sensors_mm is not None
+    assert scan.sensor_index is not None
+    looks = told(scan.points_mm, scan.sensors_mm, scan.sensor_index)
+    above = np.array([[10.0, 10.0, 8.0]])
+    assert looks.free(above, 0.5, np.array([[0.0, 0.0, 1.0]])).all()
+    assert not looks.free(above, 0.5, np.array([[1.0, 0.0, 0.0]])).any()
+
+
+@pytest.mark.parametrize("towards", [(1.0, 0.4, 0.8), (-0.6, 1.0, 0.5), (0.3, -1.0, -0.7)])
+def test_where_a_sensor_stood_is_among_the_guesses(
+    bracket: Shape, towards: tuple[float, float, float]
+) -> None:
+    scan, _ = view_of(bracket, towards, 3, moves=False)
+    guess = guess_directions(scan.points_mm[:8_000])
+    truth = np.array(towards) / np.linalg.norm(towards)
+    # the guesses are the outermost of those that pass: the truth lies among them, not at them
+    assert (guess.towards @ truth).max() > np.cos(np.radians(25.0))
+    assert guess.towards.mean(axis=0) @ truth > 0.7
+    looks = guessed(scan.points_mm, guess.towards)
+    # where nobody told the place, what the part hides is never free
+    inside = np.random.default_rng(0).uniform((16, 3, 1), (38, 22, 7), (200, 3))
+    assert not looks.free(inside, 0.5).any()
+
+
+def test_a_whole_scan_is_no_view(bracket: Shape) -> None:
+    points = sample_shape(bracket, 8_000, np.random.default_rng(0)).points_mm
+    assert len(guess_directions(points).towards) == 0
+
+
+def test_normals_turn_to_the_sensor_that_saw_them(bracket: Shape) -> None:
+    rng = np.random.default_rng(0)
+    cloud = sample_shape(bracket, 40_000, rng)
+    sensors = np.array([[20.0, 12.0, 200.0], [20.0, 12.0, -200.0]])
+    seen = [cloud.take(Rays(bracket).seen(cloud, sensor[None])) for sensor in sensors]
+    points = np.concatenate([s.points_mm for s in seen])
+    truth = np.concatenate([s.normals for s in seen])
+    looks = told(points, sensors, np.repeat([0, 1], [len(s.points_mm) for s in seen]))
+    normals, _ = planes(points, spacing_of(points))
+    facing = towards_sensors(points, normals, looks)
+    right = (facing.normals * truth).sum(axis=1) > 0.0
+    assert right[facing.sure].mean() > 0.99
+
+
+def test_views_that_share_little_find_each_other(bracket: Shape) -> None:
+    """A ring and one from below: neighbours share a third, the last the sides alone."""
+    ways = [(1.0, 0.2, 0.7), (-0.4, 1.0, 0.7), (-0.5, -1.0, 0.7), (0.8, 0.5, -0.6)]
+    made = [view_of(bracket, way, k, moves=True) for k, way in enumerate(ways)]
+    found = placed([scan for scan, _ in made])
+    assert found.which == (0, 1, 2, 3)
+    poses = [pose for _, pose in made]
+    # edges and curves alone hold the last along the plate's normal: no level face is seen by both
+    assert farthest_off_mm(found, poses, bracket) < 0.4
+    above = replace(found, which=found.which[:3], poses=found.poses[:3])
+    assert farthest_off_mm(above, poses, bracket) < 0.1
+
+
+@pytest.mark.slow
+def test_views_of_untold_sensors_are_right_or_left_out(bracket: Shape) -> None:
+    ways = [(1.0, 0.2, 0.7), (0.4, 1.0, 0.7), (-0.8, 0.8, 0.7), (-0.8, -0.7, 0.7), (0.3, -1, 0.7)]
+    made = [view_of(bracket, way, k, moves=True, tells=False) for k, way in enumerate(ways)]
+    found = placed([scan for scan, _ in made])
+    assert len(found.which) >= 3
+    assert farthest_off_mm(found, [pose for _, pose in made], bracket) < 0.15
+    assert set(found.reasons) == set(found.left_out)
+
+
+def test_views_that_fit_in_more_than_one_way_are_refused_with_advice() -> None:
+    """A ring of equal sides: every view fits on every other as well as beside it."""
+    shape = shape_of(Manifold.cylinder(12.0, 10.0, 10.0, 6))
+    made = [
+        view_of(shape, (np.cos(a), np.sin(a), 0.8), k, moves=True) for k, a in enumerate((0.0, 2.0))
+    ]
+    with pytest.raises(AlignmentError, match=r"more than one way.*--sensor-at.*one frame.*mesh"):
+        placed([scan for scan, _ in made])
+
+
+def test_views_in_one_frame_stay_as_they_came() -> None:
+    """The same ring, exported in one frame: nothing to find, and no pose mistaken."""
+    shape = shape_of(Manifold.cylinder(12.0, 10.0, 10.0, 6))
+    angles = (0.0, 1.6, 3.1, 4.7)
+    made = [
+        view_of(shape, (np.cos(a), np.sin(a), 0.8), k, moves=False) for k, a in enumerate(angles)
+    ]
+    found = placed([scan for scan, _ in made])
+    assert found.which == (0, 1, 2, 3)
+    assert farthest_off_mm(found, [pose for _, pose in made], shape) < 0.1
+
+
+def test_a_round_part_that_turned_before_a_fixed_sensor_is_not_taken_as_it_came() -> None:
+    """All views lie on each other and contradict nothing; the sensor never moved."""
+    shape = shape_of(Manifold.cylinder(12.0, 10.0, 10.0, 6))
+    one, _ = view_of(shape, (1.0, 0.0, 0.8), 0, moves=False)
+    two, _ = view_of(shape, (1.0, 0.0, 0.8), 1, moves=False)
+    with pytest.raises(AlignmentError, match="more than one way"):
+        placed([one, two])
+
+
+def test_sensor_at_is_given_once_or_for_each(tmp_path: Path, bracket: Shape) -> None:
+    paths = []
+    for k in range(3):
+        scan, _ = view_of(bracket, (1.0, 0.2, 0.7), k, moves=False)
+        paths.append(str(tmp_path / f"v{k}.ply"))
+        write_ply(scan, Path(paths[-1]))
+    call = ["template", "fit", *paths, "-o", str(tmp_path / "t.safetensors")]
+    answer = CliRunner().invoke(app, [*call, "--sensor-at", "0,0,1", "--sensor-at", "0,0,2"])
+    assert isinstance(answer.exception, InputError)
+    assert "2 times for 3 scans" in str(answer.exception)
