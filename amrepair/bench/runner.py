@@ -120,6 +120,8 @@ def run_bench(
         report = _write(out, chosen, rows, len(cells), paper)
         progress("bench", float(len(rows)), float(len(cells)))
     shutil.rmtree(out / "partial", ignore_errors=True)
+    for draft in out.rglob(".*.part"):  # what a killed run was writing
+        draft.unlink(missing_ok=True)
     return report
 
 

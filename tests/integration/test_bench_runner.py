@@ -146,9 +146,11 @@ def test_a_killed_run_goes_on_to_the_same_results(dataset: Path, tmp_path: Path)
         time.sleep(0.002)
     process.send_signal(signal.SIGKILL)
     process.wait()
+    (tmp_path / "out" / f".results.csv.{process.pid}.part").write_text("half a li")
     resumed = run_bench(
         dataset, format=LAYOUT, methods=["patchcore-fpfh"], out=tmp_path / "out", seeds=[0]
     )
+    assert not list((tmp_path / "out").rglob("*.part"))
     fresh = run_bench(
         dataset, format=LAYOUT, methods=["patchcore-fpfh"], out=tmp_path / "fresh", seeds=[0]
     )
