@@ -23,14 +23,15 @@ LEAST_MM = 1.5  # shorter stretches are seams, corners and curves
 # Half of its plastic would put it at the surface, and noise is averaged over a stretch.
 GONE_SHARE = 0.4
 # Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel beside
-# a silhouette lets rays run past a wall: by both together, rays bounded.
-GONE_BY_BOTH, MOST_SHARE = 0.5, 1.5
-# The walls that tell how far in a line stands: so far below the last layer and so deep, upright, as
-# far off as a part shrinks and no farther; of so many cells near a line those of the nearest wall.
-BELOW_LINE_MM, WALL_MM, MOST_SHIFT_MM, UPRIGHT = 0.3, 2.0, 0.35, 0.4
-WALL_CELLS, BESIDE_WALL_MM, SAME_WALL = 12, 1.5, 0.7
+# a silhouette lets rays run past a wall: by both together, rays bounded, and surer somewhere.
+GONE_BY_BOTH, SURE_BY_BOTH, MOST_SHARE = 0.5, 0.65, 1.5
+# The walls that tell how far in a line stands: so far below the last lines' middles and so deep,
+# upright, as far off as a part shrinks and no farther; of so many cells near a line those of the
+# nearest wall, a few at least.
+BELOW_LINE_MM, WALL_MM, MOST_SHIFT_MM, UPRIGHT = 0.1, 2.0, 0.35, 0.4
+WALL_CELLS, LEAST_WALL_CELLS, BESIDE_WALL_MM, SAME_WALL = 12, 4, 1.5, 0.7
 # Cells about a look that are asked for its line's top; how near to it, as a share of half a line.
-ABOUT, TOP_SHARE = 6, 0.7
+ABOUT, TOP_SHARE = 6, 1.0
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
 
 
@@ -124,9 +125,10 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
         by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
         by_both[known[_topped(middle[known], half_mm[known], lines.width_mm[line[known]],
                               evidence)]] = -1.0  # fmt: skip
-    gone = _together(by_surface, line) >= GONE_SHARE
-    gone |= _together(by_both, line) >= GONE_BY_BOTH
-    return _stretches(lines, line, share, gone, length_mm / count)
+    sure = _together(by_surface, line) >= GONE_SHARE
+    both = _together(by_both, line)
+    gone = sure | (both >= GONE_BY_BOTH)
+    return _stretches(lines, line, share, gone, sure | (both >= SURE_BY_BOTH), length_mm / count)
 
 
 def _wall_shift(
@@ -154,16 +156,17 @@ def _wall_shift(
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
     wall = np.abs(outward[:, 2]) < UPRIGHT
     which, outward = which[wall], outward[wall, :2]
-    if len(which) < WALL_CELLS:
+    if not len(which):
         return shift
-    distance, near = cKDTree(s.place_mm[which, :2]).query(
+    near = cKDTree(s.place_mm[which, :2]).query(
         middle_mm[:, :2], k=WALL_CELLS, distance_upper_bound=BESIDE_WALL_MM
-    )
-    ask = np.flatnonzero(np.isfinite(distance).all(axis=1))
-    along = outward[near[ask]]
-    same = np.einsum("akx,ax->ak", along, along[:, 0]) > SAME_WALL
-    told = np.where(same, s.deviation_mm[which][near[ask]], np.nan)
-    shift[ask, :2] = np.minimum(np.nanmedian(told, axis=1), 0.0)[:, None] * along[:, 0]
+    )[1]
+    outward = np.vstack([outward, np.zeros(2)])[near]  # no neighbour is of no wall
+    same = np.einsum("akx,ax->ak", outward, outward[:, 0]) > SAME_WALL
+    ask = np.flatnonzero(same.sum(axis=1) >= LEAST_WALL_CELLS)
+    deviation_mm = np.append(s.deviation_mm[which], 0.0)[near[ask]]
+    farther_mm = np.nanmedian(np.where(same[ask], deviation_mm, np.nan), axis=1)
+    shift[ask, :2] = np.minimum(farther_mm, 0.0)[:, None] * outward[ask, 0]
     return shift
 
 
@@ -203,15 +206,17 @@ def _stretches(
     line: Int[np.ndarray, " m"],
     share: Float[np.ndarray, " m"],
     gone: Bool[np.ndarray, " m"],
+    sure: Bool[np.ndarray, " m"],
     step_mm: Float[np.ndarray, " n"],
 ) -> PlannedBeads:
-    """Neighbouring looks that say so, as one bead each."""
+    """Neighbouring looks that say so, as one bead each; one of them is sure."""
     at = np.flatnonzero(gone)
     begins = np.ones(len(at), dtype=bool)
     begins[1:] = (np.diff(at) > 1) | (np.diff(line[at]) != 0)
     a, b = at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
-    long_ = (b - a + 1) * step_mm[line[a]] >= LEAST_MM
-    a, b = a[long_], b[long_]
+    surely = np.concatenate([[0], np.cumsum(sure)])
+    kept = ((b - a + 1) * step_mm[line[a]] >= LEAST_MM) & (surely[b + 1] > surely[a])
+    a, b = a[kept], b[kept]
     which = line[a]
     over = lines.end_mm[which] - lines.start_mm[which]
     half = 0.5 * step_mm[which] / np.maximum(np.linalg.norm(over, axis=1), 1e-9)
