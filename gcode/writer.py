@@ -176,26 +176,20 @@ class _Text:
         self._tag("TYPE", str(move.role))
         self._tag("WIDTH", number(move.width_mm, 3))
         self._tag("HEIGHT", number(move.height_mm, 3))
-        going = self._goes(points)
-        feed = self._feed_word(move.speed_mm_s) if going else ""
-        lines, place, self._owed_mm = bead_lines(
+        lines, first_end, place, self._owed_mm = bead_lines(
             points,
             np.asarray(move.section_mm2, dtype=np.float64),
             np.array(self._place),
             self._e_per_mm3,
             self._owed_mm,
-            np.frombuffer(feed.encode(), np.uint8),
             XYZ_DIGITS,
             E_DIGITS,
         )
-        if going:
-            self.lines.append(lines.tobytes().decode("ascii"))
+        if first_end:
+            text = lines.tobytes().decode("ascii")
+            feed = self._feed_word(move.speed_mm_s)
+            self.lines.append(text[:first_end] + feed + text[first_end:])
         self._place = place.tolist()
-
-    def _goes(self, points_mm: Float[np.ndarray, "n 3"]) -> bool:
-        """Whether a chain leaves the place where the nozzle is, in steps of what is written."""
-        here = np.rint(np.array(self._place) * 10**XYZ_DIGITS)
-        return bool((np.rint(points_mm[1:] * 10**XYZ_DIGITS) != here).any())
 
     def _tag(self, name: str, value: str) -> None:
         if self._tags.get(name) != value:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gcode.compiled import njit
 
-LONGEST_LINE = 96  # three axes, E and F, each of at most nineteen digits
+LONGEST_LINE = 96  # three axes and E, each of at most nineteen digits
 
 
 @njit(cache=True, nogil=True)
@@ -47,11 +47,12 @@ def bead_lines(
     place: Any,
     per_mm3: float,
     owed: float,
-    feed: Any,
     xyz_digits: int,
     e_digits: int,
-) -> tuple[Any, Any, float]:
-    """Lines of a chain that begins where the nozzle is, the nozzle's place, filament still owed.
+) -> tuple[Any, int, Any, float]:
+    """Lines of a chain from where the nozzle is on, where the first of them ends; place and debt.
+
+    The nozzle's place then, and the filament that is still owed.
 
     Parameters
     ----------
@@ -63,16 +64,13 @@ def bead_lines(
         Filament of a cubic millimetre.
     owed
         What rounding has kept back so far; what is shorter than what is written goes with the next.
-    feed
-        Bytes that the first line ends in.
     """
     to_xyz, to_e = 10.0**xyz_digits, 10.0**e_digits
-    out = np.empty(len(section) * LONGEST_LINE + len(feed), np.uint8)
+    out = np.empty(len(section) * LONGEST_LINE, np.uint8)
     here, there = np.empty(3, np.int64), np.empty(3, np.int64)
     for a in range(3):
         here[a] = np.int64(np.rint(place[a] * to_xyz))
-    at, pushed, filament = 0, np.int64(0), 0.0
-    first = True
+    at, first_end, pushed, filament = 0, 0, np.int64(0), 0.0
     for k in range(len(section)):
         square, moved = 0.0, False
         for a in range(3):
@@ -98,9 +96,6 @@ def bead_lines(
             out[at], out[at + 1] = 32, 69  # E
             at = put_number(out, at + 2, total - pushed, e_digits)
             pushed = total
-        if first:
-            for byte in feed:
-                out[at] = byte
-                at += 1
-            first = False
-    return out[:at], here / to_xyz, owed + filament - pushed / to_e
+        if first_end == 0:
+            first_end = at
+    return out[:at], first_end, here / to_xyz, owed + filament - pushed / to_e
