@@ -23,8 +23,8 @@ from amrepair.bench.synth_views import (
 )
 from amrepair.consensus.fit import _piece
 from amrepair.consensus.register import Placed, place_all
-from amrepair.consensus.views import applied
 from amrepair.errors import AlignmentError
+from amrepair.frames import moved
 from amrepair.scans import Scan
 from amrepair.template import load_mesh
 
@@ -79,9 +79,9 @@ def views(part: Path, options: argparse.Namespace) -> Made:
             points = points + rng.normal(0.0, options.noise_mm, points.shape)
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = random_rotation(rng), rng.normal(0.0, 100.0, 3)
-            told = None if options.untold else applied(pose, sensor)
+            told = None if options.untold else moved(sensor, pose)
             index = None if options.untold else np.zeros(len(points), np.int64)
-            scan = Scan(applied(pose, points), options.noise_mm, "scanner", sensors_mm=told,
+            scan = Scan(moved(points, pose), options.noise_mm, "scanner", sensors_mm=told,
                         sensor_index=index, source=f"view{len(made)}")  # fmt: skip
             made.append((scan, pose))
     return made
@@ -96,8 +96,8 @@ def off_mm(made: Made, found: Placed) -> np.ndarray:
         for k, pose in zip(found.which, found.poses, strict=True):
             scan, from_part = made[k]
             points = scan.points_mm[::40]
-            truth = applied(common_from_part @ np.linalg.inv(from_part), points)
-            squares = ((applied(pose, points) - truth) ** 2).sum(axis=1)
+            truth = moved(points, common_from_part @ np.linalg.inv(from_part))
+            squares = ((moved(points, pose) - truth) ** 2).sum(axis=1)
             row.append(float(np.sqrt(squares.mean())))
         every.append(row)
     table = np.array(every)

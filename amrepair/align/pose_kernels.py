@@ -44,3 +44,24 @@ def turn(r, x, y, z):
         r[0, column] = a + s * ca + c * (y * cd - z * cb)
         r[1, column] = b + s * cb + c * (z * ca - x * cd)
         r[2, column] = d + s * cd + c * (x * cb - y * ca)
+
+
+@njit(cache=True, nogil=True)
+def step_down(r, p, h, b, damping, least, widest, reach):
+    """One damped Gauss–Newton step of a pose, in place; `h` and `b` are used up.
+
+    It turns by at most `widest` rad, and shifts by no more than that moves what lies `reach` off.
+    """
+    turning = (h[0, 0] + h[1, 1] + h[2, 2]) / 3.0
+    moving = (h[3, 3] + h[4, 4] + h[5, 5]) / 3.0
+    for m in range(3):
+        h[m, m] += damping * turning + least
+        h[m + 3, m + 3] += damping * moving + least
+    solve(h, b)
+    angle = np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
+    shift = np.sqrt(b[3] ** 2 + b[4] ** 2 + b[5] ** 2)
+    share = min(1.0, widest / max(angle, 1e-12))
+    share = min(share, widest * reach / max(shift, 1e-12))
+    turn(r, share * b[0], share * b[1], share * b[2])
+    for m in range(3):
+        p[m] += share * b[3 + m]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from amrepair.align.pose_kernels import solve, turn
+from amrepair.align.pose_kernels import step_down
 from gcode.compiled import njit, prange
 
 LEAST_ALONG, MOST_ALONG = 3, 8  # places along an axis
@@ -109,7 +109,7 @@ def starts(points, rotations, box, values, shape, cap, gap, most):
 
 
 @njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _field(x, y, z, values, nx, ny, nz):
+def field_at(x, y, z, values, nx, ny, nz):
     """f and its gradient at a place: trilinear; beyond the grid, as its border has it.
 
     Numbers of nodes are given as floats. Inlined, so a gradient that is not asked costs nothing.
@@ -153,7 +153,7 @@ def _between_nodes(points, r, p, values, shape, cap):
         tx = r00 * x + r01 * y + r02 * z + px
         ty = r10 * x + r11 * y + r12 * z + py
         tz = r20 * x + r21 * y + r22 * z + pz
-        total += min(abs(_field(tx, ty, tz, values, nx, ny, nz)[0]), most)
+        total += min(abs(field_at(tx, ty, tz, values, nx, ny, nz)[0]), most)
     return total
 
 
@@ -186,7 +186,7 @@ def _accumulate(points, r, p, values, shape, scale, cap, h, b):
         ty = r10 * x + r11 * y + r12 * z
         tz = r20 * x + r21 * y + r22 * z
         x, y, z = tx + px, ty + py, tz + pz
-        f, gx, gy, gz = _field(x, y, z, values, nx, ny, nz)
+        f, gx, gy, gz = field_at(x, y, z, values, nx, ny, nz)
         total += min(abs(f), most)
         weight = square / (f * f + square)
         weight *= weight
@@ -227,19 +227,7 @@ def descend(points, rotations, places, values, shape, scales, cap):
         h, b = np.empty((6, 6)), np.empty(6)
         for step in range(len(scales)):
             _accumulate(points, r, p, values, shape, scales[step], cap, h, b)
-            turning = (h[0, 0] + h[1, 1] + h[2, 2]) / 3.0
-            moving = (h[3, 3] + h[4, 4] + h[5, 5]) / 3.0
-            for m in range(3):
-                h[m, m] += DAMPING * turning + 1e-12
-                h[m + 3, m + 3] += DAMPING * moving + 1e-12
-            solve(h, b)
-            angle = np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-            share = min(1.0, WIDEST_TURN_RAD / max(angle, 1e-12))
-            shift = np.sqrt(b[3] ** 2 + b[4] ** 2 + b[5] ** 2)
-            share = min(share, WIDEST_TURN_RAD * reach / max(shift, 1e-12))
-            turn(r, share * b[0], share * b[1], share * b[2])
-            for a in range(3):
-                p[a] += share * b[3 + a]
+            step_down(r, p, h, b, DAMPING, 1e-12, WIDEST_TURN_RAD, reach)
         total = _accumulate(points, r, p, values, shape, scales[-1], cap, h, b)
         scores[k] = total / points.shape[1]
     return scores

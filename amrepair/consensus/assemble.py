@@ -25,12 +25,12 @@ from amrepair.consensus.views import (
     Fit,
     Surface,
     View,
-    applied,
     distinct,
     marks_on,
     match,
     settled,
 )
+from amrepair.frames import moved
 from gcode.progress import Progress, silent
 
 
@@ -233,7 +233,7 @@ def _seed(pairs: _Pairs) -> tuple[dict[int, View], Poses]:
 
 def _joined(chosen: Mapping[int, View], poses: Poses) -> Surface:
     return Surface.of(
-        np.concatenate([applied(p, chosen[k].surface.points_mm) for k, p in poses.items()]),
+        np.concatenate([moved(chosen[k].surface.points_mm, p) for k, p in poses.items()]),
         np.concatenate([chosen[k].surface.normals @ p[:3, :3].T for k, p in poses.items()]),
     )
 

@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.coarse import poses_between
 from amrepair.consensus.cloud import planes, spacing_of
-from amrepair.consensus.views import applied
-from amrepair.frames import box_corners
+from amrepair.frames import box_corners, moved
 
 # Of the part's diagonal: voxels that leave about 1,500 and 15,000 points; how far pairs may be.
 ROUGH_VOXEL, FINE_VOXEL, PAIRS_WITHIN = 0.02, 0.006, 0.02
@@ -53,7 +52,7 @@ def propose(
     rough: list[tuple[float, np.ndarray]] = []
     for guess in poses_between(source_mm, model_mm, diagonal_mm):
         pose = trial.refined(guess, ROUGH_ITERATIONS)
-        away = [np.abs(applied(pose, corners) - applied(p, corners)).max() for _, p in rough]
+        away = [np.abs(moved(corners, pose) - moved(corners, p)).max() for _, p in rough]
         if min(away, default=np.inf) > SAME * diagonal_mm:
             rough.append((pair.score(pose, ROUGH_SCORED)[0], pose))
     bar = max(score for score, _ in rough) - DOUBT
@@ -113,10 +112,8 @@ class _Pair:
 
     def score(self, pose: Float[np.ndarray, "4 4"], count: int) -> tuple[float, float]:
         """How good a pose is, and the share that overlaps: 0 where too much contradicts it."""
-        overlap, against = self.model.agreement(
-            applied(pose, self.source.some(count)), self.reach_mm
-        )
-        back = applied(np.linalg.inv(pose), self.model.some(count))
+        overlap, against = self.model.agreement(moved(self.source.some(count), pose), self.reach_mm)
+        back = moved(self.model.some(count), np.linalg.inv(pose))
         against += self.source.agreement(back, self.reach_mm)[1]
         agrees = against <= MOST_AGAINST * overlap
         return overlap - CONTRADICTION * against, overlap if agrees else 0.0

@@ -16,8 +16,9 @@ from scipy.spatial import cKDTree
 from amrepair.align.thinning import thin_out
 from amrepair.consensus.assemble import Poses, assemble, contradicted
 from amrepair.consensus.propose import propose
-from amrepair.consensus.views import VagueError, View, applied, moved_to_planes, views_of
+from amrepair.consensus.views import VagueError, View, loss_weight, moved_to_planes, views_of
 from amrepair.errors import AlignmentError
+from amrepair.frames import moved
 from gcode.progress import Progress, silent
 
 COARSE_POINTS, FINE_POINTS = 15_000, 12_000
@@ -100,7 +101,7 @@ def place_all(
     proposed: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
     bar = GOOD_OVERLAP
     while waiting:
-        model = np.concatenate([applied(poses[k], thin[k]) for k in poses])
+        model = np.concatenate([moved(thin[k], poses[k]) for k in poses])
         size, found = len(poses), []
         for k in waiting:
             progress("align", float(len(poses)), float(len(pieces)))
@@ -215,9 +216,9 @@ def _together(
                 continue
             turn = moved_to_planes(points, normal, height, scale_mm)
             found[k] = turn @ found[k]
-            moved = applied(turn, points) - points
-            moved_mm = max(moved_mm, float(np.linalg.norm(moved, axis=1).max()))
-            weight = (scale_mm**2 / (height**2 + scale_mm**2)) ** 2
+            step_mm = np.linalg.norm(moved(points, turn) - points, axis=1)
+            moved_mm = max(moved_mm, float(step_mm.max()))
+            weight = loss_weight(height, scale_mm)
             squares += float((weight * height**2).sum())
             weights += float(weight.sum())
         rmse_mm = float(np.sqrt(squares / max(weights, 1e-12)))
@@ -234,12 +235,12 @@ def _pairs(
     sample: np.ndarray,
 ) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
     """Points of a scan, and normals and heights over the planes of the other scans."""
-    own = applied(poses[k], pieces[k].points_mm[sample])
+    own = moved(pieces[k].points_mm[sample], poses[k])
     points, normals, heights = [], [], []
     for r, piece in enumerate(pieces):
         if r == k:
             continue
-        local = applied(np.linalg.inv(poses[r]), own)
+        local = moved(own, np.linalg.inv(poses[r]))
         distance, index = piece.tree.query(
             local, distance_upper_bound=4.0 * piece.spacing_mm, workers=-1
         )

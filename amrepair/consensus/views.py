@@ -20,7 +20,7 @@ from amrepair.align.thinning import thin_out
 from amrepair.consensus import looks as sight
 from amrepair.consensus import views_kernels as kernels
 from amrepair.consensus.cloud import planes, spacing_of
-from amrepair.frames import rotation_from_vector
+from amrepair.frames import moved, rotation_from_vector
 
 POINTS, IMAGE_POINTS, GUESS_POINTS = 15_000, 40_000, 8_000
 # The grid of free space: nodes along each side, and its side in diagonals of the largest view. A
@@ -239,8 +239,8 @@ def match(first: View, second: View, diagonal_mm: float) -> list[Fit]:
     rough = []
     for pose in _search(first, second, diagonal_mm):
         within = np.geomspace(FIRST_WITHIN, LAST_WITHIN, 6) * diagonal_mm
-        moved = settled(first.surface, second.surface, pose, within, ROUGH_POINTS)
-        rough.append(_rough(first, second, moved, diagonal_mm))
+        nearer = settled(first.surface, second.surface, pose, within, ROUGH_POINTS)
+        rough.append(_rough(first, second, nearer, diagonal_mm))
     kept = distinct(rough, second.surface, SAME_POSE * diagonal_mm)[:FINE_POSES]
     last_mm = REACH_SPACINGS * max(first.spacing_mm, second.spacing_mm)
     within = np.geomspace(max(LAST_WITHIN * diagonal_mm, last_mm), last_mm, 12)
@@ -255,13 +255,13 @@ def match(first: View, second: View, diagonal_mm: float) -> list[Fit]:
     return distinct(fine, second.surface, SAME_POSE * diagonal_mm)
 
 
-def distinct(fits: list[Fit], moved: Surface, apart_mm: float) -> list[Fit]:
+def distinct(fits: list[Fit], surface: Surface, apart_mm: float) -> list[Fit]:
     """The fits by score; of those that move the view to one place, the best."""
-    places = moved.points_mm[moved.some(60)]
+    places = surface.points_mm[surface.some(60)]
     kept: list[Fit] = []
     for fit in sorted(fits, key=lambda fit: -fit.score):
-        here = applied(fit.pose, places)
-        if all(np.abs(applied(k.pose, places) - here).max() > apart_mm for k in kept):
+        here = moved(places, fit.pose)
+        if all(np.abs(moved(places, k.pose) - here).max() > apart_mm for k in kept):
             kept.append(fit)
     return kept
 
@@ -314,7 +314,7 @@ def settled(
     some = second.some(count)
     found = pose
     for reach_mm in within_mm:
-        points = applied(found, second.points_mm[some])
+        points = moved(second.points_mm[some], found)
         distance, index = first.tree.query(points, distance_upper_bound=reach_mm, workers=-1)
         near = np.isfinite(distance)
         index = index[near]
@@ -326,6 +326,11 @@ def settled(
         height = ((here - first.points_mm[index[facing]]) * normal).sum(axis=1)
         found = moved_to_planes(here, normal, height, max(0.3 * reach_mm, 1e-3)) @ found
     return found
+
+
+def loss_weight(height_mm: Float[np.ndarray, " q"], scale_mm: float) -> Float[np.ndarray, " q"]:
+    """(q,) weight of each residual under the Geman–McClure loss."""
+    return np.asarray((scale_mm**2 / (height_mm**2 + scale_mm**2)) ** 2)
 
 
 def moved_to_planes(
@@ -344,7 +349,7 @@ def moved_to_planes(
     scale_mm
         Of the Geman–McClure loss.
     """
-    weight = (scale_mm**2 / (height_mm**2 + scale_mm**2)) ** 2
+    weight = loss_weight(height_mm, scale_mm)
     centre = points_mm.mean(axis=0)
     jacobian = np.concatenate([np.cross(points_mm - centre, normals), normals], axis=1)
     weighted = jacobian * weight[:, None]
@@ -414,7 +419,7 @@ def marks_on(
 ) -> tuple[Bool[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
     """Which of another view's points lie on a view's surface, and which contradict it."""
     surface = view.surface
-    points = applied(pose, other.surface.points_mm[some])
+    points = moved(other.surface.points_mm[some], pose)
     normals = other.surface.normals[some] @ pose[:3, :3].T
     distance, index = surface.tree.query(points, distance_upper_bound=reach_mm, workers=-1)
     near = np.isfinite(distance)
@@ -424,10 +429,3 @@ def marks_on(
     on = near & (height <= min(off_mm, free_mm))
     off = near & (height > off_mm)
     return on, off | (view.looks.free(points, free_mm, normals) & ~on)
-
-
-def applied(
-    pose: Float[np.ndarray, "4 4"], points_mm: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """(n, 3) the points, moved by a (4, 4) pose."""
-    return points_mm @ pose[:3, :3].T + pose[:3, 3]

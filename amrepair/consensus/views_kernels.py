@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from amrepair.align.pose_kernels import solve, turn
-from amrepair.align.search_kernels import _field
+from amrepair.align.pose_kernels import step_down
+from amrepair.align.search_kernels import field_at
 from gcode.compiled import njit, prange
 
 DAMPING = 1e-3
@@ -55,7 +55,7 @@ def _both(points, normals, others, other_normals, field, other_field, cells, r, 
         x = r[0, 0] * u + r[0, 1] * v + r[0, 2] * w
         y = r[1, 0] * u + r[1, 1] * v + r[1, 2] * w
         z = r[2, 0] * u + r[2, 1] * v + r[2, 2] * w
-        f, gx, gy, gz = _field(
+        f, gx, gy, gz = field_at(
             np.float32(x + p[0]) + c, np.float32(y + p[1]) + c, np.float32(z + p[2]) + c,
             field, n, n, n,
         )  # fmt: skip
@@ -72,7 +72,7 @@ def _both(points, normals, others, other_normals, field, other_field, cells, r, 
     for q in range(points.shape[0]):
         # in the other's frame, where the other is at rest
         u, v, w = points[q, 0] - p[0], points[q, 1] - p[1], points[q, 2] - p[2]
-        f, ex, ey, ez = _field(
+        f, ex, ey, ez = field_at(
             np.float32(r[0, 0] * u + r[1, 0] * v + r[2, 0] * w) + c,
             np.float32(r[0, 1] * u + r[1, 1] * v + r[2, 1] * w) + c,
             np.float32(r[0, 2] * u + r[1, 2] * v + r[2, 2] * w) + c,
@@ -107,19 +107,7 @@ def reconcile(points, normals, others, other_normals, field, other_field, cells,
         for step in range(len(scales)):
             _both(points, normals, others, other_normals, field, other_field, cells, r, p,
                   scales[step], cap, h, b, j)  # fmt: skip
-            turning = (h[0, 0] + h[1, 1] + h[2, 2]) / 3.0
-            moving = (h[3, 3] + h[4, 4] + h[5, 5]) / 3.0
-            for m in range(3):
-                h[m, m] += DAMPING * turning + 1e-9
-                h[m + 3, m + 3] += DAMPING * moving + 1e-9
-            solve(h, b)
-            angle = np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-            share = min(1.0, WIDEST_TURN_RAD / max(angle, 1e-12))
-            shift = np.sqrt(b[3] ** 2 + b[4] ** 2 + b[5] ** 2)
-            share = min(share, WIDEST_TURN_RAD * reach / max(shift, 1e-12))
-            turn(r, share * b[0], share * b[1], share * b[2])
-            for m in range(3):
-                p[m] += share * b[3 + m]
+            step_down(r, p, h, b, DAMPING, 1e-9, WIDEST_TURN_RAD, reach)
         scores[k, 0], scores[k, 1] = _both(
             points, normals, others, other_normals, field, other_field, cells, r, p, scales[-1],
             cap, h, b, j,

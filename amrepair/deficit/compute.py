@@ -458,7 +458,7 @@ def _is_skipped(piece: manifold3d.Manifold, gone: PlannedBeads | None) -> bool:
     box = np.asarray(piece.bounding_box()).reshape(2, 3)
     middle = 0.5 * (gone.start_mm + gone.end_mm)
     middle[:, 2] -= 0.5 * gone.height_mm
-    return bool(((middle >= box[0]) & (middle <= box[1])).all(axis=1).any())
+    return bool(in_box(middle, box[0], box[1]).any())
 
 
 def _unseen_area(anomaly: AnomalyMap, count: int) -> float:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
+from amrepair.detect.near import has_near
 from amrepair.detect.rays import RangeImage, clearances
 from amrepair.detect.surfels import Surfels
 from amrepair.scans import Scan
@@ -200,9 +201,7 @@ def with_stubs(
     if len(gone_mm) == 0 or not evidence.has_rays:
         return evidence
     reach_mm = STUB_CELLS * s.cell_mm
-    near = np.isfinite(
-        cKDTree(gone_mm).query(s.place_mm, distance_upper_bound=reach_mm, workers=2)[0]
-    )
+    near = has_near(s.place_mm, gone_mm, reach_mm)
     which = np.flatnonzero(near & ~labelled & ~evidence.off & (s.deviation_mm < -STUB_MM))
     if len(which) == 0:
         return evidence
