@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
 from amrepair.deficit import Deficit, as_built_heights, compute_deficit, worth
 from amrepair.detect import AnomalyMap, Label, Region, detect
+from amrepair.detect.rays import range_images
 from amrepair.detect.skipped import PlannedBeads
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
@@ -103,6 +105,8 @@ class Site:
         What the job has laid so far, template frame: lines that were skipped are looked for.
     lines
         The same, all of it, build frame: a patch is laid along them.
+    surface
+        Points of what is expected and their normals, as `detect` asks for them: made beforehand.
 
     Examples
     --------
@@ -124,6 +128,7 @@ class Site:
     on_fixture: bool = False
     beads: PlannedBeads | None = None
     lines: JobLines | None = None
+    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
 
     @classmethod
     def of_part(
@@ -256,7 +261,8 @@ def plan_repair(
     True
     """
     watch = watch or Stopwatch()
-    with watch("align"):
+    with watch("align"), ThreadPoolExecutor(1) as beside:
+        seen = beside.submit(range_images, scan)  # what rays saw needs no pose, nor it them
         outer = _outside_open_infill(scan, site, guess)
         registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
     placed = _build_from_template(site, scan, registration)
@@ -275,6 +281,10 @@ def plan_repair(
             expected,
             allowance_mm=site.allowance_mm,
             top_z_mm=_top_of_layer(site),
+            images=tuple(i.moved(registration.template_from_scan) for i in seen.result())
+            if moved is whole
+            else None,
+            surface=site.surface,
             progress=progress,
         )
     with watch("deficit"):

@@ -28,7 +28,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command lines have it
+from gcode.process import prepare
+
+prepare()  # as the command lines do
 
 from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites

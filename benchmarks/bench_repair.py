@@ -9,13 +9,14 @@ Python tokenizer for the reader. Ratios above 1 say how many times faster ours i
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command lines have it
+from gcode.process import prepare
+
+prepare()  # as the command lines do
 
 import manifold3d as m3
 import numpy as np

@@ -262,7 +262,7 @@ def _from_guess(
             f"the scan {scan.source} has {len(points)} points where the part should stand; check "
             "the scanner's calibration and the part's pose"
         )
-    points = points[:: max(1, len(points) // (4 * FINE_POINTS))]
+    points = points[:: -(-len(points) // (4 * FINE_POINTS))]
     points = in_order(thin_out(points, FINE_POINTS, rng))
     wide = Prior(np.full(3, np.deg2rad(bound_deg)), np.full(3, bound_mm))
     prior = bed_prior(np.deg2rad(bound_deg), bound_mm) if on_bed else wide

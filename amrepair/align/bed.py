@@ -12,7 +12,7 @@ from amrepair.align.refine import Prior
 from amrepair.frames import moved, rotation_from_vector
 from amrepair.template.port import Template
 
-MOST_LOOKED_AT = 80_000  # points: the bed is a plane
+MOST_LOOKED_AT, MOST_FITTED = 80_000, 10_000  # points: the bed is a plane
 BAND_MM = 1.0  # how far off the guess may have the bed
 BESIDE_MM = 2.0  # bed points this near to the part may be its skirt or its foot
 LEAST_POINTS = 300
@@ -43,7 +43,7 @@ def level_on_bed(
     near = np.flatnonzero(np.abs(placed[:, 2] - low[2]) < BAND_MM)
     if len(near) < LEAST_POINTS:
         return matrix, False
-    near = near[:: max(1, len(near) // 20_000)]
+    near = near[:: -(-len(near) // MOST_FITTED)]
     apart = template.distance(placed[near])
     bed = placed[near[apart > BESIDE_MM]]
     if len(bed) < LEAST_POINTS:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.align.thinning_kernels import first_of_voxels, morton_keys
+from amrepair.frames import box_of
 
 MOST_LOOKED_AT = 200_000
 ROUNDS, CLOSE_ENOUGH = 12, 0.95
@@ -21,9 +22,9 @@ def thin_out(
     if len(points_mm) <= count:
         return np.array(points_mm, dtype=np.float64)
     order = rng.permutation(len(points_mm))[: max(MOST_LOOKED_AT, count)]
-    shuffled = np.ascontiguousarray(points_mm[order], dtype=np.float64)
-    low = shuffled.min(axis=0)
-    extent_mm = float((shuffled.max(axis=0) - low).max())
+    shuffled = np.ascontiguousarray(points_mm.take(order, axis=0), dtype=np.float64)
+    low, high = box_of(shuffled)
+    extent_mm = float((high - low).max())
     slots = np.empty(1 << int(np.ceil(np.log2(2 * count + 2))), dtype=np.int64)
     chosen = np.empty(count, dtype=np.int64)
     best = chosen[:0]
@@ -79,7 +80,7 @@ def in_order(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 def order_of(points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """(n,) numbers of the points in an order in which near ones follow each other."""
-    low = points_mm.min(axis=0)
-    edge_mm = max(float((points_mm.max(axis=0) - low).max()), 1e-9) / (1 << ORDER_BITS)
+    low, high = box_of(points_mm)
+    edge_mm = max(float((high - low).max()), 1e-9) / (1 << ORDER_BITS)
     keys = morton_keys(points_mm, low, edge_mm, ORDER_BITS)
     return np.asarray(np.argsort(keys, kind="stable"))

@@ -5,11 +5,11 @@ Nothing is computed here; messages and progress go to standard error, results to
 
 from __future__ import annotations
 
-import os
 import sys
 
-# As `gcode.cli` has it: BLAS's threads would spin where compiled loops are to run.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from gcode.process import prepare
+
+prepare()  # before numpy is loaded
 
 __all__ = ["main"]
 

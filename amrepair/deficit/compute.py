@@ -360,7 +360,7 @@ def _solid_in_box(
         # but rays that went through it count as well
         core |= (sign * f > limit_mm / 4) & (beyond > limit_mm)
     ask = np.flatnonzero(can_be & ~core & (sign * f > thin_mm) & (clip < 0))
-    nearest = evidence.tree.query(samples[ask], workers=2)[1]
+    nearest = evidence.surfels.tree.query(samples[ask], workers=2)[1]
     core[ask[labels[nearest] == int(label)]] = True
     if gone is not None and len(gone.width_mm):
         maybe = np.flatnonzero(clip < 0)
@@ -368,7 +368,7 @@ def _solid_in_box(
     if label is Label.EXCESS:
         # one reflection in mid-air is a plane, too, but none that stands out by its label
         found = np.flatnonzero(core)
-        nearest = evidence.tree.query(samples[found], workers=2)[1]
+        nearest = evidence.surfels.tree.query(samples[found], workers=2)[1]
         core[found[labels[nearest] != int(label)]] = False
     grow_mm = GROW_FACTOR * tau_mm + float(box.step_mm.max())
     reach = box.distance_to(core.reshape(box.shape)) - grow_mm

@@ -17,8 +17,9 @@ from scipy.stats import norm
 from amrepair.detect.anomaly import AnomalyMap, Label
 from amrepair.detect.evidence import Evidence, gather, with_stubs
 from amrepair.detect.faces import PLANE_POINTS
+from amrepair.detect.near import nearest_within
 from amrepair.detect.normal_variation import forgiven
-from amrepair.detect.rays import range_images
+from amrepair.detect.rays import RangeImage, range_images
 from amrepair.detect.regions import find_regions
 from amrepair.detect.surfels import Surfels, make_surfels
 from amrepair.errors import InputError
@@ -93,6 +94,8 @@ def detect(
     registration_sigma_mm: float = DEFAULT_REGISTRATION_SIGMA_MM,
     false_alarms: float = FALSE_ALARMS_PER_SCAN,
     top_k: int = 1000,
+    images: tuple[RangeImage, ...] | None = None,
+    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
     progress: Progress = silent,
 ) -> AnomalyMap:
     """Score and label a scan against its template.
@@ -114,6 +117,10 @@ def detect(
         Expected number of regions per scan that noise alone makes.
     top_k
         How many of the highest scores make the object score (PASDF: 1000).
+    images
+        What the scan's rays saw (`range_images`), where it is known already.
+    surface
+        The template's surface points, `SURFACE_SPACING_MM` apart, and normals, where they are.
 
     Raises
     ------
@@ -138,16 +145,17 @@ def detect(
     _refuse_wrong_scale(scan, template)
     progress("detect", 0.0, 4.0)
     with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
-        seen = beside.submit(range_images, scan)
+        asked = None if images is not None else beside.submit(range_images, scan)
         f_mm = template.distance(scan.points_mm)
-        keep = ~_background(scan, template, f_mm)
+        surface = surface or template.surface_points(SURFACE_SPACING_MM)
+        keep = ~_background(scan, template, f_mm, surface[0])
         if not keep.any():
             raise InputError(
                 f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the "
                 "template; check its frame, its unit and that it shows this part"
             )
         surfels = make_surfels(scan.points_mm, f_mm, keep)
-        images = seen.result()
+        seen = images or () if asked is None else asked.result()
     limit, source = _threshold(
         scan, template, surfels, threshold_mm, allowance_mm, registration_sigma_mm, false_alarms
     )
@@ -161,7 +169,7 @@ def detect(
         template,
         surfels,
         missing | excess,
-        images,
+        seen,
         threshold_mm=float(limit.low_mm(np.array([PLANE_POINTS]))[0]),
     )
     progress("detect", 2.0, 4.0)
@@ -171,7 +179,9 @@ def detect(
     label[has_cell] = np.where(
         missing[cell], int(Label.MISSING), np.where(excess[cell], int(Label.EXCESS), 0)
     )
-    surface_mm, normals = template.surface_points(max(SURFACE_SPACING_MM, surfels.spacing_mm))
+    if surfels.spacing_mm > SURFACE_SPACING_MM:
+        surface = template.surface_points(surfels.spacing_mm)
+    surface_mm, normals = surface
     surface_label = _label_surface(surface_mm, normals, template, evidence, missing, limit)
     gone_mm = surface_mm[surface_label == int(Label.MISSING)]
     evidence = with_stubs(evidence, scan, gone_mm, missing | excess)
@@ -218,11 +228,14 @@ def _refuse_wrong_scale(scan: Scan, template: Template) -> None:
 
 
 def _background(
-    scan: Scan, template: Template, f_mm: Float[np.ndarray, " n"]
+    scan: Scan,
+    template: Template,
+    f_mm: Float[np.ndarray, " n"],
+    surface_mm: Float[np.ndarray, "m 3"],
 ) -> Bool[np.ndarray, " n"]:
     """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
     low_z = float(template.bounds_mm[0, 2])
-    if _shows_underside(scan, template, f_mm):
+    if _shows_underside(scan, template, f_mm, surface_mm):
         # what lies beside the part in its lowest plane is where it stood when seen from above
         rim_mm = _rim_mm(scan)
         in_plane = np.abs(scan.points_mm[:, 2] - low_z) < rim_mm
@@ -239,7 +252,12 @@ def _rim_mm(scan: Scan) -> float:
     return max(RIM_MM, 4.0 * scan.sigma_mm)
 
 
-def _shows_underside(scan: Scan, template: Template, f_mm: Float[np.ndarray, " n"]) -> bool:
+def _shows_underside(
+    scan: Scan,
+    template: Template,
+    f_mm: Float[np.ndarray, " n"],
+    surface_mm: Float[np.ndarray, "m 3"],
+) -> bool:
     """Whether the part was seen from below: then what bulges there is no bed."""
     low_z = float(template.bounds_mm[0, 2])
     rim_mm = _rim_mm(scan)
@@ -255,8 +273,7 @@ def _shows_underside(scan: Scan, template: Template, f_mm: Float[np.ndarray, " n
     seen = cells_within(scan.points_mm[near[:: len(near) // MOST_FOOT + 1]])
     if not seen:
         return False
-    surface = template.surface_points(SURFACE_SPACING_MM)[0]
-    foot = cells_within(surface[surface[:, 2] < low_z + ON_PLANE_MM])
+    foot = cells_within(surface_mm[surface_mm[:, 2] < low_z + ON_PLANE_MM])
     return len(seen & foot) > SEEN_UNDERSIDE * max(len(foot), 1)
 
 
@@ -300,8 +317,9 @@ def _label_surfels(
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
     """Missing and excess by two scales and hysteresis; missing under the top by its own limits."""
     labels = []
-    empty = surfels.table < 0
-    wide_top = top & (top[surfels.table] | empty).all(axis=1)
+    wide_top = top.copy()
+    around = surfels.table[top]
+    wide_top[top] = (top[around] | (around < 0)).all(axis=1)
     for sign in (-1.0, 1.0):
         own, own_wide = (top, wide_top) if sign < 0 else (np.zeros_like(top),) * 2
         cell = sign * surfels.deviation_mm
@@ -374,8 +392,8 @@ def _label_surface(
     """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
     surfels = evidence.surfels
     reach_mm = 1.8 * surfels.cell_mm + limit.systematic_mm
-    distance, nearest = evidence.tree.query(surface_mm, workers=2)
-    present = (distance < reach_mm) & ~missing[nearest]
+    nearest = nearest_within(surface_mm, surfels.place_mm, reach_mm)
+    present = (nearest >= 0) & ~missing[nearest]
     label = np.where(present, int(Label.OK), int(Label.UNSEEN))
     if evidence.has_rays:
         label[_seen_through(surface_mm, normals, template, evidence, limit)] = int(Label.MISSING)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 
 from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
 from amrepair.detect.near import has_near
@@ -57,7 +56,6 @@ class Evidence:
     off: Bool[np.ndarray, " s"]
     normal: Float[np.ndarray, "s 3"]
     images: tuple[RangeImage, ...]
-    tree: cKDTree
     faces: Faces | None = None
 
     @property
@@ -143,7 +141,7 @@ class Evidence:
         near = nearest_planes(
             points_mm,
             f_mm,
-            self.tree,
+            s.tree,
             place_mm=s.place_mm,
             deviation_mm=s.deviation_mm,
             off=self.off,
@@ -171,7 +169,6 @@ def gather(
     off = off | _strips(template, surfels, off)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
-    tree = cKDTree(surfels.place_mm, compact_nodes=False, balanced_tree=False)
     faces = None
     facing = surfels.toward_sensors(which, scan)
     if facing is not None:
@@ -183,7 +180,7 @@ def gather(
         faces = find_faces(scan, template, surfels, off, patches, threshold_mm=threshold_mm)
         nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
         normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
-    return Evidence(surfels, off, normal, images, tree, faces)
+    return Evidence(surfels, off, normal, images, faces)
 
 
 def with_stubs(

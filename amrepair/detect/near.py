@@ -1,11 +1,12 @@
-"""Which places have points of a cloud beside them, in a grid of cells instead of a tree."""
+"""What of a cloud lies beside places, in a grid of cells instead of a tree."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from amrepair.detect import near_kernels as kernels
+from amrepair.frames import box_of
 
 # In one grid; cells of a larger one are wider than the distance asked for.
 MOST_CELLS = 16_000_000
@@ -21,14 +22,33 @@ def has_near(
     """(k,) whether at least so many of the points lie within a distance of each place."""
     if len(asked_mm) == 0 or len(points_mm) == 0:
         return np.zeros(len(asked_mm), dtype=bool)
-    low, high = asked_mm.min(axis=0), asked_mm.max(axis=0)
+    corner, cell_mm, shape = _cells_about(asked_mm, within_mm)
+    asked, points = np.ascontiguousarray(asked_mm), np.ascontiguousarray(points_mm)
+    start, ordered, _ = kernels.by_cell(points, corner, cell_mm, shape)
+    return np.asarray(
+        kernels.has_enough(asked, start, ordered, corner, cell_mm, shape, within_mm, enough)
+    )
+
+
+def nearest_within(
+    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "n 3"], within_mm: float
+) -> Int[np.ndarray, " k"]:
+    """(k,) number of the point nearest to each place, −1 where none is nearer than a distance."""
+    if len(asked_mm) == 0 or len(points_mm) == 0:
+        return np.full(len(asked_mm), -1, dtype=np.int32)
+    corner, cell_mm, shape = _cells_about(asked_mm, within_mm)
+    asked, points = np.ascontiguousarray(asked_mm), np.ascontiguousarray(points_mm)
+    cells = kernels.by_cell(points, corner, cell_mm, shape)
+    return np.asarray(kernels.nearest(asked, *cells, corner, cell_mm, shape, within_mm))
+
+
+def _cells_about(
+    asked_mm: Float[np.ndarray, "k 3"], within_mm: float
+) -> tuple[Float[np.ndarray, " 3"], float, Int[np.ndarray, " 3"]]:
+    """Corner, edge and shape of cells around places, one empty layer about them."""
+    low, high = box_of(asked_mm)
     size_mm = high - low + 3.0 * within_mm
     # by a hair wider: what rounding puts into the next cell is looked for there
     cell_mm = max(1.0001 * within_mm, float(np.cbrt(np.prod(size_mm) / MOST_CELLS)))
     shape = np.floor((high - low) / cell_mm).astype(np.int64) + 3
-    corner = low - cell_mm
-    asked, points = np.ascontiguousarray(asked_mm), np.ascontiguousarray(points_mm)
-    start, ordered = kernels.by_cell(points, corner, cell_mm, shape)
-    return np.asarray(
-        kernels.has_enough(asked, start, ordered, corner, cell_mm, shape, within_mm, enough)
-    )
+    return low - cell_mm, cell_mm, shape

@@ -11,7 +11,7 @@ from gcode.compiled import njit, prange
 
 @njit(cache=True, nogil=True)
 def by_cell(points: Any, low: Any, cell: float, shape: Any) -> Any:
-    """Where the points of each cell begin and the last one's end, and the points in that order.
+    """Where the points of each cell begin and the last one's end; points and numbers so ordered.
 
     Cells are numbered x-major in a box of `shape` cells; points outside it are left out.
     """
@@ -26,13 +26,14 @@ def by_cell(points: Any, low: Any, cell: float, shape: Any) -> Any:
             start[at[i] + 1] += 1
     for c in range(1, len(start)):
         start[c] += start[c - 1]
-    ordered = np.empty((start[-1], 3))
+    ordered, number = np.empty((start[-1], 3)), np.empty(start[-1], np.int32)
     for i in range(len(points) - 1, -1, -1):
         if at[i] >= 0:
             start[at[i] + 1] -= 1
+            number[start[at[i] + 1]] = i
             for a in range(3):
                 ordered[start[at[i] + 1], a] = points[i, a]
-    return start[1:], ordered
+    return start[1:], ordered, number
 
 
 @njit(cache=True, nogil=True)
@@ -85,4 +86,41 @@ def has_enough(
     found = np.zeros(len(asked), np.bool_)
     for k in prange(len(asked)):
         found[k] = reaches(asked[k], start, ordered, low, cell, shape, within, enough)
+    return found
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def nearest(
+    asked: Any,
+    start: Any,
+    ordered: Any,
+    number: Any,
+    low: Any,
+    cell: float,
+    shape: Any,
+    within: float,
+) -> Any:
+    """(k,) number of the point nearest to each place, −1 where none is within a distance.
+
+    At most a cell's edge; `start`, `ordered` and `number` are of `by_cell`.
+    """
+    found = np.empty(len(asked), np.int32)
+    for k in prange(len(asked)):
+        ix = int((asked[k, 0] - low[0]) / cell)
+        iy = int((asked[k, 1] - low[1]) / cell)
+        iz = int((asked[k, 2] - low[2]) / cell)
+        best, least = -1, within * within
+        for x in range(ix - 1, ix + 2):
+            for y in range(iy - 1, iy + 2):
+                first = (x * shape[1] + y) * shape[2] + iz - 1
+                for p in range(start[first], start[first + 3]):
+                    dx, dy, dz = (
+                        ordered[p, 0] - asked[k, 0],
+                        ordered[p, 1] - asked[k, 1],
+                        ordered[p, 2] - asked[k, 2],
+                    )
+                    apart = dx * dx + dy * dy + dz * dz
+                    if apart < least:
+                        best, least = number[p], apart
+        found[k] = best
     return found

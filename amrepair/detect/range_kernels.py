@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcode.compiled import njit
+from gcode.compiled import njit, prange
 
 
 @njit(cache=True, nogil=True)
@@ -109,11 +109,16 @@ def close_pinholes(depth, least):
             n = 0
             for rr in range(max(r - 1, 0), min(r + 2, rows)):
                 for cc in range(max(c - 1, 0), min(c + 2, columns)):
-                    if np.isfinite(depth[rr, cc]):
-                        seen[n] = depth[rr, cc]
+                    here = depth[rr, cc]
+                    if np.isfinite(here):  # as many as eight, put in their order
+                        k = n
+                        while k > 0 and seen[k - 1] > here:
+                            seen[k] = seen[k - 1]
+                            k -= 1
+                        seen[k] = here
                         n += 1
             if n >= least:
-                out[r, c] = np.median(seen[:n])
+                out[r, c] = 0.5 * (seen[(n - 1) // 2] + seen[n // 2])
     return out
 
 
@@ -197,7 +202,7 @@ def incidence(depth, low, pixel, blend):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def look_up(
     points, sensor, axes, low, pixel, depth, least, cosine, blend, flattest, best, cautious
 ):
@@ -208,7 +213,7 @@ def look_up(
     along that line nothing is raised.
     """
     rows, columns = depth.shape
-    for i in range(len(points)):
+    for i in prange(len(points)):
         x, y, z = points[i, 0] - sensor[0], points[i, 1] - sensor[1], points[i, 2] - sensor[2]
         ahead = x * axes[2, 0] + y * axes[2, 1] + z * axes[2, 2]
         if ahead <= 1e-6:

@@ -7,12 +7,13 @@ sensor makes that a question of one look-up: how far in front of the seen surfac
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from amrepair.detect import range_kernels as kernels
+from amrepair.frames import Transform
 from amrepair.scans import Scan
 from gcode.compiled import get_num_threads
 
@@ -49,6 +50,14 @@ class RangeImage:
     cosine: Float[np.ndarray, "r c"]
     blend_mm: float
     step_mm: float
+
+    def moved(self, target_from_source: Transform) -> RangeImage:
+        """The same image of a scan in another frame."""
+        return replace(
+            self,
+            sensor_mm=target_from_source.apply(self.sensor_mm[None])[0],
+            axes=target_from_source.rotate(self.axes),
+        )
 
     def raise_clearance(
         self,

@@ -178,7 +178,7 @@ def _topped(
 ) -> Bool[np.ndarray, " m"]:
     """Looks at which something was seen at the line's own top: there it is, however rounded."""
     top_mm = middle_mm + half_mm[:, None] * np.array([0.0, 0.0, 1.0])
-    distance, near = evidence.tree.query(top_mm, k=ABOUT)
+    distance, near = evidence.surfels.tree.query(top_mm, k=ABOUT)
     height_mm = np.append(evidence.surfels.place_mm[:, 2], np.inf)[near]  # inf: no such neighbour
     low_mm = np.abs(top_mm[:, 2:] - height_mm)
     at_top = (distance < 0.5 * width_mm[:, None]) & (low_mm < TOP_SHARE * half_mm[:, None])

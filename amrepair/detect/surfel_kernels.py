@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcode.compiled import njit
+from gcode.compiled import njit, prange
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def neighbour_table(keys, stride_x, stride_y):
     """(s, 27) index of the cell at each offset, −1 where it is empty.
 
@@ -17,30 +17,27 @@ def neighbour_table(keys, stride_x, stride_y):
     """
     n = keys.shape[0]
     table = np.full((n, 27), -1, np.int32)
-    column = 0
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                offset = dx * stride_x + dy * stride_y + dz
-                j = 0
-                for i in range(n):
-                    want = keys[i] + offset
-                    while j < n and keys[j] < want:
-                        j += 1
-                    if j == n:
-                        break
-                    if keys[j] == want:
-                        table[i, column] = j
-                column += 1
+    for column in prange(27):
+        dx, dy, dz = column // 9 - 1, column // 3 % 3 - 1, column % 3 - 1
+        offset = dx * stride_x + dy * stride_y + dz
+        j = 0
+        for i in range(n):
+            want = keys[i] + offset
+            while j < n and keys[j] < want:
+                j += 1
+            if j == n:
+                break
+            if keys[j] == want:
+                table[i, column] = j
     return table
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def neighbour_sums(table, values):
     """(s, c) sums of `values` over each cell and its neighbours."""
     n, channels = table.shape[0], values.shape[1]
     out = np.zeros((n, channels))
-    for i in range(n):
+    for i in prange(n):
         for k in range(table.shape[1]):
             j = table[i, k]
             if j >= 0:
@@ -107,12 +104,12 @@ def sort_by_cell(points, keep, low, cell, shape):
     return order, start, keys, of_point
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def cell_sums(order, start, points, origin, deviation):
     """(s, 11) per cell: Σx Σy Σz Σf Σxx Σyy Σzz Σxy Σxz Σyz Σff about one origin."""
     n = start.shape[0] - 1
     out = np.zeros((n, 11))
-    for i in range(n):
+    for i in prange(n):
         for k in range(start[i], start[i + 1]):
             p = order[k]
             x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]

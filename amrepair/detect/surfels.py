@@ -7,9 +7,11 @@ and so a bead-sized average and a local plane. It decides nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from amrepair.detect import surfel_kernels as kernels
 from amrepair.scans import Scan
@@ -21,7 +23,7 @@ AREA_PER_CELL = 1.5
 MOST_CELLS = 16_000_000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Surfels:
     """Occupied cells of a scan, template frame.
 
@@ -63,6 +65,11 @@ class Surfels:
 
     def __len__(self) -> int:
         return len(self.place_mm)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the places; made when first asked for, as at a clean layer few are."""
+        return cKDTree(self.place_mm, compact_nodes=False, balanced_tree=False)
 
     def planes(self, which: Int[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
         """(q, 3) unit normals (either sign) of the planes through each cell and its neighbours."""

@@ -198,21 +198,29 @@ def _shifted(walls: _Surface, layer_mm: float) -> Kind | None:
     if len(walls) < 2 * LEAST_POINTS:
         return None
     total = float(((dev - dev.mean()) ** 2).sum())
+    # normal equations of the walls below each cut, from the foot up; those above are the rest
+    up = np.argsort(z)
+    design = np.column_stack([out, np.ones(len(z)), dev])[up]
+    sums = np.cumsum(design[:, :, None] * design[:, None, :], axis=0)
     best = (0.0, 0.0)
-    for cut in np.quantile(z, np.linspace(0.1, 0.9, 17)):
-        shifts, left = [], 0.0
-        for part in (z > cut, z <= cut):
-            design = np.column_stack([out[part], np.ones(part.sum())])
-            found, *_ = np.linalg.lstsq(design, dev[part], rcond=None)
-            shifts.append(found[:2])
-            left += float(((dev[part] - design @ found) ** 2).sum())
-        best = max(best, (total - left, float(np.linalg.norm(shifts[0] - shifts[1]))))
+    for cut in np.linspace(0.1, 0.9, 17):
+        below = sums[int(cut * len(z)) - 1]
+        parts = [_fitted(moments) for moments in (sums[-1] - below, below)]
+        left = parts[0][1] + parts[1][1]
+        jump = float(np.linalg.norm(parts[0][0][:2] - parts[1][0][:2]))
+        best = max(best, (total - left, jump))
     gained, jump_mm = best
     share = gained / max(total - len(walls) * walls.noise_mm**2, 0.3 * total, 1e-12)
     if jump_mm > SHIFT_LAYERS * layer_mm and share > SHIFT_SHARE:
         sure = _sure(jump_mm, SHIFT_LAYERS * layer_mm) * min(1.0, share / (1.5 * SHIFT_SHARE))
         return Kind(DefectType.LAYER_SHIFT, sure)
     return None
+
+
+def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Least squares of the last column by the others, from all their products; what it leaves."""
+    found = np.linalg.lstsq(moments[:3, :3], moments[:3, 3], rcond=1e-9)[0]
+    return found, float(moments[3, 3] - found @ moments[:3, 3])
 
 
 def _warped(top: _Surface, layer_mm: float) -> Kind | None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool
 
+from amrepair.detect.detection import SURFACE_SPACING_MM
 from amrepair.detect.skipped import PlannedBeads
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop
@@ -63,6 +64,7 @@ def sites(
             planned=planned,
             beads=recent,
             lines=_lines(job, done),
+            surface=(planned or below).surface_points(SURFACE_SPACING_MM),
         )
 
     return at

@@ -4,13 +4,9 @@ Exit 0 done, 2 bad input or refused, 4 printer or link. `--json` prints one obje
 output; messages and progress go to standard error.
 """
 
-import os
-
 from gcode.cli.app import main
+from gcode.process import prepare
 
-# Products of some thousand rows by three columns take less time than BLAS's threads need to wake;
-# and those, spinning for more work, hold a core that compiled loops would run on. Read when numpy
-# is loaded, which a command line does late.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+prepare()  # before numpy is loaded, which a command line does late
 
 __all__ = ["main"]

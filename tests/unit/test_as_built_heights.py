@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from amrepair.deficit import compute_deficit
 from amrepair.deficit.heights import _without_fins, standing_heights
 from amrepair.detect import faces
-from amrepair.detect.near import has_near
+from amrepair.detect.near import has_near, nearest_within
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
@@ -71,6 +71,19 @@ def test_points_in_company_are_those_that_a_tree_finds(seed: int, spread_mm: flo
     found = has_near(asked, points, 0.4, enough=3)
     truth = cKDTree(points).query(asked, k=3)[0][:, -1] <= 0.4
     assert (found == truth).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), spread_mm=st.sampled_from([0.3, 3.0, 40.0]))
+def test_the_nearest_point_within_reach_is_the_one_that_a_tree_finds(
+    seed: int, spread_mm: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-spread_mm, spread_mm, (400, 3)) * [1.0, 1.0, 0.2]
+    asked = rng.uniform(-spread_mm, spread_mm, (60, 3)) * [1.0, 1.0, 0.2]
+    found = nearest_within(asked, points, 0.9)
+    distance, nearest = cKDTree(points).query(asked)
+    assert (found == np.where(distance < 0.9, nearest, -1)).all()
 
 
 def test_a_slot_that_was_designed_stays_open() -> None:

@@ -1,0 +1,30 @@
+"""What a command's process is set to before it loads anything: one thread in BLAS, memory kept.
+
+Products of some thousand rows by three columns take less time than BLAS's threads need to wake;
+and those, spinning for more work, hold a core that compiled loops would run on. And glibc gives
+every large array back to the system as soon as it is let go: each new one then costs a fault per
+page, a sixth of the processor's time at a look at half a million points.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+
+# mallopt(3): what of the heap's top is kept, and from what size on memory is mapped by itself, of
+# which glibc allows no more.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+_KEPT_BYTES, _MAPPED_BYTES = 1 << 30, 32 << 20
+
+
+def prepare() -> None:
+    """Set it; what the environment says comes first, and other C libraries are left as they are."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is loaded
+    if any(name.startswith("MALLOC_") for name in os.environ):
+        return
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (AttributeError, OSError):
+        return
+    mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
+    mallopt(_MMAP_THRESHOLD, _MAPPED_BYTES)

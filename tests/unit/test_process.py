@@ -1,0 +1,48 @@
+"""A command's process keeps the memory that it lets go of, and has one thread in BLAS."""
+
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+# Six arrays of twelve megabytes, made and let go together, twice; the faults of the second time.
+AGAIN = """
+import {first}
+import os, resource
+import numpy as np
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(6):
+        arrays = [np.ones(1_500_000) for _ in range(6)]
+        del arrays
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults()
+print(faults(), os.environ.get("OPENBLAS_NUM_THREADS"))
+"""
+
+
+def run_again(first: str, **settings: str) -> tuple[int, str]:
+    mine = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "OPENBLAS"))}
+    told = subprocess.run(
+        [sys.executable, "-c", AGAIN.format(first=first)],
+        env=mine | settings, capture_output=True, text=True, check=True,
+    ).stdout.split()  # fmt: skip
+    return int(told[0]), told[1]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library's memory")
+def test_memory_is_kept_where_a_command_runs() -> None:
+    assert run_again("gcode.cli") == (pytest.approx(0, abs=50), "1")
+    assert run_again("amrepair.cli")[0] < 50
+    # numpy asks for huge pages: there are few; without them some three thousand an array
+    assert run_again("math")[0] > 50
+
+
+def test_what_the_environment_says_comes_first() -> None:
+    faults, threads = run_again(
+        "gcode.cli", MALLOC_MMAP_THRESHOLD_="131072", OPENBLAS_NUM_THREADS="2"
+    )
+    assert faults > 50
+    assert threads == "2"
