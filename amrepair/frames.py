@@ -139,9 +139,9 @@ def box_of(points_mm: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "2 k"]:
 
 
 def in_box(
-    points_mm: Float[np.ndarray, "n 3"],
-    low_mm: Float[np.ndarray, " 3"],
-    high_mm: Float[np.ndarray, " 3"],
+    points_mm: Float[np.ndarray, "n k"],
+    low_mm: Float[np.ndarray, " k"],
+    high_mm: Float[np.ndarray, " k"],
 ) -> Bool[np.ndarray, " n"]:
     """(n,) which points lie in a box, its faces included; axis by axis, an eighth of the time."""
     inside = np.ones(len(points_mm), bool)

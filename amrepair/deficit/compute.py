@@ -8,6 +8,7 @@ averages say so. Empty space counts only where a ray crossed it or scanned surfa
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -158,29 +159,31 @@ def compute_deficit(
     if evidence is None:
         raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
     lines = None if beads is None else skipped(beads, evidence, template)
-    solids: dict[Label, list[manifold3d.Manifold]] = {Label.MISSING: [], Label.EXCESS: []}
+
+    def seen_heights() -> HeightField:
+        return as_built_heights(
+            scan,
+            template,
+            evidence.spacing_mm,
+            build_from_template=build_from_template,
+            printed_z_mm=printed_z_mm,
+            cell_mm=cell_mm,
+            images=evidence.images,
+        )
+
+    look = as_built or seen_heights
+    solids: dict[Label, list[manifold3d.Manifold]] = {}
     regions: list[Region] = []
-    for label, found in solids.items():
-        gone = lines if label is Label.MISSING else None
-        boxes = _boxes(anomaly, evidence, template, label, gone)
-        finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
-        for i, (low, high, depth) in enumerate(boxes):
-            progress(f"deficit: {label.name.lower()}", float(i), float(len(boxes)))
-            solid = _solid_in_box(
-                template,
-                evidence,
-                anomaly,
-                label,
-                low,
-                high,
-                depth_mm=min(depth, finest_mm),
-                tau_mm=tau_mm,
-                gone=gone,
-            )
-            for piece in solid.decompose():
-                if piece.volume() >= CRUMB_MM3:
-                    found.append(piece)
-                    regions.append(_region(piece, label, template, build_from_template, gone))
+    with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
+        something = bool((np.asarray(anomaly.surfel_label) == int(Label.MISSING)).any())
+        early = beside.submit(look) if something else None
+        for label in (Label.MISSING, Label.EXCESS):
+            gone = lines if label is Label.MISSING else None
+            solids[label] = _pieces(template, evidence, anomaly, label, tau_mm, gone, progress)
+            regions += [
+                _region(piece, label, template, build_from_template, gone)
+                for piece in solids[label]
+            ]
     matrix = build_from_template.matrix[:3]
     missing, excess = (
         manifold3d.Manifold.batch_boolean(found, manifold3d.OpType.Add).transform(matrix)
@@ -191,15 +194,9 @@ def compute_deficit(
     unseen = anomaly.template_label == int(Label.UNSEEN)
 
     def stands() -> HeightField:
-        seen = as_built_heights(
-            scan,
-            template,
-            evidence.spacing_mm,
-            build_from_template=build_from_template,
-            printed_z_mm=printed_z_mm,
-            cell_mm=cell_mm,
-            images=evidence.images,
-        )
+        seen = look() if early is None else early.result()
+        if as_built is not None:
+            return seen
         expected: Any = template.solid()
         solid, gone = standing_heights(seen, expected.transform(matrix), missing, excess)
         points_mm = build_from_template.apply(scan.points_mm)
@@ -213,9 +210,39 @@ def compute_deficit(
         regions=tuple(sorted(regions, key=lambda r: (int(r.label), -r.volume_mm3))),
         tolerance_mm=tau_mm,
         unseen_area_mm2=_unseen_area(anomaly, int(unseen.sum())),
-        stands=Standing(as_built or stands),
+        stands=Standing(stands),
         gone=lines,
     )
+
+
+def _pieces(
+    template: Template,
+    evidence: Evidence,
+    anomaly: AnomalyMap,
+    label: Label,
+    tau_mm: float,
+    gone: PlannedBeads | None,
+    progress: Progress,
+) -> list[manifold3d.Manifold]:
+    """Solids of one label, each in one piece, template frame."""
+    boxes = _boxes(anomaly, evidence, template, label, gone)
+    finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
+    found: list[manifold3d.Manifold] = []
+    for i, (low, high, depth) in enumerate(boxes):
+        progress(f"deficit: {label.name.lower()}", float(i), float(len(boxes)))
+        solid = _solid_in_box(
+            template,
+            evidence,
+            anomaly,
+            label,
+            low,
+            high,
+            depth_mm=min(depth, finest_mm),
+            tau_mm=tau_mm,
+            gone=gone,
+        )
+        found += [piece for piece in solid.decompose() if piece.volume() >= CRUMB_MM3]
+    return found
 
 
 def _boxes(

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.deficit import heights_kernels as kernels
+from amrepair.deficit.walls import window_around
 from amrepair.detect.near import has_near
 from amrepair.detect.rays import RangeImage, clearances
 from amrepair.frames import Transform, box_corners
@@ -45,6 +46,8 @@ FILM_MM = 0.4
 LEAST_FILM_MM = 0.1  # that the scan can tell from nothing
 # In fine cells: thinner than a bead, and than two, of which points would have been seen.
 FIN_CELLS, UNSEEN_FIN_CELLS = 2, 8
+# Around what is missing: where fins are looked for, and as far again as they are told from there.
+FIN_WINDOW_CELLS = 3 * UNSEEN_FIN_CELLS
 CHANCE_CELLS = 5
 MOST_STEPS = 64  # by which what nobody saw is followed down
 # In the scan's noise: how far a point is off upwards or aside, and tells of nothing.
@@ -156,23 +159,20 @@ def standing_heights(
     fine = HeightField(
         np.array(box[:2]), cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool)
     )
-    columns = [columns_of(solid, fine) for solid in (expected, missing)]
-    z_mm = raster_kernels.column_rest(*columns[0], *columns[1], FILM_MM, 0.0).reshape(ny, nx)
+    whole, lost = (columns_of(solid, fine) for solid in (expected, missing))
+    z_mm = raster_kernels.column_rest(*whole, *lost, FILM_MM, 0.0).reshape(ny, nx)
     at = _cells_over(seen, fine)
     # a film that the scan sees, around there too, is what is left of the part
-    films = raster_kernels.column_rest(*columns[0], *columns[1], LEAST_FILM_MM, 0.0).reshape(ny, nx)
+    films = raster_kernels.column_rest(*whole, *lost, LEAST_FILM_MM, 0.0).reshape(ny, nx)
     # a few cells without a point on it among others are chance
     sampled = ndimage.grey_closing(np.where(seen.seen, seen.z_mm, 0.0), CHANCE_CELLS)
     z_mm = np.where(ndimage.minimum_filter(sampled, 3)[at] > films - TRUST_MM, films, z_mm)
-    untouched = (columns[1][0][1:] == columns[1][0][:-1]).reshape(ny, nx)
-    # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
-    beside = ~ndimage.binary_erosion(untouched, np.ones((3, 3)), border_value=1)
-    z_mm = np.where(beside, _without_fins(z_mm, FIN_CELLS), z_mm)
-    # nor is one there that no wall is thin enough for, and of which no point was seen
-    near = ndimage.maximum_filter(~untouched, 2 * UNSEEN_FIN_CELLS - 1)
-    seen_mm = ndimage.maximum_filter(np.where(seen.seen, seen.z_mm, -np.inf), 3)[at]
-    unseen = near & (seen_mm < z_mm - TRUST_MM)
-    z_mm = np.where(unseen, _without_fins(z_mm, UNSEEN_FIN_CELLS), z_mm)
+    gone = (lost[0][1:] != lost[0][:-1]).reshape(ny, nx)
+    if gone.any():
+        rows, columns = window_around(gone, FIN_WINDOW_CELLS)
+        seen_mm = ndimage.maximum_filter(np.where(seen.seen, seen.z_mm, -np.inf), 3)
+        seen_mm = seen_mm[at[0][rows], at[1][:, columns]]
+        z_mm[rows, columns] = _without_rims_fins(z_mm[rows, columns], gone[rows, columns], seen_mm)
     if not excess.is_empty():
         z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
@@ -182,16 +182,16 @@ def standing_heights(
     by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
     off_mm = seen.z_mm[at] - z_mm
-    agrees = untouched & ((np.abs(off_mm) < NOISE_MM) | _by_chance(off_mm, around))
+    agrees = ~gone & ((np.abs(off_mm) < NOISE_MM) | _by_chance(off_mm, around))
     # what is much lower was seen on another side: of this one no point fell into the cell
     beneath = seen.z_mm[at] < z_mm - TRUST_MM
     known = seen.seen[at]
     # where something is missing it was seen to be; below it there is what was expected, and at
     # its rim, where columns and cells do not end alike
-    rim = ndimage.maximum_filter(~untouched, around)
+    rim = ndimage.maximum_filter(gone, around)
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     field = HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
-    return field, ~untouched
+    return field, gone
 
 
 def _cells_over(
@@ -235,6 +235,21 @@ def with_what_stands_out(
     z_mm = np.array(field.z_mm, dtype=np.float64)
     np.maximum.at(z_mm, tuple(index[inside].T), out[inside, 2] - off_mm)
     return field.raised(z_mm)
+
+
+def _without_rims_fins(
+    z_mm: Float[np.ndarray, "ny nx"],
+    gone: Bool[np.ndarray, "ny nx"],
+    seen_mm: Float[np.ndarray, "ny nx"],
+) -> Float[np.ndarray, "ny nx"]:
+    """Lower what is too thin to be there beside what is missing; `seen_mm` is the highest seen."""
+    # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
+    beside = ndimage.maximum_filter(gone, 3)
+    z_mm = np.where(beside, _without_fins(z_mm, FIN_CELLS), z_mm)
+    # nor is one there that no wall is thin enough for, and of which no point was seen
+    near = ndimage.maximum_filter(gone, 2 * UNSEEN_FIN_CELLS - 1)
+    unseen = near & (seen_mm < z_mm - TRUST_MM)
+    return np.where(unseen, _without_fins(z_mm, UNSEEN_FIN_CELLS), z_mm)
 
 
 def _without_fins(z_mm: Float[np.ndarray, "ny nx"], cells: int) -> Float[np.ndarray, "ny nx"]:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.deficit import walls_kernels as kernels
+from amrepair.frames import in_box
 from gcode.surfaces import HeightField
 
 # A step from column to column that is a wall, not a slope.
@@ -47,7 +48,7 @@ def with_sharp_walls(
     """
     if not gone.any() or sigma_mm <= 0:
         return field
-    rows, columns = _around(gone, BESIDE_CELLS + int(np.ceil(RADIUS_MM / field.cell_mm)))
+    rows, columns = window_around(gone, BESIDE_CELLS + int(np.ceil(RADIUS_MM / field.cell_mm)))
     z_mm = np.array(field.z_mm, dtype=np.float64)
     near = z_mm[rows, columns]
     beside = ndimage.maximum_filter(gone[rows, columns], 2 * BESIDE_CELLS + 1)
@@ -71,7 +72,7 @@ def with_even_crests(field: HeightField, gone: Bool[np.ndarray, "ny nx"]) -> Hei
     """
     if not gone.any():
         return field
-    rows, columns = _around(gone, CREST_CELLS + BESIDE_CELLS)
+    rows, columns = window_around(gone, CREST_CELLS + BESIDE_CELLS)
     z_mm = np.array(field.z_mm, dtype=np.float64)
     near = z_mm[rows, columns]
     beside = ndimage.maximum_filter(gone[rows, columns], 2 * BESIDE_CELLS + 1)
@@ -84,7 +85,7 @@ def with_even_crests(field: HeightField, gone: Bool[np.ndarray, "ny nx"]) -> Hei
     return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
 
 
-def _around(gone: Bool[np.ndarray, "ny nx"], margin: int) -> tuple[slice, slice]:
+def window_around(gone: Bool[np.ndarray, "ny nx"], margin: int) -> tuple[slice, slice]:
     """Rows and columns of the window around those that something is missing from."""
     rows, columns = (
         slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in gone.nonzero()
@@ -101,8 +102,7 @@ def _by_cell(
     """Points over a grid sorted by its cells, and where those of each cell begin, by row."""
     ny, nx = shape
     high_mm = corner_mm + cell_mm * np.array([nx, ny])
-    xy = points_mm[:, :2]
-    own = points_mm[((xy >= corner_mm) & (xy < high_mm)).all(axis=1)]
+    own = points_mm[in_box(points_mm[:, :2], corner_mm, high_mm)]
     index = np.floor((own[:, :2] - corner_mm) / cell_mm).astype(np.int64)
     cell = np.minimum(index[:, 1], ny - 1) * nx + np.minimum(index[:, 0], nx - 1)
     ends = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=ny * nx))])

@@ -26,7 +26,7 @@ NEIGHBOURS = 4
 SOLID_MM = -5.0
 # A pixel beside a silhouette, seen aslant, is off by no more than this many of its steps.
 SHARP_STEPS = 1.5
-SHARP_MM = 0.5
+SHARP_MM = 0.25  # a deficit's voxel is no larger: farther off no surface is shaped
 # As far from template that is gone as a stub of it can be, and as deep inside as noise is not.
 STUB_CELLS = 2.5
 STUB_MM = 0.05

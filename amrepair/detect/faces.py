@@ -95,15 +95,12 @@ def nearest_planes(
     k = min(count, len(place_mm))
     distance, index = tree.query(points_mm, k=k, workers=2)
     distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    offset = points_mm[:, None, :] - place_mm[index]
-    plane = (offset * normal[index]).sum(axis=2)
-    field = f_mm[:, None] - deviation_mm[index]
-    value = np.where(off[index], plane, field)
-    weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / blur_mm**2)
-    best = (weight * value).sum(axis=1) / weight.sum(axis=1)
-    height = np.abs(value[:, 0])
+    value, height = kernels.plane_values(
+        np.ascontiguousarray(points_mm), f_mm, distance, index,
+        place_mm, deviation_mm, off, normal, blur_mm,
+    )  # fmt: skip
     sideways = np.sqrt(np.maximum(distance[:, 0] ** 2 - height**2, 0.0))
-    return NearestPlanes(best, distance[:, 0].copy(), height, sideways, index[:, 0].copy())
+    return NearestPlanes(value, distance[:, 0].copy(), height, sideways, index[:, 0].copy())
 
 
 @dataclass(frozen=True, slots=True)

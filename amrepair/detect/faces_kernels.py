@@ -65,3 +65,39 @@ def smoothed(points: Any, index: Any, rounds: int, spread: float, least_spread: 
             place[i, a] = points[i, a] - above * normal[a]
             normals[i, a] = normal[a]
     return place, normals
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def plane_values(
+    points: Any,
+    f: Any,
+    distance: Any,
+    index: Any,
+    place: Any,
+    deviation: Any,
+    off: Any,
+    normal: Any,
+    blur: float,
+) -> Any:
+    """(n,) signed distance by the nearest places, weighted, and how high above the nearest alone.
+
+    `distance` and `index` (n, k) are of the nearest places, those `off` the template planes.
+    """
+    value, height = np.empty(len(points)), np.empty(len(points))
+    for i in prange(len(points)):
+        total = weights = 0.0
+        for k in range(index.shape[1]):
+            j = index[i, k]
+            if off[j]:
+                told = 0.0
+                for a in range(3):
+                    told += (points[i, a] - place[j, a]) * normal[j, a]
+            else:
+                told = f[i] - deviation[j]
+            if k == 0:
+                height[i] = abs(told)
+            weight = np.exp(-(distance[i, k] ** 2 - distance[i, 0] ** 2) / blur**2)
+            total += weight * told
+            weights += weight
+        value[i] = total / weights
+    return value, height

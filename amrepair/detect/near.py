@@ -24,7 +24,7 @@ def has_near(
         return np.zeros(len(asked_mm), dtype=bool)
     corner, cell_mm, shape = _cells_about(asked_mm, within_mm)
     asked, points = np.ascontiguousarray(asked_mm), np.ascontiguousarray(points_mm)
-    start, ordered, _ = kernels.by_cell(points, corner, cell_mm, shape)
+    start, ordered, _ = kernels.by_cell(asked, points, corner, cell_mm, shape)
     return np.asarray(
         kernels.has_enough(asked, start, ordered, corner, cell_mm, shape, within_mm, enough)
     )
@@ -38,7 +38,7 @@ def nearest_within(
         return np.full(len(asked_mm), -1, dtype=np.int32)
     corner, cell_mm, shape = _cells_about(asked_mm, within_mm)
     asked, points = np.ascontiguousarray(asked_mm), np.ascontiguousarray(points_mm)
-    cells = kernels.by_cell(points, corner, cell_mm, shape)
+    cells = kernels.by_cell(asked, points, corner, cell_mm, shape)
     return np.asarray(kernels.nearest(asked, *cells, corner, cell_mm, shape, within_mm))
 
 

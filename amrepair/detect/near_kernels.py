@@ -10,20 +10,37 @@ from gcode.compiled import njit, prange
 
 
 @njit(cache=True, nogil=True)
-def by_cell(points: Any, low: Any, cell: float, shape: Any) -> Any:
+def by_cell(asked: Any, points: Any, low: Any, cell: float, shape: Any) -> Any:
     """Where the points of each cell begin and the last one's end; points and numbers so ordered.
 
-    Cells are numbered x-major in a box of `shape` cells; points outside it are left out.
+    Cells are numbered x-major in a box of `shape` cells, an empty layer about all places that are
+    asked about; points in no cell of theirs, nor beside one, are left out.
     """
     start = np.zeros(shape[0] * shape[1] * shape[2] + 2, np.int32)
+    own, beside = np.uint8(2), np.uint8(1)
+    kind = np.zeros(len(start), np.uint8)
+    for k in range(len(asked)):
+        x = int((asked[k, 0] - low[0]) / cell)
+        y = int((asked[k, 1] - low[1]) / cell)
+        z = int((asked[k, 2] - low[2]) / cell)
+        if kind[(x * shape[1] + y) * shape[2] + z] & own:
+            continue
+        kind[(x * shape[1] + y) * shape[2] + z] |= own
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                first = ((x + dx) * shape[1] + y + dy) * shape[2] + z - 1
+                for at_z in range(first, first + 3):
+                    kind[at_z] |= beside
     at = np.full(len(points), -1, np.int32)
     for i in range(len(points)):
         x = (points[i, 0] - low[0]) / cell
         y = (points[i, 1] - low[1]) / cell
         z = (points[i, 2] - low[2]) / cell
         if x >= 0 and y >= 0 and z >= 0 and x < shape[0] and y < shape[1] and z < shape[2]:
-            at[i] = (int(x) * shape[1] + int(y)) * shape[2] + int(z)
-            start[at[i] + 1] += 1
+            cell_of = (int(x) * shape[1] + int(y)) * shape[2] + int(z)
+            if kind[cell_of]:
+                at[i] = cell_of
+                start[cell_of + 1] += 1
     for c in range(1, len(start)):
         start[c] += start[c - 1]
     ordered, number = np.empty((start[-1], 3)), np.empty(start[-1], np.int32)

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.detect import skipped_kernels as kernels
 from amrepair.detect.evidence import SOLID_MM, Evidence
-from amrepair.frames import in_box
 from amrepair.template.port import Template
 
 STEP_MM = 0.25
@@ -74,17 +74,15 @@ class PlannedBeads:
 
     def holds(self, points_mm: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
         """Which points lie in any of them."""
-        inside = np.zeros(len(points_mm), dtype=bool)
-        for a, b, wide, high in zip(
-            self.start_mm, self.end_mm, self.width_mm, self.height_mm, strict=True
-        ):
-            low = np.minimum(a, b) - np.array([0.5 * wide, 0.5 * wide, high])
-            top = np.maximum(a, b) + np.array([0.5 * wide, 0.5 * wide, 0.0])
-            ask = np.flatnonzero(in_box(points_mm, low, top))
-            along, away = b[:2] - a[:2], points_mm[ask, :2] - a[:2]
-            share = np.clip(away @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-            inside[ask] |= np.linalg.norm(away - share[:, None] * along, axis=1) <= 0.5 * wide
-        return inside
+        return np.asarray(
+            kernels.in_beads(
+                np.ascontiguousarray(points_mm),
+                self.start_mm,
+                self.end_mm,
+                self.width_mm,
+                self.height_mm,
+            )
+        )
 
 
 def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> PlannedBeads:

@@ -16,13 +16,13 @@ from scipy.spatial import cKDTree
 
 from gcode.moves import Role
 from gcode.slicing.beads import Bead
+from gcode.surfaces import raster_kernels as kernels
 
 LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
 # Beside the deficit's columns: its rim is as uncertain as the scan's noise and spacing make it.
 RIM_MM = 0.3
 ON_MM = 0.05  # of a line's middle
-SAMPLED_MM = 0.05  # along a line, to tell which columns lie in it, and how exactly
-EXACTLY_MM = 0.01
+EXACTLY_MM = 0.01  # how exactly it is told which columns lie in a line
 # A scanner's spot rounds off what is gone: a little beside a lot is the lot's own. Shares of what
 # the job lays in a piece of a line: from here on it lacks a lot, up to there a little, and less is
 # nothing.
@@ -116,8 +116,9 @@ class JobColumns:
     ) -> None:
         away_mm = ndimage.distance_transform_edt(~asked) * cell_mm
         self.near = np.asarray(away_mm <= RIM_MM)
-        self._points_mm = points_mm[self.near.ravel()]
-        low, high = self._points_mm.min(axis=0), self._points_mm.max(axis=0)
+        self._corner_mm = points_mm[0] - 0.5 * cell_mm
+        near_mm = points_mm[self.near.ravel()]
+        low, high = near_mm.min(axis=0), near_mm.max(axis=0)
         wide_mm = float((lines.section_mm2 / np.maximum(lines.height_mm, 1e-6)).max(initial=0.0))
         self._cell_mm = cell_mm
         self._lines = lines.near(
@@ -140,23 +141,12 @@ class JobColumns:
     def _over(self, lines: JobLines) -> Bool[np.ndarray, "ny nx"] | None:
         if len(lines.rim) == 0:
             return None
-        length_mm = np.linalg.norm(lines.end_mm - lines.start_mm, axis=1)
-        count = 1 + np.ceil(length_mm / SAMPLED_MM).astype(np.int64)
-        line = np.repeat(np.arange(len(count)), count)
-        step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
-        share = (step / np.maximum(count - 1, 1)[line])[:, None]
-        samples = (lines.start_mm[line] + share * (lines.end_mm - lines.start_mm)[line])[:, :2]
-        half_mm = (0.5 * lines.section_mm2 / lines.height_mm)[line]
-        # the nearest line is not always the widest, but lines are about as wide as each other
-        distance, nearest = cKDTree(samples).query(
-            self._points_mm, distance_upper_bound=float(half_mm.max()) + 2 * EXACTLY_MM
-        )
-        found = np.isfinite(distance)
-        inside = np.zeros(len(found), dtype=bool)
-        inside[found] = distance[found] <= half_mm[nearest[found]] + EXACTLY_MM
-        mask = np.zeros(self.near.shape, dtype=bool)
-        mask[self.near] = inside
-        return mask
+        half_mm = 0.5 * lines.section_mm2 / lines.height_mm
+        over = kernels.beside_lines(
+            lines.start_mm[:, :2], lines.end_mm[:, :2], half_mm + EXACTLY_MM,
+            self._corner_mm, self._cell_mm, *self.near.shape,
+        )  # fmt: skip
+        return np.asarray(over & self.near)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ from gcode.slicing.medial import fill_thin
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
+from gcode.surfaces import raster_kernels
 
 # A patch presses into pores and roughness that no scan resolves, and printers push a per cent
 # less than they are asked to: what is too little stays a void, what is too much is planed.
@@ -45,7 +46,7 @@ DRAWN_MM = 0.035
 # A point that is not free is moved by no more than this; stretches between points that are free,
 # and are not so themselves, are halved so often.
 ASIDE_MM, HALVINGS = 0.15, 2
-ON_LINE_MM, FINELY_MM = 0.02, 0.1
+ON_LINE_MM = 0.02
 ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 ROUNDING_MM = 2e-3  # more than the text's last digit
 ROUNDED_MM = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # whichever way it goes
@@ -216,10 +217,10 @@ def free_runs(
     ]
 
 
-def steps_of(bead: Bead, step_mm: float = STEP_MM) -> Int[np.ndarray, " m"]:
+def steps_of(bead: Bead) -> Int[np.ndarray, " m"]:
     """How many steps each of a bead's pieces takes."""
     lengths = np.hypot(*np.diff(bead.xy_mm, axis=0).T)
-    return np.maximum(1, np.ceil(lengths / step_mm).astype(np.int64))
+    return np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
 
 
 def free_between(
@@ -340,8 +341,7 @@ def _by_lines(
     One line has four columns across it, the next one five: that is no reason to lay less of it.
     The total stays what it is. What lies beside the lines is added to the nearest as it is.
     """
-    asked = np.flatnonzero(job.over)
-    under = asked[off_runs(runs, model.points_mm[asked]) <= job.half_mm + ON_LINE_MM]
+    under = np.flatnonzero(job.over & beside_runs(runs, job.half_mm + ON_LINE_MM, model))
     of_piece = pieces_of.query(model.points_mm[under])[1]
     number = np.bincount(of_piece, minlength=pieces_of.n)
     deep = np.bincount(of_piece, thick.ravel()[under], minlength=pieces_of.n)
@@ -355,10 +355,15 @@ def _by_lines(
     return (own + extra) * (float(volume_mm3.sum()) / whole_mm3 if whole_mm3 > 0 else 1.0)
 
 
-def off_runs(runs: list[Bead], points_mm: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, " p"]:
-    """How far points lie from the nearest run, to half a step."""
-    places = np.concatenate([divided(run.xy_mm, steps_of(run, FINELY_MM))[0] for run in runs])
-    return np.asarray(cKDTree(places).query(points_mm)[0])
+def beside_runs(runs: list[Bead], within_mm: float, model: PatchModel) -> Bool[np.ndarray, "ny nx"]:
+    """Columns whose middles lie no farther from a run."""
+    start = np.concatenate([run.xy_mm[:-1] for run in runs])
+    end = np.concatenate([run.xy_mm[1:] for run in runs])
+    return np.asarray(
+        raster_kernels.beside_lines(
+            start, end, np.full(len(start), within_mm), model.origin_mm, model.cell_mm, *model.shape
+        )
+    )
 
 
 def _smooth(

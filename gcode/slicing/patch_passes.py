@@ -22,11 +22,11 @@ from gcode.slicing.patch_beads import (
     TO_WALL_MM,
     Chain,
     begun_inside,
+    beside_runs,
     draw,
     eased,
     free_between,
     free_runs,
-    off_runs,
     weighed,
 )
 from gcode.slicing.patch_model import PatchModel
@@ -271,9 +271,7 @@ def _along_job(
     wanted = model.left_below(z_mm)
     share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), LEAST_OF_GAP, 1.0))
     chains, laid = weighed(runs, tips_mm, share * thick, strips, model, setup, job=job)
-    columns = np.flatnonzero(thick)
-    near = off_runs(runs, model.points_mm[columns]) < FAR_MM
-    served = float(thick.ravel()[columns] @ near) / float(thick.sum())
+    served = float(thick[beside_runs(runs, FAR_MM, model)].sum()) / float(thick.sum())
     return _Laying(chains, laid, served, height_mm, [])
 
 

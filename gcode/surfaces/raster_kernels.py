@@ -189,3 +189,29 @@ def column_rest(
             if done:
                 break
     return top
+
+
+@njit(cache=True, nogil=True)
+def beside_lines(start: Any, end: Any, within: Any, low: Any, cell: float, ny: int, nx: int) -> Any:
+    """(ny, nx) cells whose middles lie no farther from any stretch than `within` (n,) says.
+
+    Stretches go from `start` to `end` (n, 2); `low` is the corner of the cells.
+    """
+    found = np.zeros((ny, nx), np.bool_)
+    for n in range(len(start)):
+        ax, ay, far = start[n, 0], start[n, 1], within[n]
+        dx, dy = end[n, 0] - ax, end[n, 1] - ay
+        square = max(dx * dx + dy * dy, 1e-12)
+        x0, x1 = min(ax, ax + dx) - far - low[0], max(ax, ax + dx) + far - low[0]
+        y0, y1 = min(ay, ay + dy) - far - low[1], max(ay, ay + dy) + far - low[1]
+        for iy in range(max(0, int(np.floor(y0 / cell))), min(ny, int(np.floor(y1 / cell)) + 1)):
+            py = low[1] + (iy + 0.5) * cell - ay
+            for ix in range(
+                max(0, int(np.floor(x0 / cell))), min(nx, int(np.floor(x1 / cell)) + 1)
+            ):
+                px = low[0] + (ix + 0.5) * cell - ax
+                share = min(max((px * dx + py * dy) / square, 0.0), 1.0)
+                ox, oy = px - share * dx, py - share * dy
+                if ox * ox + oy * oy <= far * far:
+                    found[iy, ix] = True
+    return found

@@ -5,6 +5,9 @@ from __future__ import annotations
 import manifold3d as m3
 import numpy as np
 import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from amrepair.deficit import Deficit, compute_deficit
 from amrepair.detect import detect
@@ -27,6 +30,21 @@ def lines(x0: float = 0.0, x1: float = 24.0) -> PlannedBeads:
     start = np.stack([np.full(6, x0), y, z], axis=1)
     end = np.stack([np.full(6, x1), y, z], axis=1)
     return PlannedBeads(start, end, np.full(6, WIDE_MM), np.full(6, HIGH_MM))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_points_in_beads_are_those_below_and_beside_their_lines(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    start = np.column_stack([rng.uniform(0, 10, (5, 2)), rng.integers(1, 4, 5) * HIGH_MM])
+    end = start + np.column_stack([rng.normal(scale=4.0, size=(5, 2)), np.zeros(5)])
+    beads = PlannedBeads(start, end, rng.uniform(0.3, 2.0, 5), rng.uniform(0.1, 0.4, 5))
+    points = rng.uniform([0, 0, -0.2], [10, 10, 0.8], (400, 3))
+    truth = np.zeros(400, dtype=bool)
+    for a, b, wide, high in zip(start, end, beads.width_mm, beads.height_mm, strict=True):
+        apart = shapely.distance(shapely.points(points[:, :2]), shapely.LineString([a[:2], b[:2]]))
+        truth |= (apart <= wide / 2) & (points[:, 2] <= a[2]) & (points[:, 2] >= a[2] - high)
+    assert (beads.holds(points) == truth).all()
 
 
 def without(x0: float, x1: float, line: int, deep_mm: float) -> m3.Manifold:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import manifold3d as m3
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from gcode.slicing.job_lines import LITTLE, NOTHING, JobLines, JobPieces, gather
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.slicing.patch_beads import BOND_RATIO
-from gcode.surfaces import HeightField
+from gcode.surfaces import HeightField, raster_kernels
 
 SETUP = load_setup()
 PARK = (10.0, 200.0, 20.0)
@@ -53,6 +54,25 @@ def slab(x: tuple[float, float], lines: tuple[int, int], low_mm: float) -> m3.Ma
     """Some lines, from a height up to the top, as long as is said."""
     size = (x[1] - x[0], (lines[1] - lines[0]) * WIDE_MM, TOP_MM - low_mm)
     return m3.Manifold.cube(size).translate((X0 + x[0], Y0 + lines[0] * WIDE_MM, low_mm))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_columns_beside_lines_are_those_that_shapes_hold(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    start = rng.uniform(0, 12, (6, 2))
+    end = start + rng.normal(scale=3.0, size=(6, 2)) * rng.integers(0, 2, (6, 1))  # and points
+    within = rng.uniform(0.05, 0.8, 6)
+    low, cell_mm, (ny, nx) = np.array([1.0, 2.0]), 0.13, (60, 70)
+    found = raster_kernels.beside_lines(start, end, within, low, cell_mm, ny, nx)
+    x, y = (low[axis] + (np.arange(n) + 0.5) * cell_mm for axis, n in ((0, nx), (1, ny)))
+    middles = shapely.points(*np.meshgrid(x, y))
+    apart = np.array([
+        shapely.distance(middles, shapely.LineString([a, b])) - wide
+        for a, b, wide in zip(start, end, within, strict=True)
+    ]).min(axis=0)  # fmt: skip
+    sure = np.abs(apart) > 1e-9
+    assert (found == (apart <= 0))[sure].all()
 
 
 def patched(missing: m3.Manifold, field: HeightField, lines: JobLines) -> PatchPlan:
