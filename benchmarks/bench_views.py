@@ -4,6 +4,8 @@
 
 A ring of views as from a turntable, and some from below; each in a random pose of its own, with or
 without the sensor's place. Off is the root mean square of a view's points from where they belong.
+Held: for each view the standard deviation that is said of it across its surface, where that is
+largest, and by how much it truly is off across its surface, at most, from the view held best.
 """
 
 from __future__ import annotations
@@ -23,12 +25,14 @@ from amrepair.bench.synth_views import (
 )
 from amrepair.consensus.fit import _piece
 from amrepair.consensus.register import Placed, place_all
+from amrepair.consensus.together import Piece
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.scans import Scan
 from amrepair.template import load_mesh
 
 WRONG_MM = 0.3
+SIGMAS = 3.0
 Made = list[tuple[Scan, np.ndarray]]
 
 
@@ -43,21 +47,29 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=60_000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    ratios: list[float] = []
     for part in options.parts:
         made = views(part, options)
         rng = np.random.default_rng(options.seed)
         wall, cpu = time.perf_counter(), time.process_time()
         try:
-            found = place_all([_piece(scan, rng) for scan, _ in made], rng)
+            pieces = [_piece(scan, rng) for scan, _ in made]
+            found = place_all(pieces, rng)
         except AlignmentError as error:
             said = f"refused: {error}"
         else:
             off = off_mm(made, found)
             verdict = "WRONG" if off.max() > WRONG_MM else "right"
             said = f"{len(off)} of {len(made)} placed, {verdict}, off {off.round(3).tolist()} mm"
+            held = held_mm(made, pieces, found)
+            ratios += [true / sigma for sigma, true in held if sigma > 0.0]
+            said += "; held " + ", ".join(f"{sigma:.3f}/{true:.3f}" for sigma, true in held)
             said += "".join(f"; {made[k][0].source} {why}" for k, why in found.reasons.items())
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         print(f"{part.stem}: {said}; {wall:.0f} s, {cpu:.0f} s of processor time", flush=True)
+    if ratios:
+        share = float((np.array(ratios) <= SIGMAS).mean())
+        print(f"{share:.1%} of {len(ratios)} views within {SIGMAS:g} sigma, most {max(ratios):.1f}")
 
 
 def views(part: Path, options: argparse.Namespace) -> Made:
@@ -102,6 +114,20 @@ def off_mm(made: Made, found: Placed) -> np.ndarray:
         every.append(row)
     table = np.array(every)
     return np.asarray(table[int(np.argmin(np.median(table, axis=1)))])
+
+
+def held_mm(made: Made, pieces: list[Piece], found: Placed) -> list[tuple[float, float]]:
+    """Of each placed view, what is said of it and what is true, across its surface."""
+    home = int(np.argmin([np.trace(slack.covariance) for slack in found.slacks]))
+    common_from_part = found.poses[home] @ made[found.which[home]][1]
+    told = []
+    for k, pose, slack in zip(found.which, found.poses, found.slacks, strict=True):
+        points, normals = pieces[k].points_mm[::40], pieces[k].normals[::40]
+        truth = moved(points, common_from_part @ np.linalg.inv(made[k][1]))
+        across = ((moved(points, pose) - truth) * (normals @ pose[:3, :3].T)).sum(axis=1)
+        is_home = slack is found.slacks[home]
+        told.append((0.0 if is_home else slack.sigma_mm, float(np.abs(across).max())))
+    return told
 
 
 if __name__ == "__main__":

@@ -67,10 +67,27 @@ def spacing_of(points_mm: Float[np.ndarray, "n 3"]) -> float:
     return float(np.median(reach) * np.sqrt(np.pi / max(count - 1, 1)))
 
 
-def planes(
-    points_mm: Float[np.ndarray, "n 3"], spacing_mm: float
-) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """(n, 3) unit normals of either sign, and the noise across the surface, mm.
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """Through each point's neighbours.
+
+    Attributes
+    ----------
+    normals
+        (n, 3) unit normals of either sign.
+    sigma_mm
+        Noise across the surface.
+    rough_mm
+        (n,) how far the neighbours lie from the plane beyond that noise: edges and curves.
+    """
+
+    normals: Float[np.ndarray, "n 3"]
+    sigma_mm: float
+    rough_mm: Float[np.ndarray, " n"]
+
+
+def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
+    """Fit a plane at each point.
 
     On flat ground the least variance of m points is σ²/m χ² with m − 3 degrees of freedom; edges
     and curves only add to it, so a low quantile is compared.
@@ -81,14 +98,15 @@ def planes(
     found, least, count = kernels.local_planes(
         ordered, cells.low_mm, cells.cell_mm, cells.shape, cells.start, radius_mm
     )
-    normals = np.empty_like(found)
-    normals[cells.order] = found
+    normals, variance = np.empty_like(found), np.empty(len(found))
+    normals[cells.order], variance[cells.order] = found, least
     enough = count >= 8
     if not enough.any():
-        return normals, 0.0
+        return Planes(normals, 0.0, np.sqrt(np.maximum(variance, 0.0)))
     m = count[enough].astype(np.float64)
     ratio = np.maximum(least[enough], 0.0) * m / chi2.ppf(NOISE_QUANTILE, m - 3)
-    return normals, float(np.sqrt(np.quantile(ratio, NOISE_QUANTILE)))
+    sigma_mm = float(np.sqrt(np.quantile(ratio, NOISE_QUANTILE)))
+    return Planes(normals, sigma_mm, np.sqrt(np.maximum(variance - sigma_mm**2, 0.0)))
 
 
 def directions(count: int = DIRECTIONS) -> Float[np.ndarray, "k 3"]:

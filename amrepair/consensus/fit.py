@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,8 @@ import amrepair
 from amrepair.align import align
 from amrepair.consensus.cloud import outward, planes, spacing_of
 from amrepair.consensus.fuse import Cloud, Fused, fuse
-from amrepair.consensus.register import Piece, Placed, place_all
+from amrepair.consensus.register import Placed, place_all
+from amrepair.consensus.together import Piece, Slack
 from amrepair.consensus.views import towards_sensors
 from amrepair.errors import AlignmentError, InputError
 from amrepair.scans import Scan
@@ -34,6 +35,10 @@ MAX_POINTS = 400_000  # of one scan; more add time, not accuracy
 # scans of 200,000 points, noise 30 µm: 8.8 µm off, 8.2 so).
 FOLLOWED = 0.5
 SIZE_JUMP = 3.0  # scans of one part in one unit differ by less
+# A scan whose pose is known no better than one of its points is said to be; nor is one that is
+# known to this.
+SURE_MM = 0.02
+ALONE = Placed((0,), (np.eye(4),), 0.0, ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +95,15 @@ def fit_from_scans(
         pieces.append(_piece(scan, rng))
     nominal = None if mesh is None else MeshSdf.from_mesh(mesh)
     if nominal is None:
-        placed = place_all(pieces, rng) if len(pieces) > 1 else Placed((0,), (np.eye(4),), 0.0, ())
+        placed = place_all(pieces, rng, progress) if len(pieces) > 1 else ALONE
     else:
         placed = _on_mesh(scans, nominal, rng)
     progress("fit: scans", 0.7, 1.0)
     cloud = _joined([pieces[k] for k in placed.which], [scans[k] for k in placed.which], placed)
     fused = fuse(cloud, behind=nominal)
     progress("fit: scans", 1.0, 1.0)
-    notes = _notes(scans, placed, fused, len(placed.which))
+    weak = _weak(placed, cloud.sigma_mm)
+    notes = (*_notes(scans, placed, fused, len(placed.which)), *_said(scans, placed, weak))
     closed = fused.mesh
     closed.metadata["notes"] = notes
     metadata = {
@@ -115,6 +121,8 @@ def fit_from_scans(
         progress=progress,
     )
     spread = fused.spread
+    if spread is not None and weak:
+        spread = spread.widened(cloud, _slack_mm(cloud, placed, weak))
     template = replace(
         made,
         bias_mm=float(np.hypot(made.bias_mm, 2.0 * fused.standard_error_mm)),
@@ -160,10 +168,10 @@ def _piece(scan: Scan, rng: np.random.Generator) -> Piece:
             f"{len(chosen)}; check the export"
         )
     spacing_mm = spacing_of(distinct)
-    normals, sigma_mm = planes(distinct, spacing_mm)
+    plane = planes(distinct, spacing_mm)
     index = None if scan.sensor_index is None else scan.sensor_index[chosen][first]
-    return Piece(scan.source, distinct, normals, spacing_mm, sigma_mm, cKDTree(distinct),
-                 scan.sensors_mm, index)  # fmt: skip
+    return Piece(scan.source, distinct, plane.normals, plane.rough_mm, spacing_mm, plane.sigma_mm,
+                 cKDTree(distinct), scan.sensors_mm, index)  # fmt: skip
 
 
 def _on_mesh(scans: Sequence[Scan], nominal: MeshSdf, rng: np.random.Generator) -> Placed:
@@ -222,6 +230,33 @@ def _notes(scans: Sequence[Scan], placed: Placed, fused: Fused, used: int) -> tu
     if fused.rejected:
         notes.append(f"{fused.rejected} points contradicted by other scans were left out")
     return tuple(notes)
+
+
+def _weak(placed: Placed, noise_mm: float) -> dict[int, Slack]:
+    """By place in the list: of scans whose surface may be off by more than their points are."""
+    limit_mm = max(noise_mm, SURE_MM)
+    return {k: slack for k, slack in enumerate(placed.slacks) if slack.sigma_mm > limit_mm}
+
+
+def _said(scans: Sequence[Scan], placed: Placed, weak: Mapping[int, Slack]) -> list[str]:
+    return [
+        f"{scans[placed.which[k]].source} is held along ({x:.2f}, {y:.2f}, {z:.2f}) to "
+        f"{slack.sigma_mm:.2f} mm only (standard deviation, the template's frame), since it shares "
+        "hardly a face across that with the others. What it alone saw there may be off by three "
+        "times that, and is tolerated as far. Add a view that shows faces across that direction "
+        "beside faces that the others show"
+        for k, slack in weak.items()
+        for x, y, z in [slack.axis]
+    ]
+
+
+def _slack_mm(cloud: Cloud, placed: Placed, weak: Mapping[int, Slack]) -> Float[np.ndarray, " n"]:
+    """(n,) of each point: standard deviation of its scan's pose across the surface."""
+    found = np.zeros(len(cloud.points_mm))
+    for k, slack in weak.items():
+        own = cloud.scan == k
+        found[own] = slack.across(cloud.points_mm[own], cloud.normals[own])
+    return found
 
 
 def _sha256(scan: Scan) -> str:

@@ -7,7 +7,7 @@ where nobody looked is closed by a Poisson surface (Kazhdan and Hoppe 2013), or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,6 +75,30 @@ class Spread:
     origin_mm: Float[np.ndarray, " 3"]
     cell_mm: float
     values_mm: Float[np.ndarray, "x y z"]
+
+    def widened(self, cloud: Cloud, slack_mm: Float[np.ndarray, " n"]) -> Spread:
+        """With what the scans' own poses leave open.
+
+        Where several scans saw the surface, that of the middle one: the consensus is theirs.
+
+        Parameters
+        ----------
+        slack_mm
+            (n,) of each point of the cloud: standard deviation of its scan's pose across it.
+        """
+        shape = np.array(self.values_mm.shape)
+        index = np.floor((cloud.points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
+        index = np.clip(index, 0, shape - 1)
+        cell = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+        pairs, which = np.unique(cell * cloud.scans + cloud.scan, return_inverse=True)
+        each = np.bincount(which, weights=slack_mm) / np.bincount(which)
+        place = pairs // cloud.scans
+        order = np.lexsort((each, place))
+        cells, first, count = np.unique(place[order], return_index=True, return_counts=True)
+        open_mm = np.zeros(int(np.prod(shape)))
+        open_mm[cells] = each[order][first + count // 2]
+        grown = ndimage.maximum_filter(open_mm.reshape(tuple(shape)), size=3)
+        return replace(self, values_mm=np.hypot(self.values_mm, grown).astype(np.float32))
 
 
 @dataclass(frozen=True, slots=True)

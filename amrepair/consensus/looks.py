@@ -196,7 +196,7 @@ class Guess:
 def guess_directions(points_mm: Float[np.ndarray, "n 3"]) -> Guess:
     """Where one sensor stood that saw all of these points, from nothing but the points."""
     spacing_mm = spacing_of(points_mm)
-    normals, _ = planes(points_mm, spacing_mm)
+    normals = planes(points_mm, spacing_mm).normals
     ways = directions(PLACES)
     hidden = np.array([_hidden(points_mm, normals, way, spacing_mm) for way in ways])
     if hidden.min() > VIEW_RATIO:

@@ -77,7 +77,7 @@ class _Surface:
 
     @classmethod
     def of(cls, points_mm: Float[np.ndarray, "n 3"]) -> _Surface:
-        return cls(points_mm, planes(points_mm, spacing_of(points_mm))[0], cKDTree(points_mm))
+        return cls(points_mm, planes(points_mm, spacing_of(points_mm)).normals, cKDTree(points_mm))
 
     def some(self, count: int) -> Float[np.ndarray, "k 3"]:
         return self.points_mm[:: len(self.points_mm) // count + 1]

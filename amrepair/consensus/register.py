@@ -7,49 +7,22 @@ placed is left out and named.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from jaxtyping import Float
 
 from amrepair.align.thinning import thin_out
 from amrepair.consensus.assemble import Poses, assemble, contradicted
 from amrepair.consensus.propose import propose
-from amrepair.consensus.views import VagueError, View, loss_weight, moved_to_planes, views_of
+from amrepair.consensus.together import Piece, Slack, slacks, together
+from amrepair.consensus.views import VagueError, View, towards_sensors, views_of
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from gcode.progress import Progress, silent
 
-COARSE_POINTS, FINE_POINTS = 15_000, 12_000
+COARSE_POINTS = 15_000
 GOOD_OVERLAP, LEAST_OVERLAP = 0.6, 0.25
-ROUNDS = 12
-SHRINK = 0.6
-
-
-@dataclass(frozen=True, slots=True)
-class Piece:
-    """A scan as registration needs it, in its own frame.
-
-    Attributes
-    ----------
-    normals
-        (n, 3) unit normals of either sign.
-    tree
-        Of the points.
-    sensors_mm, sensor_index
-        (k, 3) and (n,): where the sensors stood, and which saw each point; None where the file
-        does not say.
-    """
-
-    name: str
-    points_mm: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    spacing_mm: float
-    sigma_mm: float
-    tree: cKDTree
-    sensors_mm: Float[np.ndarray, "k 3"] | None = None
-    sensor_index: Int[np.ndarray, " n"] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +43,8 @@ class Placed:
         By number of a scan that was left out, why; where more is known than that.
     views
         By number: what is known of where a scan's sensors stood.
+    slacks
+        How surely each of the placed scans is held, in their order.
     """
 
     which: tuple[int, ...]
@@ -78,6 +53,7 @@ class Placed:
     left_out: tuple[int, ...]
     reasons: Mapping[int, str] = field(default_factory=dict)
     views: Mapping[int, View] = field(default_factory=dict)
+    slacks: tuple[Slack, ...] = ()
 
 
 def place_all(
@@ -126,11 +102,14 @@ def place_all(
             "the part's mesh beside them"
         )
     which = sorted(poses)
-    refined, rmse_mm = _together([pieces[k] for k in which], [poses[k] for k in which], rng)
+    chosen = [pieces[k] for k in which]
+    refined, rmse_mm = together(chosen, [poses[k] for k in which], rng)
     home = np.linalg.inv(refined[0])
+    placed = tuple(home @ pose for pose in refined)
     return Placed(
-        tuple(which), tuple(home @ pose for pose in refined), rmse_mm, tuple(sorted(waiting))
-    )
+        tuple(which), placed, rmse_mm, tuple(sorted(waiting)),
+        slacks=tuple(slacks(chosen, placed, rng)),
+    )  # fmt: skip
 
 
 def _by_sight(
@@ -159,7 +138,7 @@ def _by_sight(
         views += own
     found = assemble(views, diagonal_mm, progress)
     reasons |= found.reasons
-    poses, rmse_mm = _refined(pieces, found.poses, rng)
+    poses, rmse_mm = _refined(pieces, found.views, found.poses, rng)
     for k, reason in contradicted(found.views, poses).items():
         reasons[k] = reason
         del poses[k]
@@ -175,79 +154,34 @@ def _by_sight(
         )
     which = sorted(poses)
     home = np.linalg.inv(poses[which[0]])
+    placed = tuple(home @ poses[k] for k in which)
     return Placed(
         tuple(which),
-        tuple(home @ poses[k] for k in which),
+        placed,
         rmse_mm,
         tuple(sorted(set(range(len(pieces))) - set(which))),
         reasons,
         {k: found.views[k] for k in which},
+        tuple(slacks([_facing(pieces[k], found.views[k]) for k in which], placed, rng)),
     )
 
 
 def _refined(
-    pieces: Sequence[Piece], poses: Poses, rng: np.random.Generator
+    pieces: Sequence[Piece], views: Mapping[int, View], poses: Poses, rng: np.random.Generator
 ) -> tuple[Poses, float]:
     which = sorted(poses)
     if not which:
         return {}, 0.0
-    refined, rmse_mm = _together([pieces[k] for k in which], [poses[k] for k in which], rng)
+    facing = [_facing(pieces[k], views[k]) for k in which]
+    refined, rmse_mm = together(facing, [poses[k] for k in which], rng)
     return dict(zip(which, refined, strict=True)), rmse_mm
+
+
+def _facing(piece: Piece, view: View) -> Piece:
+    """With normals to the side from which it was seen: both sides of a wall are no pair."""
+    normals = towards_sensors(piece.points_mm, piece.normals, view.looks).normals
+    return replace(piece, normals=normals, faces=True)
 
 
 def _coverage(points_mm: Float[np.ndarray, "n 3"], voxel_mm: float) -> int:
     return len(np.unique(np.floor(points_mm / voxel_mm).astype(np.int64), axis=0))
-
-
-def _together(
-    pieces: Sequence[Piece], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
-) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
-    """All poses but the first, refined against all other scans in turn, point to plane."""
-    found = [np.array(pose) for pose in poses]
-    sample = [rng.permutation(len(p.points_mm))[:FINE_POINTS] for p in pieces]
-    noise_mm = max(1e-3, *(p.sigma_mm for p in pieces))
-    scale_mm = max(10.0 * noise_mm, 0.5 * max(p.spacing_mm for p in pieces))
-    rmse_mm = 0.0
-    for _ in range(ROUNDS):
-        moved_mm, squares, weights = 0.0, 0.0, 0.0
-        for k in range(1, len(pieces)):
-            points, normal, height = _pairs(pieces, found, k, sample[k])
-            if len(points) < 100:
-                continue
-            turn = moved_to_planes(points, normal, height, scale_mm)
-            found[k] = turn @ found[k]
-            step_mm = np.linalg.norm(moved(points, turn) - points, axis=1)
-            moved_mm = max(moved_mm, float(step_mm.max()))
-            weight = loss_weight(height, scale_mm)
-            squares += float((weight * height**2).sum())
-            weights += float(weight.sum())
-        rmse_mm = float(np.sqrt(squares / max(weights, 1e-12)))
-        if moved_mm < 2e-4 and scale_mm <= 4.0 * noise_mm:
-            break
-        scale_mm = max(4.0 * noise_mm, SHRINK * scale_mm)
-    return found, rmse_mm
-
-
-def _pairs(
-    pieces: Sequence[Piece],
-    poses: Sequence[Float[np.ndarray, "4 4"]],
-    k: int,
-    sample: np.ndarray,
-) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
-    """Points of a scan, and normals and heights over the planes of the other scans."""
-    own = moved(pieces[k].points_mm[sample], poses[k])
-    points, normals, heights = [], [], []
-    for r, piece in enumerate(pieces):
-        if r == k:
-            continue
-        local = moved(own, np.linalg.inv(poses[r]))
-        distance, index = piece.tree.query(
-            local, distance_upper_bound=4.0 * piece.spacing_mm, workers=-1
-        )
-        near = np.isfinite(distance)
-        normal = piece.normals[index[near]]
-        height = ((local[near] - piece.points_mm[index[near]]) * normal).sum(axis=1)
-        points.append(own[near])
-        normals.append(normal @ poses[r][:3, :3].T)
-        heights.append(height)
-    return np.concatenate(points), np.concatenate(normals), np.concatenate(heights)

@@ -134,7 +134,7 @@ class View:
         """A view of a part of that diagonal."""
         thin = thin_out(points_mm, POINTS, rng)
         spacing_mm = spacing_of(thin)
-        normals, _ = planes(thin, spacing_mm)
+        normals = planes(thin, spacing_mm).normals
         normals = towards_sensors(thin, normals, looks).normals
         centre, cell_mm = 0.5 * (thin.min(axis=0) + thin.max(axis=0)), SIDE * diagonal_mm / CELLS
         axis = (np.arange(CELLS) - 0.5 * (CELLS - 1)) * cell_mm

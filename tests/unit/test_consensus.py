@@ -63,7 +63,7 @@ def placed(points: np.ndarray, seed: int) -> Scan:
 def joined(clouds: list[np.ndarray]) -> Cloud:
     """Scans that stand in one frame already."""
     spacing = [spacing_of(c) for c in clouds]
-    normals = np.concatenate([planes(c, s)[0] for c, s in zip(clouds, spacing, strict=True)])
+    normals = np.concatenate([planes(c, s).normals for c, s in zip(clouds, spacing, strict=True)])
     points = np.concatenate(clouds)
     together = spacing_of(points)
     scan = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
@@ -81,13 +81,13 @@ def test_noise_and_spacing_are_measured(part: AnalyticTemplate) -> None:
     spacing_mm = spacing_of(points)
     # random points of density ρ: spacing is defined as 1 / sqrt(ρ)
     assert spacing_mm == pytest.approx(np.sqrt(part.body.surface_area() / 40_000), rel=0.1)
-    assert planes(points, spacing_mm)[1] == pytest.approx(SIGMA_MM, rel=0.2)
+    assert planes(points, spacing_mm).sigma_mm == pytest.approx(SIGMA_MM, rel=0.2)
 
 
 def test_normals_point_outwards_also_in_the_hole(part: AnalyticTemplate) -> None:
     points = points_of(part, 60_000, 1)
     spacing_mm = spacing_of(points)
-    normals = outward(points, planes(points, spacing_mm)[0], spacing_mm)
+    normals = outward(points, planes(points, spacing_mm).normals, spacing_mm)
     gradient = part.distance_and_gradient(points)[1]
     agree = (normals * gradient).sum(axis=1)
     assert (agree > 0).mean() > 0.995  # planes through an edge lie across it

@@ -143,12 +143,13 @@ def test_normals_turn_to_the_sensor_that_saw_them(bracket: Shape) -> None:
     points = np.concatenate([s.points_mm for s in seen])
     truth = np.concatenate([s.normals for s in seen])
     looks = told(points, sensors, np.repeat([0, 1], [len(s.points_mm) for s in seen]))
-    normals, _ = planes(points, spacing_of(points))
+    normals = planes(points, spacing_of(points)).normals
     facing = towards_sensors(points, normals, looks)
     right = (facing.normals * truth).sum(axis=1) > 0.0
     assert right[facing.sure].mean() > 0.99
 
 
+@pytest.mark.slow
 def test_views_that_share_little_find_each_other(bracket: Shape) -> None:
     """A ring and one from below: neighbours share a third, the last the sides alone."""
     ways = [(1.0, 0.2, 0.7), (-0.4, 1.0, 0.7), (-0.5, -1.0, 0.7), (0.8, 0.5, -0.6)]
@@ -157,9 +158,12 @@ def test_views_that_share_little_find_each_other(bracket: Shape) -> None:
     assert found.which == (0, 1, 2, 3)
     poses = [pose for _, pose in made]
     # edges and curves alone hold the last along the plate's normal: no level face is seen by both
-    assert farthest_off_mm(found, poses, bracket) < 0.4
+    assert found.slacks[3].sigma_mm > max(slack.sigma_mm for slack in found.slacks[:3])
+    normal = found.poses[0][:3, :3] @ poses[0][:3, 2]
+    assert abs(found.slacks[3].axis @ normal) > 0.95
+    assert farthest_off_mm(found, poses, bracket) < 3.0 * found.slacks[3].sigma_mm
     above = replace(found, which=found.which[:3], poses=found.poses[:3])
-    assert farthest_off_mm(above, poses, bracket) < 0.1
+    assert farthest_off_mm(above, poses, bracket) < 0.05
 
 
 @pytest.mark.slow

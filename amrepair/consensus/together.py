@@ -1,0 +1,360 @@
+"""All poses of placed scans at once, point to plane, and how surely each is held.
+
+One system of normal equations over the graph of overlaps: what slips against the rest as a group
+(views from below, on each other) does not wait for its members one by one. It refines poses that
+`assemble` and `propose` found; it does not find any.
+
+How sure a pose is needs care in two places. A plane's normal is an estimate, and squares of its
+noise look like knowledge of directions in which the faces tell nothing; the normals of the two
+scans err independently, so their product does not (instrumental variables). And residuals beside
+each other err alike: what they push at is summed over patches before it is squared, with a floor
+for what all points of a patch may share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from amrepair.consensus.views import loss_weight
+from amrepair.frames import moved, rotation_from_vector
+
+SAMPLED, LEAST_SAMPLED = 48_000, 4_000  # points of all scans together; of each
+ROUNDS = 15
+SHRINK = 0.6
+WITHIN_SPACINGS = 4.0  # of the other scan: farther apart are no pair
+AGREES = 0.9  # cosine of the normals of a pair: edges are blends of two faces
+LEAST_PAIRS = 100  # of two scans, or they say nothing of each other
+STILL_MM = 2e-4
+SCALE_SIGMAS, FIRST_SIGMAS, FIRST_SPACINGS = 4.0, 10.0, 0.5  # of the Geman–McClure loss
+DAMPING = 1e-7
+# Residuals of one facing within this share of the part err alike.
+PATCH_RATIO = 0.04
+# What all points of a patch may share: what of the spacing a fit cannot tell (`fuse.reach_mm` asks
+# no more), and how far points lie from their plane beyond the noise, at edges and curves.
+SHARED_SPACINGS = 0.05
+# A motion with less information than this share of the best known one's is free.
+FREE_RATIO = 1e-6
+# Slips of more than so many spacings are contradicted by what the sensors saw through.
+HELD_SPACINGS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A scan as registration needs it, in its own frame.
+
+    Attributes
+    ----------
+    normals
+        (n, 3) unit normals; to the sensor's side where `faces`, else of either sign.
+    rough_mm
+        (n,) how far the points around lie from the plane, beyond the noise.
+    tree
+        Of the points.
+    sensors_mm, sensor_index
+        (k, 3) and (n,): where the sensors stood, and which saw each point; None where the file
+        does not say.
+    """
+
+    name: str
+    points_mm: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    rough_mm: Float[np.ndarray, " n"]
+    spacing_mm: float
+    sigma_mm: float
+    tree: cKDTree
+    sensors_mm: Float[np.ndarray, "k 3"] | None = None
+    sensor_index: Int[np.ndarray, " n"] | None = None
+    faces: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Slack:
+    """What is open of one scan's pose, against the scan that is held best.
+
+    Attributes
+    ----------
+    covariance
+        (6, 6) of a small motion in the common frame: turn about `centre_mm` in radians times
+        `size_mm`, then shift in mm.
+    most_mm
+        A slip is never larger than about this: more would be seen to contradict.
+    sigma_mm
+        The standard deviation across its own surface where that is largest.
+    axis
+        (3,) the unit vector along which the surface there may be off, common frame.
+    """
+
+    covariance: Float[np.ndarray, "6 6"]
+    centre_mm: Float[np.ndarray, " 3"]
+    size_mm: float
+    most_mm: float
+    sigma_mm: float
+    axis: Float[np.ndarray, " 3"]
+
+    def across(
+        self, points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, " n"]:
+        """(n,) standard deviation along the normals, mm; common frame."""
+        along = _jacobian(points_mm, normals, self.centre_mm, self.size_mm)
+        squares = np.einsum("ni,ij,nj->n", along, self.covariance, along)
+        return np.asarray(_capped(np.sqrt(np.maximum(squares, 0.0)), self.most_mm))
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Points and the planes of other scans, common frame.
+
+    Attributes
+    ----------
+    of, other
+        (q,) whose point, whose plane.
+    planes, own
+        (q, 3) normals: of the other scan's plane, and of the point's own.
+    height_mm
+        (q,) over the plane.
+    rough_mm
+        (q,) the rougher of the two sides.
+    """
+
+    of: Int[np.ndarray, " q"]
+    other: Int[np.ndarray, " q"]
+    points_mm: Float[np.ndarray, "q 3"]
+    planes: Float[np.ndarray, "q 3"]
+    own: Float[np.ndarray, "q 3"]
+    height_mm: Float[np.ndarray, " q"]
+    rough_mm: Float[np.ndarray, " q"]
+
+
+def together(
+    pieces: Sequence[Piece], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
+) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
+    """All poses but the first, refined jointly; and the residual's root mean square, mm."""
+    found = [np.array(pose) for pose in poses]
+    sample = _samples(pieces, rng)
+    last_mm = _scale_mm(pieces)
+    scale_mm = max(
+        FIRST_SIGMAS / SCALE_SIGMAS * last_mm, FIRST_SPACINGS * max(p.spacing_mm for p in pieces)
+    )
+    rmse_mm = 0.0
+    for _ in range(ROUNDS):
+        pairs = _pairs(pieces, found, sample)
+        if len(pairs.of) < LEAST_PAIRS:
+            break
+        weight = loss_weight(pairs.height_mm, scale_mm)
+        rmse_mm = float(np.sqrt((weight * pairs.height_mm**2).sum() / weight.sum()))
+        centre, size_mm = _frame(pairs)
+        along = _jacobian(pairs.points_mm, pairs.planes, centre, size_mm)
+        information, push = _equations(pairs, along, along, weight, len(found))
+        free = information[6:, 6:] + DAMPING * np.trace(information) / len(information) * np.eye(
+            len(information) - 6
+        )
+        step = -np.linalg.solve(free, push[6:]).reshape(-1, 6)
+        for k, (*turn, x, y, z) in enumerate(step, 1):
+            motion = np.eye(4)
+            motion[:3, :3] = rotation_from_vector(np.array(turn) / size_mm)
+            motion[:3, 3] = centre + np.array([x, y, z]) - motion[:3, :3] @ centre
+            found[k] = motion @ found[k]
+        if float(np.abs(step).max()) < STILL_MM and scale_mm <= last_mm:
+            break
+        scale_mm = max(last_mm, SHRINK * scale_mm)
+    return found, rmse_mm
+
+
+def slacks(
+    pieces: Sequence[Piece], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
+) -> list[Slack]:
+    """How surely each refined pose is held, against the scan against which most are held best."""
+    count = len(pieces)
+    pairs = _pairs(pieces, poses, _samples(pieces, rng))
+    weight = loss_weight(pairs.height_mm, _scale_mm(pieces))
+    centre, size_mm = _frame(pairs)
+    along = _jacobian(pairs.points_mm, pairs.planes, centre, size_mm)
+    instrument = _jacobian(pairs.points_mm, pairs.own, centre, size_mm)
+    information, _ = _equations(pairs, along, instrument, weight, count)
+    scatter = _scatter(pieces, pairs, instrument, weight)
+    open_ = [_open(information, scatter, home) for home in range(count)]
+    best = min(open_, key=lambda blocks: float(np.median([np.trace(b) for b in blocks])))
+    return [
+        _slack(piece, pose, block, centre, size_mm)
+        for piece, pose, block in zip(pieces, poses, best, strict=True)
+    ]
+
+
+def _samples(pieces: Sequence[Piece], rng: np.random.Generator) -> list[Int[np.ndarray, " _"]]:
+    each = max(LEAST_SAMPLED, SAMPLED // len(pieces))
+    return [rng.permutation(len(p.points_mm))[:each] for p in pieces]
+
+
+def _scale_mm(pieces: Sequence[Piece]) -> float:
+    return SCALE_SIGMAS * max(1e-3, *(p.sigma_mm for p in pieces))
+
+
+def _frame(pairs: _Pairs) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Where turns are about, and how long a radian is."""
+    centre = pairs.points_mm.mean(axis=0)
+    return centre, float(np.sqrt(((pairs.points_mm - centre) ** 2).sum(axis=1).mean()))
+
+
+def _jacobian(
+    points_mm: Float[np.ndarray, "q 3"],
+    normals: Float[np.ndarray, "q 3"],
+    centre_mm: Float[np.ndarray, " 3"],
+    size_mm: float,
+) -> Float[np.ndarray, "q 6"]:
+    return np.concatenate([np.cross(points_mm - centre_mm, normals) / size_mm, normals], axis=1)
+
+
+def _pairs(
+    pieces: Sequence[Piece],
+    poses: Sequence[Float[np.ndarray, "4 4"]],
+    sample: Sequence[Int[np.ndarray, " _"]],
+) -> _Pairs:
+    """Sampled points of each scan with the nearest planes of every other that face their way."""
+    found: list[tuple[np.ndarray, ...]] = []
+    for k, piece in enumerate(pieces):
+        own = moved(piece.points_mm[sample[k]], poses[k])
+        facing = piece.normals[sample[k]] @ poses[k][:3, :3].T
+        for r, other in enumerate(pieces):
+            if r == k:
+                continue
+            local = moved(own, np.linalg.inv(poses[r]))
+            reach, index = other.tree.query(
+                local, distance_upper_bound=WITHIN_SPACINGS * other.spacing_mm, workers=-1
+            )
+            near = np.flatnonzero(np.isfinite(reach))
+            index = index[near]
+            plane = other.normals[index] @ poses[r][:3, :3].T
+            cosine = (plane * facing[near]).sum(axis=1)
+            signed = piece.faces and other.faces
+            agrees = (cosine if signed else np.abs(cosine)) > AGREES
+            near, index, plane = near[agrees], index[agrees], plane[agrees]
+            height = ((local[near] - other.points_mm[index]) * other.normals[index]).sum(axis=1)
+            turned = facing[near] * np.sign(cosine[agrees])[:, None]
+            rough = np.maximum(piece.rough_mm[sample[k]][near], other.rough_mm[index])
+            of = np.full(len(near), k)
+            found.append((of, np.full(len(near), r), own[near], plane, turned, height, rough))
+    return _Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def _equations(
+    pairs: _Pairs,
+    along: Float[np.ndarray, "q 6"],
+    instrument: Float[np.ndarray, "q 6"],
+    weight: Float[np.ndarray, " q"],
+    count: int,
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    """Normal equations over all scans' motions, six for each."""
+    information, push = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    for k, r, which in _by_pair(pairs.of, pairs.other, count):
+        weighted = instrument[which] * weight[which, None]
+        block = weighted.T @ along[which]
+        _add(information, k, r, 0.5 * (block + block.T))
+        pushed = weighted.T @ pairs.height_mm[which]
+        push[6 * k : 6 * k + 6] += pushed
+        push[6 * r : 6 * r + 6] -= pushed
+    return information, push
+
+
+def _by_pair(
+    first: Int[np.ndarray, " q"], second: Int[np.ndarray, " q"], count: int
+) -> list[tuple[int, int, Int[np.ndarray, " _"]]]:
+    key = first * count + second
+    order = np.argsort(key, kind="stable")
+    edges = np.flatnonzero(np.diff(key[order])) + 1
+    groups = np.split(order, edges) if len(order) else []
+    return [(int(first[g[0]]), int(second[g[0]]), g) for g in groups]
+
+
+def _add(total: Float[np.ndarray, "n n"], k: int, r: int, block: Float[np.ndarray, "6 6"]) -> None:
+    """Add what depends on the difference of two scans' motions; in place."""
+    one, two = slice(6 * k, 6 * k + 6), slice(6 * r, 6 * r + 6)
+    total[one, one] += block
+    total[two, two] += block
+    total[one, two] -= block
+    total[two, one] -= block
+
+
+def _scatter(
+    pieces: Sequence[Piece],
+    pairs: _Pairs,
+    instrument: Float[np.ndarray, "q 6"],
+    weight: Float[np.ndarray, " q"],
+) -> Float[np.ndarray, "n n"]:
+    """Covariance of what the residuals push at: by patches, with what a patch may share."""
+    count = len(pieces)
+    spacing = np.array([p.spacing_mm for p in pieces])
+    sigma = np.array([p.sigma_mm for p in pieces])
+    first, second = np.minimum(pairs.of, pairs.other), np.maximum(pairs.of, pairs.other)
+    low = pairs.points_mm.min(axis=0)
+    edge_mm = PATCH_RATIO * float(np.linalg.norm(np.ptp(pairs.points_mm, axis=0)))
+    axis = np.argmax(np.abs(pairs.planes), axis=1)
+    side = np.take_along_axis(pairs.planes, axis[:, None], axis=1)[:, 0] > 0.0
+    cell = np.floor((pairs.points_mm - low) / edge_mm).astype(np.int64)
+    key = np.column_stack([first, second, cell, 2 * axis + side])
+    _, start, patch = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    shared_mm = np.hypot(
+        pairs.rough_mm, SHARED_SPACINGS * np.maximum(spacing[pairs.of], spacing[pairs.other])
+    )
+    weighted = instrument * weight[:, None]
+    pushed = _sums(
+        weighted * (pairs.height_mm * np.where(first == pairs.of, 1, -1))[:, None], patch
+    )
+    shared = _sums(weighted * shared_mm[:, None], patch)
+    noise = np.hypot(sigma[pairs.of], sigma[pairs.other])[:, None] * weighted
+    total = np.zeros((6 * count, 6 * count))
+    for k, r, which in _by_pair(first[start], second[start], count):
+        _add(total, k, r, pushed[which].T @ pushed[which] + shared[which].T @ shared[which])
+    for k, r, which in _by_pair(first, second, count):  # few patches cannot tell their own scatter
+        _add(total, k, r, noise[which].T @ noise[which])
+    return total
+
+
+def _sums(
+    values: Float[np.ndarray, "q 6"], patch: Int[np.ndarray, " q"]
+) -> Float[np.ndarray, "p 6"]:
+    return np.stack([np.bincount(patch.ravel(), weights=column) for column in values.T], axis=1)
+
+
+def _open(
+    information: Float[np.ndarray, "n n"], scatter: Float[np.ndarray, "n n"], home: int
+) -> list[Float[np.ndarray, "6 6"]]:
+    """Each scan's covariance, with one of them held still."""
+    count = len(information) // 6
+    moving: Bool[np.ndarray, " n"] = np.arange(6 * count) // 6 != home
+    values, vectors = np.linalg.eigh(information[np.ix_(moving, moving)])
+    least = FREE_RATIO * max(float(values[-1]), np.finfo(float).tiny / FREE_RATIO)
+    inverse = (vectors / np.maximum(values, least)) @ vectors.T
+    whole = np.zeros_like(information)
+    whole[np.ix_(moving, moving)] = inverse @ scatter[np.ix_(moving, moving)] @ inverse
+    return [whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)]
+
+
+def _slack(
+    piece: Piece,
+    pose: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "6 6"],
+    centre_mm: Float[np.ndarray, " 3"],
+    size_mm: float,
+) -> Slack:
+    points = moved(piece.points_mm, pose)
+    normals = piece.normals @ pose[:3, :3].T
+    most_mm = HELD_SPACINGS * piece.spacing_mm
+    made = Slack(covariance, centre_mm, size_mm, most_mm, 0.0, np.array([0.0, 0.0, 1.0]))
+    sigma = made.across(points, normals)
+    worst = int(np.argmax(sigma))
+    # the motion of that place along which it is known least
+    place = np.repeat(points[worst][None], 3, axis=0)
+    shift = _jacobian(place, np.eye(3), centre_mm, size_mm)
+    axis = np.linalg.eigh(shift @ covariance @ shift.T)[1][:, -1]
+    axis = axis * np.sign(axis[int(np.argmax(np.abs(axis)))])
+    return Slack(covariance, centre_mm, size_mm, most_mm, float(sigma[worst]), axis)
+
+
+def _capped(sigma_mm: Float[np.ndarray, " n"], most_mm: float) -> Float[np.ndarray, " n"]:
+    """Two independent limits, joined."""
+    return np.asarray(sigma_mm * most_mm / np.hypot(sigma_mm, most_mm))
