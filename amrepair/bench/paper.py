@@ -22,6 +22,7 @@ from amrepair.bench.dataset import Format
 from amrepair.bench.house import class_template, repair_distance, top_mean
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
+from amrepair.consensus.cloud import planes, spacing_of
 from amrepair.template import MeshSdf
 from amrepair.template.paper import CODE as CODE_RECIPE
 from amrepair.template.paper import PaperOptions
@@ -33,6 +34,7 @@ from amrepair.template.surface import sample_surface
 # published system found nothing.
 BENCH_PAPER = replace(CODE_RECIPE, batch=8_192, rate=5e-4, epochs=500)
 TOP_SCORES = 1_000
+BESIDE = 2.0  # spacings of the cloud: a point of the surface has one of it so near
 TARGET_POINTS = 20_000  # of the template's cloud: as many as the largest test clouds need
 
 
@@ -50,28 +52,41 @@ class Target:
     cloud_mm
         (m, 3) points of the template.
     exact
-        The normal shape; None: the cloud stands for it.
+        The normal shape; None: the planes through the cloud's points stand for it.
     """
 
     cloud_mm: Float[np.ndarray, "m 3"]
     exact: MeshSdf | None
+    _normals: Float[np.ndarray, "m 3"]
+    _spacing_mm: float
 
     @classmethod
     def of(cls, data: ClassInput) -> Target:
         """From the class's mesh, or from its first training cloud."""
         if data.mesh is None:
-            return cls(data.clouds_mm[0], None)
+            return cls.of_cloud(data.clouds_mm[0])
         mesh = data.mesh
         cloud = sample_surface(
             np.asarray(mesh.vertices), np.asarray(mesh.faces), count=TARGET_POINTS
         )[0]
-        return cls(cloud, MeshSdf.from_mesh(mesh))
+        return cls.of_cloud(cloud, MeshSdf.from_mesh(mesh))
+
+    @classmethod
+    def of_cloud(cls, cloud_mm: Float[np.ndarray, "m 3"], exact: MeshSdf | None = None) -> Target:
+        """From points, and the shape that they are of where it is known."""
+        spacing_mm = spacing_of(cloud_mm)
+        return cls(cloud_mm, exact, planes(cloud_mm, spacing_mm).normals, spacing_mm)
 
     def residual(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) distance to the normal surface, mm."""
         if self.exact is not None:
             return self.exact.unsigned_distance(points_mm)
-        return np.asarray(cKDTree(self.cloud_mm).query(points_mm)[0])
+        # to the nearest point alone it is half the cloud's spacing wherever the points lie
+        distance, index = cKDTree(self.cloud_mm).query(points_mm, workers=-1)
+        offset = points_mm - self.cloud_mm[index]
+        height = np.abs((offset * self._normals[index]).sum(axis=1))
+        beside = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
+        return np.asarray(np.hypot(height, np.maximum(beside - BESIDE * self._spacing_mm, 0.0)))
 
 
 def make_pam_aligner(data: ClassInput, seed: int, cache: Path) -> Aligner:

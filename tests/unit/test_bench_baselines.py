@@ -9,10 +9,12 @@ import pytest
 
 from amrepair.bench import METHODS
 from amrepair.bench.baselines import BankMethod, fpfh_features, raw_features, reweighted
-from amrepair.bench.dataset import Format
+from amrepair.bench.cells import Cell, _judge
+from amrepair.bench.dataset import BenchClass, Format, Sample
 from amrepair.bench.features import coreset, fill_in, fpfh, nearest
 from amrepair.bench.method import ClassInput, noise_mm
 from amrepair.bench.metrics import auroc
+from amrepair.bench.paper import Target
 from amrepair.bench.registry import BASELINES, PUBLISHED, make_method
 from amrepair.bench.synth_views import random_rotation
 from amrepair.errors import InputError
@@ -135,3 +137,47 @@ def test_names_are_those_of_the_contract() -> None:
         make_method("m3dm")
     assert PUBLISHED[Format.SHAPENET]["patchcore-fpfh+pam"] == (81.4, 86.7)
     assert fpfh_features(np.random.default_rng(0).normal(size=(50, 3)))[0].shape == (50, 33)
+
+
+@pytest.mark.parametrize(("off_mm", "low", "high"), [(0.0, 0.0, 0.1), (1.0, 0.9, 1.1)])
+def test_a_residual_over_a_sparse_cloud_is_not_its_spacing(
+    rng: np.random.Generator, off_mm: float, low: float, high: float
+) -> None:
+    """Points every 0.8 mm, noise 0.05: a good pose was told to be 0.4 mm off, beyond any limit."""
+
+    def ball(count: int) -> np.ndarray:
+        way = rng.normal(size=(count, 3))
+        way /= np.linalg.norm(way, axis=1)[:, None]
+        return (50.0 + rng.normal(0.0, 0.05, count))[:, None] * way
+
+    data = ClassInput("ball", Format.REAL3D, (ball(50_000),), None, 0.05, 1.0)
+    found = Target.of(data).residual(ball(3_000) * (1.0 + off_mm / 50.0))
+    assert low <= float(np.median(found)) <= high
+
+
+def test_a_residual_beside_a_cloud_is_the_way_to_it(rng: np.random.Generator) -> None:
+    plate = np.column_stack([rng.uniform(0.0, 50.0, (20_000, 2)), rng.normal(0.0, 0.02, 20_000)])
+    data = ClassInput("plate", Format.REAL3D, (plate,), None, 0.02, 1.0)
+    found = Target.of(data).residual(np.array([[70.0, 25.0, 0.0]]))  # in its plane
+    assert found[0] == pytest.approx(20.0, rel=0.1)
+
+
+def test_a_sample_that_pam_gave_up_on_is_badly_aligned_once(tmp_path: Path) -> None:
+    """Its last pose lies off as well: 20 of 15 were badly aligned."""
+    names = ("off", "gone", "good")
+    samples = tuple(
+        Sample("c0", name, name, tmp_path, None if name == "good" else tmp_path, Format.SHAPENET)
+        for name in names
+    )
+    one = BenchClass("c0", (), None, samples)
+    cell = Cell("pasdf-paper", one, Format.SHAPENET, 0, tmp_path)
+    cell.folder.mkdir(parents=True)
+    scored = {"score": np.arange(4.0), "label": np.array([0, 0, 1, 1])}
+    for name, residual_mm in zip(names, (1.0, 1.0, 0.05), strict=True):
+        said = {"whole": 1.0, "seconds": 1.0, "residual_mm": residual_mm, "aligned": name != "gone"}
+        np.savez(cell.folder / f"{name}.npz", **scored, **said)
+    fit = dict.fromkeys(
+        ("seconds", "sigma_mm", "cd", "emd", "cd_squared", "to_surface", "from_surface"), 0.0
+    )
+    row = _judge(cell, dict(fit))
+    assert (row.failed_alignments, row.badly_aligned) == (1, 2)  # the good one has no noise at all
