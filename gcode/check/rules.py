@@ -9,8 +9,19 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.check import plain_kernels as plain
+from gcode.check.arcs import points_of_arc
 from gcode.check.findings import Moves, Refusal, Text
-from gcode.check.words import COMMANDS, G90_SETS_E, G91_MOVES_E, LINE_LIMIT, PROBES
+from gcode.check.words import (
+    COMMANDS,
+    G90_SETS_E,
+    G91_MOVES_E,
+    LENIENT_OF_TOOLS,
+    LINE_LIMIT,
+    PROBES,
+    STARTS,
+    parameters,
+    words_of,
+)
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 
@@ -23,10 +34,11 @@ PLACE_SLACK_MM = 0.011
 FASTEST_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
 INCH_MM = 25.4
 HEATER_COMMANDS = {"M104": "hotend", "M109": "hotend", "M140": "bed", "M190": "bed"}
-_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
 _HEAD = re.compile(r"(?:N\d+\s*)?([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+_TOOL = re.compile(r"T\d+")
 _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
+KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
 _MACHINE_LIMITS = {"M201": "max_acceleration_mm_s2", "M203": "max_speed_mm_s"}
 
 
@@ -53,7 +65,9 @@ class Judge:
         self.commands = 0
         self._setup, self._dialect = setup, program.dialect
         macros = {macro.split(maxsplit=1)[0].upper() for macro in setup.printer.macros}
-        self._known = COMMANDS[program.dialect] | macros
+        self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
+        own = {self._begins.name if self._begins else "", self._ends or ""}
+        self._known = COMMANDS[program.dialect] | macros | {name.upper() for name in own}
         self._area_mm2 = math.pi / 4 * setup.printer.filament_diameter_mm**2
         self._alone = initial is None
         self._standing_top_mm = standing_top_mm
@@ -72,6 +86,7 @@ class Judge:
         self._bed_c = state.bed_c if state else 0.0
         self._pulled_mm = 0.0
         self._short_mm3 = 0.0
+        self._tool: str | None = None
         self._line, self._text = 0, ""
         printer = setup.printer
         x0, y0, x1, y1 = printer.reach_box_mm
@@ -105,13 +120,18 @@ class Judge:
             self._named(upper)
             return
         name = head.group(1) + head.group(2) + (f".{head.group(3)}" if head.group(3) else "")
-        if name not in self._known:
+        lenient = self._dialect in LENIENT_OF_TOOLS and _TOOL.fullmatch(name) is not None
+        if name not in self._known and not lenient:
             self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
             return
+        if lenient:
+            self._choose(name)
         if name in {"M117", "M118", "M862.3", "M115"}:
             return  # free text
-        words = self._words(upper[head.end() :])
-        if words is not None:
+        words, wrong = words_of(upper[head.end() :])
+        if wrong is not None:
+            self._refuse(*wrong)
+        else:
             self._act(name, words)
 
     def follow(self, text: Text, first: int, end: int) -> int:
@@ -160,31 +180,49 @@ class Judge:
     def _named(self, command: str) -> None:
         match = _NAMED.match(command)
         name = match.group(1) if match else command.split(maxsplit=1)[0]
+        given = parameters(command)
         if name not in self._known:
             self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
         elif name in PROBES and self._occupied:
             self._refuse("probing over a standing part", name, "nothing may stand there")
+        elif self._begins is not None and name == self._begins.name.upper():
+            self._home({}, name)
+            for heat, key in (("M109", self._begins.hotend), ("M190", self._begins.bed)):
+                self._heat(heat, {"S": self._number(given.get(key.upper()))})
+        elif name in STARTS and self._occupied:
+            self._refuse("homing Z onto a standing part", name, "nothing may stand there")
+        elif name == "TURN_OFF_HEATERS" or (self._ends and name == self._ends.upper()):
+            self._hotend_c = self._ready_c = self._bed_c = 0.0
+            if name != "TURN_OFF_HEATERS":
+                self._place = [None] * 3  # it goes where it parks
+        elif name == "SET_HEATER_TEMPERATURE" and given.get("HEATER") in KLIPPER_HEATERS:
+            # without a target Klipper takes 0
+            target_c = self._number(given.get("TARGET", "0"))
+            self._heat(KLIPPER_HEATERS[given["HEATER"]], {"S": target_c})
+        elif name == "SET_GCODE_OFFSET":
+            self._offset(given)
 
-    def _words(self, rest: str) -> dict[str, float | None] | None:
-        """Words of a command; a letter without a number is a flag."""
-        rest = rest.partition("*")[0]
-        words: dict[str, float | None] = {}
-        at = 0
-        while at < len(rest):
-            if rest[at] in " \t":
-                at += 1
-                continue
-            match = _WORD.match(rest, at)
-            if match is None or (match.end() < len(rest) and rest[match.end()] in ".0123456789"):
-                self._refuse("word that is no number", rest.strip(), "a letter and one number")
-                return None
-            letter, text = match.groups()
-            if letter in words:
-                self._refuse("word given twice", letter, "once")
-                return None
-            words[letter] = None if text is None else float(text)
-            at = match.end()
-        return words
+    def _offset(self, given: dict[str, str]) -> None:
+        for letter in "XYZ":
+            for key in (letter, f"{letter}_ADJUST"):
+                value = self._number(given.get(key, "0"))
+                if value is None or abs(value) > PLACE_SLACK_MM:
+                    self._refuse("shift of the coordinate system", f"{key}={given[key]}", "0 mm")
+
+    def _number(self, text: str | None) -> float | None:
+        try:
+            return None if text is None else float(text)
+        except ValueError:
+            self._refuse("word that is no number", text or "", "a number")
+            return None
+
+    def _choose(self, tool: str) -> None:
+        """The only tool may have any number, but another one later would be another colour."""
+        used = bool(self.moves.pushed_mm3.any())
+        before = self._tool or ("T0" if used else tool)
+        if tool != before:
+            self._refuse("change of tool", tool, f"one tool: {before}")
+        self._tool = before
 
     # ------------------------------------------------------------------ commands
 
@@ -244,10 +282,10 @@ class Judge:
             if name == "M109" or value_c < self._ready_c:
                 self._ready_c = value_c
 
-    def _home(self, words: dict[str, float | None]) -> None:
+    def _home(self, words: dict[str, float | None], by: str = "G28 with Z") -> None:
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
         if 2 in axes and self._occupied:
-            self._refuse("homing Z onto a standing part", "G28 with Z", "G28 X Y only")
+            self._refuse("homing Z onto a standing part", by, "G28 X Y only")
         for axis in axes:
             self._homed[axis] = True
             self._place[axis] = None  # the place of an end stop is the firmware's business
@@ -331,27 +369,15 @@ class Judge:
         if words.get("R") is not None:
             self._refuse("arc told by its radius", "R", "I and J")
             return
-        cx = x0 + (words.get("I") or 0.0) * self._unit
-        cy = y0 + (words.get("J") or 0.0) * self._unit
-        r0, r1 = math.hypot(x0 - cx, y0 - cy), math.hypot(x1 - cx, y1 - cy)
-        if r0 < 1e-3 or abs(r0 - r1) > max(0.05, 0.002 * r0):
-            self._refuse("arc whose ends lie on two circles", f"{abs(r0 - r1):.3f} mm", "0.05 mm")
+        centre = tuple((words.get(letter) or 0.0) * self._unit for letter in "IJ")
+        start, end = (x0, y0, z0), (x1, y1, z1)
+        apart_mm, points = points_of_arc(start, end, (centre[0], centre[1]), clockwise=clockwise)
+        if not points:
+            self._refuse("arc whose ends lie on two circles", f"{apart_mm:.3f} mm", "0.05 mm")
             return
-        a0 = math.atan2(y0 - cy, x0 - cx)
-        sweep = math.atan2(y1 - cy, x1 - cx) - a0
-        if clockwise:
-            sweep -= 2 * math.pi if sweep >= -1e-9 else 0.0
-        else:
-            sweep += 2 * math.pi if sweep <= 1e-9 else 0.0
-        n = max(2, math.ceil(abs(sweep) * math.sqrt(max(r0, 0.1)) / 0.3))
-        for k in range(1, n + 1):
-            t = k / n
-            point: list[float | None] = [
-                cx + r0 * math.cos(a0 + sweep * t),
-                cy + r0 * math.sin(a0 + sweep * t),
-                z0 + (z1 - z0) * t,
-            ]
-            self._go(target if k == n else point, pushed / n, moved=True)
+        for k, point in enumerate(points, 1):
+            last = k == len(points)
+            self._go(target if last else [*point], pushed / len(points), moved=True)
 
     def _go(self, target: list[float | None], pushed_mm: float, *, moved: bool) -> None:
         here = self._place

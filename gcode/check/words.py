@@ -6,6 +6,9 @@ What changes the machine lastingly, or switches a protection off, is left out on
 
 from __future__ import annotations
 
+import re
+
+_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
 _MOTION = "G0 G1 G2 G3 G4 G10 G11 G17 G20 G21 G28 G90 G91 G92"
 _COMMON = (
     "M17 M18 M73 M82 M83 M84 M104 M105 M106 M107 M109 M110 M114 M115 M117 M118 M140 M141 M190 "
@@ -31,8 +34,41 @@ COMMANDS: dict[str, frozenset[str]] = {
 }  # fmt: skip
 # What measures or moves against the bed with a probe or the nozzle: never over a standing part.
 PROBES = frozenset({"G29", "G32", "G34", "G80", "G81", "BED_MESH_CALIBRATE", "QUAD_GANTRY_LEVEL"})
+# Macros that begin a job by convention: they home all axes, and most of them probe.
+STARTS = frozenset({"START_PRINT", "PRINT_START"})
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
 # Klipper's G91 makes E relative while it lasts, whatever M82 says.
 G91_MOVES_E = frozenset({"klipper"})
+# A tool that is not there is reported and the only one goes on (klippy/gcode.py, cmd_default).
+LENIENT_OF_TOOLS = frozenset({"klipper"})
+
+
+def parameters(command: str) -> dict[str, str]:
+    """KEY=VALUE pairs of a named command, keys and values in capitals."""
+    pairs = (word.partition("=") for word in command.upper().split()[1:])
+    return {key: value for key, _, value in pairs}
+
+
+def words_of(rest: str) -> tuple[dict[str, float | None], tuple[str, str, str] | None]:
+    """Words after a command, and what is wrong with them: what, value, limit.
+
+    A letter without a number is a flag.
+    """
+    rest = rest.partition("*")[0]
+    words: dict[str, float | None] = {}
+    at = 0
+    while at < len(rest):
+        if rest[at] in " \t":
+            at += 1
+            continue
+        match = _WORD.match(rest, at)
+        if match is None or (match.end() < len(rest) and rest[match.end()] in ".0123456789"):
+            return words, ("word that is no number", rest.strip(), "a letter and one number")
+        letter, text = match.groups()
+        if letter in words:
+            return words, ("word given twice", letter, "once")
+        words[letter] = None if text is None else float(text)
+        at = match.end()
+    return words, None

@@ -12,6 +12,7 @@ from gcode.cli import console, importing
 from gcode.cli.options import (
     JsonOption,
     MaterialOption,
+    OwnMaterialOption,
     PrinterOption,
     ProcessOption,
     grid_of,
@@ -158,13 +159,14 @@ def slice_solid(
     "check",
     epilog=console.examples(
         "gcode check job.gcode --printer ender_3",
+        "gcode check job.gcode --printer creality_k1_max --material petg",
         "gcode check repair.gcode --as-built standing.stl --json",
     ),
 )
 def check(
     file: FileArgument,
     printer: PrinterOption = DEFAULT_PRINTER,
-    material: MaterialOption = DEFAULT_MATERIAL,
+    material: OwnMaterialOption = None,
     as_built: AsBuiltOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -174,7 +176,9 @@ def check(
         from gcode.moves import Program
         from gcode.profiles import load_setup
 
-    setup = load_setup(printer, material)
+    setup = load_setup(printer, material or DEFAULT_MATERIAL)
+    if material is None:
+        setup = setup.melting_all()
     program = Program(program_text(file), setup.printer.dialect)
     field = _as_built(as_built) if as_built is not None else None
     bars = console.Bars()

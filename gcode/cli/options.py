@@ -29,6 +29,13 @@ MaterialOption = Annotated[
         autocompletion=console.profile_ids("materials"),
     ),
 ]
+OwnMaterialOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Material profile: an ID or a TOML file. Left out, the flow is judged by the hotend.",
+        autocompletion=console.profile_ids("materials"),
+    ),
+]
 ProcessOption = Annotated[
     str,
     typer.Option(

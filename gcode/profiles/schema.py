@@ -81,6 +81,19 @@ class EnvelopeSlice(BaseModel):
         return polygon
 
 
+class StartMacro(BaseModel):
+    """A macro of the machine's own that homes all axes, heats, and waits for both heaters.
+
+    `hotend` and `bed` are the parameters that tell it how hot.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    hotend: str
+    bed: str
+
+
 class PrinterProfile(_Profile):
     """A machine: what it can reach, how fast, how hot, and in which words it is spoken to."""
 
@@ -113,6 +126,8 @@ class PrinterProfile(_Profile):
     start_gcode: tuple[str, ...]
     end_gcode: tuple[str, ...]
     macros: tuple[str, ...] = ()  # commands of this machine beyond its firmware's own
+    start_macro: StartMacro | None = None
+    end_macro: str | None = None  # switches both heaters off
 
     @field_validator("start_gcode", "end_gcode", mode="before")
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gcode.errors import ProfileError
@@ -26,6 +26,11 @@ class PrintSetup:
     def max_volumetric_mm3_s(self) -> float:
         """What hotend and filament both can melt, mm³/s."""
         return min(self.printer.max_volumetric_mm3_s, self.material.max_volumetric_mm3_s)
+
+    def melting_all(self) -> PrintSetup:
+        """The same with a filament that melts as fast as the hotend can: what it is nobody said."""
+        as_hotend = {"max_volumetric_mm3_s": self.printer.max_volumetric_mm3_s}
+        return replace(self, material=self.material.model_copy(update=as_hotend))
 
     @property
     def hashes(self) -> dict[str, str]:

@@ -199,6 +199,75 @@ def test_real_files_for_this_printer_pass(name: str) -> None:
     assert not find_refusals(program(text), SETUP)
 
 
+@pytest.mark.skipif("AMREPAIR_DATA" not in os.environ, reason="AMREPAIR_DATA is not set")
+@pytest.mark.parametrize("name", ["cura_slicer", "orca_slicer"])
+def test_real_files_for_a_k1_max_pass_there_and_nowhere_smaller(name: str) -> None:
+    """They are begun by the machine's own macro, which homes and heats."""
+    path = Path(os.environ["AMREPAIR_DATA"]) / "gcode" / f"{name}.gcode"
+    text = path.read_text(errors="replace")
+    assert not find_refusals(Program(text, "klipper"), load_setup("creality_k1_max").melting_all())
+    elsewhere = find_refusals(Program(text, "klipper"), load_setup("generic_klipper"))
+    assert any("before homing" in r.what for r in elsewhere)
+
+
+K1 = load_setup("creality_k1_max")
+KLIPPER = """START_PRINT EXTRUDER_TEMP=210 BED_TEMP=60
+G90
+M83
+G1 X50 Y50 Z0.3 F3000
+G1 X110 E3 F1200
+END_PRINT
+"""
+KLIPPER_FAULTS = {
+    "start too hot": ("EXTRUDER_TEMP=210", "EXTRUDER_TEMP=400", "hotend temperature"),
+    "start too cold": ("EXTRUDER_TEMP=210", "EXTRUDER_TEMP=100", "cold extrusion"),
+    "bed too hot": ("BED_TEMP=60", "BED_TEMP=160", "bed temperature"),
+    "start without a temperature": ("EXTRUDER_TEMP=210 ", "", "temperature missing"),
+    "no start": ("START_PRINT EXTRUDER_TEMP=210 BED_TEMP=60\n", "", "before homing"),
+    "no end": ("END_PRINT\n", "", "is lacking"),
+    "heater by its name": (
+        "G90\n", "G90\nSET_HEATER_TEMPERATURE HEATER=extruder TARGET=400\n", "hotend temperature"
+    ),
+    "left on by its name": (
+        "END_PRINT", "END_PRINT\nSET_HEATER_TEMPERATURE HEATER=heater_bed TARGET=60", "is lacking"
+    ),
+    "offset": ("G90\n", "SET_GCODE_OFFSET Z=-0.5\nG90\n", "coordinate system"),
+    "offset step by step": ("G90\n", "SET_GCODE_OFFSET Z_ADJUST=-0.5\nG90\n", "coordinate"),
+    "another tool": ("G1 X110 E3 F1200", "G1 X110 E3 F1200\nT1\nG1 X50 E3", "change of tool"),
+    "tools in turn": ("G90\n", "T1\nT0\nG90\n", "change of tool"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", KLIPPER_FAULTS)
+def test_faults_in_what_a_klipper_machine_adds_are_refused(name: str) -> None:
+    assert not find_refusals(Program(KLIPPER, "klipper"), K1)
+    old, new, said = KLIPPER_FAULTS[name]
+    assert old in KLIPPER
+    refusals = find_refusals(Program(KLIPPER.replace(old, new, 1), "klipper"), K1)
+    assert any(said in refusal.what for refusal in refusals)
+
+
+def test_the_only_tool_may_have_any_number_and_heaters_may_go_off_at_once() -> None:
+    text = KLIPPER.replace("G90\n", "T3\nSET_GCODE_OFFSET Z=0\nG90\n")
+    assert not find_refusals(Program(text, "klipper"), K1)
+    text = KLIPPER.replace("END_PRINT", "TURN_OFF_HEATERS")
+    assert not find_refusals(Program(text, "klipper"), K1)
+    cold = KLIPPER.replace("G1 X110", "TURN_OFF_HEATERS\nG1 X110")
+    assert find_refusals(Program(cold, "klipper"), K1)
+
+
+@pytest.mark.parametrize("printer", ["creality_k1_max", "voron_2_4", "generic_klipper"])
+@pytest.mark.parametrize("macro", ["START_PRINT", "PRINT_START", "START_PRINT EXTRUDER_TEMP=210"])
+def test_a_macro_that_begins_a_job_is_refused_over_a_standing_part(
+    printer: str, macro: str
+) -> None:
+    """It homes Z, whatever else it does; it passed."""
+    setup = load_setup(printer)
+    stands = HeightField.flat((50.0, 50.0), 1.0, z_mm=5.0)
+    refusals = find_refusals(Program(f"{macro}\n", "klipper"), setup, as_built=stands)
+    assert any("homing Z onto" in refusal.what for refusal in refusals)
+
+
 @pytest.mark.parametrize("dialect", ["klipper", "marlin"])
 def test_the_end_of_a_cura_job_pulls_back_two_millimetres(dialect: str) -> None:
     """M82, then G91: relative in Klipper and in Marlin; it was read as 1.5 m pulled back."""

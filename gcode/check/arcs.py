@@ -1,0 +1,35 @@
+"""Arcs as the short straight pieces that firmwares make of them."""
+
+from __future__ import annotations
+
+import math
+
+Point = tuple[float, float, float]
+LEAST_RADIUS_MM = 1e-3
+APART_MM, APART_RATIO = 0.05, 0.002  # the ends' distances from the centre, which slicers round
+PIECE_MM = 0.3  # at a radius of 1 mm
+
+
+def points_of_arc(
+    start_mm: Point, end_mm: Point, centre_mm: tuple[float, float], *, clockwise: bool
+) -> tuple[float, list[Point]]:
+    """How far apart the circles of its two ends are, and points along it; none if too far.
+
+    `centre_mm` is relative to the start; ends that coincide make a whole turn.
+    """
+    (x0, y0, z0), (x1, y1, z1) = start_mm, end_mm
+    cx, cy = x0 + centre_mm[0], y0 + centre_mm[1]
+    r0, r1 = math.hypot(x0 - cx, y0 - cy), math.hypot(x1 - cx, y1 - cy)
+    if r0 < LEAST_RADIUS_MM or abs(r0 - r1) > max(APART_MM, APART_RATIO * r0):
+        return abs(r0 - r1), []
+    a0 = math.atan2(y0 - cy, x0 - cx)
+    sweep = math.atan2(y1 - cy, x1 - cx) - a0
+    if clockwise:
+        sweep -= 2 * math.pi if sweep >= -1e-9 else 0.0
+    else:
+        sweep += 2 * math.pi if sweep <= 1e-9 else 0.0
+    n = max(2, math.ceil(abs(sweep) * math.sqrt(max(r0, 0.1)) / PIECE_MM))
+    turns = ((k / n, a0 + sweep * k / n) for k in range(1, n + 1))
+    return abs(r0 - r1), [
+        (cx + r0 * math.cos(a), cy + r0 * math.sin(a), z0 + (z1 - z0) * t) for t, a in turns
+    ]
