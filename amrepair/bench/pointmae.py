@@ -155,7 +155,7 @@ def load_checkpoint(path: Path | None, kind: str) -> PointTransformer:
     if path is None:
         raise InputError(
             f"patchcore-{kind} needs pretrained weights and none are included; give the "
-            f"checkpoint published with the method ({published}) as checkpoint"
+            f"checkpoint published with the method ({published}) with --checkpoint"
         )
     if not path.is_file():
         raise InputError(f"{path}: there is no such checkpoint; give the path of {published}")
