@@ -14,16 +14,17 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from amrepair.deficit.boxes import boxes_of
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.deficit.walls import with_even_crests, with_sharp_walls
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.detection import ON_PLANE_MM
 from amrepair.detect.evidence import Evidence
-from amrepair.detect.regions import classify, group_points
+from amrepair.detect.regions import classify
 from amrepair.detect.skipped import PlannedBeads, skipped
 from amrepair.errors import DeficitError
 from amrepair.frames import Transform, in_box
@@ -40,8 +41,8 @@ THIN_RATIO = 0.25
 BEAD_MM3 = 0.08
 # Pieces below this share of a bead are what marching cubes makes of noise at a rim.
 CRUMB_MM3 = 0.02
-BOX_MARGIN_MM = 1.0
-PATH_STEP_MM = 1.0
+# From so much on heights will be asked for: what a clean layer's crumbs never are.
+EARLY_MM3 = 0.5
 
 
 class Standing:
@@ -175,8 +176,7 @@ def compute_deficit(
     solids: dict[Label, list[manifold3d.Manifold]] = {}
     regions: list[Region] = []
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
-        something = bool((np.asarray(anomaly.surfel_label) == int(Label.MISSING)).any())
-        early = beside.submit(look) if something else None
+        early = beside.submit(look) if _roughly_missing(anomaly, evidence) > EARLY_MM3 else None
         for label in (Label.MISSING, Label.EXCESS):
             gone = lines if label is Label.MISSING else None
             solids[label] = _pieces(template, evidence, anomaly, label, tau_mm, gone, progress)
@@ -215,6 +215,13 @@ def compute_deficit(
     )
 
 
+def _roughly_missing(anomaly: AnomalyMap, evidence: Evidence) -> float:
+    """Volume under the surfels that are labelled missing, mm³."""
+    s = evidence.surfels
+    mine = np.asarray(anomaly.surfel_label) == int(Label.MISSING)
+    return float(np.abs(s.deviation_mm[mine]).sum()) * s.cell_mm**2
+
+
 def _pieces(
     template: Template,
     evidence: Evidence,
@@ -225,7 +232,7 @@ def _pieces(
     progress: Progress,
 ) -> list[manifold3d.Manifold]:
     """Solids of one label, each in one piece, template frame."""
-    boxes = _boxes(anomaly, evidence, template, label, gone)
+    boxes = boxes_of(anomaly, evidence, template, label, gone)
     finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
     found: list[manifold3d.Manifold] = []
     for i, (low, high, depth) in enumerate(boxes):
@@ -243,97 +250,6 @@ def _pieces(
         )
         found += [piece for piece in solid.decompose() if piece.volume() >= CRUMB_MM3]
     return found
-
-
-def _boxes(
-    anomaly: AnomalyMap,
-    evidence: Evidence,
-    template: Template,
-    label: Label,
-    lines: PlannedBeads | None,
-) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
-    """Low corner, high corner and depth of each group of labelled cells and template points."""
-    s = evidence.surfels
-    which = np.flatnonzero(np.asarray(anomaly.surfel_label) == int(label))
-    points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
-    if label is Label.MISSING:
-        gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
-        gone = np.concatenate([gone, _paths_out(template, evidence, which)])
-        points = np.concatenate([points, gone])
-        depth = np.concatenate([depth, np.full(len(gone), np.nan)])
-    else:
-        points = np.concatenate([points, _feet(evidence, which)])
-        depth = np.concatenate([depth, np.full(len(which), np.nan)])
-    group = group_points(points)
-    found = []
-    for g in range(int(group.max()) + 1 if len(group) else 0):
-        mine = points[group == g]
-        deep = depth[group == g]
-        known = deep[~np.isnan(deep)]
-        # cells with a handful of template points and nothing else are pixels, not defects
-        if len(known) == 0 and len(mine) < 4:
-            continue
-        thick = float(np.percentile(known, 90)) if len(known) else 2.0
-        found.append((mine.min(axis=0) - BOX_MARGIN_MM, mine.max(axis=0) + BOX_MARGIN_MM, thick))
-    if lines is not None:
-        for a, b, high in zip(lines.start_mm, lines.end_mm, lines.height_mm, strict=True):
-            low, top = np.minimum(a, b) - BOX_MARGIN_MM, np.maximum(a, b) + BOX_MARGIN_MM
-            found.append((low, top, float(high)))
-    return _merge(found)
-
-
-def _paths_out(
-    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"]
-) -> Float[np.ndarray, "p 3"]:
-    """Points through the empty space from a void's floor to where it leaves the template.
-
-    They tie the floor to the mouth where nobody sampled the walls between.
-    """
-    s = evidence.surfels
-    if len(which) == 0:
-        return np.zeros((0, 3))
-    _, first = np.unique(
-        np.floor(s.place_mm[which] / PATH_STEP_MM).astype(np.int64), axis=0, return_index=True
-    )
-    front, along = s.place_mm[which[first]], evidence.normal[which[first]]
-    found = []
-    reach_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-    for _ in range(int(reach_mm / PATH_STEP_MM) + 1):
-        front = front + PATH_STEP_MM * along
-        f = template.distance(front)
-        go_on = (f < 0) & (evidence.clearance(front, f)[0] > 0)
-        if not go_on.any():
-            break
-        front, along = front[go_on], along[go_on]
-        found.append(front)
-    return np.concatenate(found) if found else np.zeros((0, 3))
-
-
-def _feet(evidence: Evidence, which: Int[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
-    """Where excess surfels stand on the template: along their planes, back by their height."""
-    s = evidence.surfels
-    return np.asarray(s.place_mm[which] - s.deviation_mm[which, None] * evidence.normal[which])
-
-
-def _merge(
-    boxes: list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]],
-) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
-    """Boxes that overlap become one, so that no volume is made twice."""
-    merged = list(boxes)
-    changed = True
-    while changed:
-        changed = False
-        for i in range(len(merged)):
-            for j in range(i + 1, len(merged)):
-                (a_low, a_high, a), (b_low, b_high, b) = merged[i], merged[j]
-                if (a_low <= b_high).all() and (b_low <= a_high).all():
-                    joined = (np.minimum(a_low, b_low), np.maximum(a_high, b_high), min(a, b))
-                    merged = [m for k, m in enumerate(merged) if k not in {i, j}] + [joined]
-                    changed = True
-                    break
-            if changed:
-                break
-    return merged
 
 
 def _solid_in_box(

@@ -10,6 +10,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -71,6 +72,7 @@ class Run:
         self._sent: list[Sent] = []
         self._next_line = 0
         self._looks: list[Look] = []
+        self._unsettled: list[Callable[[], Look]] = []  # the last ones, as they are to be kept
         self._job_prints: list[PrintReport] = []
         self._repair_prints: list[PrintReport] = []
         self._stopped = ""
@@ -106,7 +108,9 @@ class Run:
         with self._watch("print"), ThreadPoolExecutor(1) as beside:
             if coming is not None and not self._tape.only_read:
                 self._coming = coming, beside.submit(self._site_at, coming)
+            settling = beside.submit(self.settle)
             report = self._send("job", self._checked, first, end, whole_job)
+        settling.result()
         if report is not None:
             self._job_prints.append(report)
             if not report.ok:
@@ -242,8 +246,15 @@ class Run:
             self._record(look)
             self._tape.write("look", **look_to_json(look))
         last = stop.layer_index is None
-        self._looks.append(settled(look, site, compared=bool(here) or last))
+        self._looks.append(look)
+        self._unsettled.append(partial(settled, look, site, compared=bool(here) or last))
         return look
+
+    def settle(self) -> None:
+        """Keep of the last looks what a report shows; while the job prints nothing waits for it."""
+        if self._unsettled:
+            self._looks[-len(self._unsettled) :] = [keep() for keep in self._unsettled]
+            self._unsettled.clear()
 
     def _plan(
         self,

@@ -138,4 +138,5 @@ def run_loop(
         with contextlib.suppress(GcodeError, OSError):
             printer.heaters_off()
         raise
+    run.settle()
     return run.report()
