@@ -262,7 +262,8 @@ def plan_repair(
     """
     watch = watch or Stopwatch()
     with watch("align"), ThreadPoolExecutor(1) as beside:
-        seen = beside.submit(range_images, scan)  # what rays saw needs no pose, nor it them
+        # what rays saw needs no pose, nor it them; a part of the scan has images of its own
+        seen = None if _is_cut(site) else beside.submit(range_images, scan)
         outer = _outside_open_infill(scan, site, guess)
         registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
     placed = _build_from_template(site, scan, registration)
@@ -281,9 +282,9 @@ def plan_repair(
             expected,
             allowance_mm=site.allowance_mm,
             top_z_mm=_top_of_layer(site),
-            images=tuple(i.moved(registration.template_from_scan) for i in seen.result())
-            if moved is whole
-            else None,
+            images=None
+            if seen is None
+            else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
             progress=progress,
         )
@@ -373,10 +374,16 @@ def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Sca
     return _subset(scan, inside_mm > -OPEN_INFILL_MM)
 
 
+def _is_cut(site: Site) -> bool:
+    """Whether what is expected ends in mid-air, and not at the bed."""
+    return site.planned is not None and is_off_bed(site.planned)
+
+
 def _in_view(scan: Scan, site: Site) -> Scan:
     """What a planned template can judge: its own last millimetres; all of it otherwise."""
-    if site.planned is None or not is_off_bed(site.planned):
-        return scan  # it reaches down to the bed: nothing was cut off
+    if not _is_cut(site):
+        return scan
+    assert site.planned is not None
     low_mm = float(site.planned.bounds_mm[0, 2]) + PLANNED_EDGE_MM
     return _subset(scan, scan.points_mm[:, 2] > low_mm)
 
