@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 FRAMES = ("build", "unknown")
 # Less than this share out of reach is not worth turning the part over.
 WORTH_TURNING_RATIO = 0.05
-UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
 
 def add_to(app: typer.Typer) -> None:
@@ -209,7 +208,7 @@ def pose_of_job(job: Path | None, template: Path, ids: tuple[str, str, str]) -> 
 
     The job cannot know whether the part was taken off meanwhile, so somebody has to say it.
     """
-    from amrepair.loop import locate_part
+    from amrepair.loop.locate import is_upright, locate_parts
     from amrepair.template import open_template
     from gcode.cli.options import job_of
     from gcode.profiles import load_setup
@@ -221,17 +220,21 @@ def pose_of_job(job: Path | None, template: Path, ids: tuple[str, str, str]) -> 
     try:
         with bars.shown():
             field = open_template(template, progress=bars)
-            placed = locate_part(
+            copies = locate_parts(
                 job_of(job, setup), field, layer_height_mm=setup.process.layer_height_mm
             )
     except (AmrepairError, GcodeError) as error:
         return f"{job} does not tell, either: {error}"
-    if placed.matrix[2, 2] < UPRIGHT:
+    if not is_upright(copies[0]):
         return f"{job} prints it lying in another way than its own file has it"
-    x, y, z = placed.translation_mm
-    turn_deg = math.degrees(math.atan2(placed.matrix[1, 0], placed.matrix[0, 0]))
-    words = f"{x:.3f},{y:.3f},{z:.3f},{turn_deg:.2f}"
-    return f"{job} prints it at --part-pose {words}: say so if it stands there still"
+    words = []
+    for placed in copies:
+        x, y, z = placed.translation_mm
+        turn_deg = math.degrees(math.atan2(placed.matrix[1, 0], placed.matrix[0, 0]))
+        words.append(f"{x:.3f},{y:.3f},{z:.3f},{turn_deg:.2f}")
+    if len(words) > 1:
+        return f"{job} prints {len(words)} of it, at --part-pose {' or '.join(words)}: say which"
+    return f"{job} prints it at --part-pose {words[0]}: say so if it stands there still"
 
 
 def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:

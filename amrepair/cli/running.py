@@ -20,12 +20,12 @@ from amrepair.loop import (
     LoopReport,
     Stop,
     Tape,
-    locate_part,
     plan_stops,
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
 from amrepair.loop.limits import Limits
+from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.pace import Pace, layers_at
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.setting import Setting, forget, keep, open_run
@@ -185,17 +185,29 @@ def _new_run(
         with watch("template"):
             field = open_template(template, progress=bars)
         with watch("locate"):
-            bars("locate", 0.0, 1.0)
-            placed = locate_part(job, field, layer_height_mm=setup.process.layer_height_mm)
-            bars("locate", 1.0, 1.0)
+            placed = locate_parts(
+                job, field, layer_height_mm=setup.process.layer_height_mm, progress=bars
+            )
+            expected, build_from_template = stood(field, placed)
+    if expected is not field:
+        console.errors.print(_how_it_stands(placed))
     setting = Setting.of(
-        setup, ids, stops=stops, build_from_template=placed, build_from_scanner=pose,
-        by_beads=True, max_iterations=MAX_ITERATIONS, adaptive=pace,
-        limited=said["approve"] == "auto", title=job_file.name, **said,
+        setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
+        copies=() if expected is field else placed, by_beads=True,
+        max_iterations=MAX_ITERATIONS, adaptive=pace, limited=said["approve"] == "auto",
+        title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
     keep(out, setting, job.program.text, field)
-    return _Begun(folder, setting, setup, job, checked, field, stops, Tape(out))
+    return _Begun(folder, setting, setup, job, checked, expected, stops, Tape(out))
+
+
+def _how_it_stands(placed: tuple[Transform, ...]) -> str:
+    """What a person should know of a template that is not as its file has it."""
+    lying = "" if is_upright(placed[0]) else ", lying in another way than its file has it"
+    if len(placed) == 1:
+        return f"The job prints the part{lying}; it is looked at so."
+    return f"The job prints {len(placed)} copies of the part{lying}; all of them are looked at."
 
 
 def _gone_on_with(

@@ -1,25 +1,40 @@
-"""Where the part stands in a job: its template registered to the job's own beads.
+"""Where the part stands in a job, and how often: its template registered to the job's own beads.
 
 It reads the job, not the bed: nothing is measured here.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from amrepair.align import align
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, box_of, rotation_from_vector
 from amrepair.scans import Scan
+from amrepair.template import StoodTemplate
 from amrepair.template.port import Template
-from gcode.reader import Job
+from gcode.progress import Progress, silent
+from gcode.reader import Beads, Job
+from gcode.surfaces import raster_kernels
 
 # Names of the outermost bead: PrusaSlicer and SuperSlicer, OrcaSlicer and Bambu, Cura.
 OUTER_WALLS = frozenset({"external perimeter", "overhang perimeter", "outer wall", "wall-outer"})
-WALL_STEP_MM = 0.8
+# What lies beside a part, and is none of it; the same slicers' names.
+BESIDE_THE_PART = frozenset(
+    {
+        "skirt", "brim", "skirt/brim", "support material", "support material interface", "support",
+        "support interface", "support transition", "support-interface", "wipe tower",
+        "prime tower", "prime-tower", "custom",
+    }
+)  # fmt: skip
+WALL_STEP_MM, THING_CELL_MM = 0.8, 0.2
+UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,46 +75,171 @@ class _Inset:
 
 
 def locate_part(job: Job, template: Template, *, layer_height_mm: float) -> Transform:
-    """Where the part stands in a job: its template registered to the job's own beads.
-
-    The centre lines of the outer walls lie half a bead inside the part, so they are registered to
-    that level of its field (idea 12 of the design).
-
-    Returns
-    -------
-    Transform
-        build from template.
+    """Where the only copy of a part stands in a job (`locate_parts`).
 
     Raises
     ------
     AlignmentError
-        If the job's walls do not fit the template to half a layer: it is another part, another
-        scale, or more than one copy.
+        As `locate_parts`, and where there are more copies.
+    """
+    placed = locate_parts(job, template, layer_height_mm=layer_height_mm)
+    if len(placed) > 1:
+        raise AlignmentError(f"the job prints {len(placed)} copies of the part, not one")
+    return placed[0]
+
+
+def locate_parts(
+    job: Job, template: Template, *, layer_height_mm: float, progress: Progress = silent
+) -> tuple[Transform, ...]:
+    """Where the part stands in a job, every copy of it: registered to the job's own beads.
+
+    What is connected as seen from above is one thing, skirts, brims and supports left aside. The
+    centre lines of the outer walls lie half a bead inside the part, so they are registered to that
+    level of its field (idea 12 of the design). Of poses that fit alike the part is turned least.
+
+    Returns
+    -------
+    tuple of Transform
+        build from template, in the order in which they are begun.
+
+    Raises
+    ------
+    AlignmentError
+        If walls do not fit the template to half a layer: another part, another scale, or one that
+        stands beside ours.
     """
     beads = job.beads
-    outer = [k for k, name in enumerate(beads.roles) if name.lower() in OUTER_WALLS]
-    pick = (beads.layer >= 0) & (np.isin(beads.role, outer) if outer else True)
-    start, end = beads.start_mm[pick], beads.end_mm[pick]
-    height_mm = beads.height_mm[pick]
+    ours = (beads.layer >= 0) & ~_of_roles(beads, BESIDE_THE_PART)
+    outer = ours & _of_roles(beads, OUTER_WALLS)
+    pick = outer if outer.any() else ours
     # half of what a bead stands for: its own rounded width is a little more
-    half_mm = float(np.median(0.5 * beads.section_mm2[pick] / np.maximum(height_mm, 1e-6)))
+    half_mm = float(
+        np.median(0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6))
+    )
+    inset = _Inset(template, half_mm)
+    thing = _things(beads.start_mm[ours, :2], beads.end_mm[ours, :2], half_mm)
+    count = int(thing.max(initial=-1)) + 1
+    bodies: Any = template.solid()
+    if len(bodies.decompose()) > 1:  # one part seems to be several things
+        thing[:], count = 0, 1
+    of_pick = thing[pick[ours]]
+    found: list[Transform] = []
+    for k in range(count):
+        progress("locate", float(k), float(count))
+        walls = _walls(beads, np.flatnonzero(pick)[of_pick == k])
+        try:
+            found.append(_place(walls, inset, layer_height_mm, found[0] if found else None))
+        except AlignmentError as error:
+            if count == 1:
+                raise
+            raise AlignmentError(
+                f"the job prints {count} things apart from each other, and the "
+                f"{_nth(k + 1)} of them does not fit the template ({error}); loop over a job that "
+                "prints copies of one part"
+            ) from error
+    progress("locate", float(count), float(count))
+    return tuple(
+        _on_bed(_untilted(placed, template), template, layer_height_mm) for placed in found
+    )
+
+
+def stood(template: Template, placed: tuple[Transform, ...]) -> tuple[Template, Transform]:
+    """The template as a job lays it on the bed, with its Z upright, and where that stands.
+
+    One copy that is only turned about Z stays as it is; else the frame is the bed's own.
+    """
+    if len(placed) == 1 and is_upright(placed[0]):
+        return template, placed[0]
+    return StoodTemplate.of(template, placed), Transform.identity("build", "template")
+
+
+def is_upright(placed: Transform) -> bool:
+    """Whether a pose has no tilt: the part lies as its own file has it."""
+    return bool(placed.matrix[2, 2] > UPRIGHT)
+
+
+def _of_roles(beads: Beads, names: frozenset[str]) -> Bool[np.ndarray, " n"]:
+    """Which beads have one of some roles."""
+    which = [k for k, name in enumerate(beads.roles) if name.lower() in names]
+    return np.isin(beads.role, which)
+
+
+def _things(
+    start_mm: Float[np.ndarray, "n 2"], end_mm: Float[np.ndarray, "n 2"], half_mm: float
+) -> Int[np.ndarray, " n"]:
+    """(n,) to which of the connected things, seen from above, each bead belongs; as they begin."""
+    low = np.minimum(start_mm, end_mm).min(axis=0) - 2.0
+    high = np.maximum(start_mm, end_mm).max(axis=0) + 2.0
+    nx, ny = (int(v) for v in np.ceil((high - low) / THING_CELL_MM))
+    covered = raster_kernels.beside_lines(
+        np.ascontiguousarray(start_mm), np.ascontiguousarray(end_mm),
+        np.full(len(start_mm), half_mm + 0.5 * THING_CELL_MM), low, THING_CELL_MM, ny, nx,
+    )  # fmt: skip
+    groups, _ = ndimage.label(covered, structure=np.ones((3, 3)))
+    x, y = np.floor((0.5 * (start_mm + end_mm) - low) / THING_CELL_MM).astype(np.int64).T
+    mine = groups[y, x]
+    _, first, number = np.unique(mine, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[number]
+
+
+def _walls(beads: Beads, which: Int[np.ndarray, " w"]) -> Scan:
+    """Points along the middles of some beads."""
+    start, end, height_mm = beads.start_mm[which], beads.end_mm[which], beads.height_mm[which]
     lengths = np.linalg.norm(end - start, axis=1)
     count = np.maximum(1, np.ceil(lengths / WALL_STEP_MM).astype(np.int64))
     owner = np.repeat(np.arange(len(count)), count)
     step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     points = start[owner] + (end - start)[owner] * ((step + 0.5) / count[owner])[:, None]
     points[:, 2] -= 0.5 * height_mm[owner]
-    scan = Scan(points, 0.05, "build", source="the job's walls")
-    found = align(scan, _Inset(template, half_mm))
-    off_mm = float(
-        np.median(np.abs(template.distance(found.template_from_scan.apply(points)) + half_mm))
-    )
+    return Scan(points, 0.05, "build", source="the job's walls")
+
+
+def _place(walls: Scan, inset: _Inset, layer_height_mm: float, like: Transform | None) -> Transform:
+    """Where one copy stands: as another one beside it, or in any way."""
+    if like is not None:
+        centre = 0.5 * inset.bounds_mm.sum(axis=0)
+        away = box_of(walls.points_mm).mean(axis=0) - like.apply(centre[None])[0]
+        beside = like.matrix.copy()
+        beside[:2, 3] += away[:2]
+        with suppress(AlignmentError):
+            guess = Transform("build", "template", beside).inverse()
+            placed = align(walls, inset, guess=guess).template_from_scan.inverse()
+            if _off_mm(walls, inset, placed) < 0.5 * layer_height_mm:
+                return placed
+    found = align(walls, inset)
+    alike = (found.template_from_scan, *found.symmetric_alternatives)
+    placed = max((pose.inverse() for pose in alike), key=lambda pose: float(np.trace(pose.matrix)))
+    off_mm = _off_mm(walls, inset, placed)
     if off_mm > 0.5 * layer_height_mm:
         raise AlignmentError(
             f"the job's walls lie {off_mm:.3f} mm off the template, the limit is half a layer "
-            f"({0.5 * layer_height_mm:g} mm); is it this part, at this scale, in one copy?"
+            f"({0.5 * layer_height_mm:g} mm); is it this part, at this scale?"
         )
-    return _on_bed(found.template_from_scan.inverse(), template, layer_height_mm)
+    return placed
+
+
+def _off_mm(walls: Scan, inset: _Inset, placed: Transform) -> float:
+    """How far walls lie off the template's, the median."""
+    return float(np.median(np.abs(inset.distance(placed.inverse().apply(walls.points_mm)))))
+
+
+def _nth(number: int) -> str:
+    return {1: "first", 2: "second", 3: "third"}.get(number, f"{number}th")
+
+
+def _untilted(placed: Transform, template: Template) -> Transform:
+    """The pose turned about Z alone, where it is upright: slicers do not tilt, walls waver."""
+    if not is_upright(placed):
+        return placed
+    turn_rad = float(np.arctan2(placed.matrix[1, 0], placed.matrix[0, 0]))
+    turn = rotation_from_vector(np.array([0.0, 0.0, turn_rad]))
+    centre = template.bounds_mm.mean(axis=0)
+    return Transform.from_rotation_translation(
+        placed.target,
+        placed.source,
+        rotation=turn,
+        translation_mm=placed.apply(centre[None])[0] - turn @ centre,
+    )
 
 
 def _on_bed(placed: Transform, template: Template, layer_height_mm: float) -> Transform:

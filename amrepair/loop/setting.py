@@ -18,7 +18,7 @@ import trimesh
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
-from amrepair.template import MeshSdf, load_template
+from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, job_for
@@ -40,6 +40,9 @@ class Setting:
         Layers are judged by the job's beads, else by the template's cut.
     build_from_template, build_from_scanner
         4×4, rows.
+    copies
+        Where each copy stands, 4×4, where the template that the run looks with is of them
+        (`locate.stood`); else empty.
     limited
         Whether it prints without asking, within the profile's limits.
     adaptive
@@ -64,6 +67,7 @@ class Setting:
     scan_timeout_s: float = 120.0
     approve: str = ""
     title: str = "job"
+    copies: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
     @classmethod
     def of(
@@ -74,6 +78,7 @@ class Setting:
         stops: Sequence[Stop],
         build_from_template: Transform,
         build_from_scanner: Transform,
+        copies: Sequence[Transform] = (),
         **others: Any,
     ) -> Setting:
         """From what a run is begun with; `ids` are the profiles as they were named."""
@@ -86,6 +91,7 @@ class Setting:
             final=any(s.layer_index is None for s in stops),
             build_from_template=_rows(build_from_template),
             build_from_scanner=_rows(build_from_scanner),
+            copies=tuple(_rows(pose) for pose in copies),
             **others,
         )
 
@@ -93,6 +99,13 @@ class Setting:
     def placed(self) -> Transform:
         """Build from template."""
         return Transform("build", "template", np.array(self.build_from_template))
+
+    def as_it_stands(self, template: Template) -> Template:
+        """What the run looks with: the part's template, or its copies as they stand."""
+        if not self.copies:
+            return template
+        poses = (Transform("build", "template", np.array(rows)) for rows in self.copies)
+        return StoodTemplate.of(template, tuple(poses))
 
     @property
     def scanner_pose(self) -> Transform:
@@ -176,7 +189,8 @@ def open_run(folder: Path) -> Recorded:
     setup = setting.setup()
     job = job_for(text, setup.printer)
     stops = plan_stops(job, setting.layers, final=setting.final)
-    return Recorded(setting, setup, job, _kept_template(folder), stops)
+    template = setting.as_it_stands(_kept_template(folder))
+    return Recorded(setting, setup, job, template, stops)
 
 
 def _keep_template(folder: Path, template: Template) -> None:

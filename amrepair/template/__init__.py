@@ -1,8 +1,9 @@
 """Templates: the part as it should be, as a signed distance field.
 
 Learned (`LearnedSdf`), learned as in the paper (`NetworkSdf`), exact (`MeshSdf`), planned from the
-job's beads (`PlannedSdf`); a layer's cut of any of them. It does not know scans' poses, nor what is
-done about a difference. torch is imported only while fitting, and by `NetworkSdf`.
+job's beads (`PlannedSdf`); a layer's cut of any of them, and copies as they stand on the bed
+(`StoodTemplate`). It does not know scans' poses, nor what is done about a difference. torch is
+imported only while fitting, and by `NetworkSdf`.
 """
 
 from amrepair.template.cut import CutTemplate
@@ -20,6 +21,7 @@ from amrepair.template.network import NetworkSdf
 from amrepair.template.opening import open_template
 from amrepair.template.planned import PlannedSdf
 from amrepair.template.port import Template
+from amrepair.template.stood import StoodTemplate
 
 __all__ = [
     "CutTemplate",
@@ -27,6 +29,7 @@ __all__ = [
     "MeshSdf",
     "NetworkSdf",
     "PlannedSdf",
+    "StoodTemplate",
     "Template",
     "default_cache_dir",
     "extract_mesh",

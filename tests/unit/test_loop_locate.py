@@ -1,0 +1,155 @@
+"""Where a job prints a part: upright where it may be, however it lies, and as often as it does."""
+
+from __future__ import annotations
+
+import manifold3d as m3
+import numpy as np
+import pytest
+import trimesh
+from jaxtyping import Float
+from loop_bench import solid_mesh
+
+from amrepair.deficit import compute_deficit
+from amrepair.detect import detect
+from amrepair.errors import AlignmentError
+from amrepair.frames import Transform, rotation_from_vector
+from amrepair.loop.locate import is_upright, locate_part, locate_parts, stood
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf, StoodTemplate
+from gcode.profiles import load_setup
+from gcode.reader import Job, job_for
+from gcode.slicing.job import plan_part
+from gcode.writer import write
+from tests import analytic
+
+SETUP = load_setup(process="repair_0.20")
+LAYER_MM = 0.2
+
+
+def wedge() -> m3.Manifold:
+    """A block with a step and a corner off: nothing about it is symmetric."""
+    block = m3.Manifold.cube((18.0, 12.0, 6.0))
+    step = m3.Manifold.cube((7.0, 20.0, 10.0)).translate((11.0, -1.0, 4.0))
+    corner = m3.Manifold.cube((9.0, 9.0, 20.0), True).rotate((0, 0, 45)).translate((0.0, 12.0, 0.0))
+    return block - step - corner
+
+
+def job_of(part: m3.Manifold) -> Job:
+    return job_for(write(plan_part(part, SETUP).toolpath, SETUP, title="job").text, SETUP.printer)
+
+
+def pose(turn_deg: tuple[float, float, float], x: float, y: float) -> Float[np.ndarray, "3 4"]:
+    """Turned about X, then Y, then Z, and laid onto the bed at a place."""
+    solid = wedge().rotate(turn_deg)
+    low = solid.bounding_box()[:3]
+    about = [rotation_from_vector(np.deg2rad(a) * np.eye(3)[k]) for k, a in enumerate(turn_deg)]
+    turn = about[2] @ about[1] @ about[0]
+    return np.column_stack([turn, np.array([x, y, 0.0]) - low])
+
+
+def off_mm(placed: Transform, truth: Float[np.ndarray, "3 4"]) -> float:
+    """How far the part's corners lie from where they are."""
+    corners = np.asarray(solid_mesh(wedge()).vertices)
+    away = placed.apply(corners) - (corners @ truth[:, :3].T + truth[:, 3])
+    return float(np.linalg.norm(away, axis=1).max())
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_part_that_fits_in_several_ways_is_taken_for_upright(seed: int) -> None:
+    """A block lies as well on its top: it was found so, and cut by layers from the wrong end."""
+    size = np.random.default_rng(seed).uniform(1.5, 16.0, 3)
+    block = m3.Manifold.cube(tuple(size))
+    template = MeshSdf.from_mesh(solid_mesh(block))
+    placed = locate_part(job_of(block.translate((100.0, 90.0, 0.0))), template,
+                         layer_height_mm=LAYER_MM)  # fmt: skip
+    assert placed.rotation[0, 0] > 0.9999
+    assert placed.rotation[2, 2] == 1.0
+    assert placed.translation_mm == pytest.approx([100.0, 90.0, 0.0], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "turn_deg",
+    [
+        (180.0, 0.0, 0.0),
+        pytest.param((90.0, 0.0, 30.0), marks=pytest.mark.slow),
+        pytest.param((0.0, 90.0, 0.0), marks=pytest.mark.slow),
+    ],
+)
+def test_a_part_sliced_lying_in_another_way_is_expected_as_it_lies(
+    turn_deg: tuple[float, float, float],
+) -> None:
+    truth = pose(turn_deg, 90.0, 70.0)
+    part = wedge().transform(truth)
+    template = MeshSdf.from_mesh(solid_mesh(wedge()))
+    placed = locate_parts(job_of(part), template, layer_height_mm=LAYER_MM)
+    assert len(placed) == 1
+    assert off_mm(placed[0], truth) < 0.15
+    assert not is_upright(placed[0])
+    expected, build_from_template = stood(template, placed)
+    assert (build_from_template.matrix == np.eye(4)).all()
+    # what is printed so far, from the bed up, whichever way its file has it
+    so_far = part.trim_by_plane((0.0, 0.0, -1.0), -3.0)
+    points = trimesh.sample.sample_surface(solid_mesh(so_far), 400, seed=1)[0]
+    assert np.abs(expected.below_z(3.0).distance(np.asarray(points))).max() < 0.15
+
+
+def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
+    truths = [pose((0.0, 0.0, turn), x, y) for turn, x, y in
+              ((0.0, 60.0, 60.0), (0.0, 81.0, 60.0), (90.0, 60.0, 80.0))]  # fmt: skip
+    plate = m3.Manifold.batch_boolean([wedge().transform(t) for t in truths], m3.OpType.Add)
+    template = MeshSdf.from_mesh(solid_mesh(wedge()))
+    placed = locate_parts(job_of(plate), template, layer_height_mm=LAYER_MM)
+    assert len(placed) == 3
+    for truth in truths:
+        assert min(off_mm(one, truth) for one in placed) < 0.1
+    with pytest.raises(AlignmentError, match="prints 3 copies"):
+        locate_part(job_of(plate), template, layer_height_mm=LAYER_MM)
+
+
+def test_another_thing_beside_the_part_is_refused_with_its_number() -> None:
+    other = m3.Manifold.cylinder(5.0, 8.0, 5.0, 48).translate((110.0, 66.0, 0.0))
+    plate = wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0)) + other
+    template = MeshSdf.from_mesh(solid_mesh(wedge()))
+    with pytest.raises(AlignmentError, match=r"2 things apart .*(first|second) of them"):
+        locate_parts(job_of(plate), template, layer_height_mm=LAYER_MM)
+
+
+def test_a_pit_in_the_second_copy_is_found_there() -> None:
+    truths = [pose((0.0, 0.0, 0.0), 60.0, 60.0), pose((0.0, 0.0, 90.0), 90.0, 60.0)]
+    copies = [wedge().transform(t) for t in truths]
+    template = StoodTemplate.of(
+        MeshSdf.from_mesh(solid_mesh(wedge())),
+        tuple(Transform("build", "template", np.vstack([t, [0, 0, 0, 1.0]])) for t in truths),
+    )
+    x0, y0, _, x1, _, z1 = copies[1].bounding_box()
+    pit = m3.Manifold.cube((3.0, 3.0, 4.0), True).translate((0.5 * (x0 + x1), y0 + 3.0, z1))
+    lost = pit ^ copies[1]
+    sensors = np.array([[60.0, 0.0, 300.0], [100.0, 150.0, 300.0], [-60.0, 80.0, 250.0],
+                        [240.0, 80.0, 250.0]])  # fmt: skip
+    points, who = analytic.ray_scan(
+        copies[0] + (copies[1] - pit), sensors, spacing_mm=0.25, sigma_mm=0.03, seed=2
+    )
+    scan = Scan(points, 0.03, "template", None, sensors, who)
+    here = Transform.identity("build", "template")
+    found = compute_deficit(scan, template, detect(scan, template), build_from_template=here)
+    assert lost.volume() > 5.0
+    assert found.missing_mm3 == pytest.approx(lost.volume(), rel=0.12)
+    assert (found.missing ^ lost).volume() > 0.85 * lost.volume()
+
+
+def test_the_field_of_copies_is_the_least_of_theirs() -> None:
+    rng = np.random.default_rng(0)
+    one = MeshSdf.from_mesh(solid_mesh(wedge()))
+    truths = [pose((0.0, 0.0, 0.0), 0.0, 0.0), pose((90.0, 0.0, 20.0), 25.0, 3.0)]
+    placed = tuple(Transform("build", "template", np.vstack([t, [0, 0, 0, 1.0]])) for t in truths)
+    stands = StoodTemplate.of(one, placed)
+    points = rng.uniform([-10, -10, -5], [60, 30, 15], (3_000, 3))
+    each = np.stack([one.distance(pose.inverse().apply(points)) for pose in placed])
+    distance, gradient = stands.distance_and_gradient(points)
+    assert distance == pytest.approx(each.min(axis=0), abs=1e-9)
+    assert np.linalg.norm(gradient, axis=1) == pytest.approx(1.0, abs=1e-6)
+    ahead = stands.distance(points + 1e-5 * gradient)
+    smooth = np.abs(each[0] - each[1]) > 1.0  # not midway between the two
+    assert np.median(np.abs((ahead - distance)[smooth] / 1e-5 - 1.0)) < 1e-3
+    assert stands.distance(stands.surface_points(0.7)[0]) == pytest.approx(0.0, abs=1e-6)
+    assert stands.solid().volume() == pytest.approx(2 * wedge().volume(), rel=1e-6)
