@@ -44,8 +44,8 @@ def boxes_of(
         deep = depth[group == g]
         known = deep[~np.isnan(deep)]
         # cells with a handful of template points and nothing else are pixels, not defects
-        if len(known) == 0 and len(mine) < 4:
-            continue
+        if len(known) == 0 and (len(mine) < 4 or label is Label.EXCESS):
+            continue  # nor is where something would stand what stands
         thick = float(np.percentile(known, 90)) if len(known) else 2.0
         found.append((mine.min(axis=0) - BOX_MARGIN_MM, mine.max(axis=0) + BOX_MARGIN_MM, thick))
     if lines is not None:

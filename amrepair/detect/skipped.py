@@ -25,6 +25,8 @@ GONE_SHARE = 0.4
 # Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel beside
 # a silhouette lets rays run past a wall: by both together, rays bounded, and surer somewhere.
 GONE_BY_BOTH, SURE_BY_BOTH, MOST_SHARE = 0.5, 0.65, 1.5
+# In a layer of which a stretch is gone others need less, and may be shorter.
+GONE_AGAIN, LEAST_AGAIN_MM, SAME_LAYER_MM = 0.35, 1.0, 0.05
 # The walls that tell how far in a line stands: so far below the last lines' middles and so deep,
 # upright, as far off as a part shrinks and no farther; of so many cells near a line those of the
 # nearest wall, a few at least.
@@ -126,7 +128,17 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     sure = _together(by_surface, line) >= GONE_SHARE
     both = _together(by_both, line)
     gone = sure | (both >= GONE_BY_BOTH)
-    return _stretches(lines, line, share, gone, sure | (both >= SURE_BY_BOTH), length_mm / count)
+    sure |= both >= SURE_BY_BOTH
+    step_mm = length_mm / count
+    found = _stretches(lines, line, share, gone, sure, step_mm, np.full(len(step_mm), LEAST_MM))
+    if not len(found.width_mm):
+        return found
+    # where the extruder has slipped in a layer it is likelier to have slipped there again
+    high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
+    again = (np.abs(high_mm[:, None] - slipped_mm) < SAME_LAYER_MM).any(axis=1)
+    likely = again[line] & (both >= GONE_AGAIN)
+    least_mm = np.where(again, LEAST_AGAIN_MM, LEAST_MM)
+    return _stretches(lines, line, share, gone | likely, sure | likely, step_mm, least_mm)
 
 
 def _wall_shift(
@@ -206,6 +218,7 @@ def _stretches(
     gone: Bool[np.ndarray, " m"],
     sure: Bool[np.ndarray, " m"],
     step_mm: Float[np.ndarray, " n"],
+    least_mm: Float[np.ndarray, " n"],
 ) -> PlannedBeads:
     """Neighbouring looks that say so, as one bead each; one of them is sure."""
     at = np.flatnonzero(gone)
@@ -213,7 +226,7 @@ def _stretches(
     begins[1:] = (np.diff(at) > 1) | (np.diff(line[at]) != 0)
     a, b = at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
     surely = np.concatenate([[0], np.cumsum(sure)])
-    kept = ((b - a + 1) * step_mm[line[a]] >= LEAST_MM) & (surely[b + 1] > surely[a])
+    kept = ((b - a + 1) * step_mm[line[a]] >= least_mm[line[a]]) & (surely[b + 1] > surely[a])
     a, b = a[kept], b[kept]
     which = line[a]
     over = lines.end_mm[which] - lines.start_mm[which]

@@ -157,3 +157,20 @@ def test_a_point_is_in_a_line_by_its_section() -> None:
         ]
     )
     assert one.holds(points).tolist() == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_where_one_line_is_gone_a_shorter_stretch_of_another_is_told_too(seed: int) -> None:
+    short = m3.Manifold.cube((1.3, WIDE_MM, 2 * HIGH_MM + 1.0))
+    short = short.translate((18.0, 2 * WIDE_MM, TOP_MM - 2 * HIGH_MM))
+    alone = scan_of(BLOCK.body - short, seed)
+    assert not len(gone_of(alone).width_mm)
+    both = gone_of(scan_of(without(4.0, 9.0, 0, 2 * HIGH_MM) - short, seed))
+    middle = 0.5 * (both.start_mm + both.end_mm)
+    assert ((middle[:, 0] > 17.0) & (np.abs(middle[:, 1] - 2.5 * WIDE_MM) < 1e-6)).any()
+
+
+def gone_of(scan: Scan) -> PlannedBeads:
+    anomaly = detect(scan, BLOCK, allowance_mm=0.1, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    return skipped(lines(), anomaly.evidence, BLOCK)
