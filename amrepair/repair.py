@@ -52,6 +52,8 @@ AS_BUILT_CELL_MM = 0.25
 OPEN_INFILL_MM = 0.5
 # No sensor sees to the bottom of a deep cell of infill, and the nozzle has just been over it.
 OPEN_CELL_MARGIN_MM = 0.0
+# What lies beside the part: so far off it, and no higher than it was to be by this much.
+OFF_THE_PART_MM, OVER_BESIDE_MM = 0.3, 0.3
 # A part stands upright where its Z is the bed's to 0.05 mm over 100 mm.
 LEVEL = 1e-7
 # Two poses whose repairs share less than this are two different repairs.
@@ -107,6 +109,9 @@ class Site:
         The same, all of it, build frame: a patch is laid along them.
     surface
         Points of what is expected and their normals, as `detect` asks for them: made beforehand.
+    beside
+        How high skirt, brim and supports stand beside the part, build frame, where the template
+        does not have them; −inf where nothing does. They are none of the part, nor too much.
 
     Examples
     --------
@@ -129,6 +134,7 @@ class Site:
     beads: PlannedBeads | None = None
     lines: JobLines | None = None
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
+    beside: HeightField | None = None
 
     @classmethod
     def of_part(
@@ -276,7 +282,7 @@ def plan_repair(
     with watch("detect"):
         whole = scan.moved(registration.template_from_scan)
         expected = site.planned or site.template
-        moved = _in_view(whole, site)
+        moved = _in_view(_of_the_part(whole, site), site)
         anomaly = detect(
             moved,
             expected,
@@ -377,6 +383,18 @@ def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Sca
 def _is_cut(site: Site) -> bool:
     """Whether what is expected ends in mid-air, and not at the bed."""
     return site.planned is not None and is_off_bed(site.planned)
+
+
+def _of_the_part(scan: Scan, site: Site) -> Scan:
+    """Without what the job laid beside the part."""
+    if site.beside is None or site.build_from_template is None:
+        return scan
+    placed = site.build_from_template.apply(scan.points_mm)
+    high_mm = site.beside.sample(placed[:, :2], outside_mm=-np.inf) + OVER_BESIDE_MM
+    low = np.flatnonzero(placed[:, 2] < high_mm)
+    keep = np.ones(len(scan), dtype=bool)
+    keep[low] = site.template.distance(scan.points_mm[low]) < OFF_THE_PART_MM
+    return scan if keep.all() else _subset(scan, keep)
 
 
 def _in_view(scan: Scan, site: Site) -> Scan:

@@ -109,8 +109,8 @@ def locate_parts(
         stands beside ours.
     """
     beads = job.beads
-    ours = (beads.layer >= 0) & ~_of_roles(beads, BESIDE_THE_PART)
-    outer = ours & _of_roles(beads, OUTER_WALLS)
+    ours = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
+    outer = ours & of_roles(beads, OUTER_WALLS)
     pick = outer if outer.any() else ours
     # half of what a bead stands for: its own rounded width is a little more
     half_mm = float(
@@ -158,7 +158,7 @@ def is_upright(placed: Transform) -> bool:
     return bool(placed.matrix[2, 2] > UPRIGHT)
 
 
-def _of_roles(beads: Beads, names: frozenset[str]) -> Bool[np.ndarray, " n"]:
+def of_roles(beads: Beads, names: frozenset[str]) -> Bool[np.ndarray, " n"]:
     """Which beads have one of some roles."""
     which = [k for k, name in enumerate(beads.roles) if name.lower() in names]
     return np.isin(beads.role, which)
@@ -173,9 +173,10 @@ def _things(
     nx, ny = (int(v) for v in np.ceil((high - low) / THING_CELL_MM))
     covered = raster_kernels.beside_lines(
         np.ascontiguousarray(start_mm), np.ascontiguousarray(end_mm),
-        np.full(len(start_mm), half_mm + 0.5 * THING_CELL_MM), low, THING_CELL_MM, ny, nx,
+        np.full(len(start_mm), half_mm + 0.5 * THING_CELL_MM), np.zeros(len(start_mm)),
+        low, THING_CELL_MM, ny, nx,
     )  # fmt: skip
-    groups, _ = ndimage.label(covered, structure=np.ones((3, 3)))
+    groups, _ = ndimage.label(covered > -np.inf, structure=np.ones((3, 3)))
     x, y = np.floor((0.5 * (start_mm + end_mm) - low) / THING_CELL_MM).astype(np.int64).T
     mine = groups[y, x]
     _, first, number = np.unique(mine, return_index=True, return_inverse=True)

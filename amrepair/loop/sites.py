@@ -9,7 +9,8 @@ from jaxtyping import Bool
 
 from amrepair.detect.detection import SURFACE_SPACING_MM
 from amrepair.detect.skipped import PlannedBeads
-from amrepair.frames import Transform
+from amrepair.frames import Transform, box_of
+from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
 from amrepair.repair import Site
 from amrepair.template import PlannedSdf
@@ -18,7 +19,10 @@ from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
+from gcode.surfaces import HeightField, raster_kernels
 
+# Around what the job lays beside the part: strands spread, and stringy ones stray.
+BESIDE_MM, BESIDE_CELL_MM = 0.4, 0.25
 RIMS = ("perimeter", "wall")  # what slicers call it
 
 
@@ -43,8 +47,15 @@ def sites(
 
     def at(stop: Stop) -> Site:
         if stop.layer_index is None:
-            whole = _lines(job, job.beads.layer >= 0)
-            return Site(template, setup, grid, build_from_template, lines=whole)
+            every = job.beads.layer >= 0
+            return Site(
+                template,
+                setup,
+                grid,
+                build_from_template,
+                lines=_lines(job, every),
+                beside=_beside(job, every),
+            )
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
         done = (beads.line < stop.line) & (beads.layer >= 0)
@@ -65,9 +76,28 @@ def sites(
             beads=recent,
             lines=_lines(job, done),
             surface=(planned or below).surface_points(SURFACE_SPACING_MM),
+            beside=None if by_beads else _beside(job, done),
         )
 
     return at
+
+
+def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:
+    """How high skirts, brims, supports and towers stand, build frame; None where there are none."""
+    beads = job.beads
+    pick = which & of_roles(beads, BESIDE_THE_PART)
+    if not pick.any():
+        return None
+    start, end = (np.ascontiguousarray(xyz[pick]) for xyz in (beads.start_mm, beads.end_mm))
+    within = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6) + BESIDE_MM
+    low, high = box_of(np.concatenate([start, end])[:, :2])
+    low = low - float(within.max())
+    nx, ny = (int(v) for v in np.ceil((high + float(within.max()) - low) / BESIDE_CELL_MM))
+    z_mm = raster_kernels.beside_lines(
+        start[:, :2], end[:, :2], within, np.maximum(start[:, 2], end[:, 2]),
+        low, BESIDE_CELL_MM, ny, nx,
+    )  # fmt: skip
+    return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
 
 
 def _lines(job: Job, which: Bool[np.ndarray, " n"]) -> JobLines:

@@ -143,10 +143,10 @@ class JobColumns:
             return None
         half_mm = 0.5 * lines.section_mm2 / lines.height_mm
         over = kernels.beside_lines(
-            lines.start_mm[:, :2], lines.end_mm[:, :2], half_mm + EXACTLY_MM,
+            lines.start_mm[:, :2], lines.end_mm[:, :2], half_mm + EXACTLY_MM, lines.end_mm[:, 2],
             self._corner_mm, self._cell_mm, *self.near.shape,
         )  # fmt: skip
-        return np.asarray(over & self.near)
+        return np.asarray((over > -np.inf) & self.near)
 
 
 @dataclass(frozen=True, slots=True)

@@ -359,11 +359,11 @@ def beside_runs(runs: list[Bead], within_mm: float, model: PatchModel) -> Bool[n
     """Columns whose middles lie no farther from a run."""
     start = np.concatenate([run.xy_mm[:-1] for run in runs])
     end = np.concatenate([run.xy_mm[1:] for run in runs])
-    return np.asarray(
-        raster_kernels.beside_lines(
-            start, end, np.full(len(start), within_mm), model.origin_mm, model.cell_mm, *model.shape
-        )
+    within, level = np.full(len(start), within_mm), np.zeros(len(start))
+    over = raster_kernels.beside_lines(
+        start, end, within, level, model.origin_mm, model.cell_mm, *model.shape
     )
+    return np.asarray(over > -np.inf)
 
 
 def _smooth(

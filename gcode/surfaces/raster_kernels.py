@@ -192,12 +192,15 @@ def column_rest(
 
 
 @njit(cache=True, nogil=True)
-def beside_lines(start: Any, end: Any, within: Any, low: Any, cell: float, ny: int, nx: int) -> Any:
-    """(ny, nx) cells whose middles lie no farther from any stretch than `within` (n,) says.
+def beside_lines(
+    start: Any, end: Any, within: Any, height: Any, low: Any, cell: float, ny: int, nx: int
+) -> Any:
+    """(ny, nx) greatest `height` (n,) of stretches that cells' middles lie within of, else −inf.
 
-    Stretches go from `start` to `end` (n, 2); `low` is the corner of the cells.
+    Stretches go from `start` to `end` (n, 2), and reach `within` (n,) aside; `low` is the corner
+    of the cells.
     """
-    found = np.zeros((ny, nx), np.bool_)
+    found = np.full((ny, nx), -np.inf)
     for n in range(len(start)):
         ax, ay, far = start[n, 0], start[n, 1], within[n]
         dx, dy = end[n, 0] - ax, end[n, 1] - ay
@@ -213,5 +216,5 @@ def beside_lines(start: Any, end: Any, within: Any, low: Any, cell: float, ny: i
                 share = min(max((px * dx + py * dy) / square, 0.0), 1.0)
                 ox, oy = px - share * dx, py - share * dy
                 if ox * ox + oy * oy <= far * far:
-                    found[iy, ix] = True
+                    found[iy, ix] = max(found[iy, ix], height[n])
     return found
