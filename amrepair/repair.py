@@ -53,7 +53,7 @@ OPEN_INFILL_MM = 0.5
 # No sensor sees to the bottom of a deep cell of infill, and the nozzle has just been over it.
 OPEN_CELL_MARGIN_MM = 0.0
 # What lies beside the part: so far off it, and no higher than it was to be by this much.
-OFF_THE_PART_MM, OVER_BESIDE_MM = 0.3, 0.3
+OFF_THE_PART_MM, OVER_BESIDE_MM, ON_BED_MM = 0.3, 0.3, 0.2
 # A part stands upright where its Z is the bed's to 0.05 mm over 100 mm.
 LEVEL = 1e-7
 # Two poses whose repairs share less than this are two different repairs.
@@ -389,12 +389,19 @@ def _of_the_part(scan: Scan, site: Site) -> Scan:
     """Without what the job laid beside the part."""
     if site.beside is None or site.build_from_template is None:
         return scan
-    placed = site.build_from_template.apply(scan.points_mm)
-    high_mm = site.beside.sample(placed[:, :2], outside_mm=-np.inf) + OVER_BESIDE_MM
-    low = np.flatnonzero(placed[:, 2] < high_mm)
+    placed = site.build_from_template
+    height_mm = scan.points_mm @ placed.rotation[2] + placed.translation_mm[2]
+    # what lies nearly on the bed is taken for it anyhow
+    over_bed = (height_mm > ON_BED_MM) & (height_mm < site.beside.top_mm + OVER_BESIDE_MM)
+    low = np.flatnonzero(over_bed)
+    xy_mm = placed.apply(scan.points_mm[low])[:, :2]
+    high_mm = site.beside.sample(xy_mm, outside_mm=-np.inf) + OVER_BESIDE_MM
+    low = low[height_mm[low] < high_mm]
+    if not len(low):
+        return scan
     keep = np.ones(len(scan), dtype=bool)
     keep[low] = site.template.distance(scan.points_mm[low]) < OFF_THE_PART_MM
-    return scan if keep.all() else _subset(scan, keep)
+    return _subset(scan, keep)
 
 
 def _in_view(scan: Scan, site: Site) -> Scan:
