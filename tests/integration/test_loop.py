@@ -102,7 +102,9 @@ def test_looks_become_pictures(broken: SimulatedRun) -> None:
     assert len(shown.points_mm) == len(shown.label_of_point)
 
 
-@pytest.mark.parametrize("process", ["repair_0.20", "standard_0.20"])
+@pytest.mark.parametrize(
+    "process", [pytest.param("repair_0.20", marks=pytest.mark.slow), "standard_0.20"]
+)
 def test_a_clean_print_is_left_alone(template: MeshSdf, process: str) -> None:
     run = simulate_run(prepared(template, process=process))
     assert run.repaired_ratio is None

@@ -172,6 +172,7 @@ def test_detection_forgives_what_normal_parts_differ_by(part: AnalyticTemplate) 
     assert forgiven(surfels, part) is surfels
 
 
+@pytest.mark.slow
 def test_what_no_scan_saw_is_closed_and_said(part: AnalyticTemplate) -> None:
     clouds = []
     for s in range(2):

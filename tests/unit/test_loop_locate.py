@@ -111,6 +111,7 @@ def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
         locate_part(job_of(plate), template, layer_height_mm=LAYER_MM)
 
 
+@pytest.mark.slow
 def test_another_thing_beside_the_part_is_refused_with_its_number() -> None:
     other = m3.Manifold.cylinder(5.0, 8.0, 5.0, 48).translate((110.0, 66.0, 0.0))
     plate = wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0)) + other
