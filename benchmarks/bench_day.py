@@ -23,6 +23,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from gcode.process import prepare
+
+prepare()  # as the command lines do
+
 import manifold3d as m3
 import numpy as np
 import trimesh

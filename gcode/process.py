@@ -11,10 +11,11 @@ from __future__ import annotations
 import ctypes
 import os
 
-# mallopt(3): what of the heap's top is kept, and from what size on memory is mapped by itself, of
-# which glibc allows no more.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-_KEPT_BYTES, _MAPPED_BYTES = 1 << 30, 32 << 20
+# mallopt(3): what of the heap's top is kept; from what size on memory is mapped by itself, of which
+# glibc allows no more; and how many heaps there are: with one for each of the threads that come and
+# go a day of prints kept half as much again.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
+_KEPT_BYTES, _MAPPED_BYTES, _ARENAS = 1 << 30, 32 << 20, 1
 
 
 def prepare() -> None:
@@ -28,3 +29,4 @@ def prepare() -> None:
         return
     mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
     mallopt(_MMAP_THRESHOLD, _MAPPED_BYTES)
+    mallopt(_ARENA_MAX, _ARENAS)
