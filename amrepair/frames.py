@@ -162,6 +162,18 @@ def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarra
     return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
 
 
+def motion_about(
+    centre_mm: Float[np.ndarray, " 3"],
+    turn_rad: Float[np.ndarray, " 3"],
+    shift_mm: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "4 4"]:
+    """(4, 4) motion that turns about a place by an axis-angle vector, and then shifts."""
+    motion = np.eye(4)
+    motion[:3, :3] = rotation_from_vector(turn_rad)
+    motion[:3, 3] = centre_mm + shift_mm - motion[:3, :3] @ centre_mm
+    return motion
+
+
 def box_corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
     """(8, 3) corners of a box, given its lowest and its highest corner."""
     grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)

@@ -50,6 +50,16 @@ class Registration:
 
         Very large, never infinite, along motions that nothing hinders.
         """
-        values, vectors = np.linalg.eigh(self.information)
-        least = FREE_RATIO * max(float(values[-1]), np.finfo(float).tiny / FREE_RATIO)
-        return np.asarray((vectors / np.maximum(values, least)) @ vectors.T)
+        return bounded_inverse(self.information, FREE_RATIO)
+
+
+def bounded_inverse(
+    information: Float[np.ndarray, "n n"], free_ratio: float
+) -> Float[np.ndarray, "n n"]:
+    """(n, n) inverse of a symmetric matrix, very large, never infinite, along what is free.
+
+    Free is a direction with less than `free_ratio` of the best known one's information.
+    """
+    values, vectors = np.linalg.eigh(information)
+    least = free_ratio * max(float(values[-1]), np.finfo(float).tiny / free_ratio)
+    return np.asarray((vectors / np.maximum(values, least)) @ vectors.T)

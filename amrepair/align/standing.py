@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, box_of
 from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
 from gcode.slicing.layers import mesh_of
@@ -25,8 +25,7 @@ RAFT_MM = 3.0
 def box_on_bed(template: Template, placed: Transform) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest corner of the part's box, build frame, mm."""
     vertices, _ = mesh_of(template.solid())
-    points = placed.apply(np.asarray(vertices, dtype=np.float64))
-    return np.stack([points.min(axis=0), points.max(axis=0)])
+    return box_of(placed.apply(np.asarray(vertices, dtype=np.float64)))
 
 
 def refuse_impossible(

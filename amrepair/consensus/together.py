@@ -14,14 +14,15 @@ for what all points of a patch may share.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.align.registration import bounded_inverse
 from amrepair.consensus.views import loss_weight
-from amrepair.frames import moved, rotation_from_vector
+from amrepair.frames import motion_about, moved
 
 SAMPLED, LEAST_SAMPLED = 48_000, 4_000  # points of all scans together; of each
 ROUNDS = 15
@@ -155,11 +156,8 @@ def together(
             len(information) - 6
         )
         step = -np.linalg.solve(free, push[6:]).reshape(-1, 6)
-        for k, (*turn, x, y, z) in enumerate(step, 1):
-            motion = np.eye(4)
-            motion[:3, :3] = rotation_from_vector(np.array(turn) / size_mm)
-            motion[:3, 3] = centre + np.array([x, y, z]) - motion[:3, :3] @ centre
-            found[k] = motion @ found[k]
+        for k, own in enumerate(step, 1):
+            found[k] = motion_about(centre, own[:3] / size_mm, own[3:]) @ found[k]
         if float(np.abs(step).max()) < STILL_MM and scale_mm <= last_mm:
             break
         scale_mm = max(last_mm, SHRINK * scale_mm)
@@ -327,9 +325,7 @@ def _open(
     """Each scan's covariance, with one of them held still."""
     count = len(information) // 6
     moving: Bool[np.ndarray, " n"] = np.arange(6 * count) // 6 != home
-    values, vectors = np.linalg.eigh(information[np.ix_(moving, moving)])
-    least = FREE_RATIO * max(float(values[-1]), np.finfo(float).tiny / FREE_RATIO)
-    inverse = (vectors / np.maximum(values, least)) @ vectors.T
+    inverse = bounded_inverse(information[np.ix_(moving, moving)], FREE_RATIO)
     whole = np.zeros_like(information)
     whole[np.ix_(moving, moving)] = inverse @ scatter[np.ix_(moving, moving)] @ inverse
     return [whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)]
@@ -354,7 +350,7 @@ def _slack(
     shift = _jacobian(place, np.eye(3), centre_mm, size_mm)
     axis = np.linalg.eigh(shift @ covariance @ shift.T)[1][:, -1]
     axis = axis * np.sign(axis[int(np.argmax(np.abs(axis)))])
-    return Slack(covariance, centre_mm, size_mm, most_mm, float(sigma[worst]), axis)
+    return replace(made, sigma_mm=float(sigma[worst]), axis=axis)
 
 
 def _capped(sigma_mm: Float[np.ndarray, " n"], most_mm: float) -> Float[np.ndarray, " n"]:

@@ -20,7 +20,7 @@ from amrepair.align.thinning import thin_out
 from amrepair.consensus import looks as sight
 from amrepair.consensus import views_kernels as kernels
 from amrepair.consensus.cloud import planes, spacing_of
-from amrepair.frames import moved, rotation_from_vector
+from amrepair.frames import motion_about, moved
 
 POINTS, IMAGE_POINTS, GUESS_POINTS = 15_000, 40_000, 8_000
 # The grid of free space: nodes along each side, and its side in diagonals of the largest view. A
@@ -356,10 +356,7 @@ def moved_to_planes(
     normal_matrix = weighted.T @ jacobian
     normal_matrix += damping * np.diag(np.diag(normal_matrix).reshape(2, 3).mean(axis=1).repeat(3))
     step = -np.linalg.solve(normal_matrix, weighted.T @ height_mm)
-    turn = np.eye(4)
-    turn[:3, :3] = rotation_from_vector(step[:3])
-    turn[:3, 3] = centre + step[3:] - turn[:3, :3] @ centre
-    return turn
+    return motion_about(centre, step[:3], step[3:])
 
 
 def _rough(first: View, second: View, pose: Float[np.ndarray, "4 4"], diagonal_mm: float) -> Fit:
