@@ -8,8 +8,15 @@ page, a sixth of the processor's time at a look at half a million points.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # mallopt(3): what of the heap's top is kept; from what size on memory is mapped by itself, of which
 # glibc allows no more; and how many heaps there are: with one for each of the threads that come and
@@ -30,3 +37,21 @@ def prepare() -> None:
     mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
     mallopt(_MMAP_THRESHOLD, _MAPPED_BYTES)
     mallopt(_ARENA_MAX, _ARENAS)
+
+
+def gives_back(long_task: Callable[P, R]) -> Callable[P, R]:
+    """Of a long task: what memory is kept is given back to the system at its end.
+
+    What a day's tasks need differs, and what one leaves between two others stays unused: without
+    this a process that runs them one after another holds three times what it uses.
+    """
+
+    @wraps(long_task)
+    def task(*args: P.args, **named: P.kwargs) -> R:
+        try:
+            return long_task(*args, **named)
+        finally:
+            with contextlib.suppress(AttributeError, OSError):
+                ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+    return task

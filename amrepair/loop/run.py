@@ -22,12 +22,14 @@ from amrepair.scans import Scan, Scanner
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import Printer
+from gcode.process import gives_back
 from gcode.progress import Progress, silent
 from gcode.reader import Job
 
 MAX_ITERATIONS = 3
 
 
+@gives_back
 def run_loop(
     job: Job,
     checked: CheckedProgram,

@@ -46,3 +46,29 @@ def test_what_the_environment_says_comes_first() -> None:
     )
     assert faults > 50
     assert threads == "2"
+
+
+HELD = """
+import gcode.cli
+from pathlib import Path
+import numpy as np
+from gcode.process import gives_back
+def resident_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+def task():
+    arrays = [np.ones(1_000_000) for _ in range(20)]  # 160 MB, of which the last stays
+    task.kept = arrays.pop()
+for a_task in (task, gives_back(task)):
+    a_task()
+    print(resident_mb())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library's memory")
+def test_a_long_task_gives_its_memory_back() -> None:
+    mine = {k: v for k, v in os.environ.items() if not k.startswith("MALLOC_")}
+    told = subprocess.run(
+        [sys.executable, "-c", HELD], env=mine, capture_output=True, text=True, check=True
+    ).stdout.split()
+    kept_mb, given_back_mb = (float(word) for word in told)
+    assert given_back_mb < kept_mb - 100
