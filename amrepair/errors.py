@@ -35,6 +35,10 @@ class AlignmentError(AmrepairError):
     """An alignment that does not converge, or that leaves the pose ambiguous."""
 
 
+class PartMovedError(AlignmentError):
+    """A scan that fits its template, but away from where it should be: farther than allowed."""
+
+
 class DeficitError(AmrepairError):
     """A deficit that cannot be made into a valid solid."""
 

@@ -20,7 +20,7 @@ from amrepair.align.pam import PAPER, PamOptions, align_paper
 from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.thinning import in_order, thin_out
-from amrepair.errors import AlignmentError, InputError
+from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, in_box, moved
 from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
@@ -281,10 +281,10 @@ def _from_guess(
     cosine = np.clip(0.5 * (np.trace(away[:3, :3]) - 1.0), -1.0, 1.0)
     turned_deg = float(np.rad2deg(np.arccos(cosine)))
     if moved_mm > bound_mm or turned_deg > bound_deg:
-        raise AlignmentError(
+        raise PartMovedError(
             f"the scan {scan.source} fits its template only {moved_mm:.2f} mm and "
             f"{turned_deg:.2f}° away from where it should be (limits {bound_mm:g} mm and "
-            f"{bound_deg:g}°); check the calibration, or whether the part has moved"
+            f"{bound_deg:g}°); the part has come off and moved, or the calibration is wrong"
         )
     return found
 

@@ -21,6 +21,7 @@ from amrepair.detect.near import nearest_within
 from amrepair.detect.normal_variation import forgiven
 from amrepair.detect.rays import RangeImage, range_images
 from amrepair.detect.regions import find_regions
+from amrepair.detect.strands import on_strands
 from amrepair.detect.surfels import Surfels, make_surfels
 from amrepair.errors import InputError
 from amrepair.scans import Scan
@@ -163,7 +164,7 @@ def detect(
     top_allowance_mm = min(allowance_mm, TOP_ALLOWANCE_MM)
     top_limit = replace(limit, systematic_mm=limit.systematic_mm - allowance_mm + top_allowance_mm)
     top = _under_plane(surfels, None if threshold_mm is not None else top_z_mm)
-    missing, excess = _label_surfels(forgiven(surfels, template), limit, top_limit, top)
+    missing, excess = _label_surfels(forgiven(surfels, template), template, limit, top_limit, top)
     evidence = gather(
         scan,
         template,
@@ -313,7 +314,11 @@ def _under_plane(surfels: Surfels, top_z_mm: float | None) -> Bool[np.ndarray, "
 
 
 def _label_surfels(
-    surfels: Surfels, limit: Threshold, top_limit: Threshold, top: Bool[np.ndarray, " s"]
+    surfels: Surfels,
+    template: Template,
+    limit: Threshold,
+    top_limit: Threshold,
+    top: Bool[np.ndarray, " s"],
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
     """Missing and excess by two scales and hysteresis; missing under the top by its own limits."""
     labels = []
@@ -334,6 +339,15 @@ def _label_surfels(
         if sign < 0:
             core |= _low_level(surfels, own_wide)
         core &= through
+        if sign > 0:
+            strands = on_strands(
+                surfels,
+                template,
+                (wide > limit.low_mm(count)) & ~core,
+                systematic_mm=limit.systematic_mm,
+                noise_mm=limit.quantile * limit.sigma_mm,
+            )
+            core, through = core | strands, through | strands
         grown = surfels.grow(core, through)
         labels.append(_drop_specks(surfels, grown, core))
     missing, excess = labels

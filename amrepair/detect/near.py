@@ -22,12 +22,9 @@ def has_near(
     """(k,) whether at least so many of the points lie within a distance of each place."""
     if len(asked_mm) == 0 or len(points_mm) == 0:
         return np.zeros(len(asked_mm), dtype=bool)
-    corner, cell_mm, shape = _cells_about(asked_mm, within_mm)
-    asked, points = np.ascontiguousarray(asked_mm), np.ascontiguousarray(points_mm)
-    start, ordered, _ = kernels.by_cell(asked, points, corner, cell_mm, shape)
-    return np.asarray(
-        kernels.has_enough(asked, start, ordered, corner, cell_mm, shape, within_mm, enough)
-    )
+    asked = np.ascontiguousarray(asked_mm)
+    start, ordered, _, *grid = cells_of(asked, points_mm, within_mm)
+    return np.asarray(kernels.has_enough(asked, start, ordered, *grid, within_mm, enough))
 
 
 def nearest_within(
@@ -36,19 +33,30 @@ def nearest_within(
     """(k,) number of the point nearest to each place, −1 where none is nearer than a distance."""
     if len(asked_mm) == 0 or len(points_mm) == 0:
         return np.full(len(asked_mm), -1, dtype=np.int32)
-    corner, cell_mm, shape = _cells_about(asked_mm, within_mm)
-    asked, points = np.ascontiguousarray(asked_mm), np.ascontiguousarray(points_mm)
-    cells = kernels.by_cell(asked, points, corner, cell_mm, shape)
-    return np.asarray(kernels.nearest(asked, *cells, corner, cell_mm, shape, within_mm))
+    asked = np.ascontiguousarray(asked_mm)
+    return np.asarray(kernels.nearest(asked, *cells_of(asked, points_mm, within_mm), within_mm))
 
 
-def _cells_about(
-    asked_mm: Float[np.ndarray, "k 3"], within_mm: float
-) -> tuple[Float[np.ndarray, " 3"], float, Int[np.ndarray, " 3"]]:
-    """Corner, edge and shape of cells around places, one empty layer about them."""
+def cells_of(
+    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "n 3"], within_mm: float
+) -> tuple[
+    Int[np.ndarray, " c"],
+    Float[np.ndarray, "m 3"],
+    Int[np.ndarray, " m"],
+    Float[np.ndarray, " 3"],
+    float,
+    Int[np.ndarray, " 3"],
+]:
+    """Points near places by cells at least as wide as a distance: what the kernels walk through.
+
+    Where each cell's points begin; the points and their numbers, so ordered; corner, edge and
+    shape of the cells, of which one empty layer lies about the places.
+    """
     low, high = box_of(asked_mm)
     size_mm = high - low + 3.0 * within_mm
     # by a hair wider: what rounding puts into the next cell is looked for there
     cell_mm = max(1.0001 * within_mm, float(np.cbrt(np.prod(size_mm) / MOST_CELLS)))
     shape = np.floor((high - low) / cell_mm).astype(np.int64) + 3
-    return low - cell_mm, cell_mm, shape
+    corner = low - cell_mm
+    points = np.ascontiguousarray(points_mm)
+    return *kernels.by_cell(asked_mm, points, corner, cell_mm, shape), corner, cell_mm, shape

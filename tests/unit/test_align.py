@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from amrepair.align import align
 from amrepair.align.coarse import cube_rotations
-from amrepair.errors import AlignmentError, InputError
+from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf, load_mesh
@@ -110,6 +110,17 @@ def test_a_part_far_from_its_guess_is_refused(template: MeshSdf) -> None:
     far = pose(4, turn_rad=0.0, shift_mm=9.0)
     with pytest.raises(AlignmentError):
         align(Scan(points, 0.03, "scanner"), template, guess=far)
+
+
+def test_a_part_that_came_off_and_moved_is_said_to_have(template: MeshSdf) -> None:
+    # regression: the class told nothing of it, and a round part that had slid by 3.5 mm was of no
+    # defect type
+    points = cloud(template, sigma_mm=0.03, seed=0)
+    slid = Transform.from_rotation_translation(
+        "template", "scanner", rotation=np.eye(3), translation_mm=np.array([2.4, 2.4, 0.0])
+    )
+    with pytest.raises(PartMovedError, match=r"3\.\d+ mm and 0\.\d+° away"):
+        align(Scan(points, 0.03, "scanner"), template, guess=slid)
 
 
 @pytest.mark.parametrize(("factor", "hint"), [(1e-3, "metres"), (25.0, "same part")])

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from amrepair.deficit import heights_kernels
-from amrepair.detect import faces_kernels, turning_kernels
+from amrepair.detect import faces_kernels, strands_kernels, turning_kernels
+from amrepair.detect.near import cells_of
 from amrepair.detect.winding import Shell
 from gcode.surfaces import HeightField
 
@@ -112,3 +113,34 @@ def test_columns_are_as_high_as_their_topmost_points(seed: int) -> None:
             assert top[cell] == own.max()
             assert count[cell] == len(near)
             np.testing.assert_allclose(mean[cell], near.mean())
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=SEEDS)
+def test_strips_every_way_are_plain_means(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, deviation = rng.uniform(-4, 4, (500, 3)), rng.normal(size=500)
+    count = rng.integers(1, 4, 500)
+    up = rng.normal(size=(6, 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    reach, ways = np.array([2.5, 0.8, 1.5]), 8
+    asked = points[:6]
+    cells = cells_of(asked, points, float(np.linalg.norm(reach)))
+    found = strands_kernels.best_strips(
+        asked, up, *cells, deviation, count, reach, ways, 0.1, 0.5, 0.3, 4.0
+    )
+    for place, normal, over in zip(asked, up, found, strict=True):
+        axis = np.eye(3)[np.argmin(np.abs(normal))]
+        u = np.cross(normal, axis)
+        u /= np.linalg.norm(u)
+        away = points - place
+        high, a, b = away @ normal, away @ u, away @ np.cross(normal, u)
+        best = -np.inf
+        for angle in np.pi * np.arange(ways) / ways:
+            on = (np.abs(high) <= 1.5) & (np.hypot(a, b) <= 2.5)
+            on &= np.abs(b * np.cos(angle) - a * np.sin(angle)) < 0.8
+            n = count[on].sum()
+            if n > 4:
+                mean = (deviation * count)[on].sum() / n
+                best = max(best, mean - max(0.1 + 0.5 / np.sqrt(n), 0.3))
+        assert over == best or abs(over - best) < 1e-9

@@ -7,23 +7,16 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import manifold3d as m3
 import numpy as np
 import pytest
-import trimesh
 
 from amrepair.detect.anomaly import DefectType
 from amrepair.frames import Transform
-from amrepair.loop import kinds, plan_stops
+from amrepair.loop import kinds
 from amrepair.loop.kinds import typed
 from amrepair.loop.shapes import last_beads
-from amrepair.loop.sites import sites
 from amrepair.repair import plan_repair
-from amrepair.template import MeshSdf
 from gcode.profiles import load_setup
-from gcode.reader import read_job
-from gcode.slicing.job import plan_part
-from gcode.writer import write
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_kinds.py"
 
@@ -41,20 +34,7 @@ def bench() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def scene(bench: ModuleType):  # type: ignore[no-untyped-def]
-    setup = load_setup()
-    part = m3.Manifold.cube((*bench.SIZE, 4.0))
-    placed = Transform.from_rotation_translation(
-        "build", "template", rotation=np.eye(3), translation_mm=np.array([*bench.CORNER, 0.0])
-    )
-    toolpath = plan_part(part.translate((*bench.CORNER, 0.0)), setup).toolpath
-    program = write(toolpath, setup, title="block")
-    job = read_job(program, dialect=program.dialect)
-    mesh = part.to_mesh64()
-    template = MeshSdf.from_mesh(
-        trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
-    )
-    stop = plan_stops(job, [bench.LAYER], final=False)[0]
-    return job, stop, placed, sites(job, template, placed, setup, by_beads=False)(stop)
+    return bench.scene(bench.part_called("block"), load_setup())
 
 
 def types_of(  # type: ignore[no-untyped-def]
@@ -63,9 +43,9 @@ def types_of(  # type: ignore[no-untyped-def]
     """Volume found by type; at least a crumb for each region."""
     job, stop, placed, site = scene
     pose = Transform.identity("build", "scanner")
-    rng = np.random.default_rng([seed, bench.KINDS.index(kind)])
+    rng, part = np.random.default_rng([seed, bench.KINDS.index(kind)]), bench.part_called("block")
     built = bench.made(kind, job, stop.line, rng)
-    scan = bench.scan_of(built, min(0.5 * built.signal_mm, 0.2), rng)
+    scan = bench.scan_of(built, min(0.5 * built.signal_mm, 0.2), rng, part)
     plan = plan_repair(
         scan, site, title="", guess=placed.inverse() @ pose, strict=False,
         wanted=lambda region: False, rng=np.random.default_rng(seed),
@@ -77,7 +57,7 @@ def types_of(  # type: ignore[no-untyped-def]
     return found
 
 
-@pytest.mark.parametrize("kind", ["void", "missing_beads", "layer_shift"])
+@pytest.mark.parametrize("kind", ["void", "missing_beads", "layer_shift", "string"])
 def test_a_defect_is_told_by_its_surface(bench: ModuleType, scene, kind: str) -> None:  # type: ignore[no-untyped-def]
     found = types_of(bench, scene, kind, 0)
     assert max(found, key=found.__getitem__) == kind
@@ -103,7 +83,8 @@ def test_nine_of_ten_are_told(bench: ModuleType, scene, seed: int) -> None:  # t
 def test_a_clean_surface_has_no_type(bench: ModuleType, scene) -> None:  # type: ignore[no-untyped-def]
     job, stop, placed, site = scene
     pose = Transform.identity("build", "scanner")
-    scan = bench.scan_of(bench.Built(0.2), 0.05, np.random.default_rng(1))
+    part = bench.part_called("block")
+    scan = bench.scan_of(bench.Built(0.2), 0.05, np.random.default_rng(1), part)
     plan = plan_repair(scan, site, title="", guess=placed.inverse() @ pose, strict=False)
     assert not typed(plan, job, site, stop.line, pose).deficit.regions
 

@@ -1,0 +1,84 @@
+"""Averages along narrow strips of a surface, every way; compiled, for `strands`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gcode.compiled import njit, prange
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def best_strips(
+    places: Any,
+    outward: Any,
+    start: Any,
+    ordered: Any,
+    number: Any,
+    low: Any,
+    cell: float,
+    shape: Any,
+    deviation: Any,
+    count: Any,
+    strip: Any,
+    ways: int,
+    systematic: float,
+    noise: float,
+    least: float,
+    enough: float,
+) -> Any:
+    """(k,) by how much the best strip through a place is over its limit.
+
+    A strip lies in the plane across `outward`; `strip` (long, wide, tall) says how far it goes to
+    each side of a place. Its limit is `systematic` and `noise` over the root of its points, or
+    `least`; with fewer points than `enough` it tells nothing. `start`, `ordered`, `number`, `low`,
+    `cell` and `shape` are of `near.cells_of`, with cells as wide as a strip's corner is away;
+    `deviation` and `count` are of all its points.
+    """
+    out = np.full(len(places), -np.inf)
+    for k in prange(len(places)):
+        nx, ny, nz = outward[k, 0], outward[k, 1], outward[k, 2]
+        # across the axis to which the outward way is least along
+        ax, ay, az = 0.0, 0.0, 0.0
+        if abs(nx) <= abs(ny) and abs(nx) <= abs(nz):
+            ax = 1.0
+        elif abs(ny) <= abs(nz):
+            ay = 1.0
+        else:
+            az = 1.0
+        ux, uy, uz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
+        length = np.sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux / length, uy / length, uz / length
+        vx, vy, vz = ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux
+        total, weight = np.zeros(ways), np.zeros(ways)
+        cos, sin = np.empty(ways), np.empty(ways)
+        for w in range(ways):
+            cos[w], sin[w] = np.cos(np.pi * w / ways), np.sin(np.pi * w / ways)
+        ix = int((places[k, 0] - low[0]) / cell)
+        iy = int((places[k, 1] - low[1]) / cell)
+        iz = int((places[k, 2] - low[2]) / cell)
+        for x in range(ix - 1, ix + 2):
+            for y in range(iy - 1, iy + 2):
+                first = (x * shape[1] + y) * shape[2] + iz - 1
+                for p in range(start[first], start[first + 3]):
+                    dx = ordered[p, 0] - places[k, 0]
+                    dy = ordered[p, 1] - places[k, 1]
+                    dz = ordered[p, 2] - places[k, 2]
+                    if abs(dx * nx + dy * ny + dz * nz) > strip[2]:
+                        continue
+                    a = dx * ux + dy * uy + dz * uz
+                    b = dx * vx + dy * vy + dz * vz
+                    if a * a + b * b > strip[0] * strip[0]:
+                        continue
+                    c = count[number[p]]
+                    f = deviation[number[p]] * c
+                    for w in range(ways):
+                        if abs(b * cos[w] - a * sin[w]) < strip[1]:
+                            total[w] += f
+                            weight[w] += c
+        for w in range(ways):
+            if weight[w] > enough:
+                limit = max(systematic + noise / np.sqrt(weight[w]), least)
+                out[k] = max(out[k], total[w] / weight[w] - limit)
+    return out
