@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.machinery
 import os
 import shutil
@@ -40,6 +41,7 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
 signal.signal(signal.SIGINT, signal.default_int_handler)
 install_import_hook(["amrepair", "gcode"], "beartype.beartype")
 sys.meta_path.insert(0, _KernelFinder)  # type: ignore[arg-type]
+importlib.import_module("gcode.process").prepare()  # as the commands do
 
 hypothesis.settings.register_profile(
     "suite",

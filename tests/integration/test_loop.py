@@ -41,6 +41,12 @@ def template() -> MeshSdf:
     return MeshSdf.from_mesh(trimesh.boolean.union([block, step], engine="manifold"))
 
 
+@pytest.fixture(scope="module")
+def plate() -> MeshSdf:
+    """A third of the other's material, where one defect is enough."""
+    return MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (17, 13, 2.6))))
+
+
 def prepared(template: MeshSdf, *defects: str, process: str = "repair_0.20") -> PreparedRun:
     parsed = [parse_defect(text) for text in defects]
     return prepare_run(template, load_setup(process=process), parsed, title="test", seed=3)
@@ -105,8 +111,8 @@ def test_looks_become_pictures(broken: SimulatedRun) -> None:
 @pytest.mark.parametrize(
     "process", [pytest.param("repair_0.20", marks=pytest.mark.slow), "standard_0.20"]
 )
-def test_a_clean_print_is_left_alone(template: MeshSdf, process: str) -> None:
-    run = simulate_run(prepared(template, process=process))
+def test_a_clean_print_is_left_alone(plate: MeshSdf, process: str) -> None:
+    run = simulate_run(prepared(plate, process=process))
     assert run.repaired_ratio is None
     assert not run.report.repair_prints
     assert len(run.report.looks) == 2  # one on the way, one at the end
@@ -133,35 +139,35 @@ def test_the_same_seed_gives_the_same_result(template: MeshSdf) -> None:
     assert twice[0] == twice[1]
 
 
-def test_excess_is_reported_and_nothing_is_printed(template: MeshSdf) -> None:
-    run = simulate_run(prepared(template, "blob:size=5,height=1.5"))
+def test_excess_is_reported_and_nothing_is_printed(plate: MeshSdf) -> None:
+    run = simulate_run(prepared(plate, "blob:size=5,height=1.5"))
     assert not run.report.repair_prints
     assert not run.report.within_tolerance
     assert result_of(run)["excess_mm3_before"] > 3.0  # type: ignore[operator]
 
 
-def test_a_declined_repair_is_not_printed(template: MeshSdf) -> None:
+def test_a_declined_repair_is_not_printed(plate: MeshSdf) -> None:
     asked: list[RepairPlan] = []
 
     def decline(plan: RepairPlan) -> bool:
         asked.append(plan)
         return False
 
-    run = simulate_run(prepared(template, "void:diameter=7,layers=3"), approve=decline)
+    run = simulate_run(prepared(plate, "void:diameter=7,layers=3"), approve=decline)
     assert asked
     assert not run.report.repair_prints
     assert any(look.declined for look in run.report.looks)
     assert not run.report.within_tolerance
 
 
-def test_heaters_are_off_when_the_loop_breaks(template: MeshSdf, tmp_path: Path) -> None:
+def test_heaters_are_off_when_the_loop_breaks(plate: MeshSdf, tmp_path: Path) -> None:
     log = tmp_path / "wire.log"
 
     def fail(look: Look) -> None:
         raise LoopError("the scanner caught fire")
 
     with pytest.raises(LoopError, match="fire"):
-        simulate_run(prepared(template), record=fail, wire_log=log)
+        simulate_run(prepared(plate), record=fail, wire_log=log)
     tail = log.read_bytes()[-2000:].decode(errors="replace")
     assert "M104 S0" in tail
     assert "M140 S0" in tail
