@@ -20,7 +20,7 @@ from scipy import ndimage
 from amrepair.deficit.boxes import boxes_of
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
-from amrepair.deficit.walls import with_even_crests, with_sharp_walls
+from amrepair.deficit.walls import with_even_crests, with_sharp_walls, with_whole_rims
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.detection import ON_PLANE_MM
 from amrepair.detect.evidence import Evidence
@@ -198,10 +198,12 @@ def compute_deficit(
         if as_built is not None:
             return seen
         expected: Any = template.solid()
-        solid, gone = standing_heights(seen, expected.transform(matrix), missing, excess)
+        solid, gone, designed_mm = standing_heights(
+            seen, expected.transform(matrix), missing, excess
+        )
         points_mm = build_from_template.apply(scan.points_mm)
         sharp = with_sharp_walls(solid, gone, points_mm, scan.sigma_mm)
-        even = with_even_crests(sharp, gone)
+        even = with_whole_rims(with_even_crests(sharp, gone), gone, designed_mm)
         return with_what_stands_out(even, points_mm, scan.sigma_mm, evidence.spacing_mm)
 
     return Deficit(

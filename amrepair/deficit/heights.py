@@ -139,8 +139,8 @@ def standing_heights(
     expected: manifold3d.Manifold,
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
-) -> tuple[HeightField, Bool[np.ndarray, "ny nx"]]:
-    """The as-built field with sharp walls, and the columns that something is missing from.
+) -> tuple[HeightField, Bool[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"]]:
+    """The as-built field with sharp walls; columns that something is missing from; what was wanted.
 
     What was expected, less what is missing, with what is too much, gives heights on a fine grid.
     They stand beside walls, where the scan saw nothing higher; elsewhere the scan itself decides.
@@ -191,7 +191,7 @@ def standing_heights(
     rim = ndimage.maximum_filter(gone, around)
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     field = HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
-    return field, gone
+    return field, gone, raster_kernels.column_top(*whole, 0.0).reshape(ny, nx)
 
 
 def _cells_over(

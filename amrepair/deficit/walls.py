@@ -29,6 +29,10 @@ MOST_SPREAD_SIGMA = 1.75
 MOST_SLANT = 0.25  # cosine: steeper than 75°
 # Thinner than a bead; and along it, as far as between two points that were seen.
 CREST_CELLS, CREST_REACH_CELLS = 4, 2
+# A face of what is missing is steep where it falls by this from one cell to the next (83°).
+STEEP_MM = 0.8
+# So much of a lip the solids' rounding may have taken, so many cells wide; what is as designed.
+ROUNDED_MM, ROUNDED_CELLS, AS_DESIGNED_MM = 0.4, 3, 0.1
 
 
 def with_sharp_walls(
@@ -82,6 +86,37 @@ def with_even_crests(field: HeightField, gone: Bool[np.ndarray, "ny nx"]) -> Hei
     crest = beside & (near - thick_mm > STEP_MM)
     highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
     near[crest] = highest_mm[crest]
+    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+
+
+def with_whole_rims(
+    field: HeightField,
+    gone: Bool[np.ndarray, "ny nx"],
+    designed_mm: Float[np.ndarray, "ny nx"],
+) -> HeightField:
+    """The as-built field, tops beside a steep face of what is missing as designed up to the face.
+
+    Solids round off such a lip by some tenths of a millimetre. Where a top is as designed up to a
+    few columns from a face, and falls steeply there, it ends at the face and not before; what lies
+    lower along a slope, as of a worn edge, is lower.
+
+    Parameters
+    ----------
+    designed_mm
+        Top of what was expected, by column.
+    """
+    if not gone.any():
+        return field
+    rows, columns = window_around(gone, ROUNDED_CELLS + BESIDE_CELLS)
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    near, lost, designed = (v[rows, columns] for v in (z_mm, gone, designed_mm))
+    lowest_mm = ndimage.minimum_filter(np.where(lost, near, np.inf), 3)
+    lip = near - lowest_mm > STEEP_MM
+    off_mm = designed - near
+    whole = (np.abs(off_mm) < AS_DESIGNED_MM) & ~ndimage.maximum_filter(lost, 3)
+    lip &= ndimage.maximum_filter(whole, 2 * ROUNDED_CELLS + 1)
+    rounded = lip & (off_mm > 0) & (off_mm < ROUNDED_MM)
+    near[rounded] = designed[rounded]
     return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
 
 

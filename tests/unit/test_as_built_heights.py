@@ -157,12 +157,12 @@ def test_what_hangs_on_over_a_floor_that_was_seen_has_points_on_it_or_is_gone() 
     edge = box(8, 9.8, 7.5, 12, 10.1, 8)
     gone = box(8, 8, 4, 12, 12, 8) - edge
     floor = HeightField.flat((20.0, 20.0), 0.25, z_mm=4.0)
-    left, _ = standing_heights(floor, part, gone, m3.Manifold())
+    left, *_ = standing_heights(floor, part, gone, m3.Manifold())
     assert heights(left, (8.1, 11.9), (8.1, 11.9)).max() < 4.3
     points_on_it = floor.z_mm.copy()
     points_on_it[39:41, 32:48] = 7.9
     seen = floor.raised(points_on_it)
-    stands, _ = standing_heights(seen, part, gone, m3.Manifold())
+    stands, *_ = standing_heights(seen, part, gone, m3.Manifold())
     assert heights(stands, (8.1, 11.9), (9.85, 10.05)).min() > 7.4
 
 

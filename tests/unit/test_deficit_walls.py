@@ -9,7 +9,7 @@ import trimesh
 from scipy import ndimage
 
 from amrepair.deficit.heights import columns_of
-from amrepair.deficit.walls import with_even_crests, with_sharp_walls
+from amrepair.deficit.walls import with_even_crests, with_sharp_walls, with_whole_rims
 from gcode.slicing.layers import mesh_of
 from gcode.surfaces import HeightField
 
@@ -131,3 +131,37 @@ def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
     even = with_even_crests(rough, gone_from(truth, piece))
     assert beside.sum() > 300
     assert (even.z_mm == z_mm).all()
+
+
+@pytest.mark.parametrize("turned", [0.0, 17.0])
+def test_a_sloping_top_ends_at_a_steep_face_and_not_before(turned: float) -> None:
+    """Its last column read 0.1 to 0.35 mm low, and the body went 0.22 mm into it."""
+    wedge = Solid.hull_points(
+        [(x, y, z) for x, high in ((0.0, 7.0), (24.0, 5.0)) for y in (0.0, 20.0) for z in (0, high)]
+    )
+    tool = Solid.cube((9.0, 30.0, 4.0), True).rotate((0.0, 0.0, turned))
+    tool = tool.translate((12.037, 10.071, 6.0))
+    truth = HeightField.from_manifold(wedge - tool, CELL_MM, margin_mm=1.0)
+    designed = HeightField.from_manifold(wedge, CELL_MM, margin_mm=1.0)
+    gone = gone_from(truth, wedge ^ tool)
+    lip = ~gone & ndimage.maximum_filter(gone, 3) & (truth.z_mm > 1.0)
+    assert lip.sum() > 300
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    z_mm[lip] -= np.random.default_rng(5).uniform(0.1, 0.35, int(lip.sum()))
+    rounded = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    # the piece, rounded off as well, has the lip's columns, too
+    whole = with_whole_rims(rounded, gone | lip, designed.z_mm)
+    assert np.abs(whole.z_mm - truth.z_mm).max() < 1e-6
+
+
+def test_a_worn_edge_is_no_lip() -> None:
+    block = Solid.cube((24.0, 20.0, 6.0))
+    tool = Solid.cube((30.0, 40.0, 20.0), True).translate((0.0, 0.0, 10.0))
+    tool = tool.rotate((0.0, 35.0, 0.0)).translate((21.037, 10.0, 5.0))
+    truth = HeightField.from_manifold(block - tool, CELL_MM, margin_mm=1.0)
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    noise = np.random.default_rng(6).normal(scale=0.05, size=truth.shape)
+    worn = HeightField(truth.origin_mm, CELL_MM, truth.z_mm + noise, truth.seen)
+    gone = gone_from(truth, block ^ tool)
+    assert gone.sum() > 5000
+    assert (with_whole_rims(worn, gone, designed.z_mm).z_mm == worn.z_mm).all()
