@@ -25,7 +25,8 @@ GONE_SHARE = 0.4
 # Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel beside
 # a silhouette lets rays run past a wall: by both together, rays bounded, and surer somewhere.
 GONE_BY_BOTH, SURE_BY_BOTH, MOST_SHARE = 0.5, 0.65, 1.5
-# In a layer of which a stretch is gone others need less, and may be shorter.
+# In a layer of which a stretch is gone others need less, and may be shorter; but rays alone do not
+# do: between thin walls of infill they say "open" of many.
 GONE_AGAIN, LEAST_AGAIN_MM, SAME_LAYER_MM = 0.35, 1.0, 0.05
 # The walls that tell how far in a line stands: so far below the last lines' middles and so deep,
 # upright, as far off as a part shrinks and no farther; of so many cells near a line those of the
@@ -125,7 +126,8 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
         by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
         by_both[known[_topped(middle[known], half_mm[known], lines.width_mm[line[known]],
                               evidence)]] = -1.0  # fmt: skip
-    sure = _together(by_surface, line) >= GONE_SHARE
+    surface_says = _together(by_surface, line)
+    sure = surface_says >= GONE_SHARE
     both = _together(by_both, line)
     gone = sure | (both >= GONE_BY_BOTH)
     sure |= both >= SURE_BY_BOTH
@@ -136,7 +138,7 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
     again = (np.abs(high_mm[:, None] - slipped_mm) < SAME_LAYER_MM).any(axis=1)
-    likely = again[line] & (both >= GONE_AGAIN)
+    likely = again[line] & (both >= GONE_AGAIN) & (surface_says > 0)
     least_mm = np.where(again, LEAST_AGAIN_MM, LEAST_MM)
     return _stretches(lines, line, share, gone | likely, sure | likely, step_mm, least_mm)
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from amrepair.deficit import Deficit, compute_deficit
 from amrepair.detect import detect
+from amrepair.detect.evidence import Evidence
 from amrepair.detect.skipped import PlannedBeads, skipped
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -168,6 +169,31 @@ def test_where_one_line_is_gone_a_shorter_stretch_of_another_is_told_too(seed: i
     both = gone_of(scan_of(without(4.0, 9.0, 0, 2 * HIGH_MM) - short, seed))
     middle = 0.5 * (both.start_mm + both.end_mm)
     assert ((middle[:, 0] > 17.0) & (np.abs(middle[:, 1] - 2.5 * WIDE_MM) < 1e-6)).any()
+
+
+def test_rays_alone_do_not_tell_of_another_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    # regression: of thin walls of clean infill, beside one told gone, dozens were told gone, too,
+    # by rays that ran past them where the surface said that they were there
+    half_mm = 0.5 * HIGH_MM
+    rays_say, clearance = Evidence.rays_say, Evidence.clearance
+
+    def past(points_mm: np.ndarray) -> np.ndarray:
+        along = (points_mm[:, 0] > 15.0) & (points_mm[:, 0] < 18.0)
+        return along & (np.abs(points_mm[:, 1] - 2.5 * WIDE_MM) < 0.2)
+
+    def rays(self: Evidence, points_mm: np.ndarray) -> np.ndarray:
+        return np.where(past(points_mm), half_mm, rays_say(self, points_mm))
+
+    def surface(self: Evidence, points_mm: np.ndarray, f_mm: np.ndarray) -> tuple[np.ndarray, ...]:
+        best, least = clearance(self, points_mm, f_mm)
+        return np.where(past(points_mm), -0.2 * half_mm, best), least
+
+    monkeypatch.setattr(Evidence, "rays_say", rays)
+    monkeypatch.setattr(Evidence, "clearance", surface)
+    monkeypatch.setattr("amrepair.detect.skipped._topped", lambda middle, *rest: middle[:, 0] < 0)
+    found = gone_of(scan_of(without(4.0, 9.0, 0, 2 * HIGH_MM), 0))
+    assert len(found.width_mm)
+    assert (0.5 * (found.start_mm + found.end_mm)[:, 0] < 10.0).all()
 
 
 def gone_of(scan: Scan) -> PlannedBeads:
