@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import manifold3d
 import numpy as np
@@ -54,6 +55,8 @@ OPEN_INFILL_MM = 0.5
 OPEN_CELL_MARGIN_MM = 0.0
 # What lies beside the part: so far off it, and no higher than it was to be by this much.
 OFF_THE_PART_MM, OVER_BESIDE_MM, ON_BED_MM = 0.3, 0.3, 0.2
+# Cosine to the vertical of a top that lies in one layer.
+FLAT = 0.99
 # A part stands upright where its Z is the bed's to 0.05 mm over 100 mm.
 LEVEL = 1e-7
 # Two poses whose repairs share less than this are two different repairs.
@@ -112,6 +115,9 @@ class Site:
     beside
         How high skirt, brim and supports stand beside the part, build frame, where the template
         does not have them; −inf where nothing does. They are none of the part, nor too much.
+    laid
+        How high the job's beads stand, build frame, for a finished part: what its layers round up
+        of a flat top of the drawing is not too much.
 
     Examples
     --------
@@ -135,6 +141,7 @@ class Site:
     lines: JobLines | None = None
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
     beside: HeightField | None = None
+    laid: HeightField | None = None
 
     @classmethod
     def of_part(
@@ -292,6 +299,7 @@ def plan_repair(
             if seen is None
             else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
+            rounded_up=None if site.laid is None else partial(_rounded_up, site, placed),
             progress=progress,
         )
     with watch("deficit"):
@@ -402,6 +410,24 @@ def _of_the_part(scan: Scan, site: Site) -> Scan:
     keep = np.ones(len(scan), dtype=bool)
     keep[low] = site.template.distance(scan.points_mm[low]) < OFF_THE_PART_MM
     return _subset(scan, keep)
+
+
+def _rounded_up(
+    site: Site,
+    placed: Transform,
+    place_mm: Float[np.ndarray, "s 3"],
+    deviation_mm: Float[np.ndarray, " s"],
+) -> Float[np.ndarray, " s"]:
+    """(s,) how far over the drawing the job's layers put the flat top that each place is over."""
+    assert site.laid is not None
+    build_mm = placed.apply(place_mm)
+    over_mm = site.laid.sample(build_mm[:, :2], outside_mm=-np.inf)
+    over_mm = over_mm - (build_mm[:, 2] - deviation_mm)
+    over_mm[(over_mm < 0) | (over_mm > site.grid.layer_height_mm)] = 0.0
+    some = np.flatnonzero(over_mm)
+    outward = site.template.distance_and_gradient(place_mm[some])[1] @ placed.rotation[2]
+    over_mm[some[outward < FLAT]] = 0.0
+    return over_mm
 
 
 def _in_view(scan: Scan, site: Site) -> Scan:

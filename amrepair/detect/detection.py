@@ -7,6 +7,7 @@ is thinner than one point's noise, and hysteresis follows it to its rim.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -28,6 +29,8 @@ from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
+# Of places in the template's frame and their deviations: a length for each.
+RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
 # Half a 0.2 mm layer: what section-at-mid-layer leaves on slopes and rounds off at tops.
 DEFAULT_ALLOWANCE_MM = 0.1
 # A layer's own top lies where the job's G-code puts it: a quarter of a layer is left to the beads.
@@ -97,6 +100,7 @@ def detect(
     top_k: int = 1000,
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
+    rounded_up: RoundedUp | None = None,
     progress: Progress = silent,
 ) -> AnomalyMap:
     """Score and label a scan against its template.
@@ -122,6 +126,9 @@ def detect(
         What the scan's rays saw (`range_images`), where it is known already.
     surface
         The template's surface points, `SURFACE_SPACING_MM` apart, and normals, where they are.
+    rounded_up
+        Of places and their deviations: how far out of the template the process itself was told to
+        go there. So much is not excess.
 
     Raises
     ------
@@ -164,7 +171,13 @@ def detect(
     top_allowance_mm = min(allowance_mm, TOP_ALLOWANCE_MM)
     top_limit = replace(limit, systematic_mm=limit.systematic_mm - allowance_mm + top_allowance_mm)
     top = _under_plane(surfels, None if threshold_mm is not None else top_z_mm)
-    missing, excess = _label_surfels(forgiven(surfels, template), template, limit, top_limit, top)
+    judged = forgiven(surfels, template)
+    over_mm = (
+        np.zeros(len(judged))
+        if rounded_up is None
+        else rounded_up(judged.place_mm, judged.deviation_mm)
+    )
+    missing, excess = _label_surfels(judged, template, limit, top_limit, top, over_mm)
     evidence = gather(
         scan,
         template,
@@ -319,16 +332,23 @@ def _label_surfels(
     limit: Threshold,
     top_limit: Threshold,
     top: Bool[np.ndarray, " s"],
+    over_mm: Float[np.ndarray, " s"],
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
     """Missing and excess by two scales and hysteresis; missing under the top by its own limits."""
+    higher = replace(
+        surfels,
+        deviation_mm=surfels.deviation_mm - over_mm,
+        wide_deviation_mm=surfels.wide_deviation_mm - over_mm,
+    )
     labels = []
     wide_top = top.copy()
     around = surfels.table[top]
     wide_top[top] = (top[around] | (around < 0)).all(axis=1)
     for sign in (-1.0, 1.0):
         own, own_wide = (top, wide_top) if sign < 0 else (np.zeros_like(top),) * 2
-        cell = sign * surfels.deviation_mm
-        wide = sign * surfels.wide_deviation_mm
+        judged = surfels if sign < 0 else higher
+        cell = sign * judged.deviation_mm
+        wide = sign * judged.wide_deviation_mm
         high = np.where(own, top_limit.high_mm(surfels.count), limit.high_mm(surfels.count))
         count = surfels.wide_count
         high_wide = np.where(own_wide, top_limit.high_mm(count), limit.high_mm(count))
@@ -341,7 +361,7 @@ def _label_surfels(
         core &= through
         if sign > 0:
             strands = on_strands(
-                surfels,
+                judged,
                 template,
                 (wide > limit.low_mm(count)) & ~core,
                 systematic_mm=limit.systematic_mm,

@@ -55,6 +55,7 @@ def sites(
                 build_from_template,
                 lines=_lines(job, every),
                 beside=_beside(job, every),
+                laid=_as_high_as(job, every, BESIDE_CELL_MM),
             )
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
@@ -88,8 +89,14 @@ def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:
     pick = which & of_roles(beads, BESIDE_THE_PART)
     if not pick.any():
         return None
+    return _as_high_as(job, pick, BESIDE_MM)
+
+
+def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> HeightField:
+    """How high some of a job's beads stand, build frame; −inf farther than that beside them."""
+    beads = job.beads
     start, end = (np.ascontiguousarray(xyz[pick]) for xyz in (beads.start_mm, beads.end_mm))
-    within = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6) + BESIDE_MM
+    within = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6) + wider_mm
     low, high = box_of(np.concatenate([start, end])[:, :2])
     low = low - float(within.max())
     nx, ny = (int(v) for v in np.ceil((high + float(within.max()) - low) / BESIDE_CELL_MM))

@@ -192,3 +192,37 @@ def test_a_skirt_is_nothing_too_much() -> None:
     plan = plan_repair(scan, site, title="x", guess=guess, strict=False)
     assert not plan.anomaly.regions
     assert not plan.deficit.regions
+
+
+def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much() -> None:
+    """A clean job of PrusaSlicer ended with 37 mm³ too much: its tops lay 0.05 mm over the drawing.
+
+    Ridges of 0.1 mm came on top, which alone are allowed for.
+    """
+    corner = m3.Manifold.cube((6.0, 4.0, 20.0)).translate((14.0, 9.0, -1.0))
+
+    def high(top_mm: float) -> m3.Manifold:
+        return (m3.Manifold.cube((18.0, 12.0, top_mm)) - corner).translate((60.0, 60.0, 0.0))
+
+    job = job_of(high(5.2))  # as slicers of whole layers make it of 5.12
+    assert job.layers[-1].z_mm == pytest.approx(5.2)
+    template = MeshSdf.from_mesh(solid_mesh(high(5.12)))
+    placed = Transform.identity("build", "template")
+    site = sites(job, template, placed, SETUP)(plan_stops(job, [])[-1])
+    guess = Transform("template", "build", placed.inverse().matrix)
+    sensors = np.array([[0.0, 0.0, 300.0], [150.0, 150.0, 300.0], [-60.0, 80.0, 250.0]])
+    bed = m3.Manifold.cube((60.0, 60.0, 1.0)).translate((40.0, 40.0, -1.0))
+
+    def found(stands: m3.Manifold, laid: bool) -> list[str]:
+        points, who = analytic.ray_scan(
+            stands + bed, sensors, spacing_mm=0.25, sigma_mm=0.03, seed=4
+        )
+        scan = Scan(points, 0.03, "build", None, sensors, who)
+        here = site if laid else replace(site, laid=None)
+        plan = plan_repair(scan, here, title="x", guess=guess, strict=False)
+        return [region.label.name for region in plan.deficit.regions]
+
+    assert "EXCESS" in found(high(5.32), laid=False)
+    assert found(high(5.32), laid=True) == []
+    blob = m3.Manifold.cube((4.0, 4.0, 1.0)).translate((64.0, 64.0, 4.6))
+    assert found(high(5.3) + blob, laid=True) == ["EXCESS"]
