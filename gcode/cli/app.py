@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gcode.estimate import Estimate
     from gcode.hosts import Printer, PrintReport
     from gcode.moves import Program
-    from gcode.profiles import PrinterProfile
+    from gcode.profiles import PrinterProfile, PrintSetup
     from gcode.surfaces import HeightField
 
 AS_BUILT_CELL_MM = 0.2
@@ -155,6 +155,14 @@ def slice_solid(
         console.out.print(f"left out: {thing.volume_mm3:.3f} mm³: {thing.reason}")
 
 
+def _setup_of(printer: str, material: str | None) -> PrintSetup:
+    """Profiles to judge by; of a filament that nobody named only the hotend's limit is known."""
+    from gcode.profiles import load_setup
+
+    setup = load_setup(printer, material or DEFAULT_MATERIAL)
+    return setup if material is not None else setup.melting_all()
+
+
 @app.command(
     "check",
     epilog=console.examples(
@@ -174,11 +182,8 @@ def check(
     with console.starting():
         from gcode.check import find_refusals
         from gcode.moves import Program
-        from gcode.profiles import load_setup
 
-    setup = load_setup(printer, material or DEFAULT_MATERIAL)
-    if material is None:
-        setup = setup.melting_all()
+    setup = _setup_of(printer, material)
     program = Program(program_text(file), setup.printer.dialect)
     field = _as_built(as_built) if as_built is not None else None
     bars = console.Bars()
@@ -272,7 +277,7 @@ def send(
         ),
     ],
     printer: PrinterOption = DEFAULT_PRINTER,
-    material: MaterialOption = DEFAULT_MATERIAL,
+    material: OwnMaterialOption = None,
     as_built: AsBuiltOption = None,
     resume: Annotated[
         bool,
@@ -308,9 +313,8 @@ def send(
     from gcode.hosts.resume import resume as resume_job
     from gcode.hosts.serial import SerialPrinter
     from gcode.moves import Program
-    from gcode.profiles import load_setup
 
-    setup = load_setup(printer, material)
+    setup = _setup_of(printer, material)
     field = _as_built(as_built) if as_built is not None else None
     program = Program(program_text(file), setup.printer.dialect)
     bars = console.Bars()

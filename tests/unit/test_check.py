@@ -286,3 +286,23 @@ def test_elsewhere_g91_leaves_an_absolute_extruder_alone() -> None:
     lines += ["G1 X110 E1.5 F1200", "G91", "G1 E1 F2700", "G90", "M104 S0"]
     job = Program("\n".join(lines) + "\n", "prusa")
     assert read_job(job).moves()[1][9] == pytest.approx(-0.5)
+
+
+def test_send_judges_flow_by_the_hotend_unless_the_filament_is_named(tmp_path: Path) -> None:
+    """A job that `gcode check` passed was refused by `gcode send`, for PLA's flow."""
+    from typer.testing import CliRunner
+
+    from gcode.cli.app import app
+
+    job, sent = tmp_path / "job.gcode", tmp_path / "sent.gcode"
+    lines = ["G21", "G90", "M83", "M140 S60", "M104 S215", "M190 S60", "M109 S215", "G28"]
+    # 0.8 mm² along 30 mm in 1.2 s: 20 mm³/s; the machine melts 23, PLA 15
+    lines += ["G1 Z0.4 F600", "G1 X50 Y50 F6000", "G1 X80 E9.97 F1500", "M104 S0", "M140 S0"]
+    job.write_text("\n".join(lines) + "\n")
+    words = ["send", str(job), "--port", f"file:{sent}", "--printer", "creality_k1"]
+    named = CliRunner().invoke(app, [*words, "--material", "pla"])
+    assert named.exit_code != 0
+    assert not sent.exists()
+    unnamed = CliRunner().invoke(app, words)
+    assert unnamed.exit_code == 0, unnamed.output
+    assert sent.read_text().split() == job.read_text().split()
