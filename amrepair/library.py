@@ -118,8 +118,13 @@ def recognise(
     for k, (name, open_part) in enumerate(library):
         progress("align", float(k), float(len(library)))
         opened[name] = open_part()
+
+        def within(stage: str, done: float, total: float, before: float = float(k)) -> None:
+            progress(stage, before + done / total, float(len(library)))
+
+        rng = np.random.default_rng(seed)
         try:
-            found = align(scan, opened[name], method=method, rng=np.random.default_rng(seed))
+            found = align(scan, opened[name], method=method, rng=rng, progress=within)
         except AlignmentError as error:
             rated.append(Candidate(name, 1.0, None, str(error)))
             continue

@@ -1,99 +1,402 @@
 """A bent part is two rigid pieces: which of them stayed where it was.
 
-An alignment lays the piece that was seen most on the template. What is left may be the same
-surface turned by some degrees: then the scan is two bodies, and the one that makes up more of the
-*template* is taken to be in place. It judges poses; it makes no scores.
+An alignment of the whole lays the piece that was seen most on the template, or neither piece, or
+the scan somewhere else, where more of it lies nearly right. What tells is how much lies on the
+template *within the noise*: of a bent part hardly more than one piece in any pose, all of it in
+two poses that agree along a hinge. Of the two pieces the one that makes up more of the *template*
+is taken to be in place. It judges poses; it makes no scores.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Bool, Float
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
-from amrepair.align.refine import refine
-from amrepair.align.thinning import thin_out
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from amrepair.align.refine import refine_all
+from amrepair.align.search import THOROUGH, CoarseField, search
+from amrepair.align.thinning import Thinned
+from amrepair.frames import moved, rotation_from_vector
 from amrepair.template.port import Template
 
-LEAST_SHARE = 0.1  # of the points: a smaller piece never outweighs the other
-LEAST_EXPLAINED = 0.6  # of that piece, by its own pose; the bent zone fits neither
-MOST_WRONG = 0.2  # of either piece, on the wrong side of the plane between them
-POINTS = 3_000
+LEAST_SHARE = 0.1  # of the points: with fewer off the template nothing was bent
+POINTS, FEW_POINTS, PIECE_POINTS, LAST_POINTS = 4_000, 1_200, 600, 15_000
 CLEAR_SIGMAS, CLEAR_RATIO = 4.0, 0.002  # a point is off the surface; the ratio is of the diagonal
-FIRST_RATIO = 0.04  # scale of the second alignment's loss, of the diagonal
+FIRST_RATIO, PIECE_RATIO = 0.02, 0.04  # scale of the loss to begin with, of the diagonal
+SHARP = 0.4  # of the limit: the loss's scale where a piece's pose ends
+ITERATIONS, ROUNDS, LEAST_RISE = 40, 6, 0.002  # of the share explained, from round to round
+NEARBY = 3.0  # limits: a point this near may yet come to lie on a piece
+ENOUGH = 0.93  # of the points, explained by two poses: nothing better is looked for
+MOST_POLISHED = 2  # pairs of each pose, the best ones to begin with
+MOST_TRIED = 4  # poses of which a second piece is asked
+NEIGHBOURS, MOSTLY = 24, 0.9  # a place lies on the template where its neighbours do
+SAME_RATIO = 0.01  # of the diagonal: poses that move the scan by less are one
+TURN_RAD = 0.14  # starts of the second piece, about the middle of what the first leaves
+CUTS = (0.3, 0.5, 0.7)  # shares of the scan on one side, along each of its main axes
+LEAST_TURNED_RAD, MOST_TURNED_RAD = 0.01, 0.5  # farther is another place that fits by chance
+HINGE_RATIO = 0.04  # of the diagonal: at the plane between the pieces both poses agree to this
+LEAST_PIECE = 0.05  # of the points
+LEAST_OF_PAIR = 0.6  # of the points, held by either pose
+LEAST_GAINED = 0.08  # of the points, by the second pose
+MOST_WRONG = 0.2  # of either piece, on the wrong side of the plane between them
+ANGLES, ALIKE = 36, 0.02  # of planes about the hinge; wrong by so little more is as good
+MOST_OF_BROKEN = 0.5  # where a pose holds more, the rest is a matter of its own
+MOST_OUTSIDE = 0.01  # of the points, beyond the noise, where something broke off
+SUNK_RATIO, SUNK_SHRINK, SUNK_STEPS = 0.01, 0.8, 30  # the loss's scale, first of the diagonal
+SUNK_TURN_RAD = 0.1  # a step turns no more
 SURFACE_RATIO = 1.0 / 60.0  # spacing of the template's points, of the diagonal
+
+Pose = Float[np.ndarray, "4 4"]
 
 
 def standing_pose(
     points_mm: Float[np.ndarray, "n 3"],
     template: Template,
-    matrix: Float[np.ndarray, "4 4"],
+    known: Sequence[Pose],
     sigma_mm: float,
     rng: np.random.Generator,
-) -> Float[np.ndarray, "4 4"]:
-    """The pose of the larger piece, where the scan shows a part bent in two; else the one given.
+) -> Pose:
+    """The pose of the larger piece, where the scan shows a part bent in two.
+
+    Else the pose in which most of it is held; the first given where that explains nearly all.
 
     Parameters
     ----------
     points_mm
         (n, 3) in the scan's frame.
-    matrix
-        (4, 4) template from scan, as aligned.
+    known
+        (4, 4) each, template from scan, best first, as aligned.
     sigma_mm
         Noise of the points.
     """
-    diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-    limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * diagonal_mm)
-    cloud = thin_out(points_mm, 2 * POINTS, rng)
-    off = _distance(cloud, template, matrix) > limit_mm
-    if off.mean() < LEAST_SHARE:
-        return matrix
-    rest = cloud[off]
-    moved = refine(
-        thin_out(rest, POINTS, rng),
-        template,
-        matrix,
-        start_scale_mm=FIRST_RATIO * diagonal_mm,
-        end_scale_mm=limit_mm,
-        sigma_mm=max(sigma_mm, 1e-3),
-        max_iterations=40,
-    ).matrix
-    if (_distance(rest, template, moved) <= limit_mm).mean() < LEAST_EXPLAINED:
-        return matrix
-    on_other = off & (_distance(cloud, template, moved) <= limit_mm)
-    return moved if _share(cloud, off, on_other, template, (matrix, moved)) > 0.5 else matrix
+    scene = _Scene.of(points_mm, template, sigma_mm, rng)
+    if scene.on(known[0]).mean() > 1.0 - LEAST_SHARE:
+        return known[0]
+    tried = scene.distinct(scene.refined(scene.thinned.to(FEW_POINTS), known))
+    best = _best_pair(tried, scene)
+    if best is None or best.explained < ENOUGH:
+        field = CoarseField.of(template)
+        found = [pose.matrix for pose in search(scene.thinned, field, effort=THOROUGH)]
+        more = scene.distinct([*tried, *scene.refined(scene.thinned.to(FEW_POINTS), found)])
+        untried = [pose for pose in more if not any(pose is one for one in tried)]
+        best = _best_pair(untried[:MOST_TRIED], scene, best)
+        tried = more
+    alone = scene.held(scene.on(tried[0]))
+    if best is not None and best.explained >= max(LEAST_OF_PAIR, alone + LEAST_GAINED):
+        return scene.finished(best.standing, best.normal, best.through_mm)
+    if alone < MOST_OF_BROKEN:
+        broken = _nothing_outside(tried[:MOST_TRIED], scene)
+        if broken is not None:
+            return scene.finished(broken)
+    return scene.finished(tried[0])
 
 
-def _distance(
-    points: Float[np.ndarray, "n 3"], template: Template, matrix: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, " n"]:
-    return np.abs(template.distance(points @ matrix[:3, :3].T + matrix[:3, 3]))
+def _nothing_outside(poses: Sequence[Pose], scene: _Scene) -> Pose | None:
+    """The pose that holds most of those that leave nothing outside the template, if there is one.
 
-
-def _share(
-    cloud: Float[np.ndarray, "n 3"],
-    off: Bool[np.ndarray, " n"],
-    on_other: Bool[np.ndarray, " n"],
-    template: Template,
-    poses: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]],
-) -> float:
-    """Share of the template's surface on the second piece's side of the plane between the two.
-
-    A plane (Fisher's discriminant), not the nearest points: a view shows little of what it was not
-    made for. 0 where no plane parts them.
+    A view into a broken face: on the template lies what is left beside it, below all the rest. Laid
+    on a flat side near by, half of the face sticks out, and nothing that breaks makes that.
     """
-    first, second = (
-        cloud[which] @ matrix[:3, :3].T + matrix[:3, 3]
-        for which, matrix in zip((~off, on_other), poses, strict=True)
+    best, most = None, LEAST_PIECE
+    for pose in poses:
+        sunk = _sunk(pose, scene)
+        distance = scene.template.distance(moved(scene.cloud, sunk))
+        if (distance > scene.limit_mm).mean() > MOST_OUTSIDE:
+            continue
+        held = scene.held(distance >= -scene.limit_mm)
+        if held > most:
+            best, most = sunk, held
+    return best
+
+
+def _sunk(pose: Pose, scene: _Scene) -> Pose:
+    """The pose moved until nothing sticks out: points inside may be far off, outside none.
+
+    Gauss–Newton as in `refine`, with Geman–McClure's weights inside and Huber's outside.
+    """
+    points = scene.thinned.to(FEW_POINTS)
+    centre = points.mean(axis=0)
+    local, rotation = points - centre, pose[:3, :3].copy()
+    place = rotation @ centre + pose[:3, 3]
+    end_mm = SHARP * scene.limit_mm
+    for scale in np.maximum(
+        SUNK_RATIO * scene.diagonal_mm * SUNK_SHRINK ** np.arange(SUNK_STEPS), end_mm
+    ):
+        turned = local @ rotation.T
+        f, gradient = scene.template.distance_and_gradient(turned + place)
+        weight = (scale**2 / (f**2 + scale**2)) ** 2
+        weight = np.where(f > 0.0, np.maximum(weight, end_mm / np.maximum(f, end_mm)), weight)
+        jacobian = np.concatenate([np.cross(turned, gradient), gradient], axis=1)
+        hessian = (jacobian * weight[:, None]).T @ jacobian
+        hessian += 1e-6 * np.trace(hessian) / 6.0 * np.eye(6)
+        step = np.linalg.solve(hessian, -jacobian.T @ (weight * f))
+        step *= min(1.0, SUNK_TURN_RAD / max(float(np.linalg.norm(step[:3])), 1e-12))
+        rotation = rotation_from_vector(step[:3]) @ rotation
+        place = place + step[3:]
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = rotation, place - rotation @ centre
+    return found
+
+
+def _best_pair(poses: Sequence[Pose], scene: _Scene, best: _Pair | None = None) -> _Pair | None:
+    for pose in poses:
+        begun = sorted(_begun(pose, scene), key=lambda one: -one[0])[:MOST_POLISHED]
+        for _, first, second in begun:
+            pair = _polished(first, second, scene)
+            if pair is not None and (best is None or pair.explained > best.explained):
+                best = pair
+        if best is not None and best.explained > ENOUGH:
+            break
+    return best
+
+
+def _begun(pose: Pose, scene: _Scene) -> Iterator[tuple[float, Pose, Pose]]:
+    """Pairs to start from, and how much is held by either pose."""
+    for first, second in _seeds(pose, scene):
+        yield scene.held(scene.on(first) | scene.on(second)), first, second
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Two poses of which one is of the larger piece.
+
+    Attributes
+    ----------
+    explained
+        Share of the places that are held by the pose of their piece.
+    normal, through_mm
+        Of the plane between the pieces, template's frame, away from the standing one.
+    """
+
+    explained: float
+    standing: Pose
+    normal: Float[np.ndarray, " 3"]
+    through_mm: Float[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """A scan and its template, and how near is on."""
+
+    thinned: Thinned
+    cloud: Float[np.ndarray, "n 3"]
+    template: Template
+    sigma_mm: float
+    diagonal_mm: float
+    limit_mm: float
+    neighbours: Int[np.ndarray, "n k"]
+
+    @classmethod
+    def of(
+        cls,
+        points_mm: Float[np.ndarray, "n 3"],
+        template: Template,
+        sigma_mm: float,
+        rng: np.random.Generator,
+    ) -> _Scene:
+        diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+        limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * diagonal_mm)
+        thinned = Thinned(points_mm, rng)
+        cloud = thinned.to(POINTS)
+        near = [*range(1, min(NEIGHBOURS, len(cloud)) + 1)]
+        index = cKDTree(cloud).query(cloud, k=near)[1]
+        return cls(thinned, cloud, template, max(sigma_mm, 1e-3), diagonal_mm, limit_mm, index)
+
+    def held(self, on: Bool[np.ndarray, " n"]) -> float:
+        """Share of the places that lie on the template with what is around them.
+
+        What crosses the template somewhere, a broken face laid on a flat one, is on it in strips.
+        """
+        return float((on & (on[self.neighbours].mean(axis=1) >= MOSTLY)).mean())
+
+    def on(
+        self, pose: Pose, points: Float[np.ndarray, "k 3"] | None = None
+    ) -> Bool[np.ndarray, " k"]:
+        """(k,) points that lie on the template."""
+        placed = moved(self.cloud if points is None else points, pose)
+        return np.abs(self.template.distance(placed)) <= self.limit_mm
+
+    def refined(
+        self,
+        points: Float[np.ndarray, "k 3"],
+        starts: Sequence[Pose],
+        first_ratio: float = FIRST_RATIO,
+    ) -> list[Pose]:
+        """Poses moved so that as many of the points as may be lie on the template."""
+        end_mm = SHARP * self.limit_mm
+        found = refine_all(
+            points,
+            self.template,
+            starts,
+            start_scale_mm=max(first_ratio * self.diagonal_mm, end_mm),
+            end_scale_mm=end_mm,
+            sigma_mm=self.sigma_mm,
+            max_iterations=ITERATIONS,
+        )
+        return [one.matrix for one in found]
+
+    def finished(
+        self,
+        pose: Pose,
+        away: Float[np.ndarray, " 3"] | None = None,
+        through_mm: Float[np.ndarray, " 3"] | None = None,
+    ) -> Pose:
+        """The pose moved on all points that lie on the template, on its side of the plane."""
+        points = self.thinned.to(LAST_POINTS)
+        for _ in range(2):
+            placed = moved(points, pose)
+            own = np.abs(self.template.distance(placed)) <= self.limit_mm
+            if away is not None and through_mm is not None:
+                own &= (placed - through_mm) @ away < -HINGE_RATIO * self.diagonal_mm
+            if own.sum() < LEAST_PIECE * len(points):
+                break
+            pose = refine_all(
+                np.ascontiguousarray(points[own]),
+                self.template,
+                [pose],
+                start_scale_mm=self.limit_mm,
+                end_scale_mm=self.limit_mm,
+                sigma_mm=self.sigma_mm,
+                max_iterations=ITERATIONS,
+            )[0].matrix
+        return pose
+
+    def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
+        """Those apart from each other, the one with most points on the template first."""
+        shares = [self.held(self.on(pose)) for pose in poses]
+        few = self.cloud[:: len(self.cloud) // 50 + 1]
+        kept: list[Pose] = []
+        for k in np.argsort(shares, kind="stable")[::-1]:
+            here = moved(few, poses[k])
+            if all(
+                np.linalg.norm(here - moved(few, one), axis=1).max() > SAME_RATIO * self.diagonal_mm
+                for one in kept
+            ):
+                kept.append(poses[k])
+        return kept
+
+
+def _seeds(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
+    """Two poses to start from: of the rest, and of both sides of some planes."""
+    on = scene.on(first)
+    rest = scene.cloud[~on]
+    if len(rest) > LEAST_PIECE * len(on):
+        few = _some(rest, PIECE_POINTS)
+        middle = moved(few, first).mean(axis=0)
+        starts = [first]
+        for vector in (*np.eye(3), *-np.eye(3)):
+            turn = rotation_from_vector(TURN_RAD * vector)
+            start = np.eye(4)
+            start[:3, :3] = turn @ first[:3, :3]
+            start[:3, 3] = turn @ (first[:3, 3] - middle) + middle
+            starts.append(start)
+        found = scene.refined(few, starts, PIECE_RATIO)
+        yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
+    cloud = scene.thinned.to(2 * PIECE_POINTS)
+    local = cloud - cloud.mean(axis=0)
+    for axis in np.linalg.eigh(local.T @ local)[1].T[::-1]:
+        height = local @ axis
+        for cut in np.quantile(height, CUTS):
+            sides = (
+                _some(cloud[height <= cut], PIECE_POINTS),
+                _some(cloud[height > cut], PIECE_POINTS),
+            )
+            low, high = (scene.refined(side, [first], PIECE_RATIO)[0] for side in sides)
+            yield low, high
+
+
+def _some(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
+    return np.ascontiguousarray(points[:: len(points) // count + 1])
+
+
+def _polished(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
+    """Both poses, each moved on the points that it explains better; None if that is no bend."""
+    poses = [first, second]
+    last = 0.0
+    for _ in range(ROUNDS):
+        off = np.stack([np.abs(scene.template.distance(moved(scene.cloud, one))) for one in poses])
+        explained = scene.held(off.min(axis=0) <= scene.limit_mm)
+        if explained < last + LEAST_RISE:
+            break
+        last = explained
+        nearer = off[1] < off[0]
+        if min(nearer.mean(), 1.0 - nearer.mean()) < LEAST_PIECE:
+            return None
+        near = off.min(axis=0) <= NEARBY * scene.limit_mm
+        own = (near & ~nearer, near & nearer)
+        if min(which.sum() for which in own) < LEAST_PIECE * len(nearer):
+            return None
+        poses = [
+            scene.refined(_some(scene.cloud[which], FEW_POINTS), [one], 0.0)[0]
+            for which, one in zip(own, poses, strict=True)
+        ]
+    return _judged(poses[0], poses[1], scene)
+
+
+def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
+    """The pair, if the second is the first turned about a line that parts what they explain."""
+    hinge = _hinge(second @ np.linalg.inv(first), scene)
+    if hinge is None:
+        return None
+    axis, through = hinge
+    placed = [moved(scene.cloud, pose) - through for pose in (first, second)]
+    off = np.stack([np.abs(scene.template.distance(one + through)) for one in placed])
+    on = off <= scene.limit_mm
+    only = (on[0] & ~on[1], on[1] & ~on[0])
+    if min(which.sum() for which in only) < LEAST_PIECE * on.shape[1]:
+        return None
+    # planes that hold the axis: the one with fewest points on the wrong side
+    u = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    u /= np.linalg.norm(u)
+    v = np.cross(axis, u)
+    angles = 2.0 * np.pi * np.arange(ANGLES) / ANGLES
+    normals = np.outer(np.cos(angles), u) + np.outer(np.sin(angles), v)
+    wrong = (placed[0][only[0]] @ normals.T > 0.0).mean(axis=0)
+    wrong += (placed[1][only[1]] @ normals.T < 0.0).mean(axis=0)
+    least = wrong <= wrong.min() + ALIKE
+    normal = normals[least].sum(axis=0)
+    normal /= max(float(np.linalg.norm(normal)), 1e-9)
+    if 0.5 * wrong.min() > MOST_WRONG:
+        return None
+    zone_mm = HINGE_RATIO * scene.diagonal_mm
+    right = (on[0] & (placed[0] @ normal < zone_mm)) | (on[1] & (placed[1] @ normal > -zone_mm))
+    surface = scene.template.surface_points(SURFACE_RATIO * scene.diagonal_mm)[0]
+    share = float(((surface - through) @ normal > 0.0).mean())
+    standing, away = (second, -normal) if share > 0.5 else (first, normal)
+    return _Pair(scene.held(right), standing, away, through)
+
+
+def _hinge(
+    second_from_first: Pose, scene: _Scene
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
+    """Direction of the line about which the second piece was turned, and a point on it.
+
+    None where it was turned too little or too much, slid along the line, or the line is far away.
+    """
+    rotation, shift = second_from_first[:3, :3], second_from_first[:3, 3]
+    twist = 0.5 * np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
     )
-    within = np.cov(first.T) + np.cov(second.T)
-    within += 1e-6 * np.trace(within) * np.eye(3)
-    across = np.linalg.solve(within, second.mean(axis=0) - first.mean(axis=0))
-    low, high = first @ across, second @ across
-    limits = np.quantile(np.concatenate([low, high]), np.linspace(0.02, 0.98, 97))
-    wrong = [0.5 * float((low > at).mean() + (high <= at).mean()) for at in limits]
-    best = int(np.argmin(wrong))
-    if wrong[best] > MOST_WRONG:
-        return 0.0
-    diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-    surface = template.surface_points(SURFACE_RATIO * diagonal_mm)[0]
-    return float((surface @ across > limits[best]).mean())
+    sine = float(np.linalg.norm(twist))
+    angle = float(np.arctan2(sine, 0.5 * (np.trace(rotation) - 1.0)))
+    if not LEAST_TURNED_RAD < angle < MOST_TURNED_RAD:
+        return None
+    axis = twist / sine
+    middle = scene.template.bounds_mm.mean(axis=0)
+    gap = rotation @ middle + shift - middle
+    along = float(gap @ axis)
+    across = gap - along * axis
+    # the fixed point of a plane rotation, seen from the middle
+    through = middle + 0.5 * (across + np.cross(axis, across) / np.tan(0.5 * angle))
+    if abs(along) > HINGE_RATIO * scene.diagonal_mm:
+        return None
+    if np.linalg.norm(through - middle) > scene.diagonal_mm:
+        return None
+    return axis, through

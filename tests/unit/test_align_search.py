@@ -182,9 +182,11 @@ def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("share_of_base", [1.0, 0.3])
-def test_the_larger_piece_of_a_bent_part_stands(share_of_base: float) -> None:
+def test_the_larger_piece_of_a_bent_part_stands(
+    share_of_base: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plate = difference(box((0, 0, 0), (60, 20, 4)), box((50, 12, -1), (61, 21, 5)))
-    points = sample_surface(plate.body, 0.4, seed=5)[0]
+    points = sample_surface(plate.body, 0.6, seed=5)[0]
     rng = np.random.default_rng(5)
     bent = points[:, 0] > 40.0
     hinge = np.array([40.0, 0.0, 0.0])
@@ -194,9 +196,59 @@ def test_the_larger_piece_of_a_bent_part_stands(share_of_base: float) -> None:
     points = points[seen] + rng.normal(0, SIGMA_MM, (int(seen.sum()), 3))
     by_end = np.eye(4)  # as an alignment on the bent end has it
     by_end[:3, :3], by_end[:3, 3] = turn.T, hinge - turn.T @ hinge
+    monkeypatch.setattr("amrepair.bench.bodies.search", lambda *_, **__: [])
     for start in (np.eye(4), by_end):
-        pose = standing_pose(points, plate, start, SIGMA_MM, np.random.default_rng(0))
-        assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.01
+        pose = standing_pose(points, plate, [start], SIGMA_MM, np.random.default_rng(0))
+        assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.002
+
+
+def test_the_larger_piece_stands_where_the_view_shows_more_of_the_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # regression: the share of the template was told by the points seen, not by the hinge
+    monkeypatch.setattr("amrepair.bench.bodies.search", lambda *_, **__: [])
+    plate = difference(box((0, 0, 0), (60, 20, 4)), box((50, 12, -1), (61, 21, 5)))
+    points = sample_surface(plate.body, 0.5, seed=5)[0]
+    points = points[points[:, 0] > 24.0]
+    beyond = np.maximum(points[:, 0] - 34.0, 0.0)  # 26 of 60 mm are bent up
+    points[:, 2] += beyond * np.tan(np.deg2rad(7.0))
+    points += np.random.default_rng(3).normal(0, SIGMA_MM, points.shape)
+    pose = standing_pose(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(0))
+    assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.005
+
+
+@pytest.mark.slow
+def test_a_bent_part_that_was_laid_elsewhere_is_found() -> None:
+    # regression: the scan lay somewhere else, where more of it is nearly right than of either piece
+    plate = difference(box((0, 0, 0), (60, 20, 4)), box((50, 12, -1), (61, 21, 5)))
+    points = sample_surface(plate.body, 0.6, seed=5)[0]
+    beyond = np.maximum(points[:, 0] - 40.0, 0.0)
+    points[:, 2] += beyond * np.tan(np.deg2rad(8.0))
+    points += np.random.default_rng(5).normal(0, SIGMA_MM, points.shape)
+    elsewhere = np.diag([1.0, -1.0, -1.0, 1.0])
+    elsewhere[:3, 3] = 0.0, 20.0, 4.0
+    pose = standing_pose(points, plate, [elsewhere], SIGMA_MM, np.random.default_rng(0))
+    assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.002
+
+
+def test_a_broken_face_is_not_laid_on_the_side_that_is_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("amrepair.bench.bodies.search", lambda *_, **__: [])
+    # regression: where a view shows mostly the face, it lay on a flat side, half of it outside
+    plate = difference(box((0, 0, 0), (40, 24, 8)), box((30, 10, 6), (34, 14, 9)))
+    rng = np.random.default_rng(2)
+    top = sample_surface(plate.body, 0.5, seed=6)[0]
+    top = top[(top[:, 0] > 28.0) & (top[:, 0] < 37.0) & (top[:, 2] > 5.0)]
+    face = rng.uniform((0.0, 0.0, 0.0), (0.0, 24.0, 8.0), (4 * len(top), 3))
+    face[:, 0] = 38.6 + 0.5 * np.sin(0.9 * face[:, 1]) + 0.4 * np.cos(1.3 * face[:, 2])
+    points = np.concatenate([top, face])
+    points += rng.normal(0, SIGMA_MM, points.shape)
+    on_the_side = np.eye(4)
+    on_the_side[0, 3] = 1.4
+    pose = standing_pose(points, plate, [on_the_side], SIGMA_MM, np.random.default_rng(0))
+    off = (points @ pose[:3, :3].T + pose[:3, 3] - points)[: len(top)]
+    assert float(np.sqrt((off**2).sum(axis=1).mean())) < 0.1
 
 
 def test_what_the_search_missed_of_a_symmetric_part_is_found(

@@ -59,7 +59,14 @@ def test_the_right_part_is_found_with_confidence(parts: dict[str, MeshSdf]) -> N
 def test_a_lost_piece_does_not_make_it_another_part(parts: dict[str, MeshSdf]) -> None:
     whole = scan_of(parts["wide"], 2)
     points = whole.points_mm[np.linalg.norm(whole.points_mm - whole.points_mm[7], axis=1) > 5.0]
-    found = recognise(Scan(points, 0.03, "scanner"), opened(parts))
+    told: list[float] = []
+    found = recognise(
+        Scan(points, 0.03, "scanner"),
+        opened(parts),
+        progress=lambda _, done, total: told.append(done / total),
+    )
+    assert told == sorted(told)
+    assert len(told) > 2 * len(parts)  # also while one part is asked, which may take seconds
     assert found.name == "wide"
 
 
