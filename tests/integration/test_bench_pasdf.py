@@ -82,10 +82,10 @@ def ball(radius_mm: float) -> trimesh.Trimesh:
 
 
 def test_repair_is_measured_to_the_surface_beside_the_sampling_floor() -> None:
-    data = ClassInput("ball", Format.SHAPENET, (np.zeros((1, 3)),), ball(50.0), 0.1, 1.0)
+    data = ClassInput("ball", Format.SHAPENET, (np.zeros((1, 3)),), ball(15.0), 0.1, 1.0)
     rng = np.random.default_rng(0)
-    same = repair_distance(MeshSdf.from_mesh(ball(50.0)), data, rng)
-    larger = repair_distance(MeshSdf.from_mesh(ball(50.5)), data, rng)
+    same = repair_distance(MeshSdf.from_mesh(ball(15.0)), data, rng)
+    larger = repair_distance(MeshSdf.from_mesh(ball(15.15)), data, rng)
     assert same is not None
     assert larger is not None
     # the same surface, sampled twice: Chamfer says 0.01 radii, point to surface nearly nothing
