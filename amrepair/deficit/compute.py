@@ -198,12 +198,13 @@ def compute_deficit(
         if as_built is not None:
             return seen
         expected: Any = template.solid()
-        solid, gone, designed_mm = standing_heights(
+        solid, lost_mm, designed_mm = standing_heights(
             seen, expected.transform(matrix), missing, excess
         )
+        gone = lost_mm > 0
         points_mm = build_from_template.apply(scan.points_mm)
         sharp = with_sharp_walls(solid, gone, points_mm, scan.sigma_mm)
-        even = with_whole_rims(with_even_crests(sharp, gone), gone, designed_mm)
+        even = with_whole_rims(with_even_crests(sharp, gone), lost_mm, designed_mm)
         return with_what_stands_out(even, points_mm, scan.sigma_mm, evidence.spacing_mm)
 
     return Deficit(

@@ -139,8 +139,8 @@ def standing_heights(
     expected: manifold3d.Manifold,
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
-) -> tuple[HeightField, Bool[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"]]:
-    """The as-built field with sharp walls; columns that something is missing from; what was wanted.
+) -> tuple[HeightField, Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"]]:
+    """The as-built field with sharp walls; what is missing from each column; what was wanted.
 
     What was expected, less what is missing, with what is too much, gives heights on a fine grid.
     They stand beside walls, where the scan saw nothing higher; elsewhere the scan itself decides.
@@ -151,6 +151,10 @@ def standing_heights(
         Heights of the scan, cell by cell (`as_built_heights`).
     expected, missing, excess
         Solids, build frame.
+
+    Returns
+    -------
+    The field; from end to end how much is missing of each of its columns; their tops as expected.
     """
     box = seen.box_mm
     area_mm2 = (box[2] - box[0]) * (box[3] - box[1])
@@ -191,7 +195,10 @@ def standing_heights(
     rim = ndimage.maximum_filter(gone, around)
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     field = HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
-    return field, gone, raster_kernels.column_top(*whole, 0.0).reshape(ny, nx)
+    offset, z = lost
+    ends = [raster_kernels.column_top(*of, 0.0) for of in (whole, lost, (offset, -z))]
+    designed_mm, high_mm, low_mm = (of.reshape(ny, nx) for of in ends)
+    return field, high_mm + low_mm, designed_mm
 
 
 def _cells_over(

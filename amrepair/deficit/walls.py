@@ -91,7 +91,7 @@ def with_even_crests(field: HeightField, gone: Bool[np.ndarray, "ny nx"]) -> Hei
 
 def with_whole_rims(
     field: HeightField,
-    gone: Bool[np.ndarray, "ny nx"],
+    lost_mm: Float[np.ndarray, "ny nx"],
     designed_mm: Float[np.ndarray, "ny nx"],
 ) -> HeightField:
     """The as-built field, tops beside a steep face of what is missing as designed up to the face.
@@ -102,17 +102,18 @@ def with_whole_rims(
 
     Parameters
     ----------
-    designed_mm
-        Top of what was expected, by column.
+    lost_mm, designed_mm
+        How much is missing from each column, from end to end, and the top of what was expected.
     """
-    if not gone.any():
+    deep = lost_mm > STEEP_MM  # beside a line that was skipped nothing stands as if cut
+    if not deep.any():
         return field
-    rows, columns = window_around(gone, ROUNDED_CELLS + BESIDE_CELLS)
+    rows, columns = window_around(deep, ROUNDED_CELLS + BESIDE_CELLS)
     z_mm = np.array(field.z_mm, dtype=np.float64)
-    near, lost, designed = (v[rows, columns] for v in (z_mm, gone, designed_mm))
-    lowest_mm = ndimage.minimum_filter(np.where(lost, near, np.inf), 3)
-    lip = near - lowest_mm > STEEP_MM
+    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
+    deep, lost = deep[rows, columns], lost_mm[rows, columns] > 0
     off_mm = designed - near
+    lip = near - ndimage.minimum_filter(np.where(deep, near, np.inf), 3) > STEEP_MM
     whole = (np.abs(off_mm) < AS_DESIGNED_MM) & ~ndimage.maximum_filter(lost, 3)
     lip &= ndimage.maximum_filter(whole, 2 * ROUNDED_CELLS + 1)
     rounded = lip & (off_mm > 0) & (off_mm < ROUNDED_MM)

@@ -138,9 +138,10 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
     again = (np.abs(high_mm[:, None] - slipped_mm) < SAME_LAYER_MM).any(axis=1)
-    likely = again[line] & (both >= GONE_AGAIN) & (surface_says > 0)
+    likely = again[line] & (both >= GONE_AGAIN)
+    sure |= likely & (surface_says > 0)
     least_mm = np.where(again, LEAST_AGAIN_MM, LEAST_MM)
-    return _stretches(lines, line, share, gone | likely, sure | likely, step_mm, least_mm)
+    return _stretches(lines, line, share, gone | likely, sure, step_mm, least_mm)
 
 
 def _wall_shift(

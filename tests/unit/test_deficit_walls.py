@@ -150,7 +150,8 @@ def test_a_sloping_top_ends_at_a_steep_face_and_not_before(turned: float) -> Non
     z_mm[lip] -= np.random.default_rng(5).uniform(0.1, 0.35, int(lip.sum()))
     rounded = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
     # the piece, rounded off as well, has the lip's columns, too
-    whole = with_whole_rims(rounded, gone | lip, designed.z_mm)
+    lost_mm = np.where(gone | lip, np.maximum(designed.z_mm - truth.z_mm, 1.0), 0.0)
+    whole = with_whole_rims(rounded, lost_mm, designed.z_mm)
     assert np.abs(whole.z_mm - truth.z_mm).max() < 1e-6
 
 
@@ -164,4 +165,18 @@ def test_a_worn_edge_is_no_lip() -> None:
     worn = HeightField(truth.origin_mm, CELL_MM, truth.z_mm + noise, truth.seen)
     gone = gone_from(truth, block ^ tool)
     assert gone.sum() > 5000
-    assert (with_whole_rims(worn, gone, designed.z_mm).z_mm == worn.z_mm).all()
+    lost_mm = np.where(gone, designed.z_mm - truth.z_mm, 0.0)
+    assert (with_whole_rims(worn, lost_mm, designed.z_mm).z_mm == worn.z_mm).all()
+
+
+def test_beside_a_skipped_line_nothing_stands_as_if_cut() -> None:
+    """At the outline its columns lie as low as the bed: what was low beside it was raised."""
+    block = Solid.cube((24.0, 20.0, 6.0))
+    line = Solid.cube((12.0, 0.5, 0.4)).translate((6.0, 0.0, 5.6))
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    z_mm = np.array(HeightField.from_manifold(block - line, CELL_MM, margin_mm=1.0).z_mm)
+    lost_mm = np.where(gone_from(designed, line), 0.4, 0.0)
+    z_mm[lost_mm > 0] = 0.0  # as a wall that stands a column farther in reads
+    z_mm[ndimage.maximum_filter(lost_mm, 5) > 0] -= 0.2
+    low = HeightField(designed.origin_mm, CELL_MM, z_mm, designed.seen)
+    assert (with_whole_rims(low, lost_mm, designed.z_mm).z_mm == z_mm).all()
