@@ -174,6 +174,16 @@ def motion_about(
     return motion
 
 
+def ways_across(
+    along: Float[np.ndarray, "*any 3"],
+) -> tuple[Float[np.ndarray, "*any 3"], Float[np.ndarray, "*any 3"]]:
+    """Two unit vectors across each unit vector, and across each other; right-handed before it."""
+    helper = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
+    across = np.cross(along, helper)
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+    return across, np.cross(along, across)
+
+
 def box_corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
     """(8, 3) corners of a box, given its lowest and its highest corner."""
     grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)

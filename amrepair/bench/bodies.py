@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from amrepair.align.refine import refine_all
 from amrepair.align.search import THOROUGH, CoarseField, search
 from amrepair.align.thinning import Thinned
-from amrepair.frames import moved, rotation_from_vector
+from amrepair.frames import moved, rotation_from_vector, ways_across
 from amrepair.template.port import Template
 
 LEAST_SHARE = 0.1  # of the points: with fewer off the template nothing was bent
@@ -349,9 +349,7 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     if min(which.sum() for which in only) < LEAST_PIECE * on.shape[1]:
         return None
     # planes that hold the axis: the one with fewest points on the wrong side
-    u = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    u /= np.linalg.norm(u)
-    v = np.cross(axis, u)
+    u, v = ways_across(axis)
     angles = 2.0 * np.pi * np.arange(ANGLES) / ANGLES
     normals = np.outer(np.cos(angles), u) + np.outer(np.sin(angles), v)
     wrong = (placed[0][only[0]] @ normals.T > 0.0).mean(axis=0)

@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from amrepair.consensus import looks_kernels as kernels
 from amrepair.consensus.cloud import directions, outward, planes, spacing_of
+from amrepair.frames import ways_across
 
 PIXEL_SPACINGS = 1.6  # every pixel of a face seen at an angle of up to 60° has a point
 CLOSING = 2  # pixels: gaps that chance leaves are closed
@@ -261,7 +262,4 @@ def axes_towards(way: Float[np.ndarray, " 3"]) -> tuple[Float[np.ndarray, "3 3"]
     """Rows: two directions across, and the way itself; and how long it is."""
     length = float(np.linalg.norm(way))
     along = way / length
-    helper = np.eye(3)[int(np.argmin(np.abs(along)))]
-    across = np.cross(along, helper)
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(along, across), along]), length
+    return np.stack([*ways_across(along), along]), length

@@ -171,13 +171,11 @@ def detect(
     top_allowance_mm = min(allowance_mm, TOP_ALLOWANCE_MM)
     top_limit = replace(limit, systematic_mm=limit.systematic_mm - allowance_mm + top_allowance_mm)
     top = _under_plane(surfels, None if threshold_mm is not None else top_z_mm)
-    judged = forgiven(surfels, template)
-    over_mm = (
-        np.zeros(len(judged))
-        if rounded_up is None
-        else rounded_up(judged.place_mm, judged.deviation_mm)
-    )
-    missing, excess = _label_surfels(judged, template, limit, top_limit, top, over_mm)
+    judged = higher = forgiven(surfels, template)
+    if rounded_up is not None:
+        over_mm = rounded_up(judged.place_mm, judged.deviation_mm)
+        higher = judged.judged_by(lambda deviation_mm: deviation_mm - over_mm)
+    missing, excess = _label_surfels(judged, higher, template, limit, top_limit, top)
     evidence = gather(
         scan,
         template,
@@ -328,18 +326,16 @@ def _under_plane(surfels: Surfels, top_z_mm: float | None) -> Bool[np.ndarray, "
 
 def _label_surfels(
     surfels: Surfels,
+    higher: Surfels,
     template: Template,
     limit: Threshold,
     top_limit: Threshold,
     top: Bool[np.ndarray, " s"],
-    over_mm: Float[np.ndarray, " s"],
 ) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
-    """Missing and excess by two scales and hysteresis; missing under the top by its own limits."""
-    higher = replace(
-        surfels,
-        deviation_mm=surfels.deviation_mm - over_mm,
-        wide_deviation_mm=surfels.wide_deviation_mm - over_mm,
-    )
+    """Missing and excess by two scales and hysteresis; missing under the top by its own limits.
+
+    `higher` has the deviations that excess is told by.
+    """
     labels = []
     wide_top = top.copy()
     around = surfels.table[top]

@@ -5,8 +5,6 @@ It changes what the labels are made from, never the deviations that are reported
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 
@@ -29,8 +27,4 @@ def forgiven(surfels: Surfels, template: Template) -> Surfels:
     def less(deviation_mm: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
         return np.sign(deviation_mm) * np.maximum(np.abs(deviation_mm) - tolerance_mm, 0.0)
 
-    return replace(
-        surfels,
-        deviation_mm=less(surfels.deviation_mm),
-        wide_deviation_mm=less(surfels.wide_deviation_mm),
-    )
+    return surfels.judged_by(less)

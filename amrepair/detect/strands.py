@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from amrepair.detect import strands_kernels as kernels
 from amrepair.detect.near import cells_of
 from amrepair.detect.surfels import Surfels
+from amrepair.frames import ways_across
 from amrepair.template.port import Template
 
 # To each side of a place: along a strand, across it, and off the surface.
@@ -51,8 +52,8 @@ def on_strands(
     reach = np.array([LONG_MM, WIDE_MM, TALL_MM])
     cells = cells_of(places, surfels.place_mm, float(np.linalg.norm(reach)))
     over_mm = kernels.best_strips(
-        places, outward, *cells, surfels.deviation_mm, surfels.count, reach, WAYS,
-        systematic_mm, noise_mm, LEAST_MM, enough,
+        places, outward, np.stack(ways_across(outward)), *cells,
+        surfels.deviation_mm, surfels.count, reach, WAYS, systematic_mm, noise_mm, LEAST_MM, enough,
     )  # fmt: skip
     on[asked[over_mm > 0]] = True
     return on

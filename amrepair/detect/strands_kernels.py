@@ -13,6 +13,7 @@ from gcode.compiled import njit, prange
 def best_strips(
     places: Any,
     outward: Any,
+    across: Any,
     start: Any,
     ordered: Any,
     number: Any,
@@ -30,27 +31,17 @@ def best_strips(
 ) -> Any:
     """(k,) by how much the best strip through a place is over its limit.
 
-    A strip lies in the plane across `outward`; `strip` (long, wide, tall) says how far it goes to
-    each side of a place. Its limit is `systematic` and `noise` over the root of its points, or
-    `least`; with fewer points than `enough` it tells nothing. `start`, `ordered`, `number`, `low`,
-    `cell` and `shape` are of `near.cells_of`, with cells as wide as a strip's corner is away;
-    `deviation` and `count` are of all its points.
+    A strip lies in the plane of `across` (2, k, 3); `strip` (long, wide, tall: along `outward`)
+    says how far it goes to each side of a place. Its limit is `systematic` and `noise` over the
+    root of its points, or `least`; with fewer points than `enough` it tells nothing. `start`,
+    `ordered`, `number`, `low`, `cell` and `shape` are of `near.cells_of`, with cells as wide as a
+    strip's corner is away; `deviation` and `count` are of all its points.
     """
     out = np.full(len(places), -np.inf)
     for k in prange(len(places)):
         nx, ny, nz = outward[k, 0], outward[k, 1], outward[k, 2]
-        # across the axis to which the outward way is least along
-        ax, ay, az = 0.0, 0.0, 0.0
-        if abs(nx) <= abs(ny) and abs(nx) <= abs(nz):
-            ax = 1.0
-        elif abs(ny) <= abs(nz):
-            ay = 1.0
-        else:
-            az = 1.0
-        ux, uy, uz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
-        length = np.sqrt(ux * ux + uy * uy + uz * uz)
-        ux, uy, uz = ux / length, uy / length, uz / length
-        vx, vy, vz = ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux
+        ux, uy, uz = across[0, k, 0], across[0, k, 1], across[0, k, 2]
+        vx, vy, vz = across[1, k, 0], across[1, k, 1], across[1, k, 2]
         total, weight = np.zeros(ways), np.zeros(ways)
         cos, sin = np.empty(ways), np.empty(ways)
         for w in range(ways):

@@ -6,7 +6,8 @@ and so a bead-sized average and a local plane. It decides nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -65,6 +66,16 @@ class Surfels:
 
     def __len__(self) -> int:
         return len(self.place_mm)
+
+    def judged_by(
+        self, of: Callable[[Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
+    ) -> Surfels:
+        """The same with other deviations, made of each cell's own and of its window's."""
+        return replace(
+            self,
+            deviation_mm=of(self.deviation_mm),
+            wide_deviation_mm=of(self.wide_deviation_mm),
+        )
 
     @cached_property
     def tree(self) -> cKDTree:

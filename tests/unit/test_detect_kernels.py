@@ -13,6 +13,7 @@ from amrepair.deficit import heights_kernels
 from amrepair.detect import faces_kernels, strands_kernels, turning_kernels
 from amrepair.detect.near import cells_of
 from amrepair.detect.winding import Shell
+from amrepair.frames import ways_across
 from gcode.surfaces import HeightField
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -127,7 +128,18 @@ def test_strips_every_way_are_plain_means(seed: int) -> None:
     asked = points[:6]
     cells = cells_of(asked, points, float(np.linalg.norm(reach)))
     found = strands_kernels.best_strips(
-        asked, up, *cells, deviation, count, reach, ways, 0.1, 0.5, 0.3, 4.0
+        asked,
+        up,
+        np.stack(ways_across(up)),
+        *cells,
+        deviation,
+        count,
+        reach,
+        ways,
+        0.1,
+        0.5,
+        0.3,
+        4.0,
     )
     for place, normal, over in zip(asked, up, found, strict=True):
         axis = np.eye(3)[np.argmin(np.abs(normal))]
