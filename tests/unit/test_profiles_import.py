@@ -252,6 +252,46 @@ def test_a_klipper_configuration(tmp_path: Path) -> None:
     assert len(keys_of(found)) == len(set(keys_of(found))) == 16
 
 
+def test_what_klipper_includes_is_read_where_it_lies_beside(tmp_path: Path) -> None:
+    """Macros mostly stand in a file of their own; a later value holds, as in Klipper."""
+    (tmp_path / "mainsail.cfg").write_text("[gcode_macro PAUSE]\ngcode: M114\n")
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "a.cfg").write_text(
+        "[extruder]\nmax_temp: 250\n[heater_bed]\nmax_temp: 90"
+    )
+    (tmp_path / "more" / "b.cfg").write_text("[gcode_macro B]\ngcode: M114\n[include ../c.cfg]\n")
+    found = read(
+        tmp_path, "printer.cfg", f"[include more/*.cfg]  # all\n{KLIPPER}[include gone.cfg]"
+    )
+    printer = found.profiles[0].values
+    assert printer["macros"] == ["B", "PARK", "PAUSE", "PRINT_START"]
+    assert (printer["max_hotend_c"], printer["max_bed_c"]) == (290.0, 120.0), "the later ones"
+    why = reasons(found)
+    assert set(why) == {"include ../c.cfg", "printer.kinematics"}, "SAVE_CONFIG's part is not read"
+    assert "does not lie in this file's folder" in why["include ../c.cfg"]
+    (tmp_path / "mainsail.cfg").write_text("[include printer.cfg]\n")
+    with pytest.raises(InputError, match=r"\[include printer.cfg\] runs in a circle"):
+        read(tmp_path, "printer.cfg", KLIPPER)
+
+
+def test_how_far_klippers_axes_go_is_said_to_be_no_plate(tmp_path: Path) -> None:
+    # regression: a K1's plate of 220 x 220 mm became 229 x 226 without a word
+    (note,) = (n for n in read(tmp_path, "printer.cfg", KLIPPER).notes if "axes go" in n)
+    assert "300 x 305 mm" in note
+    assert "plate is smaller" in note
+
+
+def test_a_flavour_that_nobody_chose_is_no_reprapfirmware(tmp_path: Path) -> None:
+    # regression: 'reprap' "has no counterpart; ours: klipper, marlin, reprap", and RepRapFirmware
+    # was inherited from
+    for flavour, parent in (("reprap", "generic_marlin"), ("reprapfirmware", "generic_reprap")):
+        found = read(tmp_path, "a.ini", PRUSA.replace("= marlin2", f"= {flavour}"))
+        assert found.profiles[0].inherits == parent
+        assert ("gcode_flavor" in reasons(found)) == (flavour == "reprap")
+    sent = reasons(read(tmp_path, "a.ini", PRUSA.replace("= marlin2", "= reprap")))["gcode_flavor"]
+    assert "tells no firmware" in sent
+
+
 def test_half_a_bed_is_no_bed(tmp_path: Path) -> None:
     found = read(tmp_path, "printer.cfg", KLIPPER.replace("position_max = 305", "step_pin: PE1"))
     assert reasons(found)["stepper_x.position_max"] == "the other axis is missing"

@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from gcode.errors import InputError, ProfileError
-from gcode.profiles.importers.klipper import KLIPPER, finish, read_klipper
+from gcode.profiles.importers.klipper import KLIPPER, bed_note, finish, read_klipper
 from gcode.profiles.importers.rules import Imported, Left, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.names import Kind, list_profiles
@@ -110,9 +110,10 @@ def import_profiles(
         )
     parents = {kind: inherits or _parent(kind, source, rules) for kind in source.kinds}
     made, left = apply(source, rules, parents)
+    notes: list[str] = []
     if rules is KLIPPER:
         left = finish(made[0], left, source)
-    notes: list[str] = []
+        notes += filter(None, [bed_note(made[0])])
     for profile in made:
         notes += _settle(profile)
         _validate(path, profile)
@@ -147,7 +148,8 @@ def _parent(kind: Kind, source: Source, rules: dict[str, Rule]) -> str:
         if mark in model:
             return profile
     flavour = source.values.get("gcode_flavor", "marlin")
-    dialect = "reprap" if flavour == "reprapfirmware" else flavour
+    # their "reprap" is what nobody chose, and no RepRapFirmware
+    dialect = {"reprapfirmware": "reprap", "reprap": "marlin"}.get(flavour, flavour)
     return _GENERIC.get(dialect, _GENERIC["marlin"])
 
 

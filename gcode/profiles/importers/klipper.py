@@ -6,6 +6,7 @@ Keys and meanings: Klipper's Config_Reference.md.
 from __future__ import annotations
 
 import configparser
+import re
 from pathlib import Path
 
 from gcode.errors import InputError
@@ -20,6 +21,9 @@ from gcode.profiles.importers.rules import (
 )
 
 _MACRO = "gcode_macro "
+_INCLUDE = "include "
+_SAVED = "#*# <"
+"""Where what SAVE_CONFIG appends begins: it is no limit of the machine."""
 
 
 def _size(axis: str) -> Rule:
@@ -62,11 +66,51 @@ KLIPPER: dict[str, Rule] = {
 def read_klipper(path: Path, text: str) -> Source:
     """Read a configuration as `section.key`; macros as one key each, their code left alone.
 
+    Files that it includes are read where they lie beside it, as Klipper reads them: in the place
+    of their line, so that of a key given twice the later one holds.
+
     Raises
     ------
     InputError
         If it is none, or names no printer.
     """
+    values: dict[str, str] = {}
+    missing: dict[str, str] = {}
+    _read_into(values, missing, path, text, ())
+    if not any(key.startswith("printer.") for key in values):
+        raise InputError(f"{path} has no [printer] section; give Klipper's main printer.cfg.")
+    return Source(path.stem, ("printers",), values, missing=missing)
+
+
+def _read_into(
+    values: dict[str, str], missing: dict[str, str], path: Path, text: str, chain: tuple[Path, ...]
+) -> None:
+    """Add a file's keys to `values`, and includes that are not read, with why, to both."""
+    own, _, _ = text.partition(_SAVED)
+    pieces = re.split(r"^\[include[ \t]+([^\]\n]+)\][^\n]*$", own, flags=re.MULTILINE)
+    for k, piece in enumerate(pieces):
+        if k % 2 == 0:
+            _add_sections(values, path, piece)
+            continue
+        where = piece.strip()
+        key = f"{_INCLUDE}{where}"
+        below = not Path(where).is_absolute() and ".." not in Path(where).parts
+        why = "no such file lies beside it" if below else "it does not lie in this file's folder"
+        for other in sorted(path.parent.glob(where)) if below else ():
+            if other.resolve() in (path.resolve(), *chain):
+                raise InputError(f"{path}: [include {where}] runs in a circle; remove one link.")
+            try:
+                inner = other.read_text(encoding="utf-8-sig")
+            except (OSError, UnicodeDecodeError) as error:
+                why = f"it cannot be read ({error})"
+                break
+            _read_into(values, missing, other, inner, (*chain, path.resolve()))
+            why = ""
+        if why:
+            values[key], missing[key] = "", why
+
+
+def _add_sections(values: dict[str, str], path: Path, text: str) -> None:
     parser = configparser.RawConfigParser(
         delimiters=(":", "="),
         comment_prefixes=("#", ";"),
@@ -74,24 +118,28 @@ def read_klipper(path: Path, text: str) -> Source:
         strict=False,
         empty_lines_in_values=True,
     )
-    own, _, _ = text.partition("#*# <")  # what SAVE_CONFIG appends is no limit of the machine
     try:
-        parser.read_string(own)
+        parser.read_string(text)
     except configparser.Error as error:
         what = str(error).splitlines()[0]
         raise InputError(f"{path} cannot be read as a Klipper printer.cfg ({what}).") from error
-    if not parser.has_section("printer"):
-        raise InputError(f"{path} has no [printer] section; give Klipper's main printer.cfg.")
-    values: dict[str, str] = {}
     for section in parser.sections():
-        if section.startswith((_MACRO, "include ")):
+        if section.startswith(_MACRO):
             values[section] = ""
             continue
         for key, value in parser[section].items():
             values[f"{section}.{key}"] = value
-    elsewhere = "the other file is not read; import a printer.cfg that holds it"
-    missing = {key: elsewhere for key in values if key.startswith("include ")}
-    return Source(path.stem, ("printers",), values, missing=missing)
+
+
+def bed_note(made: Imported) -> str | None:
+    """Say that Klipper knows how far the axes go, not how large the plate is."""
+    if "bed_size_mm" not in made.values:
+        return None
+    x_mm, y_mm = made.values["bed_size_mm"]
+    return (
+        f"bed_size_mm is how far the axes go, {x_mm:g} x {y_mm:g} mm, which printer.cfg knows; "
+        f"where the plate is smaller, write its size there"
+    )
 
 
 def finish(made: Imported, left: tuple[Left, ...], source: Source) -> tuple[Left, ...]:

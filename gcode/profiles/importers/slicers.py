@@ -13,6 +13,7 @@ from typing import Any
 
 from gcode.errors import InputError
 from gcode.profiles.importers.rules import (
+    NotMappedError,
     Rule,
     Source,
     choice,
@@ -27,12 +28,23 @@ from gcode.profiles.importers.rules import (
 )
 from gcode.profiles.names import Kind
 
-_DIALECT = choice(
+_KNOWN_DIALECT = choice(
     marlin="marlin",
     marlin2="marlin",
     klipper="klipper",
     reprapfirmware="reprap",
 )
+
+
+def _dialect(text: str, source: Source) -> str:
+    if text.strip().lower() == "reprap":
+        raise NotMappedError(
+            "it stands for RepRap/Sprinter and is what nobody chose, so that it tells no firmware; "
+            "RepRapFirmware would be 'reprapfirmware'"
+        )
+    return _KNOWN_DIALECT(text, source)
+
+
 _PATTERN = choice(
     rectilinear="rectilinear",
     alignedrectilinear="rectilinear",
@@ -68,7 +80,7 @@ PRUSA: dict[str, Rule] = {
     "max_print_height": Rule("printers", "max_z_mm", number),
     "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
     "filament_diameter": Rule("printers", "filament_diameter_mm", number),
-    "gcode_flavor": Rule("printers", "dialect", _DIALECT),
+    "gcode_flavor": Rule("printers", "dialect", _dialect),
     "retract_length": Rule("printers", "retraction_mm", number),
     "retract_speed": Rule("printers", "retraction_speed_mm_s", number),
     "retract_lift": Rule("printers", "z_hop_mm", number),
@@ -123,7 +135,7 @@ ORCA: dict[str, Rule] = {
     "printable_height": Rule("printers", "max_z_mm", number),
     "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
     "filament_diameter": Rule("printers", "filament_diameter_mm", number),
-    "gcode_flavor": Rule("printers", "dialect", _DIALECT),
+    "gcode_flavor": Rule("printers", "dialect", _dialect),
     "retraction_length": Rule("printers", "retraction_mm", number),
     "retraction_speed": Rule("printers", "retraction_speed_mm_s", number),
     "z_hop": Rule("printers", "z_hop_mm", number),
@@ -166,9 +178,21 @@ _PRUSA_NAMES: dict[str, Kind] = {
     "filament_settings_id": "materials",
     "print_settings_id": "processes",
 }
-_CHOSE = dict.fromkeys(
-    ("filament_type", "printer_model"), "it only chose the profile that is inherited from"
-)
+_REASONS = {
+    **dict.fromkeys(
+        ("filament_type", "printer_model"), "it only chose the profile that is inherited from"
+    ),
+    **dict.fromkeys(
+        (
+            "extruder_clearance_height",
+            "extruder_clearance_height_to_lid",
+            "extruder_clearance_height_to_rod",
+            "extruder_clearance_max_radius",
+            "extruder_clearance_radius",
+        ),
+        "a circle around the tool head is not its shape; measure the envelope",
+    ),
+}
 _ORCA_KINDS: dict[str, Kind] = {
     "machine": "printers",
     "filament": "materials",
@@ -207,7 +231,7 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
                 f"{path} has none of {', '.join(_TELLTALES)}; export it by PrusaSlicer's "
                 f"File, Export, Export Config."
             )
-        return Source(path.stem, kinds, values, _PRUSA_NAMES, _CHOSE)
+        return Source(path.stem, kinds, values, _PRUSA_NAMES, _REASONS)
     if preset not in presets:
         shown = ", ".join(repr(name) for name in presets if "*" not in name)
         raise InputError(
@@ -215,7 +239,7 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
         )
     kind, _, name = preset.partition(":")
     values = _inherited(parser, path, preset, ())
-    return Source(name, (_PRUSA_KINDS[kind],), values, missing=_CHOSE)
+    return Source(name, (_PRUSA_KINDS[kind],), values, missing=_REASONS)
 
 
 def _inherited(
@@ -262,7 +286,7 @@ def read_orca(path: Path, text: str, chain: tuple[Path, ...] = ()) -> Source:
         del values["inherits"]
     del values["type"]
     missing = {"inherits": "its parent is not beside the file: what that sets is not known here"}
-    return Source(path.stem, (kind,), values, {"name": kind}, {**_CHOSE, **missing})
+    return Source(path.stem, (kind,), values, {"name": kind}, {**_REASONS, **missing})
 
 
 def _text(value: Any) -> str:
