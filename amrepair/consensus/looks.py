@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from amrepair.consensus import looks_kernels as kernels
 from amrepair.consensus.cloud import directions, outward, planes, spacing_of
-from amrepair.frames import ways_across
+from amrepair.frames import moved, ways_across
 
 PIXEL_SPACINGS = 1.6  # every pixel of a face seen at an angle of up to 60° has a point
 CLOSING = 2  # pixels: gaps that chance leaves are closed
@@ -34,6 +34,19 @@ VIEW_RATIO = 0.05
 MOST_GUESSES = 10
 FEW_GUESSES, RING_RAD = 8, 0.16  # fewer are widened to what lies beside them
 DISTANCES = (2.0, 8.0)  # of the view's diagonal: nearer and farther than scanners stand
+
+
+@dataclass(frozen=True, slots=True)
+class Veil:
+    """Surface as far as it is known, (n, 3) each, and (4, 4) its frame from the looks'.
+
+    A ray that came back from nowhere has met nothing, or has met a face edge-on: what lies behind
+    such a face was not seen through.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    pose: Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +113,25 @@ class Look:
             self.first, self._least(within_mm), self.outside_px, within_mm, self.edge_on, found,
         )  # fmt: skip
 
+    def veiled(
+        self,
+        points_mm: Float[np.ndarray, "k 3"],
+        asked: Int[np.ndarray, " a"],
+        within_mm: float,
+        veil: Veil,
+    ) -> Bool[np.ndarray, " k"]:
+        """(k,) whether surface that is edge-on to this sensor stands before a place asked about."""
+        hidden = np.zeros(len(points_mm), dtype=bool)
+        size = np.array(self.near_mm.shape)
+        if len(asked):
+            kernels.behind_edge_on(
+                moved(points_mm[asked], veil.pose), asked, veil.points_mm, veil.normals,
+                moved(self.sensor_mm[None], veil.pose)[0], self.axes @ veil.pose[:3, :3].T,
+                self.distance_mm / self.pixel_mm, self.first - size,
+                self.first + 2 * size, self.edge_on, within_mm, hidden,
+            )  # fmt: skip
+        return hidden
+
     def hides(self, points_mm: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
         """(k,) whether something the sensor saw stands before each place."""
         local = (points_mm - self.sensor_mm) @ self.axes.T
@@ -138,6 +170,7 @@ class Looks:
         points_mm: Float[np.ndarray, "k 3"],
         within_mm: float,
         normals: Float[np.ndarray, "k 3"] | None = None,
+        veil: Veil | None = None,
     ) -> Bool[np.ndarray, " k"]:
         """(k,) whether nothing can be there.
 
@@ -147,12 +180,20 @@ class Looks:
             By how much the sensors saw through it, at least.
         normals
             Of surface there: what stands edge-on to the rays may be there unseen.
+        veil
+            Surface that may stand before it.
         """
         points = np.ascontiguousarray(points_mm)
         given = np.empty((0, 3)) if normals is None else np.ascontiguousarray(normals)
         found = np.full(len(points), self.guessed)
         for look in self.each:
-            look.mark(found, np.flatnonzero(found == self.guessed), points, within_mm, given)
+            asked = np.flatnonzero(found == self.guessed)
+            look.mark(found, asked, points, within_mm, given)
+            if veil is not None and not self.guessed:
+                found[asked] &= ~look.veiled(points, asked[found[asked]], within_mm, veil)[asked]
+        if veil is not None and self.guessed:  # of few places, once all looks have judged
+            for look in self.each:
+                found &= ~look.veiled(points, np.flatnonzero(found), within_mm, veil)
         return found
 
     @property

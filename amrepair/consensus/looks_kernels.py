@@ -41,3 +41,57 @@ def seen_through(points, normals, asked, sensor, axes, distance, pixel, first, l
         found[k] = beside > within or (
             beyond == 0 and np.isfinite(least[i, j]) and reach < least[i, j] - within
         )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, first, last, edge_on, within,
+                   hidden):  # fmt: skip
+    """Say which places lie behind surface that is edge-on to the sensor's rays; in `hidden[asked]`.
+
+    Pixels from `first` to `last` are looked at, as far as there are places in them.
+    """
+    count = len(points)
+    pixel = np.empty((count, 2), dtype=np.int64)
+    inside = np.empty(count, dtype=np.bool_)
+    low, high = last.copy(), first - 1
+    for k in range(count):
+        pixel[k, 0], pixel[k, 1], _ = _pixel(points[k], sensor, axes, scale)
+        inside[k] = np.all(pixel[k] >= first) and np.all(pixel[k] <= last)
+        if inside[k]:
+            low, high = np.minimum(low, pixel[k]), np.maximum(high, pixel[k])
+    rows, columns = high[0] - low[0] + 1, high[1] - low[1] + 1
+    if rows <= 0 or columns <= 0:
+        return
+    least = np.full((rows, columns), np.inf)
+    limit = edge_on * edge_on
+    for q in range(len(veil)):
+        x, y, z = veil[q, 0] - sensor[0], veil[q, 1] - sensor[1], veil[q, 2] - sensor[2]
+        square = x * x + y * y + z * z
+        along = x * normals[q, 0] + y * normals[q, 1] + z * normals[q, 2]
+        if along * along > limit * square:
+            continue
+        u, v, depth = _pixel(veil[q], sensor, axes, scale)
+        u, v = u - low[0], v - low[1]
+        if depth <= 0.0 or u < -1 or v < -1 or u > rows or v > columns:
+            continue
+        reach = np.sqrt(square)
+        # between its points a surface is closed
+        for i in range(max(u - 1, 0), min(u + 2, rows)):
+            for j in range(max(v - 1, 0), min(v + 2, columns)):
+                least[i, j] = min(least[i, j], reach)
+    for k in range(count):
+        if not inside[k]:
+            continue
+        x, y, z = points[k, 0] - sensor[0], points[k, 1] - sensor[1], points[k, 2] - sensor[2]
+        before = least[pixel[k, 0] - low[0], pixel[k, 1] - low[1]]
+        hidden[asked[k]] = np.sqrt(x * x + y * y + z * z) > before + within
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pixel(point, sensor, axes, scale):
+    """Of a place: its pixel, and how deep it lies along the middle ray."""
+    x, y, z = point[0] - sensor[0], point[1] - sensor[1], point[2] - sensor[2]
+    depth = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
+    u = int(np.floor((axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z) / depth * scale))
+    v = int(np.floor((axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z) / depth * scale))
+    return u, v, depth

@@ -70,6 +70,9 @@ REACH_SPACINGS, FREE_SPACINGS = 3.0, 1.5
 # Surface that lies beside the other's, both facing one way, is off it where it is farther than so
 # many spacings (chance and curves) or sigmas.
 OFF_SPACINGS, OFF_SIGMAS = 0.25, 6.0
+# Over or under a surface is where it has a point within so many spacings; chance leaves such a
+# place without one in exp(-pi) = 4 %.
+OVER_SPACINGS = 1.0
 AGAINST_COUNTS = 4.0
 
 
@@ -401,7 +404,8 @@ def shares_on(
 ) -> tuple[float, float]:
     """Shares of another view's points that lie on a view's surface, and that contradict it."""
     some = other.surface.some(count)
-    on, against = marks_on(view, other, pose, some, reach_mm, free_mm, off_mm)
+    veil = sight.Veil(other.surface.points_mm, other.surface.normals, np.linalg.inv(pose))
+    on, against = marks_on(view, other, pose, some, reach_mm, free_mm, off_mm, veil)
     return float(on.mean()), float(against.mean())
 
 
@@ -413,6 +417,7 @@ def marks_on(
     reach_mm: float,
     free_mm: float,
     off_mm: float,
+    veil: sight.Veil,
 ) -> tuple[Bool[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
     """Which of another view's points lie on a view's surface, and which contradict it."""
     surface = view.surface
@@ -424,5 +429,7 @@ def marks_on(
     near &= (normals * surface.normals[index]).sum(axis=1) > AGREES
     height = np.abs(((points - surface.points_mm[index]) * surface.normals[index]).sum(axis=1))
     on = near & (height <= min(off_mm, free_mm))
-    off = near & (height > off_mm)
-    return on, off | (view.looks.free(points, free_mm, normals) & ~on)
+    # beside an edge, the nearest surface is the step's other level
+    over = distance**2 - height**2 <= (OVER_SPACINGS * max(view.spacing_mm, other.spacing_mm)) ** 2
+    off = near & over & (height > off_mm)
+    return on, off | (view.looks.free(points, free_mm, normals, veil) & ~on)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +14,12 @@ from typer.testing import CliRunner
 
 from amrepair.bench.synth_views import Rays, Shape, sample_shape
 from amrepair.cli.app import app
+from amrepair.consensus.assemble import _grown, _Pairs, _seed
 from amrepair.consensus.cloud import planes, spacing_of
 from amrepair.consensus.fit import _piece
-from amrepair.consensus.looks import guess_directions, guessed, told
+from amrepair.consensus.looks import Veil, guess_directions, guessed, told
 from amrepair.consensus.register import Placed, place_all
-from amrepair.consensus.views import towards_sensors
+from amrepair.consensus.views import View, judged, towards_sensors, views_of
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan, write_ply
@@ -112,6 +115,80 @@ def test_surface_edge_on_to_a_ray_contradicts_nothing() -> None:
     above = np.array([[10.0, 10.0, 8.0]])
     assert looks.free(above, 0.5, np.array([[0.0, 0.0, 1.0]])).all()
     assert not looks.free(above, 0.5, np.array([[1.0, 0.0, 0.0]])).any()
+
+
+def test_what_a_face_edge_on_hides_was_not_seen_through() -> None:
+    """A ray that met such a face came back from nowhere, as one that met nothing does."""
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-10, 10, 81)]), axis=-1).reshape(-1, 2)
+    floor = np.column_stack([grid, np.zeros(len(grid))])
+    looks = told(floor, np.array([[0.0, 0.0, 200.0]]), np.zeros(len(floor), np.int64))
+    # a wall that leans as the rays do: from 0.125 to 0.12 of the depth, 1.4° off them
+    y, t = np.meshgrid(np.linspace(-5, 5, 41), np.linspace(0, 1, 161))
+    wall = np.column_stack([20 + 4 * t.ravel(), y.ravel(), 40 * (1 - t.ravel())])
+    outward = np.tile(np.array([1.0, 0.0, 0.1]) / np.hypot(1.0, 0.1), (len(wall), 1))
+    behind, beside, before = (26.8, 0.0, -20.0), (44.0, 0.0, -20.0), (18.3, 0.0, 50.0)
+    places, level = np.array([behind, beside, before]), np.tile([0.0, 0.0, 1.0], (3, 1))
+    turn = rotation_from_vector(np.array([0.3, -0.2, 0.5]))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, (5.0, -3.0, 8.0)
+    veil = Veil(wall @ turn.T + pose[:3, 3], outward @ turn.T, pose)
+    assert looks.free(places, 0.5, level).all()
+    assert looks.free(places, 0.5, level, veil).tolist() == [False, True, True]
+    facing = Veil(veil.points_mm, np.tile(turn[:, 2], (len(wall), 1)), pose)
+    # a face that such a ray would have seen hides nothing: it is itself contradicted
+    assert looks.free(places, 0.5, level, facing).all()
+
+
+def views_at(shape: Shape, *ways: tuple[float, float, float]) -> list[View]:
+    """Views of told sensors, all in the part's frame."""
+    rng = np.random.default_rng(0)
+    diagonal_mm = float(np.linalg.norm(np.ptp(shape.vertices_mm, axis=0)))
+    made = []
+    for k, way in enumerate(ways):
+        scan, _ = view_of(shape, way, k, moves=False)
+        made += views_of(
+            k, scan.points_mm, scan.sensors_mm, scan.sensor_index, diagonal_mm, SIGMA_MM, rng
+        )
+    return made
+
+
+def test_true_poses_contradict_nothing_behind_a_wall_seen_edge_on() -> None:
+    """A wall on a plate, from above and outside at 7°, and from within: floor behind it is hid."""
+    shape = shape_of(union(box((0, 0, 0), (30, 20, 3)), box((0, 0, 0), (30, 1, 43))).body)
+    first, second = views_at(shape, (0.05, -0.12, 1.0), (0.1, 0.6, 1.2))
+    here = judged(first, second, np.eye(4))
+    # 0.033 where the wall itself, that no ray came back from, hid nothing
+    assert max(here.against) < 0.01
+    # a plate that hangs in mid-air hides no more than itself
+    lifted = np.eye(4)
+    lifted[2, 3] = 10.0
+    assert max(judged(first, second, lifted).against) > 0.2
+
+
+def test_the_next_step_of_a_stair_is_no_contradiction() -> None:
+    """Steps lower than what pairs reach: the nearest seen surface may be the next one's."""
+    steps = [box((0, 0, 0), (20, 1.5 * (n + 1), 0.4 * (12 - n))) for n in range(12)]
+    shape = shape_of(reduce(union, steps).body)
+    first, second = views_at(shape, (0.1, 0.3, 0.9), (0.2, -1.0, 0.4))
+    # 0.11 of surface was beside a step's edge, whatever lay below; a spacing's width of it is left
+    assert max(judged(first, second, np.eye(4)).against) < 0.05
+
+
+def test_the_larger_group_of_views_is_taken() -> None:
+    """Two views from below fit each other best of all, and share hardly an edge with the rest."""
+    body = union(box((0, 0, 0), (40, 25, 3)), cylinder((30, 15, 2), 6, 14))
+    shape = shape_of(difference(body, cylinder((10, 9, -1), 4, 12)).body)
+    above = [(0.4, 0.1, 1.0), (-0.2, 0.4, 1.0), (-0.1, -0.4, 1.0)]
+    views = views_at(shape, *above, (0.02, 0.05, -1.0), (0.0, 0.05, -1.0))
+    here = {
+        (i, j): [judged(views[i], views[j], np.eye(4))]
+        for i, j in itertools.combinations(range(5), 2)
+    }
+    pairs = _Pairs(views, float(np.linalg.norm((40, 25, 16))), here)
+    assert set(_seed(pairs, range(5))[1]) == {3, 4}
+    found = _grown(pairs, range(5))
+    assert set(found.poses) == {0, 1, 2}
+    assert all("lies on the others with" in found.reasons[k] for k in (3, 4))
 
 
 @pytest.mark.parametrize("towards", [(1.0, 0.4, 0.8), (-0.6, 1.0, 0.5), (0.3, -1.0, -0.7)])
