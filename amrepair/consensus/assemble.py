@@ -50,7 +50,7 @@ class Demands:
     rival: float
 
 
-TOLD, GUESSED = Demands(0.1, 0.05, 0.015), Demands(0.2, 0.03, 0.015)
+TOLD, GUESSED = Demands(0.1, 0.05, 0.015), Demands(0.2, 0.03, 0.03)
 RIVAL_RATIO = 0.75  # of the overlap that is demanded
 PROPOSED = 3  # poses of each pair that are looked at again with all views
 # More scans than this: neighbours in the list (turntables' are) are asked first.
