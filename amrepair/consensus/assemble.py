@@ -52,6 +52,7 @@ class Demands:
 
 TOLD, GUESSED = Demands(0.1, 0.05, 0.015), Demands(0.2, 0.03, 0.03)
 RIVAL_RATIO = 0.75  # of the overlap that is demanded
+MOSTLY = 0.5  # of a scan: so much of it lies on two places only of a part that is nearly symmetric
 PROPOSED = 3  # poses of each pair that are looked at again with all views
 # More scans than this: neighbours in the list (turntables' are) are asked first.
 ALL_PAIRS, NEIGHBOURS = 9, 3
@@ -186,6 +187,9 @@ def _group(pairs: _Pairs, left: Sequence[int], numbers: Sequence[int]) -> Assemb
         _, view, fit, _, k = max(sure, key=lambda one: one[0])
         chosen[k], poses[k] = view, fit.pose
         _even(chosen, poses)
+    for k in _doubtful(pairs, chosen, poses) if poses else ():
+        del chosen[k], poses[k]
+        reasons[k] = "fits the others in more than one way"
     return Assembly(chosen, poses, {k: r for k, r in reasons.items() if k not in poses})
 
 
@@ -272,24 +276,11 @@ def _placed(
     k: int, pairs: _Pairs, chosen: Mapping[int, View], poses: Poses, whole: Surface
 ) -> tuple[float, View, Fit, str]:
     """The best pose of a scan on those that are placed: by how much, and why it is not sure."""
-    views = pairs.views
-    spacing_mm = max(view.spacing_mm for view in views)
-    within = np.geomspace(2.0 * REACH_SPACINGS, REACH_SPACINGS, 8) * spacing_mm
     best: tuple[float, View, Fit, str] | None = None
-    for number, view in enumerate(views):
+    for number, view in enumerate(pairs.views):
         if view.number != k:
             continue
-        proposed = [
-            replace(fit, pose=poses[other.number] @ fit.pose)
-            for m, other in enumerate(views)
-            if chosen.get(other.number) is other
-            for fit in pairs.of(m, number)[:PROPOSED]
-        ]
-        found = []
-        for fit in distinct(proposed, view.surface, 0.5 * SAME_POSE * pairs.diagonal_mm):
-            pose = settled(whole, view.surface, fit.pose, within, FINE_POINTS)
-            found.append(judged_by_all(view, pose, chosen, poses))
-        found = ranked(distinct(found, view.surface, SAME_POSE * pairs.diagonal_mm))
+        found = _ways(number, pairs, chosen, poses, whole)
         margin, reason = _margin(found) if found else 0.0, why_not(found)
         fit = found[0] if found else Fit(np.eye(4), (0.0, 0.0), (1.0, 1.0), view.looks.guessed)
         # of both sides from which a scan may have been seen, the one that fits better
@@ -297,6 +288,82 @@ def _placed(
             best = margin, view, fit, reason
     assert best is not None
     return best
+
+
+def _ways(
+    number: int, pairs: _Pairs, chosen: Mapping[int, View], poses: Poses, whole: Surface
+) -> list[Fit]:
+    """How a view may lie on those that are placed, as its pairs with them propose; ranked."""
+    view = pairs.views[number]
+    spacing_mm = max(view.spacing_mm for view in pairs.views)
+    within = np.geomspace(2.0 * REACH_SPACINGS, REACH_SPACINGS, 8) * spacing_mm
+    proposed = [
+        replace(fit, pose=poses[other.number] @ fit.pose)
+        for m, other in enumerate(pairs.views)
+        if chosen.get(other.number) is other
+        for fit in pairs.of(m, number)[:PROPOSED]
+    ]
+    found = []
+    for fit in distinct(proposed, view.surface, 0.5 * SAME_POSE * pairs.diagonal_mm):
+        pose = settled(whole, view.surface, fit.pose, within, FINE_POINTS)
+        found.append(judged_by_all(view, pose, chosen, poses))
+    return ranked(distinct(found, view.surface, SAME_POSE * pairs.diagonal_mm))
+
+
+def _doubtful(pairs: _Pairs, chosen: Mapping[int, View], poses: Poses) -> set[int]:
+    """Placed scans that may lie otherwise if one that was left out lies as it may as well.
+
+    A part that nearly lies on itself: of its undersides the first seemed sure, and in whichever way
+    that lies the second fits in two.
+    """
+    doubtful: set[int] = set()
+    whole = Surface.of(*_joined(chosen, poses))
+    for number, view in enumerate(pairs.views):
+        if view.number in poses:
+            continue
+        ways = _ways(number, pairs, chosen, poses, whole)
+        for fit in ways[1:]:
+            if not _alike(ways[0], fit):
+                continue
+            seen, world = {**chosen, view.number: view}, {**poses, view.number: fit.pose}
+            doubtful |= {
+                k
+                for m, one in enumerate(pairs.views)
+                for k in poses
+                if chosen[k] is one and _turns_with(m, number, pairs, seen, world)
+            }
+    return doubtful
+
+
+def _alike(best: Fit, other: Fit) -> bool:
+    """Whether most of a scan lies on the others in either pose."""
+    demands = GUESSED if best.guessed else TOLD
+    return min(*best.overlap, *other.overlap) >= MOSTLY and _rivals(best, other, demands)
+
+
+def _turns_with(
+    number: int, other: int, pairs: _Pairs, chosen: Mapping[int, View], poses: Poses
+) -> bool:
+    """Whether a placed view has a rival pose, by its pair with another."""
+    view, home = pairs.views[number], pairs.views[other].number
+    rest = {k: pose for k, pose in poses.items() if k != view.number}
+    proposed = [replace(f, pose=poses[home] @ f.pose) for f in pairs.of(other, number)[:PROPOSED]]
+    now = judged_by_all(view, poses[view.number], chosen, rest)
+    apart_mm = SAME_POSE * pairs.diagonal_mm
+    asked = [f for f in proposed if len(distinct([now, f], view.surface, apart_mm)) > 1]
+    if not asked:
+        return False
+    demands = GUESSED if now.guessed else TOLD
+    within = np.geomspace(2.0 * REACH_SPACINGS, REACH_SPACINGS, 8) * view.spacing_mm
+    whole = Surface.of(*_joined(chosen, rest))
+    found = [
+        judged_by_all(view, settled(whole, view.surface, f.pose, within, FINE_POINTS), chosen, rest)
+        for f in asked
+    ]
+    return any(
+        _rivals(now, f, demands) and len(distinct([now, f], view.surface, apart_mm)) > 1
+        for f in found
+    )
 
 
 def judged_by_all(

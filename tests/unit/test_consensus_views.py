@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from amrepair.bench.synth_views import Rays, Shape, sample_shape
 from amrepair.cli.app import app
-from amrepair.consensus.assemble import _grown, _Pairs, _seed
+from amrepair.consensus.assemble import _grown, _Pairs, _seed, ranked, why_not
 from amrepair.consensus.cloud import planes, spacing_of
 from amrepair.consensus.fit import _piece
 from amrepair.consensus.looks import Veil, guess_directions, guessed, told
@@ -189,6 +189,32 @@ def test_the_larger_group_of_views_is_taken() -> None:
     found = _grown(pairs, range(5))
     assert set(found.poses) == {0, 1, 2}
     assert all("lies on the others with" in found.reasons[k] for k in (3, 4))
+
+
+def test_an_underside_that_may_be_turned_is_not_kept_because_it_came_first() -> None:
+    """A plate whose underside a half-turn lays on itself, a tower on its top.
+
+    Of the first view from below the search found but the wrong way; of the second, both.
+    """
+    plate = union(box((0, 0, 0), (40, 25, 6)), box((8, 4, -3), (32, 21, 1)))
+    shape = shape_of(union(plate, cylinder((30, 16, 5), 3, 4)).body)
+    ways = [(0.7, 0.3, 0.4), (0.2, 0.7, 0.7), (-0.7, -0.3, -0.4), (-0.6, -0.5, -0.7)]
+    views = views_at(shape, *ways)
+    true, turned = np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])
+    turned[:2, 3] = (40.0, 25.0)
+    both = [true, turned]
+    proposed = {(0, 1): [true], (0, 2): [turned], (0, 3): both, (1, 3): both, (2, 3): both}
+    found = {
+        (i, j): ranked([judged(views[i], views[j], pose) for pose in poses])
+        for (i, j), poses in proposed.items()
+    }
+    pairs = _Pairs(views, float(np.linalg.norm(np.ptp(shape.vertices_mm, axis=0))), found)
+    # it is among the first: nothing that its pairs say is against the turned pose
+    assert not why_not(pairs.of(0, 2))
+    grown = _grown(pairs, range(4))
+    assert {0, 1} <= set(grown.poses)
+    assert 2 not in grown.poses
+    assert grown.reasons[2] == "fits the others in more than one way"
 
 
 @pytest.mark.parametrize("towards", [(1.0, 0.4, 0.8), (-0.6, 1.0, 0.5), (0.3, -1.0, -0.7)])
