@@ -42,13 +42,19 @@ def shape_of(body: Manifold) -> Shape:
 
 
 def view_of(
-    shape: Shape, towards: tuple[float, float, float], seed: int, *, moves: bool, tells: bool = True
+    shape: Shape,
+    towards: tuple[float, float, float],
+    seed: int,
+    *,
+    moves: bool,
+    tells: bool = True,
+    count: int = 60_000,
 ) -> tuple[Scan, np.ndarray]:
     """What one sensor sees, in a pose of its own; and (4, 4) scan from part."""
     rng = np.random.default_rng(seed)
     middle = 0.5 * (shape.vertices_mm.min(axis=0) + shape.vertices_mm.max(axis=0))
     sensor = middle + FAR_MM * np.array(towards) / np.linalg.norm(towards)
-    cloud = sample_shape(shape, 60_000, rng)
+    cloud = sample_shape(shape, count, rng)
     cloud = cloud.take(Rays(shape).seen(cloud, sensor[None]))
     points = cloud.points_mm + rng.normal(0.0, SIGMA_MM, cloud.points_mm.shape)
     pose = np.eye(4)
@@ -139,13 +145,13 @@ def test_what_a_face_edge_on_hides_was_not_seen_through() -> None:
     assert looks.free(places, 0.5, level, facing).all()
 
 
-def views_at(shape: Shape, *ways: tuple[float, float, float]) -> list[View]:
+def views_at(shape: Shape, *ways: tuple[float, float, float], count: int = 60_000) -> list[View]:
     """Views of told sensors, all in the part's frame."""
     rng = np.random.default_rng(0)
     diagonal_mm = float(np.linalg.norm(np.ptp(shape.vertices_mm, axis=0)))
     made = []
     for k, way in enumerate(ways):
-        scan, _ = view_of(shape, way, k, moves=False)
+        scan, _ = view_of(shape, way, k, moves=False, count=count)
         made += views_of(
             k, scan.points_mm, scan.sensors_mm, scan.sensor_index, diagonal_mm, SIGMA_MM, rng
         )
@@ -174,12 +180,13 @@ def test_the_next_step_of_a_stair_is_no_contradiction() -> None:
     assert max(judged(first, second, np.eye(4)).against) < 0.05
 
 
+@pytest.mark.slow
 def test_the_larger_group_of_views_is_taken() -> None:
     """Two views from below fit each other best of all, and share hardly an edge with the rest."""
     body = union(box((0, 0, 0), (40, 25, 3)), cylinder((30, 15, 2), 6, 14))
     shape = shape_of(difference(body, cylinder((10, 9, -1), 4, 12)).body)
     above = [(0.4, 0.1, 1.0), (-0.2, 0.4, 1.0), (-0.1, -0.4, 1.0)]
-    views = views_at(shape, *above, (0.02, 0.05, -1.0), (0.0, 0.05, -1.0))
+    views = views_at(shape, *above, (0.02, 0.05, -1.0), (0.0, 0.05, -1.0), count=30_000)
     here = {
         (i, j): [judged(views[i], views[j], np.eye(4))]
         for i, j in itertools.combinations(range(5), 2)
@@ -191,6 +198,7 @@ def test_the_larger_group_of_views_is_taken() -> None:
     assert all("lies on the others with" in found.reasons[k] for k in (3, 4))
 
 
+@pytest.mark.slow
 def test_an_underside_that_may_be_turned_is_not_kept_because_it_came_first() -> None:
     """A plate whose underside a half-turn lays on itself, a tower on its top.
 
