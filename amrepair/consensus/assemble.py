@@ -164,20 +164,24 @@ def _grown(pairs: _Pairs, numbers: Sequence[int]) -> Assembly:
     best = Assembly({}, {}, {k: _alone(k, pairs) for k in numbers})
     left = list(numbers)
     while len(left) > len(best.poses):
-        found = _group(pairs, left, numbers)
-        if not found.poses:
+        seed, poses = _seed(pairs, left)
+        if not poses:
             break
-        left = [k for k in left if k not in found.poses]
+        found = _group(pairs, seed, poses, numbers)
+        # a pair that a group ends without starts no other
+        left = [k for k in left if k not in seed and k not in found.poses]
         if len(found.poses) > len(best.poses):
             best = found
     return best
 
 
-def _group(pairs: _Pairs, left: Sequence[int], numbers: Sequence[int]) -> Assembly:
-    """Scan after scan onto the surest pair of those that are left, the surest first."""
-    chosen, poses = _seed(pairs, left)
+def _group(
+    pairs: _Pairs, seed: Mapping[int, View], begun: Poses, numbers: Sequence[int]
+) -> Assembly:
+    """Scan after scan onto a pair, the surest first."""
+    chosen, poses = dict(seed), dict(begun)
     reasons: dict[int, str] = {}
-    while poses and len(poses) < len(numbers):
+    while len(poses) < len(numbers):
         whole = Surface.of(*_joined(chosen, poses))
         found = [(*_placed(k, pairs, chosen, poses, whole), k) for k in numbers if k not in poses]
         reasons = {k: reason for _, _, _, reason, k in found}
@@ -187,7 +191,7 @@ def _group(pairs: _Pairs, left: Sequence[int], numbers: Sequence[int]) -> Assemb
         _, view, fit, _, k = max(sure, key=lambda one: one[0])
         chosen[k], poses[k] = view, fit.pose
         _even(chosen, poses)
-    for k in _doubtful(pairs, chosen, poses) if poses else ():
+    for k in _doubtful(pairs, chosen, poses):
         del chosen[k], poses[k]
         reasons[k] = "fits the others in more than one way"
     return Assembly(chosen, poses, {k: r for k, r in reasons.items() if k not in poses})
