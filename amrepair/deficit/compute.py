@@ -20,7 +20,12 @@ from scipy import ndimage
 from amrepair.deficit.boxes import boxes_of
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
-from amrepair.deficit.walls import with_even_crests, with_sharp_walls, with_whole_rims
+from amrepair.deficit.walls import (
+    with_even_crests,
+    with_rising_rims,
+    with_sharp_walls,
+    with_whole_rims,
+)
 from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.detection import ON_PLANE_MM
 from amrepair.detect.evidence import Evidence
@@ -204,8 +209,10 @@ def compute_deficit(
         gone = lost_mm > 0
         points_mm = build_from_template.apply(scan.points_mm)
         sharp = with_sharp_walls(solid, gone, points_mm, scan.sigma_mm)
-        even = with_whole_rims(with_even_crests(sharp, gone), lost_mm, designed_mm)
-        return with_what_stands_out(even, points_mm, scan.sigma_mm, evidence.spacing_mm)
+        known = with_what_stands_out(sharp, points_mm, scan.sigma_mm, evidence.spacing_mm)
+        even = with_even_crests(known, lost_mm, designed_mm)
+        rising = with_rising_rims(even, lost_mm, designed_mm, evidence.spacing_mm)
+        return with_whole_rims(rising, lost_mm, designed_mm)
 
     return Deficit(
         missing=missing,

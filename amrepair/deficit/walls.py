@@ -8,6 +8,8 @@ of the wall itself, column by column, knows better.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
@@ -29,10 +31,16 @@ MOST_SPREAD_SIGMA = 1.75
 MOST_SLANT = 0.25  # cosine: steeper than 75°
 # Thinner than a bead; and along it, as far as between two points that were seen.
 CREST_CELLS, CREST_REACH_CELLS = 4, 2
+SPLINTER_MM = 0.5  # a crest that stands so little lower than designed has lost its points, no more
 # A face of what is missing is steep where it falls by this from one cell to the next (83°).
 STEEP_MM = 0.8
-# So much of a lip the solids' rounding may have taken, so many cells wide; what is as designed.
-ROUNDED_MM, ROUNDED_CELLS, AS_DESIGNED_MM = 0.4, 3, 0.1
+# So much of a lip the solids' rounding may have taken, so many cells wide; what is as designed; how
+# far from it the foot of a face is looked for.
+ROUNDED_MM, ROUNDED_CELLS, AS_DESIGNED_MM, FOOT_CELLS = 0.4, 3, 0.1, 2
+# A fall from cell to cell that is a top's edge; in spacings, how far from it tops are rounded off.
+EDGE_MM, ROUNDED_SPACINGS = 0.4, 1.5
+# Beyond that, as far a top is looked at, at so many columns at least; and how even it is.
+SOUND_MM, LEAST_SOUND, UNEVEN_MM = 0.8, 20, 0.04
 
 
 def with_sharp_walls(
@@ -68,24 +76,73 @@ def with_sharp_walls(
     return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
 
 
-def with_even_crests(field: HeightField, gone: Bool[np.ndarray, "ny nx"]) -> HeightField:
+def with_even_crests(
+    field: HeightField, lost_mm: Float[np.ndarray, "ny nx"], designed_mm: Float[np.ndarray, "ny nx"]
+) -> HeightField:
     """The as-built field, what is thinner than a bead beside what is missing as high as near by.
 
     A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
-    what lies between two of its columns that were seen is no lower than the higher of them.
+    what lies between two of its columns that were seen is no lower than the higher of them, and
+    where that is a little lower than designed, beside a steep face, it is as designed.
+
+    Parameters
+    ----------
+    lost_mm, designed_mm
+        How much is missing from each column, from end to end, and the top of what was expected.
     """
+    gone = lost_mm > 0
     if not gone.any():
         return field
     rows, columns = window_around(gone, CREST_CELLS + BESIDE_CELLS)
     z_mm = np.array(field.z_mm, dtype=np.float64)
-    near = z_mm[rows, columns]
-    beside = ndimage.maximum_filter(gone[rows, columns], 2 * BESIDE_CELLS + 1)
+    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
+    gone, deep = gone[rows, columns], lost_mm[rows, columns] > STEEP_MM
+    beside, cut = (ndimage.maximum_filter(of, 2 * BESIDE_CELLS + 1) for of in (gone, deep))
     reach = 2 * CREST_REACH_CELLS + 1
     # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
     thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, CREST_CELLS), reach)
     crest = beside & (near - thick_mm > STEP_MM)
     highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
-    near[crest] = highest_mm[crest]
+    whole = cut & (designed > highest_mm) & (designed < highest_mm + SPLINTER_MM)
+    near[crest] = np.where(whole, designed, highest_mm)[crest]
+    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+
+
+def with_rising_rims(
+    field: HeightField,
+    lost_mm: Float[np.ndarray, "ny nx"],
+    designed_mm: Float[np.ndarray, "ny nx"],
+    spacing_mm: float,
+) -> HeightField:
+    """The as-built field, tops that rise towards an edge going on up to it, or to the design.
+
+    Solids round off a sharp rim: its last columns read as high as what lies some points farther in,
+    up to 0.3 mm too low for a worn edge that rises at 45°. A plane through what lies beyond their
+    rounding knows better.
+
+    Parameters
+    ----------
+    lost_mm, designed_mm
+        How much is missing from each column, from end to end, and the top of what was expected.
+    spacing_mm
+        Mean distance between neighbouring points.
+    """
+    deep = lost_mm > STEEP_MM
+    if not deep.any():
+        return field
+    rounded = math.ceil(ROUNDED_SPACINGS * spacing_mm / field.cell_mm)
+    reach = rounded + math.ceil(SOUND_MM / field.cell_mm)
+    rows, columns = window_around(deep, reach + BESIDE_CELLS)
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
+    beside = ndimage.maximum_filter(deep[rows, columns], 2 * BESIDE_CELLS + 1)
+    edge = near - ndimage.minimum_filter(near, 3) > EDGE_MM
+    rim = ndimage.maximum_filter(edge, 2 * rounded + 1)
+    iy, ix = (rim & beside & (near < designed)).nonzero()
+    up_mm = kernels.extended(near.copy(), iy, ix, ~rim, reach, LEAST_SOUND, UNEVEN_MM)
+    up_mm = np.minimum(up_mm, designed[iy, ix])
+    low_mm = near[iy, ix]
+    near[iy, ix] = np.where(up_mm - low_mm < ROUNDED_MM, np.maximum(up_mm, low_mm), low_mm)
     return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
 
 
@@ -113,7 +170,8 @@ def with_whole_rims(
     near, designed = z_mm[rows, columns], designed_mm[rows, columns]
     deep, lost = deep[rows, columns], lost_mm[rows, columns] > 0
     off_mm = designed - near
-    lip = near - ndimage.minimum_filter(np.where(deep, near, np.inf), 3) > STEEP_MM
+    foot_mm = ndimage.minimum_filter(np.where(deep, near, np.inf), 2 * FOOT_CELLS + 1)
+    lip = designed - foot_mm > STEEP_MM
     whole = (np.abs(off_mm) < AS_DESIGNED_MM) & ~ndimage.maximum_filter(lost, 3)
     lip &= ndimage.maximum_filter(whole, 2 * ROUNDED_CELLS + 1)
     rounded = lip & (off_mm > 0) & (off_mm < ROUNDED_MM)

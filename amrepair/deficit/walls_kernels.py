@@ -11,6 +11,8 @@ from gcode.compiled import njit
 # Around a column, so many cells: as high as what stands there; on which side of it that is.
 AROUND_CELLS, SIDE_CELLS = 2, 3
 LEAST_POINTS = 8
+# Millimetres of height per cell away: what is steeper is another surface.
+STEEPEST = 0.15
 
 
 @njit(cache=True, nogil=True)
@@ -126,4 +128,38 @@ def sharpened(
                     found = True
         if not found:
             out[q] = low if at_top > 0 else high
+    return out
+
+
+@njit(cache=True, nogil=True)
+def extended(z: Any, iy: Any, ix: Any, sound: Any, reach: int, least: int, spread: float) -> Any:
+    """(q,) heights of the columns asked about, on planes through what is sound around each.
+
+    `iy`, `ix` (q,); `sound` (ny, nx): columns that a plane goes through, within `reach` cells and
+    no steeper than `STEEPEST` from the one asked about. −∞ where there are fewer than `least`, or
+    they are farther from their plane than `spread` on average.
+    """
+    ny, nx = z.shape
+    out = np.full(len(iy), -np.inf)
+    for q in range(len(iy)):
+        i, j = iy[q], ix[q]
+        second, first, square = np.zeros((3, 3)), np.zeros(3), 0.0
+        for row in range(max(i - reach, 0), min(i + reach + 1, ny)):
+            for column in range(max(j - reach, 0), min(j + reach + 1, nx)):
+                away = np.hypot(row - i, column - j)
+                off = z[row, column] - z[i, j]
+                if not sound[row, column] or away > reach or abs(off) > STEEPEST * (away + 1.0):
+                    continue
+                at = np.array((1.0, float(row - i), float(column - j)))
+                for m in range(3):
+                    first[m] += at[m] * off
+                    for n in range(3):
+                        second[m, n] += at[m] * at[n]
+                square += off * off
+        count = second[0, 0]
+        if count < least or abs(np.linalg.det(second)) < count:
+            continue
+        plane = np.linalg.solve(second, first)
+        if square - plane @ first <= spread * spread * count:
+            out[q] = z[i, j] + plane[0]
     return out

@@ -180,13 +180,14 @@ def _plan_pass(
     Along the job's own lines where there are any and they serve; else along lines of our own.
     """
     planned = model.job.at(z_mm) if model.job is not None else None
+    reach = model.reach.at(z_mm)
+    blocked = ~model.free_at(reach)
     if planned is None:
-        thick = _due(model, z_mm, here, following_mm, most_mm, layer_mm)
+        thick = _due(model, z_mm, here, blocked, following_mm, most_mm, layer_mm)
     else:
-        thick = _due_of_job(model, z_mm, planned, following_mm, most_mm, layer_mm)
+        thick = _due_of_job(model, z_mm, planned, blocked, following_mm, most_mm, layer_mm)
     if not thick.any():
         return None
-    reach = model.reach.at(z_mm)
     laying = _along_job(model, z_mm, planned, thick, reach, setup) if planned is not None else None
     if laying is None or laying.served < SERVED:
         own = _along_own(model, z_mm, thick, reach, SOLID_ANGLES_RAD[index % 2], setup)
@@ -334,6 +335,7 @@ def _due(
     model: PatchModel,
     z_mm: float,
     here: Bool[np.ndarray, "ny nx"],
+    blocked: Bool[np.ndarray, "ny nx"],
     following_mm: Float[np.ndarray, "ny nx"],
     most_mm: float,
     layer_mm: float,
@@ -355,13 +357,14 @@ def _due(
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
     active &= model.planar_top_mm > z_mm - 0.5 * layer_mm
     deep = active & (gap > DEEP_RATIO * most_mm)
-    return _lidded(model, thick, active, deep, gap, most_mm, layer_mm)
+    return _lidded(model, thick, active, deep, blocked, gap, most_mm, layer_mm)
 
 
 def _due_of_job(
     model: PatchModel,
     z_mm: float,
     planned: Bool[np.ndarray, "ny nx"],
+    blocked: Bool[np.ndarray, "ny nx"],
     following_mm: Float[np.ndarray, "ny nx"],
     most_mm: float,
     layer_mm: float,
@@ -385,7 +388,7 @@ def _due_of_job(
     least_mm = np.where(wanted > ROUNDING_MM, ROUNDED_OFF_MM, LEAST_THICK_MM)
     active = planned & due & (thick >= least_mm)
     active &= ~deep | (wanted > LEAST_THICK_MM / 2)  # beside the part all is deep
-    return _lidded(model, thick, active, deep & active, gap, most_mm, layer_mm)
+    return _lidded(model, thick, active, deep & active, blocked, gap, most_mm, layer_mm)
 
 
 def _lidded(
@@ -393,15 +396,22 @@ def _lidded(
     thick: Float[np.ndarray, "ny nx"],
     active: Bool[np.ndarray, "ny nx"],
     deep: Bool[np.ndarray, "ny nx"],
+    blocked: Bool[np.ndarray, "ny nx"],
     gap: Float[np.ndarray, "ny nx"],
     most_mm: float,
     layer_mm: float,
 ) -> Float[np.ndarray, "ny nx"]:
-    """Over what is too deep a layer is drawn, as far as a bead holds on to what stands beside."""
+    """Over what is too deep a layer is drawn, as far as a bead holds on to what stands beside.
+
+    What the head cannot get over holds on from a little farther away: beads begin no nearer to it
+    than the flat around the bore lets them.
+    """
     if deep.any():
         # from the edge of what holds it, not from the middle of its last column
         hang_mm = HOLD_MM + 0.5 * model.cell_mm
-        held = _beside((active & ~deep) | (gap < most_mm), deep, hang_mm, model.cell_mm)
+        holds = (active & ~deep) | (gap < most_mm)
+        held = _beside(holds, deep, hang_mm, model.cell_mm)
+        held |= _beside(holds & blocked, deep, hang_mm + TO_WALL_MM, model.cell_mm)
         lidded = np.minimum(thick, layer_mm)
         model.sunk_mm = np.where(deep & held, model.sunk_mm + thick - lidded, model.sunk_mm)
         thick = np.where(deep & held, lidded, thick)
@@ -431,8 +441,9 @@ def _strips(
 ) -> Bool[np.ndarray, "ny nx"]:
     """Columns to fill that lie along a wall: it stands up to the nozzle, or higher."""
     walls = (model.surface_mm > z_mm - AGREE_MM) & (thick <= 0)
-    asked = thick > 0
-    return _beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked
+    # what is drawn over a hollow hangs: nothing presses it aside
+    asked = (thick > 0) & (z_mm - model.surface_mm <= DEEP_RATIO * model.most_mm)
+    return _beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked if asked.any() else asked
 
 
 def _thin(region: Any, z_mm: float, height_mm: float, volume_mm3: float) -> Unprintable:

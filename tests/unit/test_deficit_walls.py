@@ -9,7 +9,12 @@ import trimesh
 from scipy import ndimage
 
 from amrepair.deficit.heights import columns_of
-from amrepair.deficit.walls import with_even_crests, with_sharp_walls, with_whole_rims
+from amrepair.deficit.walls import (
+    with_even_crests,
+    with_rising_rims,
+    with_sharp_walls,
+    with_whole_rims,
+)
 from gcode.slicing.layers import mesh_of
 from gcode.surfaces import HeightField
 
@@ -116,9 +121,61 @@ def test_a_crest_between_two_columns_that_were_seen_is_as_high_as_they() -> None
     low = fin & (np.random.default_rng(3).random(z_mm.shape) < 0.3)
     z_mm[low] -= 0.8
     rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
-    even = with_even_crests(rough, gone_from(truth, piece))
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    even = with_even_crests(rough, np.where(gone_from(truth, piece), 2.0, 0.0), designed.z_mm)
     assert (even.z_mm[fin] > 5.9).mean() > 0.99
     assert (even.z_mm[~fin] == z_mm[~fin]).all()
+
+
+def test_a_splinter_a_little_lower_than_designed_is_as_designed() -> None:
+    """Of 0.1 to 0.3 mm beside a pit, read 0.1 to 0.5 mm low: the flat went 0.2 mm into it."""
+    block = Solid.cube((24.0, 15.25, 6.0))
+    piece = Solid.cube((9.0, 9.0, 3.0)).translate((7.5, 6.0, 3.0))
+    truth = HeightField.from_manifold(block - piece, CELL_MM, margin_mm=1.0)
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    lost_mm = np.where(gone_from(truth, piece), 3.0, 0.0)
+    x, y = truth.centres_mm()
+    crest = ((y > 15.0) & (y < 15.25))[:, None] & ((x > 8.0) & (x < 16.0))[None, :]
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    z_mm[crest] -= np.random.default_rng(4).uniform(0.1, 0.45, int(crest.sum()))
+    low = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    even = with_even_crests(low, lost_mm, designed.z_mm)
+    assert crest.sum() > 100
+    assert np.abs(even.z_mm[crest] - 6.0).max() < 1e-6
+    # beside a line that was skipped nothing was cut: an idler's was filled to 0.83 instead of 0.92
+    skipped = with_even_crests(low, np.minimum(lost_mm, 0.4), designed.z_mm)
+    assert skipped.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.95
+    z_mm[crest] -= 1.0  # that is no rounding: it broke off lower
+    broken_off = with_even_crests(low, lost_mm, designed.z_mm)
+    assert broken_off.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.0
+
+
+@pytest.mark.parametrize("rises_deg", [20.0, 40.0])
+def test_a_worn_edge_rises_up_to_the_wall_behind_it(rises_deg: float) -> None:
+    """Its last columns read as high as what lies three columns in: 0.2 mm low, and were hit."""
+    block = Solid.cube((24.0, 20.0, 6.0))
+    rise = np.tan(np.radians(rises_deg))
+    tool = Solid.cube((60.0, 60.0, 20.0), True).translate((0.0, 0.0, 10.0))
+    tool = tool.rotate((0.0, -rises_deg, 0.0)).translate((24.0, 10.0, 4.6))
+    tool = tool ^ Solid.cube((20.0, 40.0, 20.0)).translate((20.0, -10.0, -5.0))
+    truth = HeightField.from_manifold(block - tool, CELL_MM, margin_mm=1.0)
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    z_mm += np.random.default_rng(7).normal(scale=0.01, size=z_mm.shape) * (z_mm > 0.5)
+    x, y = truth.centres_mm()
+    inside = ((y > 1.5) & (y < 18.5))[:, None] & (x < 24.0)[None, :]
+    last = inside & (x > 23.7)[None, :]
+    z_mm[last] -= np.broadcast_to((x - 23.65) * rise, z_mm.shape)[last]
+    rounded = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    lost_mm = np.maximum(designed.z_mm - truth.z_mm, 0.0)
+    risen = with_rising_rims(rounded, lost_mm, designed.z_mm, SPACING_MM)
+    assert np.abs(risen.z_mm - truth.z_mm)[last].max() < 0.05
+    assert (risen.z_mm[~last] == z_mm[~last]).mean() > 0.95
+    assert (risen.z_mm >= z_mm).all()
+    # nothing stands higher than designed
+    low = designed.z_mm - 0.02
+    held = with_rising_rims(rounded, lost_mm, np.minimum(low, truth.z_mm), SPACING_MM)
+    assert (held.z_mm <= np.maximum(np.minimum(low, truth.z_mm), z_mm)).all()
 
 
 def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
@@ -128,7 +185,9 @@ def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
     beside = (ndimage.maximum_filter(z_mm, 3) > 5.9) & (np.abs(z_mm - 4.0) < 0.1)
     z_mm[beside] += 0.9
     rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
-    even = with_even_crests(rough, gone_from(truth, piece))
+    even = with_even_crests(
+        rough, np.where(gone_from(truth, piece), 2.0, 0.0), np.full(z_mm.shape, 6.0)
+    )
     assert beside.sum() > 300
     assert (even.z_mm == z_mm).all()
 
