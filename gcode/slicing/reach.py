@@ -16,7 +16,7 @@ from gcode.surfaces import HeightField
 
 # So deep the flat may press into the plastic beside it, and the body lie in the noise of the field;
 # with what a scan gets wrong it stays under the checker's limits, 0.2 and 0.1 mm.
-PRESS_MM = 0.075
+PRESS_MM = 0.06
 # A wall may stand this much nearer than its cells say.
 SIDE_MM = 0.03
 LEAST_TOLD_MM = 0.1

@@ -451,7 +451,7 @@ def test_how_a_groove_lies_to_the_grid_hardly_decides_how_much_is_filled(turn_de
         )
         plan, _ = plan_of(groove, block, 0.1)
         shares.append(plan.reachable_mm3 / groove.volume())
-    assert shares[1] == pytest.approx(shares[0], abs=0.03)
+    assert shares[1] == pytest.approx(shares[0], abs=0.035)
 
 
 def test_no_more_plastic_is_laid_than_the_columns_ask_for() -> None:
