@@ -105,7 +105,7 @@ def with_even_crests(
     highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
     whole = cut & (designed > highest_mm) & (designed < highest_mm + SPLINTER_MM)
     near[crest] = np.where(whole, designed, highest_mm)[crest]
-    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+    return field.raised(z_mm)
 
 
 def with_rising_rims(
@@ -142,8 +142,8 @@ def with_rising_rims(
     up_mm = kernels.extended(near.copy(), iy, ix, ~rim, reach, LEAST_SOUND, UNEVEN_MM)
     up_mm = np.minimum(up_mm, designed[iy, ix])
     low_mm = near[iy, ix]
-    near[iy, ix] = np.where(up_mm - low_mm < ROUNDED_MM, np.maximum(up_mm, low_mm), low_mm)
-    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+    near[iy, ix] = np.where(up_mm - low_mm < ROUNDED_MM, up_mm, low_mm)
+    return field.raised(z_mm)
 
 
 def with_whole_rims(
@@ -176,7 +176,7 @@ def with_whole_rims(
     lip &= ndimage.maximum_filter(whole, 2 * ROUNDED_CELLS + 1)
     rounded = lip & (off_mm > 0) & (off_mm < ROUNDED_MM)
     near[rounded] = designed[rounded]
-    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+    return field.raised(z_mm)
 
 
 def window_around(gone: Bool[np.ndarray, "ny nx"], margin: int) -> tuple[slice, slice]:

@@ -181,11 +181,10 @@ def _plan_pass(
     """
     planned = model.job.at(z_mm) if model.job is not None else None
     reach = model.reach.at(z_mm)
-    blocked = ~model.free_at(reach)
     if planned is None:
-        thick = _due(model, z_mm, here, blocked, following_mm, most_mm, layer_mm)
+        thick = _due(model, z_mm, here, reach, following_mm, most_mm, layer_mm)
     else:
-        thick = _due_of_job(model, z_mm, planned, blocked, following_mm, most_mm, layer_mm)
+        thick = _due_of_job(model, z_mm, planned, reach, following_mm, most_mm, layer_mm)
     if not thick.any():
         return None
     laying = _along_job(model, z_mm, planned, thick, reach, setup) if planned is not None else None
@@ -335,7 +334,7 @@ def _due(
     model: PatchModel,
     z_mm: float,
     here: Bool[np.ndarray, "ny nx"],
-    blocked: Bool[np.ndarray, "ny nx"],
+    reach: Bool[np.ndarray, "ry rx"],
     following_mm: Float[np.ndarray, "ny nx"],
     most_mm: float,
     layer_mm: float,
@@ -357,14 +356,14 @@ def _due(
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
     active &= model.planar_top_mm > z_mm - 0.5 * layer_mm
     deep = active & (gap > DEEP_RATIO * most_mm)
-    return _lidded(model, thick, active, deep, blocked, gap, most_mm, layer_mm)
+    return _lidded(model, thick, active, deep, reach, gap, most_mm, layer_mm)
 
 
 def _due_of_job(
     model: PatchModel,
     z_mm: float,
     planned: Bool[np.ndarray, "ny nx"],
-    blocked: Bool[np.ndarray, "ny nx"],
+    reach: Bool[np.ndarray, "ry rx"],
     following_mm: Float[np.ndarray, "ny nx"],
     most_mm: float,
     layer_mm: float,
@@ -388,7 +387,7 @@ def _due_of_job(
     least_mm = np.where(wanted > ROUNDING_MM, ROUNDED_OFF_MM, LEAST_THICK_MM)
     active = planned & due & (thick >= least_mm)
     active &= ~deep | (wanted > LEAST_THICK_MM / 2)  # beside the part all is deep
-    return _lidded(model, thick, active, deep & active, blocked, gap, most_mm, layer_mm)
+    return _lidded(model, thick, active, deep & active, reach, gap, most_mm, layer_mm)
 
 
 def _lidded(
@@ -396,7 +395,7 @@ def _lidded(
     thick: Float[np.ndarray, "ny nx"],
     active: Bool[np.ndarray, "ny nx"],
     deep: Bool[np.ndarray, "ny nx"],
-    blocked: Bool[np.ndarray, "ny nx"],
+    reach: Bool[np.ndarray, "ry rx"],
     gap: Float[np.ndarray, "ny nx"],
     most_mm: float,
     layer_mm: float,
@@ -411,6 +410,7 @@ def _lidded(
         hang_mm = HOLD_MM + 0.5 * model.cell_mm
         holds = (active & ~deep) | (gap < most_mm)
         held = _beside(holds, deep, hang_mm, model.cell_mm)
+        blocked = ~model.free_at(reach)
         held |= _beside(holds & blocked, deep, hang_mm + TO_WALL_MM, model.cell_mm)
         lidded = np.minimum(thick, layer_mm)
         model.sunk_mm = np.where(deep & held, model.sunk_mm + thick - lidded, model.sunk_mm)
@@ -426,11 +426,13 @@ def _beside(
     cell_mm: float,
 ) -> Bool[np.ndarray, "ny nx"]:
     """Which columns, among those asked about, lie within a distance of others."""
+    beside = np.zeros_like(what)
+    if not asked.any():
+        return beside
     margin = int(np.ceil(within_mm / cell_mm)) + 1
     rows, columns = (
         slice(max(int(at.min()) - margin, 0), int(at.max()) + margin + 1) for at in asked.nonzero()
     )
-    beside = np.zeros_like(what)
     apart = ndimage.distance_transform_edt(~what[rows, columns])
     beside[rows, columns] = apart * cell_mm <= within_mm + 1e-9
     return beside
@@ -443,7 +445,7 @@ def _strips(
     walls = (model.surface_mm > z_mm - AGREE_MM) & (thick <= 0)
     # what is drawn over a hollow hangs: nothing presses it aside
     asked = (thick > 0) & (z_mm - model.surface_mm <= DEEP_RATIO * model.most_mm)
-    return _beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked if asked.any() else asked
+    return _beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked
 
 
 def _thin(region: Any, z_mm: float, height_mm: float, volume_mm3: float) -> Unprintable:
