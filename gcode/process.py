@@ -1,4 +1,6 @@
-"""What a command's process is set to before it loads anything: one thread in BLAS, memory kept.
+"""What a command's process is set to before it loads anything, and how long its workers live.
+
+One thread in BLAS, memory kept.
 
 Products of some thousand rows by three columns take less time than BLAS's threads need to wake;
 and those, spinning for more work, hold a core that compiled loops would run on. And glibc gives
@@ -55,3 +57,23 @@ def gives_back(long_task: Callable[P, R]) -> Callable[P, R]:
                 ctypes.CDLL("libc.so.6").malloc_trim(0)
 
     return task
+
+
+def end_with_parent() -> None:
+    """In a worker of `multiprocessing`: end at once where the process that began it ends.
+
+    A parent that was killed tells its workers nothing: they would finish what they do, wait for
+    more for ever, and write into what the next run has begun.
+    """
+    import multiprocessing
+    import threading
+
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

@@ -187,8 +187,8 @@ def _read(path: Path) -> dict[str, torch.Tensor]:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, OSError, KeyError) as e:
         raise InputError(
-            f"{path}: the checkpoint cannot be read without running code in it "
-            f"({str(e).splitlines()[0][:120]}); save its tensors as .safetensors"
+            f"{path} cannot be read as a checkpoint without running code in it; if it is one, save "
+            "its tensors as .safetensors"
         ) from e
     table = stored.get("base_model", stored) if isinstance(stored, dict) else {}
     return {name: value for name, value in table.items() if isinstance(value, torch.Tensor)}

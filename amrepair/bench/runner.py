@@ -30,6 +30,7 @@ from amrepair.bench.tables import as_csv, as_json, as_markdown
 from amrepair.errors import InputError
 from amrepair.template.paper import PaperOptions
 from gcode.compiled import get_num_threads, set_num_threads
+from gcode.process import end_with_parent
 from gcode.progress import Progress, silent
 
 DEFAULT_SEEDS = (0, 1, 2)
@@ -176,7 +177,7 @@ def _work(cells: Sequence[Cell], jobs: int, progress: Progress) -> Iterator[Row]
     pool = ProcessPoolExecutor(
         max_workers=jobs,
         mp_context=multiprocessing.get_context("spawn"),  # threads of open3d do not survive fork
-        initializer=_limit_threads,
+        initializer=_begin_worker,
         initargs=(threads,),
     )
     try:
@@ -191,8 +192,9 @@ def _work(cells: Sequence[Cell], jobs: int, progress: Progress) -> Iterator[Row]
         pool.shutdown(cancel_futures=True)
 
 
-def _limit_threads(count: int) -> None:
-    """Libraries loaded from here on share the cores among the jobs."""
+def _begin_worker(count: int) -> None:
+    """Libraries loaded from here on share the cores among the jobs; killed, all of them end."""
+    end_with_parent()
     os.environ["OMP_NUM_THREADS"] = str(count)
     set_num_threads(min(count, get_num_threads()))
 

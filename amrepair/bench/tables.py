@@ -157,6 +157,21 @@ def _published(format: Format, method: str) -> str:
     return " / ".join("–" if value is None else f"{value:.1f}" for value in pair)
 
 
+def in_short(rows: Sequence[Row]) -> str:
+    """A line for each method: what one wants to know first."""
+    lines = []
+    for method in _methods(rows):
+        found = summary(rows, method)
+        own = [row for row in rows if row.method == method]
+        bad, samples = _total(own), sum(row.samples for row in own)
+        lines.append(
+            f"{method}: O-AUROC {_percent(*found['o_auroc'])}, P-AUROC "
+            f"{_percent(*found['p_auroc'])}, {_plain(found['seconds_per_sample'][0], 2)} s a sample"
+            + ("" if bad is None else f", {bad} of {samples} badly aligned")
+        )
+    return "\n".join(lines)
+
+
 def as_markdown(
     rows: Sequence[Row],
     format: Format,

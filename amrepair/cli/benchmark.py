@@ -10,6 +10,11 @@ import typer
 from amrepair.cli.options import SeedOption, with_settings
 from gcode.cli import console
 
+METHOD_HELP = (
+    "pasdf (ours), pasdf-paper, btf-raw, btf-fpfh, patchcore-fpfh, patchcore-fpfh-raw, "
+    "patchcore-pointmae or patchcore-pointbert; but for the first two also with +pam, aligned "
+    "first. May be repeated."
+)
 FormatOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or real3d-ad.")]
 
 
@@ -35,7 +40,7 @@ def add_to(app: typer.Typer) -> None:
 def bench(
     dataset: Annotated[Path, typer.Argument(help="Folder of the data set.")],
     layout: FormatOption,
-    method: Annotated[list[str], typer.Option("--method", help="May be repeated.")],
+    method: Annotated[list[str], typer.Option("--method", help=METHOD_HELP)],
     out: Annotated[Path, typer.Option(help="Folder for the results; gone on with if it has some.")],
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     checkpoint: Annotated[
@@ -53,6 +58,7 @@ def bench(
     with console.starting():
         from amrepair.bench.paper import BENCH_PAPER
         from amrepair.bench.runner import run_bench
+        from amrepair.bench.tables import in_short
         from amrepair.template.paper import VARIANTS
 
     recipe = with_settings({"bench": BENCH_PAPER, **VARIANTS}, paper, "--paper")
@@ -68,6 +74,7 @@ def bench(
             paper=recipe,
             progress=bars,
         )
+    console.out.print(in_short(report.rows))
     console.out.print(f"Results: {report.markdown_path}")
 
 

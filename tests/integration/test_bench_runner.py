@@ -22,6 +22,7 @@ from amrepair.bench.dataset import open_dataset
 from amrepair.bench.method import class_input
 from amrepair.bench.metrics import aupr, auroc
 from amrepair.bench.registry import make_method
+from amrepair.bench.tables import in_short
 from amrepair.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -93,6 +94,9 @@ def test_files_and_keys(dataset: Path, tmp_path: Path) -> None:
     assert "| btf-raw |" in text
     assert "63.5 / 57.1" in text  # published, beside ours
     assert "not on this synthetic set" in text
+    p_auroc = f"P-AUROC {100 * np.mean(by_seed):.1f} ± {100 * np.std(by_seed, ddof=1):.1f}, "
+    assert in_short(report.rows).startswith("btf-raw: O-AUROC ")
+    assert p_auroc in in_short(report.rows)
     assert not (tmp_path / "partial").exists()
 
 

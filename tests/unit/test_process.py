@@ -1,9 +1,10 @@
-"""A command's process keeps the memory that it lets go of, and has one thread in BLAS."""
+"""A command's process keeps the memory that it lets go of, and its workers end with it."""
 
 import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -72,3 +73,33 @@ def test_a_long_task_gives_its_memory_back() -> None:
     ).stdout.split()
     kept_mb, given_back_mb = (float(word) for word in told)
     assert given_back_mb < kept_mb - 100
+
+
+WORKING = """
+import multiprocessing, sys, time
+from gcode.process import end_with_parent
+def work(said):
+    end_with_parent()
+    said.set()
+    time.sleep(600)
+if __name__ == "__main__":
+    spawn = multiprocessing.get_context("spawn")
+    said = spawn.Event()
+    spawn.Process(target=work, args=(said,)).start()
+    said.wait()
+    print("working", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_worker_ends_with_the_process_that_was_killed(tmp_path: Path) -> None:
+    # regression: killed, `bench --jobs 2` left two processes that wrote on into its folder
+    script = tmp_path / "working.py"
+    script.write_text(WORKING)
+    mine = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen([sys.executable, script], env=mine, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == b"working\n"
+        parent.kill()
+        # the worker holds the same pipe: its end is seen where both have ended
+        parent.communicate(timeout=20)
