@@ -28,8 +28,12 @@ CLEAR_SIGMAS, CLEAR_RATIO = 4.0, 0.002  # a point is off the surface; the ratio 
 FIRST_RATIO, PIECE_RATIO = 0.02, 0.04  # scale of the loss to begin with, of the diagonal
 SHARP = 0.4  # of the limit: the loss's scale where a piece's pose ends
 ITERATIONS, ROUNDS, LEAST_RISE = 40, 6, 0.002  # of the share explained, from round to round
+ENOUGH_SIGMAS = 0.05  # of the noise: a smaller step changes nothing that is asked
 NEARBY = 3.0  # limits: a point this near may yet come to lie on a piece
 ENOUGH = 0.93  # of the points, explained by two poses: nothing better is looked for
+# Nor where they explain all but outliers off the bend itself, which is neither piece's: so far from
+# the plane between them (of the diagonal) lie at least so many of the points.
+BENT_RATIO, ENOUGH_BEYOND, LEAST_BEYOND = 0.06, 0.985, 0.5
 MOST_POLISHED = 2  # pairs of each pose, the best ones to begin with
 MOST_TRIED = 4  # poses of which a second piece is asked
 NEIGHBOURS, MOSTLY = 24, 0.9  # a place lies on the template where its neighbours do
@@ -72,12 +76,15 @@ def standing_pose(
     sigma_mm
         Noise of the points.
     """
-    scene = _Scene.of(points_mm, template, sigma_mm, rng)
-    if scene.on(known[0]).mean() > 1.0 - LEAST_SHARE:
+    thinned = Thinned(points_mm, rng)
+    limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * _diagonal_mm(template))
+    off_mm = np.abs(template.distance(moved(thinned.to(POINTS), known[0])))
+    if (off_mm > limit_mm).mean() < LEAST_SHARE:
         return known[0]
+    scene = _Scene.of(thinned, template, sigma_mm, limit_mm)
     tried = scene.distinct(scene.refined(scene.thinned.to(FEW_POINTS), known))
     best = _best_pair(tried, scene)
-    if best is None or best.explained < ENOUGH:
+    if best is None or not best.is_enough:
         field = CoarseField.of(template)
         found = [pose.matrix for pose in search(scene.thinned, field, effort=THOROUGH)]
         more = scene.distinct([*tried, *scene.refined(scene.thinned.to(FEW_POINTS), found)])
@@ -142,21 +149,17 @@ def _sunk(pose: Pose, scene: _Scene) -> Pose:
 
 
 def _best_pair(poses: Sequence[Pose], scene: _Scene, best: _Pair | None = None) -> _Pair | None:
-    for pose in poses:
-        begun = sorted(_begun(pose, scene), key=lambda one: -one[0])[:MOST_POLISHED]
-        for _, first, second in begun:
-            pair = _polished(first, second, scene)
-            if pair is not None and (best is None or pair.explained > best.explained):
-                best = pair
-        if best is not None and best.explained > ENOUGH:
-            break
+    """The pair that explains most, of those that begin at the poses; the first one's own first."""
+    for few in (poses[:1], poses[1:]):
+        for seeds in _seeds(few, scene):
+            begun = [(scene.held(scene.on(a) | scene.on(b)), a, b) for a, b in seeds]
+            for _, first, second in sorted(begun, key=lambda one: -one[0])[:MOST_POLISHED]:
+                pair = _polished(first, second, scene)
+                if pair is not None and (best is None or pair.explained > best.explained):
+                    best = pair
+            if best is not None and best.is_enough:
+                return best
     return best
-
-
-def _begun(pose: Pose, scene: _Scene) -> Iterator[tuple[float, Pose, Pose]]:
-    """Pairs to start from, and how much is held by either pose."""
-    for first, second in _seeds(pose, scene):
-        yield scene.held(scene.on(first) | scene.on(second)), first, second
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,16 +168,23 @@ class _Pair:
 
     Attributes
     ----------
-    explained
-        Share of the places that are held by the pose of their piece.
+    explained, beyond
+        Share of the places that are held by the pose of their piece: of all, and of those that the
+        bend itself leaves alone (0 where those are few).
     normal, through_mm
         Of the plane between the pieces, template's frame, away from the standing one.
     """
 
     explained: float
+    beyond: float
     standing: Pose
     normal: Float[np.ndarray, " 3"]
     through_mm: Float[np.ndarray, " 3"]
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether nothing better need be looked for."""
+        return self.explained > ENOUGH or self.beyond > ENOUGH_BEYOND
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,29 +198,27 @@ class _Scene:
     diagonal_mm: float
     limit_mm: float
     neighbours: Int[np.ndarray, "n k"]
+    surface_mm: Float[np.ndarray, "m 3"]
 
     @classmethod
-    def of(
-        cls,
-        points_mm: Float[np.ndarray, "n 3"],
-        template: Template,
-        sigma_mm: float,
-        rng: np.random.Generator,
-    ) -> _Scene:
-        diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-        limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * diagonal_mm)
-        thinned = Thinned(points_mm, rng)
-        cloud = thinned.to(POINTS)
+    def of(cls, thinned: Thinned, template: Template, sigma_mm: float, limit_mm: float) -> _Scene:
+        cloud, diagonal_mm = thinned.to(POINTS), _diagonal_mm(template)
         near = [*range(1, min(NEIGHBOURS, len(cloud)) + 1)]
         index = cKDTree(cloud).query(cloud, k=near)[1]
-        return cls(thinned, cloud, template, max(sigma_mm, 1e-3), diagonal_mm, limit_mm, index)
+        surface = template.surface_points(SURFACE_RATIO * diagonal_mm)[0]
+        sigma_mm = max(sigma_mm, 1e-3)
+        return cls(thinned, cloud, template, sigma_mm, diagonal_mm, limit_mm, index, surface)
 
     def held(self, on: Bool[np.ndarray, " n"]) -> float:
-        """Share of the places that lie on the template with what is around them.
+        """Share of the places that are held."""
+        return float(self.is_held(on).mean())
+
+    def is_held(self, on: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """(n,) places that lie on the template with what is around them.
 
         What crosses the template somewhere, a broken face laid on a flat one, is on it in strips.
         """
-        return float((on & (on[self.neighbours].mean(axis=1) >= MOSTLY)).mean())
+        return np.asarray(on & (on[self.neighbours].mean(axis=1) >= MOSTLY))
 
     def on(
         self, pose: Pose, points: Float[np.ndarray, "k 3"] | None = None
@@ -235,6 +243,7 @@ class _Scene:
             end_scale_mm=end_mm,
             sigma_mm=self.sigma_mm,
             max_iterations=ITERATIONS,
+            enough_mm=ENOUGH_SIGMAS * self.sigma_mm,
         )
         return [one.matrix for one in found]
 
@@ -279,33 +288,45 @@ class _Scene:
         return kept
 
 
-def _seeds(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
-    """Two poses to start from: of the rest, and of both sides of some planes."""
-    on = scene.on(first)
-    rest = scene.cloud[~on]
-    if len(rest) > LEAST_PIECE * len(on):
-        few = _some(rest, PIECE_POINTS)
-        middle = moved(few, first).mean(axis=0)
-        starts = [first]
-        for vector in (*np.eye(3), *-np.eye(3)):
-            turn = rotation_from_vector(TURN_RAD * vector)
-            start = np.eye(4)
-            start[:3, :3] = turn @ first[:3, :3]
-            start[:3, 3] = turn @ (first[:3, 3] - middle) + middle
-            starts.append(start)
-        found = scene.refined(few, starts, PIECE_RATIO)
-        yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
+def _seeds(poses: Sequence[Pose], scene: _Scene) -> Iterator[list[tuple[Pose, Pose]]]:
+    """Of each pose, two poses to start from: of what it leaves, and of both sides of some planes.
+
+    A side is moved from all the poses at once: they are many where a part fits in many ways.
+    """
     cloud = scene.thinned.to(2 * PIECE_POINTS)
     local = cloud - cloud.mean(axis=0)
+    sides = []
     for axis in np.linalg.eigh(local.T @ local)[1].T[::-1]:
         height = local @ axis
         for cut in np.quantile(height, CUTS):
-            sides = (
-                _some(cloud[height <= cut], PIECE_POINTS),
-                _some(cloud[height > cut], PIECE_POINTS),
-            )
-            low, high = (scene.refined(side, [first], PIECE_RATIO)[0] for side in sides)
-            yield low, high
+            for side in (height <= cut, height > cut):
+                sides.append(scene.refined(_some(cloud[side], PIECE_POINTS), poses, PIECE_RATIO))
+    for pose, *moved_sides in zip(poses, *sides, strict=True):
+        found = list(zip(moved_sides[::2], moved_sides[1::2], strict=True))
+        yield [*_of_the_rest(pose, scene), *found]
+
+
+def _of_the_rest(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
+    """The pose, and that of what it leaves, where this is a piece."""
+    on = scene.on(first)
+    rest = scene.cloud[~on]
+    if len(rest) <= LEAST_PIECE * len(on):
+        return
+    few = _some(rest, PIECE_POINTS)
+    middle = moved(few, first).mean(axis=0)
+    starts = [first]
+    for vector in (*np.eye(3), *-np.eye(3)):
+        turn = rotation_from_vector(TURN_RAD * vector)
+        start = np.eye(4)
+        start[:3, :3] = turn @ first[:3, :3]
+        start[:3, 3] = turn @ (first[:3, 3] - middle) + middle
+        starts.append(start)
+    found = scene.refined(few, starts, PIECE_RATIO)
+    yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
+
+
+def _diagonal_mm(template: Template) -> float:
+    return float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
 
 
 def _some(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
@@ -361,10 +382,14 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
         return None
     zone_mm = HINGE_RATIO * scene.diagonal_mm
     right = (on[0] & (placed[0] @ normal < zone_mm)) | (on[1] & (placed[1] @ normal > -zone_mm))
-    surface = scene.template.surface_points(SURFACE_RATIO * scene.diagonal_mm)[0]
-    share = float(((surface - through) @ normal > 0.0).mean())
-    standing, away = (second, -normal) if share > 0.5 else (first, normal)
-    return _Pair(scene.held(right), standing, away, through)
+    held = scene.is_held(right)
+    # a point of the second piece lies as far from the plane in its own pose as in the first
+    height = np.where(on[0], placed[0] @ normal, placed[1] @ normal)
+    beyond = np.abs(height) > BENT_RATIO * scene.diagonal_mm
+    share = float(held[beyond].mean()) if beyond.mean() > LEAST_BEYOND else 0.0
+    in_front = float(((scene.surface_mm - through) @ normal > 0.0).mean())
+    standing, away = (second, -normal) if in_front > 0.5 else (first, normal)
+    return _Pair(float(held.mean()), share, standing, away, through)
 
 
 def _hinge(
