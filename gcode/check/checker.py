@@ -96,7 +96,7 @@ def _judge(
         elif number <= len(lines):
             judge.read(number, lines[number - 1])
             number += 1
-    judge.end(len(lines), lines[-1])
+    judge.end(lines)
     progress("check", float(len(lines)), float(len(lines)))
     refusals, clearance_mm = list(judge.refusals), math.inf
     if as_built is not None:

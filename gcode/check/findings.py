@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 MOST_SHOWN = 60  # characters of a line in a message
 
@@ -54,7 +54,7 @@ class Text:
 
 
 class Moves:
-    """Moves with known ends, for the sweep; rows of line, start, end and plastic."""
+    """Moves with known ends; rows of line, start, end and plastic, below 0 where pulled back."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -97,4 +97,15 @@ class Moves:
     @property
     def pushed_mm3(self) -> Float[np.ndarray, " n"]:
         """(n,) plastic laid on each."""
-        return self._rows[: self.count, 7].copy()
+        return np.maximum(self._rows[: self.count, 7], 0.0)
+
+    @property
+    def pulled(self) -> Bool[np.ndarray, " n"]:
+        """(n,) whether plastic is pulled back on it."""
+        return np.asarray(self._rows[: self.count, 7] < 0)
+
+    @property
+    def sideways_mm(self) -> Float[np.ndarray, " n"]:
+        """(n,) how far each goes over the bed."""
+        rows = self._rows[: self.count]
+        return np.asarray(np.hypot(rows[:, 4] - rows[:, 1], rows[:, 5] - rows[:, 2]))

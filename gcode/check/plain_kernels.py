@@ -10,9 +10,9 @@ from gcode.compiled import njit
 # What the machine's state is, and what it may not pass.
 X, Y, Z, E, FEED, PULLED, SHORT_MM3, ABSOLUTE, ABSOLUTE_E, UNIT = range(10)
 (
-    LOW_X, LOW_Y, LOW_Z, HIGH_X, HIGH_Y, HIGH_Z, FASTEST, AREA, SHORT_MOVE, SECTION, FLOW, ALONE,
-    LINE, COLD,
-) = range(14)  # fmt: skip
+    LOW_X, LOW_Y, LOW_Z, HIGH_X, HIGH_Y, HIGH_Z, FASTEST, SHORT_MOVE, SECTION, ALONE, LINE,
+    FAST_X, FAST_Y, AREA, FLOW, COLD,
+) = range(16)  # fmt: skip
 EXACT = 2**53  # digits up to this, and as many decimals as a double divides by exactly
 MOST_DECIMALS = 22
 WORDS = 5  # X, Y, Z, E, F
@@ -85,9 +85,9 @@ def follow(data, starts, first, last, limits, state, rows, counts):
     """Follow lines first to last - 1 (from 0) as long as they are plain moves that may be.
 
     Parameters: bytes of the text, and where lines begin (one more than there are lines); `limits`
-    and `state` as named above; `rows` (n, 8) for line (from 1), start, end and plastic of moves;
-    `counts` (2,) of commands and of rows. The last three are changed. Returns the first line that
-    was not followed.
+    and `state` as named above; `rows` (n, 8) for line (from 1), start, end and plastic of moves,
+    below 0 where it is pulled back; `counts` (2,) of commands and of rows. The last three are
+    changed. Returns the first line that was not followed.
     """
     words = np.empty(WORDS)
     for line in range(first, last):
@@ -123,6 +123,9 @@ def follow(data, starts, first, last, limits, state, rows, counts):
             for axis in range(3):
                 if not limits[LOW_X + axis] <= row[4 + axis] <= limits[HIGH_X + axis]:
                     return line
+            for axis in range(2):
+                if feed * abs(row[4 + axis] - row[1 + axis]) > limits[FAST_X + axis] * length:
+                    return line
         pushed, e = 0.0, state[E]
         if not np.isnan(words[3]):
             pushed = words[3] * state[UNIT]
@@ -151,7 +154,7 @@ def follow(data, starts, first, last, limits, state, rows, counts):
                 if short_mm3 > limits[ALONE] * limits[AREA]:
                     return line
         # nothing speaks against it
-        row[7] = max(pushed, 0.0) * limits[AREA]
+        row[7] = pushed * limits[AREA]
         for axis in range(3):
             state[axis] = row[4 + axis]
         state[E], state[FEED], state[PULLED] = e, feed, pulled

@@ -2,6 +2,7 @@
 
 What changes the machine lastingly, or switches a protection off, is left out on purpose: EEPROM
 (M500, M502), steps per mm (M92), cold extrusion (M302), homing offsets (M206, M428), PID tuning.
+So are curves whose course nothing here follows (G5).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _COMMON = (
 _PROBING = "G29 G32 G34 G80 G81"
 
 COMMANDS: dict[str, frozenset[str]] = {
-    "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} G5 M0 M1 M31 M85 M113 M145 M420 M569 M593 "
+    "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M0 M1 M31 M85 M113 M145 M420 M569 M593 "
                         "M862.1 M862.3 M413 M142".split()),
     "prusa": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M0 M1 M31 M85 M862.1 M862.2 M862.3 M862.4 "
                        "M862.5 M907 M572 M142 G76".split()),
@@ -39,6 +40,9 @@ STARTS = frozenset({"START_PRINT", "PRINT_START"})
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
+# Klipper refuses G20 (klippy/extras/gcode_move.py), the MK3's firmware passes over it; both go on
+# in millimetres.
+NO_INCHES = frozenset({"klipper", "prusa"})
 # Klipper's G91 makes E relative while it lasts, whatever M82 says.
 G91_MOVES_E = frozenset({"klipper"})
 # A tool that is not there is reported and the only one goes on (klippy/gcode.py, cmd_default).

@@ -35,7 +35,7 @@ TRAVELS = st.tuples(st.floats(55, 65), st.floats(55, 65), st.floats(-0.01, 0.4))
 )
 OTHERS = st.sampled_from(
     ["", ";", "G90", "G91", "M82", "M83", "G92 E0", "G20", "G21", "G28 X Y", "M104 S0", "M109 S210",
-     "G3 X60 Y70 I0 J5 E0.5", "G92 X1", "M117 hello", "WHAT"]
+     "G3 X60 Y70 I0 J5 E0.5", "G92 X1", "M117 hello", "WHAT", "M221 S140", "M220 S180", "M84"]
 )  # fmt: skip
 PROGRAMS = st.lists(st.one_of(TRAVELS, TRAVELS, MOVES, OTHERS), max_size=20).map("\n".join)
 
@@ -50,7 +50,7 @@ def judged(text: str, initial: ModalState | None, *, plain: bool) -> Judge:
         if number <= len(lines):
             judge.read(number, lines[number - 1])
             number += 1
-    judge.end(len(lines), lines[-1])
+    judge.end(lines)
     return judge
 
 
@@ -62,6 +62,7 @@ def assert_same(text: str, initial: ModalState | None) -> Judge:
     np.testing.assert_allclose(fast.moves.start_mm, slow.moves.start_mm, atol=1e-12)
     np.testing.assert_allclose(fast.moves.end_mm, slow.moves.end_mm, atol=1e-12)
     np.testing.assert_allclose(fast.moves.pushed_mm3, slow.moves.pushed_mm3, atol=1e-12)
+    np.testing.assert_array_equal(fast.moves.pulled, slow.moves.pulled)
     return fast
 
 

@@ -1,0 +1,66 @@
+"""What a program may make the machine's own limits: speeds, accelerations, jerk.
+
+Firmwares hold moves to these limits (Marlin's M201 and M203, Klipper's `[printer]` section), so a
+program may set what it likes below them. It knows no moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from gcode.profiles import PrinterProfile
+
+# Slicers write limits that are not quite this machine's (PrusaSlicer's M201 E5000 and M203 X500
+# for an MK3S of 1,500 and 200): beyond so many times the profile's they are another machine's.
+RAISED = 5.0
+# What M201 and M203 set for each axis, by the profile's name, and its unit.
+_BY_AXIS = {
+    "M201": ("max_acceleration_mm_s2", "acceleration", "mm/s²"),
+    "M203": ("max_speed_mm_s", "speed", "mm/s"),
+    "M205": ("max_jerk_mm_s", "jerk", "mm/s"),
+    "M566": ("max_jerk_mm_s", "jerk", "mm/s"),
+}
+# RepRapFirmware's own are told in mm/min (its G-code dictionary, M203 and M566).
+_PER_MINUTE = frozenset({("reprap", "M203"), ("reprap", "M566")})
+# M204: printing, travelling, both (Marlin's S and Klipper's), and retracting.
+_OF_M204 = {"P": "x", "T": "x", "S": "x", "R": "e"}
+_OF_KLIPPER = {
+    "VELOCITY": ("max_speed_mm_s", "speed", "mm/s"),
+    "ACCEL": ("max_acceleration_mm_s2", "acceleration", "mm/s²"),
+    "SQUARE_CORNER_VELOCITY": ("max_jerk_mm_s", "jerk", "mm/s"),
+}
+COMMANDS = frozenset(_BY_AXIS) | {"M204"}
+
+
+def raised_by(
+    name: str, words: dict[str, float | None], printer: PrinterProfile, dialect: str
+) -> Iterator[tuple[str, str, str]]:
+    """What, value and limit of each limit that a command of `COMMANDS` raises too far."""
+    if name == "M204":
+        for letter, axis in _OF_M204.items():
+            limit = getattr(printer.max_acceleration_mm_s2, axis)
+            yield from _judged(f"acceleration by M204 {letter}", words.get(letter), limit, "mm/s²")
+        return
+    field, what, unit = _BY_AXIS[name]
+    per_s = 1.0 / 60.0 if (dialect, name) in _PER_MINUTE else 1.0
+    for letter in "XYZE":
+        value, limit = words.get(letter), getattr(getattr(printer, field), letter.lower())
+        told = None if value is None else value * per_s
+        yield from _judged(f"machine limit of {letter}'s {what}", told, limit, unit)
+
+
+def raised_by_klipper(
+    given: dict[str, float | None], printer: PrinterProfile
+) -> Iterator[tuple[str, str, str]]:
+    """The same of Klipper's SET_VELOCITY_LIMIT: what its parameters say."""
+    for key, (field, what, unit) in _OF_KLIPPER.items():
+        limit = getattr(printer, field).x
+        yield from _judged(f"machine limit of {what}, {key}", given.get(key), limit, unit)
+
+
+def _judged(
+    what: str, value: float | None, limit: float, unit: str
+) -> Iterator[tuple[str, str, str]]:
+    if value is not None and not 0 <= value <= RAISED * limit:
+        told = f"0 to {RAISED * limit:g} {unit}, {RAISED:g} times the profile's"
+        yield what, f"{value:g} {unit}", told

@@ -1,0 +1,321 @@
+"""Rules of moves: where they go, how fast, and what plastic they lay; the machine's state.
+
+It knows what moves mean in a dialect, and no other command (`rules`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from gcode.check import plain_kernels as plain
+from gcode.check.arcs import points_of_arc
+from gcode.check.findings import Moves, Refusal, Text
+from gcode.check.words import G91_MOVES_E, LINE_LIMIT
+from gcode.moves import ModalState, Program
+from gcode.profiles import PrintSetup
+
+# Plastic is told in five digits: what is shorter than this is judged with its neighbours.
+SHORT_MM = 0.05
+# Rounding of E and XYZ in the text, and a firmware's own flow, stay within this.
+SECTION_SLACK = 1.05
+FLOW_SLACK = 1.05
+PLACE_SLACK_MM = 0.011
+FASTEST_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
+# Firmwares clamp a feed to their own limit, and slicers ask for more (300 mm/s in Voron's own
+# printer.cfg, 350 to 500 in OrcaSlicer's profiles): far beyond it a file is another machine's.
+# Along Z and E slicers write the travel speed, whatever the axis does.
+FEED_SLACK = 2.0
+# Wipes pull back on the move; relative values that are read as absolute do half of the way.
+BACKWARDS_RATIO, BACKWARDS_MOVES = 0.25, 10
+INCH_MM = 25.4
+
+
+class Motion:
+    """The machine as moves change it; collects refusals and moves.
+
+    Parameters
+    ----------
+    standing_top_mm
+        Height of what stands on the bed; None for a bare bed.
+    initial
+        The machine's state before the first line; None: cold and not homed.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        setup: PrintSetup,
+        standing_top_mm: float | None,
+        initial: ModalState | None,
+    ) -> None:
+        self.refusals: list[Refusal] = []
+        self.moves = Moves()
+        self.commands = 0
+        self._setup, self._dialect = setup, program.dialect
+        self._filament_mm2 = math.pi / 4 * setup.printer.filament_diameter_mm**2
+        self._factor = {"M221": 1.0, "M220": 1.0}
+        self._alone = initial is None
+        self._standing_top_mm = standing_top_mm
+        self._stood = initial is not None or standing_top_mm is not None
+        state = initial
+        self._place: list[float | None] = [None] * 3 if state is None else [*state.position_mm]
+        # a standing part on a machine that is not switched off: its Z is still true
+        self._homed = [state is not None] * 2 + [self._stood]
+        self._absolute = state.absolute_xyz if state else True
+        self._absolute_e = state.absolute_e if state else True
+        self._e = state.e_mm if state else 0.0
+        self._feed_mm_s = state.feed_mm_s if state else 0.0
+        self._unit = 1.0 if state is None or state.units_mm else INCH_MM
+        self._hotend_c = state.hotend_c if state else 0.0
+        self._ready_c = self._hotend_c  # what the hotend was waited for
+        self._bed_c = state.bed_c if state else 0.0
+        self._pulled_mm = 0.0
+        self._short_mm3 = 0.0
+        self._line, self._text = 0, ""
+        printer = setup.printer
+        x0, y0, x1, y1 = printer.reach_box_mm
+        low = (x0 - PLACE_SLACK_MM, y0 - PLACE_SLACK_MM, -PLACE_SLACK_MM)
+        high = (x1 + PLACE_SLACK_MM, y1 + PLACE_SLACK_MM, printer.max_z_mm + PLACE_SLACK_MM)
+        self._limits_of_moves = (
+            *low, *high, FASTEST_MM_S, SHORT_MM, SECTION_SLACK * printer.max_bead_section_mm2,
+            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect],
+        )  # fmt: skip
+
+    def follow(self, text: Text, first: int, end: int) -> int:
+        """Judge plain moves among the lines first to end - 1; returns the first other line.
+
+        What `read` would refuse is left to it, so that both say the same.
+        """
+        if None in self._place or not all(self._homed):
+            return first
+        state = self._state()
+        counts = np.array([0, self.moves.count])
+        rows = self.moves.with_room_for(end - first)
+        at = plain.follow(
+            text.data, text.starts, first - 1, end - 1, self._plain_limits(), state, rows, counts
+        )
+        self.commands += int(counts[0])
+        self.moves.count = int(counts[1])
+        x, y, z, self._e, self._feed_mm_s, self._pulled_mm, self._short_mm3 = state[:7].tolist()
+        self._place = [x, y, z]
+        return int(at) + 1
+
+    def _state(self) -> Float[np.ndarray, " n"]:
+        modes = (self._absolute, self._e_is_absolute, self._unit)
+        used = (self._e, self._feed_mm_s, self._pulled_mm, self._short_mm3)
+        return np.array([*self._place, *used, *modes], dtype=np.float64)
+
+    def _plain_limits(self) -> Float[np.ndarray, " n"]:
+        speed, faster = self._setup.printer.max_speed_mm_s, self._factor["M220"]
+        flow = FLOW_SLACK * self._setup.max_volumetric_mm3_s / faster
+        fastest = (FEED_SLACK * speed.x / faster, FEED_SLACK * speed.y / faster)
+        cold = self._ready_c < self._setup.printer.min_extrude_c
+        return np.array(
+            [*self._limits_of_moves, *fastest, self._area_mm2, flow, cold], dtype=np.float64
+        )
+
+    @property
+    def _area_mm2(self) -> float:
+        """Plastic that a millimetre of E is, at the present flow."""
+        return self._filament_mm2 * self._factor["M221"]
+
+    @property
+    def _occupied(self) -> bool:
+        """Whether something stands on the bed: from before, or laid by the program itself."""
+        return self._stood or bool((self.moves.pushed_mm3 * self.moves.sideways_mm).any())
+
+    def _backwards(self, lines: list[str]) -> None:
+        """Relative values of E that are read as absolute go back and forth."""
+        pulled, way_mm = self.moves.pulled, self.moves.sideways_mm
+        if (pulled & (way_mm > 0)).sum() < BACKWARDS_MOVES:
+            return
+        ratio = way_mm[pulled].sum() / way_mm[pulled | (self.moves.pushed_mm3 > 0)].sum()
+        if ratio > BACKWARDS_RATIO:
+            self._line = int(self.moves.line[np.flatnonzero(pulled & (way_mm > 0))[0]])
+            self._text = lines[self._line - 1]
+            self._refuse(
+                "pulls filament back as it goes (relative values of E, read as absolute?)",
+                f"{ratio:.0%} of the way that E goes along",
+                f"{BACKWARDS_RATIO:.0%}",
+            )
+
+    def _refuse(self, what: str, value: str, limit: str) -> None:
+        self.refusals.append(Refusal(self._line, self._text, what, value, limit))
+
+    def _target(self, words: dict[str, float | None]) -> list[float | None]:
+        target = list(self._place)
+        for axis, letter in enumerate("XYZ"):
+            value = words.get(letter)
+            if value is None:
+                continue
+            here = self._place[axis]
+            if self._absolute:
+                target[axis] = value * self._unit
+            elif here is not None:
+                target[axis] = here + value * self._unit
+            elif axis == 2 and value < 0:
+                what = "relative move down from an unknown height"
+                self._refuse(what, f"{value:g} mm", "up only")
+        return target
+
+    def _pushed(self, words: dict[str, float | None]) -> float:
+        value = words.get("E")
+        if value is None:
+            return 0.0
+        value *= self._unit
+        pushed = value - self._e if self._e_is_absolute else value
+        self._e += pushed
+        return pushed
+
+    @property
+    def _e_is_absolute(self) -> bool:
+        return self._absolute_e and (self._absolute or self._dialect not in G91_MOVES_E)
+
+    def _feed(self, words: dict[str, float | None]) -> None:
+        value = words.get("F")
+        if value is None:
+            if "F" in words:
+                self._refuse("feed without a number", "F", "mm/min")
+            return
+        feed_mm_s = value * self._unit / 60.0
+        if not 0 < feed_mm_s <= FASTEST_MM_S:
+            self._refuse("feed", f"{feed_mm_s:g} mm/s", f"0 to {FASTEST_MM_S:g} mm/s")
+        self._feed_mm_s = max(feed_mm_s, 1e-3)
+
+    def _move(self, words: dict[str, float | None]) -> None:
+        for letter in "XYZE":
+            if letter in words and words[letter] is None:
+                self._refuse("axis without a number", letter, "a number")
+                return
+        self._feed(words)
+        moved = [axis for axis, letter in enumerate("XYZ") if letter in words]
+        for axis in moved:
+            if not self._homed[axis]:
+                self._refuse("move before homing", "XYZ"[axis], "home first")
+                self._homed[axis] = True  # said once
+        target = self._target(words)
+        self._go(target, self._pushed(words), moved=bool(moved))
+
+    def _arc(self, words: dict[str, float | None], *, clockwise: bool) -> None:
+        self._feed(words)
+        target, here = self._target(words), self._place
+        pushed = self._pushed(words)
+        if None in here or None in target or (not self._absolute and "R" in words):
+            self._refuse("arc from an unknown place", "G2/G3", "a known place")
+            return
+        x0, y0, z0 = (float(v or 0.0) for v in here)
+        x1, y1, z1 = (float(v or 0.0) for v in target)
+        if words.get("R") is not None:
+            self._refuse("arc told by its radius", "R", "I and J")
+            return
+        centre = tuple((words.get(letter) or 0.0) * self._unit for letter in "IJ")
+        start, end = (x0, y0, z0), (x1, y1, z1)
+        apart_mm, points = points_of_arc(start, end, (centre[0], centre[1]), clockwise=clockwise)
+        if not points:
+            self._refuse("arc whose ends lie on two circles", f"{apart_mm:.3f} mm", "0.05 mm")
+            return
+        for k, point in enumerate(points, 1):
+            last = k == len(points)
+            self._go(target if last else [*point], pushed / len(points), moved=True)
+
+    def _go(self, target: list[float | None], pushed_mm: float, *, moved: bool) -> None:
+        here = self._place
+        if moved:
+            self._bounds(target)
+        length_mm = 0.0
+        known = None not in here and None not in target
+        if known:
+            start = (float(here[0] or 0), float(here[1] or 0), float(here[2] or 0))
+            end = (float(target[0] or 0), float(target[1] or 0), float(target[2] or 0))
+            length_mm = math.dist(start, end)
+            self._speed(start, end, length_mm)
+            if length_mm > 0:
+                self.moves.add(self._line, start, end, pushed_mm * self._area_mm2)
+        elif moved and self._standing_top_mm is not None and pushed_mm <= 0:
+            z = target[2]
+            if z is not None and z < self._standing_top_mm:
+                self._refuse(
+                    "move at an unknown place below the top of what stands there",
+                    f"Z {z:g} mm",
+                    f"{self._standing_top_mm:g} mm",
+                )
+        self._place = target
+        if pushed_mm:
+            self._extrude(pushed_mm, length_mm, known=known)
+
+    def _speed(
+        self, start: tuple[float, float, float], end: tuple[float, float, float], length_mm: float
+    ) -> None:
+        feed_mm_s, limits_mm_s = self._feed_mm_s * self._factor["M220"], self._setup.printer
+        for axis, letter in enumerate("xy"):
+            limit_mm_s = FEED_SLACK * getattr(limits_mm_s.max_speed_mm_s, letter)
+            along_mm = abs(end[axis] - start[axis])
+            if feed_mm_s * along_mm > limit_mm_s * length_mm:
+                self._refuse(
+                    f"feed of {letter.upper()} beyond what the machine does",
+                    f"{feed_mm_s * along_mm / length_mm:.0f} mm/s",
+                    f"{limit_mm_s:g} mm/s, {FEED_SLACK:g} times the profile's",
+                )
+
+    def _bounds(self, target: list[float | None]) -> None:
+        x0, y0, x1, y1 = self._setup.printer.reach_box_mm
+        for axis, low, high in ((0, x0, x1), (1, y0, y1), (2, 0.0, self._setup.printer.max_z_mm)):
+            value = target[axis]
+            if value is not None and not low - PLACE_SLACK_MM <= value <= high + PLACE_SLACK_MM:
+                letter = "XYZ"[axis]
+                self._refuse(f"{letter} out of reach", f"{value:g} mm", f"{low:g} to {high:g} mm")
+
+    def _extrude(self, pushed_mm: float, length_mm: float, *, known: bool) -> None:
+        printer = self._setup.printer
+        if pushed_mm > 0 and self._ready_c < printer.min_extrude_c:
+            self._refuse(
+                "cold extrusion", f"hotend waited for at {self._ready_c:g} °C",
+                f"{printer.min_extrude_c:g} °C",
+            )  # fmt: skip
+            self._ready_c = math.inf  # said once
+        if length_mm <= SHORT_MM:
+            self._short(pushed_mm)
+            return
+        self._short_mm3 = 0.0
+        if pushed_mm < 0:
+            self._pull(pushed_mm)
+            return
+        back_mm = min(pushed_mm, self._pulled_mm)  # a wipe or an unretraction on the move
+        self._pulled_mm -= back_mm
+        volume_mm3 = (pushed_mm - back_mm) * self._area_mm2
+        section_mm2 = volume_mm3 / length_mm
+        limit_mm2 = printer.max_bead_section_mm2
+        if section_mm2 > SECTION_SLACK * limit_mm2:
+            self._refuse("bead too thick", f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²")
+        flow = section_mm2 * self._feed_mm_s * self._factor["M220"]
+        limit = self._setup.max_volumetric_mm3_s
+        if flow > FLOW_SLACK * limit:
+            self._refuse("melts more than the hotend can", f"{flow:.1f} mm³/s", f"{limit:g} mm³/s")
+
+    def _short(self, pushed_mm: float) -> None:
+        """Standing, or nearly so: plastic adds up until the nozzle has moved on."""
+        printer = self._setup.printer
+        if pushed_mm < 0:
+            self._pull(pushed_mm)
+            return
+        back_mm = min(pushed_mm, self._pulled_mm)
+        self._pulled_mm -= back_mm
+        self._short_mm3 += (pushed_mm - back_mm) * self._area_mm2
+        allowed_mm3 = printer.max_extrude_only_mm * self._area_mm2
+        if self._short_mm3 > allowed_mm3:
+            self._refuse(
+                "pushes filament standing still",
+                f"{self._short_mm3 / self._area_mm2:.1f} mm",
+                f"{printer.max_extrude_only_mm:g} mm",
+            )
+            self._short_mm3 = 0.0
+
+    def _pull(self, pushed_mm: float) -> None:
+        self._pulled_mm -= pushed_mm
+        limit_mm = self._setup.printer.max_extrude_only_mm
+        if self._pulled_mm > limit_mm:
+            self._refuse("pulls filament back", f"{self._pulled_mm:.1f} mm", f"{limit_mm:g} mm")
+            self._pulled_mm = 0.0
