@@ -27,6 +27,8 @@ SOLID_MM = -5.0
 # A pixel beside a silhouette, seen aslant, is off by no more than this many of its steps.
 SHARP_STEPS = 1.5
 SHARP_MM = 0.25  # a deficit's voxel is no larger: farther off no surface is shaped
+# Parallel to the template's surface, and turned away from the sensor that saw it by 17° and more.
+BACK_COSINE = -0.3
 # As far from template that is gone as a stub of it can be, and as deep inside as noise is not.
 STUB_CELLS = 2.5
 STUB_MM = 0.05
@@ -167,6 +169,8 @@ def gather(
 ) -> Evidence:
     """Collect the evidence of a scan whose off-template surfels and range images are known."""
     off = off | _strips(template, surfels, off)
+    if images and off.any():
+        off |= _seen_from_within(scan, template, surfels, off)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
     faces = None
@@ -217,6 +221,26 @@ def _toward(
     """Planes turned to the side of their guides."""
     sign = np.where((planes * guide).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(planes * sign[:, None])
+
+
+def _seen_from_within(
+    scan: Scan, template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"]
+) -> Bool[np.ndarray, " s"]:
+    """Surfels along the template's surface that were seen through the template.
+
+    A sheet that is left on the bed lies within noise of the template's underside, yet its upper
+    side was seen from above: it faces the other way, and what lies over it is empty.
+    """
+    found = np.zeros_like(off)
+    facing = surfels.toward_sensors(which := np.flatnonzero(~off), scan)
+    if facing is None or len(which) == 0:
+        return found
+    gradient = template.distance_and_gradient(surfels.place_mm[which])[1]
+    gradient /= np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+    facing = facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    along = np.abs((gradient * surfels.planes(which)).sum(axis=1)) > STRIP_COSINE
+    found[which] = along & ((facing * gradient).sum(axis=1) < BACK_COSINE)
+    return found
 
 
 def _strips(
