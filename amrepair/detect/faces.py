@@ -19,6 +19,7 @@ from amrepair.detect import faces_kernels as kernels
 from amrepair.detect.holes import is_backed, is_closed, spoken_of
 from amrepair.detect.near import has_near
 from amrepair.detect.rooms import Rooms, find_rooms
+from amrepair.detect.sheets import other_sides, with_own_area
 from amrepair.detect.surfels import Surfels
 from amrepair.detect.turning import side_by_view, turned_down, turned_to_close
 from amrepair.detect.winding import Shell
@@ -204,6 +205,8 @@ def find_faces(
     broken |= (along < STRIP_COSINE) & (deviation < -STRIP_MM)
     # a lone point among others is noise
     broken &= broken[neighbours].mean(axis=1) > LONE_RATIO
+    sheet = other_sides(place, plane, deviation, gradient, broken, spacing_mm=surfels.spacing_mm)
+    area = with_own_area(area, neighbours, sheet)
     rest = np.flatnonzero(~near_cell)
     places = np.concatenate([place, surfels.place_mm[rest]])
     is_off = np.concatenate([broken, np.zeros(len(rest), bool)])
@@ -211,7 +214,9 @@ def find_faces(
     spacing_mm = float(np.sqrt(np.median(area)))
     reach = np.full(len(places), PRESENT_SPACINGS * spacing_mm)
     reach[len(place) :] = 1.8 * surfels.cell_mm
-    present = _present(patches, places, is_off, tree, reach)
+    crossing = is_off.copy()
+    crossing[: len(place)] &= ~sheet
+    present = _present(patches, places, crossing, tree, reach)
     which = np.flatnonzero(broken)
     rooms = find_rooms(
         template,
@@ -230,6 +235,8 @@ def find_faces(
         side = rooms.open_side(place[which], plane[which])
         by_view = side_by_view(plane[which], patches.vector_mm2, present)
         side = np.where(side == 0, by_view, side)
+        away = -np.sign((plane[which] * gradient[which]).sum(axis=1))
+        side = np.where(sheet[which], away, side)
         outward = turned_down(
             place,
             which,
