@@ -428,33 +428,26 @@ def profiles_list(as_json: JsonOption = False) -> None:
     "show",
     epilog=console.examples(
         "gcode profiles show prusa_mk3s",
-        "gcode profiles show mine.toml --kind printers",
+        "gcode profiles show mine.toml",
     ),
 )
 def profiles_show(
     profile: Annotated[str, typer.Argument(help="ID or TOML file.")],
     kind: Annotated[
-        str, typer.Option(help="printers, materials or processes, where an ID is in several.")
+        str, typer.Option(help="printers, materials or processes, where the file leaves it open.")
     ] = "",
 ) -> None:
     """Show a profile with everything it inherits, as JSON."""
-    from gcode.profiles import load_material, load_printer, load_process
+    from gcode.profiles import kind_of, load_material, load_printer, load_process
 
     loaders: dict[str, Any] = {
         "printers": load_printer,
         "materials": load_material,
         "processes": load_process,
     }
-    for name, load in loaders.items():
-        if kind not in {"", name}:
-            continue
-        if kind == name or profile in list_profiles(name):  # type: ignore[arg-type]
-            console.show_json(load(profile).model_dump(mode="json"))
-            return
-    raise InputError(
-        f"There is no profile '{profile}'; 'gcode profiles list' names them (for a file of your "
-        "own, say --kind)."
-    )
+    if kind and kind not in loaders:
+        raise InputError(f"There is no kind '{kind}' of profiles; there are {', '.join(loaders)}.")
+    console.show_json(loaders[kind or kind_of(profile)](profile).model_dump(mode="json"))
 
 
 def _cost_of(program: Program, printer: PrinterProfile) -> Estimate | None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
         ProcessProfile,
     )
     from gcode.profiles.setup import PrintSetup, expand_script, load_setup
-    from gcode.profiles.store import load_material, load_printer, load_process
+    from gcode.profiles.store import kind_of, load_material, load_printer, load_process
 
 __all__ = [
     "DEFAULT_MATERIAL",
@@ -42,6 +42,7 @@ __all__ = [
     "PrinterProfile",
     "ProcessProfile",
     "expand_script",
+    "kind_of",
     "list_profiles",
     "load_material",
     "load_printer",
@@ -59,6 +60,7 @@ _HOMES = {
     "PrinterProfile": ("gcode.profiles.schema", "PrinterProfile"),
     "ProcessProfile": ("gcode.profiles.schema", "ProcessProfile"),
     "expand_script": ("gcode.profiles.setup", "expand_script"),
+    "kind_of": ("gcode.profiles.store", "kind_of"),
     "load_material": ("gcode.profiles.store", "load_material"),
     "load_printer": ("gcode.profiles.store", "load_printer"),
     "load_process": ("gcode.profiles.store", "load_process"),

@@ -19,7 +19,7 @@ _ROUND_SIDES = 48  # 0.2 % beyond the circle
 
 
 class _Profile(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     id: str
     name: str
@@ -29,7 +29,7 @@ class _Profile(BaseModel):
 class AxisLimits(BaseModel):
     """A limit by axis."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     x: Positive
     y: Positive
@@ -46,7 +46,7 @@ class EnvelopeSlice(BaseModel):
     file, `radius_mm` (about the axis) or `box_mm` (x0, y0, x1, y1) may stand for the polygon.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     part: Literal["nozzle", "block", "duct", "carriage", "gantry"]
     z_from_mm: Annotated[float, Field(ge=0)]
@@ -87,7 +87,7 @@ class StartMacro(BaseModel):
     `hotend` and `bed` are the parameters that tell it how hot.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     hotend: str

@@ -10,15 +10,26 @@ import json
 import tomllib
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from gcode.errors import ProfileError
 from gcode.profiles.names import Kind, id_of, list_profiles, profile_dir
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
 
+# What pydantic calls values beyond a bound, and how a bound reads.
+_BEYOND = frozenset({"greater_than", "greater_than_equal", "less_than", "less_than_equal"})
+_BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+
 _P = TypeVar("_P", PrinterProfile, MaterialProfile, ProcessProfile)
+
+
+_MODELS: dict[Kind, type[BaseModel]] = {
+    "printers": PrinterProfile,
+    "materials": MaterialProfile,
+    "processes": ProcessProfile,
+}
 
 
 def load_printer(id_or_path: str | Path) -> PrinterProfile:
@@ -39,6 +50,39 @@ def load_process(id_or_path: str | Path) -> ProcessProfile:
 def content_of(kind: Kind, id_or_path: str | Path) -> dict[str, Any]:
     """Return a profile's content with everything it inherits, before validation."""
     return _resolve(kind, _find(kind, id_or_path).resolve(), ())
+
+
+def kind_of(id_or_path: str | Path) -> Kind:
+    """Which kind of profile an ID or a file is: the one whose keys, and whose parent, it has.
+
+    Raises
+    ------
+    ProfileError
+        Where it is none, or an ID that several kinds have.
+    """
+    text = str(id_or_path)
+    named: list[Kind] = [kind for kind in _MODELS if text in list_profiles(kind)]
+    if len(named) == 1:
+        return named[0]
+    if not (text.endswith(".toml") or "/" in text):
+        several = f"is a profile of several kinds ({', '.join(named)}); say which"
+        nothing = (
+            "is no profile; 'gcode profiles list' names them, a file of your own ends in .toml"
+        )
+        raise ProfileError(f"'{text}' {several if named else nothing}.")
+    own = _read(_find("printers", text))
+    parent = Path(str(own.get("inherits", ""))).name.removesuffix(".toml")
+    points = {
+        kind: sum(key in model.model_fields for key in own) + (parent in list_profiles(kind))
+        for kind, model in _MODELS.items()
+    }
+    best = max(points.values())
+    fits = [kind for kind, value in points.items() if value == best]
+    if len(fits) > 1:
+        raise ProfileError(
+            f"{text}: its keys do not tell whether it is of {', '.join(fits)}; say which by --kind."
+        )
+    return fits[0]
 
 
 def _find(kind: Kind, id_or_path: str | Path, beside: Path | None = None) -> Path:
@@ -86,12 +130,7 @@ def _resolve(kind: Kind, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
     if path in chain:
         loop = " → ".join(p.name for p in (*chain, path))
         raise ProfileError(f"{path}: `inherits` runs in a circle ({loop}); remove one link.")
-    try:
-        own = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as e:
-        raise ProfileError(f"{path}: not valid TOML ({e}).") from e
-    except (OSError, UnicodeDecodeError) as e:
-        raise ProfileError(f"{path}: the profile cannot be read ({e}).") from e
+    own = _read(path)
     parent = own.pop("inherits", None)
     base: dict[str, Any] = {}
     if parent is not None:
@@ -106,6 +145,16 @@ def _resolve(kind: Kind, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
             base[key] = value
     base["id"] = id_of(path)
     return base
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What a file itself says."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as e:
+        raise ProfileError(f"{path}: not valid TOML ({e}).") from e
+    except (OSError, UnicodeDecodeError) as e:
+        raise ProfileError(f"{path}: the profile cannot be read ({e}).") from e
 
 
 def _validate(model: type[_P], content: dict[str, Any], path: Path) -> _P:
@@ -126,6 +175,36 @@ def _validate(model: type[_P], content: dict[str, Any], path: Path) -> _P:
             ) from e
         if first["type"] == "missing":
             raise ProfileError(f"{path}: key '{key}' is missing{more}.") from e
-        raise ProfileError(
-            f"{path}: key '{key}' = {first['input']!r} is out of range: {first['msg']}{more}."
-        ) from e
+        limits = _range(model, first["loc"])
+        where = f"{path}: key '{key}' = {first['input']!r}"
+        if first["type"] in _BEYOND and limits:
+            raise ProfileError(f"{where} is out of range: it must be {limits}{more}.") from e
+        told = f"it must be {limits}; " if limits else ""
+        raise ProfileError(f"{where} is not accepted: {told}{first['msg']}{more}.") from e
+
+
+def _range(model: type[BaseModel], loc: tuple[int | str, ...]) -> str:
+    """What a key may be, as words; empty where nothing bounds it."""
+    at: Any = model
+    said: list[Any] = []
+    for part in loc:
+        if isinstance(part, int):  # of a list: its items' own annotation
+            items = get_args(at)
+            at = items[min(part, len(items) - 1)] if items else None
+            if at is Ellipsis:
+                at = items[0]
+        elif isinstance(at, type) and issubclass(at, BaseModel) and part in at.model_fields:
+            field = at.model_fields[part]
+            at, said = field.annotation, list(field.metadata)
+        else:
+            return ""
+        while get_origin(at) is Annotated:
+            said = [m for a in get_args(at)[1:] for m in getattr(a, "metadata", [a])]
+            at = get_args(at)[0]
+    bound = {kind: getattr(m, kind) for m in said for kind in _BOUNDS if hasattr(m, kind)}
+    low = bound.get("ge", bound.get("gt"))
+    high = bound.get("le", bound.get("lt"))
+    if low is None or high is None:
+        words = [f"{_BOUNDS[kind]} {value:g}" for kind, value in bound.items()]
+        return " and ".join(words)
+    return f"{low:g} to {high:g}" + (f", more than {low:g}" if "gt" in bound else "")

@@ -252,7 +252,7 @@ def test_profiles_are_listed_and_shown() -> None:
     assert "prusa_mk3s" in listed["printers"]
     shown = json.loads(call("profiles", "show", "standard_0.20", program="gcode").stdout)
     assert shown["infill_ratio"] == 0.15
-    refused(call("profiles", "show", "nothing", program="gcode"), "no profile")
+    refused(call("profiles", "show", "nothing", program="gcode"), "is no profile")
 
 
 def test_send_prints_on_an_emulated_printer(tmp_path: Path) -> None:

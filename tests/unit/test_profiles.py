@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from gcode.errors import ProfileError
 from gcode.profiles import (
     expand_script,
+    kind_of,
     list_profiles,
     load_material,
     load_printer,
@@ -64,6 +66,49 @@ def test_a_wrong_profile_is_refused_in_one_sentence(tmp_path: Path, text: str, s
     path.write_text(text)
     with pytest.raises(ProfileError, match=said):
         load_material(path)
+
+
+@pytest.mark.parametrize(
+    ("load", "text", "said"),
+    [
+        (load_material, 'inherits = "pla"\nfan_ratio = 1.5\n', "'fan_ratio' = 1.5 .*0 to 1"),
+        (load_material, 'inherits = "pla"\ndensity_g_cm3 = 0\n', "'density_g_cm3' = 0 .*than 0"),
+        (load_material, 'inherits = "pla"\nhotend_c = inf\n', "'hotend_c' = inf .*more than 0"),
+        (load_material, 'inherits = "pla"\nbed_c = "warm"\n', "'bed_c' = 'warm' .*at least 0"),
+        (load_printer, 'inherits = "ender_3"\nnozzle_diameter_mm = 9\n', "= 9 .*0.1 to 2"),
+        (load_printer, 'inherits = "ender_3"\nmax_hotend_c = 900\n', "= 900 .*0 to 500, more than"),
+        (load_printer, 'inherits = "ender_3"\nbed_size_mm = [-5, 9]\n', "size_mm.0' = -5 .*than 0"),
+        (load_printer, 'inherits = "ender_3"\nmax_speed_mm_s = {x = -1}\n', "s.x' = -1 .*than 0"),
+        (load_printer, 'inherits = "ender_3"\ndialect = "basic"\n', "'basic' .*'klipper'"),
+    ],
+)
+def test_a_value_out_of_range_is_told_with_file_key_value_and_range(
+    tmp_path: Path, load: Callable[[Path], object], text: str, said: str
+) -> None:
+    # regression: only the bound that was passed was told, and inf was taken
+    path = tmp_path / "wrong.toml"
+    path.write_text(text)
+    with pytest.raises(ProfileError, match=f"wrong.toml: key .*{said}"):
+        load(path)
+
+
+def test_a_file_tells_by_itself_what_kind_of_profile_it_is(tmp_path: Path) -> None:
+    own = {
+        "printers": 'inherits = "ender_3"\nname = "Mine"\n',
+        "materials": 'inherits = "pla"\nhotend_c = 220.0\n',
+        "processes": 'name = "Mine"\nlayer_height_mm = 0.2\nperimeters = 3\n',
+    }
+    for kind, text in own.items():
+        (tmp_path / f"{kind}.toml").write_text(text)
+        assert kind_of(tmp_path / f"{kind}.toml") == kind
+        assert all(kind_of(name) == kind for name in list_profiles(kind))  # type: ignore[arg-type]
+    (tmp_path / "none.toml").write_text('name = "Mine"\n')
+    with pytest.raises(ProfileError, match=r"none.toml: .*--kind"):
+        kind_of(tmp_path / "none.toml")
+    with pytest.raises(ProfileError, match="no such profile file"):
+        kind_of(tmp_path / "nowhere.toml")
+    with pytest.raises(ProfileError, match="'toaster' is no profile"):
+        kind_of("toaster")
 
 
 def test_a_circle_of_inheritance_is_refused(tmp_path: Path) -> None:
