@@ -55,6 +55,7 @@ MIDDLE_MM = (125.0, 105.0)
 CELL_MM = 0.5
 TRIES = 200
 HEAD_MM, HIGHER_MM = 15.0, 3.0
+SEEN_MM2 = 1.0  # of a cut's opening: no scanner looks into a closed hollow
 FULL_MM3 = 20.0  # of what the judge's head reaches: less tells nothing of how much is filled
 Solid = manifold3d.Manifold
 Case = tuple[str, str, int]
@@ -183,6 +184,9 @@ def make_cut(name: str, kind: str, seed: int) -> Cut | None:
         if not LEAST_MM3 <= piece.volume() <= min(MOST_MM3, 0.5 * whole.volume()):
             continue
         rest = whole - tool
+        opening_mm2 = 0.5 * (whole.surface_area() + piece.surface_area() - rest.surface_area())
+        if opening_mm2 < SEEN_MM2:
+            continue
         solid = sum(1 for body in rest.decompose() if body.volume() > 0.01)
         if solid <= bodies:  # nothing hangs in the air
             return Cut(whole, rest, piece, mesh, shift)
