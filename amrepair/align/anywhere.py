@@ -203,12 +203,17 @@ def pose_from_anywhere(
                 noise_is_measured=True,
                 progress=progress,
             )
-    if hunt.share < CLEARED:
+    was_thorough = hunt.share < CLEARED
+    if was_thorough:
         progress("align", 0.2, 1.0)
+        # what was laid wrong may look like clutter: more rotations are tried of all of it first
+        hunt.take(_worth_refining(clouds, field, THOROUGH))
+    if hunt.share < CLEARED:
+        progress("align", 0.3, 1.0)
         _leave_clutter(hunt, points_mm, rng)
     if hunt.share < WELL_EXPLAINED:
         progress("align", 0.4, 1.0)
-        _search_on(hunt)
+        _search_on(hunt, thorough=not (was_thorough and hunt.clouds is clouds))
     if clouds.size_mm < PIECE_RATIO * clouds.diagonal_mm:
         progress("align", 0.5, 1.0)
         hunt.take(_worth_refining(hunt.clouds, field, PIECE))
@@ -254,12 +259,13 @@ def _leave_clutter(
             break
 
 
-def _search_on(hunt: _Hunt) -> None:
-    """Search between the rotations that were tried, or among more of them."""
+def _search_on(hunt: _Hunt, *, thorough: bool) -> None:
+    """Search between the rotations that were tried, or among more of them unless that was done."""
     starts = hunt.twins()
     if hunt.share < MOSTLY_EXPLAINED:
         starts += _by_halves(hunt.best, hunt.clouds, hunt.field)
-        starts += _worth_refining(hunt.clouds, hunt.field, THOROUGH)
+        if thorough:
+            starts += _worth_refining(hunt.clouds, hunt.field, THOROUGH)
     else:
         starts += _worth_refining(hunt.clouds, hunt.field, QUICK, turn=BETWEEN)
     hunt.take(starts)

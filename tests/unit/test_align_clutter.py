@@ -12,7 +12,7 @@ from amrepair.align import Registration, align
 from amrepair.align.anywhere import Found
 from amrepair.align.clutter import Kept, noise_across, without_clutter
 from amrepair.align.refine import Refined
-from amrepair.align.search import spread_rotations
+from amrepair.align.search import THOROUGH, spread_rotations
 from amrepair.errors import AlignmentError
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
@@ -114,6 +114,30 @@ def rotated_by_a_quarter() -> Float[np.ndarray, "4 4"]:
     start[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     start[:3, 3] = (30.0, 5.0, 4.0)
     return start
+
+
+def test_what_lay_wrong_is_no_clutter_before_more_rotations_were_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # regression: few rotations had missed the pose of a view from below; its underside was then
+    # taken for a bed, and what was left, 9 % of it, lay 0.5 mm off or was said to be mirrored
+    part = sample_surface(stepped().body, 0.6, seed=9)[0]
+    low = part[part[:, 2] < 3.0]
+    monkeypatch.setattr(
+        "amrepair.align.anywhere._worth_refining",
+        lambda clouds, field, effort, **_: [
+            np.eye(4) if effort is THOROUGH else rotated_by_a_quarter()
+        ],
+    )
+    rims = Kept(low[low[:, 2] > 0.3], 0.5)
+    asked = []
+    monkeypatch.setattr(
+        "amrepair.align.anywhere.without_clutter", lambda points, rng: asked.append(rims) or [rims]
+    )
+    found = align(Scan(low, SIGMA_MM, "scanner", source="scan.ply"), stepped())
+    assert not asked
+    assert found.clutter_ratio == 0.0
+    assert np.abs(found.template_from_scan.matrix - np.eye(4)).max() < 0.01
 
 
 def test_the_other_hand_is_refused() -> None:
