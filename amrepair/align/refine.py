@@ -114,8 +114,13 @@ def refine_all(
     prior: Prior | None = None,
     max_iterations: int = MAX_ITERATIONS,
     enough_mm: float = 0.0,
+    outside_mm: float = 0.0,
 ) -> list[Refined]:
-    """`refine` from several poses, in their order; all steps at once where the field is a grid."""
+    """`refine` from several poses, in their order; all steps at once where the field is a grid.
+
+    With `outside_mm` points inside may be far off and none outside: there the loss is Huber's, of
+    this scale.
+    """
     if not len(matrices):
         return []
     centre = points_mm.mean(axis=0)
@@ -127,7 +132,7 @@ def refine_all(
     # neighbouring points err alike (process, calibration): against a prior all of them together
     # count as one
     limits = (float(len(local)), reach_mm, sigma_mm, end_scale_mm, enough_mm)
-    asked = (known, start_scale_mm, max_iterations, limits)
+    asked = (known, start_scale_mm, max_iterations, limits, outside_mm)
     if isinstance(template, OnGrid):
         hessians, residuals, ends = kernels.refine_all(
             local, rotations, places, *asked, template.grid_numbers
@@ -154,6 +159,7 @@ def _refine_by_asking(
     start_scale_mm: float,
     max_iterations: int,
     limits: tuple[float, float, float, float, float],
+    outside_mm: float,
     template: Template,
 ) -> tuple[Float[np.ndarray, "k 6 6"], Float[np.ndarray, "k n"], Int[np.ndarray, "k 2"]]:
     """As `refine_kernels.refine_all`, of any template."""
@@ -167,7 +173,7 @@ def _refine_by_asking(
             iterations += 1
             turned = local @ rotation.T
             f, gradient = template.distance_and_gradient(turned + place)
-            hessians[k], slope = kernels.normal_equations(turned, f, gradient, scale)
+            hessians[k], slope = kernels.normal_equations(turned, f, gradient, scale, outside_mm)
             ended, pace, scale = kernels.step(
                 hessians[k], slope, known, first, rotation, place, last, pace, scale, iterations,
                 limits,

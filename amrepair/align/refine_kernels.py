@@ -25,8 +25,12 @@ GO_ON, CONVERGED, ENOUGH = 0, 1, 2  # how a step may end
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def normal_equations(turned, f, gradient, scale):
-    """(6, 6) JᵀWJ and (6,) JᵀWf of the Geman–McClure loss; rotations about the points' origin."""
+def normal_equations(turned, f, gradient, scale, outside):
+    """(6, 6) JᵀWJ and (6,) JᵀWf of the Geman–McClure loss; rotations about the points' origin.
+
+    Where `outside` is not 0, the loss of what is outside (f > 0) is Huber's of that scale, or
+    Geman–McClure's where that pulls more.
+    """
     square = scale * scale
     # one name for each sum: arrays would keep the loop from running in vectors
     b0 = b1 = b2 = b3 = b4 = b5 = h00 = h10 = h11 = h20 = h21 = h22 = 0.0
@@ -36,6 +40,8 @@ def normal_equations(turned, f, gradient, scale):
         gx, gy, gz = gradient[n, 0], gradient[n, 1], gradient[n, 2]
         weight = square / (f[n] * f[n] + square)
         weight *= weight
+        if outside > 0.0 and f[n] > 0.0:
+            weight = max(weight, outside / max(f[n], outside))
         rx, ry, rz = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
         ux, uy, uz = weight * rx, weight * ry, weight * rz
         vx, vy, vz = weight * gx, weight * gy, weight * gz
@@ -151,7 +157,9 @@ def _asked(local, rotation, place, grid, turned, f, gradient):
 
 
 @njit(cache=True, nogil=True)
-def _to_its_end(local, rotation, place, known, scale, most, limits, grid, hessian, residual):
+def _to_its_end(
+    local, rotation, place, known, scale, most, limits, outside, grid, hessian, residual
+):
     """All steps of one pose, in place: iterations, and whether it converged."""
     n = len(local)
     turned, gradient = np.empty((n, 3)), np.empty((n, 3))
@@ -161,7 +169,7 @@ def _to_its_end(local, rotation, place, known, scale, most, limits, grid, hessia
     while iterations < most and ended == GO_ON:
         iterations += 1
         _asked(local, rotation, place, grid, turned, residual, gradient)
-        h, slope = normal_equations(turned, residual, gradient, scale)
+        h, slope = normal_equations(turned, residual, gradient, scale, outside)
         hessian[:] = h
         ended, pace, scale = step(
             h, slope, known, first, rotation, place, last, pace, scale, iterations, limits
@@ -171,7 +179,7 @@ def _to_its_end(local, rotation, place, known, scale, most, limits, grid, hessia
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def refine_all(local, rotations, places, known, scale, most, limits, grid):
+def refine_all(local, rotations, places, known, scale, most, limits, outside, grid):
     """Every pose moved to its minimum on a grid's field, in place.
 
     Returns (k, 6, 6) hessians, (k, n) residuals, (k, 2) iterations and whether it converged.
@@ -181,7 +189,7 @@ def refine_all(local, rotations, places, known, scale, most, limits, grid):
     ends = np.empty((count, 2), np.int64)
     for k in prange(count):
         ends[k, 0], ends[k, 1] = _to_its_end(
-            local, rotations[k], places[k], known, scale, most, limits, grid,
+            local, rotations[k], places[k], known, scale, most, limits, outside, grid,
             hessians[k], residuals[k],
         )  # fmt: skip
     return hessians, residuals, ends

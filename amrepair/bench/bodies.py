@@ -32,8 +32,11 @@ ENOUGH_SIGMAS = 0.05  # of the noise: a smaller step changes nothing that is ask
 NEARBY = 3.0  # limits: a point this near may yet come to lie on a piece
 ENOUGH = 0.93  # of the points, explained by two poses: nothing better is looked for
 # Nor where they explain all but outliers off the bend itself, which is neither piece's: so far from
-# the plane between them (of the diagonal) lie at least so many of the points.
+# the plane between them (of the diagonal), where at least so many of the points lie.
 BENT_RATIO, ENOUGH_BEYOND, LEAST_BEYOND = 0.06, 0.985, 0.5
+# Fewer explained there: no bend. Of 117 bent scans one had less than 0.93, of 27 broken ones two
+# had more than 0.85.
+LEAST_OF_PAIR = 0.9
 MOST_POLISHED = 2  # pairs of each pose, the best ones to begin with
 MOST_TRIED = 4  # poses of which a second piece is asked
 NEIGHBOURS, MOSTLY = 24, 0.9  # a place lies on the template where its neighbours do
@@ -43,14 +46,12 @@ CUTS = (0.3, 0.5, 0.7)  # shares of the scan on one side, along each of its main
 LEAST_TURNED_RAD, MOST_TURNED_RAD = 0.01, 0.5  # farther is another place that fits by chance
 HINGE_RATIO = 0.04  # of the diagonal: at the plane between the pieces both poses agree to this
 LEAST_PIECE = 0.05  # of the points
-LEAST_OF_PAIR = 0.6  # of the points, held by either pose
 LEAST_GAINED = 0.08  # of the points, by the second pose
 MOST_WRONG = 0.2  # of either piece, on the wrong side of the plane between them
 ANGLES, ALIKE = 36, 0.02  # of planes about the hinge; wrong by so little more is as good
 MOST_OF_BROKEN = 0.5  # where a pose holds more, the rest is a matter of its own
 MOST_OUTSIDE = 0.01  # of the points, beyond the noise, where something broke off
-SUNK_RATIO, SUNK_SHRINK, SUNK_STEPS = 0.01, 0.8, 30  # the loss's scale, first of the diagonal
-SUNK_TURN_RAD = 0.1  # a step turns no more
+SUNK_RATIOS = (0.01, 0.003)  # the loss's scale to begin with, of the diagonal
 SURFACE_RATIO = 1.0 / 60.0  # spacing of the template's points, of the diagonal
 
 Pose = Float[np.ndarray, "4 4"]
@@ -92,12 +93,13 @@ def standing_pose(
         best = _best_pair(untried[:MOST_TRIED], scene, best)
         tried = more
     alone = scene.held(scene.on(tried[0]))
-    if best is not None and best.explained >= max(LEAST_OF_PAIR, alone + LEAST_GAINED):
+    gained = 0.0 if best is None else best.explained - alone
+    if best is not None and best.beyond >= LEAST_OF_PAIR and gained >= LEAST_GAINED:
         return scene.finished(best.standing, best.normal, best.through_mm)
     if alone < MOST_OF_BROKEN:
-        broken = _nothing_outside(tried[:MOST_TRIED], scene)
+        broken = _nothing_outside(tried, scene)
         if broken is not None:
-            return scene.finished(broken)
+            return broken
     return scene.finished(tried[0])
 
 
@@ -107,45 +109,16 @@ def _nothing_outside(poses: Sequence[Pose], scene: _Scene) -> Pose | None:
     A view into a broken face: on the template lies what is left beside it, below all the rest. Laid
     on a flat side near by, half of the face sticks out, and nothing that breaks makes that.
     """
-    best, most = None, LEAST_PIECE
-    for pose in poses:
-        sunk = _sunk(pose, scene)
-        distance = scene.template.distance(moved(scene.cloud, sunk))
-        if (distance > scene.limit_mm).mean() > MOST_OUTSIDE:
-            continue
-        held = scene.held(distance >= -scene.limit_mm)
-        if held > most:
-            best, most = sunk, held
-    return best
-
-
-def _sunk(pose: Pose, scene: _Scene) -> Pose:
-    """The pose moved until nothing sticks out: points inside may be far off, outside none.
-
-    Gauss–Newton as in `refine`, with Geman–McClure's weights inside and Huber's outside.
-    """
-    points = scene.thinned.to(FEW_POINTS)
-    centre = points.mean(axis=0)
-    local, rotation = points - centre, pose[:3, :3].copy()
-    place = rotation @ centre + pose[:3, 3]
-    end_mm = SHARP * scene.limit_mm
-    for scale in np.maximum(
-        SUNK_RATIO * scene.diagonal_mm * SUNK_SHRINK ** np.arange(SUNK_STEPS), end_mm
-    ):
-        turned = local @ rotation.T
-        f, gradient = scene.template.distance_and_gradient(turned + place)
-        weight = (scale**2 / (f**2 + scale**2)) ** 2
-        weight = np.where(f > 0.0, np.maximum(weight, end_mm / np.maximum(f, end_mm)), weight)
-        jacobian = np.concatenate([np.cross(turned, gradient), gradient], axis=1)
-        hessian = (jacobian * weight[:, None]).T @ jacobian
-        hessian += 1e-6 * np.trace(hessian) / 6.0 * np.eye(6)
-        step = np.linalg.solve(hessian, -jacobian.T @ (weight * f))
-        step *= min(1.0, SUNK_TURN_RAD / max(float(np.linalg.norm(step[:3])), 1e-12))
-        rotation = rotation_from_vector(step[:3]) @ rotation
-        place = place + step[3:]
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = rotation, place - rotation @ centre
-    return found
+    few, best, most = scene.thinned.to(FEW_POINTS), None, LEAST_PIECE
+    for ratio in SUNK_RATIOS:
+        for pose in scene.refined(few, poses, ratio, outside=False):
+            distance = scene.template.distance(moved(scene.cloud, pose))
+            held = scene.held(np.abs(distance) <= scene.limit_mm)
+            if held > most and (distance > scene.limit_mm).mean() <= MOST_OUTSIDE:
+                best, most = pose, held
+    if best is None:
+        return None
+    return scene.refined(scene.thinned.to(LAST_POINTS), [best], 0.0, outside=False)[0]
 
 
 def _best_pair(poses: Sequence[Pose], scene: _Scene, best: _Pair | None = None) -> _Pair | None:
@@ -170,7 +143,7 @@ class _Pair:
     ----------
     explained, beyond
         Share of the places that are held by the pose of their piece: of all, and of those that the
-        bend itself leaves alone (0 where those are few).
+        bend itself leaves alone (of all where those are few).
     normal, through_mm
         Of the plane between the pieces, template's frame, away from the standing one.
     """
@@ -232,8 +205,13 @@ class _Scene:
         points: Float[np.ndarray, "k 3"],
         starts: Sequence[Pose],
         first_ratio: float = FIRST_RATIO,
+        *,
+        outside: bool = True,
     ) -> list[Pose]:
-        """Poses moved so that as many of the points as may be lie on the template."""
+        """Poses moved so that as many of the points as may be lie on the template.
+
+        Unless `outside`, those beyond it are drawn in from anywhere.
+        """
         end_mm = SHARP * self.limit_mm
         found = refine_all(
             points,
@@ -244,6 +222,7 @@ class _Scene:
             sigma_mm=self.sigma_mm,
             max_iterations=ITERATIONS,
             enough_mm=ENOUGH_SIGMAS * self.sigma_mm,
+            outside_mm=0.0 if outside else end_mm,
         )
         return [one.matrix for one in found]
 
@@ -386,10 +365,11 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     # a point of the second piece lies as far from the plane in its own pose as in the first
     height = np.where(on[0], placed[0] @ normal, placed[1] @ normal)
     beyond = np.abs(height) > BENT_RATIO * scene.diagonal_mm
-    share = float(held[beyond].mean()) if beyond.mean() > LEAST_BEYOND else 0.0
+    share = float(held.mean())
+    share_beyond = float(held[beyond].mean()) if beyond.mean() > LEAST_BEYOND else share
     in_front = float(((scene.surface_mm - through) @ normal > 0.0).mean())
     standing, away = (second, -normal) if in_front > 0.5 else (first, normal)
-    return _Pair(float(held.mean()), share, standing, away, through)
+    return _Pair(share, share_beyond, standing, away, through)
 
 
 def _hinge(

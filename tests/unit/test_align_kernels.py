@@ -14,20 +14,22 @@ from amrepair.template import fit_template
 from tests.analytic import box, noisy_scan_points, to_trimesh
 
 
-def plain(turned, f, gradient, scale):  # type: ignore[no-untyped-def]
+def plain(turned, f, gradient, scale, outside):  # type: ignore[no-untyped-def]
     weight = (scale**2 / (f**2 + scale**2)) ** 2
+    if outside:
+        weight = np.where(f > 0, np.maximum(weight, outside / np.maximum(f, outside)), weight)
     jacobian = np.concatenate([np.cross(turned, gradient), gradient], axis=1)
     weighted = jacobian * weight[:, None]
     return weighted.T @ jacobian, weighted.T @ f
 
 
-def test_normal_equations_are_those_of_numpy() -> None:
+@pytest.mark.parametrize("outside", [0.0, 0.3])
+def test_normal_equations_are_those_of_numpy(outside: float) -> None:
     rng = np.random.default_rng(0)
     turned, gradient = rng.normal(size=(2, 77, 3))
     f = rng.normal(size=77)
-    for made, asked in zip(
-        normal_equations(turned, f, gradient, 0.7), plain(turned, f, gradient, 0.7), strict=True
-    ):
+    said = (turned, f, gradient, 0.7, outside)
+    for made, asked in zip(normal_equations(*said), plain(*said), strict=True):
         assert np.allclose(made, asked, rtol=1e-12, atol=1e-12)
 
 

@@ -231,21 +231,23 @@ def test_a_bent_part_that_was_laid_elsewhere_is_found() -> None:
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.002
 
 
+@pytest.mark.parametrize("gone_mm", [1.4, 0.95])
 def test_a_broken_face_is_not_laid_on_the_side_that_is_gone(
-    monkeypatch: pytest.MonkeyPatch,
+    gone_mm: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("amrepair.bench.bodies.search", lambda *_, **__: [])
-    # regression: where a view shows mostly the face, it lay on a flat side, half of it outside
+    # regression: where a view shows mostly the face, it lay on a flat side, half of it outside; or
+    # inside, but with its peaks drawn onto that side
     plate = difference(box((0, 0, 0), (40, 24, 8)), box((30, 10, 6), (34, 14, 9)))
     rng = np.random.default_rng(2)
     top = sample_surface(plate.body, 0.5, seed=6)[0]
     top = top[(top[:, 0] > 28.0) & (top[:, 0] < 37.0) & (top[:, 2] > 5.0)]
     face = rng.uniform((0.0, 0.0, 0.0), (0.0, 24.0, 8.0), (4 * len(top), 3))
-    face[:, 0] = 38.6 + 0.5 * np.sin(0.9 * face[:, 1]) + 0.4 * np.cos(1.3 * face[:, 2])
+    face[:, 0] = 40.0 - gone_mm + 0.5 * np.sin(0.9 * face[:, 1]) + 0.4 * np.cos(1.3 * face[:, 2])
     points = np.concatenate([top, face])
     points += rng.normal(0, SIGMA_MM, points.shape)
     on_the_side = np.eye(4)
-    on_the_side[0, 3] = 1.4
+    on_the_side[0, 3] = gone_mm
     pose = standing_pose(points, plate, [on_the_side], SIGMA_MM, np.random.default_rng(0))
     off = (points @ pose[:3, :3].T + pose[:3, 3] - points)[: len(top)]
     assert float(np.sqrt((off**2).sum(axis=1).mean())) < 0.1
