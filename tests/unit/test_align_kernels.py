@@ -14,7 +14,7 @@ from amrepair.template import fit_template
 from tests.analytic import box, noisy_scan_points, to_trimesh
 
 
-def plain(turned, f, gradient, scale, outside):  # type: ignore[no-untyped-def]
+def plain(turned, f, gradient, scale, outside=0.0):  # type: ignore[no-untyped-def]
     weight = (scale**2 / (f**2 + scale**2)) ** 2
     if outside:
         weight = np.where(f > 0, np.maximum(weight, outside / np.maximum(f, outside)), weight)
