@@ -205,11 +205,13 @@ def _refuse_mirrored(
     """Refuse a left hand where a right hand was meant: its mirror image fits far better."""
     mirrored = explained_if_mirrored(points_mm, found, template, rng)
     if 1.0 - mirrored < MIRRORED_BETTER * (1.0 - ratio):
+        # a scan of another part may lie better mirrored, too
+        said = "shows the mirror image of" if mirrored >= DOUBTFUL else "does not fit"
         raise AlignmentError(
-            f"the scan {scan.source} shows the mirror image of its template: mirrored, "
+            f"the scan {scan.source} {said} its template: mirrored, "
             f"{mirrored:.0%} of its points lie within {found.inlier_mm:.2g} mm, as it is "
-            f"{ratio:.0%}; check the export's axes (left-handed?), or take the template of the "
-            "other hand"
+            f"{ratio:.0%}; check the part and the export's axes (left-handed?), or take the "
+            "template of the other hand"
         )
 
 

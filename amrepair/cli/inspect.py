@@ -216,8 +216,9 @@ def detect(
         return
     if chosen:
         console.out.print(f"Part: {chosen['template']}, confidence {chosen['confidence']:.2f}.")
+    count = len(anomaly.regions)
     console.out.print(
-        f"{len(anomaly.regions)} regions beyond {anomaly.threshold_mm:.3f} mm "
+        f"{count} {'region' if count == 1 else 'regions'} beyond {anomaly.threshold_mm:.3f} mm "
         f"({anomaly.threshold_source}); object score {anomaly.object_score:.3f} mm."
     )
     for region in anomaly.regions:

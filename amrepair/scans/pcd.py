@@ -86,7 +86,8 @@ def _ascii(body: bytes, header: PcdHeader, path: Path) -> dict[str, Float[np.nda
     try:
         table = np.loadtxt(io.BytesIO(body), ndmin=2) if body.strip() else np.zeros((0, 0))
     except ValueError as e:
-        raise InputError(f"{path}: the PCD text cannot be read ({e})") from e
+        said = str(e).partition(";")[0]  # what follows is numpy's advice to programmers
+        raise InputError(f"{path}: the PCD text cannot be read ({said})") from e
     if table.shape != (header.points, len(header.names)):
         raise InputError(
             f"{path}: the PCD header promises {header.points} points of {len(header.names)} "

@@ -86,7 +86,8 @@ def read_vertices(data: bytes, header: PlyHeader, path: Path) -> dict[str, Float
         try:
             table = np.loadtxt(lines, max_rows=n, ndmin=2) if n else np.zeros((0, len(names)))
         except ValueError as e:
-            raise InputError(f"{path}: the PLY text cannot be read ({e})") from e
+            said = str(e).partition(";")[0]  # what follows is numpy's advice to programmers
+            raise InputError(f"{path}: the PLY text cannot be read ({said})") from e
         if table.shape != (n, len(names)):
             raise InputError(
                 f"{path}: the PLY header promises {n} vertices of {len(names)} values, "

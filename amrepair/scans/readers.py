@@ -191,7 +191,8 @@ def _read_table(path: Path, frame: str) -> Scan:
         try:
             table = np.loadtxt(lines, delimiter=delimiter, ndmin=2)
         except ValueError as e:
-            raise InputError(f"{path}: the points cannot be read ({e})") from e
+            said = str(e).partition(";")[0]  # what follows is numpy's advice to programmers
+            raise InputError(f"{path}: the points cannot be read ({said})") from e
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: rows need at least x y z, the array has shape {table.shape}")
     names = ["x", "y", "z", "nx", "ny", "nz"] if table.shape[1] == 6 else ["x", "y", "z"]

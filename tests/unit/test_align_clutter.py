@@ -146,6 +146,19 @@ def test_the_other_hand_is_refused() -> None:
         aligned(stepped(), part * (-1.0, 1.0, 1.0), part[:0])
 
 
+def test_another_part_is_not_called_a_mirror_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    # regression: so was a small part of which three quarters fitted a flat side when mirrored
+    module = importlib.import_module("amrepair.align.align")
+    monkeypatch.setattr(module, "explained_if_mirrored", lambda *_: 0.75)
+    monkeypatch.setattr(module, "MIRRORED_BETTER", 1.0)
+    rng = np.random.default_rng(3)
+    part = sample_surface(stepped().body, 0.8, seed=3)[0]
+    away = scattered(rng, len(part))
+    monkeypatch.setattr("amrepair.align.anywhere.without_clutter", lambda points, rng: [])
+    with pytest.raises(AlignmentError, match="does not fit its template: mirrored, 75%"):
+        aligned(stepped(), part, away)
+
+
 def test_noise_that_was_not_said_is_measured() -> None:
     part = sample_surface(stepped().body, 0.4, seed=4)[0]
     rng = np.random.default_rng(0)
