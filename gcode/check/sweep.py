@@ -1,7 +1,8 @@
 """The nozzle is a body: its envelope, swept along every move over what stands on the bed.
 
 Slices of the envelope reach up to the next one, and the last to infinity; over a height field
-only their lower faces can touch. What is laid on the way stands there for the moves after it.
+only what looks down can touch, lower faces and cones. What is laid on the way stands there for the
+moves after it.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ from gcode.surfaces.heightfield import footprint_rows
 TIP_SLACK_MM = 0.2
 # The head's body must clear what stands there, up to the noise of the height field.
 BODY_SLACK_MM = 0.1
-MAX_CELLS = 12_000_000  # of the field and all its slices: 96 MB; beyond that cells are joined
+MAX_CELLS = (
+    4_000_000  # of a field: 100 MB with what is needed over it; beyond that cells are joined
+)
 # What is laid is looked at in cells of this size by slices that reach farther than this.
-WIDE_MM, WIDE_CELL_MM = 2.5, 0.2
+WIDE_MM, WIDE_CELL_MM = 2.6, 0.2
 EDGE_MM = 0.5  # of a window around moves
 MOST_SAID = 20
 
@@ -48,9 +51,8 @@ def sweep(
     worst = np.full(len(start), -np.inf)
     which = np.zeros(len(start), dtype=np.int64)
     swept = _Swept(start, end, pushed, width)
-    reach = [float(np.abs(np.array(part.polygon_mm)).max()) for part in slices]
-    near = [k for k, mm in enumerate(reach) if mm <= WIDE_MM]
-    far = [k for k, mm in enumerate(reach) if mm > WIDE_MM]
+    near = [k for k, part in enumerate(slices) if part.reach_mm <= WIDE_MM]
+    far = [k for k, part in enumerate(slices) if part.reach_mm > WIDE_MM]
     for own, found in (
         (near, swept.over(as_built, [slices[k] for k in near], grows=True)),
         (far, swept.over(as_built, [slices[k] for k in far], grows=False)),
@@ -62,11 +64,11 @@ def sweep(
         deeper = depth > worst
         worst = np.where(deeper, depth, worst)
         which = np.where(deeper, np.array(own)[of_own], which)
-    tip = np.array([part.z_from_mm < 1e-9 for part in slices])
+    tip = np.array([part.is_tip for part in slices])
     refusals = []
     for k in np.flatnonzero(worst > 0)[:MOST_SAID]:
         part = slices[int(which[k])]
-        slack = TIP_SLACK_MM if part.z_from_mm < 1e-9 else BODY_SLACK_MM
+        slack = _slack_mm(part)
         refusals.append(
             Refusal(
                 int(line[k]),
@@ -110,13 +112,21 @@ class _Swept:
             return None
         rows, columns = field.window(box_mm)
         cells = (rows.stop - rows.start) * (columns.stop - columns.start)
-        factor = math.ceil(math.sqrt(cells * (len(slices) + 1) / MAX_CELLS))
+        factor = math.ceil(math.sqrt(cells / MAX_CELLS))
         field = field.coarsened(factor)
         window, near = field.window(box_mm), field.crop(box_mm)
         if not near.z_mm.size:
             return None
-        dilated = np.stack([field.max_within(part.polygon_mm, window) for part in slices])
-        return self._run(near, slices, dilated, grows=grows)
+        need = np.full(near.shape, -np.inf)
+        which = np.zeros(near.shape, dtype=np.int8)
+        for k, part in enumerate(slices):
+            under_mm = field.max_within(
+                part.polygon_mm, window, widening_mm=part.widening_mm, height_mm=part.height_mm
+            )
+            own = under_mm - part.z_from_mm - _slack_mm(part)
+            which[own > need] = k
+            np.maximum(need, own, out=need)
+        return self._run(near, slices, need, which, grows=grows)
 
     def over_laid(
         self, slices: list[EnvelopeSlice]
@@ -134,14 +144,11 @@ class _Swept:
         if not slices or box_mm is None:
             return None
         size_mm = np.array(box_mm[2:]) - np.array(box_mm[:2])
-        cell_mm = max(
-            WIDE_CELL_MM, math.sqrt(float(np.prod(size_mm)) * (len(slices) + 1) / MAX_CELLS)
-        )
+        cell_mm = max(WIDE_CELL_MM, math.sqrt(float(np.prod(size_mm)) / MAX_CELLS))
         nx, ny = (int(v) for v in np.ceil(size_mm / cell_mm) + 1)
         nothing = np.full((ny, nx), -np.inf)
-        bare = HeightField(np.array(box_mm[:2]), cell_mm, nothing, np.ones((ny, nx), bool))
-        dilated = np.repeat(nothing[None], len(slices), axis=0)
-        return self._run(bare, slices, dilated, grows=True)
+        bare = HeightField(np.array(box_mm[:2]), cell_mm, nothing.copy(), np.ones((ny, nx), bool))
+        return self._run(bare, slices, nothing, np.zeros((ny, nx), np.int8), grows=True)
 
     def _box_below(self, z_mm: float) -> tuple[float, float, float, float] | None:
         """The box of the moves that come below a height."""
@@ -156,13 +163,14 @@ class _Swept:
         self,
         field: HeightField,
         slices: list[EnvelopeSlice],
-        dilated: Float[np.ndarray, "_s _ny _nx"],
+        need_mm: Float[np.ndarray, "_ny _nx"],
+        which: Int[np.ndarray, "_ny _nx"],
         *,
         grows: bool,
     ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        tables = [footprint_rows(part.polygon_mm, field.cell_mm) for part in slices]
-        tip = np.array([part.z_from_mm < 1e-9 for part in slices])
-        worst, which = kernels.sweep(
+        steps = [(step, k) for k, part in enumerate(slices) for step in part.steps]
+        tables = [footprint_rows(step.polygon_mm, field.cell_mm) for step, _ in steps]
+        worst, own = kernels.sweep(
             self.start_mm,
             self.end_mm,
             ((self.pushed_mm3 > 0) & grows).astype(np.int64),
@@ -170,11 +178,15 @@ class _Swept:
             field.z_mm.astype(np.float64).copy(),
             field.origin_mm.astype(np.float64),
             field.cell_mm,
-            np.array([part.z_from_mm for part in slices]),
-            np.arange(len(slices)),
-            dilated,
+            np.array([step.z_from_mm + _slack_mm(slices[k]) for step, k in steps]),
+            np.array([k for _, k in steps]),
+            need_mm,
+            which,
             np.concatenate([np.stack(table, axis=1) for table in tables]),
             np.concatenate([[0], np.cumsum([len(table[0]) for table in tables])]),
-            np.where(tip, TIP_SLACK_MM, BODY_SLACK_MM),
         )
-        return np.asarray(worst), np.asarray(which)
+        return np.asarray(worst), np.asarray(own)
+
+
+def _slack_mm(part: EnvelopeSlice) -> float:
+    return TIP_SLACK_MM if part.is_tip else BODY_SLACK_MM

@@ -10,20 +10,21 @@ from gcode.compiled import njit
 
 @njit(cache=True, nogil=True)
 def sweep(
-    start, end, laid, half_width, field, origin, cell, heights, above, dilated, rows, row_at, slack
+    start, end, laid, half_width, field, origin, cell, above, owner, need, which, rows, row_at
 ):
     """Worst contact of every move.
 
     Parameters: (n, 3) start and end, (n,) 1 where plastic is laid and its half width; the field
-    (ny, nx) of what stands there, which is raised; (s,) heights of the head's slices above the
-    tip, their names' order, (s, ny, nx) the field dilated by each slice; footprint rows (dy, low,
-    high) of each slice at row_at[s]:row_at[s+1]; (s,) allowed contact.
-    Returns (n,) depth of the worst contact (≤ 0: none), and its slice.
+    (ny, nx) of what stands there, which is raised; (s,) by how much what stands under a slice of
+    the head may stand above the tip, and whose slice it is; (ny, nx) how high the tip must at
+    least be and whose fault that is, both of which are raised; footprint rows (dy, low, high) of
+    each slice at row_at[s]:row_at[s+1].
+    Returns (n,) depth of the worst contact (≤ 0: none), and whose it is.
     """
-    n, slices = len(laid), len(heights)
+    n = len(laid)
     ny, nx = field.shape
     worst = np.full(n, -np.inf)
-    which = np.zeros(n, np.int64)
+    whose = np.zeros(n, np.int64)
     step = 0.5 * cell
     # what is laid can only be hit by a slice that comes below it afterwards
     later = np.empty(n + 1)
@@ -40,11 +41,9 @@ def sweep(
             iy = int(np.floor((y - origin[1]) / cell))
             if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
                 continue
-            for s in range(slices):
-                depth = dilated[s, iy, ix] - (z + heights[s]) - slack[s]
-                if depth > worst[k]:
-                    worst[k] = depth
-                    which[k] = above[s]
+            if need[iy, ix] - z > worst[k]:
+                worst[k] = need[iy, ix] - z
+                whose[k] = which[iy, ix]
         if laid[k] <= 0:
             continue
         for i in range(count + 1):  # what is laid now stands there from now on
@@ -63,16 +62,17 @@ def sweep(
                     if px * px + py * py > half_width[k] * half_width[k]:
                         continue
                     field[iy, ix] = z
-                    raise_dilated(dilated, rows, row_at, iy, ix, z, heights, slack, later[k])
-    return worst, which
+                    raise_need(need, which, rows, row_at, iy, ix, z, above, owner, later[k])
+    return worst, whose
 
 
 @njit(cache=True, nogil=True)
-def raise_dilated(dilated, rows, row_at, iy, ix, z, heights, slack, later):
+def raise_need(need, which, rows, row_at, iy, ix, z, above, owner, later):
     """Every place of the head that covers this column sees the new height."""
-    slices, ny, nx = dilated.shape
-    for s in range(slices):
-        if z - slack[s] <= later + heights[s]:
+    ny, nx = need.shape
+    for s in range(len(above)):
+        least = z - above[s]
+        if least <= later:
             continue
         for r in range(row_at[s], row_at[s + 1]):
             row = iy - rows[r, 0]
@@ -81,4 +81,6 @@ def raise_dilated(dilated, rows, row_at, iy, ix, z, heights, slack, later):
             first = max(0, ix - rows[r, 2])
             last = min(nx - 1, ix - rows[r, 1])
             for column in range(first, last + 1):
-                dilated[s, row, column] = max(dilated[s, row, column], z)
+                if least > need[row, column]:
+                    need[row, column] = least
+                    which[row, column] = owner[s]

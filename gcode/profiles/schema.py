@@ -16,6 +16,7 @@ Ratio = Annotated[float, Field(ge=0, le=1)]
 Xy = tuple[float, float]
 Xyz = tuple[float, float, float]
 _ROUND_SIDES = 48  # 0.2 % beyond the circle
+_CONE_STEP_MM = 0.1
 
 
 class _Profile(BaseModel):
@@ -42,8 +43,16 @@ class EnvelopeSlice(BaseModel):
 
     `polygon_mm` is relative to the nozzle tip, counter-clockwise; the slice occupies
     `z_from_mm` to the next slice's `z_from_mm` above the tip (the last one: up to infinity).
-    Over a height field, whose columns are solid down to the bed, only `z_from_mm` matters. In a
-    file, `radius_mm` (about the axis) or `box_mm` (x0, y0, x1, y1) may stand for the polygon.
+    Over a height field, whose columns are solid down to the bed, only the side that looks down
+    matters. In a file, `radius_mm` (about the axis) or `box_mm` (x0, y0, x1, y1) may stand for the
+    polygon. A cone widens from `radius_mm` at `z_from_mm` to `radius_to_mm` at `z_to_mm`.
+
+    Attributes
+    ----------
+    widening_mm
+        How far a cone's upper rim lies outside of the polygon; 0: none.
+    z_to_mm
+        Height of that rim above the tip.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -51,13 +60,18 @@ class EnvelopeSlice(BaseModel):
     part: Literal["nozzle", "block", "duct", "carriage", "gantry"]
     z_from_mm: Annotated[float, Field(ge=0)]
     polygon_mm: Annotated[tuple[Xy, ...], Field(min_length=3)]
+    widening_mm: Annotated[float, Field(ge=0)] = 0.0
+    z_to_mm: float | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _outline(cls, data: Any) -> Any:
         if not isinstance(data, dict) or "polygon_mm" in data:
             return data
-        rest = {key: value for key, value in data.items() if key not in {"radius_mm", "box_mm"}}
+        short = {"radius_mm", "radius_to_mm", "box_mm"}
+        rest = {key: value for key, value in data.items() if key not in short}
+        if "radius_to_mm" in data:
+            rest["widening_mm"] = float(data["radius_to_mm"]) - float(data.get("radius_mm", 0.0))
         if "radius_mm" in data:
             corner_mm = float(data["radius_mm"]) / math.cos(math.pi / _ROUND_SIDES)
             angles = [2 * math.pi * (k + 0.5) / _ROUND_SIDES for k in range(_ROUND_SIDES)]
@@ -79,6 +93,44 @@ class EnvelopeSlice(BaseModel):
             if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) < -1e-9:
                 raise ValueError("must be a convex polygon, counter-clockwise")
         return polygon
+
+    @model_validator(mode="after")
+    def _upward(self) -> EnvelopeSlice:
+        if (self.z_to_mm is None) != (self.widening_mm == 0):
+            raise ValueError("a cone has both radius_to_mm, more than radius_mm, and z_to_mm")
+        if self.z_to_mm is not None and self.z_to_mm <= self.z_from_mm:
+            raise ValueError(f"z_to_mm must be more than z_from_mm ({self.z_from_mm:g})")
+        return self
+
+    @property
+    def is_tip(self) -> bool:
+        """Whether it is the flat around the bore."""
+        return self.z_from_mm < 1e-9
+
+    @property
+    def height_mm(self) -> float:
+        """Of a cone, from rim to rim; 0: none."""
+        return 0.0 if self.z_to_mm is None else self.z_to_mm - self.z_from_mm
+
+    @property
+    def reach_mm(self) -> float:
+        """How far from the axis it reaches in X or Y, its rim included."""
+        return max(abs(v) for corner in self.polygon_mm for v in corner) + self.widening_mm
+
+    @property
+    def steps(self) -> tuple[EnvelopeSlice, ...]:
+        """A cone as slices that do not widen, no more than half a step off it; others as is."""
+        if self.widening_mm == 0:
+            return (self,)
+        count = math.ceil(self.height_mm / _CONE_STEP_MM)
+        rim_mm = max(math.hypot(x, y) for x, y in self.polygon_mm)
+        found = []
+        for k in range(count + 1):
+            wider = 1.0 + self.widening_mm * k / count / rim_mm
+            polygon_mm = tuple((x * wider, y * wider) for x, y in self.polygon_mm)
+            z_mm = self.z_from_mm + self.height_mm * max(k - 0.5, 0.0) / count
+            found.append(EnvelopeSlice(part=self.part, z_from_mm=z_mm, polygon_mm=polygon_mm))
+        return tuple(found)
 
 
 class StartMacro(BaseModel):

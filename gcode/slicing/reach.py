@@ -29,11 +29,6 @@ class Obstacle:
     part: EnvelopeSlice
     least_tip_mm: Float[np.ndarray, "ny nx"]
 
-    @property
-    def is_tip(self) -> bool:
-        """Whether it is the flat around the bore."""
-        return self.part.z_from_mm < 1e-9
-
 
 def least_tip(
     part: EnvelopeSlice, field: HeightField, window: tuple[slice, slice], finer: int = 1
@@ -41,7 +36,19 @@ def least_tip(
     """How high the tip must at least be for a slice to clear all, wherever in its cell it is.
 
     By column of the window, each cut into `finer` × `finer`.
+
+    A cone is asked about at the middles of the field's own cells: half a cell aside it is half a
+    cell higher, not a wall.
     """
+    if part.widening_mm > 0:
+        under_mm = field.max_within(
+            part.polygon_mm,
+            window,
+            aside_mm=SIDE_MM,
+            widening_mm=part.widening_mm,
+            height_mm=part.height_mm,
+        )
+        return (under_mm - part.z_from_mm - PRESS_MM).repeat(finer, axis=0).repeat(finer, axis=1)
     rows, columns = (finer * (w.stop - w.start) for w in window)
     least = np.empty((rows, columns))
     cell_mm = field.cell_mm / finer

@@ -143,8 +143,13 @@ class HeightField:
         window: tuple[slice, slice] | None = None,
         *,
         aside_mm: float = 0.0,
+        widening_mm: float = 0.0,
+        height_mm: float = 0.0,
     ) -> Float[np.ndarray, "_my _mx"]:
         """Greatest height under a convex polygon placed with its origin on each cell's centre.
+
+        Or under a cone of which it is the lower rim: what lies farther out counts for less, by as
+        much as the cone is higher there.
 
         Parameters
         ----------
@@ -155,9 +160,19 @@ class HeightField:
             Rows and columns of the cells that are asked about; all by default.
         aside_mm
             The origin may lie this far from its cell's centre, each way.
+        widening_mm, height_mm
+            How far the cone's upper rim lies outside of the polygon, and above it. The head must
+            be wider there: the cone is taken to go on for two cells.
         """
         ny, nx = self.shape
         rows, columns = window or (slice(0, ny), slice(0, nx))
+        if widening_mm > 0:
+            far = widening_mm / self.cell_mm
+            margin = math.ceil(far) + 2
+            wider = tuple(slice(w.start - margin, w.stop + margin) for w in (rows, columns))
+            under = self.max_within(polygon_mm, (wider[0], wider[1]), aside_mm=aside_mm)
+            found = kernels.less_with_distance(under, height_mm / far, far + 2.0)
+            return np.asarray(found[margin : len(found) - margin, margin : len(found[0]) - margin])
         dy, low, high = footprint_rows(polygon_mm, self.cell_mm, aside_mm=aside_mm)
         box = len(dy) > 0 and (low == low[0]).all() and (high == high[0]).all()
         if not box:

@@ -218,3 +218,48 @@ def beside_lines(
                 if ox * ox + oy * oy <= far * far:
                     found[iy, ix] = max(found[iy, ix], height[n])
     return found
+
+
+@njit(cache=True, nogil=True)
+def less_with_distance(z: Any, rise: float, within: float) -> Any:
+    """Greatest of all cells' values less `rise` for every cell of distance, up to `within` cells.
+
+    Four sweeps hand on from cell to cell which one's value wins (Danielsson 1980, with weights).
+    What wins at a neighbour but is too far from here hides what is lower and nearer: the answer may
+    then be too low, yet no lower than the greatest of all cells there less `rise × (within - √2)`.
+    """
+    ny, nx = z.shape
+    out = z.copy()
+    from_y = np.empty((ny, nx), np.int32)
+    from_x = np.empty((ny, nx), np.int32)
+    for iy in range(ny):
+        for ix in range(nx):
+            from_y[iy, ix] = iy
+            from_x[iy, ix] = ix
+    for down in (True, False):
+        for row in range(ny):
+            iy = row if down else ny - 1 - row
+            before = iy - 1 if down else iy + 1
+            for right in (True, False):
+                for column in range(nx):
+                    ix = column if right else nx - 1 - column
+                    back = ix - 1 if right else ix + 1
+                    for k in range(4):
+                        # the row before, where it was swept already, and the cell before
+                        jy = iy if k == 3 else before
+                        jx = back if k == 3 else ix + k - 1
+                        if jy < 0 or jy >= ny or jx < 0 or jx >= nx:
+                            continue
+                        sy, sx = from_y[jy, jx], from_x[jy, jx]
+                        most = z[sy, sx]
+                        if most <= out[iy, ix]:
+                            continue
+                        far = np.sqrt(float((sy - iy) ** 2 + (sx - ix) ** 2))
+                        if far > within:
+                            continue
+                        value = most - rise * far
+                        if value > out[iy, ix]:
+                            out[iy, ix] = value
+                            from_y[iy, ix] = sy
+                            from_x[iy, ix] = sx
+    return out

@@ -11,19 +11,24 @@ from scipy import ndimage
 
 @dataclass(frozen=True)
 class HeadSlice:
-    """What the head covers from a height over the tip upward: a disc, or a box around the bore."""
+    """What the head covers from a height over the tip upward: a disc, or a box around the bore.
+
+    Or a cone, from `radius_mm` to `radius_to_mm` at `to_mm` above the tip.
+    """
 
     above_mm: float
     radius_mm: float = 0.0
     box_mm: tuple[float, float, float, float] | None = None
+    radius_to_mm: float = 0.0
+    to_mm: float = 0.0
 
 
-# An E3D V6 nozzle of 0.4 mm (1 mm flat, cone, 7 mm hexagon across the corners), its block, and the
+# An E3D V6 nozzle of 0.4 mm (1 mm flat, cone, 7 mm hexagon across the flats), its block, and the
 # fan duct of a Prusa MK3S, off the published drawings; the extruder over them as Cura's definition
 # of the machine has it, from the height on that PrusaSlicer keeps clear of other parts.
 MK3S_HEAD = (
     HeadSlice(0.0, radius_mm=0.5),
-    HeadSlice(0.8, radius_mm=1.6),
+    HeadSlice(0.0, radius_mm=0.5, radius_to_mm=2.5, to_mm=2.0),
     HeadSlice(2.0, radius_mm=4.2),
     HeadSlice(4.5, box_mm=(-9.0, -18.0, 14.0, 9.0)),
     HeadSlice(6.0, box_mm=(-24.0, -32.0, 24.0, 22.0)),
@@ -35,6 +40,8 @@ def grown(
     tops_mm: np.ndarray, cell_mm: float, part: HeadSlice, window: tuple[slice, slice]
 ) -> np.ndarray:
     """Highest thing under a slice of the head, by the column that the bore is over."""
+    if part.radius_to_mm > 0:
+        return under_cone(tops_mm, cell_mm, part)[window]
     if part.box_mm is not None:
         x0, y0, x1, y1 = (v / cell_mm for v in part.box_mm)
         size = (int(x1 - x0) | 1, int(y1 - y0) | 1)
@@ -47,6 +54,31 @@ def grown(
     corner = np.array([window[0].start, window[1].start])
     shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
     return _highest_under(tops_mm, under, corner, shape)
+
+
+def under_cone(tops_mm: np.ndarray, cell_mm: float, part: HeadSlice) -> np.ndarray:
+    """Highest thing under a cone, each as much lower as the cone is higher there."""
+    n = int(np.ceil(part.radius_to_mm / cell_mm))
+    i, j = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
+    apart = np.hypot(i, j) * cell_mm
+    keep = apart < part.radius_to_mm
+    rise = (part.to_mm - part.above_mm) / (part.radius_to_mm - part.radius_mm)
+    less = rise * np.maximum(apart[keep] - part.radius_mm, 0.0)
+    # what no neighbour is lower than lies behind one of them, seen from anywhere
+    edges = np.argwhere(tops_mm > ndimage.minimum_filter(tops_mm, 3, mode="nearest"))
+    return _spread(tops_mm, edges, np.stack([i[keep], j[keep]], axis=1), less)
+
+
+@njit(cache=True)
+def _spread(tops, edges, under, less):  # type: ignore[no-untyped-def]
+    out = tops.copy()
+    for e in range(len(edges)):
+        i, j = edges[e]
+        for u in range(len(under)):
+            a, b = i + under[u, 0], j + under[u, 1]
+            if 0 <= a < out.shape[0] and 0 <= b < out.shape[1]:
+                out[a, b] = max(out[a, b], tops[i, j] - less[u])
+    return out
 
 
 @njit(cache=True)

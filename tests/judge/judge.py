@@ -10,7 +10,7 @@ import trimesh
 from numba import njit
 from scipy import ndimage
 
-from tests.judge.head import MK3S_HEAD, HeadSlice, reachable
+from tests.judge.head import MK3S_HEAD, HeadSlice, reachable, under_cone
 from tests.judge.text import Steps, read_steps
 from tests.judge.voxels import Voxels, column_tops, occupancy
 
@@ -190,20 +190,22 @@ def _contact(
     """Deepest contact of the head with what stood there, mm, and its line."""
     worst, line = -np.inf, 0
     for part in head if len(steps.line) else ():
-        if part.box_mm is None:
+        if part.radius_to_mm > 0:
+            under, over = np.zeros((1, 2), np.int64), under_cone(tops, cell, part)
+        elif part.box_mm is None:
             n = int(np.ceil(part.radius_mm / cell))
             i, j = np.mgrid[-n : n + 1, -n : n + 1]
             under = np.argwhere(np.hypot(i, j) * cell < part.radius_mm) - n
-            grown = tops
+            over = tops
         else:
             x0, y0, x1, y1 = (v / cell for v in part.box_mm)
             size = (int(x1 - x0) | 1, int(y1 - y0) | 1)
             middle = (round((x0 + x1) / 2), round((y0 + y1) / 2))
             under = np.zeros((1, 2), np.int64)
-            grown = ndimage.maximum_filter(tops, size, mode="constant")
-            grown = ndimage.shift(grown, (-middle[0], -middle[1]), order=0, cval=0.0)
+            over = ndimage.maximum_filter(tops, size, mode="constant")
+            over = ndimage.shift(over, (-middle[0], -middle[1]), order=0, cval=0.0)
         depth, at = _deepest(
-            steps.start_mm, steps.end_mm, grown, low, cell, part.above_mm, under, tops.max()
+            steps.start_mm, steps.end_mm, over, low, cell, part.above_mm, under, tops.max()
         )
         if depth > worst:
             worst, line = depth, int(steps.line[at])

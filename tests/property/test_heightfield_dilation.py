@@ -65,3 +65,31 @@ def test_the_greatest_height_under_an_outline(
                 for w in (surely, maybe)
             )
             assert least <= got[iy, ix] <= most
+
+
+@given(
+    st.floats(0.3, 2.6),
+    st.floats(0.2, 3.0),
+    st.sampled_from([0.0, 0.6, 0.95]),
+    st.integers(0, 1000),
+)
+def test_what_stands_beside_a_cone_counts_for_less(
+    widening_mm: float, height_mm: float, bare: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    z_mm = np.where(rng.random((9, 7)) < bare, 0.0, rng.uniform(0.0, 9.0, (9, 7)))
+    field = HeightField(np.array([3.0, -2.0]), CELL_MM, z_mm, np.ones((9, 7), dtype=bool))
+    point = [(0.01, 0.01), (-0.01, 0.01), (-0.01, -0.01), (0.01, -0.01)]
+    got = field.max_within(point, widening_mm=widening_mm, height_mm=height_mm)
+    # the head is wider above the cone: what stands there counts, too
+    wider_mm = widening_mm + 4 * CELL_MM
+    rows, columns = np.indices(field.shape)
+    for iy in range(field.shape[0]):
+        for ix in range(field.shape[1]):
+            apart_mm = CELL_MM * np.hypot(rows - iy, columns - ix)
+            above = z_mm[apart_mm <= wider_mm].max() - height_mm
+            counted = z_mm - height_mm / widening_mm * apart_mm
+            least, most = (
+                counted[apart_mm <= widening_mm + far_mm + 1e-9].max() for far_mm in (0, 2 * CELL_MM)
+            )
+            assert max(least, above) - 0.02 <= max(got[iy, ix], above) <= max(most, above) + 1e-9

@@ -236,6 +236,17 @@ def test_a_travel_into_the_part_is_refused_and_one_above_it_passes() -> None:
     assert not find_refusals(program(high), SETUP, as_built=wall, initial=start)
 
 
+@pytest.mark.parametrize(("beside_mm", "hits"), [(0.6, True), (1.4, False)])
+def test_the_nozzle_is_a_cone(beside_mm: float, hits: bool) -> None:
+    # regression: beside a wall 0.6 mm higher than the tip it counted as no wider than its flat
+    wall = standing(10.0, 80.0, 84.0)
+    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    x = 80.0 - beside_mm
+    along = f"G1 X{x} Y60 Z9.4 F3000\nG1 X{x} Y70\n"
+    refusals = find_refusals(program(along), SETUP, as_built=wall, initial=start)
+    assert any("the nozzle (0.1 mm above the tip) hits" in r.what for r in refusals) == hits
+
+
 @pytest.mark.parametrize(("gap", "hits"), [(6.0, True), (40.0, False)])
 def test_the_heater_block_is_a_body_too(gap: float, hits: bool) -> None:
     # the tip stays beside a wall 7 mm higher: the block, 4.5 mm above the tip, must not meet it

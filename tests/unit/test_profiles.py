@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gcode.errors import ProfileError
@@ -29,6 +30,34 @@ def test_every_shipped_printer_loads_and_fits_its_own_bed(name: str) -> None:
         assert 0 <= z <= printer.max_z_mm
     assert printer.envelope[0].z_from_mm == 0
     assert len(printer.sha256) == 64
+
+
+@pytest.mark.parametrize("name", list_profiles("printers"))
+def test_every_shipped_nozzle_is_a_cone(name: str) -> None:
+    # regression: up to 0.8 mm over the tip it was no wider than its flat, 1 mm
+    flat, cone, hexagon = load_printer(name).envelope[:3]
+    assert flat.is_tip and cone.widening_mm > 0
+    for step in cone.steps:
+        radius_mm = np.abs(step.polygon_mm).max()
+        on_cone_mm = cone.z_from_mm + (radius_mm - 0.6) * cone.height_mm / cone.widening_mm
+        assert step.z_from_mm == pytest.approx(on_cone_mm, abs=0.06)
+    assert cone.reach_mm == pytest.approx(2.5, abs=0.01)
+    assert hexagon.z_from_mm == cone.z_to_mm
+
+
+@pytest.mark.parametrize(
+    "slice_text",
+    [
+        "z_from_mm = 0.1\nradius_mm = 0.6\nradius_to_mm = 2.5",
+        "z_from_mm = 0.1\nradius_mm = 0.6\nradius_to_mm = 0.5\nz_to_mm = 2.0",
+        "z_from_mm = 0.1\nradius_mm = 0.6\nradius_to_mm = 2.5\nz_to_mm = 0.1",
+    ],
+)
+def test_half_a_cone_is_refused(slice_text: str, tmp_path: Path) -> None:
+    own = tmp_path / "mine.toml"
+    own.write_text(f'inherits = "prusa_mk3s"\n[[envelope]]\npart = "nozzle"\n{slice_text}\n')
+    with pytest.raises(ProfileError, match=r"mine\.toml.*envelope"):
+        load_printer(own)
 
 
 @pytest.mark.parametrize("name", list_profiles("materials"))

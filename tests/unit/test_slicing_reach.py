@@ -63,3 +63,16 @@ def test_a_tower_beside_a_low_place_keeps_off_what_would_hit_it(
     window = (here[0] - 1.0, here[1] - 1.0, here[0] + 1.0, here[1] + 1.0)
     reach = Reach(field.raised(z_mm), load_setup(printer).printer, window_mm=window)
     assert bool(reach.at(0.2).all()) == free
+
+
+def test_the_cone_keeps_off_a_wall_that_its_flat_passes() -> None:
+    # regression: a wall 0.7 mm higher than the tip was passed at half a flat's width
+    z_mm = np.zeros((60, 120))
+    z_mm[:, 60:] = 5.0
+    field = HeightField(np.zeros(2), 0.1, z_mm, np.ones((60, 120), dtype=bool))
+    reach = Reach(field, load_setup(printer="prusa_mk3s").printer, finer=2)
+    for below_mm, beside_mm in ((0.3, 0.8), (0.7, 1.2), (1.5, 2.0)):  # at 45°, from the flat's rim
+        free = reach.at(5.0 - below_mm)[60]
+        nearest_mm = 6.0 - 0.05 * (np.flatnonzero(free).max() + 1)
+        assert nearest_mm == pytest.approx(beside_mm, abs=0.2)
+        assert not free[round((6.0 - beside_mm + 0.2) / 0.05) :].any()
