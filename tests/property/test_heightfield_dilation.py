@@ -90,6 +90,6 @@ def test_what_stands_beside_a_cone_counts_for_less(
             above = z_mm[apart_mm <= wider_mm].max() - height_mm
             counted = z_mm - height_mm / widening_mm * apart_mm
             least, most = (
-                counted[apart_mm <= widening_mm + far_mm + 1e-9].max() for far_mm in (0, 2 * CELL_MM)
+                counted[apart_mm <= widening_mm + cells * CELL_MM + 1e-9].max() for cells in (0, 2)
             )
             assert max(least, above) - 0.02 <= max(got[iy, ix], above) <= max(most, above) + 1e-9

@@ -36,7 +36,8 @@ def test_every_shipped_printer_loads_and_fits_its_own_bed(name: str) -> None:
 def test_every_shipped_nozzle_is_a_cone(name: str) -> None:
     # regression: up to 0.8 mm over the tip it was no wider than its flat, 1 mm
     flat, cone, hexagon = load_printer(name).envelope[:3]
-    assert flat.is_tip and cone.widening_mm > 0
+    assert flat.is_tip
+    assert cone.widening_mm > 0
     for step in cone.steps:
         radius_mm = np.abs(step.polygon_mm).max()
         on_cone_mm = cone.z_from_mm + (radius_mm - 0.6) * cone.height_mm / cone.widening_mm
