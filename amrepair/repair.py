@@ -176,7 +176,7 @@ class RepairPlan:
     >>> plan.within_tolerance, len(plan.to_fill), plan.too_much
     (False, 1, ())
     >>> round(plan.unreachable_mm3 / plan.deficit.missing_mm3, 1)  # a strip beside the cliff
-    0.1
+    0.2
     """
 
     registration: Registration

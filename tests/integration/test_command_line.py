@@ -240,7 +240,8 @@ def test_a_patch_on_what_stands_there(chipped: dict[str, Path], tmp_path: Path) 
     words = ["slice", tmp_path / "piece.stl", "-o", out, "--as-built", names["broken"], "--json"]
     done = call(*words, program="gcode")
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["beads_mm3"] == pytest.approx(76.8, rel=0.08)
+    # less a strip along two walls, where the nozzle's cone does not get down
+    assert 0.88 * 76.8 <= json.loads(done.stdout)["beads_mm3"] <= 76.8
     done = call("check", out, "--as-built", names["broken"], program="gcode")
     assert done.returncode == 0, done.stderr
     # the same program on the part as it should be would plough through it
