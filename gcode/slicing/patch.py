@@ -22,7 +22,7 @@ from gcode.slicing.job import Unprintable
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch_beads import LEAST_THICK_MM
-from gcode.slicing.patch_laying import begin, emit, end
+from gcode.slicing.patch_laying import after_first, begin, emit, end
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_order import stages_of
 from gcode.slicing.patch_passes import AGREE_MM, NOT_LISTED_MM3, plan_passes
@@ -134,9 +134,13 @@ def slice_patch(
     passes = plan_passes(model, grid, setup, progress)
     pen = begin(setup, as_built, start_mm)
     laid_mm3 = 0.0
+    first = True
     for stage in stages_of(passes, model, pen.position_mm[:2]):
         for one in stage.passes:
-            laid_mm3 += emit(pen, one, stage.reach, setup)
+            laid_mm3 += emit(pen, one, stage.reach, setup, first=first)
+            if first and standalone:
+                after_first(pen, setup)
+            first = False
     end(pen, setup, as_built, start_mm)
     unreachable, regions = _left_over(model)
     return PatchPlan(

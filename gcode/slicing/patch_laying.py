@@ -86,9 +86,18 @@ def end(
     pen.add(SetFan(0.0))
 
 
-def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
-    """Lay one pass; returns its plastic."""
+def after_first(pen: Pen, setup: PrintSetup) -> None:
+    """As hot as the material is printed otherwise; nothing waits for it."""
+    if setup.material.repair_first_bead_delta_c > 0:
+        pen.add(SetHotend(setup.material.hotend_c))
+
+
+def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup, *, first: bool) -> float:
+    """Lay one pass, the first one no faster than a first layer; returns its plastic."""
     pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
+    speed_mm_s = setup.process.repair_speed_mm_s
+    if first:
+        speed_mm_s = min(speed_mm_s, setup.process.first_layer_speed_mm_s)
     laid_mm3 = 0.0
     planar = isinstance(one.tip_mm, float)
     # along a surface they are in order: the lowest first
@@ -109,7 +118,7 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup) -> float:
         pen.extrude(
             np.column_stack([chain.xy_mm, chain.z_mm]),
             chain.section_mm2,
-            speed_mm_s=setup.process.repair_speed_mm_s,
+            speed_mm_s=speed_mm_s,
             role=chain.role,
             width_mm=width_of(width_mm, one.height_mm),
             height_mm=one.height_mm,

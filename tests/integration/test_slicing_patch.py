@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import manifold3d as m3
 import numpy as np
@@ -15,7 +16,7 @@ from amrepair.simulate.world import World
 from gcode.check import find_refusals
 from gcode.errors import SliceError
 from gcode.firmware.motion import MotionBatch
-from gcode.moves import Extrude, LayerChange, ModalState, Role, Toolpath, Travel
+from gcode.moves import Extrude, LayerChange, ModalState, Role, SetHotend, Toolpath, Travel
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
@@ -174,6 +175,35 @@ def test_a_standalone_patch_never_homes_z_and_ends_cold() -> None:
     assert not find_refusals(program, SETUP, as_built=field)
     assert "M104 S0" in program.text
     assert "M140 S0" in program.text
+
+
+def test_the_first_pass_is_slower_and_hotter_and_the_rest_is_not() -> None:
+    # regression: a patch of its own was laid as hot as its first bead to the end
+    missing = POCKETS["flat"]
+    field = HeightField.from_manifold(BLOCK - missing, 0.25, margin_mm=8.0)
+    fast = SETUP.process.model_copy(update={"repair_speed_mm_s": 35.0})
+    setup = replace(SETUP, process=fast)
+    plan = slice_patch(
+        missing, setup, as_built=field, grid=LayerGrid.from_setup(setup), standalone=True
+    )
+    hot_c = 0.0
+    speeds: list[set[float]] = []
+    heats: list[set[float]] = []
+    for move in plan.toolpath:
+        if isinstance(move, SetHotend):
+            hot_c = move.temperature_c
+        elif isinstance(move, LayerChange):
+            speeds.append(set())
+            heats.append(set())
+        elif isinstance(move, Extrude):
+            speeds[-1].add(move.speed_mm_s)
+            heats[-1].add(hot_c)
+    material, process = setup.material, setup.process
+    assert material.repair_first_bead_delta_c > 0
+    assert heats[0] == {material.hotend_c + material.repair_first_bead_delta_c}
+    assert speeds[0] == {process.first_layer_speed_mm_s}
+    assert all(heat == {material.hotend_c} for heat in heats[1:])
+    assert all(speed == {process.repair_speed_mm_s} for speed in speeds[1:])
 
 
 def test_a_deep_narrow_shaft_is_out_of_reach_and_said_so() -> None:
