@@ -151,6 +151,11 @@ def in_box(
     return inside
 
 
+def unit_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The same directions, one long; zero stays zero."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+
+
 def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """Rotation matrix of an axis-angle vector (Rodrigues), exact near zero."""
     angle_rad = float(np.linalg.norm(vector_rad))

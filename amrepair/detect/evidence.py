@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
 from amrepair.detect.near import has_near
 from amrepair.detect.rays import RangeImage, clearances
 from amrepair.detect.surfels import Surfels
+from amrepair.frames import unit_vectors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
@@ -211,7 +212,7 @@ def with_stubs(
         return evidence
     off, normal = evidence.off.copy(), evidence.normal.copy()
     off[which] = True
-    normal[which] = facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    normal[which] = unit_vectors(facing)
     return replace(evidence, off=off, normal=normal)
 
 
@@ -235,11 +236,9 @@ def _seen_from_within(
     facing = surfels.toward_sensors(which := np.flatnonzero(~off), scan)
     if facing is None or len(which) == 0:
         return found
-    gradient = template.distance_and_gradient(surfels.place_mm[which])[1]
-    gradient /= np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
-    facing = facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
-    along = np.abs((gradient * surfels.planes(which)).sum(axis=1)) > STRIP_COSINE
-    found[which] = along & ((facing * gradient).sum(axis=1) < BACK_COSINE)
+    gradient, along = _beside_template(template, surfels, which)
+    back = (unit_vectors(facing) * gradient).sum(axis=1) < BACK_COSINE
+    found[which] = (along > STRIP_COSINE) & back
     return found
 
 
@@ -258,8 +257,17 @@ def _strips(
     which = np.flatnonzero(near & ~off)
     strips = np.zeros_like(off)
     if len(which):
-        gradient = template.distance_and_gradient(surfels.place_mm[which])[1]
-        gradient /= np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
-        along = np.abs((gradient * surfels.planes(which)).sum(axis=1))
+        along = _beside_template(template, surfels, which)[1]
         strips[which] = (along < STRIP_COSINE) & (surfels.deviation_mm[which] < 0)
     return strips
+
+
+def _beside_template(
+    template: Template, surfels: Surfels, which: Int[np.ndarray, " q"]
+) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
+    """Which way the template's surface faces there, and how much the surfels' planes lie along it.
+
+    The second is the cosine between them: 1 along the surface, 0 across it.
+    """
+    gradient = unit_vectors(template.distance_and_gradient(surfels.place_mm[which])[1])
+    return gradient, np.abs((gradient * surfels.planes(which)).sum(axis=1))

@@ -23,6 +23,7 @@ from amrepair.detect.sheets import other_sides, with_own_area
 from amrepair.detect.surfels import Surfels
 from amrepair.detect.turning import side_by_view, turned_down, turned_to_close
 from amrepair.detect.winding import Shell
+from amrepair.frames import unit_vectors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
@@ -199,7 +200,7 @@ def find_faces(
         points, spacing_mm=surfels.spacing_mm, sigma_mm=max(scan.sigma_mm, surfels.spread_mm)
     )
     deviation, gradient = template.distance_and_gradient(place)
-    gradient = _unit(gradient)
+    gradient = unit_vectors(gradient)
     along = np.abs((gradient * plane).sum(axis=1))
     broken = np.abs(deviation) > threshold_mm
     broken |= (along < STRIP_COSINE) & (deviation < -STRIP_MM)
@@ -223,7 +224,7 @@ def find_faces(
         scan.points_mm[kept],
         place[which],
         patches.place_mm[present],
-        _unit(patches.vector_mm2[present]),
+        unit_vectors(patches.vector_mm2[present]),
     )
     given = None
     if scan.normals is not None:
@@ -280,7 +281,7 @@ def find_faces(
     backed = is_backed(
         template,
         patches.place_mm[holes := np.flatnonzero(~present)],
-        _unit(patches.vector_mm2[holes]),
+        unit_vectors(patches.vector_mm2[holes]),
         seen_mm=patches.place_mm[seen],
         face_mm=place[which],
         spacing_mm=spacing_mm,
@@ -319,7 +320,7 @@ def _present(
     k = min(SURROUND_POINTS, len(places_mm))
     index = tree.query(patches.place_mm[asked], k=k, workers=2)[1].reshape(-1, k)
     offset = places_mm[index] - patches.place_mm[asked, None, :]
-    normal = _unit(patches.vector_mm2[asked])
+    normal = unit_vectors(patches.vector_mm2[asked])
     offset -= np.einsum("mki,mi->mk", offset, normal)[:, :, None] * normal[:, None, :]
     sideways = np.linalg.norm(offset, axis=2).mean(axis=1)
     lopsided = np.linalg.norm(offset.mean(axis=1), axis=1) / np.maximum(sideways, 1e-9)
@@ -392,7 +393,7 @@ def _probes(
     template: Template, patches: Patches, holes: Int[np.ndarray, " h"], rooms: Rooms
 ) -> tuple[Float[np.ndarray, "h 3"], Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
     """Places just inside the holes' patches, the template's distance there, and their rooms."""
-    probes = patches.place_mm[holes] - PROBE_MM * _unit(patches.vector_mm2[holes])
+    probes = patches.place_mm[holes] - PROBE_MM * unit_vectors(patches.vector_mm2[holes])
     return probes, template.distance(probes), rooms.value_at(probes)
 
 
@@ -435,7 +436,3 @@ def _given(
     if abs(agreement) < NORMAL_AGREEMENT:
         return None
     return np.asarray(normals * np.sign(agreement))
-
-
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))

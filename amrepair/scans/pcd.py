@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.scans.lzf_kernels import lzf_decompress
+from amrepair.scans.text import read_table
 
 KINDS = {"F": "f", "I": "i", "U": "u"}
 
@@ -83,11 +84,8 @@ def _header(data: bytes, path: Path) -> PcdHeader:
 
 
 def _ascii(body: bytes, header: PcdHeader, path: Path) -> dict[str, Float[np.ndarray, " n"]]:
-    try:
-        table = np.loadtxt(io.BytesIO(body), ndmin=2) if body.strip() else np.zeros((0, 0))
-    except ValueError as e:
-        said = str(e).partition(";")[0]  # what follows is numpy's advice to programmers
-        raise InputError(f"{path}: the PCD text cannot be read ({said})") from e
+    empty = not body.strip()
+    table = np.zeros((0, 0)) if empty else read_table(io.BytesIO(body), path, "the PCD text")
     if table.shape != (header.points, len(header.names)):
         raise InputError(
             f"{path}: the PCD header promises {header.points} points of {len(header.names)} "

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from amrepair.errors import InputError
 from amrepair.scans.scan import Scan
+from amrepair.scans.text import read_table
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -83,11 +84,9 @@ def read_vertices(data: bytes, header: PlyHeader, path: Path) -> dict[str, Float
     n = header.vertices
     if header.order == "":
         lines = io.BytesIO(data[header.end :])
-        try:
-            table = np.loadtxt(lines, max_rows=n, ndmin=2) if n else np.zeros((0, len(names)))
-        except ValueError as e:
-            said = str(e).partition(";")[0]  # what follows is numpy's advice to programmers
-            raise InputError(f"{path}: the PLY text cannot be read ({said})") from e
+        table = np.zeros((0, len(names)))
+        if n:
+            table = read_table(lines, path, "the PLY text", max_rows=n)
         if table.shape != (n, len(names)):
             raise InputError(
                 f"{path}: the PLY header promises {n} vertices of {len(names)} values, "

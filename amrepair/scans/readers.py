@@ -20,6 +20,7 @@ from amrepair.errors import InputError
 from amrepair.scans.pcd import read_pcd
 from amrepair.scans.ply import read_header, read_vertices, sensors_of, write_ply
 from amrepair.scans.scan import Scan
+from amrepair.scans.text import read_table
 
 # What a structured-light scanner of the desktop class states; used where the file says nothing.
 DEFAULT_SIGMA_MM = 0.04
@@ -188,11 +189,7 @@ def _read_table(path: Path, frame: str) -> Scan:
         if not lines:
             raise InputError(f"{path}: the file holds no points; check the export")
         delimiter = next((d for d in (",", ";") if d in lines[0]), None)
-        try:
-            table = np.loadtxt(lines, delimiter=delimiter, ndmin=2)
-        except ValueError as e:
-            said = str(e).partition(";")[0]  # what follows is numpy's advice to programmers
-            raise InputError(f"{path}: the points cannot be read ({said})") from e
+        table = read_table(lines, path, "the points", delimiter=delimiter)
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: rows need at least x y z, the array has shape {table.shape}")
     names = ["x", "y", "z", "nx", "ny", "nz"] if table.shape[1] == 6 else ["x", "y", "z"]
