@@ -178,6 +178,7 @@ def gather(
     facing = surfels.toward_sensors(which, scan)
     if facing is not None:
         normal[which] = _toward(surfels.planes(which), facing)
+        surfels = surfels.halves_joined(which, normal[which])
     elif len(which):
         spacing_mm = max(PATCH_MM, surfels.spacing_mm)
         places, normals = template.surface_points(spacing_mm)

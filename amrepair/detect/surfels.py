@@ -22,6 +22,8 @@ MIN_CELL_MM, MAX_CELL_MM = 0.3, 2.0
 AREA_PER_CELL = 1.5
 # A grid of so many cells is counted in place; points of a larger one are sorted.
 MOST_CELLS = 16_000_000
+# Columns of a neighbour table: the cells before and behind along each axis.
+BEHIND = ((4, 22), (10, 16), (12, 14))
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,24 @@ class Surfels:
         second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
         covariance = second - mean[:, :, None] * mean[:, None, :]
         return np.asarray(np.linalg.eigh(covariance)[1][:, :, 0])
+
+    def halves_joined(
+        self, which: Int[np.ndarray, " q"], normal: Float[np.ndarray, "q 3"]
+    ) -> Surfels:
+        """The same where a cell's end that lies in the surface does not part it in two.
+
+        Each of the cells in `which` is moved along its normal onto the mean of what the cells
+        before and behind it hold of the same surface, as if it had been laid around that.
+        """
+        place = self.place_mm.copy()
+        axis = np.abs(normal).argmax(axis=1)
+        beside = self.table[which[:, None], np.array(BEHIND)[axis]]  # (q, 2), −1 where empty
+        apart_mm = ((self.place_mm[beside] - place[which, None]) * normal[:, None]).sum(axis=2)
+        same = (beside >= 0) & (np.abs(apart_mm) < 0.5 * self.cell_mm)
+        count = np.where(same, self.count[beside], 0)
+        moved_mm = (count * apart_mm).sum(axis=1) / (self.count[which] + count.sum(axis=1))
+        place[which] += moved_mm[:, None] * normal
+        return replace(self, place_mm=place)
 
     def toward_sensors(
         self, which: Int[np.ndarray, " q"], scan: Scan
