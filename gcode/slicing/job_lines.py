@@ -27,6 +27,7 @@ EXACTLY_MM = 0.01  # how exactly it is told which columns lie in a line
 # the job lays in a piece of a line: from here on it lacks a lot, up to there a little, and less is
 # nothing.
 LOT, LITTLE, NOTHING = 0.4, 0.35, 0.1
+NEARLY_ALL, STANDS_OUT = 0.75, 0.1  # shares that a line which is gone reads, at least, and more
 BESIDE_WIDTHS = 1.4  # from a line to its neighbour
 
 
@@ -181,7 +182,7 @@ def gathered(
     length_mm: Float[np.ndarray, " n"],
     middle_mm: Float[np.ndarray, "n 2"],
     width_mm: float,
-) -> Float[np.ndarray, " n"]:
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """What is missing, piece by piece of the job's lines, a little beside a lot given to the lot.
 
     Parameters
@@ -190,13 +191,20 @@ def gathered(
         (n,) missing, as the scan told it, and how deep on average where it is.
     job
         What lay there: no piece is given more than that, on as deep a floor, and what was seen to
-        be gone gets no less.
+        be gone gets no less where it stands out from what is around it.
     length_mm, middle_mm
         (n,) and (n, 2) of the pieces.
+
+    Returns
+    -------
+    (n,) what to lay in each piece, and (n,) how much of what was told of it is laid by that, there
+    or in the pieces that it was given to.
     """
     own_mm3 = np.maximum(job.section_mm2 * length_mm, 1e-9)
     most_mm3 = own_mm3 * np.maximum(1.0, deep_mm / job.height_mm)
-    gone = job.gone & (volume_mm3 > LITTLE * own_mm3)
+    share = volume_mm3 / own_mm3
+    gone = job.gone & (share > LITTLE)
+    gone[gone] = _rounded_off(share, gone, middle_mm, BESIDE_WIDTHS * width_mm)
     volume = np.where(gone, np.maximum(volume_mm3, own_mm3), volume_mm3)
     share = volume / own_mm3
     little = np.flatnonzero((share < LITTLE) & (share > 0))
@@ -213,7 +221,25 @@ def gathered(
                 volume[k] -= moved
             if gone[near].any():
                 volume[k] = 0.0  # it was the gone line's own, which has it already
-    return np.where(volume < NOTHING * own_mm3, 0.0, volume)
+    dropped = volume < NOTHING * own_mm3
+    return np.where(dropped, 0.0, volume), volume_mm3 - np.where(dropped, volume, 0.0)
+
+
+def _rounded_off(
+    share: Float[np.ndarray, " n"],
+    asked: Bool[np.ndarray, " n"],
+    middle_mm: Float[np.ndarray, "n 2"],
+    around_mm: float,
+) -> Bool[np.ndarray, " q"]:
+    """Which of some pieces lack all of a line, though they read as if they lacked less.
+
+    A spot takes from a line that is gone and gives to its neighbours. Where all around lacks as
+    much there is nothing to round off: thin lines, not gone ones.
+    """
+    tree = cKDTree(middle_mm)
+    near = tree.query_ball_point(middle_mm[asked], around_mm)
+    around = np.array([share[others].mean() for others in near])
+    return (share[asked] > NEARLY_ALL) | (share[asked] - around > STANDS_OUT)
 
 
 def runs_of(

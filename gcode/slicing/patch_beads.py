@@ -300,10 +300,12 @@ def weighed(
     reach = np.bincount(nearest[near], thick.ravel()[filled[near]], minlength=len(middles))
     number = np.bincount(nearest[near], minlength=len(middles))
     depth = reach / np.maximum(number, 1)
-    told_mm3, own = volume, np.zeros(len(middles))
+    told_mm3, met_mm3, own = volume, volume, np.zeros(len(middles))
     if job is not None:
         own = job.section_mm2
-        volume = gathered(volume, depth, job, lengths, middles, setup.process.line_width_mm)
+        volume, met_mm3 = gathered(
+            volume, depth, job, lengths, middles, setup.process.line_width_mm
+        )
     chains: list[Chain] = []
     given = np.zeros(len(middles))  # share of what its columns want that a piece lays
     at = 0
@@ -316,7 +318,7 @@ def weighed(
         most = np.maximum(most, BOND_RATIO * own[mine])
         most = np.minimum(most, setup.printer.max_bead_section_mm2)
         given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9))
-        given[mine] *= np.minimum(1.0, volume[mine] / np.maximum(told_mm3[mine], 1e-9))
+        given[mine] *= met_mm3[mine] / np.maximum(told_mm3[mine], 1e-9)
         section = np.minimum(section, most)
         chains += _split(Chain(run.xy_mm, tip_mm, section, run.role))
     laid = np.zeros(thick.size)

@@ -194,9 +194,30 @@ def test_gathering_moves_plastic_and_makes_none(shares, seed):
     volume = np.array(shares) * own
     middles = np.column_stack([np.arange(n) * 0.4, rng.integers(0, 3, n) * 0.45])
     job = JobPieces(own, 0.2, 0.225, np.zeros(n, dtype=bool), np.zeros((1, 1), dtype=bool))
-    out = gathered(volume, np.full(n, 0.2), job, np.ones(n), middles, 0.45)
+    out, met = gathered(volume, np.full(n, 0.2), job, np.ones(n), middles, 0.45)
+    assert out.sum() == pytest.approx(met.sum())  # whoever gave has what was given laid for it
+    assert (met <= volume + 1e-12).all()
+    assert (met >= -1e-12).all()
     assert out.sum() <= volume.sum() + 1e-12
     assert volume.sum() - out.sum() <= NOTHING * own.sum() + 1e-12
     assert (out <= np.maximum(volume, own) + 1e-12).all()
     lot = np.array(shares) >= LITTLE
     assert (out[lot] >= np.where(volume < NOTHING * own, 0.0, volume)[lot] - 1e-12).all()
+
+
+def test_a_gone_line_gets_its_own_where_it_stands_out_and_not_in_a_thin_layer():
+    """A spot rounds off what is gone; where all lines lack a half, rays run over each of them."""
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(12) * 0.4, np.arange(7) * 0.45))
+    own, middles = np.full(len(x), 0.08), np.column_stack([x, y])
+    lacks_half, line = np.full(len(x), 0.5), np.isclose(y, 3 * 0.45)
+
+    def laid(shares: np.ndarray, gone: np.ndarray) -> np.ndarray:
+        job = JobPieces(own, 0.2, 0.225, gone, np.zeros((1, 1), dtype=bool))
+        return gathered(shares * own, np.full(len(x), 0.1), job, np.ones(len(x)), middles, 0.45)[0]
+
+    one = laid(np.where(line, 0.6, 0.1), line)
+    beside = np.isclose(np.abs(y - 3 * 0.45), 0.45)
+    assert one[line] == pytest.approx(own[line])
+    assert not one[beside].any()
+    thin = laid(lacks_half, line)
+    assert thin == pytest.approx(lacks_half * own)
