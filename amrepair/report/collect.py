@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
+import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -98,13 +99,18 @@ def region_rows(plan: RepairPlan) -> tuple[RegionRow, ...]:
 
 
 def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None) -> dict[str, Any]:
-    """Volumes over the first and last look of every stop; `last` None where not rescanned."""
+    """Volumes over the first and last look of every stop; `last` None where not rescanned.
+
+    What stands out at one stop is seen again at the next, and counts once.
+    """
     ends = first if last is None else last
     return {
-        "missing_mm3_before": sum(p.deficit.missing_mm3 for p in first),
-        "missing_mm3_after": None if last is None else sum(p.deficit.missing_mm3 for p in last),
-        "excess_mm3_before": sum(p.deficit.excess_mm3 for p in first),
-        "excess_mm3_after": None if last is None else sum(p.deficit.excess_mm3 for p in last),
+        "missing_mm3_before": together_mm3(p.deficit.missing for p in first),
+        "missing_mm3_after": None
+        if last is None
+        else together_mm3(p.deficit.missing for p in last),
+        "excess_mm3_before": together_mm3(p.deficit.excess for p in first),
+        "excess_mm3_after": None if last is None else together_mm3(p.deficit.excess for p in last),
         "unreachable_mm3": sum(p.unreachable_mm3 for p in ends),
         "unprintable_mm3": float(
             sum(piece.volume_mm3 for p in ends if p.patch for piece in p.patch.unprintable)
@@ -121,6 +127,14 @@ def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None)
             for row in region_rows(plan)
         ],
     }
+
+
+def together_mm3(solids: Iterable[manifold3d.Manifold]) -> float:
+    """Volume of what any of some solids holds."""
+    found = [solid for solid in solids if not solid.is_empty()]
+    if not found:
+        return 0.0
+    return float(manifold3d.Manifold.batch_boolean(found, manifold3d.OpType.Add).volume())
 
 
 def cost_figures(plans: Sequence[RepairPlan]) -> dict[str, float]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import manifold3d
 import numpy as np
 import pytest
 
@@ -30,7 +31,7 @@ from amrepair.report import (
 )
 from amrepair.report import document as document_module
 from amrepair.report.assemble import report_of_plan
-from amrepair.report.collect import look_of, of_the_part, plan_result
+from amrepair.report.collect import look_of, of_the_part, plan_result, together_mm3
 from amrepair.report.data import Rule
 from amrepair.report.document import render_report
 from amrepair.report.live import STOPS
@@ -410,3 +411,11 @@ def test_the_bed_beside_the_part_is_not_drawn_as_excess(
     assert shown.points_mm[:, 2].max() < 9.5  # nor of what hangs in the air
     kept = len(shown.points_mm) / len(scan.points_mm)
     assert kept == pytest.approx(1.0, abs=0.002)  # and all of the part
+
+
+def test_what_stands_out_at_two_stops_counts_once() -> None:
+    """Regression: strips of 25 mm³ were told as 46, once for each look that saw them."""
+    strip = manifold3d.Manifold.cube((10.0, 0.5, 1.0))
+    aside = strip.translate((0.0, 5.0, 0.0))
+    assert together_mm3([strip, manifold3d.Manifold(), strip, aside]) == pytest.approx(10.0)
+    assert together_mm3([manifold3d.Manifold()]) == 0.0
