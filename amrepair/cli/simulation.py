@@ -215,6 +215,7 @@ def _result(
                     "missing_mm3": t.missing_mm3,
                     "filled_mm3": t.filled_mm3,
                     "excess_mm3": t.excess_mm3,
+                    "added_mm3": t.added_mm3,
                     "repaired_ratio": t.filled_mm3 / t.missing_mm3 if t.missing_mm3 > 0 else None,
                 }
                 for t in run.truth
@@ -259,11 +260,12 @@ def _say(run: SimulatedRun, result: dict[str, Any], folder: RunFolder, within: b
     from amrepair.report import summary_of_result
 
     table = Table(title=None, show_edge=False, pad_edge=False)
-    for name in ("defect", "stop", "missing mm³", "filled mm³", "ratio"):
+    for name in ("defect", "stop", "missing mm³", "filled mm³", "ratio", "elsewhere mm³"):
         table.add_column(name, justify="left" if name in {"defect", "stop"} else "right")
     for t in run.truth:
         ratio = f"{t.filled_mm3 / t.missing_mm3:.3f}" if t.missing_mm3 > 0 else "–"
-        table.add_row(t.kind, t.label, f"{t.missing_mm3:.1f}", f"{t.filled_mm3:.1f}", ratio)
+        volumes = (f"{t.missing_mm3:.1f}", f"{t.filled_mm3:.1f}", ratio, f"{t.added_mm3:.1f}")
+        table.add_row(t.kind, t.label, *volumes)
     if run.truth:
         console.out.print(table)
     console.out.print(f"Simulated {result['speed_up']:g} times as fast as the printer prints.\n")
