@@ -15,6 +15,8 @@ from amrepair.detect.skipped import PlannedBeads
 from amrepair.template.port import Template
 
 BOX_MARGIN_MM = 1.0
+# Beside what is deep, a film on an even surface is sampled as finely as if it were alone.
+FILM_MM, EVEN_MM, LEAST_FILM_MM2 = 0.5, 0.05, 5.0
 PATH_STEP_MM = 1.0
 
 
@@ -29,14 +31,17 @@ def boxes_of(
     s = evidence.surfels
     which = np.flatnonzero(np.asarray(anomaly.surfel_label) == int(label))
     points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
+    film = (depth < FILM_MM) & (np.abs(depth - np.abs(s.wide_deviation_mm[which])) < EVEN_MM)
     if label is Label.MISSING:
         gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
         gone = np.concatenate([gone, _paths_out(template, evidence, which)])
         points = np.concatenate([points, gone])
         depth = np.concatenate([depth, np.full(len(gone), np.nan)])
+        film = np.concatenate([film, np.zeros(len(gone), dtype=bool)])
     else:
         points = np.concatenate([points, _feet(evidence, which)])
         depth = np.concatenate([depth, np.full(len(which), np.nan)])
+        film = np.concatenate([film, np.zeros(len(which), dtype=bool)])
     group = group_points(points)
     found = []
     for g in range(int(group.max()) + 1 if len(group) else 0):
@@ -47,6 +52,9 @@ def boxes_of(
         if len(known) == 0 and (len(mine) < 4 or label is Label.EXCESS):
             continue  # nor is where something would stand what stands
         thick = float(np.percentile(known, 90)) if len(known) else 2.0
+        thin = deep[film[group == g]]
+        if len(thin) * s.cell_mm**2 > LEAST_FILM_MM2:
+            thick = min(thick, 1.5 * float(np.median(thin)))
         found.append((mine.min(axis=0) - BOX_MARGIN_MM, mine.max(axis=0) + BOX_MARGIN_MM, thick))
     if lines is not None:
         for a, b, high in zip(lines.start_mm, lines.end_mm, lines.height_mm, strict=True):

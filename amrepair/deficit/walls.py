@@ -31,7 +31,7 @@ MOST_SPREAD_SIGMA = 1.75
 MOST_SLANT = 0.25  # cosine: steeper than 75°
 # Thinner than a bead; and along it, as far as between two points that were seen.
 CREST_CELLS, CREST_REACH_CELLS = 4, 2
-SPLINTER_MM = 0.5  # a crest that stands so little lower than designed has lost its points, no more
+SPLINTER_MM = 0.3  # a crest that stands so little lower than designed has lost its points, no more
 # A face of what is missing is steep where it falls by this from one cell to the next (83°).
 STEEP_MM = 0.8
 # So much of a lip the solids' rounding may have taken, so many cells wide; what is as designed; how
@@ -96,13 +96,17 @@ def with_even_crests(
     rows, columns = window_around(gone, CREST_CELLS + BESIDE_CELLS)
     z_mm = np.array(field.z_mm, dtype=np.float64)
     near, designed = z_mm[rows, columns], designed_mm[rows, columns]
-    gone, deep = gone[rows, columns], lost_mm[rows, columns] > STEEP_MM
-    beside, cut = (ndimage.maximum_filter(of, 2 * BESIDE_CELLS + 1) for of in (gone, deep))
+    lost = lost_mm[rows, columns]
+    beside = ndimage.maximum_filter(gone[rows, columns], 2 * BESIDE_CELLS + 1)
+    # where what is missing lies on what stands, not beside a wall that reads too far in
+    on = (lost > STEEP_MM) & (designed - lost < near + AS_DESIGNED_MM)
+    foot_mm = ndimage.minimum_filter(np.where(on, near, np.inf), 2 * BESIDE_CELLS + 1)
     reach = 2 * CREST_REACH_CELLS + 1
     # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
     thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, CREST_CELLS), reach)
     crest = beside & (near - thick_mm > STEP_MM)
     highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
+    cut = highest_mm - foot_mm > STEEP_MM  # the tip of a worn edge falls off on its outside alone
     whole = cut & (designed > highest_mm) & (designed < highest_mm + SPLINTER_MM)
     near[crest] = np.where(whole, designed, highest_mm)[crest]
     return field.raised(z_mm)

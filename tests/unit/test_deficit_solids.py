@@ -113,6 +113,15 @@ def test_a_tenth_of_a_millimetre_over_a_wide_area() -> None:
     assert found.missing_mm3 == pytest.approx(30.0, rel=0.1)
 
 
+def test_a_film_beside_a_deep_cut_is_found_with_it() -> None:
+    # regression: the box was sampled as coarsely as the cut is deep, and 0.96 of the film was lost
+    deep, film = cube((10, 28, 8), (2, 1, 3)), cube((27, 28, 1), (11.9, 1, 9.74))
+    found = deficit_of(cloud(BLOCK.body - deep - film), BLOCK)
+    over_mm3 = (BLOCK.body ^ film).volume()
+    assert over_mm3 == pytest.approx(27 * 28 * 0.26)
+    assert (found.missing ^ film).volume() == pytest.approx(over_mm3, rel=0.05)
+
+
 def test_a_sheet_left_on_the_bed_is_seen_from_above() -> None:
     # regression: its upper side counted as the template's underside, and 0.2 mm over it as solid
     gone = cube((10, 10, 10), (-1, -1, 0.04))
