@@ -13,8 +13,10 @@ from skimage import measure
 
 from amrepair.errors import DeficitError
 
-MAX_VOXELS = 400_000
+MAX_VOXELS = 1_000_000
 FINEST_MM, COARSEST_MM = 0.05, 0.25
+# Samples across a defect, and what must be left of them where a box is large.
+FINE_RATIO, LEAST_RATIO = 4.0, 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,17 +46,24 @@ class VoxelBox:
         thickness_mm: float,
         across: int,
     ) -> VoxelBox:
-        """A grid over a box, fine enough for a defect `thickness_mm` thick across one axis."""
-        fine = float(np.clip(thickness_mm / 4, FINEST_MM, COARSEST_MM))
+        """A grid over a box, fine enough for a defect `thickness_mm` thick across one axis.
+
+        Where that is too many samples it is first coarser along the defect, up to what walls need,
+        then across it, then along it again.
+        """
+        fine = float(np.clip(thickness_mm / FINE_RATIO, FINEST_MM, COARSEST_MM))
         step = np.full(3, max(fine, min(COARSEST_MM, 2.5 * fine)))
         step[across] = fine
+        along = np.arange(3) != across
         extent = np.maximum(high_mm - low_mm, 1e-6)
-        over = float(np.prod(extent / step + 1)) / MAX_VOXELS
-        if over > 1:
-            along = np.arange(3) != across
-            step[along] *= min(np.sqrt(over), 2.0)
-            over = float(np.prod(extent / step + 1)) / MAX_VOXELS
-            step *= max(over, 1.0) ** (1 / 3)
+
+        def over() -> float:
+            return max(float(np.prod(extent / step + 1)) / MAX_VOXELS, 1.0)
+
+        step[along] *= min(np.sqrt(over()), COARSEST_MM / step[along][0])
+        step[across] *= min(over(), max(min(thickness_mm / LEAST_RATIO, COARSEST_MM) / fine, 1.0))
+        step[along] *= min(np.sqrt(over()), 2.0)
+        step *= over() ** (1 / 3)
         size = np.ceil(extent / step).astype(int) + 1
         return cls(low_mm, step, (int(size[0]), int(size[1]), int(size[2])))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amrepair.deficit import Deficit, compute_deficit
-from amrepair.deficit.voxels import VoxelBox, solid_from_field
+from amrepair.deficit.voxels import MAX_VOXELS, VoxelBox, solid_from_field
 from amrepair.detect import Label, detect
 from amrepair.errors import InputError
 from amrepair.frames import Transform, rotation_from_vector
@@ -333,6 +333,25 @@ def test_nothing_stands_higher_than_the_as_built_field_where_nobody_saw(seed: in
             -1,
         )
         assert found.as_built.sample(grid.reshape(-1, 2)).min() > top - 0.25
+
+
+@pytest.mark.parametrize("extent_mm", [(20.0, 20.0, 9.0), (6.0, 5.0, 2.0), (30.0, 20.0, 9.0)])
+def test_a_film_beside_a_deep_cut_is_sampled_finely_and_so_are_the_walls(
+    extent_mm: tuple[float, float, float],
+) -> None:
+    # regression: samples across a film of 0.24 mm left 0.31 mm between those along it, and a face
+    # of 70° stood 0.6 mm too low: the hexagon went 0.21 mm into it
+    box = VoxelBox.around(np.zeros(3), np.array(extent_mm), thickness_mm=0.36, across=2)
+    assert box.step_mm[2] <= 0.24 / 1.5
+    assert (box.step_mm[:2] <= 0.3).all()
+    assert np.prod(box.shape) <= 1.1 * MAX_VOXELS
+    assert (box.step_mm * (np.array(box.shape) - 1) >= np.array(extent_mm) - 1e-9).all()
+
+
+def test_a_wide_thin_defect_keeps_its_samples_across() -> None:
+    box = VoxelBox.around(np.zeros(3), np.array([80.0, 50.0, 2.2]), thickness_mm=0.2, across=2)
+    assert box.step_mm[2] <= 0.1
+    assert np.prod(box.shape) <= 1.1 * MAX_VOXELS
 
 
 def test_a_field_that_touches_zero_by_less_than_a_nanometre_is_no_solid() -> None:
