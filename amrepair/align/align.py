@@ -153,6 +153,8 @@ def _from_anywhere(
     if found.left_out_ratio > MUCH_LEFT_OUT and not part_is_known:
         least = LEAST_OF_REST
         sizes = f" ({found.left_out_ratio:.0%} of the scan are taken for its surroundings){sizes}"
+    if not part_is_known and ratio >= LEAST_OF_KNOWN:
+        sizes += "; if it is this part for certain, only bent, say --part-is-known"
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
     return _registration(scan, found)
 

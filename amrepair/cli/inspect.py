@@ -28,6 +28,14 @@ TemplateOption = Annotated[
     ),
 ]
 
+KnownOption = Annotated[
+    bool,
+    typer.Option(
+        "--part-is-known",
+        help="The scan shows this part, however bent: less of it has to fit.",
+    ),
+]
+
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
@@ -62,6 +70,7 @@ def align(
             "ransac=off, icp=off or iterate=off an ablation. May be repeated."
         ),
     ] = None,
+    part_is_known: KnownOption = False,
     sensor_at: SensorOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
@@ -78,6 +87,7 @@ def align(
 
     if pam and method != "paper":
         raise InputError(f"--pam belongs to --method paper, the method is {method}")
+    _refuse_known_of_many(part_is_known, template)
     settings = with_settings(VARIANTS, pam, "--pam")
     watch, bars = Stopwatch(), console.Bars()
     with bars.shown():
@@ -93,6 +103,7 @@ def align(
                     cloud,
                     field,
                     method=method,
+                    part_is_known=part_is_known,
                     pam_options=settings,
                     rng=np.random.default_rng(seed),
                     progress=bars,
@@ -131,6 +142,11 @@ def align(
     console.out.print(np.array2string(found.template_from_scan.matrix, precision=6))
 
 
+def _refuse_known_of_many(part_is_known: bool, template: Path) -> None:
+    if part_is_known and template.is_dir():
+        raise InputError(f"--part-is-known needs one template; {template} is a folder of them")
+
+
 def from_library(
     cloud: Scan, folder: Path, method: str, seed: int, watch: Stopwatch, bars: console.Bars
 ) -> Recognition:
@@ -156,6 +172,7 @@ def detect(
     scan: Annotated[Path, typer.Argument(help="Point cloud, height map or scanned mesh, mm.")],
     template: TemplateOption,
     out: Annotated[Path, typer.Option(help="Folder for anomaly.npz, anomaly.ply, result.json.")],
+    part_is_known: KnownOption = False,
     sensor_at: SensorOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
@@ -165,13 +182,16 @@ def detect(
         import numpy as np
 
     from amrepair.align import align as align_scan
+    from amrepair.deficit import compute_deficit, measured_regions
     from amrepair.detect import detect as detect_defects
+    from amrepair.frames import Transform
     from amrepair.repair import Stopwatch
     from amrepair.report.collect import rounded
     from amrepair.report.folder import RunFolder
     from amrepair.scans import read_scan
     from amrepair.template import open_template
 
+    _refuse_known_of_many(part_is_known, template)
     watch, bars = Stopwatch(), console.Bars()
     with bars.shown():
         with bars.stage("read scan"):
@@ -184,9 +204,22 @@ def detect(
         else:
             field = open_template(template, progress=bars)
             with watch("align"):
-                found = align_scan(cloud, field, rng=np.random.default_rng(seed), progress=bars)
+                found = align_scan(
+                    cloud,
+                    field,
+                    part_is_known=part_is_known,
+                    rng=np.random.default_rng(seed),
+                    progress=bars,
+                )
+        placed = cloud.moved(found.template_from_scan)
         with watch("detect"):
-            anomaly = detect_defects(cloud.moved(found.template_from_scan), field, progress=bars)
+            anomaly = detect_defects(placed, field, progress=bars)
+        with watch("measure"):
+            in_place = Transform.identity("build", "template")
+            deficit = compute_deficit(
+                placed, field, anomaly, build_from_template=in_place, progress=bars
+            )
+            regions = measured_regions(anomaly, deficit)
         with bars.stage("write"):
             _keep(folder, cloud, anomaly)
     result = {
@@ -202,7 +235,7 @@ def detect(
                 "depth_mm": region.depth_mm,
                 "box_mm": region.box_mm,
             }
-            for region in anomaly.regions
+            for region in regions
         ],
         "template_from_scan": found.template_from_scan.matrix.tolist(),
         "rmse_mm": found.rmse_mm,
@@ -216,12 +249,12 @@ def detect(
         return
     if chosen:
         console.out.print(f"Part: {chosen['template']}, confidence {chosen['confidence']:.2f}.")
-    count = len(anomaly.regions)
+    count = len(regions)
     console.out.print(
         f"{count} {'region' if count == 1 else 'regions'} beyond {anomaly.threshold_mm:.3f} mm "
         f"({anomaly.threshold_source}); object score {anomaly.object_score:.3f} mm."
     )
-    for region in anomaly.regions:
+    for region in regions:
         console.out.print(
             f"  {region.label.name.lower()} {region.type}: {region.volume_mm3:.1f} mm³, "
             f"{region.depth_mm:.2f} mm deep"

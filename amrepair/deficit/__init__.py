@@ -3,7 +3,7 @@
 It turns a detected difference into geometry with a tolerance; it does not decide what to print.
 """
 
-from amrepair.deficit.compute import Deficit, Standing, compute_deficit
+from amrepair.deficit.compute import Deficit, Standing, compute_deficit, measured_regions
 from amrepair.deficit.heights import as_built_heights
 
-__all__ = ["Deficit", "Standing", "as_built_heights", "compute_deficit"]
+__all__ = ["Deficit", "Standing", "as_built_heights", "compute_deficit", "measured_regions"]

@@ -31,17 +31,17 @@ def boxes_of(
     s = evidence.surfels
     which = np.flatnonzero(np.asarray(anomaly.surfel_label) == int(label))
     points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
-    film = (depth < FILM_MM) & (np.abs(depth - np.abs(s.wide_deviation_mm[which])) < EVEN_MM)
+    film = np.zeros(len(which), dtype=bool)
     if label is Label.MISSING:
+        film = (depth < FILM_MM) & (np.abs(depth - np.abs(s.wide_deviation_mm[which])) < EVEN_MM)
         gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
         gone = np.concatenate([gone, _paths_out(template, evidence, which)])
         points = np.concatenate([points, gone])
         depth = np.concatenate([depth, np.full(len(gone), np.nan)])
-        film = np.concatenate([film, np.zeros(len(gone), dtype=bool)])
     else:
         points = np.concatenate([points, _feet(evidence, which)])
         depth = np.concatenate([depth, np.full(len(which), np.nan)])
-        film = np.concatenate([film, np.zeros(len(which), dtype=bool)])
+    film = np.pad(film, (0, len(points) - len(film)))
     group = group_points(points)
     found = []
     for g in range(int(group.max()) + 1 if len(group) else 0):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import manifold3d
@@ -225,6 +225,31 @@ def compute_deficit(
     )
 
 
+def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...]:
+    """What `detect` found, measured by solids; the largest first, boxes in the template frame.
+
+    A surface alone tells little of how much is missing over it: of a deep notch 0.7. Depths stay
+    the largest deviation; what no solid was made of stays as its surface has it.
+
+    Parameters
+    ----------
+    deficit
+        Of the same anomaly, with a build frame that is the template's.
+    """
+
+    def touch(a: Region, b: Region) -> bool:
+        return a.label is b.label and bool(
+            (a.box_mm[0] <= b.box_mm[1]).all() and (b.box_mm[0] <= a.box_mm[1]).all()
+        )
+
+    found = []
+    for piece in deficit.regions:
+        depths = [r.depth_mm for r in anomaly.regions if touch(r, piece)]
+        found.append(replace(piece, depth_mm=max(depths, default=piece.depth_mm)))
+    found += [r for r in anomaly.regions if not any(touch(r, piece) for piece in deficit.regions)]
+    return tuple(sorted(found, key=lambda r: -r.volume_mm3))
+
+
 def _roughly_missing(anomaly: AnomalyMap, evidence: Evidence) -> float:
     """Volume under the surfels that are labelled missing, mm³."""
     s = evidence.surfels
@@ -307,12 +332,14 @@ def _solid_in_box(
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
     beyond = -sign * cautious  # missing: how empty; excess: how solid
     limit_mm, thin_mm = _limits(anomaly, label, samples, f, tau_mm, depth_mm)
-    core = (sign * f > limit_mm) & (beyond > limit_mm / 2)
+    away_mm = sign * f  # from the template, of which so much is no defect
+    away_mm[near] -= _allowed(anomaly, label, samples[near], away_mm[near] - thin_mm[near])
+    core = (away_mm > limit_mm) & (beyond > limit_mm / 2)
     if label is Label.MISSING and evidence.has_rays:
         # a planned bead is thinner than 2 τ: nothing of it would be left of an eroded template,
         # but rays that went through it count as well
-        core |= (sign * f > limit_mm / 4) & (beyond > limit_mm)
-    ask = np.flatnonzero(can_be & ~core & (sign * f > thin_mm) & (clip < 0))
+        core |= (away_mm > limit_mm / 4) & (beyond > limit_mm)
+    ask = np.flatnonzero(can_be & ~core & (away_mm > thin_mm) & (clip < 0))
     nearest = evidence.surfels.tree.query(samples[ask], workers=2)[1]
     core[ask[labels[nearest] == int(label)]] = True
     if gone is not None and len(gone.width_mm):
@@ -354,6 +381,26 @@ def _hangs_free(
     loose = beside & ~held
     loose[0] = False
     return np.asarray(loose[groups])
+
+
+def _allowed(
+    anomaly: AnomalyMap,
+    label: Label,
+    samples_mm: Float[np.ndarray, "v 3"],
+    over_mm: Float[np.ndarray, " v"],
+) -> Float[np.ndarray, " v"]:
+    """(v,) how far out of the template nothing is too much, by the nearest surfel; 0 if missing.
+
+    Asked for where `over_mm` is positive alone.
+    """
+    allowed_mm = np.zeros(len(samples_mm))
+    higher_mm = anomaly.surfel_higher_mm
+    if label is Label.EXCESS and higher_mm is not None and (higher_mm > 0).any():
+        assert anomaly.evidence is not None
+        ask = np.flatnonzero(over_mm > 0)
+        nearest = anomaly.evidence.surfels.tree.query(samples_mm[ask], workers=2)[1]
+        allowed_mm[ask] = np.maximum(higher_mm[nearest], 0.0)
+    return allowed_mm
 
 
 def _limits(

@@ -93,8 +93,10 @@ class AnomalyMap:
     top_z_mm, top_threshold_mm
         The plane of the layer just printed, under which a smaller limit holds; None where there
         is none.
-    evidence, surfel_label
-        What the labels rest on, for the deficit; None for a map read back from a file.
+    evidence, surfel_label, surfel_higher_mm
+        What the labels rest on, for the deficit, and (s,) how far out of the template each surfel
+        may be, by what normal parts differ and the process was told; None for a map read back
+        from a file.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -109,5 +111,6 @@ class AnomalyMap:
     regions: tuple[Region, ...]
     evidence: Evidence | None = None
     surfel_label: Int[np.ndarray, " s"] | None = None
+    surfel_higher_mm: Float[np.ndarray, " s"] | None = None
     top_z_mm: float | None = None
     top_threshold_mm: float = np.inf

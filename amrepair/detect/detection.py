@@ -219,6 +219,7 @@ def detect(
         top_threshold_mm=top_limit.well_seen_mm,
         evidence=evidence,
         surfel_label=np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0)),
+        surfel_higher_mm=surfels.deviation_mm - higher.deviation_mm,
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 
 from amrepair.detect import turning_kernels as kernels
 from amrepair.detect.winding import Shell
@@ -102,20 +102,22 @@ def turned_down(
     which_open, area_open = which[~sure], area_mm2[which[~sure], None]
     falls = np.zeros_like(place_mm)
     falls[which[sure]] = normal[sure]
-    for turn in range(MOST_TURNS if len(place) else 0):
-        ahead, behind = place + step_mm * open_normal, place - step_mm * open_normal
-        drop = shell.winding(behind) - shell.winding(ahead)
+    ahead, behind = place + step_mm * open_normal, place - step_mm * open_normal
+    # winding numbers add up: what turns is asked for, alone
+    drop = shell.winding(behind) - shell.winding(ahead)
+    way, laid = np.ones(len(place)), np.zeros(len(place))
+    for _ in range(MOST_TURNS if len(place) else 0):
         falls[which_open] = drop[:, None] * open_normal
         # a face is decided as a whole, not point by point
-        vote = (falls[neighbours[which_open]].sum(axis=1) * open_normal).sum(axis=1)
-        if turn and (vote >= 0).all():
+        vote = (falls[neighbours[which_open]].sum(axis=1) * open_normal).sum(axis=1) * way
+        if laid.any() and (vote >= 0).all():
             break
-        open_normal = np.where(vote[:, None] < 0, -open_normal, open_normal)
-        shell = Shell.of(
-            np.concatenate([known, place]),
-            np.concatenate([known_vector, open_normal * area_open]),
-        )
-    normal[~sure] = open_normal
+        way = np.where(vote < 0, -way, way)
+        new = np.flatnonzero(way != laid)
+        turned = Shell.of(place[new], (way - laid)[new, None] * open_normal[new] * area_open[new])
+        drop += turned.winding(behind) - turned.winding(ahead)
+        laid = way
+    normal[~sure] = way[:, None] * open_normal
     return np.asarray(normal)
 
 
@@ -213,12 +215,7 @@ def _agreeing(
     face: Int[np.ndarray, " q"],
 ) -> Float[np.ndarray, "q 3"]:
     """Normals turned alike from neighbour to neighbour, each face the way most of its area was."""
-    both = links + links.T
-    sign = np.ones(len(outward))
-    for first in np.unique(face, return_index=True)[1]:
-        order, before = breadth_first_order(both, int(first), directed=False)
-        for k in order[1:]:
-            j = before[k]
-            sign[k] = sign[j] if outward[k] @ outward[j] >= 0 else -sign[j]
+    both = (links + links.T).tocsr()
+    sign = kernels.signs_from_neighbours(both.indptr, both.indices, outward)
     most = np.bincount(face, sign * area_mm2)
     return np.asarray(outward * (sign * np.where(most < 0, -1.0, 1.0)[face])[:, None])

@@ -25,3 +25,30 @@ def area_by_way(vectors: Any, seen: Any, ways: Any, alike: float) -> Any:
                 if seen[i]:
                     out[d, 1] += area
     return out
+
+
+@njit(cache=True, nogil=True)
+def signs_from_neighbours(start: Any, beside: Any, normal: Any) -> Any:
+    """(q,) 1 or -1, so that normals agree from neighbour to neighbour, breadth first.
+
+    `start` and `beside` are the rows of a symmetric sparse matrix.
+    """
+    sign = np.zeros(len(normal))
+    queue = np.empty(len(normal), np.int64)
+    for first in range(len(normal)):
+        if sign[first] != 0.0:
+            continue
+        sign[first], queue[0], done, known = 1.0, first, 0, 1
+        while done < known:
+            j = queue[done]
+            done += 1
+            for at in range(start[j], start[j + 1]):
+                k = beside[at]
+                if sign[k] == 0.0:
+                    cosine = 0.0
+                    for a in range(3):
+                        cosine += normal[k, a] * normal[j, a]
+                    sign[k] = sign[j] if cosine >= 0.0 else -sign[j]
+                    queue[known] = k
+                    known += 1
+    return sign

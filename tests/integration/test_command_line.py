@@ -204,7 +204,26 @@ def test_align_and_detect_write_what_the_contract_says(
     assert {int(v) for v in np.unique(archive["label"])} <= {0, 1, 2}
     assert {int(v) for v in np.unique(archive["template_label"])} <= {0, 1, 3}
     assert (archive["label"] == 1).any()
-    assert {"object_score", "threshold", "regions"} <= set(json.loads(detected.stdout))
+    told = json.loads(detected.stdout)
+    assert {"object_score", "threshold", "regions"} <= set(told)
+    assert told["regions"][0]["volume_mm3"] == pytest.approx(8 * 8 * 1.2, rel=0.05)
+
+
+def test_a_bent_part_is_taken_when_it_is_known(chipped: dict[str, Path], tmp_path: Path) -> None:
+    points = np.loadtxt(chipped["scan.xyz"])
+    points[:, 2] += 0.006 * np.square(points[:, 0] - 120.0)  # both ends 2.4 mm up
+    np.savetxt(tmp_path / "bent.xyz", points, fmt="%.4f")
+    words = ["detect", tmp_path / "bent.xyz", "--template", chipped["part.stl"]]
+    words += ["--out", tmp_path / "d", "--json"]
+    refused = call(*words)
+    assert refused.returncode == 2
+    assert "--part-is-known" in refused.stderr
+    taken = call(*words, "--part-is-known")
+    assert taken.returncode == 0, taken.stderr
+    assert len(json.loads(taken.stdout)["regions"]) > 2
+    many = call("align", tmp_path / "bent.xyz", "--template", tmp_path, "--part-is-known")
+    assert many.returncode == 2
+    assert "needs one template" in many.stderr
 
 
 def test_slice_check_and_estimate_work_together(chipped: dict[str, Path], tmp_path: Path) -> None:

@@ -5,11 +5,13 @@ Five per cent is the house's promise for pieces of at least 50 mm³ at 0.2 mm sp
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import manifold3d
 import numpy as np
 import pytest
 
-from amrepair.deficit import Deficit, compute_deficit
+from amrepair.deficit import Deficit, compute_deficit, measured_regions
 from amrepair.deficit.voxels import MAX_VOXELS, VoxelBox, solid_from_field
 from amrepair.detect import Label, detect
 from amrepair.errors import InputError
@@ -120,6 +122,29 @@ def test_a_film_beside_a_deep_cut_is_found_with_it() -> None:
     over_mm3 = (BLOCK.body ^ film).volume()
     assert over_mm3 == pytest.approx(27 * 28 * 0.26)
     assert (found.missing ^ film).volume() == pytest.approx(over_mm3, rel=0.05)
+
+
+@pytest.mark.parametrize("name", sorted(CUTS))
+def test_regions_that_detection_found_are_measured_by_solids(name: str) -> None:
+    # regression: `amrepair detect` said 166 mm³ of a notch of 237 mm³ that `repair` measured right
+    scan = cloud(BLOCK.body - CUTS[name])
+    anomaly = detect(scan, BLOCK)
+    deficit = compute_deficit(scan, BLOCK, anomaly, build_from_template=IN_PLACE)
+    (region,) = measured_regions(anomaly, deficit)
+    truth = BLOCK.body ^ CUTS[name]
+    assert region.volume_mm3 == pytest.approx(truth.volume(), rel=0.05)
+    assert region.depth_mm == anomaly.regions[0].depth_mm
+    bounds = np.array(truth.bounding_box()).reshape(2, 3)
+    assert np.abs(region.box_mm - bounds).max() < 0.5
+
+
+def test_a_region_without_a_solid_keeps_what_its_surface_told() -> None:
+    scan = cloud(BLOCK.body - CUTS["corner"] - CUTS["notch"])
+    anomaly = detect(scan, BLOCK)
+    assert len(anomaly.regions) == 2
+    deficit = compute_deficit(scan, BLOCK, anomaly, build_from_template=IN_PLACE)
+    kept = replace(deficit, regions=deficit.regions[:1])
+    assert measured_regions(anomaly, kept)[1] is anomaly.regions[1]
 
 
 def test_a_sheet_left_on_the_bed_is_seen_from_above() -> None:
