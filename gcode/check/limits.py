@@ -30,6 +30,7 @@ _OF_KLIPPER = {
     "SQUARE_CORNER_VELOCITY": ("max_jerk_mm_s", "jerk", "mm/s"),
 }
 COMMANDS = frozenset(_BY_AXIS) | {"M204"}
+_MAY_BE_ZERO = "max_jerk_mm_s"  # an axis without speed or acceleration never arrives
 
 
 def raised_by(
@@ -39,14 +40,16 @@ def raised_by(
     if name == "M204":
         for letter, axis in _OF_M204.items():
             limit = getattr(printer.max_acceleration_mm_s2, axis)
-            yield from _judged(f"acceleration by M204 {letter}", words.get(letter), limit, "mm/s²")
+            what = f"acceleration by M204 {letter}"
+            yield from _judged(what, words.get(letter), limit, "mm/s²", zero=False)
         return
     field, what, unit = _BY_AXIS[name]
     per_s = 1.0 / 60.0 if (dialect, name) in _PER_MINUTE else 1.0
     for letter in "XYZE":
         value, limit = words.get(letter), getattr(getattr(printer, field), letter.lower())
         told = None if value is None else value * per_s
-        yield from _judged(f"machine limit of {letter}'s {what}", told, limit, unit)
+        what_of = f"machine limit of {letter}'s {what}"
+        yield from _judged(what_of, told, limit, unit, zero=field == _MAY_BE_ZERO)
 
 
 def raised_by_klipper(
@@ -55,12 +58,16 @@ def raised_by_klipper(
     """The same of Klipper's SET_VELOCITY_LIMIT: what its parameters say."""
     for key, (field, what, unit) in _OF_KLIPPER.items():
         limit = getattr(printer, field).x
-        yield from _judged(f"machine limit of {what}, {key}", given.get(key), limit, unit)
+        what_of = f"machine limit of {what}, {key}"
+        yield from _judged(what_of, given.get(key), limit, unit, zero=field == _MAY_BE_ZERO)
 
 
 def _judged(
-    what: str, value: float | None, limit: float, unit: str
+    what: str, value: float | None, limit: float, unit: str, *, zero: bool
 ) -> Iterator[tuple[str, str, str]]:
-    if value is not None and not 0 <= value <= RAISED * limit:
-        told = f"0 to {RAISED * limit:g} {unit}, {RAISED:g} times the profile's"
+    if value is None:
+        return
+    if not 0 <= value <= RAISED * limit or (value == 0 and not zero):
+        told = f"{'0' if zero else 'above 0'} to {RAISED * limit:g} {unit}, "
+        told += f"{RAISED:g} times the profile's"
         yield what, f"{value:g} {unit}", told

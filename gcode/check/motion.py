@@ -31,6 +31,9 @@ FEED_SLACK = 2.0
 # Wipes pull back on the move; relative values that are read as absolute do half of the way.
 BACKWARDS_RATIO, BACKWARDS_MOVES = 0.25, 10
 INCH_MM = 25.4
+# Klipper's `[idle_timeout]` gives a hot machine that stands still ten minutes.
+STILL_S = 600.0
+LEAST_BEAD_Z_MM = 0.02  # the thinnest layer that a process profile may have
 
 
 class Motion:
@@ -72,6 +75,7 @@ class Motion:
         self._hotend_c = state.hotend_c if state else 0.0
         self._ready_c = self._hotend_c  # what the hotend was waited for
         self._bed_c = state.bed_c if state else 0.0
+        self._chamber_c = 0.0
         self._pulled_mm = 0.0
         self._short_mm3 = 0.0
         self._line, self._text = 0, ""
@@ -81,7 +85,7 @@ class Motion:
         high = (x1 + PLACE_SLACK_MM, y1 + PLACE_SLACK_MM, printer.max_z_mm + PLACE_SLACK_MM)
         self._limits_of_moves = (
             *low, *high, FASTEST_MM_S, SHORT_MM, SECTION_SLACK * printer.max_bead_section_mm2,
-            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect],
+            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect], LEAST_BEAD_Z_MM,
         )  # fmt: skip
 
     def follow(self, text: Text, first: int, end: int) -> int:
@@ -114,7 +118,8 @@ class Motion:
         fastest = (FEED_SLACK * speed.x / faster, FEED_SLACK * speed.y / faster)
         cold = self._ready_c < self._setup.printer.min_extrude_c
         return np.array(
-            [*self._limits_of_moves, *fastest, self._area_mm2, flow, cold], dtype=np.float64
+            [*self._limits_of_moves, *fastest, self._area_mm2, flow, cold, STILL_S * faster],
+            dtype=np.float64,
         )
 
     @property
@@ -126,6 +131,17 @@ class Motion:
     def _occupied(self) -> bool:
         """Whether something stands on the bed: from before, or laid by the program itself."""
         return self._stood or bool((self.moves.pushed_mm3 * self.moves.sideways_mm).any())
+
+    @property
+    def _top_mm(self) -> float | None:
+        """How high what stands there is, as far as is known; None where nothing is."""
+        laid = self.moves.pushed_mm3 * self.moves.sideways_mm > 0
+        laid_mm = float(self.moves.end_mm[laid, 2].max(initial=0.0))
+        return max(laid_mm, self._standing_top_mm or 0.0) or None
+
+    @property
+    def _hot_on_part(self) -> bool:
+        return self._hotend_c >= self._setup.printer.min_extrude_c and self._occupied
 
     def _backwards(self, lines: list[str]) -> None:
         """Relative values of E that are read as absolute go back and forth."""
@@ -206,6 +222,9 @@ class Motion:
         if None in here or None in target or (not self._absolute and "R" in words):
             self._refuse("arc from an unknown place", "G2/G3", "a known place")
             return
+        if (words.get("P") or 0.0) > 1:  # OrcaSlicer's spiral hops have P1
+            self._refuse("arc of several turns", f"P{words['P']:g}", "P1")
+            return
         x0, y0, z0 = (float(v or 0.0) for v in here)
         x1, y1, z1 = (float(v or 0.0) for v in target)
         if words.get("R") is not None:
@@ -232,6 +251,9 @@ class Motion:
             end = (float(target[0] or 0), float(target[1] or 0), float(target[2] or 0))
             length_mm = math.dist(start, end)
             self._speed(start, end, length_mm)
+            if pushed_mm > 0 and length_mm > SHORT_MM and min(start[2], end[2]) < LEAST_BEAD_Z_MM:
+                low_mm = min(start[2], end[2])
+                self._refuse("bead in the bed", f"Z {low_mm:g} mm", f"{LEAST_BEAD_Z_MM:g} mm")
             if length_mm > 0:
                 self.moves.add(self._line, start, end, pushed_mm * self._area_mm2)
         elif moved and self._standing_top_mm is not None and pushed_mm <= 0:
@@ -243,6 +265,10 @@ class Motion:
                     f"{self._standing_top_mm:g} mm",
                 )
         self._place = target
+        feed_mm_s = self._feed_mm_s * self._factor["M220"]
+        if max(length_mm, abs(pushed_mm)) > STILL_S * feed_mm_s > 0:
+            seconds = max(length_mm, abs(pushed_mm)) / feed_mm_s
+            self._refuse("move that takes too long", f"{seconds:.0f} s", f"{STILL_S:g} s")
         if pushed_mm:
             self._extrude(pushed_mm, length_mm, known=known)
 

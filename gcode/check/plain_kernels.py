@@ -11,8 +11,8 @@ from gcode.compiled import njit
 X, Y, Z, E, FEED, PULLED, SHORT_MM3, ABSOLUTE, ABSOLUTE_E, UNIT = range(10)
 (
     LOW_X, LOW_Y, LOW_Z, HIGH_X, HIGH_Y, HIGH_Z, FASTEST, SHORT_MOVE, SECTION, ALONE, LINE,
-    FAST_X, FAST_Y, AREA, FLOW, COLD,
-) = range(16)  # fmt: skip
+    LEAST_Z, FAST_X, FAST_Y, AREA, FLOW, COLD, STILL,
+) = range(18)  # fmt: skip
 EXACT = 2**53  # digits up to this, and as many decimals as a double divides by exactly
 MOST_DECIMALS = 22
 WORDS = 5  # X, Y, Z, E, F
@@ -132,6 +132,10 @@ def follow(data, starts, first, last, limits, state, rows, counts):
             if state[ABSOLUTE_E] > 0:
                 pushed -= e
             e += pushed
+        if max(length, abs(pushed)) > limits[STILL] * feed > 0.0:
+            return line
+        if pushed > 0.0 and length > limits[SHORT_MOVE] and min(row[3], row[6]) < limits[LEAST_Z]:
+            return line
         pulled, short_mm3 = state[PULLED], state[SHORT_MM3]
         if pushed != 0.0:
             if pushed > 0.0 and limits[COLD] > 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from gcode.check import limits
-from gcode.check.motion import INCH_MM, PLACE_SLACK_MM, Motion
+from gcode.check.motion import INCH_MM, PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
     COMMANDS,
     G90_SETS_E,
@@ -20,8 +20,17 @@ from gcode.check.words import (
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 
-HEATER_COMMANDS = {"M104": "hotend", "M109": "hotend", "M140": "bed", "M190": "bed"}
-_HEAD = re.compile(r"(?:N\d+\s*)?([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+HEATER_COMMANDS = {
+    **dict.fromkeys(("M104", "M109"), "hotend"),
+    **dict.fromkeys(("M140", "M190"), "bed"),
+    **dict.fromkeys(("M141", "M191"), "chamber"),
+}
+# Marlin's AUTOTEMP (B, F) and presets (I) set what no number here says.
+UNSAID_HEATS = frozenset("BFI")
+_HEAD = re.compile(r"([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+_NUMBERED = re.compile(r"N\s*\d")
+# M486 A tells an object's name
+FREE_TEXT = frozenset({"M117", "M118", "M486", "M862.3", "M115"})
 _TOOL = re.compile(r"T\d+")
 _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
@@ -29,6 +38,15 @@ KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
 # Factors on flow (M221) and speed (M220), per cent.
 FACTORS = {"M221": ("flow factor", 50.0, 150.0), "M220": ("speed factor", 10.0, 200.0)}
 MOTORS_OFF = frozenset({"M18", "M84"})
+# Axes that no profile has, of idlers, turntables and second carriages.
+OTHER_AXES = frozenset("ABCUVW")
+# s per second of G4's words
+DWELLS = {"S": 1.0, "P": 1e-3}
+# Klipper's Pressure_Advance.md has 0.05 to 1 s, the most with bowden extruders.
+MOST_ADVANCE_S = 2.0
+FULL_FAN = 255.0
+SAME_NOZZLE_MM = 0.01
+HOMING_SLACK_MM = 0.2  # as much as the tip may press into what it prints on
 
 
 class Judge(Motion):
@@ -62,6 +80,9 @@ class Judge(Motion):
             limit = LINE_LIMIT[self._dialect]
             self._refuse("line too long", f"{len(command)} characters", f"{limit}")
         upper = command.upper()
+        if _NUMBERED.match(upper):
+            self._numbered("line number of its own", upper)
+            return
         head = _HEAD.match(upper)
         if head is None:
             self._named(upper)
@@ -73,13 +94,20 @@ class Judge(Motion):
             return
         if lenient:
             self._choose(name)
-        if name in {"M117", "M118", "M862.3", "M115"}:
-            return  # free text
+        if name in FREE_TEXT:
+            return
+        if "*" in upper:
+            self._numbered("checksum of its own", upper[upper.index("*") :])
+            return
         words, wrong = words_of(upper[head.end() :])
         if wrong is not None:
             self._refuse(*wrong)
         else:
             self._act(name, words)
+
+    def _numbered(self, what: str, told: str) -> None:
+        """The link puts its own around each line, and firmwares read both."""
+        self._refuse(what, told.split(maxsplit=1)[0], "none: the link adds it")
 
     def end(self, lines: list[str]) -> None:
         """Judge what the program is as a whole, and what it leaves behind after its last line."""
@@ -87,7 +115,11 @@ class Judge(Motion):
         self._line, self._text = len(lines), lines[-1]
         if not self._alone:
             return
-        heaters = (("hotend", self._hotend_c, "M104 S0"), ("bed", self._bed_c, "M140 S0"))
+        heaters = (
+            ("hotend", self._hotend_c, "M104 S0"),
+            ("bed", self._bed_c, "M140 S0"),
+            ("chamber", self._chamber_c, "M141 S0"),
+        )
         for what, value_c, off in heaters:
             if value_c > 0:
                 self._refuse(
@@ -109,13 +141,15 @@ class Judge(Motion):
         elif name in STARTS and self._occupied:
             self._refuse("homing Z onto a standing part", name, "nothing may stand there")
         elif name == "TURN_OFF_HEATERS" or (self._ends and name == self._ends.upper()):
-            self._hotend_c = self._ready_c = self._bed_c = 0.0
+            self._hotend_c = self._ready_c = self._bed_c = self._chamber_c = 0.0
             if name != "TURN_OFF_HEATERS":
                 self._place = [None] * 3  # it goes where it parks
-        elif name == "SET_HEATER_TEMPERATURE" and given.get("HEATER") in KLIPPER_HEATERS:
+        elif name == "SET_HEATER_TEMPERATURE":
             # without a target Klipper takes 0
             target_c = self._number(given.get("TARGET", "0"))
-            self._heat(KLIPPER_HEATERS[given["HEATER"]], {"S": target_c})
+            self._heat(KLIPPER_HEATERS.get(given.get("HEATER", ""), "M141"), {"S": target_c})
+        elif name == "SET_PRESSURE_ADVANCE":
+            self._advance(self._number(given.get("ADVANCE")))
         elif name == "SET_GCODE_OFFSET":
             self._offset(given)
         elif name == "TEMPERATURE_WAIT" and given.get("SENSOR") == "EXTRUDER":
@@ -150,10 +184,14 @@ class Judge(Motion):
     # ------------------------------------------------------------------ commands
 
     def _act(self, name: str, words: dict[str, float | None]) -> None:
+        if name in {"G0", "G1", "G2", "G3"}:
+            self._other_axes(words)
         if name in {"G0", "G1"}:
             self._move(words)
         elif name in {"G2", "G3"}:
             self._arc(words, clockwise=name == "G2")
+        elif name == "G4":
+            self._dwell(words)
         elif name == "G28":
             self._home(words)
         elif name in PROBES and self._occupied:
@@ -191,6 +229,44 @@ class Judge(Motion):
         elif name == "M290":
             for letter in "XYZS":
                 self._shift(f"M290 {letter}", words.get(letter))
+        else:
+            self._set_one(name, words)
+
+    def _set_one(self, name: str, words: dict[str, float | None]) -> None:
+        """Commands that set one thing."""
+        if name == "M106":
+            self._within("fan", words.get("S"), 0.0, FULL_FAN, "")
+        elif name == "M572":
+            self._advance(words.get("S"))
+        elif name == "M558" and "P" in words:
+            self._refuse("type of the probe that homes Z", name, "the machine's own")
+        elif name == "M862.1":
+            nozzle_mm = self._setup.printer.nozzle_diameter_mm
+            low_mm, high_mm = nozzle_mm - SAME_NOZZLE_MM, nozzle_mm + SAME_NOZZLE_MM
+            self._within("nozzle that it was made for", words.get("P"), low_mm, high_mm, " mm")
+
+    def _other_axes(self, words: dict[str, float | None]) -> None:
+        for letter in sorted(OTHER_AXES & words.keys()):
+            self._refuse("axis that the machine does not have", letter, "X, Y, Z and E")
+        for letter in "HS" if self._dialect == "reprap" else "":
+            if words.get(letter):
+                told = f"{letter}{words[letter]:g}"
+                self._refuse("move past the end stops or of one motor", told, f"{letter}0")
+
+    def _dwell(self, words: dict[str, float | None]) -> None:
+        for letter, per_s in DWELLS.items():
+            seconds = (words.get(letter) or 0.0) * per_s
+            if seconds < 0:
+                self._refuse("wait", f"{seconds:g} s", "0 s or more")
+            elif seconds > STILL_S and self._hot_on_part:
+                self._refuse("hot wait on the part", f"{seconds:g} s", f"{STILL_S:g} s")
+
+    def _advance(self, seconds: float | None) -> None:
+        self._within("pressure advance", seconds, 0.0, MOST_ADVANCE_S, " s")
+
+    def _within(self, what: str, value: float | None, low: float, high: float, unit: str) -> None:
+        if value is not None and not low <= value <= high:
+            self._refuse(what, f"{value:g}{unit}", f"{low:g} to {high:g}{unit}")
 
     def _tool_settings(self, name: str, words: dict[str, float | None]) -> None:
         """RepRapFirmware's G10 with P or L: a tool's temperatures, or a shift."""
@@ -199,8 +275,10 @@ class Judge(Motion):
                 self._refuse("shift of the coordinate system", f"{name} L {letter}", "0 mm")
             else:
                 self._shift(f"{name} {letter}", words.get(letter))
-        if "S" in words and "L" not in words:
-            self._heat("M104", {"S": words["S"]})
+        if "L" not in words:
+            self._within("standby temperature", words.get("R"), *self._temperatures("hotend"))
+            if "S" in words:
+                self._heat("M104", {"S": words["S"]})
 
     def _shift(self, what: str, value_mm: float | None) -> None:
         if value_mm is not None and abs(value_mm) > PLACE_SLACK_MM:
@@ -220,25 +298,48 @@ class Judge(Motion):
         if value_c is None:
             self._refuse(f"{what} temperature missing", "no S", "a temperature")
             return
-        printer = self._setup.printer
-        limit_c = printer.max_hotend_c if what == "hotend" else printer.max_bed_c
-        if not 0 <= value_c <= limit_c:
-            self._refuse(f"{what} temperature", f"{value_c:g} °C", f"{limit_c:g} °C")
+        for letter in sorted(UNSAID_HEATS & words.keys()):
+            self._refuse("temperature that the firmware chooses", f"{name} {letter}", "S alone")
+        if what == "hotend":
+            tool = f"T{words.get('T') or 0.0:g}"
+            if tool not in {"T0", self._tool}:  # firmwares pass over one that is not there
+                if value_c != 0:
+                    self._refuse("hotend of another tool", tool, "the only one, T0")
+                return
+        self._within(f"{what} temperature", value_c, *self._temperatures(what))
         if what == "bed":
             self._bed_c = value_c
+        elif what == "chamber":
+            self._chamber_c = value_c
         else:
             self._hotend_c = value_c
             # waited for, or cooling from now on
             if name == "M109" or value_c < self._ready_c:
                 self._ready_c = value_c
 
+    def _temperatures(self, what: str) -> tuple[float, float, str]:
+        """The least, the most, and their unit; no chamber gets as hot as a bed."""
+        printer = self._setup.printer
+        return 0.0, printer.max_hotend_c if what == "hotend" else printer.max_bed_c, " °C"
+
     def _home(self, words: dict[str, float | None], by: str = "G28 with Z") -> None:
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
         if 2 in axes and self._occupied:
             self._refuse("homing Z onto a standing part", by, "G28 X Y only")
+        elif self._occupied:
+            self._homes_above(self._place[2])
         for axis in axes:
             self._homed[axis] = True
             self._place[axis] = None  # the place of an end stop is the firmware's business
+
+    def _homes_above(self, z_mm: float | None) -> None:
+        """X and Y are homed across the bed: above all that stands there."""
+        top_mm = self._top_mm
+        if top_mm is None or (z_mm is None and self._standing_top_mm is None):
+            return
+        if z_mm is None or z_mm < top_mm - HOMING_SLACK_MM:
+            told = "an unknown height" if z_mm is None else f"Z {z_mm:g} mm"
+            self._refuse("homing X or Y below the top of what stands there", told, f"{top_mm:g} mm")
 
     def _set_place(self, words: dict[str, float | None]) -> None:
         for axis, letter in enumerate("XYZ"):

@@ -1,7 +1,8 @@
 """Which commands a program may hold, by dialect.
 
 What changes the machine lastingly, or switches a protection off, is left out on purpose: EEPROM
-(M500, M502), steps per mm (M92), cold extrusion (M302), homing offsets (M206, M428), PID tuning.
+(M500, M502), steps per mm (M92), cold extrusion (M302), homing offsets (M206, M428), PID tuning,
+the numbers of lines (M110).
 So are curves whose course nothing here follows (G5).
 """
 
@@ -12,7 +13,7 @@ import re
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
 _MOTION = "G0 G1 G2 G3 G4 G10 G11 G17 G20 G21 G28 G90 G91 G92"
 _COMMON = (
-    "M17 M18 M73 M82 M83 M84 M104 M105 M106 M107 M109 M110 M114 M115 M117 M118 M140 M141 M190 "
+    "M17 M18 M73 M82 M83 M84 M104 M105 M106 M107 M109 M114 M115 M117 M118 M140 M141 M190 "
     "M191 M201 M203 M204 M205 M220 M221 M300 M400 M900 T0 M155 M150 M486 M600 M601 M25"
 )
 _PROBING = "G29 G32 G34 G80 G81"
@@ -34,7 +35,9 @@ COMMANDS: dict[str, frozenset[str]] = {
                         "M572 M376 M557 M558 M593".split()),
 }  # fmt: skip
 # What measures or moves against the bed with a probe or the nozzle: never over a standing part.
-PROBES = frozenset({"G29", "G32", "G34", "G80", "G81", "BED_MESH_CALIBRATE", "QUAD_GANTRY_LEVEL"})
+PROBES = frozenset(
+    {"G29", "G32", "G34", "G76", "G80", "G81", "BED_MESH_CALIBRATE", "QUAD_GANTRY_LEVEL"}
+)
 # Macros that begin a job by convention: they home all axes, and most of them probe.
 STARTS = frozenset({"START_PRINT", "PRINT_START"})
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
@@ -60,7 +63,6 @@ def words_of(rest: str) -> tuple[dict[str, float | None], tuple[str, str, str] |
 
     A letter without a number is a flag.
     """
-    rest = rest.partition("*")[0]
     words: dict[str, float | None] = {}
     at = 0
     while at < len(rest):

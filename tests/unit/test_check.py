@@ -128,7 +128,35 @@ FAULTS = {
     "all axes set to nothing": ("G92 E0", "G92", "coordinate system"),
     "a curve that nothing follows": ("G1 X90 E3 F1000", "G5 X90 Y50 I1 J1 P1 Q1 E3", "unknown"),
     "relative moves": ("G1 X80 E0.7", "G91\nG1 X200 E0.7", "out of reach"),
-}
+    "hot wait on the part": ("G1 Z1 F720\n", "G4 S3600\nG1 Z1 F720\n", "hot wait"),
+    "hot wait in milliseconds": ("G1 Z1 F720\n", "G4 P3600000\nG1 Z1 F720\n", "hot wait"),
+    "wait of no time": ("M83\n", "M83\nG4 S-5\n", "wait"),
+    "homes X below what it printed": (
+        "G1 Z10 F720", "G1 Z0.1 F720\nG28 X\nG1 Z10 F720", "homing X or Y below"
+    ),
+    "chamber too hot": ("M83\n", "M83\nM141 S500\n", "chamber temperature"),
+    "chamber left on": ("M83\n", "M83\nM191 S45\n", "M141 S0 is lacking"),
+    "an axis that is not there": ("G1 X60 Y60 F6000", "G1 X60 Y60 A9 F6000", "axis that"),
+    "a carriage that is not there": ("G1 X60 Y60 F6000", "G1 X60 Y60 U9 F6000", "axis that"),
+    "line number": ("G1 X80 E0.7", "N5 G1 X80 E0.7", "line number"),
+    "checksum": ("G1 X80 E0.7 F1200", "G1 X80 E0.7 F1200*99", "checksum"),
+    "line numbers begun anew": ("G1 X80 E0.7", "M110 N0\nG1 X80 E0.7", "not allowed"),
+    "pressure advance": ("M83\n", "M83\nM572 S9\n", "pressure advance"),
+    "bead in the bed": ("G1 Z0.5\n", "G1 Z0.005\n", "bead in the bed"),
+    "goes down into the bed": ("G1 X80 E0.7", "G1 X80 Z0 E0.7", "bead in the bed"),
+    "a move of hours": ("G1 X80 E0.7 F1200", "G1 X80 E0.7 F0.1", "takes too long"),
+    "a push of hours": ("G1 E0.8 F2100", "G1 E0.8 F0.01", "takes too long"),
+    "a nozzle of another size": ("M83\n", "M83\nM862.1 P0.8\n", "nozzle that it was made for"),
+    "a temperature by flow": ("M109 S215", "M109 S180 B450 F1", "firmware chooses"),
+    "a temperature by preset": ("M140 S60", "M140 S60 I1", "firmware chooses"),
+    "another tool's hotend": ("M109 S215", "M109 T1 S215", "another tool"),
+    "fan beyond full": ("M107\n", "M106 S9999\n", "fan"),
+    "fan below nothing": ("M107\n", "M106 S-5\n", "fan"),
+    "no acceleration at all": ("M83\n", "M83\nM204 P0\n", "acceleration by M204 P"),
+    "an axis that never arrives": ("M83\n", "M83\nM203 X0\n", "X's speed"),
+    "probe calibrated over what it printed": ("M104 S0\n", "G76\nM104 S0\n", "probing over"),
+    "arc of several turns": ("I0 J5 E0.5", "I0 J5 P30 E0.5", "several turns"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -144,6 +172,55 @@ def test_a_planted_fault_is_refused(name: str) -> None:
     assert refusals, name
     if said is not None:
         assert any(said in refusal.what for refusal in refusals), [str(r) for r in refusals]
+
+
+ORDINARY = {
+    "prusa": ["M862.1 P0.4", "M862.1 T0 P0.4 A0", "M486 Acube.stl id:0 copy 0", "M900 K30",
+              "M907 E538", "M104 S215 T0", "M204 P1250 R1250 T1250", "M205 S0 T0", "M141 S0"],
+    "marlin": ["M862.1 P0.4", "M106 P2 S255", "M205 J0.02", "M900 K0.05", "M413 S0", "M191 S0",
+               "M204 S500", "M141 S45\nM141 S0", "M117 N5 *"],
+    "klipper": ["SET_PRESSURE_ADVANCE ADVANCE=0.04 SMOOTH_TIME=0.02", "M106 P3 S127.5",
+                "G3 Z10.4 I0.1 J1.2 P1 F6000",
+                "SET_HEATER_TEMPERATURE HEATER=chamber TARGET=45\nTURN_OFF_HEATERS",
+                "SET_VELOCITY_LIMIT ACCEL=3000 SQUARE_CORNER_VELOCITY=0", "M141 S0",
+                "EXCLUDE_OBJECT_DEFINE NAME=a*2 CENTER=50,60", "M104 T1 S0"],
+    "reprap": ["M572 D0 S0.05", "M106 P0 S0.5", "M141 P0 S0", "M568 P0 S0 R0", "G1 H0 Z10 F720"],
+}  # fmt: skip
+PRINTERS = {"prusa": "prusa_mk3s", "marlin": "ender_3", "klipper": "generic_klipper",
+            "reprap": "generic_reprap"}  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", ORDINARY)
+def test_what_slicers_ordinarily_write_passes(dialect: str) -> None:
+    """G4 and M106 everywhere; after the last bead, where most faults above would be."""
+    setup = load_setup(PRINTERS[dialect])
+    good = GOOD.replace("G28 W", "G28")
+    for line in ["G4 S0", "G4 P100", "M106 S0", "M106 S255", "G28 X0 Y0", *ORDINARY[dialect]]:
+        text = good.replace("G1 Z10 F720\n", f"G1 Z10 F720\n{line}\n")
+        assert not find_refusals(Program(text, dialect), setup), line
+
+
+def test_a_cold_machine_may_wait_and_a_hot_one_soak_before_the_first_bead() -> None:
+    for before in ("G28 W\n", "M104 S215\n"):
+        assert not find_refusals(program(GOOD.replace(before, f"G4 S3600\n{before}")), SETUP)
+
+
+@pytest.mark.parametrize(("z_mm", "said"), [(4.0, "homing X or Y below"), (5.0, None)])
+def test_x_and_y_are_homed_above_all_that_stands(z_mm: float, said: str | None) -> None:
+    start = ModalState((60.0, 60.0, z_mm), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    found = find_refusals(
+        program("G28 X Y\n"), SETUP, as_built=standing(5.0, 80.0, 84.0), initial=start
+    )
+    assert (said is None) == (not found)
+    assert all(said in r.what and "4 mm, limit 5 mm" in str(r) for r in found)
+
+
+def test_one_after_another_x_is_homed_above_the_first() -> None:
+    """At the top of the second, which is lower: the head would cross the first."""
+    tower = "G1 Z5 F720\nG1 X70 E1 F1200\nG1 Z0.5 F720\nG1 X80 Y80\nG1 X90 E1 F1200\nG28 X\n"
+    (only,) = find_refusals(program(tower), SETUP, initial=MID)
+    assert str(only).startswith("line 6 ('G28 X'): homing X or Y below")
+    assert str(only).endswith("Z 0.5 mm, limit 5 mm")
 
 
 RELATIVE = GOOD.replace(
@@ -172,6 +249,8 @@ def test_a_reprap_machine_heats_by_g10_and_waits_by_m116() -> None:
     text = GOOD.replace("M104 S215\n", "G10 P0 S215 R150\n").replace("M109 S215", "M116")
     assert not find_refusals(Program(text, "reprap"), setup)
     told = {"M203 X18000 Y18000 Z300": None, "M203 X180000": "X's speed", "M566 Z600": "Z's jerk"}
+    told |= {"G10 P0 R900": "standby", "M558 P0": "probe that homes", "M572 D0 S9": "pressure"}
+    told |= {"G1 H1": "end stops", "G1 H2": "one motor", "G1 S1": "end stops"}
     told |= {"M290 Z-0.5": "coordinate", "G10 L2 P1 X5": "coordinate", "G10 P0 S900": "hotend"}
     for line, said in told.items():
         found = find_refusals(Program(text.replace("M83", f"M83\n{line}"), "reprap"), setup)
@@ -311,6 +390,14 @@ KLIPPER_FAULTS = {
     "left on by its name": (
         "END_PRINT", "END_PRINT\nSET_HEATER_TEMPERATURE HEATER=heater_bed TARGET=60", "is lacking"
     ),
+    "chamber by its name": (
+        "G90\n", "G90\nSET_HEATER_TEMPERATURE HEATER=chamber TARGET=400\n", "chamber temperature"
+    ),
+    "chamber left on by its name": (
+        "END_PRINT", "END_PRINT\nSET_HEATER_TEMPERATURE HEATER=chamber TARGET=45", "is lacking"
+    ),
+    "pressure advance": ("G90\n", "SET_PRESSURE_ADVANCE ADVANCE=9\nG90\n", "pressure advance"),
+    "no acceleration at all": ("G90\n", "SET_VELOCITY_LIMIT ACCEL=0\nG90\n", "acceleration"),
     "offset": ("G90\n", "SET_GCODE_OFFSET Z=-0.5\nG90\n", "coordinate system"),
     "offset step by step": ("G90\n", "SET_GCODE_OFFSET Z_ADJUST=-0.5\nG90\n", "coordinate"),
     "another tool": ("G1 X110 E3 F1200", "G1 X110 E3 F1200\nT1\nG1 X50 E3", "change of tool"),
