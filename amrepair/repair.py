@@ -346,6 +346,7 @@ def plan_repair(
             grid=site.grid,
             standalone=interruption is None,
             start_mm=_start_of(interruption),
+            hotend_c=None if interruption is None else interruption.hotend_c,
             lines=_lines_of(site, deficit, placed),
             progress=progress,
         )

@@ -1,7 +1,7 @@
 """In which order beads are laid, and where loops begin.
 
-Nearest next within an island; a loop's seam goes to its sharpest inward corner, or else to the
-corner nearest to the seam of the layer below, so that seams line up.
+Nearest next within an island; a loop's seam goes to an inward corner, the nearest to the seam of
+the layer below, or else to the nearest corner or point, so that seams line up.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from gcode.slicing import order_kernels as kernels
 from gcode.slicing.beads import Bead
 
 CORNER_RAD = 0.6  # turns sharper than this hide a seam
-# Millimetres that a corner is worth: an inward one hides the seam best.
-INWARD_MM, OTHER_MM = 3.0, 1.5
+# Millimetres that a corner is worth: an inward one hides the seam wherever on the loop it is.
+INWARD_MM, OTHER_MM = 1000.0, 1.5
 
 
 def seam_index(loop: Float[np.ndarray, "n 2"], aim_mm: Float[np.ndarray, " 2"]) -> int:

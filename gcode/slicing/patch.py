@@ -83,6 +83,7 @@ def slice_patch(
     grid: LayerGrid,
     standalone: bool,
     start_mm: tuple[float, float, float] | None = None,
+    hotend_c: float | None = None,
     lines: JobLines | None = None,
     progress: Progress = silent,
 ) -> PatchPlan:
@@ -100,6 +101,9 @@ def slice_patch(
         True: a whole program for a part that stands on a machine whose Z is still true: X and Y
         are homed, Z never. False: in mid-job, hot, parked at `start_mm` with the filament pulled
         back by the profile's retraction; the patch ends there likewise.
+    hotend_c
+        What the job prints at; None: what the material is printed at. The first pass is hotter by
+        the material's `repair_first_bead_delta_c`.
     lines
         What the job laid there, where that is known: the patch follows it, step by step of its
         staircase, with as much of each line's plastic as is missing.
@@ -132,14 +136,15 @@ def slice_patch(
         raise SliceError("A patch in mid-job needs the place where the nozzle is parked.")
     model = PatchModel(deficit, setup, as_built, lines)
     passes = plan_passes(model, grid, setup, progress)
-    pen = begin(setup, as_built, start_mm)
+    hotend_c = setup.material.hotend_c if hotend_c is None else hotend_c
+    pen = begin(setup, as_built, start_mm, hotend_c)
     laid_mm3 = 0.0
     first = True
     for stage in stages_of(passes, model, pen.position_mm[:2]):
         for one in stage.passes:
-            laid_mm3 += emit(pen, one, stage.reach, setup, first=first)
-            if first and standalone:
-                after_first(pen, setup)
+            laid_mm3 += emit(pen, one, stage.reach, model, setup, first=first)
+            if first:
+                after_first(pen, setup, hotend_c)
             first = False
     end(pen, setup, as_built, start_mm)
     unreachable, regions = _left_over(model)

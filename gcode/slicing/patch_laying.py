@@ -19,37 +19,44 @@ from gcode.moves import (
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import width_of
 from gcode.slicing.patch_beads import Chain, surely_free
-from gcode.slicing.patch_model import NEAR_MM
+from gcode.slicing.patch_model import NEAR_MM, PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.pen import Pen
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 
+LEVEL_MM = 1e-6
 CLEAR_MM = 0.5  # of the tip over everything on a travel
 STANDALONE_LIFT_MM = 5.0
 
 
 def begin(
-    setup: PrintSetup, field: HeightField, start_mm: tuple[float, float, float] | None
+    setup: PrintSetup,
+    field: HeightField,
+    start_mm: tuple[float, float, float] | None,
+    hotend_c: float,
 ) -> Pen:
-    """From park (mid-job), or from a machine that stands still (standalone)."""
+    """From park (mid-job), or from a machine that stands still (standalone); hot at the end."""
+    first_c = _first_bead_c(setup, hotend_c)
     if start_mm is not None:
         pen = Pen(setup, np.array(start_mm))
         pen.retracted = setup.printer.retraction_mm > 0
         pen.add(SetFan(setup.material.fan_ratio))
+        if first_c > hotend_c:
+            pen.add(SetHotend(first_c, wait=True))
         return pen
     printer, material = setup.printer, setup.material
     safe_mm = min(field.top_mm + STANDALONE_LIFT_MM, printer.max_z_mm)
     pen = Pen(setup, np.array([*printer.prime_mm[:2], safe_mm]))
     pen.add(Comment("The part stands on the bed and Z is true: X and Y are homed, Z is not."))
     pen.add(SetBed(material.bed_c))
-    pen.add(SetHotend(material.hotend_c))
+    pen.add(SetHotend(hotend_c))
     lift = f"{safe_mm:.3f}".rstrip("0").rstrip(".")
     pen.add(Script(("G21", "G91", "G1 Z2 F600", "G90", f"G1 Z{lift} F600", "G28 X Y"), "approach"))
     pen.position_mm = np.array([0.0, 0.0, safe_mm])
     pen.move_to(np.array([*printer.prime_mm[:2], safe_mm]))
     pen.add(SetBed(material.bed_c, wait=True))
-    pen.add(SetHotend(material.hotend_c + material.repair_first_bead_delta_c, wait=True))
+    pen.add(SetHotend(first_c, wait=True))
     pen.move_to(np.array(printer.prime_mm))
     if printer.prime_length_mm > 0:
         pen.add(Prime(printer.prime_length_mm, 3.0))
@@ -86,13 +93,21 @@ def end(
     pen.add(SetFan(0.0))
 
 
-def after_first(pen: Pen, setup: PrintSetup) -> None:
-    """As hot as the material is printed otherwise; nothing waits for it."""
-    if setup.material.repair_first_bead_delta_c > 0:
-        pen.add(SetHotend(setup.material.hotend_c))
+def after_first(pen: Pen, setup: PrintSetup, hotend_c: float) -> None:
+    """As hot as everything else is printed; nothing waits for it."""
+    if _first_bead_c(setup, hotend_c) > hotend_c:
+        pen.add(SetHotend(hotend_c))
 
 
-def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup, *, first: bool) -> float:
+def _first_bead_c(setup: PrintSetup, hotend_c: float) -> float:
+    """It must melt into what has long been cold; a job may be as hot as the hotend gets."""
+    hotter_c = hotend_c + setup.material.repair_first_bead_delta_c
+    return max(hotend_c, min(hotter_c, setup.printer.max_hotend_c))
+
+
+def emit(
+    pen: Pen, one: Pass, reach: Reach, model: PatchModel, setup: PrintSetup, *, first: bool
+) -> float:
     """Lay one pass, the first one no faster than a first layer; returns its plastic."""
     pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
     speed_mm_s = setup.process.repair_speed_mm_s
@@ -103,17 +118,7 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup, *, first: bool) -
     # along a surface they are in order: the lowest first
     chains = _walls_last(one.chains, pen.position_mm[:2]) if planar else one.chains
     for chain in chains:
-        target = np.array([*chain.xy_mm[0], chain.z_mm[0]])
-        gap = target - pen.position_mm
-        near = abs(gap[2]) < 1e-6 and float(np.hypot(gap[0], gap[1])) < NEAR_MM
-        samples = 2 + int(np.ceil(3 * np.hypot(gap[0], gap[1]) / reach.field.cell_mm))
-        way = pen.position_mm[:2] + np.linspace(0.0, 1.0, samples)[:, None] * gap[:2]
-        if near and surely_free(way, one.reach, reach).all():
-            pen.move_to(target)
-        else:
-            # what this stage has laid stands no higher than this pass
-            over_mm = max(reach.least_over(way), one.z_mm) + CLEAR_MM
-            pen.hop_to(target, over_mm=min(over_mm, setup.printer.max_z_mm))
+        _go_to(pen, np.array([*chain.xy_mm[0], chain.z_mm[0]]), one, reach, model, setup)
         width_mm = float(chain.section_mm2.mean()) / one.height_mm
         pen.extrude(
             np.column_stack([chain.xy_mm, chain.z_mm]),
@@ -125,6 +130,30 @@ def emit(pen: Pen, one: Pass, reach: Reach, setup: PrintSetup, *, first: bool) -
         )
         laid_mm3 += chain.volume_mm3
     return laid_mm3
+
+
+def _go_to(
+    pen: Pen,
+    target_mm: Float[np.ndarray, " 3"],
+    one: Pass,
+    reach: Reach,
+    model: PatchModel,
+    setup: PrintSetup,
+) -> None:
+    """Directly where it is near, or over the patch all along; else pulled back and lifted."""
+    across, rise = (target_mm - pen.position_mm)[:2], float(target_mm[2] - pen.position_mm[2])
+    far = float(np.hypot(*across))
+    samples = 2 + int(np.ceil(3 * far / min(reach.field.cell_mm, model.cell_mm)))
+    way = pen.position_mm[:2] + np.linspace(0.0, 1.0, samples)[:, None] * across
+    near = abs(rise) < LEVEL_MM and far < NEAR_MM
+    # what oozes there, beads cover; what was laid before stands no higher than this pass
+    combed = isinstance(one.tip_mm, float) and rise > -LEVEL_MM and model.is_over(way).all()
+    if (near or combed) and surely_free(way, one.reach, reach).all():
+        pen.move_to(np.array([*pen.position_mm[:2], target_mm[2]]))
+        pen.move_to(target_mm)
+    else:
+        over_mm = max(reach.least_over(way), one.z_mm) + CLEAR_MM
+        pen.hop_to(target_mm, over_mm=min(over_mm, setup.printer.max_z_mm))
 
 
 def _walls_last(chains: tuple[Chain, ...], start_mm: Float[np.ndarray, " 2"]) -> list[Chain]:

@@ -133,6 +133,13 @@ class PatchModel:
         """Columns over which the nozzle may be, from an answer of `reach`."""
         return self.reach.free_in_cells(self._tip_cells, reach).reshape(self.shape)
 
+    def is_over(self, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+        """Whether something is missing below points."""
+        cells = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)[:, ::-1]
+        inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
+        cells = np.where(inside[:, None], cells, 0)
+        return np.asarray(inside & np.isfinite(self.top_mm[cells[:, 0], cells[:, 1]]))
+
     def surface(self, finished: Bool[np.ndarray, "ny nx"] | bool = True) -> HeightField:
         """The as-built field with the patch on it, or with what of it is finished."""
         return self.raised((self.laid_mm > 0) & finished, self.surface_mm)

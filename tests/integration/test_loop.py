@@ -100,6 +100,22 @@ def test_every_repair_starts_and_ends_parked(broken: SimulatedRun) -> None:
             assert places[-1][:2] == pytest.approx(broken.prepared.setup.printer.park_mm[:2])
 
 
+def test_every_repair_is_begun_hotter_and_gone_on_with_as_hot_as_the_job(
+    broken: SimulatedRun,
+) -> None:
+    material = broken.prepared.setup.material
+    job_c, hotter_c = material.hotend_c, material.hotend_c + material.repair_first_bead_delta_c
+    programs = [
+        look.plan.checked.program
+        for look in broken.report.looks
+        if look.printed and look.plan.checked is not None
+    ]
+    assert programs
+    for program in programs:
+        heats = [line for line in program.lines() if line.startswith(("M104", "M109"))]
+        assert heats == [f"M109 S{hotter_c:g}", f"M104 S{job_c:g}"]
+
+
 def test_looks_become_pictures(broken: SimulatedRun) -> None:
     first = broken.report.looks[0]
     shown = look_of(first.plan, "first", printed=first.printed)

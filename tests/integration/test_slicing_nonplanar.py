@@ -8,12 +8,13 @@ import pytest
 import trimesh
 
 from gcode.check import find_refusals
-from gcode.moves import Extrude, LayerChange, ModalState, Program
+from gcode.moves import ModalState, Program
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
+from tests.gcode_text import beads_of, points_of, steps_of
 from tests.judge import Verdict, judge
 
 PARK = (10.0, 200.0, 20.0)
@@ -44,9 +45,9 @@ def patched(block: m3.Manifold, process: str) -> tuple[PatchPlan, Program, Heigh
     return plan, write(plan.toolpath, setup, title="slope", resume=HOT, restore=False), field
 
 
-def slanted(plan: PatchPlan) -> list[np.ndarray]:
-    """Beads that are not at a layer's height, or climb."""
-    beads = [move.points_mm for move in plan.toolpath if isinstance(move, Extrude)]
+def slanted(program: Program) -> list[np.ndarray]:
+    """Beads of the text that are not at a layer's height, or climb."""
+    beads = [points_of(bead) for bead in beads_of(steps_of(program.text, PARK))]
     layers = 0.2 * np.arange(100)
     return [b for b in beads if np.abs(b[:, 2, None] - layers).min(axis=1).max() > 0.03]
 
@@ -67,28 +68,29 @@ def verdict_of(program: Program, block: m3.Manifold) -> Verdict:
 @pytest.mark.parametrize("slope_deg", [4.0, 8.0])
 def test_a_gentle_slope_is_followed_and_less_lies_outside(slope_deg: float) -> None:
     block = sloped(slope_deg)
-    plan, program, field = patched(block, "repair_0.20_nonplanar")
-    beads = slanted(plan)
+    _, program, field = patched(block, "repair_0.20_nonplanar")
+    beads = slanted(program)
     assert beads
     for bead in beads:
         over_mm = bead[:, 2] - HIGH_MM - (bead[:, 0] - MIDDLE_MM) * np.tan(np.radians(slope_deg))
         assert over_mm.min() >= -0.02
         assert over_mm.max() <= 0.07
     # regression: what was laid uphill was ploughed by the next bead; the lowest come first
-    last = max(k for k, move in enumerate(plan.toolpath) if isinstance(move, LayerChange))
-    starts_mm = [m.points_mm[0, 2] for m in plan.toolpath.moves[last:] if isinstance(m, Extrude)]
+    steps = steps_of(program.text, PARK)
+    top = [step for step in steps if step.layer == steps[-1].layer]
+    starts_mm = [bead[0].start_mm[2] for bead in beads_of(top)]
     assert starts_mm == sorted(starts_mm)
     setup = load_setup(process="repair_0.20_nonplanar")
     assert not find_refusals(program, setup, as_built=field, initial=HOT)
-    steps = verdict_of(patched(block, "repair_0.20")[1], block)
+    stepped = verdict_of(patched(block, "repair_0.20")[1], block)
     smooth = verdict_of(program, block)
-    assert smooth.filled_ratio > steps.filled_ratio - 0.005
-    assert smooth.outside_ratio < steps.outside_ratio
+    assert smooth.filled_ratio > stepped.filled_ratio - 0.005
+    assert smooth.outside_ratio < stepped.outside_ratio
 
 
 @pytest.mark.parametrize("slope_deg", [0.0, 30.0])
 def test_flat_tops_and_steep_slopes_are_laid_in_layers(slope_deg: float) -> None:
     block = sloped(slope_deg)
-    assert slanted(patched(block, "repair_0.20_nonplanar")[0]) == []
+    assert slanted(patched(block, "repair_0.20_nonplanar")[1]) == []
     one, other = (patched(block, f"repair_0.20{name}")[0] for name in ("", "_nonplanar"))
     assert one.beads_mm3 == pytest.approx(other.beads_mm3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import manifold3d as m3
 import numpy as np
@@ -16,7 +15,7 @@ from amrepair.simulate.world import World
 from gcode.check import find_refusals
 from gcode.errors import SliceError
 from gcode.firmware.motion import MotionBatch
-from gcode.moves import Extrude, LayerChange, ModalState, Role, SetHotend, Toolpath, Travel
+from gcode.moves import Extrude, LayerChange, ModalState, Role, Toolpath
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
@@ -177,35 +176,6 @@ def test_a_standalone_patch_never_homes_z_and_ends_cold() -> None:
     assert "M140 S0" in program.text
 
 
-def test_the_first_pass_is_slower_and_hotter_and_the_rest_is_not() -> None:
-    # regression: a patch of its own was laid as hot as its first bead to the end
-    missing = POCKETS["flat"]
-    field = HeightField.from_manifold(BLOCK - missing, 0.25, margin_mm=8.0)
-    fast = SETUP.process.model_copy(update={"repair_speed_mm_s": 35.0})
-    setup = replace(SETUP, process=fast)
-    plan = slice_patch(
-        missing, setup, as_built=field, grid=LayerGrid.from_setup(setup), standalone=True
-    )
-    hot_c = 0.0
-    speeds: list[set[float]] = []
-    heats: list[set[float]] = []
-    for move in plan.toolpath:
-        if isinstance(move, SetHotend):
-            hot_c = move.temperature_c
-        elif isinstance(move, LayerChange):
-            speeds.append(set())
-            heats.append(set())
-        elif isinstance(move, Extrude):
-            speeds[-1].add(move.speed_mm_s)
-            heats[-1].add(hot_c)
-    material, process = setup.material, setup.process
-    assert material.repair_first_bead_delta_c > 0
-    assert heats[0] == {material.hotend_c + material.repair_first_bead_delta_c}
-    assert speeds[0] == {process.first_layer_speed_mm_s}
-    assert all(heat == {material.hotend_c} for heat in heats[1:])
-    assert all(speed == {process.repair_speed_mm_s} for speed in speeds[1:])
-
-
 def test_a_deep_narrow_shaft_is_out_of_reach_and_said_so() -> None:
     shaft = m3.Manifold.cube((3.0, 3.0, 3.6)).translate((73.0, 73.0, TOP_MM - 3.6))
     plan, _ = plan_of(shaft)
@@ -221,21 +191,6 @@ def test_what_lies_under_a_roof_is_covered() -> None:
     assert plan.beads_mm3 == 0
     assert plan.unreachable[0].reason.startswith("covered")
     assert plan.unreachable[0].volume_mm3 == pytest.approx(cave.volume(), rel=0.01)
-
-
-def test_travels_clear_what_stands_there() -> None:
-    two = POCKETS["flat"] + m3.Manifold.cube((4.0, 4.0, 0.4)).translate((62.0, 62.0, TOP_MM - 0.4))
-    plan, field = plan_of(two)
-    place = np.array(PARK)
-    for move in plan.toolpath:
-        if isinstance(move, Extrude):
-            place = move.points_mm[-1]
-        elif isinstance(move, Travel):
-            for point in move.points_mm:
-                if np.hypot(*(point - place)[:2]) > 1.0:
-                    way = np.stack([place, point])
-                    assert min(place[2], point[2]) >= field.max_along(way, radius_mm=0.5)
-                place = point
 
 
 def test_an_empty_deficit_is_refused() -> None:
@@ -322,57 +277,6 @@ def test_overhangs_grow_as_far_along_a_diagonal_as_along_the_grid() -> None:
         shares.append(plan.reachable_mm3 / wing.volume())
     assert shares[0] > 0.75
     assert shares[1] > shares[0] - 0.03
-
-
-def test_travels_clear_what_stands_along_the_way_not_all_that_stands() -> None:
-    """A tower far from the pocket made every hop twice its height."""
-    tower = m3.Manifold.cube((4.0, 4.0, 20.0)).translate((75.0, 120.0, 0.0))
-    rim = m3.Manifold.cube((0.8, 30.0, 1.0)).translate((74.6, 60.0, TOP_MM))
-    pockets = POCKETS["deeper"] ^ (
-        m3.Manifold.cube((4.0, 9.0, 9.0)).translate((69.0, 70.5, 0.0))
-        + m3.Manifold.cube((4.0, 9.0, 9.0)).translate((77.0, 70.5, 0.0))
-    )
-    block = BLOCK + tower + rim
-    field = HeightField.from_manifold(block - pockets, 0.25, margin_mm=8.0)
-    plan = slice_patch(
-        pockets, SETUP, as_built=field, grid=LayerGrid.from_setup(SETUP), standalone=False,
-        start_mm=(10.0, 200.0, 30.0),
-    )  # fmt: skip
-    first, last = (
-        [k for k, move in enumerate(plan.toolpath) if isinstance(move, Extrude)][end]
-        for end in (0, -1)
-    )
-    between = [move for move in plan.toolpath.moves[first:last] if isinstance(move, Travel)]
-    across = [float(move.points_mm[-1, 2]) for move in between]
-    assert TOP_MM + 1.0 < max(across) < TOP_MM + 3.0  # over the rim, not over the tower
-    state = ModalState(
-        position_mm=(10.0, 200.0, 30.0), absolute_xyz=True, absolute_e=False, e_mm=0.0,
-        feed_mm_s=50.0, fan_ratio=0.0, hotend_c=215.0, bed_c=60.0, acceleration_mm_s2=None,
-        units_mm=True, tool=0,
-    )  # fmt: skip
-    program = write(plan.toolpath, SETUP, title="pockets", resume=state)
-    assert not find_refusals(program, SETUP, as_built=field, initial=state)
-
-
-def test_seams_lie_beside_old_material() -> None:
-    """Loops along the part's sides begin at their inner side, where the seam does not show."""
-    for x, y, outward in (
-        (69.0, 60.0, (0.0, -1.0)),
-        (69.0, 84.0, (0.0, 1.0)),
-        (60.0, 69.0, (-1.0, 0.0)),
-        (84.0, 69.0, (1.0, 0.0)),
-    ):
-        edge = m3.Manifold.cube((6.0, 6.0, 0.6)).translate((x, y, TOP_MM - 0.6))
-        plan, _ = plan_of(edge)
-        loops = [
-            move.points_mm
-            for move in plan.toolpath
-            if isinstance(move, Extrude) and np.allclose(move.points_mm[0], move.points_mm[-1])
-        ]
-        assert loops
-        for loop in loops:
-            along = loop[:, :2] @ np.array(outward)
-            assert along[0] < along.max() - 1.0
 
 
 def stops_of(plan: PatchPlan) -> list[tuple[float, float]]:
