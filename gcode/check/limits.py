@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 from gcode.profiles import PrinterProfile
 
-# Slicers write limits that are not quite this machine's (PrusaSlicer's M201 E5000 and M203 X500
-# for an MK3S of 1,500 and 200): beyond so many times the profile's they are another machine's.
+# Slicers write limits that are not quite this machine's (PrusaSlicer's M203 X500 for an MK3S of
+# 200): beyond so many times the profile's they are another machine's.
 RAISED = 5.0
 # What M201 and M203 set for each axis, by the profile's name, and its unit.
 _BY_AXIS = {

@@ -414,6 +414,15 @@ def test_faults_in_what_a_klipper_machine_adds_are_refused(name: str) -> None:
     assert any(said in refusal.what for refusal in refusals)
 
 
+@pytest.mark.parametrize(("printer", "taken"), [("voron_2_4", False), ("creality_k1", True)])
+def test_a_bead_that_klipper_would_stop_at_is_refused(printer: str, taken: bool) -> None:
+    """regression: 0.7 mm² passed for all; Klipper's default limit is 4 × 0.4² = 0.64 mm²."""
+    lines = ["M104 S210", "M109 S210", "G28", "M83", "G1 X50 Y50 Z0.6 F3000"]
+    lines += ["G1 X90 E11.65 F600", "M104 S0"]  # 28 mm³ along 40 mm
+    found = find_refusals(Program("\n".join(lines), "klipper"), load_setup(printer).melting_all())
+    assert [r.what for r in found] == ([] if taken else ["bead too thick"])
+
+
 def test_the_only_tool_may_have_any_number_and_heaters_may_go_off_at_once() -> None:
     text = KLIPPER.replace("G90\n", "T3\nSET_GCODE_OFFSET Z=0\nG90\n")
     assert not find_refusals(Program(text, "klipper"), K1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,6 +31,19 @@ def test_every_shipped_printer_loads_and_fits_its_own_bed(name: str) -> None:
         assert 0 <= z <= printer.max_z_mm
     assert printer.envelope[0].z_from_mm == 0
     assert len(printer.sha256) == 64
+
+
+SHIPPED = sorted((Path(__file__).parents[2] / "profiles").rglob("*.toml"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_every_shipped_figure_says_where_it_is_from(path: Path) -> None:
+    """Paragraphs with figures have a comment that tells their source; scripts have none of them."""
+    text = re.sub(r'"""\n.*?\n"""', "script", path.read_text(), flags=re.DOTALL)
+    for paragraph in text.split("\n\n"):
+        if re.search(r"^\w+ = [-\[\d]", paragraph, flags=re.MULTILINE):
+            comment = " ".join(re.findall(r"#(.*)", paragraph))
+            assert len(comment) > 20, paragraph
 
 
 @pytest.mark.parametrize("name", list_profiles("printers"))
