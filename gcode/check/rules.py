@@ -226,15 +226,15 @@ class Judge(Motion):
             off = [k for k, letter in enumerate("XYZ") if letter in words]
             for axis in off or ([] if "E" in words else range(3)):
                 self._homed[axis] = False
-        elif name == "M290":
-            for letter in "XYZS":
-                self._shift(f"M290 {letter}", words.get(letter))
         else:
             self._set_one(name, words)
 
     def _set_one(self, name: str, words: dict[str, float | None]) -> None:
         """Commands that set one thing."""
-        if name == "M106":
+        if name == "M290":
+            for letter in "XYZS":
+                self._shift(f"M290 {letter}", words.get(letter))
+        elif name == "M106":
             self._within("fan", words.get("S"), 0.0, FULL_FAN, "")
         elif name == "M572":
             self._advance(words.get("S"))

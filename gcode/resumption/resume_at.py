@@ -22,7 +22,8 @@ from gcode.progress import Progress, silent
 from gcode.reader import Job, read_job
 from gcode.reader.job import JobLayer
 from gcode.resumption.settings import Settings, settings_before
-from gcode.resumption.standing import bare_place, room_for_line, standing_field
+from gcode.resumption.standing import standing_field
+from gcode.slicing.room import bare_place, room_for_line
 from gcode.surfaces import HeightField
 from gcode.units import filament_area_mm2, mm_min_from_mm_s
 

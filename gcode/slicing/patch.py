@@ -100,7 +100,8 @@ def slice_patch(
     standalone
         True: a whole program for a part that stands on a machine whose Z is still true: X and Y
         are homed, Z never. False: in mid-job, hot, parked at `start_mm` with the filament pulled
-        back by the profile's retraction; the patch ends there likewise.
+        back by the profile's retraction; the patch ends there likewise. Nothing is primed then:
+        what else stands on the plate, where that would be, is not in `as_built`.
     hotend_c
         What the job prints at; None: what the material is printed at. The first pass is hotter by
         the material's `repair_first_bead_delta_c`.

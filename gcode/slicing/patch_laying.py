@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from gcode.errors import SliceError
 from gcode.moves import (
     Comment,
     FinishMoves,
@@ -16,18 +17,21 @@ from gcode.moves import (
     SetFan,
     SetHotend,
 )
-from gcode.profiles import PrintSetup
+from gcode.profiles import PrinterProfile, PrintSetup
 from gcode.slicing.beads import width_of
 from gcode.slicing.patch_beads import Chain, surely_free
 from gcode.slicing.patch_model import NEAR_MM, PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.pen import Pen
 from gcode.slicing.reach import Reach
+from gcode.slicing.room import bare_place, over_bed, room_for_line
 from gcode.surfaces import HeightField
 
 LEVEL_MM = 1e-6
 CLEAR_MM = 0.5  # of the tip over everything on a travel
 STANDALONE_LIFT_MM = 5.0
+WIPE_MM = 4.0  # more than a drop is wide
+PRIME_MM_S = 3.0  # of filament: 7 mm³/s
 
 
 def begin(
@@ -47,25 +51,40 @@ def begin(
         return pen
     printer, material = setup.printer, setup.material
     safe_mm = min(field.top_mm + STANDALONE_LIFT_MM, printer.max_z_mm)
-    pen = Pen(setup, np.array([*printer.prime_mm[:2], safe_mm]))
+    pen = Pen(setup, np.array([0.0, 0.0, safe_mm]))
     pen.add(Comment("The part stands on the bed and Z is true: X and Y are homed, Z is not."))
     pen.add(SetBed(material.bed_c))
     pen.add(SetHotend(hotend_c))
     lift = f"{safe_mm:.3f}".rstrip("0").rstrip(".")
     pen.add(Script(("G21", "G91", "G1 Z2 F600", "G90", f"G1 Z{lift} F600", "G28 X Y"), "approach"))
     pen.position_mm = np.array([0.0, 0.0, safe_mm])
-    pen.move_to(np.array([*printer.prime_mm[:2], safe_mm]))
+    bed = over_bed(field, printer)
+    room = room_for_line(bed, printer, WIPE_MM)
+    place = room[:2] if room is not None else bare_place(bed, printer)
+    if place is None:
+        raise SliceError(
+            "There is no bare place on the bed to prime at; take something off the bed and out of "
+            "what stands there."
+        )
+    pen.move_to(np.array([*place, safe_mm]))
     pen.add(SetBed(material.bed_c, wait=True))
     pen.add(SetHotend(first_c, wait=True))
-    pen.move_to(np.array(printer.prime_mm))
-    if printer.prime_length_mm > 0:
-        pen.add(Prime(printer.prime_length_mm, 3.0))
-    pen.retract()
-    wipe = np.array(printer.prime_mm) + np.array([4.0, 0.0, 0.0])
-    pen.move_to(wipe)
-    pen.move_to(np.array([*wipe[:2], safe_mm]))
+    _prime(pen, printer, None if room is None else np.array(room[2:]))
+    pen.move_to(np.array([*pen.position_mm[:2], safe_mm]))
     pen.add(SetFan(material.fan_ratio))
     return pen
+
+
+def _prime(pen: Pen, printer: PrinterProfile, wipe: Float[np.ndarray, " 2"] | None) -> None:
+    """On the bed, wiped off in a direction; or from high above, where the head has no room."""
+    x, y, _ = pen.position_mm
+    if wipe is not None:
+        pen.move_to(np.array([x, y, printer.prime_mm[2]]))
+    if printer.prime_length_mm > 0:
+        pen.add(Prime(printer.prime_length_mm, PRIME_MM_S))
+    pen.retract()
+    if wipe is not None:
+        pen.move_to(np.array([*(np.array([x, y]) + WIPE_MM * wipe), printer.prime_mm[2]]))
 
 
 def end(

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from gcode.check import find_refusals
 from gcode.cli.app import app
+from gcode.errors import SliceError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.slicing.job import SHORT_TRAVEL_MM, slice_part
@@ -85,6 +86,43 @@ def test_the_nozzle_is_primed_and_wiped_beside_the_part_before_it_touches_it() -
     assert down.sideways_mm == 0
     assert push.e_mm == pytest.approx(printer.retraction_mm)
     assert push.sideways_mm == 0
+
+
+@pytest.mark.parametrize(
+    ("printer", "wide_mm", "high_mm", "on_bed"),
+    [
+        ("ender_3", 60.0, 40.0, True),
+        ("ender_3", 150.0, 12.0, False),  # the duct has no room beside it
+        ("ender_3", 150.0, 40.0, False),
+        ("prusa_mk3s", 180.0, 40.0, False),
+        ("prusa_mk3s", 180.0, 10.0, True),  # not at the profile's own place
+    ],
+)
+def test_it_primes_where_the_head_has_room_or_from_above(
+    printer: str, wide_mm: float, high_mm: float, on_bed: bool
+) -> None:
+    """regression: at the profile's place whatever stood there; the checker then refused it all."""
+    setup = load_setup(printer)
+    x, y = (0.5 * (side - wide_mm) for side in setup.printer.bed_size_mm)
+    block = box((wide_mm, wide_mm, high_mm), (x, y, 0.0))
+    missing = box((12.0, 9.0, 0.6), (x + 20.0, y + 20.0, high_mm - 0.6))
+    steps, _, field = patch_of(missing, block, standalone=True, setup=setup)
+    prime, *after = steps[next(k for k, step in enumerate(steps) if step.e_mm > 0) :]
+    assert prime.e_mm == pytest.approx(setup.printer.prime_length_mm)
+    assert field.max_along(np.stack([prime.end_mm, prime.end_mm]), radius_mm=5.0) <= 0.0
+    if on_bed:
+        assert prime.end_mm[2] == setup.printer.prime_mm[2]
+        assert after[1].sideways_mm == pytest.approx(4.0)
+        assert after[1].end_mm[2] == prime.end_mm[2]
+    else:
+        assert prime.end_mm[2] > high_mm
+    assert after[0].e_mm == pytest.approx(-setup.printer.retraction_mm)
+
+
+def test_a_full_bed_has_no_place_to_prime() -> None:
+    full = box((250.0, 210.0, 3.0), (0.0, 0.0, 0.0))
+    with pytest.raises(SliceError, match="no bare place"):
+        patch_of(box((12.0, 9.0, 0.6), (90.0, 90.0, 2.4)), full, standalone=True)
 
 
 @pytest.mark.parametrize("standalone", [False, True])

@@ -1,0 +1,95 @@
+"""Where on the bed there is room to prime: beside what stands there, the whole head fitting."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage, spatial
+
+from gcode.profiles import PrinterProfile
+from gcode.slicing.reach import Reach
+from gcode.surfaces import HeightField
+
+CELL_MM = 1.0
+INSET_MM = 5.0  # from the bed's edge
+EVERY_MM = 10.0
+BARE_RADIUS_MM = 6.0  # a strand that hangs from the nozzle falls into this circle
+
+
+def over_bed(field: HeightField, printer: PrinterProfile) -> HeightField:
+    """A field as high or higher on coarse cells all over the nozzle's reach; bare beside it."""
+    x0, y0, x1, y1 = printer.reach_box_mm
+    shape = (int(np.ceil((y1 - y0) / CELL_MM)), int(np.ceil((x1 - x0) / CELL_MM)))
+    coarse = field.coarsened(max(1, int(CELL_MM / field.cell_mm)))
+    xs, ys = coarse.centres_mm()
+    iy, ix = (np.floor((at - low) / CELL_MM).astype(np.int64) for at, low in ((ys, y0), (xs, x0)))
+    rows, columns = (iy >= 0) & (iy < shape[0]), (ix >= 0) & (ix < shape[1])
+    z_mm = np.zeros(shape)
+    cells = np.ix_(iy[rows], ix[columns])
+    np.maximum.at(z_mm, cells, np.asarray(coarse.z_mm, np.float64)[np.ix_(rows, columns)])
+    # a cell reaches into those beside its middle's
+    z_mm = ndimage.maximum_filter(z_mm, 2 * int(np.ceil(0.5 * coarse.cell_mm / CELL_MM)) + 1)
+    return HeightField(np.array([x0, y0]), CELL_MM, z_mm, np.ones(shape, dtype=bool))
+
+
+def room_for_line(
+    field: HeightField, printer: PrinterProfile, length_mm: float
+) -> tuple[float, float, float, float] | None:
+    """Where a line can be drawn on the bed, the whole head fitting: (x, y) and its direction."""
+    x, y = printer.prime_mm[:2]
+    around = (x - CELL_MM, y - CELL_MM, x + length_mm + CELL_MM, y + length_mm + CELL_MM)
+    own = Reach(field, printer, window_mm=around)  # soon answered, and mostly it is enough
+    place = _room_at([(x, y)], own, field, printer, length_mm)
+    return place or _room_at(_starts(printer), Reach(field, printer), field, printer, length_mm)
+
+
+def _room_at(
+    starts: list[tuple[float, float]],
+    reach: Reach,
+    field: HeightField,
+    printer: PrinterProfile,
+    length_mm: float,
+) -> tuple[float, float, float, float] | None:
+    free = reach.at(printer.prime_mm[2])
+    along = np.arange(0.0, length_mm + 0.25, 0.25)
+    x_max, y_max = printer.reach_box_mm[2:]
+    for x, y in starts:
+        for dx, dy in ((1.0, 0.0), (0.0, 1.0)):
+            points = np.array([x, y]) + along[:, None] * np.array([dx, dy])
+            fits = points[-1, 0] <= x_max - 1.0 and points[-1, 1] <= y_max - 1.0
+            if fits and reach.free_at_points(points, free).all() and _bare(field, points).all():
+                return x, y, dx, dy
+    return None
+
+
+def bare_place(field: HeightField, printer: PrinterProfile) -> tuple[float, float] | None:
+    """A place at the bed's edge below which nothing stands, far from what does."""
+    rows, columns = np.nonzero(field.z_mm > 0)
+    if not len(rows):
+        return printer.prime_mm[:2]
+    xs, ys = field.centres_mm()
+    standing = np.stack([xs[columns], ys[rows]], axis=1)
+    places = _starts(printer)
+    away_mm, _ = spatial.KDTree(standing).query(np.array(places))
+    best = int(np.argmax(away_mm))
+    return places[best] if away_mm[best] > BARE_RADIUS_MM else None
+
+
+def _starts(printer: PrinterProfile) -> list[tuple[float, float]]:
+    """The profile's own place, and places along the bed's edges."""
+    width, depth = printer.bed_size_mm
+    xs = np.arange(INSET_MM, width - INSET_MM + 1e-6, EVERY_MM)
+    ys = np.arange(INSET_MM, depth - INSET_MM + 1e-6, EVERY_MM)
+    edges = [(float(x), y) for y in (INSET_MM, depth - INSET_MM) for x in xs]
+    edges += [(x, float(y)) for x in (INSET_MM, width - INSET_MM) for y in ys]
+    return [(printer.prime_mm[0], printer.prime_mm[1]), *edges]
+
+
+def _bare(field: HeightField, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Whether nothing stands below the points: a line is drawn on the bed, not on a brim."""
+    index = field.cells_of(points_mm)
+    ny, nx = field.shape
+    inside = np.asarray(((index >= 0) & (index < (ny, nx))).all(axis=1))
+    index = np.where(inside[:, None], index, 0)
+    height_mm = np.asarray(field.z_mm)[index[:, 0], index[:, 1]]
+    return np.asarray(~inside | (height_mm <= 0))
