@@ -276,7 +276,7 @@ class Judge(Motion):
             else:
                 self._shift(f"{name} {letter}", words.get(letter))
         if "L" not in words:
-            self._within("standby temperature", words.get("R"), *self._temperatures("hotend"))
+            self._temperature("standby", words.get("R"))
             if "S" in words:
                 self._heat("M104", {"S": words["S"]})
 
@@ -306,7 +306,7 @@ class Judge(Motion):
                 if value_c != 0:
                     self._refuse("hotend of another tool", tool, "the only one, T0")
                 return
-        self._within(f"{what} temperature", value_c, *self._temperatures(what))
+        self._temperature(what, value_c)
         if what == "bed":
             self._bed_c = value_c
         elif what == "chamber":
@@ -317,10 +317,12 @@ class Judge(Motion):
             if name == "M109" or value_c < self._ready_c:
                 self._ready_c = value_c
 
-    def _temperatures(self, what: str) -> tuple[float, float, str]:
-        """The least, the most, and their unit; no chamber gets as hot as a bed."""
+    def _temperature(self, what: str, value_c: float | None) -> None:
+        """No chamber gets as hot as a bed."""
         printer = self._setup.printer
-        return 0.0, printer.max_hotend_c if what == "hotend" else printer.max_bed_c, " °C"
+        limit_c = printer.max_bed_c if what in {"bed", "chamber"} else printer.max_hotend_c
+        if value_c is not None and not 0 <= value_c <= limit_c:
+            self._refuse(f"{what} temperature", f"{value_c:g} °C", f"{limit_c:g} °C")
 
     def _home(self, words: dict[str, float | None], by: str = "G28 with Z") -> None:
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
