@@ -6,7 +6,7 @@ They hold a void's walls and mouth too, which nobody sampled; what is solid ther
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from amrepair.detect import AnomalyMap, Label
 from amrepair.detect.evidence import Evidence
@@ -16,7 +16,7 @@ from amrepair.template.port import Template
 
 BOX_MARGIN_MM = 1.0
 # Beside what is deep, a film on an even surface is sampled as finely as if it were alone.
-FILM_MM, EVEN_MM, LEAST_FILM_MM2 = 0.5, 0.05, 5.0
+FILM_MM, EVEN_MM, LEAST_FILM_MM2, FACES_OUT = 0.5, 0.05, 5.0, 0.5
 PATH_STEP_MM = 1.0
 
 
@@ -33,7 +33,7 @@ def boxes_of(
     points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
     film = np.zeros(len(which), dtype=bool)
     if label is Label.MISSING:
-        film = (depth < FILM_MM) & (np.abs(depth - np.abs(s.wide_deviation_mm[which])) < EVEN_MM)
+        film = _films(template, evidence, which)
         gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
         gone = np.concatenate([gone, _paths_out(template, evidence, which)])
         points = np.concatenate([points, gone])
@@ -61,6 +61,22 @@ def boxes_of(
             low, top = np.minimum(a, b) - BOX_MARGIN_MM, np.maximum(a, b) + BOX_MARGIN_MM
             found.append((low, top, float(high)))
     return _merge(found)
+
+
+def _films(
+    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"]
+) -> Bool[np.ndarray, " q"]:
+    """Cells of an even surface over which a film is missing: no deeper, and it faces out of it.
+
+    What is left of a thin roof lies as near to the template's surface, but to its other side.
+    """
+    s = evidence.surfels
+    depth_mm, wide_mm = np.abs(s.deviation_mm[which]), np.abs(s.wide_deviation_mm[which])
+    film = (depth_mm < FILM_MM) & (np.abs(depth_mm - wide_mm) < EVEN_MM)
+    some = which[film]
+    outward = template.distance_and_gradient(s.place_mm[some])[1]
+    film[film] = (outward * evidence.normal[some]).sum(axis=1) > FACES_OUT
+    return film
 
 
 def _paths_out(
