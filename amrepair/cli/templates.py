@@ -149,4 +149,9 @@ def mesh(
         template = open_template(file, progress=bars)
         cut = template if below_z_mm is None else template.below_z(below_z_mm)
         with bars.stage("extract"):
-            write_mesh(extract_mesh(cut, voxel_mm, level_mm=level_mm), output)
+            made = extract_mesh(cut, voxel_mm, level_mm=level_mm)
+            write_mesh(made, output)
+    size = " × ".join(f"{mm:.1f}" for mm in made.extents)
+    console.out.print(
+        f"{output}: {len(made.faces):,} triangles, {size} mm, {made.volume:,.0f} mm³, closed"
+    )

@@ -90,3 +90,14 @@ def test_the_published_alignment_on_the_command_line(library: Path, tmp_path: Pa
     done = call("align", scan, "--template", template, "--pam", "icp=off")
     assert done.returncode == 2
     assert "--pam belongs to --method paper" in done.stderr
+
+
+def test_the_mesh_of_a_template_is_written_and_told(library: Path, tmp_path: Path) -> None:
+    output = tmp_path / "pebble.stl"
+    done = call("template", "mesh", library / "pebble.safetensors", "-o", output)
+    assert done.returncode == 0, done.stderr
+    made, part = trimesh.load(output), trimesh.load(PARTS / "pebble.stl")
+    assert made.is_watertight
+    assert made.volume == pytest.approx(part.volume, rel=0.005)
+    assert f"{len(made.faces):,} triangles" in done.stdout
+    assert "closed" in done.stdout
