@@ -141,7 +141,7 @@ def slice_patch(
     pen = begin(setup, as_built, start_mm, hotend_c)
     laid_mm3 = 0.0
     first = True
-    for stage in stages_of(passes, model, pen.position_mm[:2]):
+    for stage in stages_of(passes, model, setup, pen.position_mm[:2]):
         for one in stage.passes:
             laid_mm3 += emit(pen, one, stage.reach, model, setup, first=first)
             if first:

@@ -87,10 +87,6 @@ class PatchModel:
         self.reach = self.reach_of(as_built)
         self._tip_cells = self.reach.cells_of(self.points_mm)
 
-    def reach_over(self, finished: Bool[np.ndarray, "ny nx"]) -> Reach:
-        """Where the nozzle may be once the columns asked for are filled as planned."""
-        return self.reach_of(self.surface(finished))
-
     def reach_of(self, field: HeightField) -> Reach:
         """Where the nozzle may be over what stands there, around the patch."""
         # the lowest pass lies at most one thick bead above the deficit's floor
@@ -140,9 +136,9 @@ class PatchModel:
         cells = np.where(inside[:, None], cells, 0)
         return np.asarray(inside & np.isfinite(self.top_mm[cells[:, 0], cells[:, 1]]))
 
-    def surface(self, finished: Bool[np.ndarray, "ny nx"] | bool = True) -> HeightField:
-        """The as-built field with the patch on it, or with what of it is finished."""
-        return self.raised((self.laid_mm > 0) & finished, self.surface_mm)
+    def surface(self) -> HeightField:
+        """The as-built field with the patch on it."""
+        return self.raised(self.laid_mm > 0, self.surface_mm)
 
     def raised(
         self, columns: Bool[np.ndarray, "ny nx"], to_mm: Float[np.ndarray, "ny nx"]

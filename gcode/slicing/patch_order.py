@@ -12,11 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from gcode.profiles import PrintSetup
 from gcode.slicing.beads import divided
+from gcode.slicing.job import MOST_NOZZLES
 from gcode.slicing.patch_beads import Chain, surely_free
 from gcode.slicing.patch_model import NEAR_MM, PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.reach import Reach
+from gcode.surfaces import raster_kernels
+
+LEAST_HIGH_MM = 0.2  # a bead's plastic spreads as if it lay no higher
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +33,7 @@ class Stage:
 
 
 def stages_of(
-    passes: list[Pass], model: PatchModel, start_mm: Float[np.ndarray, " 2"]
+    passes: list[Pass], model: PatchModel, setup: PrintSetup, start_mm: Float[np.ndarray, " 2"]
 ) -> list[Stage]:
     """Split passes into stages, the regions' lowest tops first, and then what is nearest.
 
@@ -37,8 +42,7 @@ def stages_of(
     start_mm
         (2,) where the nozzle comes from.
     """
-    label = _regions(model)
-    regions = _by_region(passes, label, model)
+    regions = _by_region(passes, _regions(model), model)
     if len(regions) <= 1:
         return [Stage(tuple(passes), model.reach)] if passes else []
     groups: list[set[int]] = []
@@ -49,12 +53,29 @@ def stages_of(
         while at > 0 and not _all_free(regions[region], fields[at]):
             at -= 1
         groups[at:] = [set().union({region}, *groups[at:])]
-        done = set().union(*groups)
-        fields[at + 1 :] = [model.reach_over(np.isin(label, list(done)))]
+        laid = [chain for done in set().union(*groups) for _, chain in regions[done]]
+        fields[at + 1 :] = [_reach_over(laid, model, setup)]
     return [
         Stage(_of_regions(passes, group, regions, reach), reach)
         for group, reach in zip(groups, fields[:-1], strict=True)
     ]
+
+
+def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reach:
+    """Where the nozzle may be once beads are laid, each as wide and as high as it may get."""
+    field = model.as_built
+    wide_mm = np.concatenate([chain.section_mm2 for chain in laid]) / LEAST_HIGH_MM
+    wide_mm = np.minimum(wide_mm, MOST_NOZZLES * setup.printer.nozzle_diameter_mm)
+    stands_mm = raster_kernels.beside_lines(
+        np.concatenate([chain.xy_mm[:-1] for chain in laid]),
+        np.concatenate([chain.xy_mm[1:] for chain in laid]),
+        0.5 * wide_mm + field.cell_mm,  # wherever in its cell it ends
+        np.concatenate([np.maximum(chain.z_mm[:-1], chain.z_mm[1:]) for chain in laid]),
+        field.origin_mm.astype(np.float64),
+        field.cell_mm,
+        *field.shape,
+    )
+    return model.reach_of(field.raised(stands_mm))
 
 
 def _regions(model: PatchModel) -> Int[np.ndarray, "ny nx"]:
