@@ -97,7 +97,8 @@ def align(
         raise InputError(f"the method '{method}' is unknown; choose one of {', '.join(METHODS)}")
     if len(scan) < LEAST_POINTS:
         raise AlignmentError(
-            f"the scan {scan.source} has {len(scan)} points; an alignment needs {LEAST_POINTS}"
+            f"the scan {scan.source} has fewer points ({len(scan)}) than an alignment needs "
+            f"({LEAST_POINTS})"
         )
     refuse_repeated(scan, LEAST_POINTS)
     rng = rng if rng is not None else np.random.default_rng(0)

@@ -96,7 +96,7 @@ json.dump(answers, sys.stdout)
 SAID = {
     "empty": "no points",
     "nan": "not finite",
-    "one": "1 points",
+    "one": "fewer points (1)",
     "duplicates": "12 different points",
     "same": "1 different points",
     "metres": "metres for millimetres",

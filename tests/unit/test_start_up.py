@@ -45,6 +45,16 @@ def test_help_of_the_largest_commands_loads_none_either(words: str, tmp_path: Pa
     assert loaded_by(words, tmp_path) == set()
 
 
+@pytest.mark.parametrize("program", ["amrepair", "gcode"])
+def test_a_command_runs_as_a_module_too(program: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", program, "--version"],
+        capture_output=True, text=True, timeout=120, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(program)
+
+
 def test_profiles_are_shown_without_what_prints(tmp_path: Path) -> None:
     assert loaded_by("gcode profiles list", tmp_path) == set()
     assert loaded_by("gcode profiles show prusa_mk3s", tmp_path) == set()
