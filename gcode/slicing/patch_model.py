@@ -70,6 +70,7 @@ class PatchModel:
         self.surface_mm = floor_mm.copy()
         self.laid_mm = np.zeros(self.shape)
         self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
+        self.hem = np.zeros(self.shape, dtype=bool)  # laid in the air beside a rim
         self.lost: list[Unprintable] = []
         self.job: JobColumns | None = None
         # up to where the job's own lines are laid again

@@ -47,6 +47,8 @@ FAR_MM = 0.3  # from a line: more than half of it
 SERVED = 0.95  # share of what is due; where the job's own lines serve less, others may serve more
 # Of columns over a hollow, as many as open to the head at one height are worth a pass there.
 OPENING_MM2 = 1.0
+# From a tip in the air, as far as its bead covers a rim; less of one is not worth a line.
+HEM_MM, RIM_MM2 = 0.35, 1.0
 # A flat top: as much area, as wide, within so little height.
 FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
 ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
@@ -183,6 +185,7 @@ def _plan_pass(
     reach = model.reach.at(z_mm)
     if planned is None:
         thick = _due(model, z_mm, here, reach, following_mm, most_mm, layer_mm)
+        thick = _hemmed(model, z_mm, thick, reach, most_mm, layer_mm)
     else:
         thick = _due_of_job(model, z_mm, planned, reach, following_mm, most_mm, layer_mm)
     if not thick.any():
@@ -390,6 +393,34 @@ def _due_of_job(
     return _lidded(model, thick, active, deep & active, reach, gap, most_mm, layer_mm)
 
 
+def _hemmed(
+    model: PatchModel,
+    z_mm: float,
+    thick: Float[np.ndarray, "ny nx"],
+    reach: Bool[np.ndarray, "ry rx"],
+    most_mm: float,
+    layer_mm: float,
+) -> Float[np.ndarray, "ny nx"]:
+    """With half a line beside rims that the head gets to from outside alone.
+
+    A wall keeps it off a gap in another one, but not off the air in front: there a line laid half
+    upon the rim begins what the next ones grow from. Without it all above would stay open.
+    """
+    wanted = thick > 0
+    if not wanted.any():
+        return thick
+    free = model.free_at(reach)
+    unserved = wanted & ~_beside(wanted & free, wanted, HEM_MM, model.cell_mm)
+    air = ~wanted & ((z_mm - model.surface_mm > DEEP_RATIO * most_mm) | model.hem)
+    rim = unserved & _beside(air & free, unserved, HEM_MM, model.cell_mm)
+    label, count = ndimage.label(rim, np.ones((3, 3)))
+    area_mm2 = np.bincount(label.ravel(), minlength=count + 1) * model.cell_mm**2
+    rim &= area_mm2[label] >= RIM_MM2
+    hem = air & _beside(rim, air, HEM_MM, model.cell_mm)
+    model.hem |= hem
+    return np.where(hem, layer_mm, thick)
+
+
 def _lidded(
     model: PatchModel,
     thick: Float[np.ndarray, "ny nx"],
@@ -425,7 +456,7 @@ def _beside(
     within_mm: float,
     cell_mm: float,
 ) -> Bool[np.ndarray, "ny nx"]:
-    """Which columns, among those asked about, lie within a distance of others."""
+    """Which columns lie within a distance of others; found for those asked about at least."""
     beside = np.zeros_like(what)
     if not asked.any():
         return beside
