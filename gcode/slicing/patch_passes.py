@@ -410,7 +410,9 @@ def _hemmed(
     if not wanted.any():
         return thick
     free = model.free_at(reach)
-    unserved = wanted & ~_beside(wanted & free, wanted, HEM_MM, model.cell_mm)
+    # a row of columns holds no line
+    served = ndimage.binary_opening(wanted & free, np.ones((2, 2)))
+    unserved = wanted & ~_beside(served, wanted, HEM_MM, model.cell_mm)
     air = ~wanted & ((z_mm - model.surface_mm > DEEP_RATIO * most_mm) | model.hem)
     rim = unserved & _beside(air & free, unserved, HEM_MM, model.cell_mm)
     label, count = ndimage.label(rim, np.ones((3, 3)))

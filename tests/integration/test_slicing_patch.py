@@ -311,6 +311,27 @@ def test_a_region_that_would_stand_in_the_way_grows_together_with_its_neighbour(
     assert plan.reachable_mm3 >= 0.95 * (towers[0] + towers[1]).volume()
 
 
+@pytest.mark.parametrize("wall_mm", [71.5, 71.7, 71.9])
+def test_a_gap_behind_a_wall_is_begun_from_the_air_in_front(wall_mm: float) -> None:
+    # in the gap the tip is 0.1 mm too near to the wall, or not at all: 0.02 of it was filled
+    base = m3.Manifold.cube((20.0, 30.0, 2.0)).translate((60.0, 60.0, 0.0))
+    wall = m3.Manifold.cube((4.0, 30.0, 4.2)).translate((wall_mm, 60.0, 2.0))
+    thin = m3.Manifold.cube((4.0, 30.0, 4.0)).translate((76.0, 60.0, 2.0))
+    missing = m3.Manifold.cube((4.0, 14.0, 4.0)).translate((76.0, 68.0, 2.0))
+    plan, field = plan_of(missing, base + wall + thin)
+    program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
+    world = World((200.0, 200.0))
+    world.add(base + wall + thin)
+    whole = world.snapshot()
+    world.remove(missing)
+    gone = whole.minus(world.snapshot(whole.window))
+    world.deposit(motion_of(plan.toolpath))
+    after = world.snapshot(whole.window)
+    assert gone.common(after).volume_mm3 / gone.volume_mm3 >= 0.3
+    assert after.minus(whole).volume_mm3 / gone.volume_mm3 <= 0.05
+
+
 @pytest.mark.parametrize("apart_mm", [1.8, 1.9, 2.0, 2.1])
 def test_a_finished_region_stands_as_wide_as_its_beads_are(apart_mm: float) -> None:
     # 0.15 mm deep in the cone: the planner held the columns for what stands, the checker the beads
