@@ -29,6 +29,8 @@ from gcode.slicing.patch_passes import AGREE_MM, NOT_LISTED_MM3, plan_passes
 from gcode.surfaces import HeightField
 
 COVERED = "covered by what stands above it"
+# Of the plastic, what may be laid in the air beside rims; about twice as much lies outside then.
+MOST_HEM = 0.025
 STEP_MM = 0.15  # of a job's staircase: half a layer, and what the scan gets wrong
 TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
 Box = tuple[float, float, float, float, float, float]
@@ -137,6 +139,9 @@ def slice_patch(
         raise SliceError("A patch in mid-job needs the place where the nozzle is parked.")
     model = PatchModel(deficit, setup, as_built, lines)
     passes = plan_passes(model, grid, setup, progress)
+    if model.hem_mm3 > MOST_HEM * sum(chain.volume_mm3 for one in passes for chain in one.chains):
+        model = PatchModel(deficit, setup, as_built, lines)
+        passes = plan_passes(model, grid, setup, progress, hems=False)
     hotend_c = setup.material.hotend_c if hotend_c is None else hotend_c
     pen = begin(setup, as_built, start_mm, hotend_c)
     laid_mm3 = 0.0

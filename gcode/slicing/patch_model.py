@@ -126,6 +126,11 @@ class PatchModel:
         need = np.where(inside, self.reach.need_mm[index[:, 0], index[:, 1]], -np.inf)
         return need.reshape(self.shape)
 
+    @property
+    def hem_mm3(self) -> float:
+        """What was laid in the air beside rims."""
+        return float(self.laid_mm[self.hem].sum()) * self.cell_mm**2
+
     def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the nozzle may be, from an answer of `reach`."""
         return self.reach.free_in_cells(self._tip_cells, reach).reshape(self.shape)

@@ -75,9 +75,14 @@ class Pass:
 
 
 def plan_passes(
-    model: PatchModel, grid: LayerGrid, setup: PrintSetup, progress: Progress
+    model: PatchModel,
+    grid: LayerGrid,
+    setup: PrintSetup,
+    progress: Progress,
+    *,
+    hems: bool = True,
 ) -> list[Pass]:
-    """Passes from the floor up."""
+    """Passes from the floor up; with `hems`, begun from the air too where that is the only way."""
     low_mm, high_mm = float(model.box[2]), float(model.box[5])
     tops = grid.tops_to(high_mm)
     tops = tops[tops > low_mm + 1e-6]
@@ -106,7 +111,7 @@ def plan_passes(
         if (np.abs(openings - z_mm) < ROUNDING_MM).any():
             here &= z_mm - model.surface_mm > DEEP_RATIO * most_mm
         one = _plan_pass(
-            model, float(z_mm), here, following, most_mm, k, grid.layer_height_mm, setup
+            model, float(z_mm), here, following, most_mm, k, grid.layer_height_mm, setup, hems=hems
         )
         if one is not None:
             passes.append(one)
@@ -176,6 +181,8 @@ def _plan_pass(
     index: int,
     layer_mm: float,
     setup: PrintSetup,
+    *,
+    hems: bool,
 ) -> Pass | None:
     """Fill what is due at this height, among the columns that are filled at it.
 
@@ -185,7 +192,8 @@ def _plan_pass(
     reach = model.reach.at(z_mm)
     if planned is None:
         thick = _due(model, z_mm, here, reach, following_mm, most_mm, layer_mm)
-        thick = _hemmed(model, z_mm, thick, reach, most_mm, layer_mm)
+        if hems and model.job is None:
+            thick = _hemmed(model, z_mm, thick, reach, most_mm, layer_mm)
     else:
         thick = _due_of_job(model, z_mm, planned, reach, following_mm, most_mm, layer_mm)
     if not thick.any():
@@ -406,19 +414,23 @@ def _hemmed(
     A wall keeps it off a gap in another one, but not off the air in front: there a line laid half
     upon the rim begins what the next ones grow from. Without it all above would stay open.
     """
-    wanted = thick > 0
-    if not wanted.any():
+    wanted, beside = thick > 0, ~np.isfinite(model.top_mm)
+    air = beside & ((z_mm - model.surface_mm > DEEP_RATIO * most_mm) | model.hem)
+    if not wanted.any() or not air.any():
         return thick
     free = model.free_at(reach)
     # a row of columns holds no line
     served = ndimage.binary_opening(wanted & free, np.ones((2, 2)))
     unserved = wanted & ~_beside(served, wanted, HEM_MM, model.cell_mm)
-    air = ~wanted & ((z_mm - model.surface_mm > DEEP_RATIO * most_mm) | model.hem)
+    if not unserved.any():
+        return thick
     rim = unserved & _beside(air & free, unserved, HEM_MM, model.cell_mm)
     label, count = ndimage.label(rim, np.ones((3, 3)))
     area_mm2 = np.bincount(label.ravel(), minlength=count + 1) * model.cell_mm**2
     rim &= area_mm2[label] >= RIM_MM2
-    hem = air & _beside(rim, air, HEM_MM, model.cell_mm)
+    if not rim.any():
+        return thick
+    hem = air & _beside(rim, rim, HEM_MM, model.cell_mm)
     model.hem |= hem
     return np.where(hem, layer_mm, thick)
 

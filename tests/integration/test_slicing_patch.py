@@ -313,9 +313,9 @@ def test_a_region_that_would_stand_in_the_way_grows_together_with_its_neighbour(
 
 @pytest.mark.parametrize("wall_mm", [71.5, 71.7, 71.9])
 def test_a_gap_behind_a_wall_is_begun_from_the_air_in_front(wall_mm: float) -> None:
-    # in the gap the tip is 0.1 mm too near to the wall, or not at all: 0.02 of it was filled
+    # in the gap the tip is 0.1 mm too near to the wall, or not at all: 0.2 of it was filled
     base = m3.Manifold.cube((20.0, 30.0, 2.0)).translate((60.0, 60.0, 0.0))
-    wall = m3.Manifold.cube((4.0, 30.0, 4.2)).translate((wall_mm, 60.0, 2.0))
+    wall = m3.Manifold.cube((4.0, 30.0, 3.0)).translate((wall_mm, 60.0, 2.0))
     thin = m3.Manifold.cube((4.0, 30.0, 4.0)).translate((76.0, 60.0, 2.0))
     missing = m3.Manifold.cube((4.0, 14.0, 4.0)).translate((76.0, 68.0, 2.0))
     plan, field = plan_of(missing, base + wall + thin)
@@ -328,8 +328,8 @@ def test_a_gap_behind_a_wall_is_begun_from_the_air_in_front(wall_mm: float) -> N
     gone = whole.minus(world.snapshot(whole.window))
     world.deposit(motion_of(plan.toolpath))
     after = world.snapshot(whole.window)
-    assert gone.common(after).volume_mm3 / gone.volume_mm3 >= 0.3
-    assert after.minus(whole).volume_mm3 / gone.volume_mm3 <= 0.05
+    assert gone.common(after).volume_mm3 / gone.volume_mm3 >= 0.48
+    assert after.minus(whole).volume_mm3 / gone.volume_mm3 <= 0.04
 
 
 @pytest.mark.parametrize("apart_mm", [1.8, 1.9, 2.0, 2.1])
@@ -342,6 +342,18 @@ def test_a_finished_region_stands_as_wide_as_its_beads_are(apart_mm: float) -> N
     program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
     assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
     assert plan.reachable_mm3 >= 0.97 * (left + right).volume()
+
+
+def test_no_more_is_laid_in_the_air_than_pays() -> None:
+    # eleven layers along the rim before the head gets in, for a gap of 4 mm
+    base = m3.Manifold.cube((20.0, 30.0, 2.0)).translate((60.0, 60.0, 0.0))
+    wall = m3.Manifold.cube((4.0, 30.0, 4.2)).translate((71.8, 60.0, 2.0))
+    thin = m3.Manifold.cube((4.0, 30.0, 4.0)).translate((76.0, 60.0, 2.0))
+    missing = m3.Manifold.cube((4.0, 14.0, 4.0)).translate((76.0, 68.0, 2.0))
+    plan, _ = plan_of(missing, base + wall + thin)
+    beads = [move for move in plan.toolpath if isinstance(move, Extrude)]
+    assert max(float(bead.points_mm[:, 0].max()) for bead in beads) <= 80.0
+    assert plan.reachable_mm3 < 0.05 * missing.volume()
 
 
 @given(st.integers(0, 2**31))
