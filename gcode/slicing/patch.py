@@ -8,11 +8,12 @@ nozzle cannot reach, and what is too thin for it, is listed with its volume.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage
 
 from gcode.errors import SliceError
 from gcode.moves import Toolpath
@@ -25,13 +26,16 @@ from gcode.slicing.patch_beads import LEAST_THICK_MM
 from gcode.slicing.patch_laying import after_first, begin, emit, end
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_order import stages_of
-from gcode.slicing.patch_passes import AGREE_MM, NOT_LISTED_MM3, plan_passes
+from gcode.slicing.patch_passes import AGREE_MM, NOT_LISTED_MM3, Pass, plan_passes
 from gcode.surfaces import HeightField
 
 COVERED = "covered by what stands above it"
 # Of the plastic, what may be laid in the air beside rims; about twice as much lies outside then.
 MOST_HEM = 0.025
+# Less of a hollow than this share, so little, and over less of its opening: it closes nothing.
+LEAST_SHARE, LEAST_WORTH_MM3, LEAST_COVER = 0.1, 30.0, 0.5
 STEP_MM = 0.15  # of a job's staircase: half a layer, and what the scan gets wrong
+NOT_CLOSED = "; the little in reach would not close it"
 TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
 Box = tuple[float, float, float, float, float, float]
 
@@ -142,6 +146,8 @@ def slice_patch(
     if model.hem_mm3 > MOST_HEM * sum(chain.volume_mm3 for one in passes for chain in one.chains):
         model = PatchModel(deficit, setup, as_built, lines)
         passes = plan_passes(model, grid, setup, progress, hems=False)
+    if model.job is None:
+        passes = _worth_it(passes, model)
     hotend_c = setup.material.hotend_c if hotend_c is None else hotend_c
     pen = begin(setup, as_built, start_mm, hotend_c)
     laid_mm3 = 0.0
@@ -163,6 +169,31 @@ def slice_patch(
         regions=regions,
         predicted=model.surface(),
     )
+
+
+def _worth_it(passes: list[Pass], model: PatchModel) -> list[Pass]:
+    """Without the beads over hollows that would stay open: no repair, but strands along a rim."""
+    wanted = np.isfinite(model.top_mm)
+    label, count = ndimage.label(wanted, np.ones((3, 3)))
+    laid, due, cover, opening = (
+        np.bincount(label.ravel(), each.ravel(), minlength=count + 1) * model.cell_mm**2
+        for each in (model.laid_mm, model.wanted_below(np.inf), model.laid_mm > 0, wanted)
+    )
+    few = (laid < LEAST_SHARE * due) & (laid < LEAST_WORTH_MM3) & (cover < LEAST_COVER * opening)
+    few[0] = False
+    if not few.any():
+        return passes
+    nearest = ndimage.distance_transform_edt(~wanted, return_distances=False, return_indices=True)
+    dropped = model.given_up = few[label[tuple(nearest)]]
+    model.laid_mm[dropped] = 0.0
+    model.sunk_mm[dropped] = 0.0
+    model.surface_mm[dropped] = model.floor_mm[dropped]
+    kept = []
+    for one in passes:
+        chains = tuple(c for c in one.chains if not dropped[model.cell_at(c.middle_mm)])
+        if chains:
+            kept.append(replace(one, chains=chains))
+    return kept
 
 
 def _left_over(model: PatchModel) -> tuple[tuple[Unreachable, ...], tuple[PatchRegion, ...]]:
@@ -190,6 +221,8 @@ def _left_over(model: PatchModel) -> tuple[tuple[Unreachable, ...], tuple[PatchR
         if stuck_mm3 <= NOT_LISTED_MM3:
             continue
         reason = _reason(model, cells, left[cells])
+        if reason is not None and model.given_up[cells].any():
+            reason += NOT_CLOSED
         if reason is None:
             model.lost.append(Unprintable(volume_mm3 * (1.0 - share), box, TOO_SMALL))
         else:

@@ -66,6 +66,11 @@ class Chain:
         """Plastic in it."""
         return float(np.hypot(*np.diff(self.xy_mm, axis=0).T) @ self.section_mm2)
 
+    @property
+    def middle_mm(self) -> Float[np.ndarray, " 2"]:
+        """A point of it, halfway among its points."""
+        return self.xy_mm[len(self.xy_mm) // 2]
+
     def reversed(self) -> Chain:
         """The same from its other end."""
         return Chain(

@@ -71,6 +71,7 @@ class PatchModel:
         self.laid_mm = np.zeros(self.shape)
         self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
         self.hem = np.zeros(self.shape, dtype=bool)  # laid in the air beside a rim
+        self.given_up = np.zeros(self.shape, dtype=bool)  # too little of it is in reach
         self.lost: list[Unprintable] = []
         self.job: JobColumns | None = None
         # up to where the job's own lines are laid again
@@ -125,6 +126,11 @@ class PatchModel:
         index, inside = self._tip_cells
         need = np.where(inside, self.reach.need_mm[index[:, 0], index[:, 1]], -np.inf)
         return need.reshape(self.shape)
+
+    def cell_at(self, point_mm: Float[np.ndarray, " 2"]) -> tuple[int, int]:
+        """Row and column of the column that a point lies over."""
+        ix, iy = np.floor((point_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
+        return int(iy), int(ix)
 
     @property
     def hem_mm3(self) -> float:

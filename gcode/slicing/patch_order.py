@@ -90,9 +90,7 @@ def _by_region(
     found: dict[int, list[tuple[Pass, Chain]]] = {}
     for one in passes:
         for chain in one.chains:
-            middle = chain.xy_mm[len(chain.xy_mm) // 2]
-            ix, iy = np.floor((middle - model.origin_mm) / model.cell_mm).astype(np.int64)
-            found.setdefault(int(label[iy, ix]), []).append((one, chain))
+            found.setdefault(int(label[model.cell_at(chain.middle_mm)]), []).append((one, chain))
     return found
 
 

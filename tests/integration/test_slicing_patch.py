@@ -18,7 +18,7 @@ from gcode.firmware.motion import MotionBatch
 from gcode.moves import Extrude, LayerChange, ModalState, Role, Toolpath
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.patch import PatchPlan, slice_patch
+from gcode.slicing.patch import NOT_CLOSED, PatchPlan, slice_patch
 from gcode.slicing.patch_beads import BOND_RATIO
 from gcode.surfaces import HeightField
 from gcode.writer import write
@@ -352,8 +352,23 @@ def test_no_more_is_laid_in_the_air_than_pays() -> None:
     missing = m3.Manifold.cube((4.0, 14.0, 4.0)).translate((76.0, 68.0, 2.0))
     plan, _ = plan_of(missing, base + wall + thin)
     beads = [move for move in plan.toolpath if isinstance(move, Extrude)]
-    assert max(float(bead.points_mm[:, 0].max()) for bead in beads) <= 80.0
+    assert all(float(bead.points_mm[:, 0].max()) <= 80.0 for bead in beads)
     assert plan.reachable_mm3 < 0.05 * missing.volume()
+
+
+def test_a_hollow_that_would_stay_open_is_left_alone_and_said_so() -> None:
+    # only the last layer is in reach, and hangs from the gap's two ends: 0.5 mm of 14
+    base = m3.Manifold.cube((20.0, 30.0, 2.0)).translate((60.0, 60.0, 0.0))
+    wall = m3.Manifold.cube((4.0, 30.0, 5.8)).translate((72.0, 60.0, 2.0))
+    thin = m3.Manifold.cube((4.0, 30.0, 4.0)).translate((76.0, 60.0, 2.0))
+    missing = m3.Manifold.cube((4.0, 14.0, 4.0)).translate((76.0, 68.0, 2.0))
+    plan, _ = plan_of(missing, base + wall + thin)
+    assert not plan.toolpath.extrusions
+    assert plan.reachable_mm3 == 0.0
+    (left,) = plan.unreachable
+    assert left.volume_mm3 == pytest.approx(missing.volume(), rel=0.01)
+    assert left.reason.startswith("the nozzle would touch")
+    assert left.reason.endswith(NOT_CLOSED)
 
 
 @given(st.integers(0, 2**31))
