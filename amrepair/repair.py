@@ -300,6 +300,7 @@ def plan_repair(
             else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
             rounded_up=None if site.laid is None else partial(_rounded_up, site, placed),
+            up=placed.rotation[2],
             progress=progress,
         )
     with watch("deficit"):

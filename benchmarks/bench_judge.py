@@ -193,15 +193,16 @@ def make_cut(name: str, kind: str, seed: int) -> Cut | None:
     return None
 
 
-def scan_of(solid: Any, seed: int) -> Scan:
-    """A bare cloud of a solid."""
+def scan_of(solid: Any, seed: int, *, on_bed: bool = False) -> Scan:
+    """A bare cloud of a solid; without the foot that it stands on where it lay `on_bed`."""
     mesh = mesh_of(solid)
-    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / SPACING_MM**2), seed=seed)
+    points, faces = trimesh.sample.sample_surface(mesh, int(mesh.area / SPACING_MM**2), seed=seed)
     noise = np.random.default_rng(seed).normal(scale=NOISE_MM, size=points.shape)
-    return Scan(np.asarray(points) + noise, NOISE_MM, "build")
+    foot = (np.asarray(points)[:, 2] < 0.02) & (np.asarray(mesh.face_normals)[faces][:, 2] < -0.9)
+    return Scan((np.asarray(points) + noise)[~(foot & on_bed)], NOISE_MM, "build")
 
 
-def run(case: Case, setup: Any) -> dict[str, Any]:
+def run(case: Case, setup: Any, *, on_bed: bool) -> dict[str, Any]:
     """A case's figures."""
     name, kind, seed = case
     row: dict[str, Any] = {"part": name, "kind": kind, "seed": seed}
@@ -216,7 +217,9 @@ def run(case: Case, setup: Any) -> dict[str, Any]:
     site = Site(template, setup, LayerGrid.from_setup(setup), build_from_template=at)
     start_s = time.process_time()
     try:
-        plan = plan_repair(scan_of(cut.rest, seed), site, title=kind, guess=at.inverse())
+        plan = plan_repair(
+            scan_of(cut.rest, seed, on_bed=on_bed), site, title=kind, guess=at.inverse()
+        )
     except (AmrepairError, GcodeError) as error:
         return row | {"error": f"{type(error).__name__}: {error}"}
     row |= {"seconds": time.process_time() - start_s, "deficit_mm3": plan.deficit.missing_mm3}
@@ -302,6 +305,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", default=PARTS)
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--on-bed", action="store_true", help="the scan lacks the part's foot")
     parser.add_argument("--next", type=int, default=0, help="run so many cases not yet run")
     parser.add_argument("--within-s", type=float, default=np.inf, help="begin none after this")
     parser.add_argument("--case", nargs=3, metavar=("PART", "KIND", "SEED"))
@@ -320,7 +324,7 @@ def main() -> None:
     for case in todo:
         if time.monotonic() - start_s > args.within_s:
             break
-        row = run(case, setup)
+        row = run(case, setup, on_bed=args.on_bed)
         print(*case, said(row), "" if "skipped" in row else failings(row), flush=True)
         if not args.case:
             args.results.parent.mkdir(parents=True, exist_ok=True)

@@ -71,6 +71,8 @@ WELL_EXPLAINED, MOSTLY_EXPLAINED, EXPLAINED = 0.97, 0.95, 0.7
 BETWEEN = rotation_from_vector(np.array([0.15, -0.1, 0.08]))  # half the gap between rotations
 FEW_TRIED = 3  # poses refined of what is left without clutter, and of the mirror image
 CLEARED = 0.85  # with fewer on the part clutter is looked for, until so many are
+# A pose lays so much more of all on the part than one found without clutter: that was none.
+CLEARER_BY = 0.1
 PIECE_RATIO = 0.6  # of the part's diagonal: a smaller scan is a piece, that may lie anywhere in it
 HALVED_POINTS, LEAST_HALF = 2_000, 100  # of fewer points a half says nothing
 
@@ -208,6 +210,7 @@ def pose_from_anywhere(
         progress("align", 0.2, 1.0)
         # what was laid wrong may look like clutter: more rotations are tried of all of it first
         hunt.take(_worth_refining(clouds, field, THOROUGH))
+    of_all = hunt.found
     if hunt.share < CLEARED:
         progress("align", 0.3, 1.0)
         _leave_clutter(hunt, points_mm, rng)
@@ -224,8 +227,12 @@ def pose_from_anywhere(
         _ask_features(hunt)
     if hunt.left_out_ratio > 0.0:
         starts = [pose.matrix for _, pose in hunt.found[:FEW_TRIED]]
-        whole = refined(starts, clouds, template)
-        if explained(whole[0][1], inlier_mm) > CLEARED:
+        whole = sorted(refined(starts, clouds, template) + of_all, key=by_score)
+        share = explained(whole[0][1], inlier_mm)
+        without = hunt.best.matrix
+        off_mm = template.distance(clouds.dense_mm @ without[:3, :3].T + without[:3, 3])
+        clearer = float((np.abs(off_mm) <= inlier_mm).mean()) + CLEARER_BY
+        if share > CLEARED or share > max(least_ratio, clearer):
             # what was left out lies on the part as well: it was no clutter
             hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = (
                 clouds, whole, 0.0, points_mm

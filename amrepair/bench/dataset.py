@@ -92,7 +92,7 @@ class Sample:
 
         if self.format is Format.SHAPENET:
             return shapenet.load_anomalous(self, self.truth_path)
-        return real3d.load_anomalous(self.truth_path)
+        return real3d.load_anomalous(self, self.truth_path)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,10 @@ def read_truth(path: Path) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, " 
         If the file is missing, or rows are not four finite numbers.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such truth file; the data set is incomplete")
+        raise InputError(
+            f"{path}: there is no such truth file; the data set is incomplete, or its "
+            "layout is the other one (--format)"
+        )
     try:
         with path.open(encoding="ascii", errors="replace") as stream:
             first = next((line for line in stream if line.strip()), "")

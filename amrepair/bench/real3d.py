@@ -21,9 +21,12 @@ from amrepair.bench.dataset import (
     defect_word,
     read_truth,
 )
+from amrepair.errors import InputError
+from amrepair.scans.pcd import count_of_pcd
 
 DEFECTS = ("bulge", "sink", "concavity", "hole", "break", "bend", "crack")
 TRUTH_FOLDERS = ("gt", "GT")
+LEAST_OF_CLOUD = 0.5  # of the published pairs none differs by so much
 
 
 def find_classes(root: Path) -> tuple[BenchClass, ...]:
@@ -61,7 +64,19 @@ def _sample(class_name: str, path: Path, truth: Path) -> Sample:
     )
 
 
-def load_anomalous(truth_path: Path) -> Cloud:
-    """Geometry and labels from the txt alone."""
+def load_anomalous(sample: Sample, truth_path: Path) -> Cloud:
+    """Geometry and labels from the txt alone, unless that is only a piece of the cloud.
+
+    Raises
+    ------
+    InputError
+        If the txt has less than half of the cloud's points, or more than twice as many.
+    """
     points, labels = read_truth(truth_path)
+    count = count_of_pcd(sample.cloud_path)
+    if not LEAST_OF_CLOUD * count <= len(points) <= count / LEAST_OF_CLOUD:
+        raise InputError(
+            f"{truth_path}: {len(points)} rows of truth for the {count} points of "
+            f"{sample.cloud_path.name}; it is cut short or of another cloud: copy it again"
+        )
     return Cloud(points, labels)

@@ -13,6 +13,7 @@ from amrepair.errors import InputError
 from gcode.cli import console
 
 if TYPE_CHECKING:
+    from amrepair.align import Registration
     from amrepair.detect import AnomalyMap
     from amrepair.library import Recognition
     from amrepair.repair import Stopwatch
@@ -85,6 +86,8 @@ def align(
     from amrepair.scans import read_scan, write_ply
     from amrepair.template import open_template
 
+    if output is not None and output.suffix.lower() != ".ply":
+        raise InputError(f"{output}: an aligned scan is written as .ply; rename it")
     if pam and method != "paper":
         raise InputError(f"--pam belongs to --method paper, the method is {method}")
     _refuse_known_of_many(part_is_known, template)
@@ -130,16 +133,20 @@ def align(
         return
     if chosen:
         console.out.print(f"Part: {chosen['template']}, confidence {chosen['confidence']:.2f}.")
-    if found.clutter_ratio > 0.0:
-        console.out.print(
-            f"{found.clutter_ratio:.0%} of the scan is not the part (scattered points, what it "
-            "stands on, other pieces) and was left aside."
-        )
+    _say_clutter(found)
     console.out.print(
         f"Aligned: {found.rmse_mm:.3f} mm rms over {found.inlier_ratio:.1%} of the points, "
         f"{len(found.symmetric_alternatives)} other poses fit as well."
     )
     console.out.print(np.array2string(found.template_from_scan.matrix, precision=6))
+
+
+def _say_clutter(found: Registration) -> None:
+    if found.clutter_ratio > 0.0:
+        console.out.print(
+            f"{found.clutter_ratio:.0%} of the scan is not the part (scattered points, what it "
+            "stands on, other pieces) and was left aside."
+        )
 
 
 def _refuse_known_of_many(part_is_known: bool, template: Path) -> None:
@@ -239,6 +246,9 @@ def detect(
         ],
         "template_from_scan": found.template_from_scan.matrix.tolist(),
         "rmse_mm": found.rmse_mm,
+        "inlier_ratio": found.inlier_ratio,
+        "clutter_ratio": found.clutter_ratio,
+        "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
         "seconds": {stage: round(spent, 3) for stage, spent in watch.seconds.items()},
         **chosen,
     }
@@ -249,6 +259,12 @@ def detect(
         return
     if chosen:
         console.out.print(f"Part: {chosen['template']}, confidence {chosen['confidence']:.2f}.")
+    _say_clutter(found)
+    if others := len(found.symmetric_alternatives):
+        console.out.print(
+            f"{1 + others} poses fit equally well: of a part that is not symmetric the regions may "
+            "lie at another of them; scan more of it, or give the sensors' places (--sensor-at)."
+        )
     count = len(regions)
     console.out.print(
         f"{count} {'region' if count == 1 else 'regions'} beyond {anomaly.threshold_mm:.3f} mm "

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -28,12 +29,15 @@ from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
     from amrepair.repair import RepairPlan
+    from amrepair.template.port import Template
     from amrepair.turning import Turn
 
 # A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
 # Less than this share out of reach is not worth turning the part over.
 WORTH_TURNING_RATIO = 0.05
+# A foot higher or lower than this is worth a word: no calibration and no squashed layer does it.
+ON_BED_MM = 0.15
 
 
 def add_to(app: typer.Typer) -> None:
@@ -159,6 +163,9 @@ def repair(
     if program is not None:
         text = program.text
         console.write_whole(output, lambda path: path.write_text(text, encoding="utf-8"))
+    older = program is None and output.exists()
+    if older:  # `repair && send` must not send what another scan asked for
+        output.unlink()
     if standing is not None:
         console.write_whole(standing, plan.deficit.as_built.write)
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
@@ -169,6 +176,10 @@ def repair(
         seconds=seconds,
         setup=setup,
     )
+    result |= {
+        "clutter_ratio": plan.registration.clutter_ratio,
+        "foot_z_mm": round(_foot_z_mm(field, plan), 3),
+    }
     if turns:
         result["turns"] = [asdict(one) for one in ranked]
     within = plan_is_enough(plan)
@@ -188,19 +199,47 @@ def repair(
     else:
         for line in summary_of_result(result, within_tolerance=within):
             console.out.print(line)
+        for line in _taken_for_granted(result):
+            console.out.print(line)
         for line in left_out_lines(plan):
             console.out.print(f"Left out, {line}.", markup=False)
         if program is not None and plan.estimate is not None:
             does = what_it_does(program, plan.estimate)
             console.out.print(f"Repair: {output}: {does}.", markup=False)
         elif not within:
-            older = "; the file of that name is older, and not for this scan" * output.exists()
-            said = f"{output} was not written: no bead can be laid{older}."
+            console.out.print(f"{output} was not written: no bead can be laid.", markup=False)
+        if older:
+            said = f"The {output} that was there is removed: it was for another scan."
             console.out.print(said, markup=False)
         for line in _suggestion(plan, ranked):
             console.out.print(line)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def _foot_z_mm(template: Template, plan: RepairPlan) -> float:
+    """Height of the part's lowest point, build frame."""
+    from amrepair.align.standing import box_on_bed
+
+    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    return float(box_on_bed(template, placed)[0, 2])
+
+
+def _taken_for_granted(result: Mapping[str, Any]) -> list[str]:
+    """What was left aside of the scan, and how high the part is taken to stand."""
+    lines = []
+    if (clutter := result["clutter_ratio"]) > 0.0:
+        lines.append(
+            f"{clutter:.0%} of the scan is not the part (scattered points, what it stands on, "
+            "other pieces) and was left aside where it was aligned."
+        )
+    if abs(foot_mm := result["foot_z_mm"]) > ON_BED_MM:
+        where = f"{foot_mm:.2f} mm above" if foot_mm > 0 else f"{-foot_mm:.2f} mm in"
+        lines.append(
+            f"The part's foot is taken to be {where} the bed; if it stands on no raft and no "
+            "fixture, the pose or the scan's Z is off by as much, and so is every bead."
+        )
+    return lines
 
 
 def pose_of_job(job: Path | None, template: Path, ids: tuple[str, str, str]) -> str:

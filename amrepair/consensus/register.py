@@ -98,8 +98,8 @@ def place_all(
         raise AlignmentError(
             f"{len(waiting)} of {len(pieces)} scans overlap the others by less than "
             f"{LEAST_OVERLAP:.0%}, or contradict them, in every pose that was tried ({names}); "
-            "check that they show the same part in the same unit, scan with more overlap, or give "
-            "the part's mesh beside them"
+            "check that they show the same part in the same unit, scan with more overlap, give one "
+            "view a file and where its sensor stood (--sensor-at), or the part's mesh beside them"
         )
     which = sorted(poses)
     chosen = [pieces[k] for k in which]

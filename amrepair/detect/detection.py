@@ -18,6 +18,7 @@ from scipy.stats import norm
 from amrepair.detect.anomaly import AnomalyMap, Label
 from amrepair.detect.evidence import Evidence, gather, with_stubs
 from amrepair.detect.faces import PLANE_POINTS
+from amrepair.detect.holes import UPRIGHT
 from amrepair.detect.near import nearest_within
 from amrepair.detect.normal_variation import forgiven
 from amrepair.detect.rays import RangeImage, range_images
@@ -101,6 +102,7 @@ def detect(
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
     rounded_up: RoundedUp | None = None,
+    up: Float[np.ndarray, " 3"] = UPRIGHT,
     progress: Progress = silent,
 ) -> AnomalyMap:
     """Score and label a scan against its template.
@@ -129,6 +131,8 @@ def detect(
     rounded_up
         Of places and their deviations: how far out of the template the process itself was told to
         go there. So much is not excess.
+    up
+        Unit vector away from what the part stands on, template frame.
 
     Raises
     ------
@@ -183,6 +187,7 @@ def detect(
         missing | excess,
         seen,
         threshold_mm=float(limit.low_mm(np.array([PLANE_POINTS]))[0]),
+        up=up,
     )
     progress("detect", 2.0, 4.0)
     label = np.zeros(len(scan), np.int64)

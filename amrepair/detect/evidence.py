@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
+from amrepair.detect.holes import UPRIGHT
 from amrepair.detect.near import has_near
 from amrepair.detect.rays import RangeImage, clearances
 from amrepair.detect.surfels import Surfels
@@ -167,6 +168,7 @@ def gather(
     images: tuple[RangeImage, ...],
     *,
     threshold_mm: float,
+    up: Float[np.ndarray, " 3"] = UPRIGHT,
 ) -> Evidence:
     """Collect the evidence of a scan whose off-template surfels and range images are known."""
     off = off | _strips(template, surfels, off)
@@ -183,7 +185,7 @@ def gather(
         spacing_mm = max(PATCH_MM, surfels.spacing_mm)
         places, normals = template.surface_points(spacing_mm)
         patches = Patches(places, normals * spacing_mm**2)
-        faces = find_faces(scan, template, surfels, off, patches, threshold_mm=threshold_mm)
+        faces = find_faces(scan, template, surfels, off, patches, threshold_mm=threshold_mm, up=up)
         nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
         normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
     return Evidence(surfels, off, normal, images, faces)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.detect import faces_kernels as kernels
-from amrepair.detect.holes import is_backed, is_closed, spoken_of
+from amrepair.detect.holes import UPRIGHT, is_backed, is_closed, is_lined, spoken_of, stood_on
 from amrepair.detect.near import has_near
 from amrepair.detect.rooms import Rooms, find_rooms
 from amrepair.detect.sheets import other_sides, with_own_area
@@ -52,6 +52,8 @@ SURE_WINDING = 0.05
 PROBE_MM = 0.5
 OPEN_WINDING = 0.3
 STEP_SPACINGS = 2.0  # before a face and behind it, where the winding number is asked
+# Faces are turned to close what was seen where that leaves less than so much of the opening.
+CLOSER_RATIO = 0.5
 # A sign vector needs this mean agreement with the template before file normals are believed.
 NORMAL_AGREEMENT = 0.5
 
@@ -184,6 +186,7 @@ def find_faces(
     patches: Patches,
     *,
     threshold_mm: float,
+    up: Float[np.ndarray, " 3"] = UPRIGHT,
 ) -> Faces:
     """Look at the scan around the surfels in `off` and close what stands there.
 
@@ -191,6 +194,8 @@ def find_faces(
     ----------
     threshold_mm
         Deviation from the template that is more than noise for a mean of `PLANE_POINTS` points.
+    up
+        Unit vector away from what the part stands on.
     """
     kept = surfels.of_point >= 0
     near_cell = _around(scan.points_mm[kept], surfels, off, patches)
@@ -204,8 +209,9 @@ def find_faces(
     along = np.abs((gradient * plane).sum(axis=1))
     broken = np.abs(deviation) > threshold_mm
     broken |= (along < STRIP_COSINE) & (deviation < -STRIP_MM)
-    # a lone point among others is noise
+    # a lone point among others is noise, as are crumbs along the rim of what nobody saw
     broken &= broken[neighbours].mean(axis=1) > LONE_RATIO
+    broken &= has_near(place, surfels.place_mm[off], AROUND_MM)
     sheet = other_sides(place, plane, deviation, gradient, broken, spacing_mm=surfels.spacing_mm)
     area = with_own_area(area, neighbours, sheet)
     rest = np.flatnonzero(~near_cell)
@@ -218,6 +224,8 @@ def find_faces(
     crossing = is_off.copy()
     crossing[: len(place)] &= ~sheet
     present = _present(patches, places, crossing, tree, reach)
+    foot = stood_on(patches.place_mm, patches.vector_mm2, present, up)
+    stands = present | foot
     which = np.flatnonzero(broken)
     rooms = find_rooms(
         template,
@@ -225,6 +233,7 @@ def find_faces(
         place[which],
         patches.place_mm[present],
         unit_vectors(patches.vector_mm2[present]),
+        foot=(up, float((patches.place_mm[foot] @ up).min())) if foot.any() else None,
     )
     given = None
     if scan.normals is not None:
@@ -244,8 +253,8 @@ def find_faces(
             plane,
             area,
             neighbours,
-            present_mm=patches.place_mm[present],
-            present_mm2=patches.vector_mm2[present],
+            present_mm=patches.place_mm[stands],
+            present_mm2=patches.vector_mm2[stands],
             step_mm=STEP_SPACINGS * spacing_mm,
             side=side,
         )
@@ -255,14 +264,25 @@ def find_faces(
         template, patches.place_mm[holes], place[which], outward, spacing_mm=spacing_mm
     )
     present[holes[~spoken]] = True
-    seen_mm2 = patches.vector_mm2[present].sum(axis=0)
+    seen_mm2 = patches.vector_mm2[present | foot].sum(axis=0)
     whole_mm2 = patches.vector_mm2.sum(axis=0)
-    closed = is_closed(seen_mm2, whole_mm2, outward * area[which, None])
-    if given is None and not closed:
+    lined = is_lined(
+        patches.place_mm[~(present | foot)],
+        patches.place_mm[seen],
+        place[which],
+        spacing_mm=spacing_mm,
+    )
+    closed = lined and is_closed(seen_mm2, whole_mm2, outward * area[which, None])
+    if given is None and lined and not closed:
         other = turned_to_close(
             outward, area[which], side != 0, which, neighbours, seen_mm2=seen_mm2
         )
         closed = is_closed(seen_mm2, whole_mm2, other * area[which, None])
+        before_mm2, after_mm2 = (
+            float(np.linalg.norm(seen_mm2 + area[which] @ way)) for way in (outward, other)
+        )
+        # what is open for want of a look stays open: turning faces only hides some of it
+        closed &= after_mm2 < CLOSER_RATIO * before_mm2
         outward = other if closed else outward
     vectors = outward * area[which, None]
     normal = np.zeros((len(places), 3))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+from amrepair.detect.near import has_near
 from amrepair.template.port import Template
 
 # Patches nearer to each other than this are one hole; so near to its rim a face touches it.
@@ -18,6 +19,42 @@ HOLE_MM, RIM_MM = 1.0, 1.0
 LOOK_MM, LOOKING = 0.5, 2000
 # Faces close what was seen but for this share of their own area: rims are ragged.
 OPEN_RATIO = 0.25
+# Along what is gone broken faces meet the template's seen surface: along so much of it at least.
+LINED_RATIO = 0.5
+UPRIGHT = np.array([0.0, 0.0, 1.0])
+# A part's lowest surface, to so much, facing down to 26°; less than this share of it was seen.
+FOOT_MM, FOOT_COSINE, SEEN_OF_FOOT = 0.3, -0.9, 0.3
+
+
+def stood_on(
+    patch_mm: Float[np.ndarray, "m 3"],
+    patch_mm2: Float[np.ndarray, "m 3"],
+    present: Bool[np.ndarray, " m"],
+    up: Float[np.ndarray, " 3"],
+) -> Bool[np.ndarray, " m"]:
+    """(m,) unseen patches of the part's foot, where it stood on a bed while it was scanned.
+
+    Nobody sees what a part stands on: of its lowest surface next to nothing was. That hole is
+    the largest of such a scan, and says nothing: what broke looks out of the others.
+
+    Parameters
+    ----------
+    patch_mm, patch_mm2
+        The template's surface: places, and outward normals times area.
+    present
+        Which of it was seen.
+    up
+        Unit vector away from the bed.
+    """
+    if len(patch_mm) == 0:
+        return np.zeros(0, dtype=bool)
+    area_mm2 = np.linalg.norm(patch_mm2, axis=1)
+    height_mm = patch_mm @ up
+    foot = (height_mm < height_mm.min() + FOOT_MM) & (patch_mm2 @ up < FOOT_COSINE * area_mm2)
+    seen_mm2 = area_mm2[foot & present].sum()
+    if seen_mm2 >= SEEN_OF_FOOT * area_mm2[foot].sum():
+        return np.zeros(len(patch_mm), dtype=bool)
+    return np.asarray(foot & ~present)
 
 
 def spoken_of(
@@ -94,6 +131,34 @@ def is_backed(
         if len(left) == 0:
             break
     return backed
+
+
+def is_lined(
+    hole_mm: Float[np.ndarray, "h 3"],
+    seen_mm: Float[np.ndarray, "m 3"],
+    face_mm: Float[np.ndarray, "q 3"],
+    *,
+    spacing_mm: float,
+) -> bool:
+    """Whether broken faces run along most of where holes meet surface that was seen.
+
+    Where material is gone there is a break between what stands and what does not; where nobody
+    looked there is none. A view from above leaves all walls open, and they cancel in `is_closed`.
+
+    Parameters
+    ----------
+    hole_mm, seen_mm
+        Places on the template's surface that no point lies on, and that were seen.
+    face_mm
+        Broken faces.
+    spacing_mm
+        Of the scan.
+    """
+    if len(hole_mm) == 0 or len(seen_mm) == 0 or len(face_mm) == 0:
+        return True
+    reach_mm = max(RIM_MM, 3.0 * spacing_mm)
+    rim_mm = hole_mm[has_near(hole_mm, seen_mm, reach_mm)]
+    return len(rim_mm) == 0 or bool(has_near(rim_mm, face_mm, 2.0 * reach_mm).mean() >= LINED_RATIO)
 
 
 def is_closed(

@@ -19,6 +19,8 @@ VOXEL_MM, ROOM_MM, MOST_VOXELS = 0.3, 3.0, 600_000
 UNDER_MM = 0.8
 # A room is what its many seeds say if the others are fewer than this share.
 LEAK_RATIO = 0.02
+# It leaks if it holds a larger share of all seeds of the other kind, however few those are.
+LEAK_OF_ALL = 0.1
 # A face looks this far ahead and behind: beyond the thickness of the wall of voxels.
 LOOK_VOXELS = (2.5, 3.5)
 
@@ -65,6 +67,8 @@ def find_rooms(
     face_mm: Float[np.ndarray, "q 3"],
     present_mm: Float[np.ndarray, "m 3"],
     present_normals: Float[np.ndarray, "m 3"],
+    *,
+    foot: tuple[Float[np.ndarray, " 3"], float] | None,
 ) -> Rooms:
     """Rooms around broken faces.
 
@@ -74,6 +78,9 @@ def find_rooms(
         The scan.
     present_mm, present_normals
         Places on the template's surface where it was seen, and outward unit normals.
+    foot
+        The way up, and the height of the part's foot that way: it closes rooms, though nobody saw
+        it. None where it was seen.
     """
     if len(face_mm) == 0:
         return Rooms(np.zeros(3), VOXEL_MM, np.zeros((0, 0, 0), np.int64), np.zeros(1))
@@ -86,6 +93,8 @@ def find_rooms(
         index, ok = _cells(points, low, voxel_mm, shape)
         wall[tuple(index[ok].T)] = True
     wall = ndimage.binary_dilation(wall)  # a sheet of points has gaps of chance
+    if foot is not None:
+        wall |= _slab(template, low, voxel_mm, shape, *foot)
     number, count = ndimage.label(~wall)
     edge = np.ones(shape, bool)
     edge[1:-1, 1:-1, 1:-1] = False
@@ -98,10 +107,27 @@ def find_rooms(
     empties = np.bincount(number[tuple(outside.T)], minlength=count + 1)
     solids = np.bincount(number[tuple(inside.T)], minlength=count + 1)
     value = np.zeros(count + 1)
-    value[(empties > 0) & (solids < LEAK_RATIO * empties)] = 1.0
-    value[(solids > 0) & (empties < LEAK_RATIO * solids)] = -1.0
+    for mine, other, said in ((empties, solids, 1.0), (solids, empties, -1.0)):
+        sure = (other < LEAK_RATIO * mine) & (other <= LEAK_OF_ALL * other.sum())
+        value[(mine > 0) & sure] = said
     value[0] = 0.0
     return Rooms(low, voxel_mm, np.asarray(number, np.int64), value)
+
+
+def _slab(
+    template: Template,
+    low_mm: Float[np.ndarray, " 3"],
+    voxel_mm: float,
+    shape: tuple[int, ...],
+    up: Float[np.ndarray, " 3"],
+    height_mm: float,
+) -> Bool[np.ndarray, "x y z"]:
+    """Voxels along the plane that the part stands on, under the part."""
+    x, y, z = (low_mm[k] + (np.arange(shape[k]) + 0.5) * voxel_mm for k in range(3))
+    over_mm = (up[0] * x)[:, None, None] + (up[1] * y)[:, None] + up[2] * z - height_mm
+    slab = np.abs(over_mm) <= voxel_mm
+    slab[slab] = template.distance(low_mm + (np.argwhere(slab) + 0.5) * voxel_mm) < voxel_mm
+    return np.asarray(slab)
 
 
 def _cells(

@@ -50,6 +50,22 @@ def read_pcd(data: bytes, path: Path) -> tuple[dict[str, Float[np.ndarray, " n"]
     return columns, header
 
 
+def count_of_pcd(path: Path) -> int:
+    """How many points a file's header promises.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or its header is none of a PCD file.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(65536)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    return _header(head, path).points
+
+
 def _header(data: bytes, path: Path) -> PcdHeader:
     match = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data[:65536], re.MULTILINE)
     if match is None:

@@ -89,8 +89,10 @@ def band_field(
 
     The outermost nodes are outside, whatever the template says.
     """
-    if not voxel_mm > 0:
+    if not 0 < voxel_mm < np.inf:
         raise TemplateError(f"the voxel is {voxel_mm} mm; it must be above 0")
+    if not np.isfinite(level_mm):
+        raise TemplateError(f"the level is {level_mm} mm; it must be a number")
     margin_mm = max(level_mm, 0.0) + 2.0 * voxel_mm
     bounds_mm = template.bounds_mm
     low_mm = bounds_mm[0] - margin_mm

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,17 +33,16 @@ def write_template(path: Path, arrays: dict[str, np.ndarray], head: dict[str, An
     """
     from safetensors.numpy import save
 
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     said = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "units": "mm",
         "frame": "template",
+        "crc32": _crc32(arrays),
         **head,
     }
-    data = save(
-        {name: np.ascontiguousarray(array) for name, array in arrays.items()},
-        metadata={HEAD: json.dumps(said)},
-    )
+    data = save(arrays, metadata={HEAD: json.dumps(said)})
     temporary = path.with_name(f".{os.getpid()}-{path.name}")
     try:
         temporary.write_bytes(data)
@@ -59,7 +59,7 @@ def read_template(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises
     ------
     TemplateError
-        If it is missing, truncated, foreign or of another version.
+        If it is missing, truncated, damaged, foreign or of another version.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -78,11 +78,25 @@ def read_template(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
                     f"{path} is a template of another version ({head.get('format_version')}, this "
                     f"one reads {FORMAT_VERSION}); fit it again"
                 )
-            return {name: file.get_tensor(name) for name in file.keys()}, head  # noqa: SIM118
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError) as error:
         raise TemplateError(
             f"the template {path} is truncated or no template ({error}); fit it again"
         ) from error
+    if head.get("crc32", said := _crc32(arrays)) != said:
+        raise TemplateError(
+            f"the template {path} is damaged (its numbers do not add up to the checksum it was "
+            "written with); copy it again, or fit it again"
+        )
+    return arrays, head
+
+
+def _crc32(arrays: dict[str, np.ndarray]) -> int:
+    """Checksum of all arrays, in the order of their names."""
+    checksum = 0
+    for name in sorted(arrays):
+        checksum = zlib.crc32(arrays[name].tobytes(), checksum)
+    return checksum
 
 
 def require_kind(path: Path, found: object, wanted: str) -> None:

@@ -33,6 +33,7 @@ _log = logging.getLogger(__name__)
 
 # Cracks narrower than this share of the extent are closed: 0.01 mm on a part of 100 mm.
 SEW_RATIO = 1e-4
+LEAST_PART_MM = 1.0  # a printer that prints smaller ones lays no beads
 MAX_LID_EDGES = 32  # a larger hole has a shape that we do not know
 # More open edges than this share of all edges is a bag of polygons, not a surface with a hole.
 MAX_OPEN_EDGE_RATIO = 0.05
@@ -93,11 +94,17 @@ def load_mesh(path: Path | str) -> trimesh.Trimesh:
     Raises
     ------
     TemplateError
-        If the file is missing, unreadable, empty, holds values that are not finite, or is not a
-        surface that bounds a volume and cannot be made one.
+        If the file is missing, unreadable, empty, holds values that are not finite, is of another
+        unit, or is not a surface that bounds a volume and cannot be made one.
     """
     path = Path(path)
     mesh = _read(path)
+    if (across_mm := float(np.linalg.norm(mesh.extents))) < LEAST_PART_MM:
+        raise TemplateError(
+            f"the mesh {path.name} is {across_mm:.3g} mm across, and no part is smaller than "
+            f"{LEAST_PART_MM:g} mm; coordinates are millimetres: was it exported in metres? Scale "
+            "it by 1000"
+        )
     closed, notes = close_mesh(mesh, source=path.name)
     for note in notes:
         _log.warning("%s: %s", path.name, note)

@@ -16,7 +16,7 @@ from skimage import measure
 from gcode.moves import Role
 from gcode.profiles import PrintSetup
 from gcode.slicing import reach_kernels
-from gcode.slicing.beads import Bead, divided, spacing_of
+from gcode.slicing.beads import ROUND_LOSS, Bead, divided, spacing_of
 from gcode.slicing.infill import ring_beads, solid_fill
 from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES
 from gcode.slicing.job_lines import JobPieces, gathered
@@ -54,11 +54,15 @@ ROUNDED_MM = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # whi
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """A bead of a pass: (n, 2) points, (n,) heights of the tip, (n-1,) cross-sections, mm²."""
+    """A bead of a pass: (n, 2) points, (n,) heights of the tip, (n-1,) cross-sections, mm².
+
+    `deep_mm` has (n-1,) how far what lies under it is below the tip.
+    """
 
     xy_mm: Float[np.ndarray, "n 2"]
     z_mm: Float[np.ndarray, " n"]
     section_mm2: Float[np.ndarray, " m"]
+    deep_mm: Float[np.ndarray, " m"]
     role: Role
 
     @property
@@ -77,6 +81,7 @@ class Chain:
             np.ascontiguousarray(self.xy_mm[::-1]),
             np.ascontiguousarray(self.z_mm[::-1]),
             np.ascontiguousarray(self.section_mm2[::-1]),
+            np.ascontiguousarray(self.deep_mm[::-1]),
             self.role,
         )
 
@@ -319,13 +324,14 @@ def weighed(
         mine = slice(at, at + n)
         at += n
         section = BOND_RATIO * _smooth(volume[mine], lengths[mine], closed=run.closed)
-        most = np.maximum(depth[mine], LEAST_THICK_MM) * MOST_NOZZLES * nozzle_mm
+        deep = np.maximum(depth[mine], LEAST_THICK_MM)
+        most = deep * (MOST_NOZZLES * nozzle_mm - deep * ROUND_LOSS)
         most = np.maximum(most, BOND_RATIO * own[mine])
         most = np.minimum(most, setup.printer.max_bead_section_mm2)
         given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9))
         given[mine] *= met_mm3[mine] / np.maximum(told_mm3[mine], 1e-9)
         section = np.minimum(section, most)
-        chains += _split(Chain(run.xy_mm, tip_mm, section, run.role))
+        chains += _split(Chain(run.xy_mm, tip_mm, section, deep, run.role))
     laid = np.zeros(thick.size)
     laid[filled[near]] = thick.ravel()[filled[near]] * given[nearest[near]]
     return chains, laid.reshape(thick.shape)
@@ -393,7 +399,13 @@ def _split(chain: Chain) -> list[Chain]:
     keep = np.concatenate([[False], chain.section_mm2 > LEAST_SECTION_MM2, [False]])
     edges = np.flatnonzero(np.diff(keep.astype(np.int8)))
     return [
-        Chain(chain.xy_mm[a : b + 1], chain.z_mm[a : b + 1], chain.section_mm2[a:b], chain.role)
+        Chain(
+            chain.xy_mm[a : b + 1],
+            chain.z_mm[a : b + 1],
+            chain.section_mm2[a:b],
+            chain.deep_mm[a:b],
+            chain.role,
+        )
         for a, b in zip(edges[::2], edges[1::2], strict=True)
     ]
 

@@ -138,14 +138,14 @@ def emit(
     chains = _walls_last(one.chains, pen.position_mm[:2]) if planar else one.chains
     for chain in chains:
         _go_to(pen, np.array([*chain.xy_mm[0], chain.z_mm[0]]), one, reach, model, setup)
-        width_mm = float(chain.section_mm2.mean()) / one.height_mm
+        deep_mm = float(chain.deep_mm.mean())
         pen.extrude(
             np.column_stack([chain.xy_mm, chain.z_mm]),
             chain.section_mm2,
             speed_mm_s=speed_mm_s,
             role=chain.role,
-            width_mm=width_of(width_mm, one.height_mm),
-            height_mm=one.height_mm,
+            width_mm=width_of(float(chain.section_mm2.mean()) / deep_mm, deep_mm),
+            height_mm=deep_mm,
         )
         laid_mm3 += chain.volume_mm3
     return laid_mm3

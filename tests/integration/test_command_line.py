@@ -181,6 +181,32 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     assert (x1, y1, z1) == pytest.approx((140.0, 110.0, 12.0), abs=0.4)
 
 
+def test_a_repair_that_is_not_needed_leaves_no_older_program(
+    chipped: dict[str, Path], tmp_path: Path
+) -> None:
+    # regression: `repair -o r.gcode && send r.gcode` of a whole part sent yesterday's repair
+    points, faces = trimesh.sample.sample_surface(trimesh.load(chipped["part.stl"]), 80_000, seed=1)
+    seen = trimesh.load(chipped["part.stl"]).face_normals[faces][:, 2] > -0.5
+    whole, out = tmp_path / "whole.xyz", tmp_path / "r.gcode"
+    # and 0.4 mm in the air: no raft is so thin that nobody needs to know
+    np.savetxt(whole, np.asarray(points)[seen] + (100.0, 80.0, 0.4), fmt="%.4f")
+    out.write_text("G28\n")
+    done = call("repair", whole, "--template", chipped["part.stl"], "-o", out)
+    assert done.returncode == 0, done.stderr
+    assert not out.exists()
+    said = " ".join(done.stdout.split())
+    assert "that was there is removed" in said
+    assert "0.40 mm above the bed" in said
+
+
+def test_an_aligned_scan_is_a_ply(chipped: dict[str, Path], tmp_path: Path) -> None:
+    words = [chipped["scan.xyz"], "--template", chipped["part.stl"], "-o", tmp_path / "a.foo"]
+    refused = call("align", *words)
+    assert refused.returncode == 2
+    assert ".ply" in refused.stderr
+    assert not (tmp_path / "a.foo").exists()
+
+
 def test_align_and_detect_write_what_the_contract_says(
     chipped: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -205,7 +231,9 @@ def test_align_and_detect_write_what_the_contract_says(
     assert {int(v) for v in np.unique(archive["template_label"])} <= {0, 1, 3}
     assert (archive["label"] == 1).any()
     told = json.loads(detected.stdout)
-    assert {"object_score", "threshold", "regions"} <= set(told)
+    # regression: an ambiguous pose was told by align alone
+    assert {"object_score", "threshold", "regions", "symmetric_alternatives", "inlier_ratio",
+            "clutter_ratio"} <= set(told)  # fmt: skip
     assert told["regions"][0]["volume_mm3"] == pytest.approx(8 * 8 * 1.2, rel=0.05)
 
 

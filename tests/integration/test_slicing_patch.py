@@ -129,6 +129,17 @@ def test_the_plastic_is_the_missing_volume(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", POCKETS)
+def test_no_bead_is_wider_than_two_nozzles_by_what_the_text_says(name: str) -> None:
+    # regression: widths were told for a pass's mean height, where a bead filled a deeper place:
+    # up to 1.37 mm
+    plan, _ = plan_of(POCKETS[name])
+    text = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False).text
+    widths = [float(line[7:]) for line in text.splitlines() if line.startswith(";WIDTH:")]
+    assert widths
+    assert max(widths) <= 2 * SETUP.printer.nozzle_diameter_mm + 1e-9
+
+
+@pytest.mark.parametrize("name", POCKETS)
 def test_a_patch_passes_the_checker(name: str) -> None:
     plan, field = plan_of(POCKETS[name])
     program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)

@@ -6,6 +6,7 @@ import importlib
 
 import numpy as np
 import pytest
+import trimesh
 from jaxtyping import Float
 
 from amrepair.align import Registration, align
@@ -88,6 +89,26 @@ def test_a_scan_without_clutter_keeps_nearly_all_of_itself() -> None:
     kept = without_clutter(points + rng.normal(0, SIGMA_MM, points.shape), rng)
     # edges may look scattered and a face like a bed, never more
     assert all(one.left_out_ratio < 0.45 for one in kept)
+
+
+def test_a_top_around_a_wide_pit_is_no_bed() -> None:
+    # regression: of a block with a wide shallow pit the rim of its top was taken for the plane that
+    # it stands on (all the rest lies below), and the pit was laid on the top: 0.37 mm too high
+    block = box((0, 0, 0), (70, 40, 17))
+    mesh = to_trimesh(block.body)
+    points, faces = trimesh.sample.sample_surface(mesh, 60_000, seed=3)
+    points = np.asarray(points)
+    away = ((points[:, 0] - 35.0) / 25.0) ** 2 + ((points[:, 1] - 20.0) / 17.5) ** 2
+    top = mesh.face_normals[faces][:, 2] > 0.9
+    points[top, 2] -= 3.4 * np.sqrt(np.maximum(1.0 - away[top], 0.0))
+    seen = mesh.face_normals[faces][:, 2] > -0.9
+    rim = (away > 1.0)[seen] & top[seen]
+    points = points[seen]
+    points += np.random.default_rng(3).normal(0, SIGMA_MM, points.shape)
+    found = align(Scan(points, SIGMA_MM, "build"), block)
+    assert found.clutter_ratio == 0.0
+    moved = found.template_from_scan.apply(points)
+    assert np.abs(np.median(block.distance(moved[rim]))) < 0.05
 
 
 def test_what_lies_on_the_part_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

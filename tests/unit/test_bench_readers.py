@@ -103,6 +103,16 @@ def test_real3d_truth_with_any_white_space(tmp_path: Path, rng: np.random.Genera
     assert cloud.labels.tolist() == [1, 0]
 
 
+def test_real3d_truth_of_a_piece_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    # regression: a txt that was cut short counted as the whole sample
+    write_pcd_binary(tmp_path / "fish" / "train" / "1_template.pcd", rng.normal(size=(5, 3)))
+    write_pcd_binary(tmp_path / "fish" / "test" / "2_sink.pcd", rng.normal(size=(40, 3)))
+    write_truth(tmp_path / "fish" / "gt" / "2_sink.txt", rng.normal(size=(9, 3)), np.arange(9) % 2)
+    with pytest.raises(InputError, match="9 rows of truth for the 40 points") as caught:
+        open_dataset(tmp_path, "real3d-ad").classes[0].test[0].load()
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(("variant", "sep"), [("pcd", ","), ("new_pcd", ","), ("16384", " ")])
 @pytest.mark.parametrize("below", ["", "dataset", "dataset/{variant}"])
 def test_shapenet_variants_and_separators(

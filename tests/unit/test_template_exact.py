@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from jaxtyping import Float
 
+from amrepair.errors import TemplateError
 from amrepair.template import MeshSdf, load_mesh
 from amrepair.template.fit import GRID_CELLS, fit_fast
 from amrepair.template.nearest import TriangleTree
@@ -135,3 +136,11 @@ def test_long_parts_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stocky.grid.cell_mm == pytest.approx(40.0 / (GRID_CELLS // 4), rel=0.1)
     assert long.grid.cell_mm < 0.5 * 200.0 / (GRID_CELLS // 4)
     assert long.grid.base.size < 1.5 * stocky.grid.base.size
+
+
+def test_a_mesh_in_metres_is_refused(tmp_path: Path) -> None:
+    # regression: a template 0.08 mm across was fitted, "good to 0.000 mm"
+    path = tmp_path / "metres.stl"
+    trimesh.creation.box((0.08, 0.04, 0.02)).export(path)
+    with pytest.raises(TemplateError, match=r"0\.0917 mm across.*metres"):
+        load_mesh(path)

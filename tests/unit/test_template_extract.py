@@ -47,6 +47,15 @@ def test_a_surface_on_the_grid_is_closed(shape: trimesh.Trimesh, voxel_mm: float
     assert solid.volume() == pytest.approx(float(shape.volume), rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("voxel_mm", "level_mm", "said"), [(0.5, np.nan, "level is nan"), (np.nan, 0.0, "voxel is nan")]
+)
+def test_what_is_no_number_is_refused(voxel_mm: float, level_mm: float, said: str) -> None:
+    ball = MeshSdf.from_mesh(trimesh.creation.icosphere(2, 5.0))
+    with pytest.raises(TemplateError, match=said):
+        extract_mesh(ball, voxel_mm, level_mm=level_mm)
+
+
 class Leaking:
     """A ball that says it is smaller than it is, as a network does that was taught too little."""
 

@@ -93,12 +93,17 @@ def test_a_file_comes_back_bit_for_bit(knob: LearnedSdf, tmp_path: Path) -> None
     assert again.solid().volume() == pytest.approx(knob.solid().volume())
 
 
-@pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "foreign", "text"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "zeroed", "foreign", "text"])
 def test_a_damaged_file_is_refused(knob: LearnedSdf, tmp_path: Path, damage: str) -> None:
     path = tmp_path / "t.safetensors"
     if damage == "truncated":
         knob.save(path)
         path.write_bytes(path.read_bytes()[:5000])
+    elif damage == "zeroed":  # regression: it was read, and its distances were taken for true
+        knob.save(path)
+        data = bytearray(path.read_bytes())
+        data[-6000:-2000] = bytes(4000)
+        path.write_bytes(data)
     elif damage == "foreign":
         from safetensors.numpy import save_file
 
