@@ -318,15 +318,25 @@ def _tops(
 def _close_gaps(
     z_mm: Float[np.ndarray, "ny nx"], seen: Bool[np.ndarray, "ny nx"], cell_mm: float
 ) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
-    """A few cells that sampling left empty among seen ones take their highest neighbour."""
+    """A few cells that sampling left empty among seen ones take their highest seen neighbour.
+
+    Each its own: chance links such cells by their corners, and a wall beside one is none beside
+    the last of them.
+    """
     groups, count = ndimage.label(~seen, structure=np.ones((3, 3)))
     if count == 0:
         return z_mm, seen
     size = np.bincount(groups.ravel(), minlength=count + 1)
     small = (size <= max(1, int(GAP_MM2 / cell_mm**2)))[groups] & ~seen
-    highest = ndimage.maximum_filter(np.where(seen, z_mm, -np.inf), 3)
-    by_group = ndimage.maximum(highest, groups, index=np.arange(count + 1))
-    return np.where(small, np.asarray(by_group)[groups], z_mm), seen | small
+    z_mm, known = z_mm.copy(), seen.copy()
+    while (small & ~known).any():  # from the rim in: a gap of a few cells has no more of them
+        highest = ndimage.maximum_filter(np.where(known, z_mm, -np.inf), 3)
+        new = small & ~known & np.isfinite(highest)
+        if not new.any():
+            break
+        z_mm[new] = highest[new]
+        known |= new
+    return z_mm, known
 
 
 def _designed(

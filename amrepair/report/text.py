@@ -243,8 +243,8 @@ def _left(outcome: Outcome, figures: Figures) -> str:
         parts.append(f"{quantity(figures.unprintable_mm3, 'mm³')} can hold no bead")
     if figures.unseen_area_mm2 >= 0.5:
         parts.append(
-            f"no sensor saw {quantity(figures.unseen_area_mm2, 'mm²')} of the surface, for which "
-            "nobody can vouch"
+            f"no sensor saw {quantity(figures.unseen_area_mm2, 'mm²')} of the surface (what it "
+            "stands on included), for which nobody can vouch"
         )
     text = "; ".join(parts)
     return text[0].upper() + text[1:] + "."

@@ -8,13 +8,16 @@ import pytest
 import trimesh
 from scipy import ndimage
 
-from amrepair.deficit.heights import columns_of
+from amrepair.deficit.heights import as_built_heights, columns_of
 from amrepair.deficit.walls import (
     with_even_crests,
     with_rising_rims,
     with_sharp_walls,
     with_whole_rims,
 )
+from amrepair.frames import Transform
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf
 from gcode.slicing.layers import mesh_of
 from gcode.surfaces import HeightField
 
@@ -239,3 +242,28 @@ def test_beside_a_skipped_line_nothing_stands_as_if_cut() -> None:
     z_mm[ndimage.maximum_filter(lost_mm, 5) > 0] -= 0.2
     low = HeightField(designed.origin_mm, CELL_MM, z_mm, designed.seen)
     assert (with_whole_rims(low, lost_mm, designed.z_mm).z_mm == z_mm).all()
+
+
+def test_cells_that_chance_left_empty_are_as_high_as_what_is_next_to_them() -> None:
+    # regression: a chain of such cells, corner to corner, was as high as the wall at its end: the
+    # head kept off a worn edge that it could reach, and 0.90 of it was filled instead of 0.97
+    cell_mm = 0.3
+    x, y = (g.ravel() for g in np.meshgrid(np.arange(0.15, 12, 0.3), np.arange(0.15, 9, 0.3)))
+    column, row = np.rint(x / cell_mm - 0.5), np.rint(y / cell_mm - 0.5)
+    wall = column >= 30
+    empty = (column + row == 40) & (column > 24) & ~wall  # five cells, the last beside the wall
+    z = np.where(wall, 6.0, 2.0)
+    points = np.column_stack([x, y, z])[~empty]
+    template = MeshSdf.from_mesh(trimesh.creation.box(bounds=[[0, 0, 0], [12, 9, 6]]))
+    field = as_built_heights(
+        Scan(points, 0.0, "template"),
+        template,
+        0.25,
+        build_from_template=Transform.identity("build", "template"),
+        printed_z_mm=None,
+        cell_mm=cell_mm,
+    )
+    told = field.sample(np.column_stack([x, y])[empty], outside_mm=np.nan)
+    beside = column[empty] == 29
+    assert told[~beside] == pytest.approx(2.0)
+    assert told[beside] == pytest.approx(6.0)  # it may be the wall's
