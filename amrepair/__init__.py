@@ -26,10 +26,10 @@ from gcode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from amrepair.align import align as align_scan
-    from amrepair.detect import detect as detect_defects
     from amrepair.errors import AmrepairError
     from amrepair.frames import Transform
     from amrepair.loop import run_loop
+    from amrepair.regions import detect as detect_defects
     from amrepair.repair import RepairPlan, Site, plan_repair
     from amrepair.scans import Scan, Scanner, read_scan
     from amrepair.template import fit_template, open_template
@@ -61,7 +61,7 @@ _HOMES = {
     "Site": ("amrepair.repair", "Site"),
     "Transform": ("amrepair.frames", "Transform"),
     "align_scan": ("amrepair.align", "align"),
-    "detect_defects": ("amrepair.detect", "detect"),
+    "detect_defects": ("amrepair.regions", "detect"),
     "fit_template": ("amrepair.template", "fit_template"),
     "open_template": ("amrepair.template", "open_template"),
     "plan_repair": ("amrepair.repair", "plan_repair"),

@@ -21,11 +21,13 @@ from amrepair.align import align
 from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
 from amrepair.deficit import Deficit, as_built_heights, compute_deficit, worth
-from amrepair.detect import AnomalyMap, Label, Region, detect
-from amrepair.detect.rays import range_images
-from amrepair.detect.skipped import PlannedBeads
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
+from amrepair.observe.rays import range_images
+from amrepair.regions import AnomalyMap, Label, Region, detect
+from amrepair.regions.options import RegionOptions
+from amrepair.regions.significance import Tail
+from amrepair.regions.skipped import PlannedBeads
 from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
 from gcode.check import CheckedProgram, check
@@ -104,6 +106,10 @@ class Site:
         Height printed so far, build frame; None for a finished part.
     allowance_mm
         What the process may leave (half a layer for a CAD template, 0 for planned beads).
+    process_sigma_mm
+        By how much sound parts of the process depart as a whole: a quarter of a layer.
+    tail
+        How the scanner's errors fall off, as a calibration knows it; None: as the scan tells.
     on_fixture
         Somebody said that a finished part's foot is above the bed.
     beads
@@ -135,6 +141,8 @@ class Site:
     build_from_template: Transform | None = None
     printed_z_mm: float | None = None
     allowance_mm: float = 0.1
+    process_sigma_mm: float = 0.05
+    tail: Tail | None = None
     planned: Template | None = None
     on_fixture: bool = False
     beads: PlannedBeads | None = None
@@ -293,7 +301,10 @@ def plan_repair(
         anomaly = detect(
             moved,
             expected,
-            allowance_mm=site.allowance_mm,
+            options=RegionOptions(
+                allowance_mm=site.allowance_mm, process_sigma_mm=site.process_sigma_mm
+            ),
+            tail=site.tail,
             top_z_mm=_top_of_layer(site),
             images=None
             if seen is None

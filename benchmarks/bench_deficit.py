@@ -19,8 +19,8 @@ import numpy as np
 import trimesh
 
 from amrepair.deficit import compute_deficit
-from amrepair.detect import detect
 from amrepair.frames import Transform
+from amrepair.regions import detect
 from amrepair.scans import Scan
 from amrepair.template.mesh_sdf import MeshSdf
 

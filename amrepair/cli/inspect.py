@@ -14,8 +14,8 @@ from gcode.cli import console
 
 if TYPE_CHECKING:
     from amrepair.align import Registration
-    from amrepair.detect import AnomalyMap
     from amrepair.library import Recognition
+    from amrepair.regions import AnomalyMap
     from amrepair.repair import Stopwatch
     from amrepair.report.folder import RunFolder
     from amrepair.scans import Scan
@@ -190,8 +190,8 @@ def detect(
 
     from amrepair.align import align as align_scan
     from amrepair.deficit import compute_deficit, measured_regions
-    from amrepair.detect import detect as detect_defects
     from amrepair.frames import Transform
+    from amrepair.regions import detect as detect_defects
     from amrepair.repair import Stopwatch
     from amrepair.report.collect import rounded
     from amrepair.report.folder import RunFolder

@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from amrepair.detect import AnomalyMap, Label
-from amrepair.detect.evidence import Evidence
-from amrepair.detect.regions import group_points
-from amrepair.detect.skipped import PlannedBeads
+from amrepair.field.as_built import Evidence
+from amrepair.field.groups import group_points
+from amrepair.regions import AnomalyMap, Label
+from amrepair.regions.skipped import PlannedBeads
 from amrepair.template.port import Template
 
 BOX_MARGIN_MM = 1.0

@@ -26,13 +26,13 @@ from amrepair.deficit.walls import (
     with_sharp_walls,
     with_whole_rims,
 )
-from amrepair.detect import AnomalyMap, Label, Region, detect
-from amrepair.detect.detection import ON_PLANE_MM
-from amrepair.detect.evidence import Evidence
-from amrepair.detect.regions import classify
-from amrepair.detect.skipped import PlannedBeads, skipped
 from amrepair.errors import DeficitError
+from amrepair.field.as_built import Evidence
 from amrepair.frames import Transform, in_box
+from amrepair.observe.background import ON_PLANE_MM
+from amrepair.regions import AnomalyMap, Label, Region, detect
+from amrepair.regions.regions import classify
+from amrepair.regions.skipped import PlannedBeads, skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -463,6 +463,6 @@ def _is_skipped(piece: manifold3d.Manifold, gone: PlannedBeads | None) -> bool:
 
 def _unseen_area(anomaly: AnomalyMap, count: int) -> float:
     """Area of the unseen template points, from their mean spacing."""
-    from amrepair.detect.regions import area_per_point
+    from amrepair.field.groups import area_per_point
 
     return count * area_per_point(anomaly.template_points_mm)

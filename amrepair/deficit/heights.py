@@ -17,9 +17,9 @@ from scipy import ndimage
 
 from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.walls import window_around
-from amrepair.detect.near import has_near
-from amrepair.detect.rays import RangeImage, clearances
+from amrepair.field.near import has_near
 from amrepair.frames import Transform, box_corners
+from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.slicing.layers import mesh_of

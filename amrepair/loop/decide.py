@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from amrepair.detect.anomaly import DefectType
+from amrepair.regions.anomaly import DefectType
 from amrepair.repair import EXCESS_LAYERS, MIN_EXCESS_MM3, MIN_REPAIR_MM3, MIN_SKIPPED_MM3
 
 

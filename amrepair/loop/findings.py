@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.deficit.worth import defect_volumes
-from amrepair.detect import Label, Region
 from amrepair.loop.decide import Action, Cover, Finding, judge
+from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals
 from gcode.errors import ReadError

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from amrepair.detect import Label, Region
-from amrepair.detect.anomaly import DefectType
 from amrepair.frames import Transform
 from amrepair.loop.findings import matching
 from amrepair.loop.shapes import bead_way, last_beads, spread, tall_mm
 from amrepair.loop.shapes import chain as chain_of
+from amrepair.regions import Label, Region
+from amrepair.regions.anomaly import DefectType
 from amrepair.repair import RepairPlan, Site
 from gcode.reader import Job
 

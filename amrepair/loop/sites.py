@@ -7,11 +7,12 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool
 
-from amrepair.detect.detection import SURFACE_SPACING_MM
-from amrepair.detect.skipped import PlannedBeads
 from amrepair.frames import Transform, box_of
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
+from amrepair.regions.options import RegionOptions
+from amrepair.regions.significance import NORMAL_TAIL
+from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Site
 from amrepair.template import PlannedSdf
 from amrepair.template.port import Template
@@ -53,6 +54,7 @@ def sites(
                 setup,
                 grid,
                 build_from_template,
+                tail=NORMAL_TAIL,
                 lines=_lines(job, every),
                 beside=_beside(job, every),
                 laid=_as_high_as(job, every, BESIDE_CELL_MM),
@@ -73,10 +75,11 @@ def sites(
             grid,
             build_from_template,
             stop.z_mm,
+            tail=NORMAL_TAIL,
             planned=planned,
             beads=recent,
             lines=_lines(job, done),
-            surface=(planned or below).surface_points(SURFACE_SPACING_MM),
+            surface=(planned or below).surface_points(RegionOptions().spacing_mm),
             beside=None if by_beads else _beside(job, done),
         )
 

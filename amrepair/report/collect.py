@@ -14,12 +14,12 @@ import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float
 
-from amrepair.detect import Label
-from amrepair.detect.detection import BED_BAND_MM
 from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
 from amrepair.loop.decide import FINDINGS, STOPS
 from amrepair.loop.findings import reach_of
+from amrepair.observe.background import BED_BAND_MM
+from amrepair.regions import Label
 from amrepair.repair import RepairPlan
 from amrepair.report.data import (
     BeadPath,

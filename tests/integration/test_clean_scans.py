@@ -11,8 +11,8 @@ import pytest
 import trimesh
 
 from amrepair.deficit import compute_deficit
-from amrepair.detect import detect
 from amrepair.frames import Transform
+from amrepair.regions import detect
 from amrepair.scans import Scan
 from amrepair.template import load_mesh, load_or_fit
 from gcode.solids import as_manifold

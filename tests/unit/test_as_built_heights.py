@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from amrepair.deficit import compute_deficit
 from amrepair.deficit.heights import _without_fins, standing_heights
-from amrepair.detect import faces
-from amrepair.detect.near import has_near, nearest_within
+from amrepair.field import faces
+from amrepair.field.near import has_near, nearest_within
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf

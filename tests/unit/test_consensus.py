@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from amrepair.detect.normal_variation import forgiven
 
 from amrepair.consensus import fit_from_scans
 from amrepair.consensus.cloud import outward, planes, spacing_of
 from amrepair.consensus.fit import _piece
 from amrepair.consensus.fuse import Cloud, Fused, fuse
 from amrepair.consensus.register import place_all
-from amrepair.detect.normal_variation import forgiven
-from amrepair.detect.surfels import make_surfels
 from amrepair.errors import AlignmentError, InputError, TemplateError
+from amrepair.field.fused import make_surfels
 from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan
 from amrepair.template import LearnedSdf, MeshSdf, load_template

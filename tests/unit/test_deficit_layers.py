@@ -9,8 +9,8 @@ import trimesh
 
 from amrepair.deficit import Deficit, compute_deficit
 from amrepair.deficit.worth import MIN_REPAIR_MM3, worth_mending
-from amrepair.detect import detect
 from amrepair.frames import Transform
+from amrepair.regions import detect
 from amrepair.scans import ScanRequest
 from amrepair.simulate.parameters import load_world
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner, default_sensors_mm

@@ -13,9 +13,10 @@ import pytest
 
 from amrepair.deficit import Deficit, compute_deficit, measured_regions
 from amrepair.deficit.voxels import MAX_VOXELS, VoxelBox, solid_from_field
-from amrepair.detect import Label, detect
 from amrepair.errors import InputError
 from amrepair.frames import Transform, rotation_from_vector
+from amrepair.regions import Label, detect
+from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from tests import analytic
 from tests.analytic import AnalyticTemplate
@@ -111,7 +112,11 @@ def test_a_gap_in_a_thin_wall_in_a_bare_cloud() -> None:
 def test_a_tenth_of_a_millimetre_over_a_wide_area() -> None:
     """Under-extrusion below every single point's threshold, with an exact template."""
     built = BLOCK.body - cube((20, 10, 0.15), (10, 10, 9.85))
-    found = deficit_of(rays(built, ABOVE), BLOCK, allowance_mm=0.0, registration_sigma_mm=0.01)
+    found = deficit_of(
+        rays(built, ABOVE),
+        BLOCK,
+        options=RegionOptions(allowance_mm=0.0, registration_sigma_mm=0.01),
+    )
     assert found.missing_mm3 == pytest.approx(30.0, rel=0.1)
 
 

@@ -10,7 +10,7 @@ import trimesh
 import amrepair
 import gcode
 from amrepair.deficit import compute_deficit
-from amrepair.detect.holes import is_lined, stood_on
+from amrepair.field.holes import is_lined, stood_on
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from amrepair.detect import Label, detect
+from amrepair.regions import Label, detect
+from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from tests.analytic import box, cylinder, difference, sample_surface
 
@@ -20,8 +21,8 @@ def alarms(false_alarms: float, scans: int, threshold_mm: float | None) -> float
     for seed in range(scans):
         noise = np.random.default_rng(seed).normal(0, SIGMA_MM, points.shape)
         scan = Scan(points + noise, SIGMA_MM, "template")
-        limits = {"threshold_mm": threshold_mm, "false_alarms": false_alarms}
-        found += len(detect(scan, part, **limits).regions)  # type: ignore[arg-type]
+        options = RegionOptions(false_regions=false_alarms, tolerance_mm=threshold_mm)
+        found += len(detect(scan, part, options=options).regions)
     return found / scans
 
 

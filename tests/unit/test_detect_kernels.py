@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from amrepair.deficit import heights_kernels
-from amrepair.detect import faces_kernels, strands_kernels, turning_kernels
-from amrepair.detect.near import cells_of
-from amrepair.detect.surfels import make_surfels
-from amrepair.detect.winding import Shell
+from amrepair.field import faces_kernels, turning_kernels
+from amrepair.field.fused import make_surfels
+from amrepair.field.near import cells_of
+from amrepair.field.winding import Shell
 from amrepair.frames import ways_across
+from amrepair.regions import strands_kernels
 from gcode.surfaces import HeightField
 
 SEEDS = st.integers(0, 2**32 - 1)

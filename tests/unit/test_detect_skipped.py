@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amrepair.deficit import Deficit, compute_deficit
-from amrepair.detect import detect
-from amrepair.detect.evidence import Evidence
-from amrepair.detect.skipped import PlannedBeads, skipped
+from amrepair.field.as_built import Evidence
 from amrepair.frames import Transform
+from amrepair.regions import detect
+from amrepair.regions.skipped import PlannedBeads, skipped
 from amrepair.scans import Scan
 from tests import analytic
 
@@ -60,7 +60,7 @@ def scan_of(solid: m3.Manifold, seed: int) -> Scan:
 
 
 def deficit_of(scan: Scan, beads: PlannedBeads | None) -> Deficit:
-    anomaly = detect(scan, BLOCK, allowance_mm=0.1, top_z_mm=TOP_MM)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     return compute_deficit(scan, BLOCK, anomaly, build_from_template=HERE, beads=beads)
 
 
@@ -190,13 +190,13 @@ def test_rays_alone_do_not_tell_of_another_line(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(Evidence, "rays_say", rays)
     monkeypatch.setattr(Evidence, "clearance", surface)
-    monkeypatch.setattr("amrepair.detect.skipped._topped", lambda middle, *rest: middle[:, 0] < 0)
+    monkeypatch.setattr("amrepair.regions.skipped._topped", lambda middle, *rest: middle[:, 0] < 0)
     found = gone_of(scan_of(without(4.0, 9.0, 0, 2 * HIGH_MM), 0))
     assert len(found.width_mm)
     assert (0.5 * (found.start_mm + found.end_mm)[:, 0] < 10.0).all()
 
 
 def gone_of(scan: Scan) -> PlannedBeads:
-    anomaly = detect(scan, BLOCK, allowance_mm=0.1, top_z_mm=TOP_MM)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
     return skipped(lines(), anomaly.evidence, BLOCK)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amrepair.detect.anomaly import DefectType, Label, Region
 from amrepair.loop.decide import (
     FINDINGS,
     STOPS,
@@ -23,6 +22,7 @@ from amrepair.loop.decide import (
     tables,
 )
 from amrepair.loop.findings import _whole_defects
+from amrepair.regions.anomaly import DefectType, Label, Region
 
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "decisions.md"
 VOID = Finding(

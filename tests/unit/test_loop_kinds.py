@@ -10,11 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from amrepair.detect.anomaly import DefectType
 from amrepair.frames import Transform
 from amrepair.loop import kinds
 from amrepair.loop.kinds import typed
 from amrepair.loop.shapes import last_beads
+from amrepair.regions.anomaly import DefectType
 from amrepair.repair import plan_repair
 from gcode.profiles import load_setup
 

@@ -12,12 +12,12 @@ from jaxtyping import Float
 from loop_bench import solid_mesh
 
 from amrepair.deficit import compute_deficit
-from amrepair.detect import Label, Region, detect
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.loop.locate import is_upright, locate_part, locate_parts, stood
 from amrepair.loop.looks import plan_stops
 from amrepair.loop.sites import sites
+from amrepair.regions import Label, Region, detect
 from amrepair.repair import plan_repair
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf, StoodTemplate

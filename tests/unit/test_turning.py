@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from amrepair.detect.turning import turned_to_close
+from amrepair.field.turning import turned_to_close
 
 APART_MM = 0.2
 # (origin, along, across, normal into the pit) of a floor and four walls of a pit 8 × 6 × 2 mm

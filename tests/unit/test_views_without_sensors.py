@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from amrepair.deficit import compute_deficit
-from amrepair.detect.holes import is_closed, spoken_of
+from amrepair.field.holes import is_closed, spoken_of
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf

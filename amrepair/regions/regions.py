@@ -5,31 +5,19 @@ Figures here come from the surface alone (area × depth); `deficit` measures vol
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 
-from amrepair.detect.anomaly import DefectType, Label, Region
-from amrepair.detect.evidence import Evidence
+from amrepair.field.as_built import Evidence
+from amrepair.field.groups import area_per_point, group_points
+from amrepair.regions.anomaly import DefectType, Label, Region
+from amrepair.regions.significance import Level
 from amrepair.template.port import Template
 
-# Pieces nearer than this are one defect.
-GROUP_MM = 1.2
 # Template points alone (seen through by rays) need this much surface to be a region.
 MIN_AREA_MM2 = 2.0
-
-
-def group_points(
-    points_mm: Float[np.ndarray, "n 3"], *, reach_mm: float = GROUP_MM
-) -> Int[np.ndarray, " n"]:
-    """(n,) group number of each point: those in touching cells of `reach_mm` belong together."""
-    if len(points_mm) == 0:
-        return np.zeros(0, np.int64)
-    index = np.floor((points_mm - points_mm.min(axis=0)) / reach_mm).astype(np.int64)
-    occupied = np.zeros(tuple(index.max(axis=0) + 1), bool)
-    occupied[tuple(index.T)] = True
-    numbered, _ = ndimage.label(occupied, structure=np.ones((3, 3, 3), bool))
-    return numbered[tuple(index.T)].astype(np.int64) - 1
 
 
 def find_regions(
@@ -39,15 +27,16 @@ def find_regions(
     surface_mm: Float[np.ndarray, "m 3"],
     surface_label: Int[np.ndarray, " m"],
     template: Template,
+    *,
+    levels: tuple[Level, ...],
 ) -> tuple[Region, ...]:
     """Regions of both kinds, largest first."""
     s = evidence.surfels
     gone = surface_mm[surface_label == int(Label.MISSING)]
     area_each = area_per_point(surface_mm)
     found: list[Region] = []
-    for label, cells, extra in (
-        (Label.MISSING, missing, gone),
-        (Label.EXCESS, excess, np.zeros((0, 3))),
+    for side, (label, cells, extra) in enumerate(
+        ((Label.MISSING, missing, gone), (Label.EXCESS, excess, np.zeros((0, 3))))
     ):
         which = np.flatnonzero(cells)
         points = np.concatenate([s.place_mm[which], extra])
@@ -58,19 +47,17 @@ def find_regions(
             n_gone = int(mine[len(which) :].sum())
             if len(own) == 0 and n_gone * area_each < MIN_AREA_MM2:
                 continue
-            found.append(_region(label, s.deviation_mm[own], points[mine], s.cell_mm, template))
+            region = _region(label, s.deviation_mm[own], points[mine], s.cell_mm, template)
+            found.append(replace(region, p_value=_p_value(levels, side, own)))
     return tuple(sorted(found, key=lambda r: -r.volume_mm3))
 
 
-def area_per_point(surface_mm: Float[np.ndarray, "m 3"]) -> float:
-    """Rough area per template point, from how many cells of 2 mm they fill."""
-    if len(surface_mm) == 0:
-        return 0.0
-    index = np.floor(surface_mm / 2.0).astype(np.int64)
-    index -= index.min(axis=0)
-    size = index.max(axis=0) + 1
-    cells = len(np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]))
-    return 1.5 * 4.0 * cells / len(surface_mm)
+def _p_value(levels: tuple[Level, ...], side: int, cells: Int[np.ndarray, " q"]) -> float:
+    """The least expected number of false regions at any scale, times the tests that were made."""
+    if len(cells) == 0:
+        return float("nan")
+    least = min(float(level.log_p[side, level.scale.of_base[cells]].min()) for level in levels)
+    return float(min(2 * len(levels) * np.exp(least), 1.0))
 
 
 def _region(

@@ -8,7 +8,9 @@ from enum import IntEnum, StrEnum
 import numpy as np
 from jaxtyping import Float, Int
 
-from amrepair.detect.evidence import Evidence
+from amrepair.field.as_built import Evidence
+from amrepair.regions.noise import Noise
+from amrepair.regions.options import RegionOptions
 
 
 class Label(IntEnum):
@@ -54,7 +56,9 @@ class Region:
     confidence
         That it is there and is of that type, 0 to 1; 1 where nobody has judged it.
     skipped
-        Lines of the job are gone in it (`detect.skipped`).
+        Lines of the job are gone in it (`regions.skipped`).
+    p_value
+        Expected number of false regions in a scan that stand out as much; NaN where no test was.
     """
 
     label: Label
@@ -66,6 +70,7 @@ class Region:
     below_bead: bool = False
     confidence: float = 1.0
     skipped: bool = False
+    p_value: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +102,8 @@ class AnomalyMap:
         What the labels rest on, for the deficit, and (s,) how far out of the template each surfel
         may be, by what normal parts differ and the process was told; None for a map read back
         from a file.
+    noise, options
+        What the scan told of its errors, and what the test was set to.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -114,3 +121,5 @@ class AnomalyMap:
     surfel_higher_mm: Float[np.ndarray, " s"] | None = None
     top_z_mm: float | None = None
     top_threshold_mm: float = np.inf
+    noise: Noise | None = None
+    options: RegionOptions | None = None

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from amrepair.detect import skipped_kernels as kernels
-from amrepair.detect.evidence import SOLID_MM, Evidence
+from amrepair.field.as_built import SOLID_MM, Evidence
+from amrepair.regions import skipped_kernels as kernels
 from amrepair.template.port import Template
 
 STEP_MM = 0.25

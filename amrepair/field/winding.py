@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from amrepair.detect import winding_kernels as kernels
+from amrepair.field import winding_kernels as kernels
 
 LEAF_MM = 1.5
 # A node is one dipole beyond this many of its radii (Barill et al. use 2).

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from amrepair.detect.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
-from amrepair.detect.holes import UPRIGHT
-from amrepair.detect.near import has_near
-from amrepair.detect.rays import RangeImage, clearances
-from amrepair.detect.surfels import Surfels
+from amrepair.field.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
+from amrepair.field.fused import Surfels
+from amrepair.field.holes import UPRIGHT
+from amrepair.field.near import has_near
 from amrepair.frames import unit_vectors
+from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 

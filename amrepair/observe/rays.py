@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.detect import range_kernels as kernels
 from amrepair.frames import Transform
+from amrepair.observe import range_kernels as kernels
 from amrepair.scans import Scan
 from gcode.compiled import get_num_threads
 

@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from amrepair.detect import faces_kernels as kernels
-from amrepair.detect.holes import UPRIGHT, is_backed, is_closed, is_lined, spoken_of, stood_on
-from amrepair.detect.near import has_near
-from amrepair.detect.rooms import Rooms, find_rooms
-from amrepair.detect.sheets import other_sides, with_own_area
-from amrepair.detect.surfels import Surfels
-from amrepair.detect.turning import side_by_view, turned_down, turned_to_close
-from amrepair.detect.winding import Shell
+from amrepair.field import faces_kernels as kernels
+from amrepair.field.fused import Surfels
+from amrepair.field.holes import UPRIGHT, is_backed, is_closed, is_lined, spoken_of, stood_on
+from amrepair.field.near import has_near
+from amrepair.field.rooms import Rooms, find_rooms
+from amrepair.field.sheets import other_sides, with_own_area
+from amrepair.field.turning import side_by_view, turned_down, turned_to_close
+from amrepair.field.winding import Shell
 from amrepair.frames import unit_vectors
 from amrepair.scans import Scan
 from amrepair.template.port import Template

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from amrepair.detect import turning_kernels as kernels
-from amrepair.detect.winding import Shell
+from amrepair.field import turning_kernels as kernels
+from amrepair.field.winding import Shell
 
 MOST_TURNS = 12
 # Points of one face: their planes are less than 14° askew to each other.

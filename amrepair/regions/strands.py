@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from amrepair.detect import strands_kernels as kernels
-from amrepair.detect.near import cells_of
-from amrepair.detect.surfels import Surfels
+from amrepair.field.fused import Surfels
+from amrepair.field.near import cells_of
 from amrepair.frames import ways_across
+from amrepair.regions import strands_kernels as kernels
 from amrepair.template.port import Template
 
 # To each side of a place: along a strand, across it, and off the surface.

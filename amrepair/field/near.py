@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from amrepair.detect import near_kernels as kernels
+from amrepair.field import near_kernels as kernels
 from amrepair.frames import box_of
 
 # In one grid; cells of a larger one are wider than the distance asked for.

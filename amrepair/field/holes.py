@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from amrepair.detect.near import has_near
+from amrepair.field.near import has_near
 from amrepair.template.port import Template
 
 # Patches nearer to each other than this are one hole; so near to its rim a face touches it.
@@ -76,7 +76,7 @@ def spoken_of(
     spacing_mm
         Of the scan.
     """
-    from amrepair.detect.regions import group_points  # it knows anomalies, which know evidence
+    from amrepair.field.groups import group_points
 
     if len(hole_mm) == 0 or len(face_mm) == 0:
         return np.zeros(len(hole_mm), dtype=bool), np.zeros(len(hole_mm), dtype=bool)

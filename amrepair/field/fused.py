@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from amrepair.detect import surfel_kernels as kernels
+from amrepair.field import fused_kernels as kernels
 from amrepair.scans import Scan
 
 MIN_CELL_MM, MAX_CELL_MM = 0.3, 2.0
@@ -50,6 +50,8 @@ class Surfels:
         (s, 27) neighbours, −1 where empty.
     of_point
         (n,) the surfel of each point, −1 for points left out.
+    point_deviation_mm
+        (n,) deviation of each point.
     """
 
     cell_mm: float
@@ -65,6 +67,7 @@ class Surfels:
     moments: Float[np.ndarray, "s 11"]
     order: Int[np.ndarray, " kept"]
     start: Int[np.ndarray, " s1"]
+    point_deviation_mm: Float[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.place_mm)
@@ -208,6 +211,7 @@ def make_surfels(
         moments=sums,
         order=order,
         start=start,
+        point_deviation_mm=deviation_mm,
     )
 
 

@@ -1,0 +1,36 @@
+"""Groups: points in touching cells, and the area that points on a surface stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import ndimage
+
+# Pieces nearer than this are one defect.
+GROUP_MM = 1.2
+# The area of points is counted in cells of this edge; a surface at a random slope fills 2/3 more.
+AREA_CELL_MM, AREA_PER_CELL = 2.0, 1.5
+
+
+def group_points(
+    points_mm: Float[np.ndarray, "n 3"], *, reach_mm: float = GROUP_MM
+) -> Int[np.ndarray, " n"]:
+    """(n,) group number of each point: those in touching cells of `reach_mm` belong together."""
+    if len(points_mm) == 0:
+        return np.zeros(0, np.int64)
+    index = np.floor((points_mm - points_mm.min(axis=0)) / reach_mm).astype(np.int64)
+    occupied = np.zeros(tuple(index.max(axis=0) + 1), bool)
+    occupied[tuple(index.T)] = True
+    numbered, _ = ndimage.label(occupied, structure=np.ones((3, 3, 3), bool))
+    return numbered[tuple(index.T)].astype(np.int64) - 1
+
+
+def area_per_point(surface_mm: Float[np.ndarray, "m 3"]) -> float:
+    """Rough area per template point, mm², from how many cells they fill."""
+    if len(surface_mm) == 0:
+        return 0.0
+    index = np.floor(surface_mm / AREA_CELL_MM).astype(np.int64)
+    index -= index.min(axis=0)
+    size = index.max(axis=0) + 1
+    cells = len(np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]))
+    return AREA_PER_CELL * AREA_CELL_MM**2 * cells / len(surface_mm)

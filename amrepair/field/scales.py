@@ -1,0 +1,161 @@
+"""Scales: the deviations of a field's cells as robust local means over wider and wider windows.
+
+Every scale has cells twice as wide as the one before; the value of a cell is the median of the
+cells in it, and a window is a cell with the neighbours that face the same way, so that the two
+sides of a thin wall stay apart. It measures; what is significant is decided in `regions`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from amrepair.field import scales_kernels as kernels
+
+# Neighbours of one window face within 60° of each other: a curved surface is one, the two sides
+# of a wall and the faces of an edge are not.
+FACING_COSINE = 0.5
+# The third lowest and highest of a window: three cells together are a surface, two may be chance.
+RANK = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The field at one scale, template frame.
+
+    Attributes
+    ----------
+    cell_mm
+        Edge of a cell.
+    of_base
+        (b,) the cell of this scale that each cell of the field lies in.
+    place_mm, normal
+        (s, 3) weighted mean place and outward unit normal of each cell.
+    value_mm
+        (s,) median deviation of the field's cells within.
+    weight
+        (s,) observations within each cell; `window_weight`: within each window.
+    table, count
+        (s, k) cells of each window, itself included, and (s,) how many.
+    median_mm, low_mm, high_mm
+        (s,) median, `RANK`-th lowest and `RANK`-th highest value of each window.
+    noise_mm
+        (s,) standard deviation of the cells' values about their neighbours', as seen around.
+    """
+
+    cell_mm: float
+    of_base: Int[np.ndarray, " b"]
+    place_mm: Float[np.ndarray, "s 3"]
+    normal: Float[np.ndarray, "s 3"]
+    value_mm: Float[np.ndarray, " s"]
+    weight: Float[np.ndarray, " s"]
+    table: Int[np.ndarray, "s k"]
+    count: Int[np.ndarray, " s"]
+    median_mm: Float[np.ndarray, " s"]
+    low_mm: Float[np.ndarray, " s"]
+    high_mm: Float[np.ndarray, " s"]
+    noise_mm: Float[np.ndarray, " s"]
+    window_weight: Float[np.ndarray, " s"]
+
+    def __len__(self) -> int:
+        return len(self.value_mm)
+
+
+def scales_of(
+    place_mm: Float[np.ndarray, "b 3"],
+    normal: Float[np.ndarray, "b 3"],
+    value_mm: Float[np.ndarray, " b"],
+    weight: Float[np.ndarray, " b"],
+    *,
+    cell_mm: float,
+    widest_mm: float,
+) -> tuple[Scale, ...]:
+    """The field at cells of `cell_mm` and wider, up to windows of `widest_mm` across.
+
+    Parameters
+    ----------
+    place_mm, normal, value_mm, weight
+        Of the field's cells: places, outward unit normals of the template, deviations and numbers
+        of observations.
+    cell_mm
+        Edge of the field's own cells.
+    widest_mm
+        No window is wider than this, but for the first scale's.
+    """
+    found: list[Scale] = []
+    of_base = np.arange(len(place_mm))
+    inner = (place_mm, normal, value_mm, weight.astype(np.float64))
+    size_mm = cell_mm
+    while True:
+        scale = _scale(of_base, *inner, size_mm, medians=bool(found))
+        found.append(scale)
+        if 2.0 * 3.0 * size_mm > widest_mm or len(scale) <= kernels.MOST_NEIGHBOURS:
+            return tuple(found)
+        of_base = scale.of_base
+        inner = (scale.place_mm, scale.normal, scale.value_mm, scale.weight)
+        size_mm *= 2.0
+
+
+def _scale(
+    of_base: Int[np.ndarray, " b"],
+    place_mm: Float[np.ndarray, "c 3"],
+    normal: Float[np.ndarray, "c 3"],
+    value_mm: Float[np.ndarray, " c"],
+    weight: Float[np.ndarray, " c"],
+    cell_mm: float,
+    *,
+    medians: bool,
+) -> Scale:
+    """Group the cells of the scale below, and look at each group's window."""
+    order, start, keys, strides = _grouped(place_mm, normal, cell_mm)
+    group = np.empty(len(order), np.int64)
+    group[order] = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    first = start[:-1]
+    total = np.add.reduceat(weight[order], first)
+    place = np.add.reduceat((place_mm * weight[:, None])[order], first) / total[:, None]
+    facing = np.add.reduceat((normal * weight[:, None])[order], first)
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    value = (
+        kernels.group_medians(order, start, value_mm)
+        if medians
+        else np.add.reduceat((value_mm * weight)[order], first) / total
+    )
+    table, count = kernels.neighbours(keys, *strides, facing, FACING_COSINE)
+    seen = kernels.window_statistics(table, count, value, total, RANK)
+    noise = kernels.window_medians(table, count, np.ascontiguousarray(seen[:, 3]))
+    known = noise[np.isfinite(noise)]
+    noise[~np.isfinite(noise)] = float(np.median(known)) if len(known) else 0.0
+    return Scale(
+        cell_mm=cell_mm,
+        of_base=group[of_base],
+        place_mm=place,
+        normal=facing,
+        value_mm=value,
+        weight=total,
+        table=table,
+        count=count,
+        median_mm=np.ascontiguousarray(seen[:, 0]),
+        low_mm=np.ascontiguousarray(seen[:, 1]),
+        high_mm=np.ascontiguousarray(seen[:, 2]),
+        noise_mm=noise,
+        window_weight=np.ascontiguousarray(seen[:, 4]),
+    )
+
+
+def _grouped(
+    place_mm: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, "c 3"], cell_mm: float
+) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
+    """Order of the cells by the wider cell that holds them, where each begins, keys, strides."""
+    low = place_mm.min(axis=0)
+    index = np.floor((place_mm - low) / cell_mm).astype(np.int64) + 1
+    shape = index.max(axis=0) + 2
+    strides = (int(shape[1] * shape[2]), int(shape[2]))
+    axis = np.abs(normal).argmax(axis=1)
+    way = 2 * axis + (normal[np.arange(len(normal)), axis] > 0)
+    key = (index @ np.array([*strides, 1])) * kernels.SLOTS + way
+    order = np.argsort(key, kind="stable")
+    ranked = key[order]
+    begins = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]])
+    return order, np.append(begins, len(ranked)), ranked[begins], strides

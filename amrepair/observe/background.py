@@ -1,0 +1,88 @@
+"""Background: points of a scan that are none of the part: bed, skirt, far clutter, a wrong unit."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from amrepair.errors import InputError
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+
+# Excess farther out than this is not part of the print (clutter, the bed's rim).
+MAX_EXCESS_MM = 12.0
+# Bed, skirt and first-layer ooze: one thick layer above the lowest plane of the part.
+BED_BAND_MM = 0.35
+# The template's distance is the height under a plane: to rounding.
+ON_PLANE_MM = 1e-4
+# So much of the underside seen, so far from its rim: nothing lies under the part, there is no bed.
+SEEN_UNDERSIDE, RIM_MM, FOOT_CELL_MM, MOST_FOOT = 0.3, 0.15, 1.0, 20_000
+# So many points tell a scan's size, to the factor between two units.
+SIZE_POINTS = 20_000
+
+
+def refuse_wrong_scale(scan: Scan, template: Template) -> None:
+    """Metres or inches read as millimetres: the sizes differ by the factor between the units."""
+    some = scan.points_mm[:: max(1, len(scan) // SIZE_POINTS)]
+    scan_mm = float(np.linalg.norm(np.ptp(some, axis=0)))
+    part_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    if 0 < scan_mm * 200 < part_mm:
+        raise InputError(
+            f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "
+            f"the scan looks like metres; multiply it by 1000"
+        )
+    if scan_mm > 200 * part_mm:
+        raise InputError(
+            f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "
+            f"the scan looks like micrometres, or the template like metres; convert one to mm"
+        )
+
+
+def background(
+    scan: Scan,
+    template: Template,
+    f_mm: Float[np.ndarray, " n"],
+    surface_mm: Float[np.ndarray, "m 3"],
+) -> Bool[np.ndarray, " n"]:
+    """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
+    low_z = float(template.bounds_mm[0, 2])
+    if _shows_underside(scan, template, f_mm, surface_mm):
+        # what lies beside the part in its lowest plane is where it stood when seen from above
+        rim_mm = _rim_mm(scan)
+        in_plane = np.abs(scan.points_mm[:, 2] - low_z) < rim_mm
+        beside = in_plane & (f_mm > max(rim_mm, BED_BAND_MM / 2))
+        return np.asarray((f_mm > MAX_EXCESS_MM) | beside)
+    bed = (scan.points_mm[:, 2] < low_z + BED_BAND_MM) & (f_mm > 0.02)
+    inside_band = scan.points_mm[:, 2] > low_z - BED_BAND_MM
+    # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
+    return (bed & (f_mm > BED_BAND_MM / 2)) | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
+
+
+def _rim_mm(scan: Scan) -> float:
+    """How far from the lowest plane a point may lie that is on it."""
+    return max(RIM_MM, 4.0 * scan.sigma_mm)
+
+
+def _shows_underside(
+    scan: Scan,
+    template: Template,
+    f_mm: Float[np.ndarray, " n"],
+    surface_mm: Float[np.ndarray, "m 3"],
+) -> bool:
+    """Whether the part was seen from below: then what bulges there is no bed."""
+    low_z = float(template.bounds_mm[0, 2])
+    rim_mm = _rim_mm(scan)
+    near = np.flatnonzero((np.abs(f_mm) < rim_mm) & (scan.points_mm[:, 2] < low_z + rim_mm))
+
+    def cells_within(points_mm: Float[np.ndarray, "k 3"]) -> set[tuple[int, int]]:
+        above = points_mm.copy()
+        above[:, 2] = low_z + rim_mm + RIM_MM
+        under = above[template.distance(above) < -rim_mm, :2] if len(above) else above[:, :2]
+        index = np.unique(np.floor(under / FOOT_CELL_MM).astype(np.int64), axis=0)
+        return {(int(x), int(y)) for x, y in index}
+
+    seen = cells_within(scan.points_mm[near[:: len(near) // MOST_FOOT + 1]])
+    if not seen:
+        return False
+    foot = cells_within(surface_mm[surface_mm[:, 2] < low_z + ON_PLANE_MM])
+    return len(seen & foot) > SEEN_UNDERSIDE * max(len(foot), 1)

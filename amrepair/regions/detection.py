@@ -1,0 +1,306 @@
+"""Detection: from an aligned scan to regions, each with how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from amrepair.errors import InputError
+from amrepair.field.as_built import Evidence, gather, with_stubs
+from amrepair.field.fused import Surfels, make_surfels
+from amrepair.field.holes import UPRIGHT
+from amrepair.field.near import nearest_within
+from amrepair.field.scales import scales_of
+from amrepair.frames import unit_vectors
+from amrepair.observe.background import (
+    MAX_EXCESS_MM,
+    ON_PLANE_MM,
+    background,
+    refuse_wrong_scale,
+)
+from amrepair.observe.rays import RangeImage, clearances, range_images
+from amrepair.regions.anomaly import AnomalyMap, Label
+from amrepair.regions.labels import grown
+from amrepair.regions.noise import Noise, noise_of
+from amrepair.regions.options import RegionOptions
+from amrepair.regions.regions import find_regions
+from amrepair.regions.significance import Level, Tail, tested
+from amrepair.scans import Scan
+from amrepair.template.port import Template
+from gcode.progress import Progress, silent
+
+# Of places in the template's frame and their deviations: a length for each.
+RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
+# Normal parts lie within three standard deviations of what they differ by.
+TOLERATED_SPREADS = 3.0
+# A template point is present where scanned surface lies within so many cells of it.
+PRESENT_CELLS = 1.8
+
+
+@dataclass(frozen=True, slots=True)
+class Sites:
+    """Where the test looks: cells of the field, and template surface that rays saw through.
+
+    Attributes
+    ----------
+    place_mm, normal, value_mm, weight
+        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points.
+    tolerance_mm
+        (2, b) δ for missing and for excess.
+    """
+
+    place_mm: Float[np.ndarray, "b 3"]
+    normal: Float[np.ndarray, "b 3"]
+    value_mm: Float[np.ndarray, " b"]
+    weight: Float[np.ndarray, " b"]
+    tolerance_mm: Float[np.ndarray, "2 b"]
+
+
+def detect(
+    scan: Scan,
+    template: Template,
+    *,
+    options: RegionOptions | None = None,
+    tail: Tail | None = None,
+    top_z_mm: float | None = None,
+    images: tuple[RangeImage, ...] | None = None,
+    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
+    rounded_up: RoundedUp | None = None,
+    up: Float[np.ndarray, " 3"] = UPRIGHT,
+    progress: Progress = silent,
+) -> AnomalyMap:
+    """Score and label a scan against its template.
+
+    Parameters
+    ----------
+    scan
+        In the template's frame.
+    options
+        What the test is set to; None takes the defaults.
+    tail
+        How errors of sound places fall off, as a calibration knows it; None tells it from the scan.
+    top_z_mm
+        Height of the layer just printed, where the template ends there: what is missing under
+        that plane is judged with `top_allowance_mm`, since the job says exactly where it lies.
+    images
+        What the scan's rays saw (`range_images`), where it is known already.
+    surface
+        The template's surface points, `spacing_mm` apart, and normals, where they are.
+    rounded_up
+        Of places and their deviations: how far out of the template the process itself was told to
+        go there. So much is not excess.
+    up
+        Unit vector away from what the part stands on, template frame.
+
+    Raises
+    ------
+    InputError
+        If the scan is not in the template's frame, or its size contradicts the template's.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from amrepair import align_scan, detect_defects, open_template, read_scan
+    >>> template = open_template(Path("part.safetensors"))
+    >>> scan = read_scan(Path("scan.ply"), frame="build")
+    >>> pose = align_scan(scan, template).template_from_scan
+    >>> anomaly = detect_defects(scan.moved(pose), template)
+    >>> [(r.label.name, 1.4 < r.depth_mm < 1.8) for r in anomaly.regions if r.volume_mm3 > 2.0]
+    [('MISSING', True)]
+    """
+    options = options or RegionOptions()
+    _refuse_other_frame(scan)
+    refuse_wrong_scale(scan, template)
+    progress("detect", 0.0, 4.0)
+    with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
+        asked = None if images is not None else beside.submit(range_images, scan)
+        f_mm = template.distance(scan.points_mm)
+        surface_mm, normals = surface or template.surface_points(options.spacing_mm)
+        keep = ~background(scan, template, f_mm, surface_mm)
+        _refuse_nothing_near(scan, keep)
+        surfels = make_surfels(scan.points_mm, f_mm, keep)
+        seen = images or () if asked is None else asked.result()
+    if surfels.spacing_mm > options.spacing_mm:
+        surface_mm, normals = template.surface_points(surfels.spacing_mm)
+    progress("detect", 1.0, 4.0)
+    crossed, depth_mm = _crossed(surface_mm, surfels, seen)
+    sites = _sites(surfels, template, surface_mm[crossed], normals[crossed], depth_mm)
+    sites = _with_tolerance(sites, surfels, template, options, top_z_mm, rounded_up)
+    noise, levels = _tested(sites, surfels, scan, options, tail)
+    labels = grown(levels, sites.tolerance_mm, options)
+    missing, excess = labels[:, : len(surfels)]
+    progress("detect", 2.0, 4.0)
+    grow_mm = options.grow_share * float(np.median(sites.tolerance_mm[0]))
+    evidence = gather(scan, template, surfels, missing | excess, seen, threshold_mm=grow_mm, up=up)
+    limit_mm = levels[1].smallest_mm
+    gone = np.zeros(len(surface_mm), bool)
+    gone[crossed] = labels[0, len(surfels) :]
+    surface_label = _label_surface(surface_mm, normals, template, evidence, missing, gone, limit_mm)
+    evidence = with_stubs(evidence, scan, surface_mm[gone], missing | excess)
+    progress("detect", 3.0, 4.0)
+    score = np.abs(f_mm)
+    k = min(options.top_k, int(keep.sum()))
+    regions = find_regions(
+        evidence, missing, excess, surface_mm, surface_label, template, levels=levels
+    )
+    progress("detect", 4.0, 4.0)
+    surfel_label = np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0))
+    allowed_mm = sites.tolerance_mm[1] - sites.tolerance_mm[0]
+    return AnomalyMap(
+        points_mm=scan.points_mm,
+        deviation_mm=f_mm,
+        score=score,
+        label=np.append(surfel_label, 0)[surfels.of_point],
+        template_points_mm=surface_mm,
+        template_label=surface_label,
+        threshold_mm=limit_mm,
+        threshold_source=_source(options, template, noise),
+        object_score=float(np.partition(score[keep], -k)[-k:].mean()),
+        regions=regions,
+        top_z_mm=top_z_mm if options.tolerance_mm is None else None,
+        top_threshold_mm=limit_mm - max(options.allowance_mm - options.top_allowance_mm, 0.0),
+        evidence=evidence,
+        surfel_label=surfel_label,
+        surfel_higher_mm=np.maximum(allowed_mm[: len(surfels)], 0.0),
+        noise=noise,
+        options=options,
+    )
+
+
+def _refuse_other_frame(scan: Scan) -> None:
+    if scan.frame != "template":
+        raise InputError(
+            f"the scan {scan.source} is in frame '{scan.frame}'; align it to the template first"
+        )
+
+
+def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"]) -> None:
+    if not keep.any():
+        raise InputError(
+            f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the "
+            "template; check its frame, its unit and that it shows this part"
+        )
+
+
+def _crossed(
+    surface_mm: Float[np.ndarray, "m 3"], surfels: Surfels, images: tuple[RangeImage, ...]
+) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    """Template points with no scanned surface near that rays passed, and by how much, mm.
+
+    What is gone leaves no points of its own: the ray that should have ended there says so.
+    """
+    if not images:
+        return np.zeros(0, np.int64), np.zeros(0)
+    near = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
+    absent = np.flatnonzero(near < 0)
+    depth_mm = clearances(images, surface_mm[absent], -np.inf)[1]
+    passed = depth_mm > 0
+    return absent[passed], depth_mm[passed]
+
+
+def _sites(
+    surfels: Surfels,
+    template: Template,
+    crossed_mm: Float[np.ndarray, "c 3"],
+    crossed_normal: Float[np.ndarray, "c 3"],
+    depth_mm: Float[np.ndarray, " c"],
+) -> Sites:
+    """Cells and crossed template points, as yet without a tolerance."""
+    outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
+    typical = float(np.median(surfels.count))
+    return Sites(
+        place_mm=np.concatenate([surfels.place_mm, crossed_mm]),
+        normal=np.concatenate([outward, crossed_normal]),
+        value_mm=np.concatenate([surfels.deviation_mm, -depth_mm]),
+        weight=np.concatenate([surfels.count, np.full(len(depth_mm), typical)]),
+        tolerance_mm=np.zeros((2, len(surfels) + len(depth_mm))),
+    )
+
+
+def _with_tolerance(
+    sites: Sites,
+    surfels: Surfels,
+    template: Template,
+    options: RegionOptions,
+    top_z_mm: float | None,
+    rounded_up: RoundedUp | None,
+) -> Sites:
+    """With δ for either sign: process, registration, template, and what normal parts differ by."""
+    known = float(np.hypot(2 * options.registration_sigma_mm, template.bias_mm))
+    given = options.tolerance_mm
+    tolerance_mm = np.full(
+        (2, len(sites.value_mm)), options.allowance_mm + known if given is None else given
+    )
+    if top_z_mm is not None and given is None:
+        cells = slice(0, len(surfels))
+        under = surfels.place_mm[:, 2] - top_z_mm
+        top = np.abs(surfels.deviation_mm - under) < ON_PLANE_MM
+        allowance_mm = min(options.allowance_mm, options.top_allowance_mm)
+        tolerance_mm[0, cells][top] = allowance_mm + options.registration_sigma_mm
+    spread = getattr(template, "spread_mm", None)
+    if spread is not None:
+        tolerance_mm += TOLERATED_SPREADS * spread(sites.place_mm)
+    if rounded_up is not None:
+        tolerance_mm[1] += rounded_up(sites.place_mm, sites.value_mm)
+    return Sites(sites.place_mm, sites.normal, sites.value_mm, sites.weight, tolerance_mm)
+
+
+def _tested(
+    sites: Sites, surfels: Surfels, scan: Scan, options: RegionOptions, tail: Tail | None
+) -> tuple[Noise, tuple[Level, ...]]:
+    """The noise as the scan shows it, and the test of every scale."""
+    scales = scales_of(
+        sites.place_mm,
+        sites.normal,
+        sites.value_mm,
+        sites.weight,
+        cell_mm=surfels.cell_mm,
+        widest_mm=options.widest_mm,
+    )
+    levels = tested(scales, sites.tolerance_mm, options, tail=tail)
+    return noise_of(levels, surfels, scan, options), levels
+
+
+def _source(options: RegionOptions, template: Template, noise: Noise) -> str:
+    """How the limit came about, in a sentence."""
+    if options.tolerance_mm is not None:
+        tolerance = f"given tolerance {options.tolerance_mm:g} mm"
+    else:
+        tolerance = (
+            f"tolerance from allowance {options.allowance_mm:g} mm, registration "
+            f"{options.registration_sigma_mm:g} mm and template bias {template.bias_mm:.3f} mm"
+        )
+    return (
+        f"{tolerance}; noise {noise.sigma_mm:.3f} mm a point ({noise.source}): "
+        f"{options.false_regions:g} false regions expected per scan"
+    )
+
+
+def _label_surface(
+    surface_mm: Float[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "m 3"],
+    template: Template,
+    evidence: Evidence,
+    missing: Bool[np.ndarray, " s"],
+    gone: Bool[np.ndarray, " m"],
+    limit_mm: float,
+) -> Int[np.ndarray, " m"]:
+    """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
+    surfels = evidence.surfels
+    nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
+    present = (nearest >= 0) & ~missing[nearest]
+    label = np.where(present, int(Label.OK), int(Label.UNSEEN))
+    if evidence.has_rays:
+        label[gone] = int(Label.MISSING)
+    elif missing.any():
+        open_ = np.flatnonzero(~present)
+        # just inside the surface, as deep as the limit: empty there is more than noise
+        inside = surface_mm[open_] - limit_mm * normals[open_]
+        f_mm = template.distance(inside)
+        empty = (evidence.cautious(inside, f_mm) > limit_mm / 2) & (f_mm < -limit_mm / 2)
+        label[open_[empty]] = int(Label.MISSING)
+    return label

@@ -1,0 +1,121 @@
+"""Noise: what a scan itself tells of its errors, for the person who has to trust it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.field.fused import Surfels
+from amrepair.field.scales import Scale
+from amrepair.field.scales_kernels import NORMAL_MEDIAN
+from amrepair.regions.options import RegionOptions
+from amrepair.regions.significance import Level
+from amrepair.scans import Scan
+
+# Errors beyond three standard deviations of their place are the tail: 0.3 % of normal ones.
+TAIL_SIGMAS = 3.0
+# Errors hang together over the distance at which their variogram has reached this share (1 − 1/e).
+SILL_SHARE = 0.632
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What a scan's own deviations tell of its errors.
+
+    Attributes
+    ----------
+    sigma_mm
+        Standard deviation of one point about its neighbours.
+    tail_share
+        Share of the places that are off by more than three standard deviations.
+    correlation_mm
+        Over which distance errors hang together; 0 where no farther than a cell.
+    view_disagreement_mm
+        Standard deviation between what views say of the same place; None with one view.
+    smallest_mm
+        Of each scale: area of a window, mm², and the least depth that it would show, mm.
+    source
+        Where the noise is from: this scan, or a profile where it has too few points.
+    """
+
+    sigma_mm: float
+    tail_share: float
+    correlation_mm: float
+    view_disagreement_mm: float | None
+    smallest_mm: tuple[tuple[float, float], ...]
+    source: str
+
+    def to_json(self) -> dict[str, object]:
+        """As results have it."""
+        return {
+            "sigma_mm": self.sigma_mm,
+            "tail_share": self.tail_share,
+            "correlation_mm": self.correlation_mm,
+            "view_disagreement_mm": self.view_disagreement_mm,
+            "smallest": [{"area_mm2": a, "depth_mm": d} for a, d in self.smallest_mm],
+            "source": self.source,
+        }
+
+
+def noise_of(
+    levels: tuple[Level, ...], surfels: Surfels, scan: Scan, options: RegionOptions
+) -> Noise:
+    """Tell the noise of a scan from its tested scales.
+
+    Parameters
+    ----------
+    levels
+        The first scale's third deviations and medians, then every wider scale's medians.
+    """
+    first = levels[0].scale
+    per_cell = float(np.median(first.noise_mm))
+    points = max(float(np.median(surfels.count)), 1.0)
+    told = len(first) >= options.least_cells
+    sigma_mm = per_cell * np.sqrt(points) if told else scan.sigma_mm
+    off = np.abs(first.value_mm - first.median_mm) > TAIL_SIGMAS * np.maximum(first.noise_mm, 1e-9)
+    return Noise(
+        sigma_mm=float(sigma_mm),
+        tail_share=float(off.mean()),
+        correlation_mm=_correlation_mm([level.scale for level in levels[1:]]),
+        view_disagreement_mm=_between_views(surfels, scan),
+        smallest_mm=tuple(
+            (9.0 * level.scale.cell_mm**2, level.smallest_mm) for level in levels[1:]
+        ),
+        source="this scan" if told else f"the profile's, {len(first)} cells are too few to tell",
+    )
+
+
+def _correlation_mm(scales: list[Scale]) -> float:
+    """The distance over which errors hang together, by how window means spread with their width.
+
+    Means of independent errors spread as one over the width of their window; where they spread
+    more, the rest is common to the window.
+    """
+    spread = [float(np.median(np.abs(s.median_mm))) / NORMAL_MEDIAN for s in scales]
+    alone = [float(np.median(s.noise_mm / np.sqrt(np.maximum(s.count, 1)))) for s in scales]
+    common = np.sqrt(np.maximum(np.square(spread) - np.square(alone), 0.0))
+    if common[0] <= alone[0]:
+        return 0.0
+    together = common >= (1.0 - SILL_SHARE) * common[0]
+    last = int(np.argmin(together)) if not together.all() else len(scales)
+    return float(3.0 * scales[max(last - 1, 0)].cell_mm)
+
+
+def _between_views(surfels: Surfels, scan: Scan) -> float | None:
+    """Standard deviation between views' means of one cell, of the cells that several saw."""
+    if scan.sensor_index is None or int(scan.sensor_index.max()) == 0:
+        return None
+    cell, f_mm = surfels.of_point, surfels.point_deviation_mm
+    has = cell >= 0
+    views = int(scan.sensor_index.max()) + 1
+    key = cell[has] * views + scan.sensor_index[has]
+    keys, index = np.unique(key, return_inverse=True)
+    mean = np.bincount(index, f_mm[has]) / np.bincount(index)
+    of_cell: Float[np.ndarray, " k"] = keys // views
+    beside = np.flatnonzero(of_cell[1:] == of_cell[:-1])
+    if not len(beside):
+        return None
+    apart = np.abs(mean[beside + 1] - mean[beside])
+    return float(np.median(apart) / NORMAL_MEDIAN / np.sqrt(2.0))

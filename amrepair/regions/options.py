@@ -1,0 +1,81 @@
+"""What the test is set to: each number once, with its unit and where it comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from amrepair.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class RegionOptions:
+    """Settings of the test for regions; a result records those it was made with.
+
+    Attributes
+    ----------
+    false_regions
+        Expected number of regions that a scan of a sound part shows: the promise of the test,
+        shared out over scales, signs and places.
+    tolerance_mm
+        δ, by how much a sound part may depart anywhere; None adds up the three that follow and
+        the template's own bias.
+    allowance_mm
+        What the process may leave. Half a 0.2 mm layer: what section-at-mid-layer leaves on slopes
+        and rounds off at tops.
+    top_allowance_mm
+        The same under the plane of the layer just printed, which lies where the job's G-code puts
+        it: a quarter of a layer is left to the beads.
+    registration_sigma_mm
+        Standard deviation of the alignment at the surface.
+    process_sigma_mm
+        By how much sound parts of this process depart from the template as a whole, as a profile
+        or a calibration knows it; 0 where nobody does: then all of it is taken for the scanner's.
+    widest_mm
+        Windows of local means reach up to this width: correlated errors of desktop and laser
+        scanners hang together over 2 to 10 mm, so that wider means gain nothing.
+    most_defects
+        So many regions of each sign may be real where the scan's own exceedances tell what its
+        errors are; more than that in one scan are taken for errors of the scanner.
+    tail_from
+        Standard errors beyond the tolerance from which on exceedances tell the tail: normal noise
+        leads there at one place in 44.
+    grow_share
+        A region goes on to where the mean deviation is this share of the tolerance.
+    grow_sigmas
+        … and beyond the noise by so many standard errors: 95 % of noise stays below.
+    density_step
+        Classes of how densely a place was seen, in octaves: aslant and at its edges a scanner
+        sees fewer points an area, and worse ones.
+    least_cells
+        Cells from which the noise of a class is told; with fewer it is that of the class below.
+        A scan with fewer in all cannot tell its noise: the profile's is used, and named.
+    spacing_mm
+        Template surface points are asked for so far apart.
+    top_k
+        How many of the highest scores make the object score (PASDF: 1000).
+    """
+
+    false_regions: float = 0.05
+    tolerance_mm: float | None = None
+    allowance_mm: float = 0.1
+    top_allowance_mm: float = 0.05
+    registration_sigma_mm: float = 0.03
+    process_sigma_mm: float = 0.0
+    widest_mm: float = 10.0
+    most_defects: int = 8
+    tail_from: float = 2.0
+    grow_share: float = 0.5
+    grow_sigmas: float = 2.0
+    density_step: float = 0.5
+    least_cells: int = 30
+    spacing_mm: float = 0.6
+    top_k: int = 1000
+
+    def __post_init__(self) -> None:
+        if not self.false_regions > 0.0:
+            raise InputError(
+                f"the expected false regions per scan are {self.false_regions}; give more than 0, "
+                "such as 0.05"
+            )
+        if self.tolerance_mm is not None and not self.tolerance_mm >= 0.0:
+            raise InputError(f"the tolerance is {self.tolerance_mm} mm; it must be ≥ 0")
