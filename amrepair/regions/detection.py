@@ -29,6 +29,7 @@ from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import find_regions
 from amrepair.regions.significance import Level, Tail, tested
+from amrepair.regions.strands import on_strands
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -133,10 +134,11 @@ def detect(
     noise, levels = _tested(sites, surfels, scan, options, tail)
     labels = grown(levels, sites.tolerance_mm, options)
     missing, excess = labels[:, : len(surfels)]
+    limit_mm = levels[1].smallest_mm
+    excess = _with_strands(excess, missing, surfels, template, levels, limit_mm)
     progress("detect", 2.0, 4.0)
     grow_mm = options.grow_share * float(np.median(sites.tolerance_mm[0]))
     evidence = gather(scan, template, surfels, missing | excess, seen, threshold_mm=grow_mm, up=up)
-    limit_mm = levels[1].smallest_mm
     gone = np.zeros(len(surface_mm), bool)
     gone[crossed] = labels[0, len(surfels) :]
     surface_label = _label_surface(surface_mm, normals, template, evidence, missing, gone, limit_mm)
@@ -263,6 +265,29 @@ def _tested(
     )
     levels = tested(scales, sites.tolerance_mm, options, tail=tail)
     return noise_of(levels, surfels, scan, options), levels
+
+
+def _with_strands(
+    excess: Bool[np.ndarray, " s"],
+    missing: Bool[np.ndarray, " s"],
+    surfels: Surfels,
+    template: Template,
+    levels: tuple[Level, ...],
+    limit_mm: float,
+) -> Bool[np.ndarray, " s"]:
+    """Excess, with strips narrower than any window that stand out along their length."""
+    first = levels[1]
+    cells = slice(0, len(surfels))
+    window_mm = first.scale.median_mm[first.scale.of_base[cells]]
+    per_point_mm = float(np.median(first.scale.noise_mm) * np.sqrt(np.median(surfels.count)))
+    strands = on_strands(
+        surfels,
+        template,
+        (window_mm > 0.5 * limit_mm) & ~excess & ~missing,
+        systematic_mm=limit_mm,
+        noise_mm=float(first.critical[1]) * per_point_mm,
+    )
+    return np.asarray(surfels.grow(strands, surfels.deviation_mm > 0.5 * limit_mm) | excess)
 
 
 def _source(options: RegionOptions, template: Template, noise: Noise) -> str:

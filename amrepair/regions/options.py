@@ -33,6 +33,9 @@ class RegionOptions:
     widest_mm
         Windows of local means reach up to this width: correlated errors of desktop and laser
         scanners hang together over 2 to 10 mm, so that wider means gain nothing.
+    far_mm
+        Windows between half of this and this far apart tell by how much errors wander: twice the
+        length over which they hang together.
     most_defects
         So many regions of each sign may be real where the scan's own exceedances tell what its
         errors are; more than that in one scan are taken for errors of the scanner.
@@ -49,6 +52,9 @@ class RegionOptions:
     least_cells
         Cells from which the noise of a class is told; with fewer it is that of the class below.
         A scan with fewer in all cannot tell its noise: the profile's is used, and named.
+    most_pairs
+        Windows whose distance to others tells how errors hang together: enough for their median
+        to a few per cent.
     spacing_mm
         Template surface points are asked for so far apart.
     top_k
@@ -62,12 +68,14 @@ class RegionOptions:
     registration_sigma_mm: float = 0.03
     process_sigma_mm: float = 0.0
     widest_mm: float = 10.0
+    far_mm: float = 20.0
     most_defects: int = 8
     tail_from: float = 2.0
     grow_share: float = 0.5
     grow_sigmas: float = 2.0
     density_step: float = 0.5
     least_cells: int = 30
+    most_pairs: int = 2000
     spacing_mm: float = 0.6
     top_k: int = 1000
 

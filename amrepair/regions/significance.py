@@ -15,11 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from scipy.special import comb
 from scipy.stats import norm
 
 from amrepair.field import scales_kernels
-from amrepair.field.scales import RANK, Scale
+from amrepair.field.scales import FACING_COSINE, RANK, Scale
 from amrepair.field.scales_kernels import NORMAL_MEDIAN
 from amrepair.regions.options import RegionOptions
 
@@ -109,7 +110,7 @@ def tested(
         delta = np.stack(
             [np.bincount(scale.of_base, side, minlength=len(scale)) / size for side in tolerance_mm]
         )
-        apart = class_medians(scale, np.abs(scale.median_mm), options) / NORMAL_MEDIAN
+        apart = _wander(scale, options)
         common = np.sqrt(np.maximum(apart**2 - options.process_sigma_mm**2, 0.0))
         single = np.maximum(scale.noise_mm, LEAST_SIGMA_MM)
         noise = MEDIAN_LOSS * single / np.sqrt(scale.count)
@@ -125,29 +126,67 @@ def tested(
 
 
 def density_class(scale: Scale, step: float) -> Int[np.ndarray, " s"]:
-    """(s,) how densely each window was seen: octaves over `step`, 0 the sparsest."""
+    """(s,) how densely each window was seen: octaves over `step`, 0 the sparsest.
+
+    The half that was seen best is one class.
+    """
     relative = scale.window_weight / float(np.median(scale.window_weight))
-    octaves = np.floor(np.log2(relative) / step).astype(np.int64)
+    octaves = np.minimum(np.floor(np.log2(relative) / step), 0.0).astype(np.int64)
     return np.asarray(octaves - octaves.min())
 
 
 def class_medians(
     scale: Scale, value: Float[np.ndarray, " s"], options: RegionOptions
 ) -> Float[np.ndarray, " s"]:
-    """(s,) median of a value over the windows that were seen as densely, never less if less so.
+    """(s,) median of a value over the windows that were seen as densely."""
+    group = density_class(scale, options.density_step)
+    return _by_class(group, value, int(group.max()) + 1, options)[group]
+
+
+def _by_class(
+    group: Int[np.ndarray, " n"],
+    value: Float[np.ndarray, " n"],
+    classes: int,
+    options: RegionOptions,
+) -> Float[np.ndarray, " c"]:
+    """(c,) median of a value in each class, never less in one that was seen less densely.
 
     Aslant and at edges a scanner errs more, and as a whole, over the length on which its errors
     hang together.
     """
-    group = density_class(scale, options.density_step)
-    found = np.zeros(int(group.max()) + 1)
+    found = np.zeros(classes)
     worst = 0.0
-    for k in range(len(found) - 1, -1, -1):
+    for k in range(classes - 1, -1, -1):
         here = group == k
         if here.sum() >= options.least_cells:
             worst = max(worst, float(np.median(value[here])))
         found[k] = worst
-    return np.asarray(found[group])
+    return found
+
+
+def _wander(scale: Scale, options: RegionOptions) -> Float[np.ndarray, " s"]:
+    """(s,) standard deviation of window means about what is normal some way off.
+
+    From the differences of windows that face the same way, about as far apart as errors hang
+    together: a layer that lacks as a whole is no noise. By how densely the worse one was seen.
+    """
+    far_mm = options.far_mm
+    pick = np.arange(0, len(scale), max(len(scale) // options.most_pairs, 1))
+    tree = cKDTree(scale.place_mm)
+    around = tree.query_ball_point(scale.place_mm[pick], far_mm, return_sorted=False)
+    size = np.array([len(found) for found in around])
+    one = np.repeat(pick, size)
+    other = np.concatenate([np.asarray(found, np.int64) for found in around])
+    apart_mm = np.linalg.norm(scale.place_mm[one] - scale.place_mm[other], axis=1)
+    alike = (scale.normal[one] * scale.normal[other]).sum(axis=1) > FACING_COSINE
+    kept = alike & (apart_mm > 0.5 * far_mm)
+    one, other = one[kept], other[kept]
+    if len(one) < options.least_cells:
+        return np.zeros(len(scale))
+    group = density_class(scale, options.density_step)
+    worse = np.minimum(group[one], group[other])
+    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / NORMAL_MEDIAN / np.sqrt(2.0)
+    return _by_class(worse, off_mm, int(group.max()) + 1, options)[group]
 
 
 def _independent(
@@ -178,7 +217,8 @@ def _level(
     z[:, alone] = -np.inf
     n = max(int((~alone).sum()), 1)
     # `together` of a window's cells are all as far out: Q^r in any of C(k, r) choices
-    ways = float(comb(float(np.median(scale.count)), together)) if together > 1.0 else 1.0
+    usual = float(np.median(scale.count))
+    ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
     quantile = norm.isf(min((share / (n * ways)) ** (1.0 / together), 0.5))
     log_p, critical, tails = np.empty_like(z), np.empty(2), []
     for side in range(2):
@@ -204,7 +244,7 @@ def _tail(scale: Scale, z: Float[np.ndarray, " s"], options: RegionOptions) -> T
     over = z > options.tail_from
     group, groups = scales_kernels.components(scale.table, scale.count, over)
     kept = groups - options.most_defects
-    if kept < options.most_defects:  # too few to tell a tail from
+    if kept < options.most_defects // 2:  # too few to tell a tail from
         return Tail(options.tail_from, 0.0, groups)
     peak = np.full(groups, -np.inf)
     np.maximum.at(peak, group[over], z[over])
