@@ -25,8 +25,8 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.observe.rays import range_images
 from amrepair.regions import AnomalyMap, Label, Region, detect
+from amrepair.regions.calibration import Calibration
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import Tail
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
@@ -108,8 +108,8 @@ class Site:
         What the process may leave (half a layer for a CAD template, 0 for planned beads).
     process_sigma_mm
         By how much sound parts of the process depart as a whole: a quarter of a layer.
-    tail
-        How the scanner's errors fall off, as a calibration knows it; None: as the scan tells.
+    calibration
+        What sound parts look like to this scanner; None: as the scan itself tells.
     on_fixture
         Somebody said that a finished part's foot is above the bed.
     beads
@@ -142,7 +142,7 @@ class Site:
     printed_z_mm: float | None = None
     allowance_mm: float = 0.1
     process_sigma_mm: float = 0.05
-    tail: Tail | None = None
+    calibration: Calibration | None = None
     planned: Template | None = None
     on_fixture: bool = False
     beads: PlannedBeads | None = None
@@ -304,7 +304,7 @@ def plan_repair(
             options=RegionOptions(
                 allowance_mm=site.allowance_mm, process_sigma_mm=site.process_sigma_mm
             ),
-            tail=site.tail,
+            calibration=site.calibration,
             top_z_mm=_top_of_layer(site),
             images=None
             if seen is None

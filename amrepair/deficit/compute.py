@@ -27,7 +27,7 @@ from amrepair.deficit.walls import (
     with_whole_rims,
 )
 from amrepair.errors import DeficitError
-from amrepair.field.as_built import Evidence
+from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.frames import Transform, in_box
 from amrepair.observe.background import ON_PLANE_MM
 from amrepair.regions import AnomalyMap, Label, Region, detect
@@ -165,6 +165,9 @@ def compute_deficit(
     if evidence is None:
         raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
     lines = None if beads is None else skipped(beads, evidence, template)
+    if lines is not None and len(lines.width_mm):
+        labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
+        evidence = with_stubs(evidence, scan, lines.samples_mm(), labelled)
 
     def seen_heights() -> HeightField:
         return as_built_heights(

@@ -143,11 +143,12 @@ def components(table, count, chosen):
 
 
 @njit(cache=True, nogil=True)
-def spread(table, count, chosen):
-    """(s,) whether a cell lies in the window of a chosen one."""
-    out = np.zeros(len(chosen), np.bool_)
+def surest(table, count, chosen, log_p):
+    """(s,) the least `log_p` of the chosen windows that a cell lies in; 0 where it is in none."""
+    out = np.zeros(len(chosen))
     for i in range(len(chosen)):
         if chosen[i]:
             for k in range(count[i]):
-                out[table[i, k]] = True
+                j = table[i, k]
+                out[j] = min(out[j], log_p[i])
     return out

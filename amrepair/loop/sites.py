@@ -10,8 +10,8 @@ from jaxtyping import Bool
 from amrepair.frames import Transform, box_of
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
+from amrepair.regions.calibration import NORMAL
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import NORMAL_TAIL
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Site
 from amrepair.template import PlannedSdf
@@ -54,7 +54,7 @@ def sites(
                 setup,
                 grid,
                 build_from_template,
-                tail=NORMAL_TAIL,
+                calibration=NORMAL,
                 lines=_lines(job, every),
                 beside=_beside(job, every),
                 laid=_as_high_as(job, every, BESIDE_CELL_MM),
@@ -75,7 +75,7 @@ def sites(
             grid,
             build_from_template,
             stop.z_mm,
-            tail=NORMAL_TAIL,
+            calibration=NORMAL,
             planned=planned,
             beads=recent,
             lines=_lines(job, done),

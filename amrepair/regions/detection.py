@@ -24,11 +24,12 @@ from amrepair.observe.background import (
 )
 from amrepair.observe.rays import RangeImage, clearances, range_images
 from amrepair.regions.anomaly import AnomalyMap, Label
+from amrepair.regions.calibration import Calibration
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import find_regions
-from amrepair.regions.significance import Level, Tail, tested
+from amrepair.regions.significance import Level, tested
 from amrepair.regions.strands import on_strands
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -49,7 +50,8 @@ class Sites:
     Attributes
     ----------
     place_mm, normal, value_mm, weight
-        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points.
+        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are on the
+        template's surface.
     tolerance_mm
         (2, b) δ for missing and for excess.
     """
@@ -66,7 +68,7 @@ def detect(
     template: Template,
     *,
     options: RegionOptions | None = None,
-    tail: Tail | None = None,
+    calibration: Calibration | None = None,
     top_z_mm: float | None = None,
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
@@ -82,8 +84,8 @@ def detect(
         In the template's frame.
     options
         What the test is set to; None takes the defaults.
-    tail
-        How errors of sound places fall off, as a calibration knows it; None tells it from the scan.
+    calibration
+        What sound parts look like to this scanner; None: as the scan itself tells.
     top_z_mm
         Height of the layer just printed, where the template ends there: what is missing under
         that plane is judged with `top_allowance_mm`, since the job says exactly where it lies.
@@ -131,11 +133,12 @@ def detect(
     crossed, depth_mm = _crossed(surface_mm, surfels, seen)
     sites = _sites(surfels, template, surface_mm[crossed], normals[crossed], depth_mm)
     sites = _with_tolerance(sites, surfels, template, options, top_z_mm, rounded_up)
-    noise, levels = _tested(sites, surfels, scan, options, tail)
-    labels = grown(levels, sites.tolerance_mm, options)
+    noise, levels = _tested(sites, surfels, scan, options, calibration)
+    strands = _strands(surfels, template, levels, options)
+    labels, log_p = grown(levels, sites.tolerance_mm, options, strands=strands)
     missing, excess = labels[:, : len(surfels)]
-    limit_mm = levels[1].smallest_mm
-    excess = _with_strands(excess, missing, surfels, template, levels, limit_mm)
+    noise_mm = float(np.median(levels[1].critical[0] * levels[1].error_mm))
+    limit_mm, top_mm = (t + noise_mm for t in _tolerances(options, template))
     progress("detect", 2.0, 4.0)
     grow_mm = options.grow_share * float(np.median(sites.tolerance_mm[0]))
     evidence = gather(scan, template, surfels, missing | excess, seen, threshold_mm=grow_mm, up=up)
@@ -147,7 +150,7 @@ def detect(
     score = np.abs(f_mm)
     k = min(options.top_k, int(keep.sum()))
     regions = find_regions(
-        evidence, missing, excess, surface_mm, surface_label, template, levels=levels
+        evidence, missing, excess, surface_mm, surface_label, template, p_value=np.exp(log_p)
     )
     progress("detect", 4.0, 4.0)
     surfel_label = np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0))
@@ -164,7 +167,7 @@ def detect(
         object_score=float(np.partition(score[keep], -k)[-k:].mean()),
         regions=regions,
         top_z_mm=top_z_mm if options.tolerance_mm is None else None,
-        top_threshold_mm=limit_mm - max(options.allowance_mm - options.top_allowance_mm, 0.0),
+        top_threshold_mm=top_mm,
         evidence=evidence,
         surfel_label=surfel_label,
         surfel_higher_mm=np.maximum(allowed_mm[: len(surfels)], 0.0),
@@ -214,8 +217,10 @@ def _sites(
     """Cells and crossed template points, as yet without a tolerance."""
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
     typical = float(np.median(surfels.count))
+    # on the template: cells that noise alone put one above the other are one place
+    feet_mm = surfels.place_mm - surfels.deviation_mm[:, None] * outward
     return Sites(
-        place_mm=np.concatenate([surfels.place_mm, crossed_mm]),
+        place_mm=np.concatenate([feet_mm, crossed_mm]),
         normal=np.concatenate([outward, crossed_normal]),
         value_mm=np.concatenate([surfels.deviation_mm, -depth_mm]),
         weight=np.concatenate([surfels.count, np.full(len(depth_mm), typical)]),
@@ -232,17 +237,13 @@ def _with_tolerance(
     rounded_up: RoundedUp | None,
 ) -> Sites:
     """With δ for either sign: process, registration, template, and what normal parts differ by."""
-    known = float(np.hypot(2 * options.registration_sigma_mm, template.bias_mm))
-    given = options.tolerance_mm
-    tolerance_mm = np.full(
-        (2, len(sites.value_mm)), options.allowance_mm + known if given is None else given
-    )
-    if top_z_mm is not None and given is None:
+    anywhere_mm, top_mm = _tolerances(options, template)
+    tolerance_mm = np.full((2, len(sites.value_mm)), anywhere_mm)
+    if top_z_mm is not None:
         cells = slice(0, len(surfels))
         under = surfels.place_mm[:, 2] - top_z_mm
         top = np.abs(surfels.deviation_mm - under) < ON_PLANE_MM
-        allowance_mm = min(options.allowance_mm, options.top_allowance_mm)
-        tolerance_mm[0, cells][top] = allowance_mm + options.registration_sigma_mm
+        tolerance_mm[0, cells][top] = top_mm
     spread = getattr(template, "spread_mm", None)
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(sites.place_mm)
@@ -251,8 +252,21 @@ def _with_tolerance(
     return Sites(sites.place_mm, sites.normal, sites.value_mm, sites.weight, tolerance_mm)
 
 
+def _tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:
+    """δ anywhere, and under the plane of the layer just printed, mm."""
+    if options.tolerance_mm is not None:
+        return options.tolerance_mm, options.tolerance_mm
+    sigma_mm = options.registration_sigma_mm
+    anywhere_mm = options.allowance_mm + float(np.hypot(2 * sigma_mm, template.bias_mm))
+    return anywhere_mm, min(options.allowance_mm, options.top_allowance_mm) + sigma_mm
+
+
 def _tested(
-    sites: Sites, surfels: Surfels, scan: Scan, options: RegionOptions, tail: Tail | None
+    sites: Sites,
+    surfels: Surfels,
+    scan: Scan,
+    options: RegionOptions,
+    calibration: Calibration | None,
 ) -> tuple[Noise, tuple[Level, ...]]:
     """The noise as the scan shows it, and the test of every scale."""
     scales = scales_of(
@@ -263,31 +277,26 @@ def _tested(
         cell_mm=surfels.cell_mm,
         widest_mm=options.widest_mm,
     )
-    levels = tested(scales, sites.tolerance_mm, options, tail=tail)
+    levels = tested(scales, sites.tolerance_mm, options, calibration=calibration)
     return noise_of(levels, surfels, scan, options), levels
 
 
-def _with_strands(
-    excess: Bool[np.ndarray, " s"],
-    missing: Bool[np.ndarray, " s"],
-    surfels: Surfels,
-    template: Template,
-    levels: tuple[Level, ...],
-    limit_mm: float,
+def _strands(
+    surfels: Surfels, template: Template, levels: tuple[Level, ...], options: RegionOptions
 ) -> Bool[np.ndarray, " s"]:
-    """Excess, with strips narrower than any window that stand out along their length."""
+    """(s,) cells of strips narrower than any window that stand out along their length."""
     first = levels[1]
-    cells = slice(0, len(surfels))
-    window_mm = first.scale.median_mm[first.scale.of_base[cells]]
+    at = first.scale.of_base[: len(surfels)]
+    low_mm = options.grow_share * first.tolerance_mm[1] + options.grow_sigmas * first.error_mm
     per_point_mm = float(np.median(first.scale.noise_mm) * np.sqrt(np.median(surfels.count)))
-    strands = on_strands(
+    critical = float(first.critical[1])
+    return on_strands(
         surfels,
         template,
-        (window_mm > 0.5 * limit_mm) & ~excess & ~missing,
-        systematic_mm=limit_mm,
-        noise_mm=float(first.critical[1]) * per_point_mm,
+        surfels.wide_deviation_mm > low_mm[at],  # a mean: a median tells nothing of a strip
+        systematic_mm=float(np.median(first.tolerance_mm[1] + critical * first.common_mm)),
+        noise_mm=critical * per_point_mm,
     )
-    return np.asarray(surfels.grow(strands, surfels.deviation_mm > 0.5 * limit_mm) | excess)
 
 
 def _source(options: RegionOptions, template: Template, noise: Noise) -> str:

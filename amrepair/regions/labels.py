@@ -7,15 +7,20 @@ from jaxtyping import Bool, Float
 
 from amrepair.field import scales_kernels
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import Level, class_medians
+from amrepair.regions.significance import Level, usual_error_mm
 
 
 def grown(
     levels: tuple[Level, ...],
     tolerance_mm: Float[np.ndarray, "2 b"],
     options: RegionOptions,
-) -> Bool[np.ndarray, "2 b"]:
-    """(2, b) cells of missing and of excess regions.
+    *,
+    strands: Bool[np.ndarray, " s"],
+) -> tuple[Bool[np.ndarray, "2 b"], Float[np.ndarray, "2 b"]]:
+    """(2, b) cells of missing and of excess regions, and how sure the windows over each are.
+
+    `strands` are cells that stand out as strips. The second is the logarithm of the expected
+    number of false regions, over all that is tested.
 
     From every window that is significant a region grows through neighbouring cells of the field
     for as long as their deviation is beyond a share of the tolerance and beyond the noise.
@@ -24,17 +29,24 @@ def grown(
     scale = finest.scale
     value_mm = scale.value_mm[scale.of_base]
     # what is normal where a place was seen as densely: a defect's own slopes are no noise
-    error_mm = class_medians(scale, finest.error_mm, options)[scale.of_base]
+    error_mm = usual_error_mm(finest, options)[scale.of_base]
     low_mm = options.grow_share * tolerance_mm + options.grow_sigmas * error_mm
     through = np.stack([-value_mm, value_mm]) > low_mm
+    through[1, : len(strands)] |= strands
     labels = np.zeros_like(through)
+    log_p = np.zeros(through.shape)
+    tests = np.log(2 * len(levels))
     for side in range(2):
         seeds = np.zeros(len(value_mm), bool)
+        if side == 1:
+            seeds[: len(strands)] = strands
         for level in levels:
-            here = level.rejected[side]
-            if here.any():
-                window = scales_kernels.spread(level.scale.table, level.scale.count, here)
-                seeds |= window[level.scale.of_base]
+            if level.rejected[side].any():
+                surest = scales_kernels.surest(
+                    level.scale.table, level.scale.count, level.rejected[side], level.log_p[side]
+                )[level.scale.of_base]
+                seeds |= surest < 0
+                log_p[side] = np.minimum(log_p[side], surest + tests)
         seeds &= through[side]
         if not seeds.any():
             continue
@@ -47,4 +59,4 @@ def grown(
         kept[-1] = False  # what −1 looks up
         labels[side] = kept[group][scale.of_base] & through[side]
     labels[1] &= ~labels[0]
-    return labels
+    return labels, np.minimum(log_p, 0.0)

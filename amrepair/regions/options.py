@@ -36,25 +36,23 @@ class RegionOptions:
     far_mm
         Windows between half of this and this far apart tell by how much errors wander: twice the
         length over which they hang together.
-    most_defects
-        So many regions of each sign may be real where the scan's own exceedances tell what its
-        errors are; more than that in one scan are taken for errors of the scanner.
     tail_from
-        Standard errors beyond the tolerance from which on exceedances tell the tail: normal noise
-        leads there at one place in 44.
+        Standard errors beyond the tolerance from which on exceedances tell the tail.
     grow_share
         A region goes on to where the mean deviation is this share of the tolerance.
     grow_sigmas
         … and beyond the noise by so many standard errors: 95 % of noise stays below.
+    most_defective
+        Share of the places that may be defective where the scan itself tells its errors: the
+        widest of its differences, so many, say nothing of them.
     density_step
         Classes of how densely a place was seen, in octaves: aslant and at its edges a scanner
         sees fewer points an area, and worse ones.
     least_cells
         Cells from which the noise of a class is told; with fewer it is that of the class below.
         A scan with fewer in all cannot tell its noise: the profile's is used, and named.
-    most_pairs
-        Windows whose distance to others tells how errors hang together: enough for their median
-        to a few per cent.
+    most_windows
+        So many windows tell by how much means wander: enough for a few per cent.
     spacing_mm
         Template surface points are asked for so far apart.
     top_k
@@ -69,13 +67,13 @@ class RegionOptions:
     process_sigma_mm: float = 0.0
     widest_mm: float = 10.0
     far_mm: float = 20.0
-    most_defects: int = 8
-    tail_from: float = 2.0
+    tail_from: float = 1.0
     grow_share: float = 0.5
     grow_sigmas: float = 2.0
+    most_defective: float = 0.1
     density_step: float = 0.5
     least_cells: int = 30
-    most_pairs: int = 2000
+    most_windows: int = 3000
     spacing_mm: float = 0.6
     top_k: int = 1000
 

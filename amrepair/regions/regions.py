@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import area_per_point, group_points
 from amrepair.regions.anomaly import DefectType, Label, Region
-from amrepair.regions.significance import Level
 from amrepair.template.port import Template
 
 # Template points alone (seen through by rays) need this much surface to be a region.
@@ -28,9 +27,12 @@ def find_regions(
     surface_label: Int[np.ndarray, " m"],
     template: Template,
     *,
-    levels: tuple[Level, ...],
+    p_value: Float[np.ndarray, "2 b"],
 ) -> tuple[Region, ...]:
-    """Regions of both kinds, largest first."""
+    """Regions of both kinds, largest first.
+
+    `p_value` is of each cell (and crossed template point), for missing and for excess.
+    """
     s = evidence.surfels
     gone = surface_mm[surface_label == int(Label.MISSING)]
     area_each = area_per_point(surface_mm)
@@ -48,16 +50,8 @@ def find_regions(
             if len(own) == 0 and n_gone * area_each < MIN_AREA_MM2:
                 continue
             region = _region(label, s.deviation_mm[own], points[mine], s.cell_mm, template)
-            found.append(replace(region, p_value=_p_value(levels, side, own)))
+            found.append(replace(region, p_value=float(p_value[side, own].min(initial=1.0))))
     return tuple(sorted(found, key=lambda r: -r.volume_mm3))
-
-
-def _p_value(levels: tuple[Level, ...], side: int, cells: Int[np.ndarray, " q"]) -> float:
-    """The least expected number of false regions at any scale, times the tests that were made."""
-    if len(cells) == 0:
-        return float("nan")
-    least = min(float(level.log_p[side, level.scale.of_base[cells]].min()) for level in levels)
-    return float(min(2 * len(levels) * np.exp(least), 1.0))
 
 
 def _region(

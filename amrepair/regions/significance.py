@@ -6,7 +6,7 @@ stated number of false regions is shared out over scales, signs and windows. The
 a mean comes from the scan itself: what neighbouring cells differ by, and by how much windows that
 were seen as densely depart as a whole, less what the process is known to leave. Where more places
 exceed the tolerance than can be real, their peaks tell the tail of the null (Efron 2004, by peaks
-over a threshold), with the highest of them left out as possibly real.
+over a threshold), but for those that stand out of it.
 """
 
 from __future__ import annotations
@@ -21,33 +21,15 @@ from scipy.stats import norm
 
 from amrepair.field import scales_kernels
 from amrepair.field.scales import FACING_COSINE, RANK, Scale
-from amrepair.field.scales_kernels import NORMAL_MEDIAN
+from amrepair.regions.calibration import Calibration, Tail
 from amrepair.regions.options import RegionOptions
 
 # Standard error of a median, of that of a mean, for normal noise: √(π/2).
 MEDIAN_LOSS = float(np.sqrt(np.pi / 2))
 # Coordinates in files are rounded to micrometres; no error is smaller.
 LEAST_SIGMA_MM = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class Tail:
-    """How the standardised exceedances of sound places fall off.
-
-    Attributes
-    ----------
-    start, scale
-        Beyond `start` peaks are exponential with mean `scale`; 0: as normal noise.
-    peaks
-        How many there were to tell it from.
-    """
-
-    start: float
-    scale: float
-    peaks: int
-
-
-NORMAL_TAIL = Tail(0.0, 0.0, 0)
+# More standard errors than that are certain.
+MOST_ERRORS = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,21 +42,30 @@ class Level:
         The scale.
     tolerance_mm, error_mm
         (2, s) δ for missing and excess, and (s,) the standard error of the statistic.
+    common_mm
+        (s,) the part of it that averaging over a window does not lessen.
     z
         (2, s) standard errors beyond the tolerance: missing, excess.
     critical
         (2,) from which on they are significant.
     log_p
         (2, s) natural logarithm of the expected number of false regions as high or higher.
+    wander_mm
+        (c,) standard deviation of window means by class of density, the densest first.
+    tails, peaks
+        For missing and excess: how peaks of sound places fall off, and the peaks themselves.
     """
 
     scale: Scale
     tolerance_mm: Float[np.ndarray, "2 s"]
     error_mm: Float[np.ndarray, " s"]
+    common_mm: Float[np.ndarray, " s"]
     z: Float[np.ndarray, "2 s"]
     critical: Float[np.ndarray, " 2"]
     log_p: Float[np.ndarray, "2 s"]
+    wander_mm: Float[np.ndarray, " c"]
     tails: tuple[Tail, Tail]
+    peaks: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]
 
     @property
     def rejected(self) -> Bool[np.ndarray, "2 s"]:
@@ -92,7 +83,7 @@ def tested(
     tolerance_mm: Float[np.ndarray, "2 b"],
     options: RegionOptions,
     *,
-    tail: Tail | None,
+    calibration: Calibration | None,
 ) -> tuple[Level, ...]:
     """Test every scale's medians, and the third deepest and highest cells of the first.
 
@@ -100,8 +91,8 @@ def tested(
     ----------
     tolerance_mm
         (2, b) δ of each cell of the field: for missing, for excess.
-    tail
-        Of sound places, as a calibration knows it; None tells it from the scan.
+    calibration
+        What sound parts look like to this scanner; None: as the scan itself tells.
     """
     share = options.false_regions / (2 * (len(scales) + 1))
     levels = []
@@ -110,37 +101,76 @@ def tested(
         delta = np.stack(
             [np.bincount(scale.of_base, side, minlength=len(scale)) / size for side in tolerance_mm]
         )
-        apart = _wander(scale, options)
-        common = np.sqrt(np.maximum(apart**2 - options.process_sigma_mm**2, 0.0))
-        single = np.maximum(scale.noise_mm, LEAST_SIGMA_MM)
-        noise = MEDIAN_LOSS * single / np.sqrt(scale.count)
+        errors = _errors(scale, options, calibration)
         if k == 0:
-            thirds = (-scale.low_mm, scale.high_mm)
-            together = _independent(scale, noise, apart)
-            error = np.hypot(single, common)
-            levels.append(_level(scale, thirds, delta, error, share, options, tail, together))
-        means = (-scale.median_mm, scale.median_mm)
-        error = np.hypot(noise, common)
-        levels.append(_level(scale, means, delta, error, share, options, tail, 1.0))
+            thirds = np.stack([-scale.low_mm, scale.high_mm])
+            levels.append(_level(scale, thirds, delta, errors, share, options, calibration, 0))
+        means = np.stack([-scale.median_mm, scale.median_mm])
+        levels.append(_level(scale, means, delta, errors, share, options, calibration, 1))
     return tuple(levels)
 
 
-def density_class(scale: Scale, step: float) -> Int[np.ndarray, " s"]:
-    """(s,) how densely each window was seen: octaves over `step`, 0 the sparsest.
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Standard errors of a scale.
 
-    The half that was seen best is one class.
+    Attributes
+    ----------
+    cell_mm, window_mm
+        (s,) of a cell's value and of a window's median, by what neighbours differ by.
+    common_mm
+        (s,) what a window's cells have in common.
+    wander_mm
+        (c,) `common_mm` and `window_mm` together, by class of density.
+    """
+
+    cell_mm: Float[np.ndarray, " s"]
+    window_mm: Float[np.ndarray, " s"]
+    common_mm: Float[np.ndarray, " s"]
+    wander_mm: Float[np.ndarray, " c"]
+
+    @property
+    def independent(self) -> float:
+        """How many of `RANK` cells of a window err by themselves: all do, or (1) all together.
+
+        Of independent errors a window's median has what its cells' differences tell; what it
+        departs by more, its cells have in common.
+        """
+        whole = np.hypot(self.window_mm, self.common_mm)
+        ratio = float(np.median(self.window_mm)) / float(np.median(whole))
+        return 1.0 + (RANK - 1) * ratio**2
+
+
+def _errors(scale: Scale, options: RegionOptions, calibration: Calibration | None) -> Errors:
+    """What neighbouring cells differ by, and by how much whole windows wander."""
+    group = density_class(scale, options.density_step)
+    classes = int(group.max()) + 1
+    # what few neighbours tell by chance to be quiet is as noisy as places seen as densely
+    usual = _by_class(group, scale.noise_mm, classes, options)[group]
+    cell = np.maximum(np.maximum(scale.noise_mm, usual), LEAST_SIGMA_MM)
+    window = MEDIAN_LOSS * cell / np.sqrt(scale.count)
+    if calibration is None:
+        wander = _wander(scale, group, classes, options)
+    else:
+        wander = calibration.wander(3.0 * scale.cell_mm, classes)
+    explained = options.process_sigma_mm**2 + window**2
+    common = np.sqrt(np.maximum(wander[group] ** 2 - explained, 0.0))
+    return Errors(cell, window, common, wander)
+
+
+def density_class(scale: Scale, step: float) -> Int[np.ndarray, " s"]:
+    """(s,) how densely each window was seen: octaves over `step` below the better half, which is 0.
+
+    Aslant and at edges a scanner sees fewer points an area, and errs more, and as a whole.
     """
     relative = scale.window_weight / float(np.median(scale.window_weight))
-    octaves = np.minimum(np.floor(np.log2(relative) / step), 0.0).astype(np.int64)
-    return np.asarray(octaves - octaves.min())
+    return np.maximum(-np.floor(np.log2(relative) / step), 0.0).astype(np.int64)
 
 
-def class_medians(
-    scale: Scale, value: Float[np.ndarray, " s"], options: RegionOptions
-) -> Float[np.ndarray, " s"]:
-    """(s,) median of a value over the windows that were seen as densely."""
-    group = density_class(scale, options.density_step)
-    return _by_class(group, value, int(group.max()) + 1, options)[group]
+def usual_error_mm(level: Level, options: RegionOptions) -> Float[np.ndarray, " s"]:
+    """(s,) median standard error of the windows that were seen as densely."""
+    group = density_class(level.scale, options.density_step)
+    return _by_class(group, level.error_mm, int(group.max()) + 1, options)[group]
 
 
 def _by_class(
@@ -148,71 +178,55 @@ def _by_class(
     value: Float[np.ndarray, " n"],
     classes: int,
     options: RegionOptions,
+    *,
+    share: float = 0.5,
 ) -> Float[np.ndarray, " c"]:
-    """(c,) median of a value in each class, never less in one that was seen less densely.
-
-    Aslant and at edges a scanner errs more, and as a whole, over the length on which its errors
-    hang together.
-    """
+    """(c,) quantile of a value in each class; never less in one that was seen less densely."""
     found = np.zeros(classes)
-    worst = 0.0
-    for k in range(classes - 1, -1, -1):
+    for k in range(classes):
         here = group == k
         if here.sum() >= options.least_cells:
-            worst = max(worst, float(np.median(value[here])))
-        found[k] = worst
-    return found
+            found[k] = float(np.quantile(value[here], share))
+    return np.maximum.accumulate(found)
 
 
-def _wander(scale: Scale, options: RegionOptions) -> Float[np.ndarray, " s"]:
-    """(s,) standard deviation of window means about what is normal some way off.
+def _wander(
+    scale: Scale, group: Int[np.ndarray, " s"], classes: int, options: RegionOptions
+) -> Float[np.ndarray, " c"]:
+    """(c,) standard deviation of window means about what is normal some way off, by class.
 
-    From the differences of windows that face the same way, about as far apart as errors hang
-    together: a layer that lacks as a whole is no noise. By how densely the worse one was seen.
+    From the differences of windows that face the same way, farther apart than errors hang
+    together: a layer that lacks as a whole is no error. By how densely the worse one was seen.
     """
-    far_mm = options.far_mm
-    pick = np.arange(0, len(scale), max(len(scale) // options.most_pairs, 1))
-    tree = cKDTree(scale.place_mm)
-    around = tree.query_ball_point(scale.place_mm[pick], far_mm, return_sorted=False)
-    size = np.array([len(found) for found in around])
-    one = np.repeat(pick, size)
-    other = np.concatenate([np.asarray(found, np.int64) for found in around])
+    pick = np.arange(0, len(scale), max(len(scale) // options.most_windows, 1))
+    pairs = cKDTree(scale.place_mm[pick]).query_pairs(options.far_mm, output_type="ndarray")
+    one, other = pick[pairs.T]
     apart_mm = np.linalg.norm(scale.place_mm[one] - scale.place_mm[other], axis=1)
     alike = (scale.normal[one] * scale.normal[other]).sum(axis=1) > FACING_COSINE
-    kept = alike & (apart_mm > 0.5 * far_mm)
+    kept = alike & (apart_mm > 0.5 * options.far_mm)
     one, other = one[kept], other[kept]
-    if len(one) < options.least_cells:
-        return np.zeros(len(scale))
-    group = density_class(scale, options.density_step)
-    worse = np.minimum(group[one], group[other])
-    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / NORMAL_MEDIAN / np.sqrt(2.0)
-    return _by_class(worse, off_mm, int(group.max()) + 1, options)[group]
-
-
-def _independent(
-    scale: Scale, noise_mm: Float[np.ndarray, " s"], apart_mm: Float[np.ndarray, " s"]
-) -> float:
-    """How many of `RANK` cells of a window err by themselves: all do, or (1) all err together.
-
-    Of independent errors a window's median has the `noise_mm` that its cells' differences tell;
-    what it departs by more, its cells have in common.
-    """
-    ratio = (float(np.median(noise_mm)) / max(float(np.median(apart_mm)), LEAST_SIGMA_MM)) ** 2
-    return 1.0 + (RANK - 1) * min(ratio, 1.0)
+    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / np.sqrt(2.0)
+    sound = 1.0 - options.most_defective
+    off_mm /= norm.ppf(0.5 + 0.5 * sound)
+    return _by_class(np.maximum(group[one], group[other]), off_mm, classes, options, share=sound)
 
 
 def _level(
     scale: Scale,
-    sides: tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]],
+    sides: Float[np.ndarray, "2 s"],
     tolerance_mm: Float[np.ndarray, "2 s"],
-    error_mm: Float[np.ndarray, " s"],
+    errors: Errors,
     share: float,
     options: RegionOptions,
-    tail: Tail | None,
-    together: float,
+    calibration: Calibration | None,
+    statistic: int,
 ) -> Level:
     """Standardise one statistic, and say from which value on it is significant."""
-    z = (np.stack(sides) - tolerance_mm) / error_mm
+    own_mm, together = (
+        (errors.cell_mm, errors.independent) if statistic == 0 else (errors.window_mm, 1.0)
+    )
+    error_mm = np.hypot(own_mm, errors.common_mm)
+    z = (sides - tolerance_mm) / error_mm
     alone = scale.count < RANK  # fewer cells than that are no surface
     z[:, alone] = -np.inf
     n = max(int((~alone).sum()), 1)
@@ -220,34 +234,52 @@ def _level(
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
     quantile = norm.isf(min((share / (n * ways)) ** (1.0 / together), 0.5))
-    log_p, critical, tails = np.empty_like(z), np.empty(2), []
+    log_p, critical = np.empty_like(z), np.empty(2)
+    peaks = tuple(_peaks(scale, side, options.tail_from) for side in z)
+    tails = []
     for side in range(2):
-        fitted = tail or _tail(scale, z[side], options)
-        tails.append(fitted)
-        safe = np.clip(z[side], 0.0, 1e3)
+        tail = (
+            _tail(peaks[side], options)
+            if calibration is None
+            else calibration.tail(statistic, side, len(scale))
+        )
+        tails.append(tail)
+        safe = np.clip(z[side], 0.0, MOST_ERRORS)
         log_p[side] = np.log(n * ways) + together * norm.logsf(safe)
         critical[side] = quantile
-        if fitted.scale > 0:
-            fallen = np.log(max(fitted.peaks, 1)) - (safe - fitted.start) / fitted.scale
+        if tail.scale > 0:
+            count = max(tail.peaks, 1.0)
+            fallen = np.log(count) - (safe - tail.start) / tail.scale
             log_p[side] = np.maximum(log_p[side], fallen)
-            level = fitted.start + fitted.scale * np.log(max(fitted.peaks, 1) / share)
-            critical[side] = max(quantile, level)
-    return Level(scale, tolerance_mm, error_mm, z, critical, log_p, (tails[0], tails[1]))
+            critical[side] = max(quantile, tail.start + tail.scale * np.log(count / share))
+    return Level(
+        scale, tolerance_mm, error_mm, errors.common_mm, z, critical, log_p, errors.wander_mm,
+        (tails[0], tails[1]), (peaks[0], peaks[1]),
+    )  # fmt: skip
 
 
-def _tail(scale: Scale, z: Float[np.ndarray, " s"], options: RegionOptions) -> Tail:
-    """The exponential tail of the peaks over the tolerance, the highest left out.
-
-    The maximum-likelihood mean of an exponential of which the largest values are known only to be
-    no smaller (type II censoring; Epstein and Sobel 1953).
-    """
-    over = z > options.tail_from
+def _peaks(scale: Scale, z: Float[np.ndarray, " s"], start: float) -> Float[np.ndarray, " p"]:
+    """(p,) the highest of each connected group of windows that exceed `start`, rising."""
+    over = z > start
     group, groups = scales_kernels.components(scale.table, scale.count, over)
-    kept = groups - options.most_defects
-    if kept < options.most_defects // 2:  # too few to tell a tail from
-        return Tail(options.tail_from, 0.0, groups)
     peak = np.full(groups, -np.inf)
     np.maximum.at(peak, group[over], z[over])
-    peak = np.sort(peak) - options.tail_from
-    mean = (peak[:kept].sum() + options.most_defects * peak[kept - 1]) / kept
-    return Tail(options.tail_from, float(mean), groups)
+    return np.sort(peak)
+
+
+def _tail(peaks: Float[np.ndarray, " p"], options: RegionOptions) -> Tail:
+    """The exponential tail of the peaks over the tolerance that belong together.
+
+    The lower half of the peaks is taken for errors; from there upwards each is, too, for as long
+    as it is no outlier of the exponential that those before it tell (a forward search, as in
+    Kimber 1982). The first outlier and all above it may be real.
+    """
+    if len(peaks) < 2 * RANK:  # the lower half is too few to tell a tail from
+        return Tail(options.tail_from, 0.0, float(len(peaks)))
+    beyond = peaks - options.tail_from
+    sound = len(beyond) // 2
+    while sound < len(beyond):
+        if beyond[sound] > beyond[:sound].mean() * np.log(sound / options.false_regions):
+            break
+        sound += 1
+    return Tail(options.tail_from, float(beyond[:sound].mean()), float(sound))

@@ -75,6 +75,17 @@ class PlannedBeads:
             self.start_mm[which], self.end_mm[which], self.width_mm[which], self.height_mm[which]
         )
 
+    def samples_mm(self) -> Float[np.ndarray, "p 3"]:
+        """(p, 3) places along the middles of their tops, `STEP_MM` apart."""
+        length_mm = np.linalg.norm(self.end_mm - self.start_mm, axis=1)
+        count = np.ceil(length_mm / STEP_MM).astype(np.int64) + 1
+        line = np.repeat(np.arange(len(count)), count)
+        step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
+        share = step / np.maximum(count[line] - 1, 1)
+        return np.asarray(
+            self.start_mm[line] + share[:, None] * (self.end_mm - self.start_mm)[line]
+        )
+
     def holds(self, points_mm: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
         """Which points lie in any of them."""
         return np.asarray(

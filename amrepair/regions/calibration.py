@@ -1,0 +1,183 @@
+"""Calibration: what a scanner and a printer leave on sound parts, learned once and kept by name.
+
+It stands in for what a scan has to tell of itself: how far window means wander, by their width and
+by how densely they were seen, and how the peaks over the tolerance fall off.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.errors import InputError
+
+if TYPE_CHECKING:
+    from amrepair.regions.significance import Level
+
+VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Tail:
+    """How the standardised exceedances of sound places fall off.
+
+    Attributes
+    ----------
+    start, scale
+        Beyond `start` peaks are exponential with mean `scale`; 0: as normal noise.
+    peaks
+        How many such peaks a scan has.
+    """
+
+    start: float
+    scale: float
+    peaks: float
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Errors of sound parts.
+
+    Attributes
+    ----------
+    name, scans
+        What it is kept by, and how many scans of sound parts it was learned from.
+    width_mm
+        (k,) widths of the windows that it knows.
+    wander_mm
+        (k, c) standard deviation of window means, by width and by class of density, the densest
+        first.
+    tails
+        (statistic, side) → start, scale and peaks a window; statistic 0 is of three cells
+        together, 1 of window medians; side 0 missing, 1 excess.
+    """
+
+    name: str
+    scans: int
+    width_mm: tuple[float, ...] = ()
+    wander_mm: tuple[tuple[float, ...], ...] = ()
+    tails: tuple[tuple[float, float, float], ...] = ()
+
+    def wander(self, width_mm: float, classes: int) -> Float[np.ndarray, " c"]:
+        """(c,) standard deviation of means of windows so wide, by class; 0 where none is known."""
+        if not self.width_mm:
+            return np.zeros(classes)
+        nearest = int(np.argmin(np.abs(np.log(np.array(self.width_mm) / width_mm))))
+        known = np.array(self.wander_mm[nearest])
+        return np.asarray(known[np.minimum(np.arange(classes), len(known) - 1)])
+
+    def tail(self, statistic: int, side: int, windows: int) -> Tail:
+        """How the peaks of so many windows fall off."""
+        if not self.tails:
+            return Tail(0.0, 0.0, 0.0)
+        start, scale, rate = self.tails[2 * statistic + side]
+        return Tail(start, scale, rate * windows)
+
+    @classmethod
+    def learned(cls, name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
+        """From the tested scales of scans of sound parts.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        if not scans:
+            raise InputError("a calibration needs a scan of a sound part at least; name one")
+        widths: dict[float, list[Float[np.ndarray, " c"]]] = {}
+        for levels in scans:
+            for level in levels[1:]:
+                width_mm = round(3.0 * level.scale.cell_mm, 1)
+                widths.setdefault(width_mm, []).append(level.wander_mm)
+        wander = []
+        for found in (widths[width] for width in sorted(widths)):
+            classes = max(len(table) for table in found)
+            whole = [np.append(t, np.full(classes - len(t), t[-1])) for t in found]
+            mean = np.sqrt(np.square(whole).mean(axis=0))
+            wander.append(tuple(float(v) for v in np.maximum.accumulate(mean)))
+        tails = []
+        for statistic in (0, 1):
+            for side in (0, 1):
+                some = [levels[0:1] if statistic == 0 else levels[1:] for levels in scans]
+                every = [level for levels in some for level in levels]
+                peaks = np.concatenate([level.peaks[side] for level in every])
+                windows = sum(len(level.scale) for level in every)
+                start = every[0].tails[side].start
+                mean_z = float(peaks.mean() - start) if len(peaks) else 0.0
+                tails.append((start, mean_z, len(peaks) / windows))
+        return cls(name, len(scans), tuple(sorted(widths)), tuple(wander), tuple(tails))
+
+    def save(self, folder: Path) -> Path:
+        """Write it into the user's folder; the whole file or nothing.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
+        path = file_of(self.name, folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            new = path.with_name(f".{path.name}.new")
+            new.write_text(json.dumps({"version": VERSION, **asdict(self)}, indent=1) + "\n")
+            new.replace(path)
+        except OSError as e:
+            raise InputError(f"{path}: the calibration cannot be written ({e.strerror})") from e
+        return path
+
+    @classmethod
+    def load(cls, name: str, folder: Path) -> Calibration:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            If there is none of that name, or it is damaged.
+        """
+        path = file_of(name, folder)
+        if not path.is_file():
+            there = sorted(p.stem for p in folder.glob("*.json"))
+            known = f"there are {', '.join(there)}" if there else "there is none yet"
+            raise InputError(
+                f"no calibration is named '{name}' in {folder}; {known}: make it with 'amrepair "
+                f"calibrate --sound SCAN --template FILE --name {name}'"
+            )
+        try:
+            said: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            if said.pop("version") != VERSION:
+                raise InputError(f"{path}: the calibration is of another version than {VERSION}")
+            return cls(**{key: _tuples(value) for key, value in said.items()})
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
+            raise InputError(f"{path}: the calibration cannot be read ({e}); make it again") from e
+
+
+# Independent normal errors and nothing else: what the simulated scanner leaves by default.
+NORMAL = Calibration("normal noise", 0)
+
+
+def file_of(name: str, folder: Path) -> Path:
+    """The file that a calibration is kept in.
+
+    Raises
+    ------
+    InputError
+        If the name is no plain file name.
+    """
+    if not name or Path(name).name != name or name.startswith("."):
+        raise InputError(f"a calibration's name is a plain word, not '{name}'")
+    return folder / f"{name}.json"
+
+
+def users_folder() -> Path:
+    """Where calibrations are kept."""
+    return Path.home() / ".config" / "amrepair" / "calibrations"
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
