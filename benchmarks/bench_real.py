@@ -93,7 +93,7 @@ def run(command: Sequence[str], limit_s: float) -> Run:
         process = subprocess.Popen(
             [sys.executable, "-m", "amrepair", *command], stdout=said, stderr=complaint
         )
-        status, usage = _waited(process.pid, began + limit_s, process.kill)
+        status, peak_gb = _waited(process.pid, began + limit_s, process.kill)
         process.returncode = os.waitstatus_to_exitcode(status)
         wall_s = time.perf_counter() - began
         said.seek(0)
@@ -104,20 +104,33 @@ def run(command: Sequence[str], limit_s: float) -> Run:
     except json.JSONDecodeError:
         late = f"no answer in {limit_s:g} s; " if wall_s > limit_s else ""
         result, why = None, f"{late}exit {process.returncode}: {why[-300:]}"
-    return Run(result, "" if result else why, wall_s, usage.ru_maxrss / 1024**2)
+    return Run(result, "" if result else why, wall_s, peak_gb)
 
 
-def _waited(pid: int, until_s: float, kill: Callable[[], None]) -> tuple[int, Any]:
-    """Exit status and resource usage of a child, killed where it takes too long."""
+def _waited(pid: int, until_s: float, kill: Callable[[], None]) -> tuple[int, float]:
+    """Exit status of a child, killed where it takes too long, and the most memory that it held.
+
+    Linux counts what a parent held before the child's first instruction as the child's own
+    (`ru_maxrss`); the kernel's high-water mark of the running process begins anew.
+    """
+    peak_gb = 0.0
     while True:
-        done, status, usage = os.wait4(pid, os.WNOHANG)
+        done, status = os.waitpid(pid, os.WNOHANG)
         if done:
-            return status, usage
+            return status, peak_gb
         if time.perf_counter() > until_s:
             kill()
-            _, status, usage = os.wait4(pid, 0)
-            return status, usage
+            return os.waitpid(pid, 0)[1], peak_gb
+        peak_gb = max(peak_gb, _peak_gb(pid))
         time.sleep(0.02)
+
+
+def _peak_gb(pid: int) -> float:
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return next((int(w.split()[1]) / 1024**2 for w in lines if w.startswith("VmHWM")), 0.0)
 
 
 def judged(case: Case, found: Run) -> Row:

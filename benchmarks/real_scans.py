@@ -202,6 +202,12 @@ class Surface:
         asked = o3d.core.Tensor(points.astype(np.float32))
         return np.asarray(self._scene.compute_signed_distance(asked).numpy(), dtype=float)
 
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3) outward normals of the nearest places of the surface."""
+        asked = o3d.core.Tensor(points.astype(np.float32))
+        faces = self._scene.compute_closest_points(asked)["primitive_ids"].numpy()
+        return np.asarray(self.mesh.face_normals[faces])
+
     def wall_mm(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(n,) how thick the part is below points of its surface."""
         rays = np.hstack([points - 0.05 * normals, -normals]).astype(np.float32)
