@@ -8,7 +8,9 @@ are far off, and what edges do. What shifts a view as a whole is fitted first an
 
 from __future__ import annotations
 
+import io
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,6 +29,7 @@ STEEPEST = np.tan(np.deg2rad(80.0))  # depth that changes faster than this is an
 SIGMA_OF_MAD = 1.4826  # normal distribution
 CLIP_SIGMAS = 3.0  # pairs are compared within: a few points far off would say all
 LAGS_MM = 12.0  # how far apart pairs are compared
+LARGEST_BYTES = 2**30  # of an array: 200 views of a megapixel
 PITCH_MM = (0.02, 5.0)  # as a scanner's spacing_mm
 _KEYS = ("version", "pitch_mm", "residual_mm", "cosine", "edge_mm", "offset_mm", "source")
 _HOW = "make it anew with benchmarks/record_scanner.py"
@@ -280,11 +283,14 @@ def load_recording(path: Path) -> Recording:
         If the file cannot be read, is of another version, or does not hold together.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            content = {key: file[key] for key in _KEYS if key in file.files}
+        with path.open("rb") as stream, zipfile.ZipFile(stream) as file:
+            members = {key: file.read(f"{key}.npy") for key in _KEYS if _holds(file, key)}
+        content = {
+            key: np.load(io.BytesIO(data), allow_pickle=False) for key, data in members.items()
+        }
     except OSError as error:
         raise InputError(f"{path}: the recording cannot be read ({error})") from error
-    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile, MemoryError) as error:
+    except (ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path} is no recording of a scanner (.npz); {_HOW}") from error
     lacking = [key for key in _KEYS if key not in content]
     if lacking:
@@ -303,6 +309,16 @@ def load_recording(path: Path) -> Recording:
         content["offset_mm"],
         str(content["source"]),
     )
+
+
+def _holds(file: zipfile.ZipFile, key: str) -> bool:
+    """Whether an archive has an array, of a size that can be one."""
+    name = f"{key}.npy"
+    if name not in file.namelist():
+        return False
+    if file.getinfo(name).file_size > LARGEST_BYTES:
+        raise ValueError(f"{name} is larger than {LARGEST_BYTES} bytes")
+    return True
 
 
 def _wrong(content: dict[str, np.ndarray]) -> str:

@@ -77,7 +77,8 @@ class Replay:
         away = known & ~by_edge
         found = [_kind(recording, mask) for mask in (away, by_edge)]
         # a recording without edges has nothing to say of them
-        self._kinds = [kind or found[1 - k] for k, kind in enumerate(found)]
+        any_kind = next(kind for kind in found if kind is not None)
+        self._kinds = [kind or any_kind for kind in found]
 
     def errors_mm(
         self,
