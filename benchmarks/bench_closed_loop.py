@@ -11,6 +11,8 @@ to a minute. Truth is the world against a reference printed by the same motion w
 A look follows the last layer of a defect, as if it had been found late; `--each` takes one after
 each of its layers (`amrepair loop --every 1`), where what fell is not yet covered.
 
+`--scanner recorded:FILE` looks with the noise of a real scanner (`record_scanner.py` makes FILE).
+
 The loop prints on the emulated firmware, fed in this process, and the job ends where the defect has
 been repaired: a case takes a tenth of the time. `--wire` prints all of it through the serial
 adapter and a pseudo-terminal; figures differ by no more than what wandering flow makes of them.
@@ -35,6 +37,7 @@ prepare()  # as the command lines do
 from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.simulate.defects import parse_defect
+from amrepair.simulate.parameters import DEFAULT_SCANNER, load_world
 from amrepair.simulate.run import PreparedRun, prepare_run, set_stage, simulate_run
 from amrepair.simulate.stage import DefectTruth
 from amrepair.template import load_mesh, load_or_fit
@@ -135,11 +138,13 @@ def stops_of(prepared: PreparedRun, *, each: bool) -> tuple[Stop, ...]:
     return (next(stop for stop in prepared.stops if stop.layer_index == defect.last_layer),)
 
 
-def run_without_wire(prepared: PreparedRun, *, each: bool) -> tuple[LoopReport, DefectTruth]:
+def run_without_wire(
+    prepared: PreparedRun, *, each: bool, scanner: str = DEFAULT_SCANNER
+) -> tuple[LoopReport, DefectTruth]:
     """The loop up to the last stop at which the defect is seen."""
     stops = stops_of(prepared, each=each)
     printer = CorePrinter(prepared, stops[-1])
-    stage = set_stage(prepared, printer.take_motion)
+    stage = set_stage(prepared, printer.take_motion, scanner=scanner)
     report = run_loop(
         prepared.job,
         prepared.checked,
@@ -159,7 +164,9 @@ def run_without_wire(prepared: PreparedRun, *, each: bool) -> tuple[LoopReport, 
     return report, stage.truth[0]
 
 
-def run_case(case: Case, process: str, *, wire: bool, each: bool = False) -> dict[str, Any]:
+def run_case(
+    case: Case, process: str, *, wire: bool, each: bool = False, scanner: str = DEFAULT_SCANNER
+) -> dict[str, Any]:
     """Print, break and mend one part; what became of it."""
     part, kind, seed = case
     began = time.perf_counter()
@@ -168,12 +175,12 @@ def run_case(case: Case, process: str, *, wire: bool, each: bool = False) -> dic
     setup = load_setup(process=process)
     prepared = prepare_run(load_or_fit(mesh), setup, [parse_defect(kind)], title=part, seed=seed)
     if wire:
-        run = simulate_run(prepared, max_iterations=MAX_ITERATIONS)
+        run = simulate_run(prepared, max_iterations=MAX_ITERATIONS, scanner=scanner)
         report, truth = run.report, run.truth[0]
     else:
-        report, truth = run_without_wire(prepared, each=each)
+        report, truth = run_without_wire(prepared, each=each, scanner=scanner)
     return (
-        {"part": part, "defect": kind, "seed": seed, "process": process}
+        {"part": part, "defect": kind, "seed": seed, "process": process, "scanner": scanner}
         | figures(report, truth, prepared.defects[0].layers)
         | {"seconds": round(time.perf_counter() - began, 1)}
     )
@@ -238,17 +245,20 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("out/closed-loop.jsonl"))
     parser.add_argument("--each", action="store_true", help="a look after each layer of a defect")
     parser.add_argument("--wire", action="store_true", help="through the serial adapter, all of it")
+    parser.add_argument("--scanner", default=DEFAULT_SCANNER, help="of the world, or recorded:FILE")
     parser.add_argument("--table", action="store_true")
     args = parser.parse_args()
+    load_world().scanner(args.scanner)  # refused before any work
     args.results.parent.mkdir(parents=True, exist_ok=True)
     text = args.results.read_text() if args.results.is_file() else ""
     rows = [json.loads(line) for line in text.splitlines()]
+    rows = [row for row in rows if row.get("scanner", DEFAULT_SCANNER) == args.scanner]
     done = {(row["part"], row["defect"], row["seed"]) for row in rows}
     todo = [case for case in cases(args.parts) if case not in done][: args.next]
     if args.case:
         todo = [(args.case[0], args.case[1], int(args.case[2]))]
     for case in todo:
-        row = run_case(case, args.process, wire=args.wire, each=args.each)
+        row = run_case(case, args.process, wire=args.wire, each=args.each, scanner=args.scanner)
         rows.append(row)
         with args.results.open("a") as file:
             file.write(json.dumps(row) + "\n")

@@ -79,7 +79,11 @@ def simulate(
         ),
     ] = None,
     scanner: Annotated[
-        str, typer.Option(help="structured-light, laser-line, or another of the world's file.")
+        str,
+        typer.Option(
+            help="structured-light, laser-line, another of the world's file, or recorded:FILE: "
+            "the noise of a real scanner."
+        ),
     ] = "structured-light",
     max_iterations: Annotated[
         int, typer.Option(min=0, max=10, help="Repairs at one stop, at most.")

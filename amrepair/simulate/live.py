@@ -81,6 +81,7 @@ class PrintedScanner:
             ),
             rng=rng,
             model=model,
+            recording=told.recording(scanner),
         )
 
     @property

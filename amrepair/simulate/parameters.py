@@ -19,9 +19,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from amrepair.errors import InputError
+from amrepair.simulate.recording import Recording, load_recording
 
 SHIPPED = Path(__file__).with_name("world.toml")
 DEFAULT_SCANNER = "structured-light"
+RECORDED = "recorded:"  # before the file with a real scanner's residuals
 
 Share = Annotated[float, Field(ge=0, le=0.5)]
 
@@ -200,17 +202,37 @@ class WorldParameters:
     sha256: str
 
     def scanner(self, name: str = DEFAULT_SCANNER) -> ScannerModel:
-        """The scanner of a name.
+        """The scanner of a name; of `recorded:FILE` the default one with the file's noise.
 
         Raises
         ------
         InputError
-            If the file has none of that name.
+            If the file has none of that name, or the recording cannot be read.
         """
+        recording = self.recording(name)
+        if recording is not None:
+            # what it says of its noise, as a data sheet would; the noise itself is replayed
+            told = {"sigma_mm": recording.sigma_mm, "slope_power": 0.0, "outlier_ratio": 0.0}
+            return self.scanner().model_copy(update=told)
         if name not in self.scanners:
             known = ", ".join(sorted(self.scanners))
-            raise InputError(f"there is no scanner {name!r} in this world; there are {known}")
+            raise InputError(
+                f"there is no scanner {name!r} in this world; there are {known}, and "
+                f"{RECORDED}FILE for the noise of a real one"
+            )
         return self.scanners[name]
+
+    def recording(self, name: str) -> Recording | None:
+        """What a scanner `recorded:FILE` replays; None for one that is described by figures.
+
+        Raises
+        ------
+        InputError
+            If the recording cannot be read.
+        """
+        if not name.startswith(RECORDED):
+            return None
+        return load_recording(Path(name.removeprefix(RECORDED)))
 
 
 @lru_cache(maxsize=8)

@@ -235,7 +235,14 @@ def set_stage(
     return Stage(
         standing,
         defects=run.defects,
-        scanner=SimulatedScanner(standing, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model),
+        scanner=SimulatedScanner(
+            standing,
+            pose=pose,
+            sensors_mm=sensors_mm,
+            rng=rng,
+            model=model,
+            recording=told.recording(scanner),
+        ),
         take_motion=lambda: noisy_flow(take_motion(), flow_rng, told.flow),
         layer_height_mm=run.setup.process.layer_height_mm,
         part=run.part,

@@ -21,6 +21,8 @@ from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import ScanRequest
 from amrepair.simulate.columns import IntervalMap
 from amrepair.simulate.parameters import ScannerModel
+from amrepair.simulate.recording import Recording
+from amrepair.simulate.replay import Replay
 from amrepair.simulate.scanner_kernels import BED, cast, unhidden
 from amrepair.simulate.world import World
 
@@ -117,6 +119,8 @@ class SimulatedScanner:
         How well it measures.
     rng
         Draws noise and the rays' sub-spacing positions.
+    recording
+        Residuals of a real scanner, laid over the points instead of the model's noise.
     """
 
     def __init__(
@@ -127,12 +131,14 @@ class SimulatedScanner:
         sensors_mm: Float[np.ndarray, "k 3"],
         rng: np.random.Generator,
         model: ScannerModel | None = None,
+        recording: Recording | None = None,
     ) -> None:
         self.world = world
         self._pose = pose
         self._sensors_mm = np.array(sensors_mm, dtype=np.float64)
         self._rng = rng
         self.model = model or ScannerModel()
+        self._replay = None if recording is None else Replay(recording)
 
     @property
     def build_from_scanner(self) -> Transform:
@@ -173,11 +179,19 @@ class SimulatedScanner:
             )
             seen = self._measured(points, normals, kinds, sensor, bounds)
             seen &= self._unhidden(solid, top_mm, sensor, points)
-            noise = self._noise(points, normals, sensor)
             at_rest = np.where((kinds == BED)[:, None], points, self.world.as_cooled(points))
-            seen = (at_rest + noise)[seen]
-            clouds.append(seen)
-            indices.append(np.full(len(seen), index, dtype=np.int64))
+            if self._replay is None:
+                noise = self._noise(points, normals, sensor)[seen]
+            else:
+                noise = self._replay.errors_mm(
+                    points[seen],
+                    normals[seen],
+                    sensor,
+                    spacing_mm=self.model.line_step_mm or self.model.spacing_mm,
+                    rng=self._rng,
+                )
+            clouds.append(at_rest[seen] + noise)
+            indices.append(np.full(len(noise), index, dtype=np.int64))
         scanner_from_build = self._pose.build_from_scanner_true.inverse()
         return Scan(
             points_mm=scanner_from_build.apply(np.concatenate(clouds)),
