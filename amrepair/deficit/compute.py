@@ -246,11 +246,17 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
         )
 
     found = []
-    for piece in deficit.regions:
-        depths = [r.depth_mm for r in anomaly.regions if touch(r, piece)]
-        found.append(replace(piece, depth_mm=max(depths, default=piece.depth_mm)))
-    found += [r for r in anomaly.regions if not any(touch(r, piece) for piece in deficit.regions)]
-    return tuple(sorted(found, key=lambda r: -r.volume_mm3))
+    left = list(deficit.regions)
+    for region in anomaly.regions:
+        own = [piece for piece in left if touch(region, piece)]
+        left = [piece for piece in left if not touch(region, piece)]
+        boxes = np.array([piece.box_mm for piece in own] or [region.box_mm])
+        whole = replace(own[0], volume_mm3=sum(piece.volume_mm3 for piece in own)) if own else region
+        box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        found.append(
+            replace(whole, box_mm=box, depth_mm=region.depth_mm, p_value=region.p_value)
+        )
+    return tuple(sorted(found + left, key=lambda r: -r.volume_mm3))
 
 
 def _roughly_missing(anomaly: AnomalyMap, evidence: Evidence) -> float:

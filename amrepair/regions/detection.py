@@ -289,7 +289,8 @@ def _strands(
     at = first.scale.of_base[: len(surfels)]
     low_mm = options.grow_share * first.tolerance_mm[1] + options.grow_sigmas * first.error_mm
     per_point_mm = float(np.median(first.scale.noise_mm) * np.sqrt(np.median(surfels.count)))
-    critical = float(first.critical[1])
+    # of what is as narrow as a few cells, errors have a tail as long as that of those cells
+    critical = float(max(first.critical[1], levels[0].critical[1]))
     return on_strands(
         surfels,
         template,
