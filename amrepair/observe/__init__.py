@@ -1,0 +1,10 @@
+"""Observe: from a placed scan to deviations, and what of them is the scan's or the whole part's.
+
+It says nothing about defects: residual pose, scale, bow and offsets between views are fitted,
+told and taken out here; what is left is for the rooms above to judge.
+"""
+
+from amrepair.observe.basis import NuisanceOptions
+from amrepair.observe.nuisance import Nuisance, fit_nuisance
+
+__all__ = ["Nuisance", "NuisanceOptions", "fit_nuisance"]
