@@ -24,9 +24,9 @@ from amrepair.observe.basis import (
     shape_columns,
 )
 from amrepair.observe.cells import Cells, blocks, gather
-from amrepair.observe.robust import Problem, Solution, covariance, solve
+from amrepair.observe.robust import Problem, Solution, covariance, solve, starts_by_block
 
-CELLS_ACROSS = 96  # a nuisance is smooth: cells finer than this say nothing more about it
+CELLS_ACROSS = 48  # a nuisance is smooth: cells finer than this say nothing more about it
 STATIONS = np.linspace(-1, 1, 21)  # from end to end of an axis
 NORMAL = NuisanceOptions()
 BESIDE_RATIO = 0.1  # a bow along one axis alone is told with that axis's length
@@ -281,10 +281,10 @@ def _supported(
     kept = np.ones(design.shape[1], bool)
     block = blocks(cells.place_mm)
     spare = max(int(block.max()), 1)  # degrees of freedom that leaving out blocks has
-    start: tuple[Float[np.ndarray, " k"], ...] = ()
+    problem = Problem(design, cells.deviation_mm, cells.share, tolerance_mm)
+    starts = starts_by_block(problem, block)
     while True:
-        problem = Problem(design[:, kept], cells.deviation_mm, cells.share, tolerance_mm)
-        solution = solve(problem, start)
+        solution = solve(problem, starts)
         spread = covariance(problem, solution, block)
         place = np.cumsum(kept) - 1
         chance = {
@@ -296,8 +296,9 @@ def _supported(
         if not weakest or chance[weakest] < options.support_p:
             return solution, kept, spread
         stay = np.delete(np.arange(int(kept.sum())), place[terms[weakest]])
-        start = (solution.unknown[stay],)
+        starts = (solution.unknown[stay],)
         kept[terms[weakest]] = False
+        problem = Problem(design[:, kept], cells.deviation_mm, cells.share, tolerance_mm)
 
 
 def _chance(

@@ -23,6 +23,8 @@ GRADUATION = 1.4  # the loss is narrowed by this factor a step (Yang et al. 2020
 STEPS_PER_WIDTH = 3
 FINAL_STEPS = 60
 SCALE_STEPS = 30
+FINALISTS = 3  # descents that are followed to their end
+NARROW = 4.0  # data without any noise are judged by a quarter of what a part is allowed
 CONVERGED = 1e-6  # of a prior's standard deviation
 
 
@@ -51,17 +53,21 @@ class Problem:
         """Observed minus modelled."""
         return self.observed_mm - self.design @ unknown
 
-    def sigma_mm(self, unknown: Float[np.ndarray, " p"]) -> float:
-        """Noise of one observation, by those that the loss would count, and a sound part's form."""
+    def noise_mm(self, unknown: Float[np.ndarray, " p"]) -> float:
+        """Standard deviation of one observation, by those that the loss would count."""
         off = np.abs(self.residual_mm(unknown))
-        sigma_mm = np.inf
+        noise_mm = np.inf
         for _ in range(SCALE_STEPS):
-            near = off <= BIWEIGHT_EFFICIENT * sigma_mm
+            near = off <= self.width_mm(noise_mm)
+            before_mm = noise_mm
             noise_mm = MAD_TO_SIGMA * weighted_median(off[near], self.share[near])
-            before_mm, sigma_mm = sigma_mm, np.hypot(noise_mm, self.allowed_mm / BIWEIGHT_EFFICIENT)
-            if sigma_mm == before_mm:
+            if noise_mm == before_mm:
                 break
-        return float(sigma_mm)
+        return float(noise_mm)
+
+    def width_mm(self, noise_mm: float) -> float:
+        """From where on an observation has no say: beyond the noise and what a part may have."""
+        return float(np.hypot(BIWEIGHT_EFFICIENT * noise_mm, self.allowed_mm))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,15 +81,12 @@ class Solution:
     weight
         (n,) what the loss leaves of each observation, 0 to 1.
     sigma_mm
-        Standard deviation of one observation.
-    cost
-        Robust cost with the priors'; half of it is minus the logarithm of a likelihood.
+        Standard deviation of one observation, with what a sound part is allowed.
     """
 
     unknown: Float[np.ndarray, " p"]
     weight: Float[np.ndarray, " n"]
     sigma_mm: float
-    cost: float
 
 
 def weighted_median(value: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> float:
@@ -94,39 +97,66 @@ def weighted_median(value: Float[np.ndarray, " n"], weight: Float[np.ndarray, " 
 
 
 def solve(problem: Problem, starts: tuple[Float[np.ndarray, " p"], ...] = ()) -> Solution:
-    """Return the best of a graduated descent and of descents from `starts` and from zero."""
+    """Return the best of descents from a graduated answer, from zero and from `starts`.
+
+    The best is judged by the noise alone, without what a sound part is allowed: that most lies
+    close together says more than that all lies within the tolerance.
+    """
     zero = np.zeros(problem.design.shape[1])
-    found = [_graduated(problem), *starts, zero]
-    sigma_mm = min(problem.sigma_mm(unknown) for unknown in found)
-    return min((_descend(problem, at, sigma_mm) for at in found), key=lambda s: s.cost)
+    at = [_graduated(problem), zero, *starts]
+    noise_mm = min(problem.noise_mm(unknown) for unknown in at)
+    width_mm = problem.width_mm(noise_mm)
+    narrow_mm = max(BIWEIGHT_EFFICIENT * noise_mm, problem.allowed_mm / NARROW)
+    at = [_descend(problem, unknown, width_mm, STEPS_PER_WIDTH) for unknown in at]
+    at.sort(key=lambda unknown: _cost(problem, unknown, narrow_mm))
+    at = [_descend(problem, unknown, width_mm, FINAL_STEPS) for unknown in at[:FINALISTS]]
+    best = min(at, key=lambda unknown: _cost(problem, unknown, narrow_mm))
+    weight = biweight(problem.residual_mm(best), width_mm)
+    return Solution(best, weight, width_mm / BIWEIGHT_EFFICIENT)
+
+
+def starts_by_block(
+    problem: Problem, block: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " p"], ...]:
+    """Answers of plain least squares that leave out a half, a quarter or an eighth of the blocks.
+
+    Blocks are numbered by halving, so that those of one part of the surface share their first
+    digits: one that leaves out a region of defects starts beside the truth.
+    """
+    sigma_mm = problem.width_mm(0.0) / BIWEIGHT_EFFICIENT
+    parts = int(block.max()) + 1
+    out = [
+        block * count // parts == k for count in (2, 4, 8) if count < parts for k in range(count)
+    ]
+    return tuple(_step(problem, (~left).astype(float), sigma_mm) for left in out)
 
 
 def _graduated(problem: Problem) -> Float[np.ndarray, " p"]:
     unknown = np.zeros(problem.design.shape[1])
     width_mm = 2.0 * float(np.abs(problem.observed_mm).max())
-    sigma_mm = problem.sigma_mm(unknown)
-    while width_mm > BIWEIGHT_EFFICIENT * sigma_mm:
-        for _ in range(STEPS_PER_WIDTH):
-            weight = biweight(problem.residual_mm(unknown), width_mm)
-            unknown = _step(problem, weight, sigma_mm)
+    final_mm = problem.width_mm(problem.noise_mm(unknown))
+    while width_mm > final_mm:
+        unknown = _descend(problem, unknown, width_mm, STEPS_PER_WIDTH)
         width_mm /= GRADUATION
-        sigma_mm = problem.sigma_mm(unknown)
+        final_mm = problem.width_mm(problem.noise_mm(unknown))
     return unknown
 
 
-def _descend(problem: Problem, unknown: Float[np.ndarray, " p"], sigma_mm: float) -> Solution:
-    width_mm = BIWEIGHT_EFFICIENT * sigma_mm
-    for _ in range(FINAL_STEPS):
+def _descend(
+    problem: Problem, unknown: Float[np.ndarray, " p"], width_mm: float, steps: int
+) -> Float[np.ndarray, " p"]:
+    for _ in range(steps):
         weight = biweight(problem.residual_mm(unknown), width_mm)
-        before, unknown = unknown, _step(problem, weight, sigma_mm)
+        before, unknown = unknown, _step(problem, weight, width_mm / BIWEIGHT_EFFICIENT)
         if np.abs(unknown - before).max() < CONVERGED:
             break
-    residual_mm = problem.residual_mm(unknown)
-    weight = biweight(residual_mm, width_mm)
-    inside = np.minimum((residual_mm / width_mm) ** 2, 1.0)
+    return unknown
+
+
+def _cost(problem: Problem, unknown: Float[np.ndarray, " p"], width_mm: float) -> float:
+    inside = np.minimum((problem.residual_mm(unknown) / width_mm) ** 2, 1.0)
     loss = BIWEIGHT_EFFICIENT**2 / 3 * (1 - (1 - inside) ** 3)  # (r / sigma)² near zero
-    cost = float(problem.share @ loss + unknown @ unknown)
-    return Solution(unknown, weight, sigma_mm, cost)
+    return float(problem.share @ loss + unknown @ unknown)
 
 
 def biweight(residual_mm: Float[np.ndarray, " n"], width_mm: float) -> Float[np.ndarray, " n"]:

@@ -184,6 +184,14 @@ def thick_top(p: np.ndarray) -> np.ndarray:
     return 0.6 * ((p[:, 2] > 23.9) & (p[:, 1] > 0))
 
 
+def test_a_worn_end_of_a_bowed_plate_is_no_bow() -> None:
+    seen = Seen(PLATE, bowed(0.6, 150.0), up=True)
+    gone_mm = -1.0 * (seen.place_mm[:, 0] > 30)
+    seen.deviation_mm = seen.deviation_mm + gone_mm
+    assert (gone_mm < 0).mean() == pytest.approx(0.3, abs=0.02)
+    assert np.abs(seen.left_mm(seen.fit())).max() < 0.08  # a bow and a tilt would hide 0.75 mm
+
+
 @pytest.mark.parametrize("defect", [dent, corner, worn_top, thick_top])
 @pytest.mark.parametrize("ratio", [0.0, -0.007])
 def test_defects_keep_their_depth(defect: Move, ratio: float) -> None:
