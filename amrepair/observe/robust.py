@@ -56,14 +56,16 @@ class Problem:
     def noise_mm(self, unknown: Float[np.ndarray, " p"]) -> float:
         """Standard deviation of one observation, by those that the loss would count."""
         off = np.abs(self.residual_mm(unknown))
+        order = np.argsort(off, kind="stable")
+        off, reached = off[order], np.cumsum(self.share[order])
         noise_mm = np.inf
         for _ in range(SCALE_STEPS):
-            near = off <= self.width_mm(noise_mm)
-            before_mm = noise_mm
-            noise_mm = MAD_TO_SIGMA * weighted_median(off[near], self.share[near])
+            last = np.searchsorted(off, self.width_mm(noise_mm), side="right") - 1
+            middle = off[np.searchsorted(reached, reached[max(int(last), 0)] / 2)]
+            before_mm, noise_mm = noise_mm, MAD_TO_SIGMA * float(middle)
             if noise_mm == before_mm:
                 break
-        return float(noise_mm)
+        return noise_mm
 
     def width_mm(self, noise_mm: float) -> float:
         """From where on an observation has no say: beyond the noise and what a part may have."""
@@ -87,13 +89,6 @@ class Solution:
     unknown: Float[np.ndarray, " p"]
     weight: Float[np.ndarray, " n"]
     sigma_mm: float
-
-
-def weighted_median(value: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> float:
-    """The value with half of the weight on either side."""
-    order = np.argsort(value, kind="stable")
-    reached = np.cumsum(weight[order])
-    return float(value[order[np.searchsorted(reached, reached[-1] / 2)]])
 
 
 def solve(problem: Problem, starts: tuple[Float[np.ndarray, " p"], ...] = ()) -> Solution:

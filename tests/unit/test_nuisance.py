@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import analytic
 import numpy as np
@@ -334,3 +337,28 @@ def test_what_cannot_be_used_is_said(change: dict[str, object], said: str) -> No
 def test_a_prior_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="scale_sigma_ratio is 0"):
         NuisanceOptions(scale_sigma_ratio=0.0)
+
+
+def test_a_real_plate_is_told_to_be_bent_and_what_stands_on_it_keeps_its_height(
+    data_dir: Path,
+) -> None:
+    if not (data_dir / "real" / "plate" / "plate.xyz").is_file():
+        pytest.skip("the scan of the plate is not among the data")
+    source = Path(__file__).parents[2] / "benchmarks" / "plate_case.py"
+    spec = importlib.util.spec_from_file_location("plate_case", source)
+    assert spec is not None
+    assert spec.loader is not None
+    plate_case = importlib.util.module_from_spec(spec)
+    sys.modules["plate_case"] = plate_case
+    spec.loader.exec_module(plate_case)
+    said = plate_case.case(data_dir, [0.3])
+    assert "metres" in said["unit"]
+    found = said["tolerance 0.3 mm"]
+    assert 0.2 < found["nuisance"]["flatness_mm"] < 0.32
+    assert any("It is bent by 0.2" in told for told in found["nuisance"]["told"])
+    middle = {name: found[name]["local_medians_mm"]["50 %"] for name in ("before", "after")}
+    assert middle["after"] < middle["before"] / 2
+    (sink,) = found["after"]["regions_on_bare_plate"]  # it is there: 0.5 mm deep round a pit
+    assert sink["deviation_mm"] == pytest.approx(-0.55, abs=0.1)
+    height_mm = found["height_above_the_plate_beside_it_mm"]
+    assert height_mm["after"] == pytest.approx(height_mm["before"], abs=0.1)
