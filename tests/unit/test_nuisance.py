@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from amrepair.errors import InputError
 from amrepair.observe import Nuisance, NuisanceOptions, fit_nuisance
+from amrepair.observe.cells import gather, independent_share
 
 SPACING_MM = 1.0
 CORRELATION_MM = 2.0
@@ -362,3 +363,33 @@ def test_a_real_plate_is_told_to_be_bent_and_what_stands_on_it_keeps_its_height(
     assert sink["deviation_mm"] == pytest.approx(-0.55, abs=0.1)
     height_mm = found["height_above_the_plate_beside_it_mm"]
     assert height_mm["after"] == pytest.approx(height_mm["before"], abs=0.1)
+
+
+@pytest.mark.parametrize(("weight", "said"), [((1, 1), 1.5), ((1, 3), 2.0), ((3, 1), 1.0)])
+def test_a_cell_says_the_middle_of_its_sites(weight: tuple[int, int], said: float) -> None:
+    """The lower of two made every part 0.02 mm smaller than it was."""
+    place_mm = np.array([[0.1, 0.1, 0.0], [0.2, 0.1, 0.0], [5.1, 0.1, 0.0], [5.2, 0.1, 0.0]])
+    cells = gather(
+        place_mm,
+        np.tile([0.0, 0.0, 1.0], (4, 1)),
+        np.array([2.0, 1.0, 12.0, 11.0]),
+        np.array([*weight[::-1], *weight[::-1]], float),
+        np.zeros(4, np.int64),
+        side_mm=1.0,
+        correlation_mm=0.0,
+    )
+    assert cells.deviation_mm == pytest.approx([said, 10 + said])
+    assert cells.share == pytest.approx([1.0, 1.0])
+
+
+def test_a_crowd_counts_for_its_area_and_not_for_its_number() -> None:
+    rng = np.random.default_rng(5)
+    place_mm = np.column_stack([rng.uniform(0, 100, (6_000, 2)), np.zeros(6_000)])
+    view = np.zeros(6_000, np.int64)
+    dense = independent_share(place_mm, view, 2.0).sum()
+    thin = independent_share(place_mm[:3_000], view[:3_000], 2.0).sum()
+    expected = 100**2 / (2 * np.pi * 2.0**2)  # the integral of exp(−r/L) over the plane is 2πL²
+    assert dense == pytest.approx(expected, rel=0.35)  # cut off at 3 L, and at the edges
+    assert dense / thin < 1.1
+    two = independent_share(np.r_[place_mm, place_mm], np.repeat([0, 1], 6_000), 2.0)
+    assert two.sum() == pytest.approx(2 * dense)  # another view's errors are its own
