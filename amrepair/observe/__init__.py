@@ -1,4 +1,11 @@
-"""Observe: from an aligned scan to what it says of the part: deviations, rays, what is background.
+"""Observe: from a placed scan to deviations and rays, and what of them is the whole part's.
 
-It measures along rays and normals; it sums nothing up and judges nothing.
+It says nothing about defects. It measures along rays and normals and tells background from part;
+residual pose, scale, bow and offsets between views are fitted, told and taken out here. What is
+left is for the rooms above to judge.
 """
+
+from amrepair.observe.basis import NuisanceOptions
+from amrepair.observe.nuisance import Nuisance, fit_nuisance
+
+__all__ = ["Nuisance", "NuisanceOptions", "fit_nuisance"]

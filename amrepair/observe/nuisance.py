@@ -1,0 +1,359 @@
+"""What of a scan's deviations belongs to the whole part or to a whole view, and is no defect.
+
+Residual pose, scale, bow and the views' offsets are fitted together, each with its prior, so
+robustly that defects do not pull them. What the observations do not support stays zero; what
+exceeds its prior is told in a sentence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.stats import f as f_distribution
+
+from amrepair.errors import InputError
+from amrepair.observe.basis import (
+    BOW_AT,
+    SCALE_AT,
+    VIEWS_AT,
+    Frame,
+    NuisanceOptions,
+    priors,
+    shape_columns,
+)
+from amrepair.observe.cells import Cells, blocks, gather
+from amrepair.observe.robust import Problem, Solution, covariance, solve, starts_by_block
+
+CELLS_ACROSS = 48  # a nuisance is smooth: cells finer than this say nothing more about it
+STATIONS = np.linspace(-1, 1, 21)  # from end to end of an axis
+NORMAL = NuisanceOptions()
+BESIDE_RATIO = 0.1  # a bow along one axis alone is told with that axis's length
+
+
+@dataclass(frozen=True, slots=True)
+class Nuisance:
+    """Residual pose, scale, bow and view offsets of one scan, in the template's frame.
+
+    Attributes
+    ----------
+    frame
+        What rotation, scale and bow are about: centre, principal axes, half extents.
+    twist
+        (6,) translation in mm and small rotation in rad about the centre.
+    scale_ratio
+        Size over nominal size, minus one: −0.007 is a part 0.7 % small.
+    bow_mm
+        (4,) the sag, middle against ends, of the first axis towards the second, of the first
+        towards the third, of the second towards the third; and how far corners leave the plane
+        of the first two axes by twisting.
+    view_offset_mm
+        (v,) how far outside each view says the surface is; empty where views are not told.
+    covariance
+        (11 + v, 11 + v) of twist, scale, bow and offsets, by noise and by what changes where an
+        eighth of the surface is left out. Zero for a term that stayed zero.
+    sigma_mm
+        Standard deviation of one cell's deviation, with what a sound part is allowed.
+    supported
+        The terms that the observations asked for: of scale, bow, views, common.
+    used_ratio
+        Share of the observations that the fit believed; the rest is defects and outliers.
+    independent
+        How many independent observations there were.
+    options
+        The priors.
+    """
+
+    frame: Frame
+    twist: Float[np.ndarray, " 6"]
+    scale_ratio: float
+    bow_mm: Float[np.ndarray, " 4"]
+    view_offset_mm: Float[np.ndarray, " v"]
+    covariance: Float[np.ndarray, "p p"]
+    sigma_mm: float
+    supported: tuple[str, ...]
+    used_ratio: float
+    independent: float
+    options: NuisanceOptions
+
+    def removed_mm(
+        self,
+        place_mm: Float[np.ndarray, "s 3"],
+        normal: Float[np.ndarray, "s 3"],
+        view: Int[np.ndarray, " s"] | None = None,
+    ) -> Float[np.ndarray, " s"]:
+        """Return the part of the deviation that is nuisance, to be subtracted.
+
+        Parameters
+        ----------
+        place_mm, normal
+            (s, 3) in the template's frame.
+        view
+            (s,) which view saw it; None takes what the views have in common.
+        """
+        shape = shape_columns(place_mm, normal, self.frame)
+        removed_mm = shape @ np.r_[self.twist, self.scale_ratio, self.bow_mm]
+        if len(self.view_offset_mm):
+            known = self.view_offset_mm.mean() if view is None else self.view_offset_mm[view]
+            removed_mm = removed_mm + known
+        return np.asarray(removed_mm)
+
+    def told(self) -> tuple[str, ...]:
+        """Say in plain sentences what exceeds its prior; views count from 1."""
+        return (*self._told_pose(), *self._told_scale(), *self._told_bow(), *self._told_views())
+
+    def _told_pose(self) -> list[str]:
+        moved_mm, turned = np.linalg.norm(self.twist[:3]), np.linalg.norm(self.twist[3:])
+        far = moved_mm > self.options.told_sigma * self.options.pose_translation_sigma_mm
+        if far or turned > self.options.told_sigma * self.options.pose_rotation_sigma_rad:
+            degrees = np.degrees(turned)
+            return [f"It lies {moved_mm:.2f} mm and {degrees:.2f}° from where it was laid."]
+        return []
+
+    def _told_scale(self) -> list[str]:
+        prior = self.options.scale_sigma_ratio
+        if abs(self.scale_ratio) <= self.options.told_sigma * prior:
+            return []
+        word = "small" if self.scale_ratio < 0 else "large"
+        percent = 100 * abs(self.scale_ratio)
+        return [f"The part is {percent:.1f} % {word} (prior {100 * prior:.1f} %)."]
+
+    def _told_bow(self) -> list[str]:
+        prior_mm = self.options.bow_sigma_mm
+        length = [f"{2 * half_mm:.0f}" for half_mm in self.frame.half_extent_mm]
+        sags = np.abs(self.bow_mm[1:3])
+        flatness_mm = self.flatness_mm
+        alone = flatness_mm < (1 + BESIDE_RATIO) * sags.max()
+        over = length[int(np.argmax(sags))] if alone else f"{length[0]} × {length[1]}"
+        told = []
+        for bow_mm, where in ((flatness_mm, over), (abs(self.bow_mm[0]), length[0])):
+            if bow_mm > self.options.told_sigma * prior_mm:
+                told.append(f"It is bent by {bow_mm:.2f} mm over {where} mm (prior {prior_mm} mm).")
+        return told
+
+    @property
+    def centre_mm(self) -> Float[np.ndarray, " 3"]:
+        """What rotation, scale and bow are about."""
+        return self.frame.centre_mm
+
+    @property
+    def flatness_mm(self) -> float:
+        """How far apart two planes are that hold the bow of the first two axes between them."""
+        u, v = np.meshgrid(STATIONS, STATIONS)
+        along_mm = self.bow_mm[1] * u**2 + self.bow_mm[2] * v**2 + self.bow_mm[3] * u * v
+        return float(np.ptp(along_mm))
+
+    def _told_views(self) -> list[str]:
+        offset = self.view_offset_mm
+        limit_mm = self.options.told_sigma * self.options.view_offset_sigma_mm
+        told = []
+        common_limit_mm = self.options.told_sigma * self.options.common_offset_sigma_mm
+        if len(offset) and abs(offset.mean()) > common_limit_mm:
+            side = "outside" if offset.mean() > 0 else "inside"
+            whole = "All views lie" if len(offset) > 1 else "The view lies"
+            told.append(f"{whole} {abs(offset.mean()):.2f} mm {side} the template.")
+        if len(offset) == 2 and abs(offset[1] - offset[0]) > limit_mm:
+            side = "outside" if offset[1] > offset[0] else "inside"
+            told.append(f"View 2 lies {abs(offset[1] - offset[0]):.2f} mm {side} view 1.")
+        for k in range(len(offset) if len(offset) > 2 else 0):
+            off_mm = float(offset[k] - np.median(np.delete(offset, k)))
+            if abs(off_mm) > limit_mm:
+                side = "outside" if off_mm > 0 else "inside"
+                told.append(f"View {k + 1} lies {abs(off_mm):.2f} mm {side} the others.")
+        return told
+
+    def to_json(self) -> dict[str, object]:
+        """Return plain numbers, with the standard errors and what is told."""
+        error = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return {
+            "told": list(self.told()),
+            "scale_ratio": self.scale_ratio,
+            "scale_error_ratio": float(error[SCALE_AT]),
+            "flatness_mm": self.flatness_mm,
+            "bow_mm": self.bow_mm.tolist(),
+            "bow_error_mm": error[BOW_AT:VIEWS_AT].tolist(),
+            "extent_mm": (2 * self.frame.half_extent_mm).tolist(),
+            "axes": self.frame.axes.tolist(),
+            "view_offset_mm": self.view_offset_mm.tolist(),
+            "view_offset_error_mm": error[VIEWS_AT:].tolist(),
+            "translation_mm": self.twist[:3].tolist(),
+            "rotation_rad": self.twist[3:].tolist(),
+            "pose_error": error[:SCALE_AT].tolist(),
+            "centre_mm": self.centre_mm.tolist(),
+            "sigma_mm": self.sigma_mm,
+            "supported": list(self.supported),
+            "used_ratio": self.used_ratio,
+            "independent": self.independent,
+        }
+
+
+def fit_nuisance(
+    place_mm: Float[np.ndarray, "s 3"],
+    normal: Float[np.ndarray, "s 3"],
+    deviation_mm: Float[np.ndarray, " s"],
+    weight: Float[np.ndarray, " s"],
+    *,
+    view: Int[np.ndarray, " s"] | None = None,
+    tolerance_mm: float,
+    correlation_mm: float,
+    options: NuisanceOptions = NORMAL,
+) -> Nuisance:
+    """Fit what is common to the whole part or to a whole view.
+
+    Parameters
+    ----------
+    place_mm
+        (s, 3) where the surface was expected or seen, template frame.
+    normal
+        (s, 3) the template's unit normals there.
+    deviation_mm
+        (s,) signed, positive outside.
+    weight
+        (s,) how much each site is worth beside the others; sites of weight zero are left out.
+    view
+        (s,) which view saw the site, from 0; None: offsets of views are not asked for.
+    tolerance_mm
+        What a sound part may deviate by: larger deviations soon lose their say.
+    correlation_mm
+        Distance over which the errors' correlation falls to 1/e; 0 where they are independent.
+    options
+        The priors.
+
+    Returns
+    -------
+    Nuisance
+        With every term zero where there are no sites.
+
+    Raises
+    ------
+    InputError
+        If the arrays do not belong together or a number cannot be used.
+    """
+    _refuse(place_mm, normal, deviation_mm, weight, view, tolerance_mm, correlation_mm)
+    views = 0 if view is None else int(view.max(initial=-1)) + 1
+    used = weight > 0
+    if not used.any():
+        return _nothing(views, options)
+    side_mm = max(correlation_mm, float(np.ptp(place_mm[used], axis=0).max()) / CELLS_ACROSS, 1e-9)
+    cells = gather(
+        place_mm[used],
+        normal[used],
+        deviation_mm[used],
+        weight[used],
+        np.zeros(int(used.sum()), np.int64) if view is None else view[used],
+        side_mm=side_mm,
+        correlation_mm=correlation_mm,
+    )
+    frame = Frame.of(cells.place_mm)
+    shape = shape_columns(cells.place_mm, cells.normal, frame)
+    columns = np.column_stack([shape, cells.view[:, None] == np.arange(views)]).astype(float)
+    physical, terms = priors(frame.half_extent_mm, views, options)
+    solution, kept, spread = _supported(columns @ physical, terms, cells, tolerance_mm, options)
+    on = physical[:, kept]
+    value, cov = on @ solution.unknown, on @ spread @ on.T
+    return Nuisance(
+        frame,
+        twist=_fixed(value[:SCALE_AT]),
+        scale_ratio=float(value[SCALE_AT]),
+        bow_mm=_fixed(value[BOW_AT:VIEWS_AT]),
+        view_offset_mm=_fixed(value[VIEWS_AT:]),
+        covariance=_fixed(cov),
+        sigma_mm=solution.sigma_mm,
+        supported=tuple(name for name, at in terms.items() if name != "pose" and kept[at].all()),
+        used_ratio=float(cells.share @ solution.weight / cells.share.sum()),
+        independent=float(cells.share.sum()),
+        options=options,
+    )
+
+
+def _supported(
+    design: Float[np.ndarray, "n q"],
+    terms: dict[str, Int[np.ndarray, " ..."]],
+    cells: Cells,
+    tolerance_mm: float,
+    options: NuisanceOptions,
+) -> tuple[Solution, np.ndarray, Float[np.ndarray, "k k"]]:
+    """Fit all terms, then leave out the one with the least evidence as long as it is too little.
+
+    One at a time: of two terms that do the same, one goes and the other takes all.
+    """
+    kept = np.ones(design.shape[1], bool)
+    block = blocks(cells.place_mm)
+    spare = max(int(block.max()), 1)  # degrees of freedom that leaving out blocks has
+    problem = Problem(design, cells.deviation_mm, cells.share, tolerance_mm)
+    starts = starts_by_block(problem, block)
+    while True:
+        solution = solve(problem, starts)
+        spread = covariance(problem, solution, block)
+        place = np.cumsum(kept) - 1
+        chance = {
+            name: _chance(solution.unknown[place[at]], spread, place[at], spare)
+            for name, at in terms.items()
+            if name != "pose" and kept[at].all()
+        }
+        weakest = max(chance, key=chance.__getitem__, default="")
+        if not weakest or chance[weakest] < options.support_p:
+            return solution, kept, spread
+        stay = np.delete(np.arange(int(kept.sum())), place[terms[weakest]])
+        starts = (solution.unknown[stay],)
+        kept[terms[weakest]] = False
+        problem = Problem(design[:, kept], cells.deviation_mm, cells.share, tolerance_mm)
+
+
+def _chance(
+    value: Float[np.ndarray, " k"],
+    spread: Float[np.ndarray, "q q"],
+    at: Int[np.ndarray, " k"],
+    spare: int,
+) -> float:
+    """How probable so large a value is where the truth is zero (Hotelling's test)."""
+    within = spread[np.ix_(at, at)]
+    size = float(value @ np.linalg.solve(within, value)) / len(value)
+    return float(f_distribution.sf(size, len(value), spare))
+
+
+def _fixed(array: np.ndarray) -> np.ndarray:
+    array = np.array(array, float)
+    array.setflags(write=False)
+    return array
+
+
+def _nothing(views: int, options: NuisanceOptions) -> Nuisance:
+    return Nuisance(
+        Frame(_fixed(np.zeros(3)), _fixed(np.eye(3)), _fixed(np.zeros(3))),
+        twist=_fixed(np.zeros(6)),
+        scale_ratio=0.0,
+        bow_mm=_fixed(np.zeros(4)),
+        view_offset_mm=_fixed(np.zeros(views)),
+        covariance=_fixed(np.zeros((VIEWS_AT + views,) * 2)),
+        sigma_mm=0.0,
+        supported=(),
+        used_ratio=0.0,
+        independent=0.0,
+        options=options,
+    )
+
+
+def _refuse(
+    place_mm: np.ndarray,
+    normal: np.ndarray,
+    deviation_mm: np.ndarray,
+    weight: np.ndarray,
+    view: np.ndarray | None,
+    tolerance_mm: float,
+    correlation_mm: float,
+) -> None:
+    for name, array in (("place", place_mm), ("normal", normal), ("deviation", deviation_mm),
+                        ("weight", weight)):  # fmt: skip
+        bad = int(np.size(array) - np.isfinite(array).sum())
+        if bad:
+            raise InputError(f"{bad} numbers of the {name}s are not finite; leave those sites out")
+    if len(weight) and weight.min() < 0:
+        raise InputError(f"a weight is {weight.min():.3g}; weights must not be negative")
+    if view is not None and len(view) and view.min() < 0:
+        raise InputError(f"a view is numbered {view.min()}; views count from 0")
+    if not (np.isfinite(tolerance_mm) and tolerance_mm > 0):
+        raise InputError(f"the tolerance is {tolerance_mm} mm; it must be above zero")
+    if not (np.isfinite(correlation_mm) and correlation_mm >= 0):
+        raise InputError(f"the correlation length is {correlation_mm} mm; it must not be negative")
