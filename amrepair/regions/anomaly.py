@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.field.as_built import Evidence
+from amrepair.observe.nuisance import Nuisance
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
 
@@ -102,8 +103,9 @@ class AnomalyMap:
         What the labels rest on, for the deficit, and (s,) how far out of the template each surfel
         may be, by what normal parts differ and the process was told; None for a map read back
         from a file.
-    noise, options
-        What the scan told of its errors, and what the test was set to.
+    noise, nuisance, options
+        What the scan told of its errors, what belongs to the whole part (None where a calibration
+        stood in), and what the test was set to.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -122,4 +124,5 @@ class AnomalyMap:
     top_z_mm: float | None = None
     top_threshold_mm: float = np.inf
     noise: Noise | None = None
+    nuisance: Nuisance | None = None
     options: RegionOptions | None = None

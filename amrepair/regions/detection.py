@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,6 +22,7 @@ from amrepair.observe.background import (
     background,
     refuse_wrong_scale,
 )
+from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import RangeImage, clearances, range_images
 from amrepair.regions.anomaly import AnomalyMap, Label
 from amrepair.regions.calibration import Calibration
@@ -133,6 +134,10 @@ def detect(
     crossed, depth_mm = _crossed(surface_mm, surfels, seen)
     sites = _sites(surfels, template, surface_mm[crossed], normals[crossed], depth_mm)
     sites = _with_tolerance(sites, surfels, template, options, top_z_mm, rounded_up)
+    nuisance = None
+    if calibration is None:
+        nuisance, removed_mm = _nuisance(sites, surfels, scan, options)
+        sites = replace(sites, value_mm=sites.value_mm - removed_mm)
     noise, levels = _tested(sites, surfels, scan, options, calibration)
     strands = _strands(surfels, template, levels, options)
     labels, log_p = grown(levels, sites.tolerance_mm, options, strands=strands)
@@ -172,6 +177,7 @@ def detect(
         surfel_label=surfel_label,
         surfel_higher_mm=np.maximum(allowed_mm[: len(surfels)], 0.0),
         noise=noise,
+        nuisance=nuisance,
         options=options,
     )
 
@@ -249,7 +255,34 @@ def _with_tolerance(
         tolerance_mm += TOLERATED_SPREADS * spread(sites.place_mm)
     if rounded_up is not None:
         tolerance_mm[1] += rounded_up(sites.place_mm, sites.value_mm)
-    return Sites(sites.place_mm, sites.normal, sites.value_mm, sites.weight, tolerance_mm)
+    return replace(sites, tolerance_mm=tolerance_mm)
+
+
+def _nuisance(
+    sites: Sites, surfels: Surfels, scan: Scan, options: RegionOptions
+) -> tuple[Nuisance, Float[np.ndarray, " b"]]:
+    """What belongs to the whole part or to whole views, and (b,) how much of each site it is."""
+    n = len(surfels)
+    several = scan.sensor_index is not None and int(scan.sensor_index.max()) > 0
+    if several:
+        assert scan.sensor_index is not None
+        cell, view, value_mm, count = surfels.by_view(scan.sensor_index)
+    else:
+        cell, view = np.arange(n), None
+        value_mm, count = sites.value_mm[:n], surfels.count
+    found = fit_nuisance(
+        sites.place_mm[cell],
+        sites.normal[cell],
+        value_mm,
+        count.astype(np.float64),
+        view=view,
+        tolerance_mm=float(np.median(sites.tolerance_mm)),
+        correlation_mm=options.correlation_mm,
+    )
+    share_mm = found.removed_mm(sites.place_mm[cell], sites.normal[cell], view)
+    removed_mm = np.zeros(len(sites.value_mm))
+    removed_mm[:n] = np.bincount(cell, count * share_mm, n) / np.bincount(cell, count, n)
+    return found, removed_mm
 
 
 def _tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:

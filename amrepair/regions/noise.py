@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from amrepair.field.fused import Surfels
 from amrepair.field.scales import Scale
@@ -107,14 +106,8 @@ def _between_views(surfels: Surfels, scan: Scan) -> float | None:
     """Standard deviation between views' means of one cell, of the cells that several saw."""
     if scan.sensor_index is None or int(scan.sensor_index.max()) == 0:
         return None
-    cell, f_mm = surfels.of_point, surfels.point_deviation_mm
-    has = cell >= 0
-    views = int(scan.sensor_index.max()) + 1
-    key = cell[has] * views + scan.sensor_index[has]
-    keys, index = np.unique(key, return_inverse=True)
-    mean = np.bincount(index, f_mm[has]) / np.bincount(index)
-    of_cell: Float[np.ndarray, " k"] = keys // views
-    beside = np.flatnonzero(of_cell[1:] == of_cell[:-1])
+    cell, _, mean, _ = surfels.by_view(scan.sensor_index)
+    beside = np.flatnonzero(cell[1:] == cell[:-1])
     if not len(beside):
         return None
     apart = np.abs(mean[beside + 1] - mean[beside])

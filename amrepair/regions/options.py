@@ -33,6 +33,8 @@ class RegionOptions:
     widest_mm
         Windows of local means reach up to this width: correlated errors of desktop and laser
         scanners hang together over 2 to 10 mm, so that wider means gain nothing.
+    correlation_mm
+        Errors hang together over about so far, where what belongs to the whole part is fitted.
     far_mm
         Windows between half of this and this far apart tell by how much errors wander: twice the
         length over which they hang together.
@@ -66,6 +68,7 @@ class RegionOptions:
     registration_sigma_mm: float = 0.03
     process_sigma_mm: float = 0.0
     widest_mm: float = 10.0
+    correlation_mm: float = 2.5
     far_mm: float = 20.0
     tail_from: float = 1.0
     grow_share: float = 0.5
