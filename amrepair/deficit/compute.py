@@ -250,12 +250,20 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
     for region in anomaly.regions:
         own = [piece for piece in left if touch(region, piece)]
         left = [piece for piece in left if not touch(region, piece)]
-        boxes = np.array([piece.box_mm for piece in own] or [region.box_mm])
-        whole = (
-            replace(own[0], volume_mm3=sum(piece.volume_mm3 for piece in own)) if own else region
+        if not own:
+            found.append(region)
+            continue
+        boxes = np.array([piece.box_mm for piece in own])
+        found.append(
+            replace(
+                own[0],
+                volume_mm3=sum(piece.volume_mm3 for piece in own),
+                area_mm2=sum(piece.area_mm2 for piece in own),
+                box_mm=np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]),
+                depth_mm=region.depth_mm,
+                p_value=region.p_value,
+            )
         )
-        box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
-        found.append(replace(whole, box_mm=box, depth_mm=region.depth_mm, p_value=region.p_value))
     return tuple(sorted(found + left, key=lambda r: -r.volume_mm3))
 
 

@@ -51,8 +51,8 @@ class Sites:
     Attributes
     ----------
     place_mm, normal, value_mm, weight
-        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are on the
-        template's surface.
+        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are drawn to
+        the template's surface by up to half a cell.
     tolerance_mm
         (2, b) δ for missing and for excess.
     """
@@ -135,14 +135,15 @@ def detect(
     sites = _sites(surfels, template, surface_mm[crossed], normals[crossed], depth_mm)
     sites = _with_tolerance(sites, surfels, template, options, top_z_mm, rounded_up)
     nuisance = None
-    if calibration is None:
+    # a layer that lacks as a whole is no pose: how high its top lies the job has said
+    if calibration is None and top_z_mm is None:
         nuisance, removed_mm = _nuisance(sites, surfels, scan, options)
         sites = replace(sites, value_mm=sites.value_mm - removed_mm)
     noise, levels = _tested(sites, surfels, scan, options, calibration)
     strands = _strands(surfels, template, levels, options)
     labels, log_p = grown(levels, sites.tolerance_mm, options, strands=strands)
     missing, excess = labels[:, : len(surfels)]
-    noise_mm = float(np.median(levels[1].critical[0] * levels[1].error_mm))
+    noise_mm = float(np.median(levels[1].quantile * levels[1].error_mm))
     limit_mm, top_mm = (t + noise_mm for t in _tolerances(options, template))
     progress("detect", 2.0, 4.0)
     grow_mm = options.grow_share * float(np.median(sites.tolerance_mm[0]))
@@ -223,8 +224,10 @@ def _sites(
     """Cells and crossed template points, as yet without a tolerance."""
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
     typical = float(np.median(surfels.count))
-    # on the template: cells that noise alone put one above the other are one place
-    feet_mm = surfels.place_mm - surfels.deviation_mm[:, None] * outward
+    # cells that noise alone put one above the other are one place
+    half_mm = 0.5 * surfels.cell_mm
+    aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
+    feet_mm = surfels.place_mm - aside_mm[:, None] * outward
     return Sites(
         place_mm=np.concatenate([feet_mm, crossed_mm]),
         normal=np.concatenate([outward, crossed_normal]),

@@ -21,6 +21,7 @@ from scipy.stats import norm
 
 from amrepair.field import scales_kernels
 from amrepair.field.scales import FACING_COSINE, RANK, Scale
+from amrepair.field.scales_kernels import PAIR_MEDIAN
 from amrepair.regions.calibration import Calibration, Tail
 from amrepair.regions.options import RegionOptions
 
@@ -48,6 +49,8 @@ class Level:
         (2, s) standard errors beyond the tolerance: missing, excess.
     critical
         (2,) from which on they are significant.
+    quantile
+        From which on they would be if errors were normal.
     log_p
         (2, s) natural logarithm of the expected number of false regions as high or higher.
     wander_mm
@@ -62,6 +65,7 @@ class Level:
     common_mm: Float[np.ndarray, " s"]
     z: Float[np.ndarray, "2 s"]
     critical: Float[np.ndarray, " 2"]
+    quantile: float
     log_p: Float[np.ndarray, "2 s"]
     wander_mm: Float[np.ndarray, " c"]
     tails: tuple[Tail, Tail]
@@ -178,16 +182,19 @@ def _by_class(
     value: Float[np.ndarray, " n"],
     classes: int,
     options: RegionOptions,
-    *,
-    share: float = 0.5,
 ) -> Float[np.ndarray, " c"]:
-    """(c,) quantile of a value in each class; never less in one that was seen less densely."""
+    """(c,) median of a value in each class.
+
+    Never less in one that was seen less densely, nor more by a larger factor than it was seen less
+    densely: aslant at an angle θ, both points and depth resolution go with cos θ.
+    """
     found = np.zeros(classes)
     for k in range(classes):
         here = group == k
         if here.sum() >= options.least_cells:
-            found[k] = float(np.quantile(value[here], share))
-    return np.maximum.accumulate(found)
+            found[k] = float(np.median(value[here]))
+    most = found[0] * 2.0 ** (options.density_step * np.arange(classes))
+    return np.maximum.accumulate(np.minimum(found, most))
 
 
 def _wander(
@@ -205,10 +212,8 @@ def _wander(
     alike = (scale.normal[one] * scale.normal[other]).sum(axis=1) > FACING_COSINE
     kept = alike & (apart_mm > 0.5 * options.far_mm)
     one, other = one[kept], other[kept]
-    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / np.sqrt(2.0)
-    sound = 1.0 - options.most_defective
-    off_mm /= norm.ppf(0.5 + 0.5 * sound)
-    return _by_class(np.maximum(group[one], group[other]), off_mm, classes, options, share=sound)
+    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_MEDIAN
+    return _by_class(np.maximum(group[one], group[other]), off_mm, classes, options)
 
 
 def _level(
@@ -233,7 +238,7 @@ def _level(
     # `together` of a window's cells are all as far out: Q^r in any of C(k, r) choices
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
-    quantile = norm.isf(min((share / (n * ways)) ** (1.0 / together), 0.5))
+    quantile = float(norm.isf(min((share / (n * ways)) ** (1.0 / together), 0.5)))
     log_p, critical = np.empty_like(z), np.empty(2)
     peaks = tuple(_peaks(scale, side, options.tail_from) for side in z)
     tails = []
@@ -253,8 +258,8 @@ def _level(
             log_p[side] = np.maximum(log_p[side], fallen)
             critical[side] = max(quantile, tail.start + tail.scale * np.log(count / share))
     return Level(
-        scale, tolerance_mm, error_mm, errors.common_mm, z, critical, log_p, errors.wander_mm,
-        (tails[0], tails[1]), (peaks[0], peaks[1]),
+        scale, tolerance_mm, error_mm, errors.common_mm, z, critical, quantile, log_p,
+        errors.wander_mm, (tails[0], tails[1]), (peaks[0], peaks[1]),
     )  # fmt: skip
 
 
@@ -282,4 +287,6 @@ def _tail(peaks: Float[np.ndarray, " p"], options: RegionOptions) -> Tail:
         if beyond[sound] > beyond[:sound].mean() * np.log(sound / options.false_regions):
             break
         sound += 1
-    return Tail(options.tail_from, float(beyond[:sound].mean()), float(sound))
+    return Tail(
+        options.tail_from, min(float(beyond[:sound].mean()), options.longest_tail), float(sound)
+    )
