@@ -245,11 +245,14 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
             (a.box_mm[0] <= b.box_mm[1]).all() and (b.box_mm[0] <= a.box_mm[1]).all()
         )
 
-    found = []
-    left = list(deficit.regions)
-    for region in anomaly.regions:
-        own = [piece for piece in left if touch(region, piece)]
-        left = [piece for piece in left if not touch(region, piece)]
+    pieces: dict[int, list[Region]] = {k: [] for k in range(-1, len(anomaly.regions))}
+    for piece in deficit.regions:
+        near = [k for k, region in enumerate(anomaly.regions) if touch(region, piece)]
+        off_mm = [np.abs(anomaly.regions[k].box_mm - piece.box_mm).max() for k in near]
+        pieces[near[int(np.argmin(off_mm))] if near else -1].append(piece)
+    found = pieces[-1]
+    for k, region in enumerate(anomaly.regions):
+        own = pieces[k]
         if not own:
             found.append(region)
             continue
@@ -264,7 +267,7 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
                 p_value=region.p_value,
             )
         )
-    return tuple(sorted(found + left, key=lambda r: -r.volume_mm3))
+    return tuple(sorted(found, key=lambda r: -r.volume_mm3))
 
 
 def _roughly_missing(anomaly: AnomalyMap, evidence: Evidence) -> float:
@@ -367,6 +370,11 @@ def _solid_in_box(
         found = np.flatnonzero(core)
         nearest = evidence.surfels.tree.query(samples[found], workers=2)[1]
         core[found[labels[nearest] != int(label)]] = False
+    else:
+        said = [s.place_mm[inside], anomaly.template_points_mm[anomaly.template_label == label]]
+        if gone is not None:
+            said.append(gone.samples_mm())
+        core = _of_a_region(core, box, np.concatenate(said), s.cell_mm)
     grow_mm = GROW_FACTOR * tau_mm + float(box.step_mm.max())
     reach = box.distance_to(core.reshape(box.shape)) - grow_mm
     shaped = clip.reshape(box.shape)
@@ -376,6 +384,25 @@ def _solid_in_box(
             _hangs_free(f.reshape(box.shape) < 0, shaped < 0, field < 0), shaped, field
         )
     return solid_from_field(box, field)
+
+
+def _of_a_region(
+    core: Bool[np.ndarray, " v"],
+    box: VoxelBox,
+    labelled_mm: Float[np.ndarray, "p 3"],
+    reach_mm: float,
+) -> Bool[np.ndarray, " v"]:
+    """(v,) what of the samples hangs together with a place that the test found: noise does not."""
+    high_mm = box.low_mm + box.step_mm * (np.array(box.shape) - 1)
+    near = in_box(labelled_mm, box.low_mm, high_mm)
+    index = np.round((labelled_mm[near] - box.low_mm) / box.step_mm).astype(np.int64)
+    told = np.zeros(box.shape, bool)
+    told[tuple(index.T)] = True
+    shaped = core.reshape(box.shape)
+    groups, count = ndimage.label(shaped, structure=np.ones((3, 3, 3), bool))
+    kept = np.zeros(count + 1, bool)
+    kept[groups[shaped & (box.distance_to(told) <= reach_mm)]] = True
+    return np.asarray(kept[groups].ravel())
 
 
 def _hangs_free(

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
-# Pieces nearer than this are one defect.
-GROUP_MM = 1.2
+# Pieces nearer than this are one defect, and so are cells of a field that touch at a corner.
+GROUP_MM, CELLS_APART = 1.2, 1.8
 # The area of points is counted in cells of this edge; a surface at a random slope fills 2/3 more.
 AREA_CELL_MM, AREA_PER_CELL = 2.0, 1.5
 

@@ -140,7 +140,10 @@ def detect(
         nuisance, removed_mm = _nuisance(sites, surfels, scan, options)
         sites = replace(sites, value_mm=sites.value_mm - removed_mm)
     noise, levels = _tested(sites, surfels, scan, options, calibration)
-    strands = _strands(surfels, template, levels, options)
+    # what errors leave in strips no scan tells by itself
+    strands = np.zeros(len(surfels), bool)
+    if calibration is not None:
+        strands = _strands(surfels, template, levels, options)
     labels, log_p = grown(levels, sites.tolerance_mm, options, strands=strands)
     missing, excess = labels[:, : len(surfels)]
     noise_mm = float(np.median(levels[1].quantile * levels[1].error_mm))

@@ -10,11 +10,9 @@ from amrepair.field.fused import Surfels
 from amrepair.field.scales import Scale
 from amrepair.field.scales_kernels import NORMAL_MEDIAN
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import Level
+from amrepair.regions.significance import OUTLIER_SIGMAS, Level
 from amrepair.scans import Scan
 
-# Errors beyond three standard deviations of their place are the tail: 0.3 % of normal ones.
-TAIL_SIGMAS = 3.0
 # Errors hang together over the distance at which their variogram has reached this share (1 − 1/e).
 SILL_SHARE = 0.632
 
@@ -73,7 +71,9 @@ def noise_of(
     points = max(float(np.median(surfels.count)), 1.0)
     told = len(first) >= options.least_cells
     sigma_mm = per_cell * np.sqrt(points) if told else scan.sigma_mm
-    off = np.abs(first.value_mm - first.median_mm) > TAIL_SIGMAS * np.maximum(first.noise_mm, 1e-9)
+    off = np.abs(first.value_mm - first.median_mm) > OUTLIER_SIGMAS * np.maximum(
+        first.noise_mm, 1e-9
+    )
     return Noise(
         sigma_mm=float(sigma_mm),
         tail_share=float(off.mean()),

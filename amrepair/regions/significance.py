@@ -29,6 +29,8 @@ from amrepair.regions.options import RegionOptions
 MEDIAN_LOSS = float(np.sqrt(np.pi / 2))
 # Coordinates in files are rounded to micrometres; no error is smaller.
 LEAST_SIGMA_MM = 1e-3
+# Of normal noise 0.3 % lies farther out.
+OUTLIER_SIGMAS = 3.0
 # More standard errors than that are certain.
 MOST_ERRORS = 1e3
 
@@ -239,6 +241,11 @@ def _level(
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
     quantile = float(norm.isf(min((share / (n * ways)) ** (1.0 / together), 0.5)))
+    if statistic == 0 and calibration is None:
+        outlying = np.abs(scale.value_mm - scale.median_mm)
+        outliers = outlying > np.maximum(OUTLIER_SIGMAS * error_mm, tolerance_mm[0])
+        if n * comb(usual, RANK) * float(outliers.mean()) ** RANK > share:
+            quantile = np.inf  # so many outlying cells fall together by chance
     log_p, critical = np.empty_like(z), np.empty(2)
     peaks = tuple(_peaks(scale, side, options.tail_from) for side in z)
     tails = []
