@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.stats import norm
 
 from amrepair.errors import InputError
 from amrepair.field.as_built import Evidence, gather, with_stubs
@@ -149,8 +150,15 @@ def detect(
     noise_mm = float(np.median(levels[1].quantile * levels[1].error_mm))
     limit_mm, top_mm = (t + noise_mm for t in _tolerances(options, template))
     progress("detect", 2.0, 4.0)
-    grow_mm = options.grow_share * float(np.median(sites.tolerance_mm[0]))
-    evidence = gather(scan, template, surfels, missing | excess, seen, threshold_mm=grow_mm, up=up)
+    evidence = gather(
+        scan,
+        template,
+        surfels,
+        missing | excess,
+        seen,
+        threshold_mm=_stray_limit_mm(levels[0], options),
+        up=up,
+    )
     gone = np.zeros(len(surface_mm), bool)
     gone[crossed] = labels[0, len(surfels) :]
     surface_label = _label_surface(surface_mm, normals, template, evidence, missing, gone, limit_mm)
@@ -171,7 +179,7 @@ def detect(
         label=np.append(surfel_label, 0)[surfels.of_point],
         template_points_mm=surface_mm,
         template_label=surface_label,
-        threshold_mm=limit_mm,
+        threshold_mm=_stray_limit_mm(levels[0], options),
         threshold_source=_source(options, template, noise),
         object_score=float(np.partition(score[keep], -k)[-k:].mean()),
         regions=regions,
@@ -337,6 +345,18 @@ def _strands(
         systematic_mm=float(np.median(first.tolerance_mm[1] + critical * first.common_mm)),
         noise_mm=critical * per_point_mm,
     )
+
+
+def _stray_limit_mm(level: Level, options: RegionOptions) -> float:
+    """How far from the template a cell is broken off: beyond δ's share, and how cells stray.
+
+    Of all cells as many stray farther from their neighbours as of normal noise lie beyond
+    `grow_sigmas`: the tail of a real scanner's errors counts.
+    """
+    stray_mm = np.abs(level.scale.value_mm - level.scale.median_mm)
+    share = 1.0 - 2.0 * float(norm.sf(options.grow_sigmas))
+    tolerance_mm = options.grow_share * float(np.median(level.tolerance_mm[0]))
+    return tolerance_mm + float(np.quantile(stray_mm, share))
 
 
 def _source(options: RegionOptions, template: Template, noise: Noise) -> str:
