@@ -25,8 +25,9 @@ from amrepair.detect import AnomalyMap, Label, Region, detect
 from amrepair.detect.rays import range_images
 from amrepair.detect.skipped import PlannedBeads
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, unit_vectors
 from amrepair.scans import Scan
+from amrepair.template.laid import LaidBeads
 from amrepair.template.port import Template, is_off_bed
 from gcode.check import CheckedProgram, check
 from gcode.errors import CheckRefusedError
@@ -55,8 +56,6 @@ OPEN_INFILL_MM = 0.5
 OPEN_CELL_MARGIN_MM = 0.0
 # What lies beside the part: so far off it, and no higher than it was to be by this much.
 OFF_THE_PART_MM, OVER_BESIDE_MM, ON_BED_MM = 0.3, 0.3, 0.2
-# Cosine to the vertical of a top that lies in one layer.
-FLAT = 0.99
 # A part stands upright where its Z is the bed's to 0.05 mm over 100 mm.
 LEVEL = 1e-7
 # Two poses whose repairs share less than this are two different repairs.
@@ -116,8 +115,8 @@ class Site:
         How high skirt, brim and supports stand beside the part, build frame, where the template
         does not have them; −inf where nothing does. They are none of the part, nor too much.
     laid
-        How high the job's beads stand, build frame, for a finished part: what its layers round up
-        of a flat top of the drawing is not too much.
+        The job's beads so far, build frame: what its own path puts beyond what is expected
+        (heights that are rounded up, plastic that has no room) is not too much.
 
     Examples
     --------
@@ -141,7 +140,7 @@ class Site:
     lines: JobLines | None = None
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
     beside: HeightField | None = None
-    laid: HeightField | None = None
+    laid: LaidBeads | None = None
 
     @classmethod
     def of_part(
@@ -299,7 +298,7 @@ def plan_repair(
             if seen is None
             else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
-            rounded_up=None if site.laid is None else partial(_rounded_up, site, placed),
+            rounded_up=None if site.laid is None else partial(_laid_beyond, site, placed),
             up=placed.rotation[2],
             progress=progress,
         )
@@ -414,22 +413,23 @@ def _of_the_part(scan: Scan, site: Site) -> Scan:
     return _subset(scan, keep)
 
 
-def _rounded_up(
+def _laid_beyond(
     site: Site,
     placed: Transform,
     place_mm: Float[np.ndarray, "s 3"],
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
-    """(s,) how far over the drawing the job's layers put the flat top that each place is over."""
+    """(s,) how far out of what is expected the job's own path may put each place."""
     assert site.laid is not None
-    build_mm = placed.apply(place_mm)
-    over_mm = site.laid.sample(build_mm[:, :2], outside_mm=-np.inf)
-    over_mm = over_mm - (build_mm[:, 2] - deviation_mm)
-    over_mm[(over_mm < 0) | (over_mm > site.grid.layer_height_mm)] = 0.0
-    some = np.flatnonzero(over_mm)
-    outward = site.template.distance_and_gradient(place_mm[some])[1] @ placed.rotation[2]
-    over_mm[some[outward < FLAT]] = 0.0
-    return over_mm
+    beyond_mm = np.zeros(len(place_mm))
+    some = np.flatnonzero(deviation_mm > 0.5 * site.allowance_mm)
+    if len(some):
+        expected = site.planned or site.template
+        normal = unit_vectors(expected.distance_and_gradient(place_mm[some])[1])
+        beyond_mm[some] = site.laid.interval(
+            placed.apply(place_mm[some]), placed.rotate(normal), deviation_mm[some]
+        )[1]
+    return np.maximum(beyond_mm, 0.0)
 
 
 def _in_view(scan: Scan, site: Site) -> Scan:

@@ -33,6 +33,7 @@ import numpy as np
 import trimesh
 from bench_clean import HALTS, MOST_CURL_MM, motion_of
 
+from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.loop import Stop, locate_part, plan_stops
 from amrepair.loop.decide import Action
@@ -40,7 +41,7 @@ from amrepair.loop.kinds import typed
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.sites import sites
 from amrepair.loop.situation import decide_look
-from amrepair.repair import RepairPlan, plan_repair
+from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
@@ -54,6 +55,11 @@ from gcode.resumption.flow import ChangedLayer
 
 CENTRE_MM = (60.0, 60.0)
 MUCH_EXCESS_MM3 = 10.0
+# A look whose scan fits nothing: counted as a halt.
+NOTHING: dict[str, Any] = {
+    "missing_mm3": 0.0, "excess_mm3": 0.0, "repair_mm3": 0.0, "flow_mm3": None, "regions": [],
+    "action": str(Action.STOP), "halted": True,
+}  # fmt: skip
 COMMON = (
     *("--layer-height", "0.2", "--first-layer-height", "0.2", "--nozzle-diameter", "0.4"),
     *("--filament-diameter", "1.75", "--gcode-flavor", "marlin"),
@@ -240,6 +246,31 @@ def figures(
     }
 
 
+def judged(
+    scan: Scan, pose: Transform, job: Job, site: Site, stop: Stop, *, rng: np.random.Generator
+) -> dict[str, Any]:
+    """What the loop decides of a scan."""
+    placed = site.build_from_template
+    assert placed is not None
+    plan = plan_repair(
+        scan, site, title=stop.label, guess=placed.inverse() @ pose, strict=False,
+        interruption=job.state_after(stop.line), rng=rng,
+    )  # fmt: skip
+    plan = typed(plan, job, site, stop.line, pose)
+    decision = decide_look(
+        plan, job, site, stop, (), seen_twice=False, max_iterations=3, limits=None
+    )
+    changed = None
+    if decision.changes_next and stop.layer_index is not None:
+        after = stop.layer_index + 1
+        changed = rewritten_layer(job, site.setup, after, plan, decision.changes_next)
+    return figures(stop, plan, decision.verdicts, changed) | {
+        "action": str(decision.action),
+        "repair_mm3": round(sum(r.volume_mm3 for r in plan.to_fill), 2),
+        "halted": decision.action in HALTS,
+    }
+
+
 def run_job(
     name: str, *, looks: int, seed: int, told: WorldParameters, scanner_name: str, folder: Path
 ) -> dict[str, Any]:
@@ -258,25 +289,10 @@ def run_job(
     seen = []
     for number, (stop, (scan, pose)) in enumerate(zip(stops, scans, strict=True), start=1):
         site = site_at(stop)
-        state = job.state_after(stop.line)
-        plan = plan_repair(
-            scan, site, title=name, guess=placed.inverse() @ pose, strict=False,
-            interruption=state, rng=np.random.default_rng([seed, number]),
-        )  # fmt: skip
-        plan = typed(plan, job, site, stop.line, pose)
-        decision = decide_look(
-            plan, job, site, stop, (), seen_twice=False, max_iterations=3, limits=None
-        )
-        changed = None
-        if decision.changes_next and stop.layer_index is not None:
-            after = stop.layer_index + 1
-            changed = rewritten_layer(job, setup, after, plan, decision.changes_next)
-        row = figures(stop, plan, decision.verdicts, changed)
-        row |= {
-            "action": str(decision.action),
-            "repair_mm3": round(sum(r.volume_mm3 for r in plan.to_fill), 2),
-            "halted": decision.action in HALTS,
-        }
+        try:
+            row = judged(scan, pose, job, site, stop, rng=np.random.default_rng([seed, number]))
+        except AlignmentError as error:  # twice in a row, and the loop ends
+            row = {"stop": stop.label, "z_mm": round(stop.z_mm, 2), **NOTHING, "why": str(error)}
         seen.append(row)
     return {
         "job": name,
@@ -319,6 +335,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     lines.append("")
     for row in rows:
         for look in row["looks"]:
+            if "why" in look:
+                lines.append(f"{row['job']} {look['stop']} (z {look['z_mm']}): {look['why']}")
             said = [r for r in look["regions"] if r["action"] != str(Action.GO_ON)]
             if look["excess_mm3"] > MUCH_EXCESS_MM3:
                 said += [r for r in look["regions"] if r["label"] == "EXCESS" and r not in said]

@@ -13,7 +13,7 @@ from amrepair.frames import Transform, box_of
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
 from amrepair.repair import Site
-from amrepair.template import PlannedSdf
+from amrepair.template import LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
@@ -55,7 +55,7 @@ def sites(
                 build_from_template,
                 lines=_lines(job, every),
                 beside=_beside(job, every),
-                laid=_as_high_as(job, every, BESIDE_CELL_MM),
+                laid=_laid(job, every),
             )
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
@@ -78,9 +78,25 @@ def sites(
             lines=_lines(job, done),
             surface=(planned or below).surface_points(SURFACE_SPACING_MM),
             beside=None if by_beads else _beside(job, done),
+            laid=_laid(job, done),
         )
 
     return at
+
+
+def _laid(job: Job, which: Bool[np.ndarray, " n"]) -> LaidBeads | None:
+    """Some of a job's beads, by layer, without what it lays beside the part."""
+    beads = job.beads
+    pick = which & ~of_roles(beads, BESIDE_THE_PART)
+    if not pick.any():
+        return None
+    return LaidBeads.from_beads(
+        beads.start_mm[pick],
+        beads.end_mm[pick],
+        beads.section_mm2[pick],
+        beads.height_mm[pick],
+        beads.layer[pick],
+    )
 
 
 def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:

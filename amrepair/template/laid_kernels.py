@@ -1,0 +1,93 @@
+# mypy: disable-error-code="no-untyped-def"
+"""Plastic of beads in cells, and what of it finds no room behind a wall: loops, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gcode.compiled import njit, prange
+
+
+@njit(cache=True, nogil=True)
+def plastic(start, end, section, width, corner, cell, ny, nx):
+    """(ny, nx) volume that beads lay in each cell; all of it is counted, in points of half a cell.
+
+    A bead is a rectangle seen from above, `width` across.
+    """
+    found = np.zeros((ny, nx))
+    for k in range(len(section)):
+        dx, dy = end[k, 0] - start[k, 0], end[k, 1] - start[k, 1]
+        dz = end[k, 2] - start[k, 2]
+        flat = np.sqrt(dx * dx + dy * dy)
+        volume = section[k] * np.sqrt(flat * flat + dz * dz)
+        along = max(1, int(np.ceil(flat / (0.5 * cell))))
+        across = max(1, int(np.ceil(width[k] / (0.5 * cell))))
+        part = volume / (along * across)
+        ux, uy = (dx / flat, dy / flat) if flat > 1e-9 else (1.0, 0.0)
+        for i in range(along):
+            t = (i + 0.5) / along
+            x, y = start[k, 0] + t * dx, start[k, 1] + t * dy
+            for j in range(across):
+                aside = ((j + 0.5) / across - 0.5) * width[k]
+                ix = int(np.floor((x - aside * uy - corner[0]) / cell))
+                iy = int(np.floor((y + aside * ux - corner[1]) / cell))
+                if 0 <= ix < nx and 0 <= iy < ny:
+                    found[iy, ix] += part
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _at(field, gx, gy):
+    """Between cell middles; 0 outside of the grid."""
+    ny, nx = field.shape
+    ix, iy = int(np.floor(gx)), int(np.floor(gy))
+    if ix < 0 or iy < 0 or ix >= nx - 1 or iy >= ny - 1:
+        return 0.0
+    tx, ty = gx - ix, gy - iy
+    return (
+        field[iy, ix] * (1 - tx) * (1 - ty)
+        + field[iy, ix + 1] * tx * (1 - ty)
+        + field[iy + 1, ix] * (1 - tx) * ty
+        + field[iy + 1, ix + 1] * tx * ty
+    )
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def at(field, corner, cell, place):
+    """(q,) of a field at places."""
+    out = np.empty(len(place))
+    for k in prange(len(place)):
+        out[k] = _at(
+            field, (place[k, 0] - corner[0]) / cell - 0.5, (place[k, 1] - corner[1]) / cell - 0.5
+        )
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def pushed_out(fill, corner, cell, place, inward, flow, beside, reach):
+    """How far out a wall may be pushed, and how far back its first plastic is, mm.
+
+    From `beside` outside of the wall inwards, the plastic laid (`fill`, times `flow`) less the
+    room there is (1 inside, 0 outside) adds up; the most that it comes to on the way is what finds
+    no room anywhere before the free side. Plastic half a layer thick is a wall.
+    """
+    pushed, back = np.zeros(len(place)), np.zeros(len(place))
+    step = 0.5 * cell
+    before, steps = int(np.ceil(beside / step)), int(np.ceil(reach / step))
+    for k in prange(len(place)):
+        total, most, first = 0.0, 0.0, -1.0
+        for i in range(-before, steps):
+            s = (i + 0.5) * step
+            f = _at(
+                fill,
+                (place[k, 0] + s * inward[k, 0] - corner[0]) / cell - 0.5,
+                (place[k, 1] + s * inward[k, 1] - corner[1]) / cell - 0.5,
+            )
+            if first < 0.0 and f >= 0.5:
+                first = max(s - 0.5 * step, 0.0)
+            total += (flow * f - (1.0 if s > 0.0 else 0.0)) * step
+            if s > 0.0:
+                most = max(most, total)
+        pushed[k] = most
+        back[k] = first if first > cell else 0.0
+    return pushed, back
