@@ -31,9 +31,11 @@ class LaidOptions:
     flow_ratio
         More than asked for may come out by this share: filament of 1.75 ± 0.02 mm has 2.3 % more
         or less area.
-    push_beads
+    push_beads, push_strands
         The outermost bead is pushed out by at most this share of its own width: farther, the
-        plastic climbs over it.
+        plastic climbs over it. A strand with nothing below gives way by as much as it is wide.
+    around_layers
+        A scanner's spot shows a wall that a layer pushed out so many layers over and under it.
     rise_layers
         What has no room below rises over a top by at most this share of a layer: what stands
         higher, the nozzle's flat planes off.
@@ -53,6 +55,8 @@ class LaidOptions:
 
     flow_ratio: float = 0.023
     push_beads: float = 0.5
+    push_strands: float = 1.0
+    around_layers: float = 1.5
     rise_layers: float = 0.5
     sag_layers: float = 1.0
     reach_mm: float = 4.0
@@ -63,13 +67,13 @@ class LaidOptions:
 
 @dataclass(frozen=True, slots=True)
 class _Fill:
-    """Plastic over room of one layer, by cells; their corner; how wide its beads are, the mean."""
+    """Plastic over room of one layer, by cells; the widest bead's width there; their corner."""
 
     ratio: Float[np.ndarray, "ny nx"]
+    widest_mm: Float[np.ndarray, "ny nx"]
     corner_mm: Float[np.ndarray, " 2"]
-    bead_mm: float
 
-    def at(self, place_mm: Float[np.ndarray, "q 3"], cell_mm: float) -> Float[np.ndarray, " q"]:
+    def at(self, place_mm: Float[np.ndarray, "q d"], cell_mm: float) -> Float[np.ndarray, " q"]:
         """(q,) the ratio at places."""
         return np.asarray(kernels.at(self.ratio, self.corner_mm, cell_mm, place_mm))
 
@@ -188,15 +192,19 @@ class LaidBeads:
         level, upright = np.hypot(normal[:, 0], normal[:, 1]), np.abs(normal[:, 2])
         found = _Found(surface, -normal[:, :2] / np.maximum(level, 1e-9)[:, None])
         wall, up = upright < o.upright, normal[:, 2] > 0
+        fill: _Fill | None = None
         for k in range(len(self.top_mm)):
-            h, over = float(self.layer_mm[k]), surface[:, 2] - self.top_mm[k]
-            walls = np.flatnonzero(wall & (np.abs(over + 0.5 * h) < 1.5 * h))
+            h, over, below = float(self.layer_mm[k]), surface[:, 2] - self.top_mm[k], fill
+            walls = np.flatnonzero(wall & (np.abs(over + 0.5 * h) < (o.around_layers + 0.5) * h))
             tops = np.flatnonzero(~wall & up & (over > -h) & (over < o.reach_mm))
             unders = np.flatnonzero(~wall & ~up & (np.abs(over + h) < ROUNDS * h))
+            fill = None
             if not len(walls) + len(tops) + len(unders):
                 continue
             fill = self._fill(k)
-            self._walls(k, fill, walls, found)
+            if below is None and k > 0:
+                below = self._fill(k - 1)
+            self._walls(k, fill, below, walls, found)
             self._tops(k, fill, tops, found)
             self._undersides(k, fill, unders, found)
         low, high = (np.where(np.isfinite(side), side, 0.0) for side in (found.low, found.high))
@@ -213,15 +221,26 @@ class LaidBeads:
         low, high = self.interval(place_mm, normal, deviation_mm)
         return 0.5 * (low + high), 0.5 * (high - low)
 
-    def _walls(self, k: int, fill: _Fill, which: Int[np.ndarray, " w"], found: _Found) -> None:
+    def _walls(
+        self,
+        k: int,
+        fill: _Fill,
+        below: _Fill | None,
+        which: Int[np.ndarray, " w"],
+        found: _Found,
+    ) -> None:
         """How far a layer pushes walls out that lie in it, over it or under it."""
         o, h = self.options, float(self.layer_mm[k])
+        share = np.full(len(which), o.push_beads)
+        if below is not None:
+            inside = found.surface_mm[which, :2] + 0.5 * o.blur_mm * found.inward[which]
+            share[below.at(inside, o.cell_mm) < 0.5] = o.push_strands
         pushed, back = kernels.pushed_out(
-            fill.ratio, fill.corner_mm, o.cell_mm, found.surface_mm[which, :2],
-            found.inward[which], 1.0 + o.flow_ratio, o.blur_mm, o.reach_mm,
+            fill.ratio, fill.widest_mm, fill.corner_mm, o.cell_mm,
+            found.surface_mm[which, :2], found.inward[which],
+            1.0 + o.flow_ratio, o.blur_mm, o.reach_mm, share,
         )  # fmt: skip
-        out = np.minimum(pushed, o.push_beads * fill.bead_mm)
-        found.high[which] = np.fmax(found.high[which], out)
+        found.high[which] = np.fmax(found.high[which], pushed)
         own = np.abs(found.surface_mm[which, 2] - self.top_mm[k] + 0.5 * h) <= 0.5 * h + 1e-6
         found.low[which[own]] = np.fmax(found.low[which[own]], -back[own])
 
@@ -258,8 +277,7 @@ class LaidBeads:
         low = np.minimum(start, end).min(axis=0)[:2] - margin
         size = np.maximum(start, end).max(axis=0)[:2] + margin - low
         nx, ny = (int(n) for n in np.ceil(size / o.cell_mm))
-        volume = kernels.plastic(start, end, section, wide, low, o.cell_mm, ny, nx)
+        volume, widest = kernels.plastic(start, end, section, wide, low, o.cell_mm, ny, nx)
         over = 2 * int(0.5 * o.blur_mm / o.cell_mm) + 1
         ratio = uniform_filter(volume / (o.cell_mm**2 * h), over, mode="constant")
-        length = np.maximum(np.linalg.norm(end - start, axis=1), 1e-9)
-        return _Fill(ratio, low, float(np.average(wide, weights=length)))
+        return _Fill(ratio, widest, low)

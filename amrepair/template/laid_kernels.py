@@ -10,11 +10,12 @@ from gcode.compiled import njit, prange
 
 @njit(cache=True, nogil=True)
 def plastic(start, end, section, width, corner, cell, ny, nx):
-    """(ny, nx) volume that beads lay in each cell; all of it is counted, in points of half a cell.
+    """(ny, nx) volume that beads lay in each cell, and the width of the widest of them there.
 
-    A bead is a rectangle seen from above, `width` across.
+    A bead is a rectangle seen from above, `width` across; all of it is counted, in points of half
+    a cell.
     """
-    found = np.zeros((ny, nx))
+    found, widest = np.zeros((ny, nx)), np.zeros((ny, nx))
     for k in range(len(section)):
         dx, dy = end[k, 0] - start[k, 0], end[k, 1] - start[k, 1]
         dz = end[k, 2] - start[k, 2]
@@ -33,7 +34,8 @@ def plastic(start, end, section, width, corner, cell, ny, nx):
                 iy = int(np.floor((y + aside * ux - corner[1]) / cell))
                 if 0 <= ix < nx and 0 <= iy < ny:
                     found[iy, ix] += part
-    return found
+                    widest[iy, ix] = max(widest[iy, ix], width[k])
+    return found, widest
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -63,31 +65,49 @@ def at(field, corner, cell, place):
     return out
 
 
+@njit(cache=True, nogil=True)
+def _without_room(fill, widest, corner, cell, x, y, ux, uy, flow, beside, reach):
+    """Along one line inwards: most plastic without room, what of it is outside, first, widest."""
+    ny, nx = fill.shape
+    step = 0.5 * cell
+    total, most, outside, first, wide = 0.0, 0.0, 0.0, -1.0, 0.0
+    for i in range(-int(np.ceil(beside / step)), int(np.ceil(reach / step))):
+        s = (i + 0.5) * step
+        gx, gy = (x + s * ux - corner[0]) / cell - 0.5, (y + s * uy - corner[1]) / cell - 0.5
+        f = _at(fill, gx, gy)
+        if first < 0.0 and f >= 0.5:
+            first = max(s - 0.5 * step, 0.0)
+        total += (flow * f - (1.0 if s > 0.0 else 0.0)) * step
+        if s > 0.0:
+            most = max(most, total)
+        else:
+            outside = total
+        if abs(s) < beside:
+            ix, iy = int(np.floor(gx + 0.5)), int(np.floor(gy + 0.5))
+            if 0 <= ix < nx and 0 <= iy < ny:
+                wide = max(wide, widest[iy, ix])
+    return most, outside, first, wide
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def pushed_out(fill, corner, cell, place, inward, flow, beside, reach):
+def pushed_out(fill, widest, corner, cell, place, inward, flow, beside, reach, share):
     """How far out a wall may be pushed, and how far back its first plastic is, mm.
 
     From `beside` outside of the wall inwards, the plastic laid (`fill`, times `flow`) less the
     room there is (1 inside, 0 outside) adds up; the most that it comes to on the way is what finds
-    no room anywhere before the free side. Plastic half a layer thick is a wall.
+    no room anywhere before the free side. It goes aside, too: the worst of three lines counts. The
+    outermost bead gives way by no more than a `share` of its width, which is told by place.
+    Plastic half a layer thick is a wall.
     """
     pushed, back = np.zeros(len(place)), np.zeros(len(place))
-    step = 0.5 * cell
-    before, steps = int(np.ceil(beside / step)), int(np.ceil(reach / step))
     for k in prange(len(place)):
-        total, most, first = 0.0, 0.0, -1.0
-        for i in range(-before, steps):
-            s = (i + 0.5) * step
-            f = _at(
-                fill,
-                (place[k, 0] + s * inward[k, 0] - corner[0]) / cell - 0.5,
-                (place[k, 1] + s * inward[k, 1] - corner[1]) / cell - 0.5,
-            )
-            if first < 0.0 and f >= 0.5:
-                first = max(s - 0.5 * step, 0.0)
-            total += (flow * f - (1.0 if s > 0.0 else 0.0)) * step
-            if s > 0.0:
-                most = max(most, total)
-        pushed[k] = most
-        back[k] = first if first > cell else 0.0
+        ux, uy = inward[k, 0], inward[k, 1]
+        for side in (-1.0, 0.0, 1.0):
+            most, outside, first, wide = _without_room(
+                fill, widest, corner, cell, place[k, 0] - side * beside * uy,
+                place[k, 1] + side * beside * ux, ux, uy, flow, beside, reach,
+            )  # fmt: skip
+            pushed[k] = max(pushed[k], min(most, outside + share[k] * wide))
+            if side == 0.0 and first > cell:
+                back[k] = first
     return pushed, back
