@@ -37,8 +37,8 @@ class LaidOptions:
     around_layers
         A scanner's spot shows a wall that a layer pushed out so many layers over and under it.
     rise_layers
-        What has no room below rises over a top by at most this share of a layer: what stands
-        higher, the nozzle's flat planes off.
+        What has no room in a layer rises over its top by at most this share of the layer: what
+        stands higher, the nozzle's flat planes off.
     sag_layers
         Strands that cross a gap hang lower than their own height by at most this: more is a bridge
         that failed.
@@ -88,7 +88,6 @@ class _Found:
         self.inward = np.ascontiguousarray(inward)
         self.low = np.full(len(surface_mm), np.nan)
         self.high = np.full(len(surface_mm), np.nan)
-        self.spare_mm = np.zeros(len(surface_mm))  # of plastic without room under a top
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +195,7 @@ class LaidBeads:
         for k in range(len(self.top_mm)):
             h, over, below = float(self.layer_mm[k]), surface[:, 2] - self.top_mm[k], fill
             walls = np.flatnonzero(wall & (np.abs(over + 0.5 * h) < (o.around_layers + 0.5) * h))
-            tops = np.flatnonzero(~wall & up & (over > -h) & (over < o.reach_mm))
+            tops = np.flatnonzero(~wall & up & (np.abs(over) < ROUNDS * h))
             unders = np.flatnonzero(~wall & ~up & (np.abs(over + h) < ROUNDS * h))
             fill = None
             if not len(walls) + len(tops) + len(unders):
@@ -245,17 +244,17 @@ class LaidBeads:
         found.low[which[own]] = np.fmax(found.low[which[own]], -back[own])
 
     def _tops(self, k: int, fill: _Fill, which: Int[np.ndarray, " w"], found: _Found) -> None:
-        """Tops lie where the layer that is rounded to them does, plus what has no room below."""
+        """Tops lie where the layer that is rounded to them does, a little off by its own plastic.
+
+        What earlier layers had no room for went aside: the nozzle's flat levels every layer.
+        """
         o, h = self.options, float(self.layer_mm[k])
         mm = fill.at(found.surface_mm[which], o.cell_mm) * h
-        laid = mm > 0.5 * h
-        spare = found.spare_mm[which] + (1.0 + o.flow_ratio) * mm - h
-        found.spare_mm[which] = np.where(laid, np.maximum(spare, 0.0), 0.0)
         over = float(self.top_mm[k]) - found.surface_mm[which, 2]
-        near = laid & (np.abs(over) < ROUNDS * h)
-        at, over = which[near], over[near]
-        found.low[at] = over + np.minimum(mm[near] - h, 0.0)
-        found.high[at] = over + np.minimum(found.spare_mm[at], o.rise_layers * h)
+        near = mm > 0.5 * h
+        at, over, spare = which[near], over[near], mm[near] - h
+        found.low[at] = over + np.minimum(spare, 0.0)
+        found.high[at] = over + np.clip(spare, 0.0, o.rise_layers * h)
 
     def _undersides(self, k: int, fill: _Fill, which: Int[np.ndarray, " w"], found: _Found) -> None:
         """Undersides lie where the lowest layer's strands hang, and sag a little."""
