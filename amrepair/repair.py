@@ -382,11 +382,19 @@ def _subset(scan: Scan, keep: Bool[np.ndarray, " n"]) -> Scan:
 
 
 def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Scan:
-    """Without the points that look into sparse infill: deep inside the part, as CAD has it."""
+    """Without the points that look into sparse infill: deep inside the part, as CAD has it.
+
+    A layer or two above the bottom's skin they are not deep; then the beads tell them.
+    """
     if site.planned is None or guess is None:
         return scan
-    inside_mm = site.template.distance(guess.apply(scan.points_mm))
-    return _subset(scan, inside_mm > -OPEN_INFILL_MM)
+    points_mm = guess.apply(scan.points_mm)
+    inside_mm = site.template.distance(points_mm)
+    keep = inside_mm > -OPEN_INFILL_MM
+    shallow = np.flatnonzero(keep & (inside_mm < -site.grid.layer_height_mm))
+    as_planned_mm = np.abs(site.planned.distance(points_mm[shallow]))
+    keep[shallow] = as_planned_mm > 0.5 * np.abs(inside_mm[shallow])
+    return _subset(scan, keep)
 
 
 def _is_cut(site: Site) -> bool:

@@ -13,7 +13,7 @@ def plastic(start, end, section, width, corner, cell, ny, nx):
     """(ny, nx) volume that beads lay in each cell, and the width of the widest of them there.
 
     A bead is a rectangle seen from above, `width` across; all of it is counted, in points of half
-    a cell.
+    a cell along it and an eighth across.
     """
     found, widest = np.zeros((ny, nx)), np.zeros((ny, nx))
     for k in range(len(section)):
@@ -22,7 +22,7 @@ def plastic(start, end, section, width, corner, cell, ny, nx):
         flat = np.sqrt(dx * dx + dy * dy)
         volume = section[k] * np.sqrt(flat * flat + dz * dz)
         along = max(1, int(np.ceil(flat / (0.5 * cell))))
-        across = max(1, int(np.ceil(width[k] / (0.5 * cell))))
+        across = max(1, int(np.ceil(width[k] / (0.125 * cell))))
         part = volume / (along * across)
         ux, uy = (dx / flat, dy / flat) if flat > 1e-9 else (1.0, 0.0)
         for i in range(along):
@@ -78,26 +78,27 @@ def _without_room(fill, widest, corner, cell, x, y, ux, uy, flow, beside, reach)
         if first < 0.0 and f >= 0.5:
             first = max(s - 0.5 * step, 0.0)
         total += (flow * f - (1.0 if s > 0.0 else 0.0)) * step
-        if s > 0.0:
+        if s > 0.5 * beside:
             most = max(most, total)
-        else:
+        elif s < 0.0:
             outside = total
         if abs(s) < beside:
             ix, iy = int(np.floor(gx + 0.5)), int(np.floor(gy + 0.5))
             if 0 <= ix < nx and 0 <= iy < ny:
                 wide = max(wide, widest[iy, ix])
-    return most, outside, first, wide
+    # averaging alone puts an eighth of its width of a full wall outside
+    return most, max(outside - 0.125 * beside, 0.0), first, wide
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def pushed_out(fill, widest, corner, cell, place, inward, flow, beside, reach, share):
     """How far out a wall may be pushed, and how far back its first plastic is, mm.
 
-    From `beside` outside of the wall inwards, the plastic laid (`fill`, times `flow`) less the
-    room there is (1 inside, 0 outside) adds up; the most that it comes to on the way is what finds
-    no room anywhere before the free side. It goes aside, too: the worst of three lines counts. The
-    outermost bead gives way by no more than a `share` of its width, which is told by place.
-    Plastic half a layer thick is a wall.
+    `fill` is averaged over `beside`. From so far outside of the wall inwards, the plastic laid
+    (times `flow`) less the room there is (1 inside, 0 outside) adds up; the most that it comes to
+    on the way is what finds no room anywhere before the free side. It goes aside, too: the worst
+    of three lines counts. The outermost bead gives way by no more than a `share` of its width,
+    which is told by place. Plastic half a layer thick is a wall.
     """
     pushed, back = np.zeros(len(place)), np.zeros(len(place))
     for k in prange(len(place)):
