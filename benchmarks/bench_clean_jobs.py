@@ -4,11 +4,12 @@
     python benchmarks/bench_clean_jobs.py --jobs clip:default ring:solid
     python benchmarks/bench_clean_jobs.py --table      # what there is so far
 
-Seven small parts, made here, are cut by the installed PrusaSlicer in four ways, printed into the
-simulated world of `world.toml` (wandering flow, shrinkage, curl, noise, dropouts, outliers), and
-looked at after a few layers and at the end. Every look goes the loop's own way: `sites` says what
-is expected, `plan_repair`, `typed` and `decide_look` what is to be done, `rewritten_layer` how the
-next layer's flow changes. Nothing is wrong with any of them, so whatever is done is a false alarm.
+Seven small parts, made here (or any STL: `--jobs part.stl:two`), are cut by the installed
+PrusaSlicer in four ways, printed into the simulated world of `world.toml` (wandering flow,
+shrinkage, curl, noise, dropouts, outliers), and looked at after a few layers and at the end. Every
+look goes the loop's own way: `sites` says what is expected, `plan_repair`, `typed` and
+`decide_look` what is to be done, `rewritten_layer` how the next layer's flow changes. Nothing is
+wrong with any of them, so whatever is done is a false alarm.
 
 Counted are repairs, looks that claim more than 10 mm³ of excess (so many millimetres cubed of
 regions, of whatever size each), changed layers and halts. Lines of JSON in `--results`, one a job,
@@ -47,7 +48,7 @@ from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
 from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
 from amrepair.simulate.world import World
-from amrepair.template import MeshSdf
+from amrepair.template import MeshSdf, load_mesh
 from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import Job, read_job
@@ -141,16 +142,22 @@ def mesh_of(solid: m3.Manifold) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
 
 
+def mesh_called(part: str) -> trimesh.Trimesh:
+    """One of ours, or a file."""
+    return mesh_of(PARTS[part]()) if part in PARTS else load_mesh(Path(part))
+
+
 def sliced(part: str, way: str, folder: Path) -> Job:
     """The part's job, cut by the installed PrusaSlicer once."""
-    gcode = folder / f"{part}-{way}.gcode"
+    name = Path(part).stem
+    gcode = folder / f"{name}-{way}.gcode"
     if not gcode.is_file():
         program = shutil.which("prusa-slicer")
         if program is None:
             raise SystemExit("prusa-slicer is not on the path; install it, or judge kept scans")
         folder.mkdir(parents=True, exist_ok=True)
-        stl = folder / f"{part}.stl"
-        mesh_of(PARTS[part]()).export(stl)
+        stl = folder / f"{name}.stl"
+        mesh_called(part).export(stl)
         subprocess.run(
             [program, "-g", *COMMON, *WAYS[way], "-o", str(gcode), str(stl)],
             check=True,
@@ -276,15 +283,17 @@ def run_job(
 ) -> dict[str, Any]:
     """Print one job and judge every look at it."""
     began = time.perf_counter()
-    part, way = name.split(":")
+    part, way = name.rsplit(":", 1)
     setup = load_setup()
     job = sliced(part, way, folder)
     stops = stops_of(job, looks)
     layer_mm = setup.process.layer_height_mm
-    template = MeshSdf.from_mesh(mesh_of(PARTS[part]()))
+    template = MeshSdf.from_mesh(mesh_called(part))
     placed = locate_part(job, template, layer_height_mm=layer_mm)
     site_at = sites(job, template, placed, setup)
-    kept = folder / f"{part}-{way}-{looks}-{seed}-{told.sha256[:8]}-{scanner_name}.pickle"
+    kept = (
+        folder / f"{Path(part).stem}-{way}-{looks}-{seed}-{told.sha256[:8]}-{scanner_name}.pickle"
+    )
     scans = kept_scans(kept, lambda: scans_of(job, stops, told, scanner_name, seed))
     seen = []
     for number, (stop, (scan, pose)) in enumerate(zip(stops, scans, strict=True), start=1):
@@ -324,8 +333,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         "| missing, most mm³ | excess, most mm³ |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for word in (*PARTS, *WAYS, "all"):
-        mine = [row for row in rows if word in (*row["job"].split(":"), "all")]
+    names = dict.fromkeys(row["job"].rsplit(":", 1)[0] for row in rows)
+    for word in (*names, *WAYS, "all"):
+        mine = [row for row in rows if word in (*row["job"].rsplit(":", 1), "all")]
         if not mine:
             continue
         looks = [look for row in mine for look in row["looks"]]
@@ -352,7 +362,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def main() -> None:
     every = [f"{part}:{way}" for way in WAYS for part in PARTS]
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--jobs", nargs="+", choices=every, metavar="PART:WAY", default=every)
+    parser.add_argument("--jobs", nargs="+", metavar="PART:WAY", default=every)
     parser.add_argument("--next", type=int, default=0, help="how many jobs not yet run")
     parser.add_argument("--looks", type=int, default=6, help="a job, the final one among them")
     parser.add_argument("--seed", type=int, default=0)
@@ -362,6 +372,10 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("out/clean-jobs.jsonl"))
     parser.add_argument("--table", action="store_true", help="of the results so far, and no more")
     args = parser.parse_args()
+    for name in args.jobs:
+        part, _, way = name.rpartition(":")
+        if way not in WAYS or (part not in PARTS and not Path(part).is_file()):
+            parser.error(f"there is no job '{name}'; ways are {', '.join(WAYS)}")
     args.results.parent.mkdir(parents=True, exist_ok=True)
     text = args.results.read_text() if args.results.is_file() else ""
     rows = [json.loads(line) for line in text.splitlines()]
