@@ -149,6 +149,38 @@ class Site:
         """A finished part on the layers of the process profile."""
         return cls(template, setup, LayerGrid.from_setup(setup), build_from_template)
 
+    def expected_offset_mm(
+        self,
+        place_mm: Float[np.ndarray, "s 3"],
+        normal: Float[np.ndarray, "s 3"],
+        deviation_mm: Float[np.ndarray, " s"],
+        *,
+        placed: Transform,
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+        """How far off the drawing the job's own path puts places, and give or take how much.
+
+        Parameters
+        ----------
+        place_mm, normal
+            (s, 3) each, template frame: what was seen, and the outward unit normals of what is
+            expected there.
+        deviation_mm
+            (s,) how far out of what is expected each place lies.
+        placed
+            Where the part stands, build from template.
+
+        Returns
+        -------
+        offset_mm, tolerance_mm
+            (s,) each: a deviation within `offset ± tolerance` is the job's own; 0 where there is
+            no job.
+        """
+        if self.laid is None:
+            return np.zeros(len(place_mm)), np.zeros(len(place_mm))
+        return self.laid.expected_offset_mm(
+            placed.apply(place_mm), placed.rotate(normal), deviation_mm
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class RepairPlan:
@@ -428,15 +460,15 @@ def _laid_beyond(
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
     """(s,) how far out of what is expected the job's own path may put each place."""
-    assert site.laid is not None
     beyond_mm = np.zeros(len(place_mm))
     some = np.flatnonzero(deviation_mm > 0.5 * site.allowance_mm)
     if len(some):
         expected = site.planned or site.template
         normal = unit_vectors(expected.distance_and_gradient(place_mm[some])[1])
-        beyond_mm[some] = site.laid.interval(
-            placed.apply(place_mm[some]), placed.rotate(normal), deviation_mm[some]
-        )[1]
+        offset_mm, tolerance_mm = site.expected_offset_mm(
+            place_mm[some], normal, deviation_mm[some], placed=placed
+        )
+        beyond_mm[some] = offset_mm + tolerance_mm
     return np.maximum(beyond_mm, 0.0)
 
 

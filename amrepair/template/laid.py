@@ -184,7 +184,7 @@ class LaidBeads:
         Returns
         -------
         low_mm, high_mm
-            (s,) each, positive outwards; 0 where the job lays nothing near.
+            (s,) each, positive outwards; 0 where no layer of the job is near.
         """
         o = self.options
         surface = place_mm - deviation_mm[:, None] * normal

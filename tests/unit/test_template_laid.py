@@ -108,6 +108,12 @@ def test_a_top_lies_where_its_layer_was_rounded_to(drawn_mm: float) -> None:
 def test_what_the_job_leaves_out_is_expected_to_be_missing() -> None:
     low, _ = laid(8, skip=(0, 1)).interval(*along_wall(0.0, -1.0))
     assert low == pytest.approx(-2 * SPACING_MM, abs=0.15)
+    # a thin line of its own is there, all the same
+    thin = laid(1, fill=0.5).interval(*along_wall(0.25 * SPACING_MM, -1.0))
+    assert np.abs(thin[0]).max() < 0.15
+    # a fin beside the part that is thinner than a bead: nothing of it is laid
+    low, _ = laid(8).interval(*along_wall(10.0, -1.0))
+    assert (low == -NO_WANDER.reach_mm).all()
 
 
 def test_the_expectation_turns_with_the_job() -> None:
