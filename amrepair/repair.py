@@ -22,13 +22,14 @@ from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
 from amrepair.deficit import Deficit, as_built_heights, compute_deficit, worth
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, unit_vectors
 from amrepair.observe.rays import range_images
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.calibration import Calibration
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.scans import Scan
+from amrepair.template.laid import LaidBeads
 from amrepair.template.port import Template, is_off_bed
 from gcode.check import CheckedProgram, check
 from gcode.errors import CheckRefusedError
@@ -57,8 +58,6 @@ OPEN_INFILL_MM = 0.5
 OPEN_CELL_MARGIN_MM = 0.0
 # What lies beside the part: so far off it, and no higher than it was to be by this much.
 OFF_THE_PART_MM, OVER_BESIDE_MM, ON_BED_MM = 0.3, 0.3, 0.2
-# Cosine to the vertical of a top that lies in one layer.
-FLAT = 0.99
 # A part stands upright where its Z is the bed's to 0.05 mm over 100 mm.
 LEVEL = 1e-7
 # Two poses whose repairs share less than this are two different repairs.
@@ -122,8 +121,8 @@ class Site:
         How high skirt, brim and supports stand beside the part, build frame, where the template
         does not have them; −inf where nothing does. They are none of the part, nor too much.
     laid
-        How high the job's beads stand, build frame, for a finished part: what its layers round up
-        of a flat top of the drawing is not too much.
+        The job's beads so far, build frame: what its own path puts beyond what is expected
+        (heights that are rounded up, plastic that has no room) is not too much.
 
     Examples
     --------
@@ -149,7 +148,7 @@ class Site:
     lines: JobLines | None = None
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
     beside: HeightField | None = None
-    laid: HeightField | None = None
+    laid: LaidBeads | None = None
 
     @classmethod
     def of_part(
@@ -157,6 +156,38 @@ class Site:
     ) -> Site:
         """A finished part on the layers of the process profile."""
         return cls(template, setup, LayerGrid.from_setup(setup), build_from_template)
+
+    def expected_offset_mm(
+        self,
+        place_mm: Float[np.ndarray, "s 3"],
+        normal: Float[np.ndarray, "s 3"],
+        deviation_mm: Float[np.ndarray, " s"],
+        *,
+        placed: Transform,
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+        """How far off the drawing the job's own path puts places, and give or take how much.
+
+        Parameters
+        ----------
+        place_mm, normal
+            (s, 3) each, template frame: what was seen, and the outward unit normals of what is
+            expected there.
+        deviation_mm
+            (s,) how far out of what is expected each place lies.
+        placed
+            Where the part stands, build from template.
+
+        Returns
+        -------
+        offset_mm, tolerance_mm
+            (s,) each: a deviation within `offset ± tolerance` is the job's own; 0 where there is
+            no job.
+        """
+        if self.laid is None:
+            return np.zeros(len(place_mm)), np.zeros(len(place_mm))
+        return self.laid.expected_offset_mm(
+            placed.apply(place_mm), placed.rotate(normal), deviation_mm
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +341,7 @@ def plan_repair(
             if seen is None
             else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
-            rounded_up=None if site.laid is None else partial(_rounded_up, site, placed),
+            rounded_up=None if site.laid is None else partial(_laid_beyond, site, placed),
             up=placed.rotation[2],
             progress=progress,
         )
@@ -394,11 +425,19 @@ def _subset(scan: Scan, keep: Bool[np.ndarray, " n"]) -> Scan:
 
 
 def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Scan:
-    """Without the points that look into sparse infill: deep inside the part, as CAD has it."""
+    """Without the points that look into sparse infill: deep inside the part, as CAD has it.
+
+    A layer or two above the bottom's skin they are not deep; then the beads tell them.
+    """
     if site.planned is None or guess is None:
         return scan
-    inside_mm = site.template.distance(guess.apply(scan.points_mm))
-    return _subset(scan, inside_mm > -OPEN_INFILL_MM)
+    points_mm = guess.apply(scan.points_mm)
+    inside_mm = site.template.distance(points_mm)
+    keep = inside_mm > -OPEN_INFILL_MM
+    shallow = np.flatnonzero(keep & (inside_mm < -site.grid.layer_height_mm))
+    as_planned_mm = np.abs(site.planned.distance(points_mm[shallow]))
+    keep[shallow] = as_planned_mm > 0.5 * np.abs(inside_mm[shallow])
+    return _subset(scan, keep)
 
 
 def _is_cut(site: Site) -> bool:
@@ -425,22 +464,23 @@ def _of_the_part(scan: Scan, site: Site) -> Scan:
     return _subset(scan, keep)
 
 
-def _rounded_up(
+def _laid_beyond(
     site: Site,
     placed: Transform,
     place_mm: Float[np.ndarray, "s 3"],
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
-    """(s,) how far over the drawing the job's layers put the flat top that each place is over."""
-    assert site.laid is not None
-    build_mm = placed.apply(place_mm)
-    over_mm = site.laid.sample(build_mm[:, :2], outside_mm=-np.inf)
-    over_mm = over_mm - (build_mm[:, 2] - deviation_mm)
-    over_mm[(over_mm < 0) | (over_mm > site.grid.layer_height_mm)] = 0.0
-    some = np.flatnonzero(over_mm)
-    outward = site.template.distance_and_gradient(place_mm[some])[1] @ placed.rotation[2]
-    over_mm[some[outward < FLAT]] = 0.0
-    return over_mm
+    """(s,) how far out of what is expected the job's own path may put each place."""
+    beyond_mm = np.zeros(len(place_mm))
+    some = np.flatnonzero(deviation_mm > 0.5 * site.allowance_mm)
+    if len(some):
+        expected = site.planned or site.template
+        normal = unit_vectors(expected.distance_and_gradient(place_mm[some])[1])
+        offset_mm, tolerance_mm = site.expected_offset_mm(
+            place_mm[some], normal, deviation_mm[some], placed=placed
+        )
+        beyond_mm[some] = offset_mm + tolerance_mm
+    return np.maximum(beyond_mm, 0.0)
 
 
 def _in_view(scan: Scan, site: Site) -> Scan:

@@ -58,6 +58,9 @@ class Finding:
         Lowest and highest corner, build frame.
     skipped
         A line of the job that is not there lies in it: its room is a bead's.
+    layer_off
+        The layer's top lies off its plane there by more than tolerance and its own scatter
+        explain (`layer_level`): what the next layer's flow is changed for.
     """
 
     kind: str
@@ -73,6 +76,7 @@ class Finding:
     box_mm: tuple[tuple[float, float, float], tuple[float, float, float]]
     seen_twice: bool = False
     skipped: bool = False
+    layer_off: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +150,7 @@ _NAMES = {
     "hit_mm": "in the head's way by",
     "seen_twice": "looked at twice",
     "skipped": "where a line was skipped",
+    "layer_off": "the layer lies off by more than its own scatter",
     "last_pass": "it was the last pass allowed",
     "stuck": "the last pass changed little",
     "little_left": "little is left",
@@ -205,6 +210,11 @@ def _below(fact: str, value: float) -> Condition:
     return Condition(fact, "<", value)
 
 
+_THIN = (
+    _is("skipped", False), _below("thickness_layers", THIN_LAYERS),
+    _from("thickness_layers", LEAST_LAYERS), _below("height_layers", ONE_LAYER),
+    _is("cover", Cover.SOLID),
+)  # fmt: skip
 _MISSING, _EXCESS = _is("kind", "missing"), _is("kind", "excess")
 
 FINDINGS: tuple[Row, ...] = (
@@ -222,7 +232,8 @@ FINDINGS: tuple[Row, ...] = (
     Row("F6", Action.LOWER_NEXT, (_EXCESS, _from("volume_mm3", MIN_EXCESS_MM3),
                                   _from("thickness_layers", LEAST_LAYERS),
                                   _below("thickness_layers", EXCESS_LAYERS),
-                                  _is("cover", (Cover.SOLID, Cover.OPEN))),
+                                  _is("cover", (Cover.SOLID, Cover.OPEN)),
+                                  _is("layer_off", True)),
         "the next layer's beads have less room there"),
     Row("F7", Action.GO_ON, (_EXCESS,),
         "printing cannot take excess away"),
@@ -236,15 +247,13 @@ FINDINGS: tuple[Row, ...] = (
         "it hardly stands out from the noise"),
     Row("F10", Action.GO_ON, (_MISSING, _below("confidence", DOUBTFUL)),
         "two looks do not make it stand out from the noise"),
-    Row("F11", Action.FILL_WITH_NEXT, (_MISSING, _is("skipped", False),
-                                       _below("thickness_layers", THIN_LAYERS),
-                                       _from("thickness_layers", LEAST_LAYERS),
-                                       _below("height_layers", ONE_LAYER),
-                                       _is("cover", Cover.SOLID)),
+    Row("F11a", Action.GO_ON, (_MISSING, *_THIN, _is("layer_off", False)),
+        "no more than the layer's own beads differ by"),
+    Row("F11b", Action.FILL_WITH_NEXT, (_MISSING, *_THIN),
         "thinner than a bead of its own; the next layer's beads can carry it"),
     Row("F12", Action.FILL_WITH_NEXT, (_MISSING, _below("reachable_ratio", 0.05),
                                        _below("height_layers", ONE_LAYER),
-                                       _is("cover", Cover.SOLID)),
+                                       _is("cover", Cover.SOLID), _is("layer_off", True)),
         "the nozzle cannot get down to it, and the next layer's beads can carry it"),
     Row("F13", Action.GO_ON, (_MISSING, _below("reachable_ratio", 0.05)),
         "nothing of it can be reached"),

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from amrepair.deficit.worth import defect_volumes
 from amrepair.loop.decide import Action, Cover, Finding, judge
+from amrepair.loop.layer_level import FLOW_TEST, FlowTest, LayerLevel, lie_off
 from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals
@@ -111,6 +112,7 @@ def findings(
     layer_index: int | None,
     line: int,
     seen_twice: bool = False,
+    flow_test: FlowTest = FLOW_TEST,
 ) -> tuple[Finding, ...]:
     """The facts about every region of a plan.
 
@@ -120,13 +122,17 @@ def findings(
         The layer just finished (None: the finished part), and the job's next line.
     seen_twice
         Whether this stop was looked at before, nothing printed between.
+    flow_test
+        What it takes to change the next layer's flow.
     """
     after = next_layer(job, layer_index)
     end_line = job.layers[after].end_line if after is not None else line
     pieces = plan.deficit.excess.decompose() if not plan.deficit.excess.is_empty() else []
     found = []
     regions = plan.deficit.regions
-    for region, whole_mm3 in zip(regions, _whole_defects(regions), strict=True):
+    z_mm = None if layer_index is None else job.layers[layer_index].z_mm
+    off = lie_off(LayerLevel.of(plan, z_mm, flow_test) if regions else None, regions)
+    for region, whole_mm3, is_off in zip(regions, _whole_defects(regions), off, strict=True):
         reach, hit = 1.0, 0.0
         if region.label is Label.MISSING:
             reach = reach_of(plan, region.box_mm)
@@ -149,6 +155,7 @@ def findings(
                 box_mm=_corners(region.box_mm),
                 seen_twice=seen_twice,
                 skipped=region.skipped,
+                layer_off=is_off,
             )
         )
     return tuple(found)

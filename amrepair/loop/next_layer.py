@@ -30,17 +30,9 @@ def rewritten_layer(
     plan
         Whose solids the verdicts are about.
     """
-    solids: list[tuple[manifold3d.Manifold, float]] = []
-    for solid, action, sign in (
-        (plan.deficit.missing, Action.FILL_WITH_NEXT, 1.0),
-        (plan.deficit.excess, Action.LOWER_NEXT, -1.0),
-    ):
-        pieces = solid.decompose() if not solid.is_empty() else []
-        for verdict in verdicts:
-            if verdict.action is action:
-                piece = matching(pieces, np.array(verdict.finding.box_mm))
-                if piece is not None:
-                    solids.append((piece, sign))
+    floor_mm = job.layers[layer - 1].z_mm if layer > 0 else 0.0
+    deficit = plan.deficit
+    solids = gap_solids(deficit.missing, deficit.excess, verdicts, floor_mm=floor_mm)
     if not solids:
         return None
     gap = GapField.from_solids(solids, CELL_MM)
@@ -48,3 +40,33 @@ def rewritten_layer(
         return change_flow(job, setup, job.layers[layer].index, gap)
     except GcodeError:
         return None  # the layer is then printed as it is
+
+
+def gap_solids(
+    missing: manifold3d.Manifold,
+    excess: manifold3d.Manifold,
+    verdicts: Sequence[Verdict],
+    *,
+    floor_mm: float,
+) -> list[tuple[manifold3d.Manifold, float]]:
+    """What the next layer's beads have more room (+1) or less (−1) by.
+
+    Parameters
+    ----------
+    floor_mm
+        The top of the layer below: what hangs beside the layers under it is in nobody's way.
+    """
+    solids = []
+    for solid, action, sign in (
+        (missing, Action.FILL_WITH_NEXT, 1.0),
+        (excess, Action.LOWER_NEXT, -1.0),
+    ):
+        pieces = solid.decompose() if not solid.is_empty() else []
+        for verdict in verdicts:
+            if verdict.action is action:
+                piece = matching(pieces, np.array(verdict.finding.box_mm))
+                if piece is not None and sign < 0:
+                    piece = piece.trim_by_plane((0.0, 0.0, 1.0), floor_mm)
+                if piece is not None and not piece.is_empty():
+                    solids.append((piece, sign))
+    return solids

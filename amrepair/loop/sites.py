@@ -14,7 +14,7 @@ from amrepair.regions.calibration import NORMAL
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Site
-from amrepair.template import PlannedSdf
+from amrepair.template import LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
@@ -57,7 +57,7 @@ def sites(
                 calibration=NORMAL,
                 lines=_lines(job, every),
                 beside=_beside(job, every),
-                laid=_as_high_as(job, every, BESIDE_CELL_MM),
+                laid=_laid(job, every),
             )
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
@@ -81,9 +81,25 @@ def sites(
             lines=_lines(job, done),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
             beside=None if by_beads else _beside(job, done),
+            laid=_laid(job, done),
         )
 
     return at
+
+
+def _laid(job: Job, which: Bool[np.ndarray, " n"]) -> LaidBeads | None:
+    """Some of a job's beads, by layer, without what it lays beside the part."""
+    beads = job.beads
+    pick = which & ~of_roles(beads, BESIDE_THE_PART)
+    if not pick.any():
+        return None
+    return LaidBeads.from_beads(
+        beads.start_mm[pick],
+        beads.end_mm[pick],
+        beads.section_mm2[pick],
+        beads.height_mm[pick],
+        beads.layer[pick],
+    )
 
 
 def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:

@@ -268,7 +268,8 @@ def _with_tolerance(
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(sites.place_mm)
     if rounded_up is not None:
-        tolerance_mm[1] += rounded_up(sites.place_mm, sites.value_mm)
+        seen_mm = np.concatenate([surfels.place_mm, sites.place_mm[len(surfels) :]])
+        tolerance_mm[1] += rounded_up(seen_mm, sites.value_mm)
     return replace(sites, tolerance_mm=tolerance_mm)
 
 

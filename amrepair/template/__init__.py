@@ -14,6 +14,7 @@ from amrepair.template.fitting import (
     load_or_fit,
     load_template,
 )
+from amrepair.template.laid import LaidBeads, LaidOptions
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh
 from amrepair.template.mesh_sdf import MeshSdf
@@ -25,6 +26,8 @@ from amrepair.template.stood import StoodTemplate
 
 __all__ = [
     "CutTemplate",
+    "LaidBeads",
+    "LaidOptions",
     "LearnedSdf",
     "MeshSdf",
     "NetworkSdf",

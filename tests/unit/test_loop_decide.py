@@ -45,7 +45,8 @@ CASES = {
     "F8b": replace(VOID, volume_mm3=0.2, defect_mm3=0.5, skipped=True),
     "F9": replace(VOID, confidence=0.1),
     "F10": replace(VOID, confidence=0.1, seen_twice=True),
-    "F11": THIN,
+    "F11a": replace(THIN, layer_off=False),
+    "F11b": THIN,
     "F12": replace(VOID, thickness_layers=0.9, height_layers=1.0, reachable_ratio=0.0),
     "F13": replace(VOID, reachable_ratio=0.0),
     "F14": VOID,
@@ -95,7 +96,7 @@ def test_the_gravest_counts_and_the_thin_waits_for_the_next_layer() -> None:
     decision = decide(verdicts, Situation(Action.FILL_NOW, last_pass=True))
     assert decision.action is Action.FILL_WITH_NEXT
     assert decision.row == "S6, S10"
-    assert {v.row for v in decision.changes_next} == {"F11", "F6"}
+    assert {v.row for v in decision.changes_next} == {"F11b", "F6"}
 
 
 def test_a_speck_in_the_heads_way_does_not_end_a_print() -> None:

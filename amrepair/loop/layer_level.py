@@ -1,0 +1,153 @@
+"""Whether a layer's top lies off by more than its own scatter explains: a test, with its options.
+
+A flat layer is looked at in patches of several beads; how much their means differ is what this
+layer, this print and this scanner do by themselves. A region changes the next layer's flow where
+the mean of its patches is beyond the tolerance by more than that. Walls do not count: what bulges
+beside a layer leaves its top where it is. Nothing is decided here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import stats
+
+from amrepair.loop.decide import LEAST_LAYERS
+from amrepair.regions import Region
+from amrepair.repair import RepairPlan
+
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
+
+
+@dataclass(frozen=True, slots=True)
+class FlowTest:
+    """What it takes to change a layer's flow.
+
+    Attributes
+    ----------
+    false_alarm
+        Probability that a look at a clean layer changes anything: shared out over as many places
+        as the layer has for a region of that size.
+    patch_mm
+        Edge of a patch: four beads, beyond which neither a bead's own waver nor a scanner's
+        errors hang together.
+    tolerance_layers
+        Of the layer height: within this a layer's beads differ by themselves.
+    band_layers
+        So far over and under its plane a point can be of the layer's top.
+    least_points, least_patches
+        Of a patch, and of a layer whose scatter can be told.
+    """
+
+    false_alarm: float = 1e-3
+    patch_mm: float = 2.0
+    tolerance_layers: float = LEAST_LAYERS
+    band_layers: float = 2.0
+    least_points: int = 5
+    least_patches: int = 6
+
+
+FLOW_TEST = FlowTest()
+"""What the loop goes by."""
+
+
+@dataclass(frozen=True, slots=True)
+class LayerLevel:
+    """How far a layer's top lies off its plane, by patches.
+
+    Attributes
+    ----------
+    cell
+        (p, 2) number of each patch.
+    mean_mm
+        (p,) mean height over the plane.
+    spread_mm
+        Robust standard deviation between patches.
+    """
+
+    cell: Int[np.ndarray, "p 2"]
+    mean_mm: Float[np.ndarray, " p"]
+    spread_mm: float
+    layer_mm: float
+    options: FlowTest
+
+    @classmethod
+    def of(
+        cls, plan: RepairPlan, z_mm: float | None, options: FlowTest = FLOW_TEST
+    ) -> LayerLevel | None:
+        """Of the layer whose top is at z, build frame; None where too little of it was seen.
+
+        Parameters
+        ----------
+        z_mm
+            None for the finished part, which no layer follows.
+        """
+        if z_mm is None:
+            return None
+        placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+        return cls.of_points(
+            placed.apply(plan.anomaly.points_mm),
+            plan.anomaly.deviation_mm,
+            z_mm,
+            plan.layer_height_mm,
+            options,
+        )
+
+    @classmethod
+    def of_points(
+        cls,
+        place_mm: Float[np.ndarray, "n 3"],
+        deviation_mm: Float[np.ndarray, " n"],
+        z_mm: float,
+        layer_mm: float,
+        options: FlowTest = FLOW_TEST,
+    ) -> LayerLevel | None:
+        """Of a scan's points, build frame, and how far out of what is expected they lie."""
+        over = place_mm[:, 2] - z_mm
+        # over a flat top the distance from what is expected is the height over its plane
+        top = (np.abs(over) < options.band_layers * layer_mm) & (
+            np.abs(over - deviation_mm) < options.tolerance_layers * layer_mm
+        )
+        if not top.any():
+            return None
+        cell, of, count = np.unique(
+            np.floor(place_mm[top, :2] / options.patch_mm).astype(np.int64),
+            axis=0,
+            return_inverse=True,
+            return_counts=True,
+        )
+        mean = np.bincount(of.ravel(), weights=over[top], minlength=len(cell)) / count
+        many = count >= options.least_points
+        if many.sum() < options.least_patches:
+            return None
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(mean[many] - np.median(mean[many]))))
+        return cls(cell[many], mean[many], spread, layer_mm, options)
+
+    def is_off(self, box_mm: Float[np.ndarray, "2 3"]) -> bool:
+        """Whether the layer lies off over a box by more than tolerance and scatter explain."""
+        mine = self._within(box_mm)
+        count, layer = int(mine.sum()), len(self.cell)
+        if not count:
+            return False
+        places = layer / count
+        quantile = float(stats.t.isf(0.5 * self.options.false_alarm / places, layer - 1))
+        limit_mm = self.options.tolerance_layers * self.layer_mm
+        limit_mm += quantile * self.spread_mm / np.sqrt(count)
+        return bool(abs(self.mean_mm[mine].mean()) > limit_mm)
+
+    def _within(self, box_mm: Float[np.ndarray, "2 3"]) -> Bool[np.ndarray, " p"]:
+        """Patches whose middles lie in a box; the one around its middle where none does."""
+        middle = (self.cell + 0.5) * self.options.patch_mm
+        inside = ((middle >= box_mm[0, :2]) & (middle <= box_mm[1, :2])).all(axis=1)
+        if not inside.any():
+            centre = np.floor(0.5 * (box_mm[0, :2] + box_mm[1, :2]) / self.options.patch_mm)
+            inside = (self.cell == centre.astype(np.int64)).all(axis=1)
+        return np.asarray(inside)
+
+
+def lie_off(level: LayerLevel | None, regions: Sequence[Region]) -> list[bool]:
+    """For each region, whether its layer lies off there; nowhere where nobody can tell."""
+    return [level is not None and level.is_off(np.asarray(region.box_mm)) for region in regions]

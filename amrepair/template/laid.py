@@ -1,0 +1,282 @@
+"""`LaidBeads`: how far from the drawing a job's own beads put a surface, by place and by volume.
+
+A slicer's path is not the drawing: layers round heights up and down, infill overlaps perimeters so
+that a layer is given more plastic than it has room for, bridges are laid thicker than a layer, and
+what is thinner than a bead is left out. What has no room goes to the nearest free side; on which
+side nobody can say. So every place of a surface gets an interval, from where its beads stand if
+nothing is pushed to where they stand if all of it is pushed there. Nothing is judged here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import uniform_filter
+
+from amrepair.errors import TemplateError
+from amrepair.template import laid_kernels as kernels
+
+# A slicer cuts in the middle of a layer: tops are rounded by no more than half of one.
+ROUNDS = 0.55
+
+
+@dataclass(frozen=True, slots=True)
+class LaidOptions:
+    """What is taken for granted of plastic that has no room.
+
+    Attributes
+    ----------
+    flow_ratio
+        More than asked for may come out by this share: filament of 1.75 ± 0.02 mm has 2.3 % more
+        or less area.
+    push_beads, push_strands
+        The outermost bead is pushed out by at most this share of its own width: farther, the
+        plastic climbs over it. A strand with nothing below gives way by as much as it is wide.
+    around_layers
+        A scanner's spot shows a wall that a layer pushed out so many layers over and under it.
+    rise_layers
+        What has no room in a layer rises over its top by at most this share of the layer: what
+        stands higher, the nozzle's flat planes off.
+    sag_layers
+        Strands that cross a gap hang lower than their own height by at most this: more is a bridge
+        that failed.
+    reach_mm
+        Plastic is pushed no farther than this from where it was laid: a nozzle's flat and the
+        beads beside it.
+    cell_mm, blur_mm
+        Cells that plastic is counted in, and the width that it is averaged over: more than the
+        spacing of two lines, so that the groove between them is no lack.
+    upright
+        A surface is a top (or an underside) where its normal's Z is at least this, 45°; else a
+        wall.
+    """
+
+    flow_ratio: float = 0.023
+    push_beads: float = 0.5
+    push_strands: float = 1.0
+    around_layers: float = 1.5
+    rise_layers: float = 0.5
+    sag_layers: float = 1.0
+    reach_mm: float = 4.0
+    cell_mm: float = 0.2
+    blur_mm: float = 0.6
+    upright: float = 0.7071
+
+
+@dataclass(frozen=True, slots=True)
+class _Fill:
+    """Plastic over room of one layer, by cells; the widest bead's width there; their corner."""
+
+    ratio: Float[np.ndarray, "ny nx"]
+    widest_mm: Float[np.ndarray, "ny nx"]
+    corner_mm: Float[np.ndarray, " 2"]
+
+    def at(self, place_mm: Float[np.ndarray, "q d"], cell_mm: float) -> Float[np.ndarray, " q"]:
+        """(q,) the ratio at places."""
+        return np.asarray(kernels.at(self.ratio, self.corner_mm, cell_mm, place_mm))
+
+
+class _Found:
+    """What the layers so far say of every place; NaN where they say nothing."""
+
+    def __init__(
+        self, surface_mm: Float[np.ndarray, "s 3"], inward: Float[np.ndarray, "s 2"]
+    ) -> None:
+        self.surface_mm = np.ascontiguousarray(surface_mm)
+        self.inward = np.ascontiguousarray(inward)
+        self.low = np.full(len(surface_mm), np.nan)
+        self.high = np.full(len(surface_mm), np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class LaidBeads:
+    """A job's beads by layer, asked where they put a surface.
+
+    Attributes
+    ----------
+    start_mm, end_mm
+        (n, 3) nozzle positions, in the frame that places are told in; layer by layer.
+    section_mm2, height_mm
+        (n,) plastic, and height, of each.
+    first
+        (k + 1,) where each layer's beads begin.
+    top_mm, layer_mm
+        (k,) height of each layer's top, and of the layer; rising.
+    """
+
+    start_mm: Float[np.ndarray, "n 3"]
+    end_mm: Float[np.ndarray, "n 3"]
+    section_mm2: Float[np.ndarray, " n"]
+    height_mm: Float[np.ndarray, " n"]
+    first: Int[np.ndarray, " k1"]
+    top_mm: Float[np.ndarray, " k"]
+    layer_mm: Float[np.ndarray, " k"]
+    options: LaidOptions = LaidOptions()
+
+    @classmethod
+    def from_beads(
+        cls,
+        start_mm: Float[np.ndarray, "n 3"],
+        end_mm: Float[np.ndarray, "n 3"],
+        section_mm2: Float[np.ndarray, " n"],
+        height_mm: Float[np.ndarray, " n"],
+        layer: Int[np.ndarray, " n"],
+        *,
+        options: LaidOptions = LaidOptions(),
+    ) -> LaidBeads:
+        """Sort beads into layers.
+
+        Parameters
+        ----------
+        layer
+            (n,) index of each bead's layer; its top is the height of most of its plastic.
+
+        Raises
+        ------
+        TemplateError
+            If there is no bead.
+        """
+        if len(layer) == 0:
+            raise TemplateError("there are no beads to say what a job lays; give at least one")
+        order = np.argsort(layer, kind="stable")
+        _, begins = np.unique(layer[order], return_index=True)
+        start, end = (np.ascontiguousarray(xyz[order], dtype=np.float64) for xyz in
+                      (start_mm, end_mm))  # fmt: skip
+        top = np.array([np.median(z) for z in np.split(end[:, 2], begins[1:])])
+        rising = np.argsort(top, kind="stable")
+        ends = np.append(begins[1:], len(order))
+        again = np.concatenate([np.arange(begins[k], ends[k]) for k in rising])
+        counts = (ends - begins)[rising]
+        low = np.array([height_mm[order][begins[k] : ends[k]].min() for k in rising])
+        step = np.diff(top[rising], prepend=0.0)
+        # what is laid beside lower layers (copies one by one) is as high as its own beads
+        layer_mm = np.where((step > 1e-3) & (step < low), step, low)
+        return cls(
+            start[again],
+            end[again],
+            np.ascontiguousarray(section_mm2[order][again], dtype=np.float64),
+            np.ascontiguousarray(height_mm[order][again], dtype=np.float64),
+            np.concatenate([[0], np.cumsum(counts)]),
+            top[rising],
+            layer_mm,
+            options,
+        )
+
+    def interval(
+        self,
+        place_mm: Float[np.ndarray, "s 3"],
+        normal: Float[np.ndarray, "s 3"],
+        deviation_mm: Float[np.ndarray, " s"],
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+        """From where to where the job puts the surface, along its normal.
+
+        Parameters
+        ----------
+        place_mm
+            (s, 3) places that were seen.
+        normal
+            (s, 3) outward unit normals of what is expected there.
+        deviation_mm
+            (s,) how far out of what is expected each place lies: the surface is that far back.
+
+        Returns
+        -------
+        low_mm, high_mm
+            (s,) each, positive outwards; 0 where no layer of the job is near.
+        """
+        o = self.options
+        surface = place_mm - deviation_mm[:, None] * normal
+        level, upright = np.hypot(normal[:, 0], normal[:, 1]), np.abs(normal[:, 2])
+        found = _Found(surface, -normal[:, :2] / np.maximum(level, 1e-9)[:, None])
+        wall, up = upright < o.upright, normal[:, 2] > 0
+        fill: _Fill | None = None
+        for k in range(len(self.top_mm)):
+            h, over, below = float(self.layer_mm[k]), surface[:, 2] - self.top_mm[k], fill
+            walls = np.flatnonzero(wall & (np.abs(over + 0.5 * h) < (o.around_layers + 0.5) * h))
+            tops = np.flatnonzero(~wall & up & (np.abs(over) < ROUNDS * h))
+            unders = np.flatnonzero(~wall & ~up & (np.abs(over + h) < ROUNDS * h))
+            fill = None
+            if not len(walls) + len(tops) + len(unders):
+                continue
+            fill = self._fill(k)
+            if below is None and k > 0:
+                below = self._fill(k - 1)
+            self._walls(k, fill, below, walls, found)
+            self._tops(k, fill, tops, found)
+            self._undersides(k, fill, unders, found)
+        low, high = (np.where(np.isfinite(side), side, 0.0) for side in (found.low, found.high))
+        share = np.where(wall, level, upright)  # of a way out, or up, along the normal
+        return low * share, np.maximum(high, low) * share
+
+    def expected_offset_mm(
+        self,
+        place_mm: Float[np.ndarray, "s 3"],
+        normal: Float[np.ndarray, "s 3"],
+        deviation_mm: Float[np.ndarray, " s"],
+    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+        """(s,) middle of `interval`, and (s,) half its width: an offset and its tolerance."""
+        low, high = self.interval(place_mm, normal, deviation_mm)
+        return 0.5 * (low + high), 0.5 * (high - low)
+
+    def _walls(
+        self,
+        k: int,
+        fill: _Fill,
+        below: _Fill | None,
+        which: Int[np.ndarray, " w"],
+        found: _Found,
+    ) -> None:
+        """How far a layer pushes walls out that lie in it, over it or under it."""
+        o, h = self.options, float(self.layer_mm[k])
+        share = np.full(len(which), o.push_beads)
+        if below is not None:
+            inside = found.surface_mm[which, :2] + 0.5 * o.blur_mm * found.inward[which]
+            share[below.at(inside, o.cell_mm) < 0.5] = o.push_strands
+        pushed, back = kernels.pushed_out(
+            fill.ratio, fill.widest_mm, fill.corner_mm, o.cell_mm,
+            found.surface_mm[which, :2], found.inward[which],
+            1.0 + o.flow_ratio, o.blur_mm, o.reach_mm, share,
+        )  # fmt: skip
+        found.high[which] = np.fmax(found.high[which], pushed)
+        own = np.abs(found.surface_mm[which, 2] - self.top_mm[k] + 0.5 * h) <= 0.5 * h + 1e-6
+        found.low[which[own]] = np.fmax(found.low[which[own]], -back[own])
+
+    def _tops(self, k: int, fill: _Fill, which: Int[np.ndarray, " w"], found: _Found) -> None:
+        """Tops lie where the layer that is rounded to them does, a little off by its own plastic.
+
+        What earlier layers had no room for went aside: the nozzle's flat levels every layer.
+        """
+        o, h = self.options, float(self.layer_mm[k])
+        mm = fill.at(found.surface_mm[which], o.cell_mm) * h
+        over = float(self.top_mm[k]) - found.surface_mm[which, 2]
+        near = mm > 0.5 * h
+        at, over, spare = which[near], over[near], mm[near] - h
+        found.low[at] = over + np.minimum(spare, 0.0)
+        found.high[at] = over + np.clip(spare, 0.0, o.rise_layers * h)
+
+    def _undersides(self, k: int, fill: _Fill, which: Int[np.ndarray, " w"], found: _Found) -> None:
+        """Undersides lie where the lowest layer's strands hang, and sag a little."""
+        o, h = self.options, float(self.layer_mm[k])
+        laid = fill.at(found.surface_mm[which], o.cell_mm) > 0.5
+        at = which[laid & ~np.isfinite(found.low[which])]
+        hangs = float(self.height_mm[self.first[k] : self.first[k + 1]].max())
+        under = found.surface_mm[at, 2] - float(self.top_mm[k])
+        found.low[at] = under + h
+        found.high[at] = under + max(hangs, h) + o.sag_layers * h
+
+    def _fill(self, k: int) -> _Fill:
+        """A layer's plastic over its room, averaged."""
+        o, which = self.options, slice(int(self.first[k]), int(self.first[k + 1]))
+        start, end, section = self.start_mm[which], self.end_mm[which], self.section_mm2[which]
+        h = float(self.layer_mm[k])
+        wide = section / h
+        margin = 0.5 * float(wide.max()) + o.blur_mm + 2 * o.cell_mm
+        low = np.minimum(start, end).min(axis=0)[:2] - margin
+        size = np.maximum(start, end).max(axis=0)[:2] + margin - low
+        nx, ny = (int(n) for n in np.ceil(size / o.cell_mm))
+        volume, widest = kernels.plastic(start, end, section, wide, low, o.cell_mm, ny, nx)
+        over = 2 * int(0.5 * o.blur_mm / o.cell_mm) + 1
+        ratio = uniform_filter(volume / (o.cell_mm**2 * h), over, mode="constant")
+        return _Fill(ratio, widest, low)

@@ -1,0 +1,80 @@
+"""A layer's look in the first open layers, and what the job's own path puts beyond a drawing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_bench import Small
+
+from amrepair.align import align
+from amrepair.frames import Transform
+from amrepair.loop import Stop
+from amrepair.loop.sites import sites
+from amrepair.repair import Site, _outside_open_infill
+from amrepair.scans import Scan
+
+
+@pytest.fixture(scope="module")
+def small() -> Small:
+    return Small.made("standard_0.20", 4.0)
+
+
+def look(small: Small, layer: int) -> tuple[Site, Stop]:
+    one = small.job.layers[layer]
+    stop = Stop(layer, one.end_line, one.z_mm)
+    return sites(small.job, small.template, small.placed, small.setup)(stop), stop
+
+
+def scan_from_above(site: Site, placed: Transform, low_mm: float) -> Scan:
+    """All of the part that lies open upwards and aside, too low as by a calibration's error."""
+    assert site.planned is not None
+    points, normals = site.planned.surface_points(0.3)
+    seen = (normals[:, 2] > -0.1) & (points[:, 2] > 0.1) & (site.template.distance(points) < 0.3)
+    rng = np.random.default_rng(2)
+    noisy = placed.apply(points[seen]) + rng.normal(scale=0.02, size=(int(seen.sum()), 3))
+    return Scan(noisy - [0.0, 0.0, low_mm], 0.02, "scanner", placed.rotate(normals[seen]))
+
+
+@pytest.mark.parametrize("above_skin", [1, 2, 3])
+def test_a_clean_look_into_shallow_open_infill_fits(small: Small, above_skin: int) -> None:
+    """Regression: most points lay on the infill's floor, and the run was ended as a misfit."""
+    layer = small.setup.process.bottom_layers + above_skin - 1
+    site, _ = look(small, layer)
+    scan = scan_from_above(site, small.placed, 0.1)
+    guess = Transform("template", "scanner", small.placed.inverse().matrix)
+    found = align(_outside_open_infill(scan, site, guess), site.template, guess=guess)
+    moved = found.template_from_scan.apply(scan.points_mm)
+    off_mm = moved - small.placed.inverse().apply(scan.points_mm) - [0.0, 0.0, 0.1]
+    assert np.abs(off_mm).max() < 0.06
+
+
+def test_what_is_missing_below_a_layer_still_counts_against_the_fit(small: Small) -> None:
+    """Only the infill's own floor is left out: a pit in it lies where no bead was planned."""
+    site, _ = look(small, small.setup.process.bottom_layers + 1)
+    scan = scan_from_above(site, small.placed, 0.0)
+    guess = Transform("template", "scanner", small.placed.inverse().matrix)
+    inside_mm = site.template.distance(guess.apply(scan.points_mm))
+    floor = (inside_mm < -0.3) & (inside_mm > -0.45)
+    assert floor.sum() > 300
+    deeper = replace(scan, points_mm=scan.points_mm - floor[:, None] * [0.0, 0.0, 0.3])
+    kept = [len(_outside_open_infill(one, site, guess)) for one in (scan, deeper)]
+    assert kept[0] < len(scan) - 0.9 * floor.sum()
+    assert kept[1] > kept[0]
+
+
+def test_a_site_tells_in_its_templates_frame_what_its_job_leaves(small: Small) -> None:
+    site, _ = look(small, small.setup.process.bottom_layers - 1)
+    x = np.linspace(4.0, 12.0, 9)
+    wall = np.column_stack([x, np.zeros(9), np.full(9, 0.5)])
+    normal = np.tile([0.0, -1.0, 0.0], (9, 1))
+    offset, tolerance = site.expected_offset_mm(wall, normal, np.zeros(9), placed=small.placed)
+    assert (tolerance >= 0).all()
+    # our own slicer fills a solid layer to a per cent: 4 mm of it and 2.3 % of filament
+    assert (offset + tolerance).max() < 0.25
+    assert (offset - tolerance).min() > -0.1
+    none = replace(site, laid=None).expected_offset_mm(
+        wall, normal, np.zeros(9), placed=small.placed
+    )
+    assert not np.any(none)
