@@ -14,6 +14,7 @@ from amrepair.cli.options import (
     ProcessOption,
     SeedOption,
 )
+from amrepair.errors import InputError
 from gcode.cli import console
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
@@ -27,11 +28,25 @@ def add_to(app: typer.Typer) -> None:
             "amrepair calibrate --target-gcode target.gcode",
             "amrepair calibrate --scan target.ply -o calibration.json",
             "amrepair calibrate --scan layer.ply --job job.gcode --layer 0 --json",
+            "amrepair calibrate --sound a.ply --sound b.ply --template part.stl --name bench",
         ),
     )(calibrate_command)
 
 
 def calibrate_command(
+    sound: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Scan of a sound part: learn what this scanner and printer leave on one. May be "
+            "repeated; wants --template and --name."
+        ),
+    ] = None,
+    template: Annotated[
+        Path | None, typer.Option(help="Template of the sound part, or its mesh.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Keep what was learned by this name, for --calibration.")
+    ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="File to write, for 'loop --calibration'.")
     ] = Path("calibration.json"),
@@ -63,9 +78,14 @@ def calibrate_command(
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where the scanner hangs over the bed, from a printed target or a job's first layers."""
+    """Find where the scanner hangs; or learn from sound parts what it leaves on them."""
     with console.starting():
-        from amrepair.cli import calibrating
+        from amrepair.cli import calibrating, sound_parts
+    if sound:
+        sound_parts.run(sound, template, name, seed=seed, as_json=as_json)
+        return
+    if template is not None or name is not None:
+        raise InputError("--template and --name belong to --sound SCAN; name a sound part's scan")
 
     if target_gcode is not None:
         calibrating.write_target(target_gcode, (printer, material, process), as_json=as_json)

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amrepair.cli.options import JsonOption, SeedOption, SensorOption, sensors, with_settings
+from amrepair.cli.options import (
+    CalibrationOption,
+    JsonOption,
+    SeedOption,
+    SensorOption,
+    calibration_named,
+    sensors,
+    with_settings,
+)
 from amrepair.errors import InputError
 from gcode.cli import console
 
@@ -181,6 +189,13 @@ def detect(
     out: Annotated[Path, typer.Option(help="Folder for anomaly.npz, anomaly.ply, result.json.")],
     part_is_known: KnownOption = False,
     sensor_at: SensorOption = None,
+    calibration: CalibrationOption = None,
+    smallest_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="Depth of the smallest defect that matters: refuse a scan too noisy."
+        ),
+    ] = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -199,6 +214,7 @@ def detect(
     from amrepair.template import open_template
 
     _refuse_known_of_many(part_is_known, template)
+    known_errors = calibration_named(calibration)
     watch, bars = Stopwatch(), console.Bars()
     with bars.shown():
         with bars.stage("read scan"):
@@ -220,7 +236,8 @@ def detect(
                 )
         placed = cloud.moved(found.template_from_scan)
         with watch("detect"):
-            anomaly = detect_defects(placed, field, progress=bars)
+            anomaly = detect_defects(placed, field, calibration=known_errors, progress=bars)
+        _refuse_too_noisy(anomaly, smallest_mm, scan)
         with watch("measure"):
             in_place = Transform.identity("build", "template")
             deficit = compute_deficit(
@@ -241,9 +258,11 @@ def detect(
                 "area_mm2": region.area_mm2,
                 "depth_mm": region.depth_mm,
                 "box_mm": region.box_mm,
+                "p_value": None if np.isnan(region.p_value) else region.p_value,
             }
             for region in regions
         ],
+        **_told(anomaly, calibration),
         "template_from_scan": found.template_from_scan.matrix.tolist(),
         "rmse_mm": found.rmse_mm,
         "inlier_ratio": found.inlier_ratio,
@@ -270,10 +289,44 @@ def detect(
         f"{count} {'region' if count == 1 else 'regions'} beyond {anomaly.threshold_mm:.3f} mm "
         f"({anomaly.threshold_source}); object score {anomaly.object_score:.3f} mm."
     )
+    for sentence in told_of(anomaly):
+        console.out.print(sentence)
     for region in regions:
         console.out.print(
             f"  {region.label.name.lower()} {region.type}: {region.volume_mm3:.1f} mm³, "
             f"{region.depth_mm:.2f} mm deep"
+        )
+
+
+def told_of(anomaly: AnomalyMap) -> tuple[str, ...]:
+    """What belongs to the whole part or to whole views, in sentences."""
+    return () if anomaly.nuisance is None else anomaly.nuisance.told()
+
+
+def _told(anomaly: AnomalyMap, calibration: str | None) -> dict[str, Any]:
+    """What a result says beside its regions: noise, what belongs to the whole part, settings."""
+    from dataclasses import asdict
+
+    assert anomaly.noise is not None
+    assert anomaly.options is not None
+    return {
+        "noise": anomaly.noise.to_json(),
+        "nuisance": None if anomaly.nuisance is None else anomaly.nuisance.to_json(),
+        "told": list(told_of(anomaly)),
+        "options": asdict(anomaly.options),
+        "calibration": calibration,
+    }
+
+
+def _refuse_too_noisy(anomaly: AnomalyMap, smallest_mm: float | None, scan: Path) -> None:
+    """Refuse a scan that cannot show the smallest defect asked for."""
+    assert anomaly.noise is not None
+    area_mm2, depth_mm = min(anomaly.noise.smallest_mm, key=lambda pair: pair[1])
+    if smallest_mm is not None and depth_mm > smallest_mm:
+        raise InputError(
+            f"{scan}: the smallest defect that this scan could show is {depth_mm:.2f} mm deep over "
+            f"{area_mm2:.0f} mm², and {smallest_mm:g} mm was asked for; scan more finely or from "
+            "more sides"
         )
 
 

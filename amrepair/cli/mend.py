@@ -12,12 +12,14 @@ import typer
 
 from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.options import (
+    CalibrationOption,
     JsonOption,
     MaterialOption,
     PrinterOption,
     ProcessOption,
     SeedOption,
     SensorOption,
+    calibration_named,
     part_pose,
     sensors,
 )
@@ -83,6 +85,7 @@ def repair(
         ),
     ] = False,
     sensor_at: SensorOption = None,
+    calibration: CalibrationOption = None,
     job: Annotated[
         Path | None, typer.Option(help="The job's G-code: repair layers lie on its layers.")
     ] = None,
@@ -134,6 +137,7 @@ def repair(
         console.writable(path)
     placed = part_pose(pose) if pose is not None else None
     setup = load_setup(printer, material, process)
+    known_errors = calibration_named(calibration)
     watch, bars = Stopwatch(), console.Bars()
     frame = "build" if scan_frame == "build" else "scanner"
     with bars.shown():
@@ -144,7 +148,12 @@ def repair(
             field = open_template(template, progress=bars)
         guess = placed.inverse() if placed is not None and frame == "build" else None
         site = Site(
-            field, setup, grid, placed if frame == "scanner" else None, on_fixture=on_fixture
+            field,
+            setup,
+            grid,
+            placed if frame == "scanner" else None,
+            on_fixture=on_fixture,
+            calibration=known_errors,
         )
         plan = plan_repair(
             cloud,

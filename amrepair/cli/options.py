@@ -16,15 +16,18 @@ if TYPE_CHECKING:
     import numpy as np
 
     from amrepair.frames import Transform
+    from amrepair.regions.calibration import Calibration
     from gcode.profiles import PrintSetup
 
 __all__ = [
+    "CalibrationOption",
     "JsonOption",
     "MaterialOption",
     "PrinterOption",
     "ProcessOption",
     "SeedOption",
     "SensorOption",
+    "calibration_named",
     "numbers",
     "part_pose",
     "scaled_mesh",
@@ -109,6 +112,22 @@ SensorOption = Annotated[
         "missing.",
     ),
 ]
+
+
+CalibrationOption = Annotated[
+    str | None,
+    typer.Option(
+        "--calibration",
+        help="Name under which 'calibrate --sound' kept what this scanner leaves on sound parts.",
+    ),
+]
+
+
+def calibration_named(name: str | None) -> Calibration | None:
+    """The calibration of that name, from the user's folder; None where none was named."""
+    from amrepair.regions.calibration import Calibration, users_folder
+
+    return None if name is None else Calibration.load(name, users_folder())
 
 
 def sensors(texts: list[str] | None) -> np.ndarray | None:

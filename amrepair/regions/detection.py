@@ -26,7 +26,7 @@ from amrepair.observe.background import (
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import RangeImage, clearances, range_images
 from amrepair.regions.anomaly import AnomalyMap, Label
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.calibration import NORMAL, Calibration
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
@@ -118,33 +118,19 @@ def detect(
     [('MISSING', True)]
     """
     options = options or RegionOptions()
-    _refuse_other_frame(scan)
-    refuse_wrong_scale(scan, template)
     progress("detect", 0.0, 4.0)
-    with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
-        asked = None if images is not None else beside.submit(range_images, scan)
-        f_mm = template.distance(scan.points_mm)
-        surface_mm, normals = surface or template.surface_points(options.spacing_mm)
-        keep = ~background(scan, template, f_mm, surface_mm)
-        _refuse_nothing_near(scan, keep)
-        surfels = make_surfels(scan.points_mm, f_mm, keep)
-        seen = images or () if asked is None else asked.result()
-    if surfels.spacing_mm > options.spacing_mm:
-        surface_mm, normals = template.surface_points(surfels.spacing_mm)
+    seen = _observed(scan, template, options, images, surface)
     progress("detect", 1.0, 4.0)
-    crossed, depth_mm = _crossed(surface_mm, surfels, seen)
-    sites = _sites(surfels, template, surface_mm[crossed], normals[crossed], depth_mm)
-    sites = _with_tolerance(sites, surfels, template, options, top_z_mm, rounded_up)
-    nuisance = None
+    surfels, surface_mm = seen.surfels, seen.surface_mm
+    sites = _sites(seen, template, options, top_z_mm, rounded_up)
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
-    if calibration is None and top_z_mm is None:
-        nuisance, removed_mm = _nuisance(sites, surfels, scan, options)
-        sites = replace(sites, value_mm=sites.value_mm - removed_mm)
-    noise, levels = _tested(sites, surfels, scan, options, calibration)
-    # what errors leave in strips no scan tells by itself
-    strands = np.zeros(len(surfels), bool)
-    if calibration is not None:
-        strands = _strands(surfels, template, levels, options)
+    whole_part = top_z_mm is None and calibration is not NORMAL
+    nuisance, sites = (
+        _without_nuisance(sites, surfels, scan, options) if whole_part else (None, sites)
+    )
+    levels = _tested(sites, surfels, options, calibration)
+    noise = noise_of(levels, surfels, scan, options)
+    strands = _strands(surfels, template, levels, options, calibration)
     labels, log_p = grown(levels, sites.tolerance_mm, options, strands=strands)
     missing, excess = labels[:, : len(surfels)]
     noise_mm = float(np.median(levels[1].quantile * levels[1].error_mm))
@@ -155,17 +141,17 @@ def detect(
         template,
         surfels,
         missing | excess,
-        seen,
+        seen.images,
         threshold_mm=_stray_limit_mm(levels[0], options),
         up=up,
     )
     gone = np.zeros(len(surface_mm), bool)
-    gone[crossed] = labels[0, len(surfels) :]
-    surface_label = _label_surface(surface_mm, normals, template, evidence, missing, gone, limit_mm)
+    gone[seen.crossed] = labels[0, len(surfels) :]
+    surface_label = _label_surface(seen, template, evidence, missing, gone, limit_mm)
     evidence = with_stubs(evidence, scan, surface_mm[gone], missing | excess)
     progress("detect", 3.0, 4.0)
-    score = np.abs(f_mm)
-    k = min(options.top_k, int(keep.sum()))
+    score = np.abs(seen.f_mm)
+    k = min(options.top_k, int(seen.keep.sum()))
     regions = find_regions(
         evidence, missing, excess, surface_mm, surface_label, template, p_value=np.exp(log_p)
     )
@@ -174,14 +160,14 @@ def detect(
     allowed_mm = sites.tolerance_mm[1] - sites.tolerance_mm[0]
     return AnomalyMap(
         points_mm=scan.points_mm,
-        deviation_mm=f_mm,
+        deviation_mm=seen.f_mm,
         score=score,
         label=np.append(surfel_label, 0)[surfels.of_point],
         template_points_mm=surface_mm,
         template_label=surface_label,
         threshold_mm=_stray_limit_mm(levels[0], options),
         threshold_source=_source(options, template, noise),
-        object_score=float(np.partition(score[keep], -k)[-k:].mean()),
+        object_score=float(np.partition(score[seen.keep], -k)[-k:].mean()),
         regions=regions,
         top_z_mm=top_z_mm if options.tolerance_mm is None else None,
         top_threshold_mm=top_mm,
@@ -192,6 +178,81 @@ def detect(
         nuisance=nuisance,
         options=options,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """What a scan shows of its template.
+
+    Attributes
+    ----------
+    f_mm, keep
+        (n,) deviation of each point, and whether it is one of the part.
+    surfels
+        The points of the part, condensed.
+    images
+        What rays saw.
+    surface_mm, normals
+        (m, 3) each: the template's surface.
+    crossed, depth_mm
+        (c,) numbers of surface points with no scanned surface near that rays passed, and by how
+        much.
+    """
+
+    f_mm: Float[np.ndarray, " n"]
+    keep: Bool[np.ndarray, " n"]
+    surfels: Surfels
+    images: tuple[RangeImage, ...]
+    surface_mm: Float[np.ndarray, "m 3"]
+    normals: Float[np.ndarray, "m 3"]
+    crossed: Int[np.ndarray, " c"]
+    depth_mm: Float[np.ndarray, " c"]
+
+
+def judged_levels(
+    scan: Scan, template: Template, options: RegionOptions | None = None
+) -> tuple[Level, ...]:
+    """The tested scales of a scan, for a calibration to learn from.
+
+    Parameters
+    ----------
+    scan
+        Of a sound part, in the template's frame.
+
+    Raises
+    ------
+    InputError
+        As `detect`.
+    """
+    options = options or RegionOptions()
+    seen = _observed(scan, template, options, None, None)
+    sites = _sites(seen, template, options, None, None)
+    _, sites = _without_nuisance(sites, seen.surfels, scan, options)
+    return _tested(sites, seen.surfels, options, None)
+
+
+def _observed(
+    scan: Scan,
+    template: Template,
+    options: RegionOptions,
+    images: tuple[RangeImage, ...] | None,
+    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None,
+) -> Observed:
+    """Deviations, rays, and what of the template they speak of."""
+    _refuse_other_frame(scan)
+    refuse_wrong_scale(scan, template)
+    with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
+        asked = None if images is not None else beside.submit(range_images, scan)
+        f_mm = template.distance(scan.points_mm)
+        surface_mm, normals = surface or template.surface_points(options.spacing_mm)
+        keep = ~background(scan, template, f_mm, surface_mm)
+        _refuse_nothing_near(scan, keep)
+        surfels = make_surfels(scan.points_mm, f_mm, keep)
+        seen = images or () if asked is None else asked.result()
+    if surfels.spacing_mm > options.spacing_mm:
+        surface_mm, normals = template.surface_points(surfels.spacing_mm)
+    crossed, depth_mm = _crossed(surface_mm, surfels, seen)
+    return Observed(f_mm, keep, surfels, seen, surface_mm, normals, crossed, depth_mm)
 
 
 def _refuse_other_frame(scan: Scan) -> None:
@@ -226,65 +287,51 @@ def _crossed(
 
 
 def _sites(
-    surfels: Surfels,
-    template: Template,
-    crossed_mm: Float[np.ndarray, "c 3"],
-    crossed_normal: Float[np.ndarray, "c 3"],
-    depth_mm: Float[np.ndarray, " c"],
-) -> Sites:
-    """Cells and crossed template points, as yet without a tolerance."""
-    outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
-    typical = float(np.median(surfels.count))
-    # cells that noise alone put one above the other are one place
-    half_mm = 0.5 * surfels.cell_mm
-    aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
-    feet_mm = surfels.place_mm - aside_mm[:, None] * outward
-    return Sites(
-        place_mm=np.concatenate([feet_mm, crossed_mm]),
-        normal=np.concatenate([outward, crossed_normal]),
-        value_mm=np.concatenate([surfels.deviation_mm, -depth_mm]),
-        weight=np.concatenate([surfels.count, np.full(len(depth_mm), typical)]),
-        tolerance_mm=np.zeros((2, len(surfels) + len(depth_mm))),
-    )
-
-
-def _with_tolerance(
-    sites: Sites,
-    surfels: Surfels,
+    seen: Observed,
     template: Template,
     options: RegionOptions,
     top_z_mm: float | None,
     rounded_up: RoundedUp | None,
 ) -> Sites:
-    """With δ for either sign: process, registration, template, and what normal parts differ by."""
+    """Cells and crossed template points, each with what a sound part may depart there."""
+    surfels = seen.surfels
+    outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
+    # cells that noise alone put one above the other are one place
+    half_mm = 0.5 * surfels.cell_mm
+    aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
+    feet_mm = surfels.place_mm - aside_mm[:, None] * outward
+    crossed_mm = seen.surface_mm[seen.crossed]
+    value_mm = np.concatenate([surfels.deviation_mm, -seen.depth_mm])
+    typical = np.full(len(crossed_mm), float(np.median(surfels.count)))
     anywhere_mm, top_mm = _tolerances(options, template)
-    tolerance_mm = np.full((2, len(sites.value_mm)), anywhere_mm)
+    tolerance_mm = np.full((2, len(value_mm)), anywhere_mm)
     if top_z_mm is not None:
-        cells = slice(0, len(surfels))
         under = surfels.place_mm[:, 2] - top_z_mm
         top = np.abs(surfels.deviation_mm - under) < ON_PLANE_MM
-        tolerance_mm[0, cells][top] = top_mm
+        tolerance_mm[0, : len(surfels)][top] = top_mm
     spread = getattr(template, "spread_mm", None)
+    place_mm = np.concatenate([surfels.place_mm, crossed_mm])
     if spread is not None:
-        tolerance_mm += TOLERATED_SPREADS * spread(sites.place_mm)
+        tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
     if rounded_up is not None:
-        seen_mm = np.concatenate([surfels.place_mm, sites.place_mm[len(surfels) :]])
-        tolerance_mm[1] += rounded_up(seen_mm, sites.value_mm)
-    return replace(sites, tolerance_mm=tolerance_mm)
+        tolerance_mm[1] += rounded_up(place_mm, value_mm)
+    return Sites(
+        place_mm=np.concatenate([feet_mm, crossed_mm]),
+        normal=np.concatenate([outward, seen.normals[seen.crossed]]),
+        value_mm=value_mm,
+        weight=np.concatenate([surfels.count, typical]),
+        tolerance_mm=tolerance_mm,
+    )
 
 
-def _nuisance(
+def _without_nuisance(
     sites: Sites, surfels: Surfels, scan: Scan, options: RegionOptions
-) -> tuple[Nuisance, Float[np.ndarray, " b"]]:
-    """What belongs to the whole part or to whole views, and (b,) how much of each site it is."""
+) -> tuple[Nuisance, Sites]:
+    """What belongs to the whole part or to whole views, and the sites without it."""
     n = len(surfels)
-    several = scan.sensor_index is not None and int(scan.sensor_index.max()) > 0
-    if several:
-        assert scan.sensor_index is not None
+    cell, view, value_mm, count = np.arange(n), None, sites.value_mm[:n], surfels.count
+    if scan.sensor_index is not None and int(scan.sensor_index.max()) > 0:
         cell, view, value_mm, count = surfels.by_view(scan.sensor_index)
-    else:
-        cell, view = np.arange(n), None
-        value_mm, count = sites.value_mm[:n], surfels.count
     found = fit_nuisance(
         sites.place_mm[cell],
         sites.normal[cell],
@@ -295,9 +342,9 @@ def _nuisance(
         correlation_mm=options.correlation_mm,
     )
     share_mm = found.removed_mm(sites.place_mm[cell], sites.normal[cell], view)
-    removed_mm = np.zeros(len(sites.value_mm))
-    removed_mm[:n] = np.bincount(cell, count * share_mm, n) / np.bincount(cell, count, n)
-    return found, removed_mm
+    value_mm = sites.value_mm.copy()
+    value_mm[:n] -= np.bincount(cell, count * share_mm, n) / np.bincount(cell, count, n)
+    return found, replace(sites, value_mm=value_mm)
 
 
 def _tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:
@@ -310,13 +357,9 @@ def _tolerances(options: RegionOptions, template: Template) -> tuple[float, floa
 
 
 def _tested(
-    sites: Sites,
-    surfels: Surfels,
-    scan: Scan,
-    options: RegionOptions,
-    calibration: Calibration | None,
-) -> tuple[Noise, tuple[Level, ...]]:
-    """The noise as the scan shows it, and the test of every scale."""
+    sites: Sites, surfels: Surfels, options: RegionOptions, calibration: Calibration | None
+) -> tuple[Level, ...]:
+    """The test of every scale."""
     scales = scales_of(
         sites.place_mm,
         sites.normal,
@@ -325,14 +368,22 @@ def _tested(
         cell_mm=surfels.cell_mm,
         widest_mm=options.widest_mm,
     )
-    levels = tested(scales, sites.tolerance_mm, options, calibration=calibration)
-    return noise_of(levels, surfels, scan, options), levels
+    return tested(scales, sites.tolerance_mm, options, calibration=calibration)
 
 
 def _strands(
-    surfels: Surfels, template: Template, levels: tuple[Level, ...], options: RegionOptions
+    surfels: Surfels,
+    template: Template,
+    levels: tuple[Level, ...],
+    options: RegionOptions,
+    calibration: Calibration | None,
 ) -> Bool[np.ndarray, " s"]:
-    """(s,) cells of strips narrower than any window that stand out along their length."""
+    """(s,) cells of strips narrower than any window that stand out along their length.
+
+    What errors leave in strips a scan does not tell by itself: without a calibration there is none.
+    """
+    if calibration is None:
+        return np.zeros(len(surfels), bool)
     first = levels[1]
     at = first.scale.of_base[: len(surfels)]
     low_mm = options.grow_share * first.tolerance_mm[1] + options.grow_sigmas * first.error_mm
@@ -376,8 +427,7 @@ def _source(options: RegionOptions, template: Template, noise: Noise) -> str:
 
 
 def _label_surface(
-    surface_mm: Float[np.ndarray, "m 3"],
-    normals: Float[np.ndarray, "m 3"],
+    seen: Observed,
     template: Template,
     evidence: Evidence,
     missing: Bool[np.ndarray, " s"],
@@ -385,7 +435,7 @@ def _label_surface(
     limit_mm: float,
 ) -> Int[np.ndarray, " m"]:
     """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
-    surfels = evidence.surfels
+    surfels, surface_mm = evidence.surfels, seen.surface_mm
     nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     present = (nearest >= 0) & ~missing[nearest]
     label = np.where(present, int(Label.OK), int(Label.UNSEEN))
@@ -394,7 +444,7 @@ def _label_surface(
     elif missing.any():
         open_ = np.flatnonzero(~present)
         # just inside the surface, as deep as the limit: empty there is more than noise
-        inside = surface_mm[open_] - limit_mm * normals[open_]
+        inside = surface_mm[open_] - limit_mm * seen.normals[open_]
         f_mm = template.distance(inside)
         empty = (evidence.cautious(inside, f_mm) > limit_mm / 2) & (f_mm < -limit_mm / 2)
         label[open_[empty]] = int(Label.MISSING)
