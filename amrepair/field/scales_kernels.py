@@ -86,6 +86,17 @@ def window_statistics(table, count, value, weight, rank):
 
 
 @njit(cache=True, nogil=True, parallel=True)
+def window_means(table, count, value):
+    """(s,) mean over each window."""
+    out = np.zeros(table.shape[0])
+    for i in prange(table.shape[0]):
+        for k in range(count[i]):
+            out[i] += value[table[i, k]]
+        out[i] /= count[i]
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
 def window_medians(table, count, value):
     """(s,) median over each window of the values that are numbers; NaN where none is."""
     n = table.shape[0]

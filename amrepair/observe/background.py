@@ -13,6 +13,8 @@ from amrepair.template.port import Template
 MAX_EXCESS_MM = 12.0
 # Bed, skirt and first-layer ooze: one thick layer above the lowest plane of the part.
 BED_BAND_MM = 0.35
+# Of a plane's points one in 30,000 lies farther from it, by noise of so many sigmas.
+NOISE_SIGMAS = 4.0
 # The template's distance is the height under a plane: to rounding.
 ON_PLANE_MM = 1e-4
 # So much of the underside seen, so far from its rim: nothing lies under the part, there is no bed.
@@ -52,15 +54,16 @@ def background(
         in_plane = np.abs(scan.points_mm[:, 2] - low_z) < rim_mm
         beside = in_plane & (f_mm > max(rim_mm, BED_BAND_MM / 2))
         return np.asarray((f_mm > MAX_EXCESS_MM) | beside)
-    bed = (scan.points_mm[:, 2] < low_z + BED_BAND_MM) & (f_mm > 0.02)
-    inside_band = scan.points_mm[:, 2] > low_z - BED_BAND_MM
+    band_mm = max(BED_BAND_MM, NOISE_SIGMAS * scan.sigma_mm)
+    bed = (scan.points_mm[:, 2] < low_z + band_mm) & (f_mm > band_mm / 2)
+    inside_band = scan.points_mm[:, 2] > low_z - band_mm
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
-    return (bed & (f_mm > BED_BAND_MM / 2)) | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
+    return bed | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
 
 
 def _rim_mm(scan: Scan) -> float:
     """How far from the lowest plane a point may lie that is on it."""
-    return max(RIM_MM, 4.0 * scan.sigma_mm)
+    return max(RIM_MM, NOISE_SIGMAS * scan.sigma_mm)
 
 
 def _shows_underside(

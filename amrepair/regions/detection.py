@@ -386,7 +386,7 @@ def _strands(
         return np.zeros(len(surfels), bool)
     first = levels[1]
     at = first.scale.of_base[: len(surfels)]
-    low_mm = options.grow_share * first.tolerance_mm[1] + options.grow_sigmas * first.error_mm
+    low_mm = options.grow_share * first.tolerance_mm[1]
     per_point_mm = float(np.median(first.scale.noise_mm) * np.sqrt(np.median(surfels.count)))
     # of what is as narrow as a few cells, errors have a tail as long as that of those cells
     critical = float(max(first.critical[1], levels[0].critical[1]))

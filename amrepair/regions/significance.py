@@ -104,8 +104,9 @@ def tested(
     levels = []
     for k, scale in enumerate(scales):
         size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
+        cells = (np.bincount(scale.of_base, side, len(scale)) / size for side in tolerance_mm)
         delta = np.stack(
-            [np.bincount(scale.of_base, side, minlength=len(scale)) / size for side in tolerance_mm]
+            [scales_kernels.window_means(scale.table, scale.count, side) for side in cells]
         )
         errors = _errors(scale, options, calibration)
         if k == 0:
