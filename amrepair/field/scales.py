@@ -123,7 +123,7 @@ def _scale(
         else np.add.reduceat((value_mm * weight)[order], first) / total
     )
     table, count = kernels.neighbours(keys, *strides, facing, FACING_COSINE)
-    seen = kernels.window_statistics(table, count, value, total, RANK)
+    seen = kernels.window_statistics(table, count, place, value, total, RANK)
     noise = kernels.window_medians(table, count, np.ascontiguousarray(seen[:, 3]))
     known = noise[np.isfinite(noise)]
     noise[~np.isfinite(noise)] = float(np.median(known)) if len(known) else 0.0

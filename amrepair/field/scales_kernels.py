@@ -15,6 +15,10 @@ SLOTS = 8
 NORMAL_MEDIAN = 0.674490
 # median |a − b| of two normal values of standard deviation 1
 PAIR_MEDIAN = 0.953873
+# A plane: level and slope.
+TREND_TERMS = 4
+# Of a window's own spread: nothing beside what is in the surface, much across it.
+RIDGE, TINY = 1e-3, 1e-9
 
 
 @njit(cache=True, nogil=True)
@@ -57,11 +61,41 @@ def neighbours(keys, stride_x, stride_y, normal, cosine):
     return table, count
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def window_statistics(table, count, value, weight, rank):
-    """(s, 5): median, `rank`-th lowest and highest, noise by pairs, summed weight of a window.
+@njit(cache=True, nogil=True)
+def _off_plane(place, value, table, count, i):
+    """(n,) distances of a window's values from the plane through them by least squares."""
+    n = count[i]
+    matrix = np.zeros((TREND_TERMS, TREND_TERMS))
+    right = np.zeros(TREND_TERMS)
+    row = np.ones(TREND_TERMS)
+    for k in range(n):
+        j = table[i, k]
+        for a in range(3):
+            row[a + 1] = place[j, a] - place[i, a]
+        for a in range(TREND_TERMS):
+            right[a] += row[a] * value[j]
+            for b in range(TREND_TERMS):
+                matrix[a, b] += row[a] * row[b]
+    across = RIDGE * (matrix[1, 1] + matrix[2, 2] + matrix[3, 3]) + TINY
+    for a in range(1, TREND_TERMS):
+        matrix[a, a] += across  # cells hardly reach across the surface that they lie on
+    trend = np.linalg.solve(matrix, right)
+    off = np.empty(n)
+    for k in range(n):
+        j = table[i, k]
+        at = trend[0]
+        for a in range(3):
+            at += trend[a + 1] * (place[j, a] - place[i, a])
+        off[k] = abs(value[j] - at)
+    return off
 
-    The noise is NaN where a cell has fewer than `rank` others beside it.
+
+@njit(cache=True, nogil=True, parallel=True)
+def window_statistics(table, count, place, value, weight, rank):
+    """(s, 5): median, `rank`-th lowest and highest, noise, summed weight of a window.
+
+    The noise is what the values differ by from a plane, the side of a dent being none; by pairs
+    where cells are too few for a plane; NaN where a cell has fewer than `rank` others beside it.
     """
     n = table.shape[0]
     out = np.empty((n, 5))
@@ -81,6 +115,11 @@ def window_statistics(table, count, value, weight, rank):
         at = min(rank, count[i]) - 1
         out[i, 1], out[i, 2] = ranked[at], ranked[count[i] - 1 - at]
         out[i, 3] = _median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
+        if count[i] >= 2 * TREND_TERMS:
+            off = _off_plane(place, value, table, count, i)
+            # a plane on a surface takes three of the n degrees of freedom
+            spread = _median(off, count[i]) / NORMAL_MEDIAN * np.sqrt(count[i] / (count[i] - 3.0))
+            out[i, 3] = min(out[i, 3], spread)
         out[i, 4] = total
     return out
 
