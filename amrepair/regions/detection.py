@@ -142,7 +142,7 @@ def detect(
         surfels,
         missing | excess,
         seen.images,
-        threshold_mm=_stray_limit_mm(levels[0], options),
+        threshold_mm=min(_stray_limit_mm(levels[0], options, calibration), limit_mm),
         up=up,
     )
     gone = np.zeros(len(surface_mm), bool)
@@ -165,7 +165,7 @@ def detect(
         label=np.append(surfel_label, 0)[surfels.of_point],
         template_points_mm=surface_mm,
         template_label=surface_label,
-        threshold_mm=_stray_limit_mm(levels[0], options),
+        threshold_mm=limit_mm,
         threshold_source=_source(options, template, noise),
         object_score=float(np.partition(score[seen.keep], -k)[-k:].mean()),
         regions=regions,
@@ -399,15 +399,17 @@ def _strands(
     )
 
 
-def _stray_limit_mm(level: Level, options: RegionOptions) -> float:
+def _stray_limit_mm(level: Level, options: RegionOptions, calibration: Calibration | None) -> float:
     """How far from the template a cell is broken off: beyond δ's share, and how cells stray.
 
     Of all cells as many stray farther from their neighbours as of normal noise lie beyond
     `grow_sigmas`: the tail of a real scanner's errors counts.
     """
+    tolerance_mm = options.grow_share * float(np.median(level.tolerance_mm[0]))
+    if calibration is not None:
+        return tolerance_mm + options.grow_sigmas * float(np.median(level.error_mm))
     stray_mm = np.abs(level.scale.value_mm - level.scale.median_mm)
     share = 1.0 - 2.0 * float(norm.sf(options.grow_sigmas))
-    tolerance_mm = options.grow_share * float(np.median(level.tolerance_mm[0]))
     return tolerance_mm + float(np.quantile(stray_mm, share))
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from amrepair.field import scales_kernels
+from amrepair.field.scales import Scale
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import Level, usual_error_mm
 
@@ -23,23 +24,21 @@ def grown(
     number of false regions, over all that is tested.
 
     From every window that is significant a region grows through neighbouring cells of the field
-    for as long as their deviation is beyond a share of the tolerance and beyond the noise.
+    for as long as they are beyond the noise and deeper than the tolerance or half the region,
+    whichever is less: what is allowed beside a defect is none of it, and a shallow one has a rim.
     """
-    finest = levels[0]
-    scale = finest.scale
+    scale = levels[0].scale
     value_mm = scale.value_mm[scale.of_base]
     # what is normal where a place was seen as densely: a defect's own slopes are no noise
-    error_mm = usual_error_mm(finest, options)[scale.of_base]
-    low_mm = options.grow_share * tolerance_mm + options.grow_sigmas * error_mm
-    through = np.stack([-value_mm, value_mm]) > low_mm
-    through[1, : len(strands)] |= strands
-    labels = np.zeros_like(through)
-    log_p = np.zeros(through.shape)
+    noise_mm = options.grow_sigmas * usual_error_mm(levels[0], options)[scale.of_base]
+    labels = np.zeros(tolerance_mm.shape, bool)
+    log_p = np.zeros(tolerance_mm.shape)
     tests = np.log(2 * len(levels))
-    for side in range(2):
-        seeds = np.zeros(len(value_mm), bool)
+    for side, deep_mm in enumerate((-value_mm, value_mm)):
+        strips = np.zeros(len(value_mm), bool)
         if side == 1:
-            seeds[: len(strands)] = strands
+            strips[: len(strands)] = strands
+        seeds = np.zeros(len(value_mm), bool)
         for level in levels:
             if level.rejected[side].any():
                 surest = scales_kernels.surest(
@@ -47,16 +46,30 @@ def grown(
                 )[level.scale.of_base]
                 seeds |= surest < 0
                 log_p[side] = np.minimum(log_p[side], surest + tests)
-        seeds &= through[side]
-        if not seeds.any():
+        through = (deep_mm > options.grow_share * tolerance_mm[side] + noise_mm) | strips
+        region = _reached(scale, (seeds | strips) & through, through)
+        if not (region >= 0).any():
             continue
-        open_cells, start_cells = np.zeros((2, len(scale)), bool)
-        open_cells[scale.of_base[through[side]]] = True
-        start_cells[scale.of_base[seeds]] = True
-        group, groups = scales_kernels.components(scale.table, scale.count, open_cells)
-        kept = np.zeros(groups + 1, bool)
-        kept[group[start_cells]] = True
-        kept[-1] = False  # what −1 looks up
-        labels[side] = kept[group][scale.of_base] & through[side]
+        depth_mm = np.zeros(int(region.max()) + 1)
+        within = (region >= 0) & seeds
+        np.maximum.at(depth_mm, region[within], deep_mm[within])
+        # a strip alone has no depth to go by; number −1 looks up the last, and is no region anyhow
+        low_mm = np.minimum(0.5 * depth_mm[region], tolerance_mm[side])
+        through &= (region >= 0) & ((deep_mm > low_mm + noise_mm) | (depth_mm[region] == 0))
+        labels[side] = _reached(scale, (seeds | strips) & through, through) >= 0
     labels[1] &= ~labels[0]
     return labels, np.minimum(log_p, 0.0)
+
+
+def _reached(
+    scale: Scale, seeds: Bool[np.ndarray, " b"], through: Bool[np.ndarray, " b"]
+) -> Int[np.ndarray, " b"]:
+    """(b,) number of the connected group of cells in `through` that holds a seed, else −1."""
+    open_cells, start_cells = np.zeros((2, len(scale)), bool)
+    open_cells[scale.of_base[through]] = True
+    start_cells[scale.of_base[seeds]] = True
+    group, groups = scales_kernels.components(scale.table, scale.count, open_cells)
+    kept = np.zeros(groups + 1, bool)
+    kept[group[start_cells]] = True
+    kept[-1] = False  # what −1 looks up
+    return np.where(through & kept[group][scale.of_base], group[scale.of_base], -1)
