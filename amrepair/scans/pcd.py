@@ -116,6 +116,7 @@ def _header(data: bytes, path: Path) -> PcdHeader:
         view = [float(v) for v in (said.get("VIEWPOINT") or ["0"] * 3)]
         if len(view) not in (3, 7):
             raise ValueError(f"VIEWPOINT has {len(view)} values instead of 7")
+        turn = view[3:] or [1.0, 0.0, 0.0, 0.0]
     except (KeyError, IndexError, ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: the PCD header cannot be understood ({e})") from e
     return PcdHeader(
@@ -127,7 +128,9 @@ def _header(data: bytes, path: Path) -> PcdHeader:
         shape=shape,
         data=mode,
         viewpoint_mm=(view[0], view[1], view[2]),
-        viewpoint_wxyz=(view[3], view[4], view[5], view[6]) if len(view) == 7 else (1.0, 0, 0, 0),
+        viewpoint_wxyz=(turn[0], turn[1], turn[2], turn[3]),
+        if len(view) == 7
+        else (1.0, 0.0, 0.0, 0.0),
         end=match.end(),
     )
 

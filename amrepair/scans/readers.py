@@ -239,7 +239,7 @@ def _read_pcd(path: Path, frame: str) -> Scan:
 
 def _without_gaps(
     columns: dict[str, Float[np.ndarray, " n"]], grid: RangeGrid
-) -> tuple[dict[str, Float[np.ndarray, " n"]], RangeGrid]:
+) -> tuple[dict[str, Float[np.ndarray, " m"]], RangeGrid]:
     """Points of a range image that are NaN are gaps.
 
     So are those that lie in the origin, where there are several: some drivers write 0 0 0 for

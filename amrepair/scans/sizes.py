@@ -23,6 +23,7 @@ PARSER_ERRORS = (
     OSError,
     RecursionError,
     RuntimeError,
+    StopIteration,
     SyntaxError,
     TypeError,
     ValueError,
