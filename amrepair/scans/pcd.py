@@ -129,8 +129,6 @@ def _header(data: bytes, path: Path) -> PcdHeader:
         data=mode,
         viewpoint_mm=(view[0], view[1], view[2]),
         viewpoint_wxyz=(turn[0], turn[1], turn[2], turn[3]),
-        if len(view) == 7
-        else (1.0, 0.0, 0.0, 0.0),
         end=match.end(),
     )
 
