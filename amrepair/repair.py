@@ -15,7 +15,7 @@ from functools import partial
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from amrepair.align import align
 from amrepair.align.registration import Registration
@@ -414,16 +414,6 @@ def plan_repair(
     )
 
 
-def _subset(scan: Scan, keep: Bool[np.ndarray, " n"]) -> Scan:
-    """Some points of a scan."""
-    return replace(
-        scan,
-        points_mm=scan.points_mm[keep],
-        normals=None if scan.normals is None else scan.normals[keep],
-        sensor_index=None if scan.sensor_index is None else scan.sensor_index[keep],
-    )
-
-
 def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Scan:
     """Without the points that look into sparse infill: deep inside the part, as CAD has it.
 
@@ -437,7 +427,7 @@ def _outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Sca
     shallow = np.flatnonzero(keep & (inside_mm < -site.grid.layer_height_mm))
     as_planned_mm = np.abs(site.planned.distance(points_mm[shallow]))
     keep[shallow] = as_planned_mm > 0.5 * np.abs(inside_mm[shallow])
-    return _subset(scan, keep)
+    return scan.subset(keep)
 
 
 def _is_cut(site: Site) -> bool:
@@ -461,7 +451,7 @@ def _of_the_part(scan: Scan, site: Site) -> Scan:
         return scan
     keep = np.ones(len(scan), dtype=bool)
     keep[low] = site.template.distance(scan.points_mm[low]) < OFF_THE_PART_MM
-    return _subset(scan, keep)
+    return scan.subset(keep)
 
 
 def _laid_beyond(
@@ -489,7 +479,7 @@ def _in_view(scan: Scan, site: Site) -> Scan:
         return scan
     assert site.planned is not None
     low_mm = float(site.planned.bounds_mm[0, 2]) + PLANNED_EDGE_MM
-    return _subset(scan, scan.points_mm[:, 2] > low_mm)
+    return scan.subset(scan.points_mm[:, 2] > low_mm)
 
 
 def _top_of_layer(site: Site) -> float | None:

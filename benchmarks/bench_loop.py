@@ -21,7 +21,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gcode.process import prepare
@@ -172,8 +172,7 @@ def scans_of(
                     break
                 spacing *= 0.98 * float(np.sqrt(len(scan) / points))
             pick = np.sort(rng.permutation(len(scan))[:points])
-            index = None if scan.sensor_index is None else scan.sensor_index[pick]
-            kept[stop.label] = replace(scan, points_mm=scan.points_mm[pick], sensor_index=index)
+            kept[stop.label] = scan.subset(pick)
     return broken, clean, pose.build_from_scanner_calibrated
 
 

@@ -40,13 +40,13 @@ def settled(look: Look, site: Site, *, compared: bool = False) -> Look:
     most = FOUND_POINTS if deficit.regions or compared else CLEAN_POINTS
     chosen, every = _around_the_part(plan, most)
     apart = max(1, -(-len(anomaly.template_points_mm) // most))
-    thin = _only(plan.scan, chosen)
+    thin = plan.scan.subset(chosen)
     if plan.patch is None and anomaly.evidence is not None:
         spacing_mm = anomaly.evidence.spacing_mm * float(np.sqrt(every))
         deficit = replace(deficit, stands=Standing(_heights_later(plan, thin, site, spacing_mm)))
     return replace(
         look,
-        scan=_only(look.scan, chosen if len(look.scan) == len(plan.scan) else _some(look, most)),
+        scan=look.scan.subset(chosen if len(look.scan) == len(plan.scan) else _some(look, most)),
         scanned_points=len(look.scan),
         plan=replace(
             plan,
@@ -102,13 +102,3 @@ def _around_the_part(plan: RepairPlan, most: int) -> tuple[Int[np.ndarray, " k"]
 def _some(look: Look, most: int) -> Int[np.ndarray, " k"]:
     """Indices of at most so many points of a scan of which only a part was planned with."""
     return np.arange(0, len(look.scan), max(1, -(-len(look.scan) // most)))
-
-
-def _only(scan: Scan, chosen: Int[np.ndarray, " k"]) -> Scan:
-    """Some points of a scan; their own memory."""
-    return replace(
-        scan,
-        points_mm=scan.points_mm[chosen],
-        normals=None if scan.normals is None else scan.normals[chosen],
-        sensor_index=None if scan.sensor_index is None else scan.sensor_index[chosen],
-    )

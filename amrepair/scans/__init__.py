@@ -5,16 +5,22 @@ This room reads files and sensors into `Scan`; it does not align, clean or judge
 
 from amrepair.scans.files import FileScanner, WatchedFolderScanner
 from amrepair.scans.ply import write_ply
+from amrepair.scans.range_grid import EDGE, FLYING, EdgeOptions, RangeGrid, edge_flags
 from amrepair.scans.readers import read_height_map, read_scan
 from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import Scanner, ScanRequest
 
 __all__ = [
+    "EDGE",
+    "FLYING",
+    "EdgeOptions",
     "FileScanner",
+    "RangeGrid",
     "Scan",
     "ScanRequest",
     "Scanner",
     "WatchedFolderScanner",
+    "edge_flags",
     "read_height_map",
     "read_scan",
     "write_ply",

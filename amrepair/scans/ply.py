@@ -1,4 +1,4 @@
-"""PLY point clouds: ascii and binary in, binary out. Faces are left to the mesh reader."""
+"""PLY point clouds and range images: ascii and binary in, binary out. Faces: the mesh reader."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.errors import InputError
+from amrepair.scans.range_grid import NO_POINT, RangeGrid
+from amrepair.scans.range_grid_kernels import lists_of_bytes, lists_of_numbers
 from amrepair.scans.scan import Scan
-from amrepair.scans.text import read_table
+from amrepair.scans.sizes import refuse_short
+from amrepair.scans.text import filled, read_table
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -23,32 +26,85 @@ FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 SENSOR_COMMENT = "sensor_mm"
 
 
+MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "in": 25.4, "inch": 25.4}
+GRID_ELEMENT = "range_grid"
+
+
+@dataclass(frozen=True, slots=True)
+class PlyList:
+    """A list property: the types of its length and of its entries."""
+
+    length: str
+    entry: str
+
+
+@dataclass(frozen=True, slots=True)
+class PlyElement:
+    """One element of a header: properties by name, a type of numpy or a list."""
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str | PlyList], ...]
+
+    def least_bytes(self, *, text: bool) -> int:
+        """How short it can be: every list empty; in text a digit and a space a value."""
+        each = sum(
+            2 if text else np.dtype(kind.length if isinstance(kind, PlyList) else kind).itemsize
+            for _, kind in self.properties
+        )
+        return self.count * each
+
+
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
-    """What stands before the data."""
+    """What stands before the data.
+
+    Attributes
+    ----------
+    order
+        Of the bytes, as numpy writes it; empty for text.
+    elements
+        In the file's order; vertices come first.
+    comments, infos
+        What stands after `comment` and after `obj_info`.
+    end
+        Where the data begin.
+    """
 
     order: str
-    vertices: int
-    properties: tuple[tuple[str, str], ...]
-    faces: int
+    elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
+    infos: tuple[str, ...]
     end: int
+
+    def count_of(self, name: str) -> int:
+        """How many of an element there are; 0 of one that the file does not have."""
+        return next((e.count for e in self.elements if e.name == name), 0)
+
+    def said(self, name: str) -> str | None:
+        """The one word that a comment or an obj_info says of `name`; None without any."""
+        for line in (*self.comments, *self.infos):
+            words = line.split()
+            if len(words) == 2 and words[0] == name:
+                return words[1]
+        return None
 
 
 def read_header(data: bytes, path: Path) -> PlyHeader:
-    """Parse the header.
+    """Parse the header, and hold what it promises against the file's length.
 
     Raises
     ------
     InputError
-        If it is not a PLY file with vertices first.
+        If it is not a PLY file with vertices first, or the file is shorter than it says.
     """
     stop = data.find(b"end_header")
     if not data.startswith(b"ply") or stop < 0:
         raise InputError(f"{path}: not a PLY file (no 'ply' … 'end_header'); export it again")
-    end = data.index(b"\n", stop) + 1 if b"\n" in data[stop:] else len(data)
-    order, elements, comments = "", [], []
-    properties: list[tuple[str, str]] = []
+    end = data.find(b"\n", stop) + 1 or len(data)
+    order: str | None = None
+    elements: list[tuple[str, int, list[tuple[str, str | PlyList]]]] = []
+    comments, infos = [], []
     try:
         for line in data[:stop].decode("ascii", "replace").splitlines():
             words = line.split()
@@ -58,49 +114,174 @@ def read_header(data: bytes, path: Path) -> PlyHeader:
                 order = FORMATS[words[1]]
             elif words[0] == "comment":
                 comments.append(line.strip()[8:])
+            elif words[0] == "obj_info":
+                infos.append(line.strip()[9:])
             elif words[0] == "element":
-                elements.append((words[1], int(words[2])))
-            elif words[0] == "property" and elements and elements[-1][0] == "vertex":
-                properties.append((words[-1], TYPES[words[1]]))
+                elements.append((words[1], int(words[2]), []))
+            elif words[0] == "property" and elements:
+                elements[-1][2].append((words[-1], _type_of(words)))
     except (KeyError, IndexError, ValueError) as e:
         raise InputError(f"{path}: the PLY header cannot be understood ({e})") from e
-    if not elements or elements[0][0] != "vertex":
+    if order is None or not elements or elements[0][0] != "vertex":
         raise InputError(f"{path}: the PLY file does not start with vertices; export it again")
-    faces = next((n for name, n in elements if name == "face"), 0)
-    return PlyHeader(order, elements[0][1], tuple(properties), faces, tuple(comments), end)
+    header = PlyHeader(
+        order,
+        tuple(PlyElement(name, count, tuple(properties)) for name, count, properties in elements),
+        tuple(comments),
+        tuple(infos),
+        end,
+    )
+    _refuse_promises(header, len(data) - end, path)
+    return header
 
 
-def read_vertices(data: bytes, header: PlyHeader, path: Path) -> dict[str, Float[np.ndarray, " n"]]:
-    """Columns of the vertex element by name.
+def _type_of(words: list[str]) -> str | PlyList:
+    """The type of a property's line."""
+    if words[1] != "list":
+        return TYPES[words[1]]
+    length, entry = TYPES[words[2]], TYPES[words[3]]
+    if "f" in length:
+        raise ValueError(f"a list whose length is of type {words[2]}")
+    return PlyList(length, entry)
+
+
+def _refuse_promises(header: PlyHeader, have_bytes: int, path: Path) -> None:
+    """Refuse counts and names that cannot be."""
+    need = 0
+    for element in header.elements:
+        names = [name for name, _ in element.properties]
+        if element.count < 0 or len(set(names)) < len(names):
+            raise InputError(
+                f"{path}: the PLY header cannot be understood ({element.count} of {element.name} "
+                f"with {names})"
+            )
+        need += element.least_bytes(text=header.order == "")
+        # the last value of a text needs no end of line
+        refuse_short(path, f"{element.count} of {element.name}", need - 1, have_bytes)
+
+
+def read_vertices(
+    data: bytes, header: PlyHeader, path: Path
+) -> tuple[dict[str, Float[np.ndarray, " n"]], memoryview]:
+    """Columns of the vertex element by name, and the data after it.
 
     Raises
     ------
     InputError
         If the file is shorter than its header says, or x, y, z are not there.
     """
-    names = [name for name, _ in header.properties]
-    if not {"x", "y", "z"} <= set(names):
-        raise InputError(f"{path}: the PLY vertices have no x, y, z but {names}")
-    n = header.vertices
+    vertices = header.elements[0]
+    kinds = {name: kind for name, kind in vertices.properties if isinstance(kind, str)}
+    n = vertices.count
+    if not {"x", "y", "z"} <= set(kinds):
+        raise InputError(f"{path}: the PLY vertices have no x, y, z but {list(kinds)}")
+    if len(kinds) < len(vertices.properties):
+        raise InputError(f"{path}: PLY vertices with lists are not read; export plain vertices")
+    if n == 0:
+        raise InputError(f"{path}: the PLY file has no vertices; scan again or check the export")
+    body = memoryview(data)[header.end :]
     if header.order == "":
-        lines = io.BytesIO(data[header.end :])
-        table = np.zeros((0, len(names)))
-        if n:
-            table = read_table(lines, path, "the PLY text", max_rows=n)
-        if table.shape != (n, len(names)):
+        text = io.BytesIO(body)
+        table = read_table(filled(text), path, "the PLY text", max_rows=n)
+        if table.shape != (n, len(kinds)):
             raise InputError(
-                f"{path}: the PLY header promises {n} vertices of {len(names)} values, "
+                f"{path}: the PLY header promises {n} vertices of {len(kinds)} values, "
                 f"the file holds {table.shape[0]} of {table.shape[1]}; it is cut off or damaged"
             )
-        return {name: table[:, i] for i, name in enumerate(names)}
-    kind = np.dtype([(name, header.order + t) for name, t in header.properties])
-    have = (len(data) - header.end) // kind.itemsize
+        return {name: table[:, i].copy() for i, name in enumerate(kinds)}, body[text.tell() :]
+    kind = np.dtype([(name, header.order + t) for name, t in kinds.items()])
+    have = len(body) // kind.itemsize
     if have < n:
         raise InputError(
             f"{path}: the PLY header promises {n} vertices, the file holds {have}; it is cut off"
         )
-    rows = np.frombuffer(data, kind, n, header.end)
-    return {name: rows[name].astype(np.float64) for name in names}
+    rows = np.frombuffer(body, kind, n)
+    columns = {name: rows[name].astype(np.float64) for name in kinds}
+    return columns, body[n * kind.itemsize :]
+
+
+def read_grid(rest: memoryview, header: PlyHeader, path: Path) -> RangeGrid | None:
+    """The grid of a range image, of the data after the vertices; None where there is none.
+
+    An element `range_grid` holds for each pixel a list of no vertex or of one, row after row, as
+    the range images of the Stanford 3D Scanning Repository have it; `obj_info num_cols` and
+    `num_rows` say how many.
+
+    Raises
+    ------
+    InputError
+        If the grid's size is not told or not kept, or it names vertices that are not there.
+    """
+    if header.count_of(GRID_ELEMENT) == 0:
+        return None
+    grid = header.elements[1]
+    kinds = [kind for _, kind in grid.properties]
+    if grid.name != GRID_ELEMENT or len(kinds) != 1 or not isinstance(kinds[0], PlyList):
+        raise InputError(
+            f"{path}: the PLY file's range_grid is not one list a pixel right after the vertices"
+        )
+    try:
+        rows, columns = (int(header.said(name) or "") for name in ("num_rows", "num_cols"))
+    except ValueError as e:
+        raise InputError(
+            f"{path}: the PLY file has a range_grid but no obj_info num_rows and num_cols; "
+            "export it again"
+        ) from e
+    if rows * columns != grid.count or rows < 1:
+        raise InputError(
+            f"{path}: the PLY file's range_grid has {grid.count} pixels, not {rows} rows of "
+            f"{columns} columns; it is damaged"
+        )
+    entries = _grid_entries(rest, header.order, kinds[0], grid.count, path)
+    if int(entries.min()) < NO_POINT or int(entries.max()) >= header.elements[0].count:
+        raise InputError(
+            f"{path}: a pixel of the PLY file's range_grid is neither a gap nor one of its "
+            f"{header.elements[0].count} vertices; it is damaged"
+        )
+    return RangeGrid(entries.astype(np.int32).reshape(rows, columns))
+
+
+def _grid_entries(
+    rest: memoryview, order: str, kind: PlyList, count: int, path: Path
+) -> Int[np.ndarray, " n"]:
+    """One number a pixel: its vertex, or -1 for a gap; others are errors."""
+    if order == "":
+        try:
+            numbers = np.array(bytes(rest).split()).astype(np.int64)
+        except (ValueError, OverflowError) as e:
+            raise InputError(f"{path}: the PLY file's range_grid has words in it ({e})") from e
+        entries, end = lists_of_numbers(numbers, count)
+    else:
+        if "f" in kind.entry:
+            raise InputError(f"{path}: the PLY file's range_grid names vertices by fractions")
+        entries, end = lists_of_bytes(
+            np.frombuffer(rest, np.uint8),
+            count,
+            np.dtype(kind.length).itemsize,
+            np.dtype(kind.entry).itemsize,
+            order == ">",
+        )
+    if end < 0:
+        raise InputError(f"{path}: the PLY file's range_grid breaks off; the file is cut off")
+    return entries
+
+
+def millimetres_of(header: PlyHeader, path: Path) -> float:
+    """Millimetres in the file's unit: `comment unit m` or `obj_info unit m`; 1 without a word.
+
+    Raises
+    ------
+    InputError
+        If the unit is unknown.
+    """
+    unit = header.said("unit")
+    if unit is None:
+        return 1.0
+    if unit.lower() not in MM_PER:
+        raise InputError(
+            f"{path}: the PLY file's unit is '{unit[:20]}'; known are {', '.join(MM_PER)}"
+        )
+    return MM_PER[unit.lower()]
 
 
 def sensors_of(header: PlyHeader) -> Float[np.ndarray, "k 3"] | None:
@@ -119,7 +300,7 @@ def write_ply(
     colours: Int[np.ndarray, "n 3"] | None = None,
     scalars: dict[str, np.ndarray] | None = None,
 ) -> None:
-    """Write a scan as binary PLY: points, normals, colours, named scalars, sensors and noise.
+    """Write a scan as binary PLY: points, normals, colours, named scalars, sensors, edges, noise.
 
     Parameters
     ----------
@@ -138,6 +319,8 @@ def write_ply(
         columns += [(c, "uchar", colours[:, i]) for i, c in enumerate(("red", "green", "blue"))]
     if scan.sensor_index is not None:
         columns.append(("sensor", "int", scan.sensor_index))
+    if scan.edge is not None:
+        columns.append(("edge", "uchar", scan.edge))
     for name, values in (scalars or {}).items():
         if len(values) != n:
             raise InputError(f"the scalar '{name}' has {len(values)} values for {n} points")

@@ -1,34 +1,42 @@
-"""Scan files in: point clouds, height maps and meshes become a `Scan`.
+"""Scan files in: point clouds, range images, height maps and meshes become a `Scan`.
 
-It reads, and refuses with one sentence what it cannot read; it does not clean, scale or guess
-frames. Points that are not finite are refused, not dropped (organised PCD and NaN cells of
-height maps apart: there NaN is the format's word for "nothing seen").
+It reads, and refuses with one sentence what it cannot read; it does not clean or guess frames.
+Points that are not finite are refused, not dropped, but in range images: there NaN is the format's
+word for "nothing seen", a gap. Lengths are millimetres, but where the format (PTX) or the file
+(a PLY's `comment unit m`) says otherwise.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import tifffile
-import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from amrepair.errors import InputError
-from amrepair.scans.pcd import read_pcd
-from amrepair.scans.ply import read_header, read_vertices, sensors_of, write_ply
-from amrepair.scans.scan import Scan
+from amrepair.scans.arrays import is_map, load_npy, read_height_map, read_npz
+from amrepair.scans.depth_map import camera_beside, read_depth_map
+from amrepair.scans.mesh import read_mesh
+from amrepair.scans.pcd import PcdHeader, read_pcd
+from amrepair.scans.ply import (
+    millimetres_of,
+    read_grid,
+    read_header,
+    read_vertices,
+    sensors_of,
+    write_ply,
+)
+from amrepair.scans.ptx import read_ptx
+from amrepair.scans.range_grid import NO_POINT, RangeGrid, edge_flags
+from amrepair.scans.scan import DEFAULT_SIGMA_MM, Scan
 from amrepair.scans.text import read_table
+from amrepair.scans.viewpoint import viewpoint_of
 
-# What a structured-light scanner of the desktop class states; used where the file says nothing.
-DEFAULT_SIGMA_MM = 0.04
-MESH_SPACING_MM = 0.2
-MAX_MESH_SAMPLES = 2_000_000
-# A height map has no sensor; straight down from this far is straight down to a micrometre.
-FAR_ABOVE_MM = 10_000.0
-POINT_SUFFIXES = frozenset({".ply", ".pcd", ".xyz", ".txt", ".csv", ".asc", ".npy", ".npz"})
+POINT_SUFFIXES = frozenset(
+    {".ply", ".pcd", ".ptx", ".xyz", ".txt", ".csv", ".asc", ".npy", ".npz", ".png"}
+)
 MESH_SUFFIXES = frozenset({".stl", ".obj", ".3mf"})
 HEIGHT_SUFFIXES = frozenset({".tif", ".tiff"})
 
@@ -46,10 +54,14 @@ def read_scan(
 ) -> Scan:
     """Read a scan from a file.
 
+    Range images (PLY with `range_grid`, organised PCD, PTX, depth maps, height maps) bring their
+    grid and edge flags; their sensor is taken from the file, else from the grid (`viewpoint_of`).
+
     Parameters
     ----------
     path
-        .ply, .pcd, .xyz/.txt/.csv/.asc, .npy/.npz, .tif/.tiff (height map), .stl/.obj/.3mf.
+        .ply, .pcd, .ptx, .xyz/.txt/.csv/.asc, .npy/.npz, .png/.tif/.tiff with a camera's .json
+        beside it (depth map), .tif/.tiff without (height map), .stl/.obj/.3mf.
     frame
         The frame that the coordinates are in.
     sigma_mm
@@ -74,26 +86,46 @@ def read_scan(
     (3, 0.03)
     """
     path = Path(path)
-    suffix = path.suffix.lower()
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
         raise InputError(f"{path}: {what}")
-    if suffix in HEIGHT_SUFFIXES or (suffix == ".npy" and _is_map(path)):
-        scan = read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
-    elif suffix == ".npz":
-        scan = _read_npz(path, frame, cell_mm, origin_mm)
-    elif suffix == ".ply":
-        scan = _read_ply(path, frame)
-    elif suffix == ".pcd":
-        scan = _read_pcd(path, frame)
-    elif suffix in POINT_SUFFIXES:
-        scan = _read_table(path, frame)
-    elif suffix in MESH_SUFFIXES:
-        scan = _read_mesh(path, frame)
-    else:
-        known = sorted(POINT_SUFFIXES | MESH_SUFFIXES | HEIGHT_SUFFIXES)
-        raise InputError(f"{path}: a scan is one of {', '.join(known)}, not '{suffix}'")
-    return _with_word(scan, sigma_mm, sensor_at)
+    with np.errstate(all="ignore"):  # what overflows is refused as not finite
+        scan = _read(path, frame, cell_mm, origin_mm)
+        scan = _with_word(scan, sigma_mm, sensor_at)
+        return _with_edges(scan)
+
+
+def _read(
+    path: Path, frame: str, cell_mm: float | None, origin_mm: tuple[float, float] | None
+) -> Scan:
+    """By the ending of its name, as the file has it."""
+    suffix = path.suffix.lower()
+    if suffix == ".png" or suffix in HEIGHT_SUFFIXES:
+        camera = camera_beside(path)
+        if camera is not None:
+            return read_depth_map(path, camera, frame=frame, sigma_mm=DEFAULT_SIGMA_MM)
+        if suffix == ".png":
+            raise InputError(
+                f"{path}: a PNG is read as a depth map, and needs the camera in "
+                f"{path.with_suffix('.json').name} beside it: fx, fy, cx, cy, width, height, "
+                "depth_scale_mm"
+            )
+    if suffix in HEIGHT_SUFFIXES or (suffix == ".npy" and is_map(path)):
+        return read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
+    if suffix == ".npz":
+        return read_npz(path, frame, DEFAULT_SIGMA_MM, cell_mm, origin_mm)
+    if suffix == ".ply":
+        return _read_ply(path, frame)
+    if suffix == ".pcd":
+        return _read_pcd(path, frame)
+    if suffix == ".ptx":
+        return read_ptx(_bytes(path), path, frame=frame, sigma_mm=DEFAULT_SIGMA_MM)
+    if suffix in POINT_SUFFIXES:
+        return _read_table(path, frame)
+    if suffix in MESH_SUFFIXES:
+        return read_mesh(path, frame, DEFAULT_SIGMA_MM)
+    known = sorted(POINT_SUFFIXES | MESH_SUFFIXES | HEIGHT_SUFFIXES)
+    raise InputError(f"{path}: a scan is one of {', '.join(known)}, not '{suffix}'")
 
 
 def _with_word(
@@ -112,15 +144,27 @@ def _with_word(
                     "property"
                 )
             index = np.zeros(len(scan.points_mm), np.int64)
-    return Scan(
-        points_mm=scan.points_mm,
+    return replace(
+        scan,
         sigma_mm=scan.sigma_mm if sigma_mm is None else sigma_mm,
-        frame=scan.frame,
-        normals=scan.normals,
         sensors_mm=sensors,
         sensor_index=index,
-        source=scan.source,
     )
+
+
+def _with_edges(scan: Scan) -> Scan:
+    """What a range image's grid tells: its sensor, where nobody named it, and its edges."""
+    if scan.grids is None:
+        return scan
+    sensors, index, grids = scan.sensors_mm, scan.sensor_index, scan.grids
+    if sensors is None and len(grids) == 1 and len(grids[0].points) == len(scan):
+        seen = viewpoint_of(scan.points_mm, grids[0])
+        if seen is not None:
+            sensors, index = seen.sensors_mm, np.empty(len(scan), np.int64)
+            index[grids[0].points] = seen.sensor_index
+            grids = (RangeGrid(grids[0].index, seen.kind),)
+    edge = edge_flags(scan.points_mm, grids, sensors, index) if scan.edge is None else scan.edge
+    return replace(scan, sensors_mm=sensors, sensor_index=index, grids=grids, edge=edge)
 
 
 def _from_columns(
@@ -131,9 +175,11 @@ def _from_columns(
     sigma_mm: float = DEFAULT_SIGMA_MM,
     sensors_mm: Float[np.ndarray, "k 3"] | None = None,
     normal_names: tuple[str, str, str] = ("nx", "ny", "nz"),
+    grid: RangeGrid | None = None,
+    unit_mm: float = 1.0,
 ) -> Scan:
     """A scan from named columns."""
-    points = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1) * unit_mm
     normals = None
     if set(normal_names) <= set(columns):
         raw = np.stack([columns[name] for name in normal_names], axis=1)
@@ -143,47 +189,103 @@ def _from_columns(
             normals = raw / np.maximum(length, 1e-12)
     index: Int[np.ndarray, " n"] | None = None
     if sensors_mm is not None:
-        column = columns.get("sensor", np.zeros(len(points)))
+        column = np.nan_to_num(columns.get("sensor", np.zeros(len(points))))
         index = np.clip(column, 0, len(sensors_mm) - 1).astype(np.int64)
-    return Scan(points, sigma_mm, frame, normals, sensors_mm, index, str(path))
+    edge: UInt8[np.ndarray, " n"] | None = None
+    if "edge" in columns:
+        edge = np.clip(np.nan_to_num(columns["edge"]), 0, 255).astype(np.uint8)
+    grids = None if grid is None else (grid,)
+    return Scan(points, sigma_mm, frame, normals, sensors_mm, index, str(path), grids, edge)
 
 
 def _read_ply(path: Path, frame: str) -> Scan:
     data = _bytes(path)
     header = read_header(data, path)
-    if header.faces > 0:
-        return _read_mesh(path, frame)
+    unit_mm = millimetres_of(header, path)
+    if header.count_of("face") > 0:
+        return read_mesh(path, frame, DEFAULT_SIGMA_MM, unit_mm=unit_mm)
     sigma_mm = DEFAULT_SIGMA_MM
-    for comment in header.comments:
-        words = comment.split()
-        if len(words) == 2 and words[0] == "sigma_mm":
-            try:
-                sigma_mm = float(words[1])
-            except ValueError:
-                continue
-    columns = read_vertices(data, header, path)
-    return _from_columns(columns, path, frame, sigma_mm=sigma_mm, sensors_mm=sensors_of(header))
+    said = header.said("sigma_mm")
+    if said is not None:
+        try:
+            sigma_mm = float(said)
+        except ValueError as e:
+            raise InputError(f"{path}: the PLY file's sigma_mm is '{said[:20]}'") from e
+    columns, rest = read_vertices(data, header, path)
+    grid = read_grid(rest, header, path)
+    if grid is not None:
+        columns, grid = _without_gaps(columns, grid)
+    return _from_columns(
+        columns, path, frame,
+        sigma_mm=sigma_mm, sensors_mm=sensors_of(header), grid=grid, unit_mm=unit_mm,
+    )  # fmt: skip
 
 
 def _read_pcd(path: Path, frame: str) -> Scan:
     columns, header = read_pcd(_bytes(path), path)
-    xyz = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    seen = ~np.isnan(xyz).all(axis=1)
-    columns = {name: values[seen] for name, values in columns.items()}
-    view = np.array(header.viewpoint_mm)
-    # 0 0 0 is what writers put who know nothing of a viewpoint
-    sensors = view.reshape(1, 3) if np.abs(view).max() > 0 else None
+    grid = None
+    if header.shape is not None:
+        grid = RangeGrid(np.arange(header.points, dtype=np.int32).reshape(header.shape))
+        columns, grid = _without_gaps(columns, grid)
+    else:
+        nothing = np.isnan([columns[axis] for axis in "xyz"]).all(axis=0)
+        columns = {name: values[~nothing] for name, values in columns.items()}
+    sensors, kind = _viewpoint(columns, grid, header)
+    if grid is not None and kind:
+        grid = RangeGrid(grid.index, "perspective")
     names = ("normal_x", "normal_y", "normal_z")
-    return _from_columns(columns, path, frame, sensors_mm=sensors, normal_names=names)
+    return _from_columns(columns, path, frame, sensors_mm=sensors, normal_names=names, grid=grid)
+
+
+def _without_gaps(
+    columns: dict[str, Float[np.ndarray, " n"]], grid: RangeGrid
+) -> tuple[dict[str, Float[np.ndarray, " m"]], RangeGrid]:
+    """Points of a range image that are NaN are gaps.
+
+    So are those that lie in the origin, where there are several: some drivers write 0 0 0 for
+    NaN, and no two pixels see one point.
+    """
+    xyz = np.stack([columns[axis] for axis in "xyz"])
+    gap = np.isnan(xyz).any(axis=0)
+    nought = (xyz == 0).all(axis=0)
+    if np.count_nonzero(nought) > 1:
+        gap |= nought
+    if not gap.any():
+        return columns, grid
+    number = np.where(gap, NO_POINT, np.cumsum(~gap) - 1).astype(np.int32)
+    index = np.where(grid.index >= 0, number[np.maximum(grid.index, 0)], np.int32(NO_POINT))
+    return {name: values[~gap] for name, values in columns.items()}, RangeGrid(index, grid.kind)
+
+
+def _viewpoint(
+    columns: dict[str, Float[np.ndarray, " n"]], grid: RangeGrid | None, header: PcdHeader
+) -> tuple[Float[np.ndarray, "1 3"] | None, bool]:
+    """Where a PCD file's VIEWPOINT puts the sensor, and whether rays meet there.
+
+    Some programs write points in the sensor's own frame and its place in another one, others
+    write both in one frame. The grid of an organised cloud tells which: where rays meet in the
+    origin, the points are the sensor's own. The points stay as the file has them.
+    """
+    place, turn = np.array(header.viewpoint_mm), np.array(header.viewpoint_wxyz)
+    # 0 0 0 1 0 0 0 is what writers put who know nothing of a viewpoint
+    if not np.isfinite(place).all() or not (np.abs(place).max() > 0 or np.abs(turn[1:]).max() > 0):
+        return None, False
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    if grid is not None and np.isfinite(points).all():
+        seen = viewpoint_of(points, grid)
+        if seen is not None and seen.kind == "perspective":
+            return seen.sensors_mm, True
+    return place.reshape(1, 3), True
 
 
 def _read_table(path: Path, frame: str) -> Scan:
     """Text or .npy rows of x y z, or x y z nx ny nz; one line of names is allowed in text."""
     if path.suffix.lower() == ".npy":
-        table = _load_npy(path)
+        table = load_npy(path)
     else:
         text = _bytes(path).decode("utf-8", "replace")
-        lines = [line for line in text.splitlines() if line.strip() and line[0] not in "#/;"]
+        bare = (line.split("#", 1)[0].strip() for line in text.splitlines())
+        lines = [line for line in bare if line and line[0] not in "/;"]
         if lines and not _is_row(lines[0]):
             lines = lines[1:]
         if not lines:
@@ -203,99 +305,6 @@ def _is_row(line: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _read_npz(
-    path: Path, frame: str, cell_mm: float | None, origin_mm: tuple[float, float] | None
-) -> Scan:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            stored = {name: np.asarray(archive[name]) for name in archive.files}
-    except (OSError, ValueError, KeyError, EOFError) as e:
-        raise InputError(f"{path}: the archive cannot be read ({e})") from e
-    if "z_mm" in stored:
-        return read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
-    points = stored.get("points_mm", stored.get("points"))
-    if points is None or points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: the archive needs points_mm (n, 3), it has {sorted(stored)}")
-    sensors, index = stored.get("sensors_mm"), stored.get("sensor_index")
-    normals = stored.get("normals")
-    return Scan(
-        points.astype(np.float64),
-        float(stored.get("sigma_mm", DEFAULT_SIGMA_MM)),
-        frame,
-        None if normals is None else normals.astype(np.float64),
-        None if sensors is None or index is None else sensors.astype(np.float64),
-        None if sensors is None or index is None else index.astype(np.int64),
-        str(path),
-    )
-
-
-def read_height_map(
-    path: Path,
-    *,
-    frame: str,
-    cell_mm: float | None = None,
-    origin_mm: tuple[float, float] | None = None,
-) -> Scan:
-    """A height map as points seen straight from above; NaN cells were not seen.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or does not say how large its cells are.
-    """
-    from gcode.errors import InputError as GcodeInputError
-    from gcode.surfaces import HeightField
-
-    try:
-        heights = HeightField.read(path, cell_mm=cell_mm, origin_mm=origin_mm)
-    except GcodeInputError as e:
-        raise InputError(str(e)) from e
-    except (tifffile.TiffFileError, struct.error, ValueError, IndexError) as e:
-        raise InputError(f"{path}: the height map cannot be read ({e})") from e
-    x, y = heights.centres_mm()
-    grid_x, grid_y = np.meshgrid(x, y)
-    seen = heights.seen
-    points = np.stack([grid_x[seen], grid_y[seen], heights.z_mm[seen]], axis=1).astype(np.float64)
-    if len(points) == 0:
-        raise InputError(f"{path}: the height map has no seen cell")
-    middle = points.mean(axis=0)
-    sensor = np.array([[middle[0], middle[1], middle[2] + FAR_ABOVE_MM]])
-    index = np.zeros(len(points), np.int64)
-    return Scan(points, DEFAULT_SIGMA_MM, frame, None, sensor, index, str(path))
-
-
-def _read_mesh(path: Path, frame: str) -> Scan:
-    """A scanned mesh, open ones too, as points spread evenly over it with its normals."""
-    try:
-        mesh = trimesh.load(path, force="mesh")
-    except (ValueError, OSError, KeyError, IndexError, AttributeError, TypeError) as e:
-        raise InputError(f"{path}: the mesh cannot be read ({e}); export it again") from e
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{path}: the mesh has no faces; export it again")
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"{path}: the mesh has vertices that are not finite numbers (NaN)")
-    area = float(mesh.area)
-    if area <= 0:
-        raise InputError(f"{path}: the mesh has no area; export it again")
-    count = int(np.clip(area / MESH_SPACING_MM**2, 1, MAX_MESH_SAMPLES))
-    points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
-    normals = np.asarray(mesh.face_normals)[np.asarray(face)]
-    return Scan(np.asarray(points, np.float64), DEFAULT_SIGMA_MM, frame, normals, source=str(path))
-
-
-def _is_map(path: Path) -> bool:
-    """Whether an .npy file is a height map: two dimensions, and not three or six columns."""
-    table = _load_npy(path)
-    return table.ndim == 2 and table.shape[1] not in {3, 6}
-
-
-def _load_npy(path: Path) -> Float[np.ndarray, ...]:
-    try:
-        return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-    except (OSError, ValueError, EOFError, TypeError) as e:
-        raise InputError(f"{path}: the array cannot be read ({e})") from e
 
 
 def _bytes(path: Path) -> bytes:

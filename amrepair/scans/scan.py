@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
+from amrepair.scans.range_grid import RangeGrid
+
+# What a structured-light scanner of the desktop class states; used where the file says nothing.
+DEFAULT_SIGMA_MM = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +35,11 @@ class Scan:
         (n,) which sensor saw each point, or None.
     source
         Where it came from, for messages.
+    grids
+        The pixels of each view, where the file is a range image; None otherwise.
+    edge
+        (n,) bits `EDGE` and `FLYING` of `amrepair.scans.range_grid`: what lies at the seen
+        surface's edge, and what hangs between two surfaces; None where no grid told.
 
     Raises
     ------
@@ -54,6 +63,8 @@ class Scan:
     sensors_mm: Float[np.ndarray, "k 3"] | None = None
     sensor_index: Int[np.ndarray, " n"] | None = None
     source: str = "memory"
+    grids: tuple[RangeGrid, ...] | None = None
+    edge: UInt8[np.ndarray, " n"] | None = None
 
     def __post_init__(self) -> None:
         if len(self.points_mm) == 0:
@@ -78,7 +89,20 @@ class Scan:
             )
         if (self.sensor_index is None) != (self.sensors_mm is None):
             raise InputError(f"the scan {self.source} needs sensors_mm and sensor_index together")
-        for array in (self.points_mm, self.normals, self.sensors_mm, self.sensor_index):
+        if self.edge is not None and len(self.edge) != len(self.points_mm):
+            raise InputError(
+                f"the scan {self.source} has {len(self.points_mm)} points but edge flags for "
+                f"{len(self.edge)}"
+            )
+        most = max((int(grid.index.max()) for grid in self.grids or ()), default=-1)
+        if most >= len(self.points_mm):
+            raise InputError(
+                f"the scan {self.source} has a range grid that names point {most}, but only "
+                f"{len(self.points_mm)} points (counted from 0)"
+            )
+        for array in (
+            self.points_mm, self.normals, self.sensors_mm, self.sensor_index, self.edge
+        ):  # fmt: skip
             if array is not None:
                 array.setflags(write=False)
 
@@ -86,7 +110,7 @@ class Scan:
         return len(self.points_mm)
 
     def moved(self, target_from_source: Transform) -> Scan:
-        """The same scan in another frame; normals and sensors move along."""
+        """The same scan in another frame; normals and sensors move along, grid and flags stay."""
         if target_from_source.source != self.frame:
             raise InputError(
                 f"the scan {self.source} is in frame {self.frame}, the transform starts from "
@@ -100,4 +124,18 @@ class Scan:
             if self.sensors_mm is None
             else target_from_source.apply(self.sensors_mm),
             frame=target_from_source.target,
+        )
+
+    def subset(self, keep: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> Scan:
+        """Some of the points, by a mask or by their numbers, with all that is said of each.
+
+        The grids are dropped: their gaps would no longer be gaps. The edge flags stay true.
+        """
+        return replace(
+            self,
+            points_mm=self.points_mm[keep],
+            normals=None if self.normals is None else self.normals[keep],
+            sensor_index=None if self.sensor_index is None else self.sensor_index[keep],
+            grids=None,
+            edge=None if self.edge is None else self.edge[keep],
         )

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -99,12 +99,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 
 def thinned(scan: Scan) -> Scan:
     """What a coarser sensor would have seen."""
-    normals, sensors = (
-        None if rows is None else rows[::EVERY_NTH] for rows in (scan.normals, scan.sensor_index)
-    )
-    return replace(
-        scan, points_mm=scan.points_mm[::EVERY_NTH], normals=normals, sensor_index=sensors
-    )
+    return scan.subset(np.arange(0, len(scan), EVERY_NTH))
 
 
 class Command:
