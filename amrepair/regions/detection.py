@@ -34,6 +34,7 @@ from amrepair.regions.regions import find_regions
 from amrepair.regions.significance import Level, tested
 from amrepair.regions.strands import on_strands
 from amrepair.scans import Scan
+from amrepair.scans.range_grid import FLYING
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
@@ -246,6 +247,8 @@ def _observed(
         f_mm = template.distance(scan.points_mm)
         surface_mm, normals = surface or template.surface_points(options.spacing_mm)
         keep = ~background(scan, template, f_mm, surface_mm)
+        if scan.edge is not None:  # pixels that hang between two surfaces lie on neither
+            keep &= scan.edge & FLYING == 0
         _refuse_nothing_near(scan, keep)
         surfels = make_surfels(scan.points_mm, f_mm, keep)
         seen = images or () if asked is None else asked.result()
