@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from amrepair.detect.normal_variation import forgiven
 
 from amrepair.consensus import fit_from_scans
 from amrepair.consensus.cloud import outward, planes, spacing_of
@@ -15,8 +14,9 @@ from amrepair.consensus.fit import _piece
 from amrepair.consensus.fuse import Cloud, Fused, fuse
 from amrepair.consensus.register import place_all
 from amrepair.errors import AlignmentError, InputError, TemplateError
-from amrepair.field.fused import make_surfels
 from amrepair.frames import rotation_from_vector
+from amrepair.regions import Label, detect
+from amrepair.regions.calibration import NORMAL
 from amrepair.scans import Scan
 from amrepair.template import LearnedSdf, MeshSdf, load_template
 from tests.analytic import (
@@ -163,13 +163,14 @@ def test_detection_forgives_what_normal_parts_differ_by(part: AnalyticTemplate) 
         def spread_mm(self, points_mm: np.ndarray) -> np.ndarray:
             return np.where(points_mm[:, 0] > 20, 0.1, 0.0)
 
-    points = points_of(part, 8_000, 2)
-    surfels = make_surfels(points, np.full(len(points), 0.35), np.ones(len(points), bool))
-    changed = forgiven(surfels, Varying(part.field, part.body))
-    right = surfels.place_mm[:, 0] > 20
-    assert changed.deviation_mm[right] == pytest.approx(0.05)  # 0.35 − 3 × 0.1
-    assert changed.deviation_mm[~right] == pytest.approx(0.35)
-    assert forgiven(surfels, part) is surfels
+    template = Varying(part.field, part.body)
+    points, normals = sample_surface(part.body, 0.6, seed=2)
+    scan = Scan(points + 0.35 * normals, 0.03, "template", normals)
+    # a whole part that is 0.35 mm too large everywhere: by more than it may be, but on the right
+    found = detect(scan, template, calibration=NORMAL)
+    right, left = points[:, 0] > 22, points[:, 0] < 18
+    assert (found.label[left] == int(Label.EXCESS)).mean() > 0.6  # corners are cut by no surface
+    assert (found.label[right] == int(Label.OK)).mean() > 0.9  # 0.35 − 3 × 0.1 < 0.16
 
 
 @pytest.mark.slow
