@@ -10,7 +10,11 @@ from amrepair.field.fused import Surfels
 from amrepair.field.scales import Scale
 from amrepair.field.scales_kernels import NORMAL_MEDIAN
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import OUTLIER_SIGMAS, Level
+from amrepair.regions.significance import (
+    OUTLIER_SIGMAS,
+    Level,
+    point_sigma_mm,
+)
 from amrepair.scans import Scan
 
 # Errors hang together over the distance at which their variogram has reached this share (1 − 1/e).
@@ -67,10 +71,8 @@ def noise_of(
         The first scale's third deviations and medians, then every wider scale's medians.
     """
     first = levels[0].scale
-    per_cell = float(np.median(first.noise_mm))
-    points = max(float(np.median(surfels.count)), 1.0)
     told = len(first) >= options.least_cells
-    sigma_mm = per_cell * np.sqrt(points) if told else scan.sigma_mm
+    sigma_mm = point_sigma_mm(first) if told else scan.sigma_mm
     off = np.abs(first.value_mm - first.median_mm) > OUTLIER_SIGMAS * np.maximum(
         first.noise_mm, 1e-9
     )

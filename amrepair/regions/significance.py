@@ -108,7 +108,9 @@ def tested(
         delta = np.stack(
             [scales_kernels.window_means(scale.table, scale.count, side) for side in cells]
         )
-        errors = _errors(scale, options, calibration)
+        errors = _errors(
+            scale, options, calibration, options.most_wander * point_sigma_mm(scales[0])
+        )
         if k == 0:
             thirds = np.stack([-scale.low_mm, scale.high_mm])
             levels.append(_level(scale, thirds, delta, errors, share, options, calibration, 0))
@@ -148,8 +150,15 @@ class Errors:
         return 1.0 + (RANK - 1) * ratio**2
 
 
-def _errors(scale: Scale, options: RegionOptions, calibration: Calibration | None) -> Errors:
-    """What neighbouring cells differ by, and by how much whole windows wander."""
+def point_sigma_mm(first: Scale) -> float:
+    """Standard deviation of one point about its neighbours, from the field's own cells."""
+    return float(np.median(first.noise_mm) * np.sqrt(max(float(np.median(first.weight)), 1.0)))
+
+
+def _errors(
+    scale: Scale, options: RegionOptions, calibration: Calibration | None, most_mm: float
+) -> Errors:
+    """What neighbouring cells differ by, and by how much, at most, whole windows wander."""
     group = density_class(scale, options.density_step)
     classes = int(group.max()) + 1
     # what few neighbours tell by chance to be quiet is as noisy as places seen as densely
@@ -157,7 +166,7 @@ def _errors(scale: Scale, options: RegionOptions, calibration: Calibration | Non
     cell = np.maximum(np.maximum(scale.noise_mm, usual), LEAST_SIGMA_MM)
     window = MEDIAN_LOSS * cell / np.sqrt(scale.count)
     if calibration is None:
-        wander = _wander(scale, group, classes, options)
+        wander = _wander(scale, group, classes, options, most_mm)
     else:
         wander = calibration.wander(3.0 * scale.cell_mm, classes)
     explained = options.process_sigma_mm**2 + window**2
@@ -201,7 +210,11 @@ def _by_class(
 
 
 def _wander(
-    scale: Scale, group: Int[np.ndarray, " s"], classes: int, options: RegionOptions
+    scale: Scale,
+    group: Int[np.ndarray, " s"],
+    classes: int,
+    options: RegionOptions,
+    most_mm: float,
 ) -> Float[np.ndarray, " c"]:
     """(c,) standard deviation of window means about what is normal some way off, by class.
 
@@ -216,7 +229,9 @@ def _wander(
     kept = alike & (apart_mm > 0.5 * options.far_mm)
     one, other = one[kept], other[kept]
     off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_MEDIAN
-    return _by_class(np.maximum(group[one], group[other]), off_mm, classes, options)
+    found = _by_class(np.maximum(group[one], group[other]), off_mm, classes, options)
+    # a bent part wanders too, but no scanner does so smoothly and so far
+    return found * min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
 
 
 def _level(
