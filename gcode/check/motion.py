@@ -33,6 +33,9 @@ BACKWARDS_RATIO, BACKWARDS_MOVES = 0.25, 10
 INCH_MM = 25.4
 # Klipper's `[idle_timeout]` gives a hot machine that stands still ten minutes.
 STILL_S = 600.0
+# What stands molten in a hotend (the melt zone of a V6 is 10 mm long) is pushed out at any speed: a
+# drop that a job primes with after a retraction.
+MOLTEN_MM = 5.0
 LEAST_BEAD_Z_MM = 0.02  # the thinnest layer that a process profile may have
 
 
@@ -85,7 +88,7 @@ class Motion:
         high = (x1 + PLACE_SLACK_MM, y1 + PLACE_SLACK_MM, printer.max_z_mm + PLACE_SLACK_MM)
         self._limits_of_moves = (
             *low, *high, FASTEST_MM_S, SHORT_MM, SECTION_SLACK * printer.max_bead_section_mm2,
-            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect], LEAST_BEAD_Z_MM,
+            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect], LEAST_BEAD_Z_MM, MOLTEN_MM,
         )  # fmt: skip
 
     def follow(self, text: Text, first: int, end: int) -> int:
@@ -303,7 +306,7 @@ class Motion:
             )  # fmt: skip
             self._ready_c = math.inf  # said once
         if length_mm <= SHORT_MM:
-            self._short(pushed_mm)
+            self._short(pushed_mm, length_mm)
             return
         self._short_mm3 = 0.0
         if pushed_mm < 0:
@@ -316,12 +319,16 @@ class Motion:
         limit_mm2 = printer.max_bead_section_mm2
         if section_mm2 > SECTION_SLACK * limit_mm2:
             self._refuse("bead too thick", f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²")
+        self._melts(section_mm2)
+
+    def _melts(self, section_mm2: float) -> None:
+        """So much plastic for each millimetre that the feed counts."""
         flow = section_mm2 * self._feed_mm_s * self._factor["M220"]
         limit = self._setup.max_volumetric_mm3_s
         if flow > FLOW_SLACK * limit:
             self._refuse("melts more than the hotend can", f"{flow:.1f} mm³/s", f"{limit:g} mm³/s")
 
-    def _short(self, pushed_mm: float) -> None:
+    def _short(self, pushed_mm: float, length_mm: float) -> None:
         """Standing, or nearly so: plastic adds up until the nozzle has moved on."""
         printer = self._setup.printer
         if pushed_mm < 0:
@@ -329,7 +336,10 @@ class Motion:
             return
         back_mm = min(pushed_mm, self._pulled_mm)
         self._pulled_mm -= back_mm
-        self._short_mm3 += (pushed_mm - back_mm) * self._area_mm2
+        fresh_mm3 = (pushed_mm - back_mm) * self._area_mm2
+        self._short_mm3 += fresh_mm3
+        if fresh_mm3 > 0 and self._short_mm3 > MOLTEN_MM * self._area_mm2:
+            self._melts(fresh_mm3 / (length_mm or pushed_mm))  # alone, F is the filament's own
         allowed_mm3 = printer.max_extrude_only_mm * self._area_mm2
         if self._short_mm3 > allowed_mm3:
             self._refuse(
