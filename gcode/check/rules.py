@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from gcode.check import limits, waits
+from gcode.check.findings import Policy
 from gcode.check.motion import INCH_MM, PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
     COMMANDS,
@@ -58,8 +60,10 @@ class Judge(Motion):
         setup: PrintSetup,
         standing_top_mm: float | None,
         initial: ModalState | None,
+        policy: Policy = Policy.STRICT,
     ) -> None:
-        super().__init__(program, setup, standing_top_mm, initial)
+        super().__init__(program, setup, standing_top_mm, initial, policy)
+        self.added: tuple[str, ...] = ()
         macros = {macro.split(maxsplit=1)[0].upper() for macro in setup.printer.macros}
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
         own = {self._begins.name if self._begins else "", self._ends or ""}
@@ -112,8 +116,12 @@ class Judge(Motion):
         """The link puts its own around each line, and firmwares read both."""
         self._refuse(what, told.split(maxsplit=1)[0], "none: the link adds it")
 
-    def end(self, lines: list[str]) -> None:
-        """Judge what the program is as a whole, and what it leaves behind after its last line."""
+    def end(self, lines: list[str], *, leave_heaters: bool = False) -> None:
+        """Judge what the program is as a whole, and what it leaves behind after its last line.
+
+        Heaters that a user's job leaves on are switched off by lines that are `added`, unless
+        somebody asked to leave them.
+        """
         self._backwards(lines)
         self._line, self._text = len(lines), lines[-1]
         if not self._alone:
@@ -124,10 +132,16 @@ class Judge(Motion):
             ("chamber", self._chamber_c, "M141 S0"),
         )
         for what, value_c, off in heaters:
-            if value_c > 0:
-                self._refuse(
-                    f"{what} left on at the end, {off} is lacking", f"{value_c:g} °C", "0 °C"
-                )
+            if value_c <= 0:
+                continue
+            told = f"{what} left on at the end, {off} is"
+            if leave_heaters:
+                self._warn(f"{told} left out as asked", f"{value_c:g} °C", "0 °C")
+            elif self.policy is Policy.STRICT:
+                self._refuse(f"{told} lacking", f"{value_c:g} °C", "0 °C")
+            else:
+                self._warn(f"{told} added", f"{value_c:g} °C", "0 °C")
+                self.added += (off,)
 
     def _named(self, command: str) -> None:
         match = _NAMED.match(command)
@@ -159,8 +173,8 @@ class Judge(Motion):
             self._wait_for_sensor(given)
         elif name == "SET_VELOCITY_LIMIT":
             told = {key: self._number(value) for key, value in given.items()}
-            for refusal in limits.raised_by_klipper(told, self._setup.printer):
-                self._refuse(*refusal)
+            for raised in limits.raised_by_klipper(told, self._setup.printer):
+                self._raised(*raised)
 
         if name in self._macros:
             self._heats_unsaid = True
@@ -236,8 +250,8 @@ class Judge(Motion):
         elif name in {"G10", "G11"}:
             self._refuse("firmware retraction", name, "its length is not in the program")
         elif name in limits.COMMANDS:
-            for refusal in limits.raised_by(name, words, self._setup.printer, self._dialect):
-                self._refuse(*refusal)
+            for raised in limits.raised_by(name, words, self._setup.printer, self._dialect):
+                self._raised(*raised)
         elif name in FACTORS and words.get("S") is not None:
             self._scale(name, words["S"] or 0.0)
         elif name in MOTORS_OFF and "S" not in words:
@@ -246,6 +260,11 @@ class Judge(Motion):
                 self._homed[axis] = False
         else:
             self._set_one(name, words)
+
+    def _raised(self, what: str, value: str, limit: str, over_ratio: float) -> None:
+        """A limit of the machine's; what never arrives is refused in any job."""
+        gross = math.nextafter(math.inf, 0.0)
+        self._beyond(what, value, limit, over_ratio, gross)
 
     def _set_one(self, name: str, words: dict[str, float | None]) -> None:
         """Commands that set one thing."""

@@ -542,8 +542,9 @@ def test_send_judges_flow_by_the_hotend_unless_the_filament_is_named(tmp_path: P
     job.write_text("\n".join(lines) + "\n")
     words = ["send", str(job), "--port", f"file:{sent}", "--printer", "creality_k1"]
     named = CliRunner().invoke(app, [*words, "--material", "pla"])
-    assert named.exit_code != 0
-    assert not sent.exists()
+    assert named.exit_code == 0
+    assert "20.0 mm³/s, limit 15 mm³/s" in named.stderr
     unnamed = CliRunner().invoke(app, words)
     assert unnamed.exit_code == 0, unnamed.output
+    assert "limit" not in unnamed.stderr
     assert sent.read_text().split() == job.read_text().split()
