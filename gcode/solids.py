@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from gcode.errors import InputError
 from gcode.solids_kernels import first_of_each
+from gcode.threemf import read_3mf
 
 _log = logging.getLogger(__name__)
 
@@ -23,11 +24,14 @@ SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
 WELD_RATIO = 1e-6  # of the extent: STL holds single precision
 EQUAL_DIGITS = 8  # of mm
 STL_HEAD = 84
+STL_TEXT_BYTES = 256  # spaces before a text file's first word
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("of_colour", "<u2")])
-_READ_ERRORS = (
-    ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, EOFError,
-    NotImplementedError, RuntimeError,
+# trimesh's readers raise whatever their parsing hits; these are the kinds seen in malformed files
+READ_ERRORS = (
+    ValueError, ArithmeticError, LookupError, TypeError, AttributeError, NameError, OSError,
+    EOFError, NotImplementedError, RuntimeError, MemoryError,
 )  # fmt: skip
+LARGEST_MM = 1e6  # a kilometre: what is welded is counted in hundred-millionths of a millimetre
 
 
 def read_solid(path: Path) -> Any:
@@ -52,7 +56,7 @@ def read_solid(path: Path) -> Any:
         raise InputError(f"{path}: a solid is one of {', '.join(SUFFIXES)}.")
     try:
         vertices, faces = read_triangles(path)
-    except _READ_ERRORS as error:
+    except READ_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: the mesh cannot be read ({reason}); export it again.") from error
     if len(faces) == 0:
@@ -81,25 +85,64 @@ def read_solid(path: Path) -> Any:
 
 
 def read_triangles(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and faces of a file, as they are in it; none where it holds no mesh."""
+    """Vertices and faces of a file, as they are in it; none where it holds no mesh.
+
+    Raises
+    ------
+    ValueError
+        Where a face has a corner that is no vertex, or a vertex lies beyond all measure; and what
+        else is in `READ_ERRORS`, where the file is damaged.
+    """
+    vertices, faces = _triangles_in(path)
+    if len(faces):
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise ValueError("its faces are no triangles of points in space")
+        low, high = int(faces.min()), int(faces.max())
+        if not 0 <= low <= high < len(vertices):
+            wrong = low if low < 0 else high
+            raise ValueError(f"a face has corner {wrong}, and there are {len(vertices)} vertices")
+    largest = float(np.abs(vertices[np.isfinite(vertices)]).max(initial=0.0))
+    if largest > LARGEST_MM:
+        raise ValueError(f"a vertex lies at {largest:.3g} mm, the limit is {LARGEST_MM:g} mm")
+    return vertices, faces
+
+
+def _triangles_in(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """What a reader makes of it."""
     if path.suffix.lower() == ".stl":
         corners = _binary_stl(path)
         if corners is not None:
             return corners, np.arange(len(corners)).reshape(-1, 3)
+    if path.suffix.lower() == ".3mf":
+        return read_3mf(path)
     import trimesh  # as long as half of what is to be read: only where it must be
 
-    mesh = trimesh.load(path, force="mesh", process=False)
+    with np.errstate(all="ignore"):  # numbers beyond measure are refused by whoever asked
+        mesh = trimesh.load(path, force="mesh", process=False)
     if not isinstance(mesh, trimesh.Trimesh):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
 
 
 def _binary_stl(path: Path) -> Float[np.ndarray, "v 3"] | None:
-    """Corners of a binary STL file's triangles; None where it is not as long as it says."""
+    """Corners of a binary STL file's triangles; None where it is text.
+
+    Raises
+    ------
+    ValueError
+        Where it is no text, and shorter or longer than its header says.
+    """
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
-    if len(data) != STL_HEAD + STL_TRIANGLE.itemsize * count:
-        return None
+    expected = STL_HEAD + STL_TRIANGLE.itemsize * count
+    if len(data) != expected:
+        if data[:STL_TEXT_BYTES].lstrip()[:5].lower() == b"solid" and b"facet" in data:
+            return None
+        if len(data) < STL_HEAD:
+            raise ValueError(f"it has {len(data)} bytes, and a header alone has {STL_HEAD}")
+        raise ValueError(
+            f"its header promises {count} triangles, which are {expected} bytes; it has {len(data)}"
+        )
     triangles = np.frombuffer(data, STL_TRIANGLE, offset=STL_HEAD)
     return np.ascontiguousarray(triangles["corners"].reshape(-1, 3), dtype=np.float64)
 

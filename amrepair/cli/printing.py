@@ -24,6 +24,7 @@ from amrepair.cli.options import (
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
+from gcode.cli.judging import LeaveHeatersOption
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 APPROVALS = ("ask", "auto")
@@ -116,6 +117,7 @@ def loop(
             help="With --resume: a scan has shown that the part stands where it stood.",
         ),
     ] = False,
+    leave_heaters: LeaveHeatersOption = False,
     view: ViewOption = False,
     view_host: HostOption = LOOPBACK,
     view_port: PortOption = VIEW_PORT,
@@ -143,6 +145,7 @@ def loop(
         scanner=scanner,
         approve=approve,
         scan_timeout_s=scan_timeout_s,
+        leave_heaters=leave_heaters,
         seed=seed,
         as_json=as_json,
     )

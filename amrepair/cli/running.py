@@ -38,13 +38,15 @@ from amrepair.report.folder import RunFolder
 from amrepair.scans import Scanner, WatchedFolderScanner
 from amrepair.template import open_template
 from amrepair.template.port import Template
-from gcode.check import CheckedProgram, check
+from gcode.check import CheckedProgram, check, policy_of
 from gcode.cli import console
+from gcode.cli.judging import tell_warnings, warnings_json
 from gcode.cli.options import job_of
 from gcode.errors import JournalError
 from gcode.hosts import connect
 from gcode.hosts.journal import Journal, default_path
 from gcode.profiles import PrintSetup, load_setup
+from gcode.progress import Progress, silent
 from gcode.reader import Job
 
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
@@ -181,7 +183,7 @@ def _new_run(
     layers = [*looks.at_layers, *layers_at(job, looks.at_mm), *([] if pace else fixed)]
     stops = plan_stops(job, layers)
     with bars.shown():
-        checked = check(job.program, setup, progress=bars)
+        checked = _judged(job, setup, leave_heaters=said["leave_heaters"], progress=bars)
         with watch("template"):
             field = open_template(template, progress=bars)
         with watch("locate"):
@@ -189,6 +191,7 @@ def _new_run(
                 job, field, layer_height_mm=setup.process.layer_height_mm, progress=bars
             )
             expected, build_from_template = stood(field, placed)
+    tell_warnings(job_file, checked.report)
     if expected is not field:
         console.errors.print(_how_it_stands(placed))
     setting = Setting.of(
@@ -200,6 +203,16 @@ def _new_run(
     forget(out)
     keep(out, setting, job.program.text, field)
     return _Begun(folder, setting, setup, job, checked, expected, stops, Tape(out))
+
+
+def _judged(
+    job: Job, setup: PrintSetup, *, leave_heaters: bool, progress: Progress = silent
+) -> CheckedProgram:
+    """A job of the user's own is refused what can hurt; one of ours keeps every figure."""
+    return check(
+        job.program, setup, policy=policy_of(job.program), leave_heaters=leave_heaters,
+        progress=progress,
+    )  # fmt: skip
 
 
 def _how_it_stands(placed: tuple[Transform, ...]) -> str:
@@ -221,7 +234,7 @@ def _gone_on_with(
         raise InputError(f"the run in {folder} was simulated; there is no printer to go on with")
     tape = Tape(folder)
     tape.reopen()
-    checked = check(run.job.program, run.setup)
+    checked = _judged(run.job, run.setup, leave_heaters=setting.leave_heaters)
     return _Begun(
         RunFolder(folder), setting, run.setup, run.job, checked, run.template, run.stops, tape
     )
@@ -328,6 +341,7 @@ def _tell(
     result = loop_result(
         report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
     )
+    result |= warnings_json(begun.checked.report)
     folder.write_json("result.json", result)
     within = report.within_tolerance
     with bars.shown(), bars.stage("report"):

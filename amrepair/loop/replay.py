@@ -20,7 +20,7 @@ from amrepair.loop.sites import sites
 from amrepair.loop.tape import Tape, read_events
 from amrepair.repair import Stopwatch
 from amrepair.scans import Scan, ScanRequest
-from gcode.check import CheckedProgram, check
+from gcode.check import CheckedProgram, check, policy_of
 from gcode.hosts.file import FilePrinter
 from gcode.progress import Progress, silent
 
@@ -89,7 +89,12 @@ def looks_of(
     setting = run.setting
     report = run_loop(
         run.job,
-        judge(run.job.program, run.setup),
+        judge(
+            run.job.program,
+            run.setup,
+            policy=policy_of(run.job.program),
+            leave_heaters=setting.leave_heaters,
+        ),
         FilePrinter(Path("/dev/null")),
         _TapeScanner(setting.scanner_pose),
         sites(run.job, run.template, setting.placed, run.setup, by_beads=setting.by_beads),

@@ -47,6 +47,8 @@ class Setting:
         Whether it prints without asking, within the profile's limits.
     adaptive
         Layers that adaptive looks begin with (`pace`); 0 where there are none.
+    leave_heaters
+        The job may leave heaters on; else lines that switch them off are put at its end.
     """
 
     printer: str
@@ -68,6 +70,7 @@ class Setting:
     approve: str = ""
     title: str = "job"
     copies: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    leave_heaters: bool = False
 
     @classmethod
     def of(

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
 from gcode.solids import (
+    READ_ERRORS,
     SUFFIXES,
     as_manifold,
     first_closed,
@@ -37,19 +38,6 @@ LEAST_PART_MM = 1.0  # a printer that prints smaller ones lays no beads
 MAX_LID_EDGES = 32  # a larger hole has a shape that we do not know
 # More open edges than this share of all edges is a bag of polygons, not a surface with a hole.
 MAX_OPEN_EDGE_RATIO = 0.05
-# trimesh's readers raise whatever their parsing hits; these are the kinds seen in malformed files
-_READ_ERRORS = (
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    AttributeError,
-    OSError,
-    EOFError,
-    NotImplementedError,
-    RuntimeError,
-    UnicodeError,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +113,7 @@ def _read(path: Path) -> trimesh.Trimesh:
         )
     try:
         vertices, faces = read_triangles(path)
-    except _READ_ERRORS as error:
+    except READ_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise TemplateError(
             f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} ({reason}); "

@@ -4,8 +4,19 @@ It shares no code with slicing, writer and reader, so that their mistakes are no
 `check` makes a `CheckedProgram`, and only that may be printed.
 """
 
-from gcode.check.checker import check, find_refusals
-from gcode.check.findings import Refusal
+from gcode.check.checker import Verdict, check, find_refusals, judge, policy_of
+from gcode.check.findings import Policy, Refusal, Warned
 from gcode.check.proof import CheckedProgram, CheckReport
 
-__all__ = ["CheckReport", "CheckedProgram", "Refusal", "check", "find_refusals"]
+__all__ = [
+    "CheckReport",
+    "CheckedProgram",
+    "Policy",
+    "Refusal",
+    "Verdict",
+    "Warned",
+    "check",
+    "find_refusals",
+    "judge",
+    "policy_of",
+]

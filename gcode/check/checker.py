@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import dataclass
 
-from gcode.check.findings import Refusal, Text
+from gcode.check.findings import Policy, Refusal, Text
 from gcode.check.proof import CheckedProgram, CheckReport, _prove
 from gcode.check.rules import Judge
 from gcode.check.sweep import sweep
@@ -16,6 +18,28 @@ from gcode.progress import Progress, silent
 from gcode.surfaces import HeightField
 
 SAY_EVERY_LINES = 20_000  # some hundredths of a second
+OUR_MARK = re.compile(r"^;AMREPAIR:", re.MULTILINE)  # before each script that our writer puts in
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a program was found to be.
+
+    Attributes
+    ----------
+    refusals
+        In the program's order; empty where nothing speaks against it.
+    report
+        What was judged, by which policy, with its warnings and what was added at the end.
+    """
+
+    refusals: tuple[Refusal, ...]
+    report: CheckReport
+
+
+def policy_of(program: Program) -> Policy:
+    """Whose program it is: strict for our own, by the marks that our writer leaves in it."""
+    return Policy.STRICT if OUR_MARK.search(program.text) else Policy.DANGER
 
 
 def find_refusals(
@@ -24,10 +48,13 @@ def find_refusals(
     *,
     as_built: HeightField | None = None,
     initial: ModalState | None = None,
+    policy: Policy = Policy.STRICT,
     progress: Progress = silent,
 ) -> tuple[Refusal, ...]:
     """Everything that speaks against printing a program, in its order; see `check`."""
-    return _judge(program, setup, as_built, initial, progress)[0]
+    return judge(
+        program, setup, as_built=as_built, initial=initial, policy=policy, progress=progress
+    ).refusals
 
 
 def check(
@@ -36,6 +63,8 @@ def check(
     *,
     as_built: HeightField | None = None,
     initial: ModalState | None = None,
+    policy: Policy = Policy.STRICT,
+    leave_heaters: bool = False,
     progress: Progress = silent,
 ) -> CheckedProgram:
     """Judge a program.
@@ -49,6 +78,11 @@ def check(
     initial
         The machine's state before the first line, for a program within a job; None: a machine
         that is cold and not homed (with `as_built`: not homed in X and Y, its Z still true).
+    policy
+        `policy_of` tells which suits a file. By `DANGER` the report has warnings, and heaters that
+        the program leaves on are switched off by lines at its end.
+    leave_heaters
+        The program may leave its heaters on.
 
     Raises
     ------
@@ -65,50 +99,64 @@ def check(
     ...     print(error)  # doctest: +ELLIPSIS
     The checker refuses the program: ...cold...
     """
-    refusals, report = _judge(program, setup, as_built, initial, progress)
+    verdict = judge(
+        program, setup, as_built=as_built, initial=initial, policy=policy,
+        leave_heaters=leave_heaters, progress=progress,
+    )  # fmt: skip
+    refusals = verdict.refusals
     if refusals:
         more = f" (and {len(refusals) - 1} more)" if len(refusals) > 1 else ""
         raise CheckRefusedError(f"The checker refuses the program: {refusals[0]}{more}.", refusals)
-    return _prove(program, setup.printer.id, report)
+    if verdict.report.added:
+        text = "\n".join([program.text.rstrip("\n"), *verdict.report.added, ""])
+        program = Program(text, program.dialect)
+    return _prove(program, setup.printer.id, verdict.report)
 
 
-def _judge(
+def judge(
     program: Program,
     setup: PrintSetup,
-    as_built: HeightField | None,
-    initial: ModalState | None,
-    progress: Progress,
-) -> tuple[tuple[Refusal, ...], CheckReport]:
+    *,
+    as_built: HeightField | None = None,
+    initial: ModalState | None = None,
+    policy: Policy = Policy.STRICT,
+    leave_heaters: bool = False,
+    progress: Progress = silent,
+) -> Verdict:
+    """What `check` goes by, for whoever wants to know and not to print."""
     if program.dialect not in COMMANDS:
         raise InputError(
             f"There is no dialect '{program.dialect}' to check; there are {', '.join(COMMANDS)}."
         )
     lines = program.text.split("\n")
     top_mm = as_built.top_mm if as_built is not None else None
-    judge = Judge(program, setup, top_mm, initial)
+    one = Judge(program, setup, top_mm, initial, policy)
     text = Text.of(program.text)
     number, said = 1, 0
     while number <= len(lines):
-        number = judge.follow(text, number, min(len(lines), said + SAY_EVERY_LINES) + 1)
+        number = one.follow(text, number, min(len(lines), said + SAY_EVERY_LINES) + 1)
         if number - said > SAY_EVERY_LINES:
             progress("check", float(number - 1), float(len(lines)))
             said = number - 1
         elif number <= len(lines):
-            judge.read(number, lines[number - 1])
+            one.read(number, lines[number - 1])
             number += 1
-    judge.end(lines)
+    one.end(lines, leave_heaters=leave_heaters)
     progress("check", float(len(lines)), float(len(lines)))
-    refusals, clearance_mm = list(judge.refusals), math.inf
+    refusals, clearance_mm = list(one.refusals), math.inf
     if as_built is not None:
         progress("sweep", 0.0, 1.0)
-        hits, clearance_mm = sweep(judge.moves, lines, setup.printer, as_built)
+        hits, clearance_mm = sweep(one.moves, lines, setup.printer, as_built)
         progress("sweep", 1.0, 1.0)
         refusals += hits
     refusals.sort(key=lambda refusal: refusal.line)
     report = CheckReport(
-        commands=judge.commands,
-        moves=judge.moves.count,
+        commands=one.commands,
+        moves=one.moves.count,
         swept=as_built is not None,
         least_clearance_mm=clearance_mm if math.isfinite(clearance_mm) else None,
+        policy=policy,
+        warnings=one.warnings.told(),
+        added=one.added,
     )
-    return tuple(refusals), report
+    return Verdict(tuple(refusals), report)

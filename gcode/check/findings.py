@@ -1,13 +1,27 @@
-"""What the checker reads and what it finds: the text, its moves, and refusals."""
+"""What the checker reads and what it finds: the text, its moves, refusals and warnings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 MOST_SHOWN = 60  # characters of a line in a message
+
+
+class Policy(StrEnum):
+    """Whose program it is, and so what is refused.
+
+    `STRICT`, for programs of our own, holds them to every figure of the profiles. `DANGER`, for a
+    user's own job, refuses what can hurt and tells the rest: what a profile says of flow, speed,
+    acceleration and bead size is what its machine prints well with, and whoever prints a job every
+    day knows better.
+    """
+
+    STRICT = "strict"
+    DANGER = "danger"
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +51,44 @@ class Refusal:
         shown = text if len(text) <= MOST_SHOWN else text[: MOST_SHOWN - 1] + "…"
         where = f"line {self.line} ({shown!r})" if shown else f"line {self.line}"
         return f"{where}: {self.what}: {self.value}, limit {self.limit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """Something beyond a profile's figures that a user's own job may do.
+
+    Attributes
+    ----------
+    lines
+        How many lines do it.
+    worst
+        The line that goes furthest beyond.
+    """
+
+    lines: int
+    worst: Refusal
+
+    def __str__(self) -> str:
+        more = f"; {self.lines} lines do" if self.lines > 1 else ""
+        return f"{self.worst}{more}"
+
+
+class Warnings:
+    """Warnings by what they are about."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, tuple[int, float, Refusal]] = {}
+
+    def add(self, refusal: Refusal, over_ratio: float) -> None:
+        """One more line that goes so many times beyond its limit."""
+        count, worst_ratio, worst = self._found.get(refusal.what, (0, -1.0, refusal))
+        if over_ratio > worst_ratio:
+            worst_ratio, worst = over_ratio, refusal
+        self._found[refusal.what] = (count + 1, worst_ratio, worst)
+
+    def told(self) -> tuple[Warned, ...]:
+        """All of them, in the order in which they were first met."""
+        return tuple(Warned(count, worst) for count, _, worst in self._found.values())
 
 
 @dataclass(frozen=True, slots=True)

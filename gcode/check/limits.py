@@ -6,6 +6,7 @@ program may set what it likes below them. It knows no moves.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from gcode.profiles import PrinterProfile
@@ -13,6 +14,7 @@ from gcode.profiles import PrinterProfile
 # Slicers write limits that are not quite this machine's (PrusaSlicer's M203 X500 for an MK3S of
 # 200): beyond so many times the profile's they are another machine's.
 RAISED = 5.0
+Finding = tuple[str, str, str, float]  # what, value, limit, and how many times the limit it is
 # What M201 and M203 set for each axis, by the profile's name, and its unit.
 _BY_AXIS = {
     "M201": ("max_acceleration_mm_s2", "acceleration", "mm/s²"),
@@ -35,8 +37,8 @@ _MAY_BE_ZERO = "max_jerk_mm_s"  # an axis without speed or acceleration never ar
 
 def raised_by(
     name: str, words: dict[str, float | None], printer: PrinterProfile, dialect: str
-) -> Iterator[tuple[str, str, str]]:
-    """What, value and limit of each limit that a command of `COMMANDS` raises too far."""
+) -> Iterator[Finding]:
+    """What a command of `COMMANDS` raises too far, or sets to what no axis ever arrives with."""
     if name == "M204":
         for letter, axis in _OF_M204.items():
             limit = getattr(printer.max_acceleration_mm_s2, axis)
@@ -52,9 +54,7 @@ def raised_by(
         yield from _judged(what_of, told, limit, unit, zero=field == _MAY_BE_ZERO)
 
 
-def raised_by_klipper(
-    given: dict[str, float | None], printer: PrinterProfile
-) -> Iterator[tuple[str, str, str]]:
+def raised_by_klipper(given: dict[str, float | None], printer: PrinterProfile) -> Iterator[Finding]:
     """The same of Klipper's SET_VELOCITY_LIMIT: what its parameters say."""
     for key, (field, what, unit) in _OF_KLIPPER.items():
         limit = getattr(printer, field).x
@@ -64,10 +64,11 @@ def raised_by_klipper(
 
 def _judged(
     what: str, value: float | None, limit: float, unit: str, *, zero: bool
-) -> Iterator[tuple[str, str, str]]:
+) -> Iterator[Finding]:
     if value is None:
         return
+    over_ratio = value / (RAISED * limit) if value > 0 else math.inf
     if not 0 <= value <= RAISED * limit or (value == 0 and not zero):
         told = f"{'0' if zero else 'above 0'} to {RAISED * limit:g} {unit}, "
         told += f"{RAISED:g} times the profile's"
-        yield what, f"{value:g} {unit}", told
+        yield what, f"{value:g} {unit}", told, over_ratio

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from gcode.check import plain_kernels as plain
 from gcode.check.arcs import points_of_arc
-from gcode.check.findings import Moves, Refusal, Text
+from gcode.check.findings import Moves, Policy, Refusal, Text, Warnings
 from gcode.check.words import G91_MOVES_E, LINE_LIMIT
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
@@ -33,6 +33,13 @@ BACKWARDS_RATIO, BACKWARDS_MOVES = 0.25, 10
 INCH_MM = 25.4
 # Klipper's `[idle_timeout]` gives a hot machine that stands still ten minutes.
 STILL_S = 600.0
+# What stands molten in a hotend (the melt zone of a V6 is 10 mm long) is pushed out at any speed: a
+# drop that a job primes with after a retraction.
+MOLTEN_MM = 5.0
+# Between a plain hotend and the fastest that is sold (V6: 11 to 15 mm³/s, Rapido and CHT: 40) lies
+# a factor of three, and as much between a bead and a blob that the nozzle drags along: what a
+# user's job asks beyond this does not come from another taste.
+GROSS = 3.0
 LEAST_BEAD_Z_MM = 0.02  # the thinnest layer that a process profile may have
 
 
@@ -45,6 +52,8 @@ class Motion:
         Height of what stands on the bed; None for a bare bed.
     initial
         The machine's state before the first line; None: cold and not homed.
+    policy
+        Whether what is beyond the profiles' figures is refused, or told.
     """
 
     def __init__(
@@ -53,8 +62,11 @@ class Motion:
         setup: PrintSetup,
         standing_top_mm: float | None,
         initial: ModalState | None,
+        policy: Policy = Policy.STRICT,
     ) -> None:
         self.refusals: list[Refusal] = []
+        self.warnings = Warnings()
+        self.policy = policy
         self.moves = Moves()
         self.commands = 0
         self._setup, self._dialect = setup, program.dialect
@@ -85,7 +97,7 @@ class Motion:
         high = (x1 + PLACE_SLACK_MM, y1 + PLACE_SLACK_MM, printer.max_z_mm + PLACE_SLACK_MM)
         self._limits_of_moves = (
             *low, *high, FASTEST_MM_S, SHORT_MM, SECTION_SLACK * printer.max_bead_section_mm2,
-            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect], LEAST_BEAD_Z_MM,
+            printer.max_extrude_only_mm, LINE_LIMIT[program.dialect], LEAST_BEAD_Z_MM, MOLTEN_MM,
         )  # fmt: skip
 
     def follow(self, text: Text, first: int, end: int) -> int:
@@ -160,6 +172,19 @@ class Motion:
 
     def _refuse(self, what: str, value: str, limit: str) -> None:
         self.refusals.append(Refusal(self._line, self._text, what, value, limit))
+
+    def _beyond(
+        self, what: str, value: str, limit: str, over_ratio: float, gross: float = GROSS
+    ) -> None:
+        """So many times a figure of the profile's: told in a user's job, if it is not gross."""
+        if self.policy is Policy.STRICT or over_ratio > gross:
+            self._refuse(what, value, limit)
+        else:
+            self._warn(what, value, limit, over_ratio)
+
+    def _warn(self, what: str, value: str, limit: str, over_ratio: float = 1.0) -> None:
+        refusal = Refusal(self._line, self._text, what, value, limit)
+        self.warnings.add(refusal, over_ratio)
 
     def _target(self, words: dict[str, float | None]) -> list[float | None]:
         target = list(self._place)
@@ -280,10 +305,13 @@ class Motion:
             limit_mm_s = FEED_SLACK * getattr(limits_mm_s.max_speed_mm_s, letter)
             along_mm = abs(end[axis] - start[axis])
             if feed_mm_s * along_mm > limit_mm_s * length_mm:
-                self._refuse(
+                along_mm_s = feed_mm_s * along_mm / length_mm
+                self._beyond(
                     f"feed of {letter.upper()} beyond what the machine does",
-                    f"{feed_mm_s * along_mm / length_mm:.0f} mm/s",
+                    f"{along_mm_s:.0f} mm/s",
                     f"{limit_mm_s:g} mm/s, {FEED_SLACK:g} times the profile's",
+                    along_mm_s / limit_mm_s,
+                    math.inf,  # the firmware goes no faster than it can
                 )
 
     def _bounds(self, target: list[float | None]) -> None:
@@ -303,7 +331,7 @@ class Motion:
             )  # fmt: skip
             self._ready_c = math.inf  # said once
         if length_mm <= SHORT_MM:
-            self._short(pushed_mm)
+            self._short(pushed_mm, length_mm)
             return
         self._short_mm3 = 0.0
         if pushed_mm < 0:
@@ -315,13 +343,19 @@ class Motion:
         section_mm2 = volume_mm3 / length_mm
         limit_mm2 = printer.max_bead_section_mm2
         if section_mm2 > SECTION_SLACK * limit_mm2:
-            self._refuse("bead too thick", f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²")
+            over = section_mm2 / limit_mm2
+            self._beyond("bead too thick", f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²", over)
+        self._melts(section_mm2)
+
+    def _melts(self, section_mm2: float) -> None:
+        """So much plastic for each millimetre that the feed counts."""
         flow = section_mm2 * self._feed_mm_s * self._factor["M220"]
         limit = self._setup.max_volumetric_mm3_s
         if flow > FLOW_SLACK * limit:
-            self._refuse("melts more than the hotend can", f"{flow:.1f} mm³/s", f"{limit:g} mm³/s")
+            told = (f"{flow:.1f} mm³/s", f"{limit:g} mm³/s")
+            self._beyond("melts more than the hotend can", *told, flow / limit)
 
-    def _short(self, pushed_mm: float) -> None:
+    def _short(self, pushed_mm: float, length_mm: float) -> None:
         """Standing, or nearly so: plastic adds up until the nozzle has moved on."""
         printer = self._setup.printer
         if pushed_mm < 0:
@@ -329,7 +363,10 @@ class Motion:
             return
         back_mm = min(pushed_mm, self._pulled_mm)
         self._pulled_mm -= back_mm
-        self._short_mm3 += (pushed_mm - back_mm) * self._area_mm2
+        fresh_mm3 = (pushed_mm - back_mm) * self._area_mm2
+        self._short_mm3 += fresh_mm3
+        if fresh_mm3 > 0 and self._short_mm3 > MOLTEN_MM * self._area_mm2:
+            self._melts(fresh_mm3 / (length_mm or pushed_mm))  # alone, F is the filament's own
         allowed_mm3 = printer.max_extrude_only_mm * self._area_mm2
         if self._short_mm3 > allowed_mm3:
             self._refuse(

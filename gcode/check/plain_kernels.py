@@ -11,8 +11,8 @@ from gcode.compiled import njit
 X, Y, Z, E, FEED, PULLED, SHORT_MM3, ABSOLUTE, ABSOLUTE_E, UNIT = range(10)
 (
     LOW_X, LOW_Y, LOW_Z, HIGH_X, HIGH_Y, HIGH_Z, FASTEST, SHORT_MOVE, SECTION, ALONE, LINE,
-    LEAST_Z, FAST_X, FAST_Y, AREA, FLOW, COLD, STILL,
-) = range(18)  # fmt: skip
+    LEAST_Z, MOLTEN, FAST_X, FAST_Y, AREA, FLOW, COLD, STILL,
+) = range(19)  # fmt: skip
 EXACT = 2**53  # digits up to this, and as many decimals as a double divides by exactly
 MOST_DECIMALS = 22
 WORDS = 5  # X, Y, Z, E, F
@@ -154,7 +154,12 @@ def follow(data, starts, first, last, limits, state, rows, counts):
                     return line
             else:
                 pulled -= back
-                short_mm3 += (pushed - back) * limits[AREA]
+                fresh = (pushed - back) * limits[AREA]
+                short_mm3 += fresh
+                melts = fresh / (length if length > 0.0 else pushed) * feed
+                molten = short_mm3 <= limits[MOLTEN] * limits[AREA]
+                if fresh > 0.0 and not molten and melts > limits[FLOW]:
+                    return line
                 if short_mm3 > limits[ALONE] * limits[AREA]:
                     return line
         # nothing speaks against it

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn, SupportsIndex
 
+from gcode.check.findings import Policy, Warned
 from gcode.errors import LocalProtocolError
 from gcode.moves import Program
 
@@ -25,12 +26,21 @@ class CheckReport:
     least_clearance_mm
         The smallest distance by which a part of the head above the tip cleared it; None where
         nothing was swept.
+    policy
+        By what it was judged.
+    warnings
+        What goes beyond the profiles' figures, where that policy lets it.
+    added
+        Lines that were put at its end, because it left heaters on.
     """
 
     commands: int
     moves: int
     swept: bool
     least_clearance_mm: float | None
+    policy: Policy = Policy.STRICT
+    warnings: tuple[Warned, ...] = ()
+    added: tuple[str, ...] = ()
 
 
 class CheckedProgram:
@@ -67,7 +77,7 @@ class CheckedProgram:
 
     @property
     def program(self) -> Program:
-        """The text and its dialect."""
+        """The text, with what was put at its end, and its dialect."""
         return self._program
 
     @property

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 
-from gcode.check import limits
+from gcode.check import limits, waits
+from gcode.check.findings import Policy
 from gcode.check.motion import INCH_MM, PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
     COMMANDS,
@@ -58,11 +60,16 @@ class Judge(Motion):
         setup: PrintSetup,
         standing_top_mm: float | None,
         initial: ModalState | None,
+        policy: Policy = Policy.STRICT,
     ) -> None:
-        super().__init__(program, setup, standing_top_mm, initial)
+        super().__init__(program, setup, standing_top_mm, initial, policy)
+        self.added: tuple[str, ...] = ()
         macros = {macro.split(maxsplit=1)[0].upper() for macro in setup.printer.macros}
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
         own = {self._begins.name if self._begins else "", self._ends or ""}
+        self._macros = macros | STARTS - {self._begins.name.upper() if self._begins else ""}
+        self._heats_unsaid = False  # whether a macro ran that may have heated something
+        self._waited_s, self._waited_at = 0.0, -1
         self._known = COMMANDS[program.dialect] | macros | {name.upper() for name in own}
         self._tool: str | None = None
 
@@ -109,8 +116,12 @@ class Judge(Motion):
         """The link puts its own around each line, and firmwares read both."""
         self._refuse(what, told.split(maxsplit=1)[0], "none: the link adds it")
 
-    def end(self, lines: list[str]) -> None:
-        """Judge what the program is as a whole, and what it leaves behind after its last line."""
+    def end(self, lines: list[str], *, leave_heaters: bool = False) -> None:
+        """Judge what the program is as a whole, and what it leaves behind after its last line.
+
+        Heaters that a user's job leaves on are switched off by lines that are `added`, unless
+        somebody asked to leave them.
+        """
         self._backwards(lines)
         self._line, self._text = len(lines), lines[-1]
         if not self._alone:
@@ -121,10 +132,16 @@ class Judge(Motion):
             ("chamber", self._chamber_c, "M141 S0"),
         )
         for what, value_c, off in heaters:
-            if value_c > 0:
-                self._refuse(
-                    f"{what} left on at the end, {off} is lacking", f"{value_c:g} °C", "0 °C"
-                )
+            if value_c <= 0:
+                continue
+            told = f"{what} left on at the end, {off} is"
+            if leave_heaters:
+                self._warn(f"{told} left out as asked", f"{value_c:g} °C", "0 °C")
+            elif self.policy is Policy.STRICT:
+                self._refuse(f"{told} lacking", f"{value_c:g} °C", "0 °C")
+            else:
+                self._warn(f"{told} added", f"{value_c:g} °C", "0 °C")
+                self.added += (off,)
 
     def _named(self, command: str) -> None:
         match = _NAMED.match(command)
@@ -152,12 +169,27 @@ class Judge(Motion):
             self._advance(self._number(given.get("ADVANCE")))
         elif name == "SET_GCODE_OFFSET":
             self._offset(given)
-        elif name == "TEMPERATURE_WAIT" and given.get("SENSOR") == "EXTRUDER":
-            self._ready_c = self._number(given.get("MINIMUM", "0")) or 0.0
+        elif name == "TEMPERATURE_WAIT":
+            self._wait_for_sensor(given)
         elif name == "SET_VELOCITY_LIMIT":
             told = {key: self._number(value) for key, value in given.items()}
-            for refusal in limits.raised_by_klipper(told, self._setup.printer):
-                self._refuse(*refusal)
+            for raised in limits.raised_by_klipper(told, self._setup.printer):
+                self._raised(*raised)
+
+        if name in self._macros:
+            self._heats_unsaid = True
+
+    def _wait_for_sensor(self, given: dict[str, str]) -> None:
+        sensor = given.get("SENSOR", "").strip("\"'")
+        low_c, high_c = (self._number(given.get(key)) for key in ("MINIMUM", "MAXIMUM"))
+        told_c = {"EXTRUDER": self._hotend_c, "HEATER_BED": self._bed_c}.get(sensor)
+        if told_c is not None and self._heats_unsaid:  # a macro may have told it more
+            printer = self._setup.printer
+            told_c = None if sensor == "HEATER_BED" else printer.max_hotend_c
+        for refusal in waits.for_sensor(sensor, low_c, high_c, told_c, self._setup.printer):
+            self._refuse(*refusal)
+        if sensor == "EXTRUDER" and low_c is not None:
+            self._ready_c = low_c
 
     def _offset(self, given: dict[str, str]) -> None:
         for letter in "XYZ":
@@ -218,8 +250,8 @@ class Judge(Motion):
         elif name in {"G10", "G11"}:
             self._refuse("firmware retraction", name, "its length is not in the program")
         elif name in limits.COMMANDS:
-            for refusal in limits.raised_by(name, words, self._setup.printer, self._dialect):
-                self._refuse(*refusal)
+            for raised in limits.raised_by(name, words, self._setup.printer, self._dialect):
+                self._raised(*raised)
         elif name in FACTORS and words.get("S") is not None:
             self._scale(name, words["S"] or 0.0)
         elif name in MOTORS_OFF and "S" not in words:
@@ -228,6 +260,11 @@ class Judge(Motion):
                 self._homed[axis] = False
         else:
             self._set_one(name, words)
+
+    def _raised(self, what: str, value: str, limit: str, over_ratio: float) -> None:
+        """A limit of the machine's; what never arrives is refused in any job."""
+        gross = math.nextafter(math.inf, 0.0)
+        self._beyond(what, value, limit, over_ratio, gross)
 
     def _set_one(self, name: str, words: dict[str, float | None]) -> None:
         """Commands that set one thing."""
@@ -254,12 +291,20 @@ class Judge(Motion):
                 self._refuse("move past the end stops or of one motor", told, f"{letter}0")
 
     def _dwell(self, words: dict[str, float | None]) -> None:
+        """Waits add up as long as nothing moves between them."""
+        if self._waited_at != self.moves.count:
+            self._waited_s, self._waited_at = 0.0, self.moves.count
         for letter, per_s in DWELLS.items():
             seconds = (words.get(letter) or 0.0) * per_s
             if seconds < 0:
                 self._refuse("wait", f"{seconds:g} s", "0 s or more")
-            elif seconds > STILL_S and self._hot_on_part:
-                self._refuse("hot wait on the part", f"{seconds:g} s", f"{STILL_S:g} s")
+                continue
+            self._waited_s += seconds
+            limit_s = STILL_S if self._hot_on_part else waits.LONGEST_S
+            if self._waited_s > limit_s:
+                what = "hot wait on the part" if self._hot_on_part else "wait of more than a day"
+                self._refuse(what, f"{self._waited_s:g} s", f"{limit_s:g} s")
+                self._waited_s = 0.0
 
     def _advance(self, seconds: float | None) -> None:
         self._within("pressure advance", seconds, 0.0, MOST_ADVANCE_S, " s")
@@ -293,8 +338,10 @@ class Judge(Motion):
             self._refuse(what, f"{percent:g} %", f"{low:g} to {high:g} %")
 
     def _heat(self, name: str, words: dict[str, float | None]) -> None:
-        value_c = words.get("S", words.get("R"))
+        value_c = waits.told_c(words, self._dialect)
         what = HEATER_COMMANDS[name]
+        for refusal in waits.for_cooling(name, what, words, self._dialect):
+            self._refuse(*refusal)
         if value_c is None:
             self._refuse(f"{what} temperature missing", "no S", "a temperature")
             return

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gcode.cli import console, importing
+from gcode.cli.judging import LeaveHeatersOption, refusal_json, tell_warnings, warnings_json
 from gcode.cli.options import (
     JsonOption,
     MaterialOption,
@@ -24,6 +25,7 @@ from gcode.errors import GcodeError, InputError, ReadError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, list_profiles
 
 if TYPE_CHECKING:
+    from gcode.check import CheckReport
     from gcode.estimate import Estimate
     from gcode.hosts import Printer, PrintReport
     from gcode.moves import Program
@@ -176,11 +178,16 @@ def check(
     printer: PrinterOption = DEFAULT_PRINTER,
     material: OwnMaterialOption = None,
     as_built: AsBuiltOption = None,
+    leave_heaters: LeaveHeatersOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Judge a program: limits, temperatures, sections, and the tool head against --as-built."""
+    """Judge a program: limits, temperatures, sections, and the tool head against --as-built.
+
+    Programs of our own keep every figure of the profiles. In a job of yours only what can hurt is
+    refused; flow, speed, acceleration and bead size beyond the profile's figures are told.
+    """
     with console.starting():
-        from gcode.check import find_refusals
+        from gcode.check import judge, policy_of
         from gcode.moves import Program
 
     setup = _setup_of(printer, material)
@@ -188,23 +195,19 @@ def check(
     field = _as_built(as_built) if as_built is not None else None
     bars = console.Bars()
     with bars.shown():
-        refusals = find_refusals(program, setup, as_built=field, progress=bars)
+        verdict = judge(
+            program, setup, as_built=field, policy=policy_of(program),
+            leave_heaters=leave_heaters, progress=bars,
+        )  # fmt: skip
+    refusals = verdict.refusals
     if as_json:
         console.show_json(
             {
                 "ok": not refusals,
                 "printer": setup.printer.id,
                 "sha256": program.sha256,
-                "refusals": [
-                    {
-                        "line": r.line,
-                        "move": r.text.strip(),
-                        "what": r.what,
-                        "value": r.value,
-                        "limit": r.limit,
-                    }
-                    for r in refusals
-                ],
+                "refusals": [refusal_json(refusal) for refusal in refusals],
+                **warnings_json(verdict.report, "warnings"),
             }
         )
     elif refusals:
@@ -213,7 +216,11 @@ def check(
         if len(refusals) > 20:
             console.errors.print(f"and {len(refusals) - 20} more")
     else:
-        console.out.print(f"{file}: nothing speaks against it on {setup.printer.name}.")
+        tell_warnings(file, verdict.report)
+        console.out.print(
+            f"{file}: nothing {'else ' if verdict.report.warnings else ''}speaks against it on "
+            f"{setup.printer.name}."
+        )
     if refusals:
         raise typer.Exit(2)
 
@@ -301,12 +308,17 @@ def send(
             min=1, help="Lines under way at once; more than 1 for firmware that buffers them."
         ),
     ] = 1,
+    leave_heaters: LeaveHeatersOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a program, then print it; whatever goes wrong, heaters are told to switch off."""
+    """Check a program, then print it; whatever goes wrong, heaters are told to switch off.
+
+    What is judged, and how strictly, is told by 'gcode check --help'.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     from gcode.check import check as check_program
+    from gcode.check import policy_of
     from gcode.cli.words import what_it_does
     from gcode.hosts import connect
     from gcode.hosts.journal import default_path
@@ -320,7 +332,11 @@ def send(
     bars = console.Bars()
     with ThreadPoolExecutor(1) as beside, bars.shown():  # nobody waits for the estimate alone
         cost = beside.submit(_cost_of, program, setup.printer)
-        checked = check_program(program, setup, as_built=field, progress=bars)
+        checked = check_program(
+            program, setup, as_built=field, policy=policy_of(program),
+            leave_heaters=leave_heaters, progress=bars,
+        )  # fmt: skip
+    tell_warnings(file, checked.report)
     console.errors.print(
         f"{file} on {setup.printer.name}: {what_it_does(program, cost.result())}.", markup=False
     )
@@ -354,7 +370,7 @@ def send(
         raise
     finally:
         machine.close()
-    _tell(report, as_json=as_json)
+    _tell(report, checked.report, as_json=as_json)
     if not report.ok:
         raise typer.Exit(4)
 
@@ -468,7 +484,7 @@ def _abort(machine: Printer) -> None:
         console.errors.print(f"gcode: the printer could not be made safe: {error}", markup=False)
 
 
-def _tell(report: PrintReport, *, as_json: bool) -> None:
+def _tell(report: PrintReport, judged: CheckReport, *, as_json: bool) -> None:
     """What became of a print, with the counters of its link."""
     result = {
         "ok": report.ok,
@@ -484,6 +500,7 @@ def _tell(report: PrintReport, *, as_json: bool) -> None:
             for name, seconds in zip(("p50", "p95", "p99"), report.round_trip_s, strict=True)
         },
         "warnings": list(report.warnings),
+        **warnings_json(judged),
         "seconds": round(report.seconds, 3),
     }
     if as_json:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from gcode.errors import ProfileError
 from gcode.profiles.names import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+from gcode.profiles.priming import prime_line
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
 from gcode.profiles.store import load_material, load_printer, load_process
 
@@ -81,7 +82,8 @@ def expand_script(
     """Fill `{name}` in a profile's own G-code.
 
     Known names: hotend_c, first_layer_hotend_c, bed_c, fan, bed_x_mm, bed_y_mm, max_z_mm, park_x,
-    park_y, park_z, filament, printer, and what `values` adds (such as `max_layer_z`).
+    park_y, park_z, filament, printer, prime_line (lines of their own, within the profiles' limits),
+    and what `values` adds (such as `max_layer_z`).
     """
     p, m = setup.printer, setup.material
     known: dict[str, float | str] = {
@@ -97,6 +99,7 @@ def expand_script(
         "park_z": p.park_mm[2],
         "filament": m.id,
         "printer": p.id,
+        "prime_line": "\n".join(prime_line(p, m)),
         **values,
     }
 
@@ -110,4 +113,4 @@ def expand_script(
         value = known[name]
         return value if isinstance(value, str) else f"{value:g}"
 
-    return tuple(_FIELD.sub(fill, line) for line in lines)
+    return tuple(part for line in lines for part in _FIELD.sub(fill, line).split("\n"))

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 
 from gcode.errors import ProfileError
 from gcode.profiles.names import Kind, id_of, list_profiles, profile_dir
+from gcode.profiles.own_limits import own_fault
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
 
 # What pydantic calls values beyond a bound, and how a bound reads.
@@ -109,13 +110,13 @@ def _find(kind: Kind, id_or_path: str | Path, beside: Path | None = None) -> Pat
 
 @lru_cache(maxsize=128)
 def _load_cached(model: type[Any], kind: Kind, path: Path, stamp: int) -> Any:
-    return _validate(model, _resolve(kind, path, ()), path)
+    return _sound(_validate(model, _resolve(kind, path, ()), path), path)
 
 
 def _load(model: type[_P], kind: Kind, id_or_path: str | Path) -> _P:
     path = _find(kind, id_or_path).resolve()
     if _inherits_from_user(path):
-        return _validate(model, _resolve(kind, path, ()), path)
+        return _sound(_validate(model, _resolve(kind, path, ()), path), path)
     loaded: _P = _load_cached(model, kind, path, path.stat().st_mtime_ns)
     return loaded
 
@@ -181,6 +182,17 @@ def _validate(model: type[_P], content: dict[str, Any], path: Path) -> _P:
             raise ProfileError(f"{where} is out of range: it must be {limits}{more}.") from e
         told = f"it must be {limits}; " if limits else ""
         raise ProfileError(f"{where} is not accepted: {told}{first['msg']}{more}.") from e
+
+
+def _sound(profile: _P, path: Path) -> _P:
+    """The profile, unless it breaks its own limits."""
+    fault = own_fault(profile) if isinstance(profile, PrinterProfile) else None
+    if fault is not None:
+        remedy = " (a line {prime_line} primes within them)" if "start_gcode" in fault else ""
+        raise ProfileError(
+            f"{path}: the profile breaks its own limits: {fault}; correct one of the two{remedy}."
+        )
+    return profile
 
 
 def _range(model: type[BaseModel], loc: tuple[int | str, ...]) -> str:

@@ -17,7 +17,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
-from gcode.check import CheckedProgram, check
+from gcode.check import CheckedProgram, check, policy_of
 from gcode.dialects import number
 from gcode.errors import InputError
 from gcode.moves import ModalState, Program
@@ -129,7 +129,7 @@ def change_flow(job: Job, setup: PrintSetup, layer: int, gap: GapField) -> Chang
         return None
     pen.end(job.state_after(one.end_line))
     program = Program("\n".join(pen.text) + "\n", job.program.dialect)
-    checked = check(program, setup, initial=initial)
+    checked = check(program, setup, initial=initial, policy=policy_of(job.program))
     return ChangedLayer(checked, one.first_line, one.end_line, pen.changed, pen.added_mm3)
 
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gcode.check import CheckedProgram, check
+from gcode.check import CheckedProgram, check, policy_of
 from gcode.dialects import number
 from gcode.errors import InputError
 from gcode.moves import ModalState, Program
@@ -108,8 +108,9 @@ def resume_at(
     head.restore(settings)
     body = program.text.rstrip().split("\n")[line:]
     text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
+    whole = Program(text, program.dialect)
     return Resumption(
-        checked=check(Program(text, program.dialect), setup, as_built=field, progress=progress),
+        checked=check(whole, setup, as_built=field, policy=policy_of(program), progress=progress),
         standing=field,
         layer=first,
         first_line=line,

@@ -17,7 +17,7 @@ from gcode.moves import (
     SetFan,
     SetHotend,
 )
-from gcode.profiles import PrinterProfile, PrintSetup
+from gcode.profiles import PrintSetup
 from gcode.slicing.beads import width_of
 from gcode.slicing.patch_beads import Chain, surely_free
 from gcode.slicing.patch_model import NEAR_MM, PatchModel
@@ -26,12 +26,14 @@ from gcode.slicing.pen import Pen
 from gcode.slicing.reach import Reach
 from gcode.slicing.room import bare_place, over_bed, room_for_line
 from gcode.surfaces import HeightField
+from gcode.units import filament_area_mm2
 
 LEVEL_MM = 1e-6
 CLEAR_MM = 0.5  # of the tip over everything on a travel
 STANDALONE_LIFT_MM = 5.0
 WIPE_MM = 4.0  # more than a drop is wide
 PRIME_MM_S = 3.0  # of filament: 7 mm³/s
+MELTING_RATIO = 0.9  # of what can be melted, most that a hotend that has just become hot is given
 
 
 def begin(
@@ -69,19 +71,21 @@ def begin(
     pen.move_to(np.array([*place, safe_mm]))
     pen.add(SetBed(material.bed_c, wait=True))
     pen.add(SetHotend(first_c, wait=True))
-    _prime(pen, printer, None if room is None else np.array(room[2:]))
+    _prime(pen, setup, None if room is None else np.array(room[2:]))
     pen.move_to(np.array([*pen.position_mm[:2], safe_mm]))
     pen.add(SetFan(material.fan_ratio))
     return pen
 
 
-def _prime(pen: Pen, printer: PrinterProfile, wipe: Float[np.ndarray, " 2"] | None) -> None:
+def _prime(pen: Pen, setup: PrintSetup, wipe: Float[np.ndarray, " 2"] | None) -> None:
     """On the bed, wiped off in a direction; or from high above, where the head has no room."""
+    printer = setup.printer
     x, y, _ = pen.position_mm
     if wipe is not None:
         pen.move_to(np.array([x, y, printer.prime_mm[2]]))
     if printer.prime_length_mm > 0:
-        pen.add(Prime(printer.prime_length_mm, PRIME_MM_S))
+        melts_mm_s = setup.max_volumetric_mm3_s / filament_area_mm2(printer.filament_diameter_mm)
+        pen.add(Prime(printer.prime_length_mm, min(PRIME_MM_S, MELTING_RATIO * melts_mm_s)))
     pen.retract()
     if wipe is not None:
         pen.move_to(np.array([*(np.array([x, y]) + WIPE_MM * wipe), printer.prime_mm[2]]))

@@ -155,6 +155,14 @@ FAULTS = {
     "no acceleration at all": ("M83\n", "M83\nM204 P0\n", "acceleration by M204 P"),
     "an axis that never arrives": ("M83\n", "M83\nM203 X0\n", "X's speed"),
     "probe calibrated over what it printed": ("M104 S0\n", "G76\nM104 S0\n", "probing over"),
+    "a bed that never gets as cold": ("M140 S0\n", "M140 S0\nM190 R10\n", "waits for ever"),
+    "a nozzle that never gets as cold": ("M104 S0\n", "M109 R20\nM104 S0\n", "waits for ever"),
+    "a chamber that never gets as cold": ("M140 S0\n", "M140 S0\nM191 R0\n", "waits for ever"),
+    "a cold wait of days": ("M83\n", "M83\nG4 S90000\n", "more than a day"),
+    "a hot wait in pieces": ("G1 Z1 F720\n", "G4 S400\nG4 S400\nG1 Z1 F720\n", "hot wait"),
+    "pushed faster than it melts": ("G1 E0.8 F2100", "G1 E40 F9000", "melts more"),
+    "pushed fast bit by bit": ("G1 E0.8 F2100", "G1 E5 F9000\n" * 3, "melts more"),
+    "pushed fast on the spot": ("G1 E0.8 F2100", "G1 X60.02 E40 F900", "melts more"),
     "arc of several turns": ("I0 J5 E0.5", "I0 J5 P30 E0.5", "several turns"),
 }  # fmt: skip
 
@@ -188,6 +196,63 @@ ORDINARY = {
 }  # fmt: skip
 PRINTERS = {"prusa": "prusa_mk3s", "marlin": "ender_3", "klipper": "generic_klipper",
             "reprap": "generic_reprap"}  # fmt: skip
+
+
+# What never ends, or melts too much, in each dialect; the second word tells whether it is refused.
+WAITS = {
+    "M190 R10": {"prusa", "marlin", "reprap", "klipper"},
+    "M109 R0": {"prusa", "marlin", "reprap", "klipper"},
+    "M190 R40": {"klipper"},  # which knows no R, and would switch the bed off
+    "M109 S20": {"klipper"},
+    "M190 S20": {"klipper"},
+    "M190 S0": set(),
+    "M190 S55": set(),
+    "G1 E50 F9000": {"prusa", "marlin", "reprap", "klipper"},
+    "G1 E45 F150": set(),
+    "G1 E-5 F9000\nG1 E5 F9000": set(),
+    "G1 E-5 F9000\nG1 E5.3 F9000": set(),
+    "G1 E4.8 F1500": set(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", PRINTERS)
+def test_what_never_ends_or_melts_too_much_is_refused_in_every_dialect(dialect: str) -> None:
+    """regression: `M190 R10` passed, and on a K1 150 mm/s into the hotend."""
+    good = GOOD.replace("G28 W", "G28")
+    for printer in {PRINTERS[dialect], "creality_k1" if dialect == "klipper" else "ender_3"}:
+        setup = load_setup(printer).melting_all()
+        for line, dialects in WAITS.items():
+            text = good.replace("G1 Z10 F720\n", f"G1 X60 Y60 Z10 F720\n{line}\n")
+            found = find_refusals(Program(text, dialect), setup)
+            assert bool(found) == (dialect in dialects), (printer, line, [str(r) for r in found])
+
+
+KLIPPER_WAITS = {
+    "SENSOR=extruder MINIMUM=205": True,
+    "SENSOR=extruder MINIMUM=211": False,
+    "SENSOR=extruder MAXIMUM=205": False,
+    "SENSOR=extruder MINIMUM=205 MAXIMUM=212": True,
+    "SENSOR=extruder MINIMUM=205 MAXIMUM=200": False,
+    "SENSOR=heater_bed MINIMUM=60": True,
+    "SENSOR=heater_bed MINIMUM=61": False,
+    "SENSOR=heater_bed MAXIMUM=10": False,
+    "SENSOR=chamber MINIMUM=40": True,
+    "SENSOR=chamber MINIMUM=400": False,
+    "SENSOR=chamber MAXIMUM=10": False,
+    "SENSOR=chamber": False,
+}
+
+
+@pytest.mark.parametrize("wait", KLIPPER_WAITS)
+def test_klipper_waits_for_sensors_only_for_what_comes(wait: str) -> None:
+    text = KLIPPER.replace("G90\n", f"TEMPERATURE_WAIT {wait}\nG90\n", 1)
+    found = find_refusals(Program(text, "klipper"), K1)
+    assert (not found) == KLIPPER_WAITS[wait], [str(r) for r in found]
+
+
+def test_what_a_macro_has_heated_may_be_waited_for() -> None:
+    lines = "PRINT_START\nTEMPERATURE_WAIT SENSOR=heater_bed MINIMUM=60\n"
+    assert not find_refusals(Program(lines, "klipper"), load_setup("voron_2_4"))
 
 
 @pytest.mark.parametrize("dialect", ORDINARY)
@@ -477,8 +542,9 @@ def test_send_judges_flow_by_the_hotend_unless_the_filament_is_named(tmp_path: P
     job.write_text("\n".join(lines) + "\n")
     words = ["send", str(job), "--port", f"file:{sent}", "--printer", "creality_k1"]
     named = CliRunner().invoke(app, [*words, "--material", "pla"])
-    assert named.exit_code != 0
-    assert not sent.exists()
+    assert named.exit_code == 0
+    assert "20.0 mm³/s, limit 15 mm³/s" in named.stderr
     unnamed = CliRunner().invoke(app, words)
     assert unnamed.exit_code == 0, unnamed.output
+    assert "limit" not in unnamed.stderr
     assert sent.read_text().split() == job.read_text().split()

@@ -179,3 +179,58 @@ def test_a_script_with_an_unknown_name_is_refused() -> None:
     assert expand_script(("M104 S{hotend_c}",), setup) == ("M104 S210",)
     with pytest.raises(ProfileError, match="nonsense"):
         expand_script(("M104 S{nonsense}",), setup)
+
+
+def test_the_prime_line_keeps_the_limits_of_printer_and_material() -> None:
+    """regression: 0.752 mm² where 0.64 are allowed, and 6 mm³/s of TPU where 3 are."""
+    for name in list_profiles("printers"):
+        for material in list_profiles("materials"):
+            setup = load_setup(name, material)
+            lines = expand_script(("{prime_line}",), setup)
+            x_mm, e_mm = setup.printer.prime_mm[0], 0.0
+            for line in lines:
+                words = {w[0]: float(w[1:]) for w in line.split()[1:]}
+                if line.startswith("G1") and "E" in words:
+                    volume_mm3 = words["E"] * np.pi / 4 * setup.printer.filament_diameter_mm**2
+                    section_mm2 = volume_mm3 / (words["X"] - x_mm)
+                    assert section_mm2 <= setup.printer.max_bead_section_mm2
+                    assert section_mm2 * words["F"] / 60.0 <= setup.max_volumetric_mm3_s
+                    e_mm += words["E"]
+                x_mm = words.get("X", x_mm)
+            assert e_mm > setup.printer.prime_length_mm
+
+
+def test_the_prime_line_ends_on_a_small_bed(tmp_path: Path) -> None:
+    own = tmp_path / "small.toml"
+    own.write_text('inherits = "ender_3"\nbed_size_mm = [80.0, 80.0]\npark_mm = [5, 75, 20]\n')
+    setup = load_setup(own)
+    text = " ".join(expand_script(("{prime_line}",), setup))
+    places = [float(x) for x in re.findall(r"X([\d.]+)", text)]
+    assert places == sorted(places)
+    assert places[-1] == 75.0
+
+
+OWN_LIMITS = {
+    "bead": ('start_gcode = "G28\\nM83\\nG1 Z0.3 F300\\nG1 X5 Y5\\nG1 X45 E12.5 F600"',
+             r"line 5 \('G1 X45 E12.5 F600'\): a bead of 0.752 mm², .* is 0.64"),
+    "absolute extruder": (
+        'start_gcode = "M82\\nG92 E0\\nG1 X5 Y5\\nG1 X65 E9 F1000\\nG1 X105 E21.5 F600"',
+        "line 5 .*0.752 mm²"),
+    "flow": ('start_gcode = "M83\\nG1 X5 Y5\\nG1 X65 E9 F6000"', "36.1 mm³/s"),
+    "standing": ('start_gcode = "M83\\nG1 X5 Y5\\nG1 E60 F100"', "60 mm of filament standing"),
+    "reach": ('start_gcode = "G1 X5 Y-9"', "Y -9 mm is out of reach, 0 to 220 mm"),
+    "hotend": ('start_gcode = "M104 S300"', "the hotend at 300 °C, 'max_hotend_c' is 260"),
+    "place": ("prime_mm = [5.0, 400.0, 0.3]", "'prime_mm': Y 400 mm is out of reach"),
+    "priming": ("prime_length_mm = 60.0", "'prime_length_mm' = 60 .*'max_extrude_only_mm' = 50"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "said"), OWN_LIMITS.values(), ids=OWN_LIMITS.keys())
+def test_a_profile_that_breaks_its_own_limits_is_refused(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    """regression: its start script was taken, and every job of it refused."""
+    own = tmp_path / "mine.toml"
+    own.write_text(f'inherits = "generic_klipper"\n{text}\n')
+    with pytest.raises(ProfileError, match=f"mine.toml: the profile breaks its own .*{said}"):
+        load_printer(own)

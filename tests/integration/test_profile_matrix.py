@@ -1,0 +1,32 @@
+"""Every shipped printer, material and process together: a small box is sliced and checked."""
+
+from __future__ import annotations
+
+import itertools
+
+import manifold3d as m3
+import pytest
+
+from gcode.check import find_refusals
+from gcode.profiles import list_profiles, load_setup
+from gcode.slicing.job import slice_part
+from gcode.writer import write
+
+SIDE_MM, HIGH_MM = 8.0, 0.8  # infill and two layers after the first
+
+
+@pytest.mark.parametrize("printer", list_profiles("printers"))
+def test_every_material_and_process_slices_and_passes(printer: str) -> None:
+    """regression: 125 of 300 were refused for their own prime line, and ASA on a Mini."""
+    box = m3.Manifold.cube((SIDE_MM, SIDE_MM, HIGH_MM)).translate((90.0, 90.0, 0.0))
+    wrong = {}
+    for material, process in itertools.product(
+        list_profiles("materials"), list_profiles("processes")
+    ):
+        setup = load_setup(printer, material, process)
+        toolpath = slice_part(box, setup)
+        assert 0.97 < toolpath.volume_mm3 / box.volume() < 2.0  # with its skirt
+        refusals = find_refusals(write(toolpath, setup, title="box"), setup)
+        if refusals:
+            wrong[material, process] = str(refusals[0])
+    assert wrong == {}
