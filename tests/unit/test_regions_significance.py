@@ -1,0 +1,171 @@
+"""The test for regions: silent on sound parts whatever the noise, sure of what is missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from amrepair.errors import InputError
+from amrepair.field.scales import FACING_COSINE, RANK, scales_of
+from amrepair.regions import Label, detect
+from amrepair.regions.calibration import NORMAL, Calibration
+from amrepair.regions.detection import judged_levels
+from amrepair.regions.options import RegionOptions
+from amrepair.scans import Scan
+from tests.analytic import AnalyticTemplate, cylinder, noisy_scan_points, sample_surface, sphere
+
+BALL_MM, SPACING_MM = 30.0, 0.6
+
+
+@pytest.fixture(scope="module")
+def ball() -> AnalyticTemplate:
+    return sphere((0, 0, 0), BALL_MM)
+
+
+def rough(ball: AnalyticTemplate, seed: int, *, dent_mm: float = 0.0) -> Scan:
+    """A scan whose errors hang together over 3 mm, 2 % of which are off by 0.5 mm and more.
+
+    With a dent as wide as deep times four, at the top.
+    """
+    rng = np.random.default_rng(seed)
+    points, normals = sample_surface(ball.body, SPACING_MM, seed=seed)
+    knots = rng.normal(size=(6000, 3))
+    knots *= BALL_MM / np.linalg.norm(knots, axis=1, keepdims=True)
+    lump = rng.standard_normal(len(knots)) * np.where(rng.random(len(knots)) < 0.03, 4.0, 1.0)
+    apart, near = cKDTree(knots).query(points, k=8)
+    weight = np.exp(-0.5 * (apart / 1.2) ** 2)
+    common = (weight * lump[near]).sum(axis=1) / weight.sum(axis=1)
+    off = 0.12 * common / common.std() + rng.normal(scale=0.06, size=len(points))
+    deep = np.maximum(dent_mm - (points[:, 0] ** 2 + points[:, 1] ** 2) / 12.0, 0.0)
+    off -= np.where(points[:, 2] > 0, deep, 0.0)
+    return Scan(points + off[:, None] * normals, 0.04, "template")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_errors_that_hang_together_raise_no_alarm(ball: AnalyticTemplate, seed: int) -> None:
+    """Judged by normal noise of 0.04 mm, as the file says, such a scan has tens of regions."""
+    scan = rough(ball, seed)
+    assert detect(scan, ball).regions == ()
+    assert len(detect(scan, ball, calibration=NORMAL).regions) > 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dent_among_such_errors_is_found_and_nothing_else(
+    ball: AnalyticTemplate, seed: int
+) -> None:
+    (region,) = detect(rough(ball, seed, dent_mm=1.5), ball).regions
+    assert region.label is Label.MISSING
+    assert region.box_mm[1, 2] > BALL_MM - 2.5
+    assert np.abs(region.box_mm[:, :2]).max() < 6.0
+    assert region.p_value < 1e-4
+
+
+def test_what_the_scan_tells_of_its_noise_is_so(ball: AnalyticTemplate) -> None:
+    points, normals = sample_surface(ball.body, 0.3, seed=1)
+    rng = np.random.default_rng(1)
+    for sigma_mm in (0.02, 0.1):
+        noisy = points + rng.normal(scale=sigma_mm, size=(len(points), 1)) * normals
+        noise = detect(Scan(noisy, 0.04, "template"), ball).noise
+        assert noise is not None
+        assert noise.sigma_mm == pytest.approx(sigma_mm, rel=0.25)
+        assert noise.source == "this scan"
+        areas, depths = np.array(noise.smallest_mm).T
+        assert (np.diff(areas) > 0).all()
+        assert (depths > 0.16).all()  # nothing within the tolerance is ever shown
+
+
+def test_too_few_points_take_the_profiles_noise_and_say_so(ball: AnalyticTemplate) -> None:
+    points = sample_surface(ball.body, 8.0, seed=1)[0][:20]
+    noise = detect(Scan(points, 0.07, "template"), ball).noise
+    assert noise is not None
+    assert noise.sigma_mm == 0.07
+    assert "profile" in noise.source
+
+
+def test_windows_are_what_a_plain_loop_makes_of_them() -> None:
+    """Medians, third lowest and highest of every window, by brute force."""
+    part = cylinder((0, 0, 0), 6.0, 5.0)
+    place, normal = sample_surface(part.body, 0.6, seed=3)
+    value = np.random.default_rng(3).normal(size=len(place))
+    first = scales_of(place, normal, value, np.ones(len(place)), cell_mm=0.8, widest_mm=5.0)[0]
+    cell = np.floor((place - place.min(axis=0)) / 0.8).astype(int)
+    of = first.of_base
+    index = np.zeros((len(first), 3), int)
+    index[of] = cell
+    for k in range(0, len(first), 37):
+        beside = (np.abs(index - index[k]) <= 1).all(axis=1)
+        beside &= (first.normal @ first.normal[k] > FACING_COSINE) | (np.arange(len(first)) == k)
+        ranked = np.sort(first.value_mm[beside])
+        assert first.count[k] == len(ranked)
+        assert first.median_mm[k] == pytest.approx(np.median(ranked))
+        if len(ranked) >= RANK:
+            assert first.low_mm[k] == ranked[RANK - 1]
+            assert first.high_mm[k] == ranked[-RANK]
+
+
+def test_scales_do_not_mix_the_sides_of_a_thin_wall() -> None:
+    from tests.analytic import box
+
+    wall = box((0, 0, 0), (20, 1.0, 20))
+    place, normal = sample_surface(wall.body, 0.4, seed=2)
+    value = np.where(place[:, 1] > 0.5, -0.3, 0.0)
+    for scale in scales_of(place, normal, value, np.ones(len(place)), cell_mm=0.8, widest_mm=10.0):
+        front = scale.normal[:, 1] > 0.9
+        back = scale.normal[:, 1] < -0.9
+        assert scale.median_mm[front] == pytest.approx(-0.3)
+        assert scale.median_mm[back] == pytest.approx(0.0)
+
+
+def test_a_calibration_is_kept_by_name_and_read_again(
+    ball: AnalyticTemplate, tmp_path: Path
+) -> None:
+    levels = [judged_levels(rough(ball, seed), ball) for seed in (11, 12, 13)]
+    learned = Calibration.learned("bench", levels)
+    learned.save(tmp_path)
+    again = Calibration.load("bench", tmp_path)
+    assert again == learned
+    assert again.scans == 3
+    assert 0.01 < again.wander_mm[0][0] < 0.2
+    assert detect(rough(ball, 14), ball, calibration=again).regions == ()
+    (region,) = detect(rough(ball, 15, dent_mm=1.5), ball, calibration=again).regions
+    assert region.label is Label.MISSING
+
+
+def test_a_calibration_that_is_not_there_names_those_that_are(tmp_path: Path) -> None:
+    (tmp_path / "bench.json").write_text("{}")
+    with pytest.raises(InputError, match=r"no calibration is named 'desk'.*there are bench"):
+        Calibration.load("desk", tmp_path)
+    with pytest.raises(InputError, match="cannot be read"):
+        Calibration.load("bench", tmp_path)
+    (tmp_path / "bench.json").write_text(json.dumps({"version": 99}))
+    with pytest.raises(InputError, match="another version"):
+        Calibration.load("bench", tmp_path)
+    for name in ("", "../x", ".x"):
+        with pytest.raises(InputError, match="plain word"):
+            Calibration.load(name, tmp_path)
+
+
+def test_options_out_of_range_are_refused() -> None:
+    with pytest.raises(InputError, match="false regions"):
+        RegionOptions(false_regions=0.0)
+    with pytest.raises(InputError, match="tolerance"):
+        RegionOptions(tolerance_mm=-1.0)
+
+
+@pytest.mark.slow
+def test_the_promise_of_false_regions_holds_within_a_factor_of_three(
+    ball: AnalyticTemplate,
+) -> None:
+    """0.05 are promised; 200 sound scans each of normal and of lumpy errors."""
+    normal = 0
+    for seed in range(200):
+        points, _ = noisy_scan_points(ball.body, spacing_mm=0.6, sigma_mm=0.1, seed=seed)
+        options = RegionOptions(tolerance_mm=0.02)
+        normal += len(detect(Scan(points, 0.1, "template"), ball, options=options).regions)
+    lumpy = sum(len(detect(rough(ball, seed), ball).regions) for seed in range(200))
+    assert normal <= 0.15 * 200
+    assert lumpy <= 0.15 * 200
