@@ -122,7 +122,7 @@ def _scale(
         if medians
         else np.add.reduceat((value_mm * weight)[order], first) / total
     )
-    table, count = kernels.neighbours(keys, *strides, facing, FACING_COSINE)
+    table, count = kernels.neighbours(keys, *strides, facing, value, FACING_COSINE, 0.5 * cell_mm)
     seen = kernels.window_statistics(table, count, place, value, total, RANK)
     noise = kernels.window_medians(table, count, np.ascontiguousarray(seen[:, 3]))
     known = noise[np.isfinite(noise)]

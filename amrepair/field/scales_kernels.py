@@ -30,14 +30,19 @@ def _median(values, n):
 
 
 @njit(cache=True, nogil=True)
-def _alike(normal, i, j, cosine):
-    """Whether two cells face the same way."""
+def _alike(normal, value, i, j, cosine, aside):
+    """Whether two cells face the same way, or both are more than `aside` off on the same side.
+
+    The broken end of a thin wall is as near to one of its sides as to the other.
+    """
     dot = normal[i, 0] * normal[j, 0] + normal[i, 1] * normal[j, 1] + normal[i, 2] * normal[j, 2]
-    return dot > cosine
+    if dot > cosine:
+        return True
+    return min(value[i], value[j]) > aside or max(value[i], value[j]) < -aside
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def neighbours(keys, stride_x, stride_y, normal, cosine):
+def neighbours(keys, stride_x, stride_y, normal, value, cosine, aside):
     """(s, MOST_NEIGHBOURS) cells around each, itself included; (s,) how many.
 
     `keys` are sorted cell numbers times SLOTS plus the way that the cell faces.
@@ -53,7 +58,9 @@ def neighbours(keys, stride_x, stride_y, normal, cosine):
                 first = (cell + dx * stride_x + dy * stride_y - 1) * SLOTS
                 j = np.searchsorted(keys, first)
                 while j < n and keys[j] < first + 3 * SLOTS:
-                    if found < MOST_NEIGHBOURS and (j == i or _alike(normal, i, j, cosine)):
+                    if found < MOST_NEIGHBOURS and (
+                        j == i or _alike(normal, value, i, j, cosine, aside)
+                    ):
                         table[i, found] = j
                         found += 1
                     j += 1

@@ -132,10 +132,13 @@ def detect(
     levels = _tested(sites, surfels, options, calibration)
     noise = noise_of(levels, surfels, scan, options)
     strands = _strands(surfels, template, levels, options, calibration)
-    labels, log_p = grown(levels, sites.tolerance_mm, options, strands=strands)
+    tolerances_mm = _tolerances(options, template)
+    labels, log_p = grown(
+        levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
+    )
     missing, excess = labels[:, : len(surfels)]
     noise_mm = float(np.median(levels[1].quantile * levels[1].error_mm))
-    limit_mm, top_mm = (t + noise_mm for t in _tolerances(options, template))
+    limit_mm, top_mm = (t + noise_mm for t in tolerances_mm)
     progress("detect", 2.0, 4.0)
     evidence = gather(
         scan,
@@ -383,9 +386,10 @@ def _strands(
 ) -> Bool[np.ndarray, " s"]:
     """(s,) cells of strips narrower than any window that stand out along their length.
 
-    What errors leave in strips a scan does not tell by itself: without a calibration there is none.
+    What errors leave in strips neither a scan nor a calibration tells: only where they are known to
+    be normal is there any.
     """
-    if calibration is None:
+    if calibration is not NORMAL:
         return np.zeros(len(surfels), bool)
     first = levels[1]
     at = first.scale.of_base[: len(surfels)]

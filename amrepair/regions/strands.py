@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool
+from scipy.spatial import cKDTree
 
 from amrepair.field.fused import Surfels
 from amrepair.field.near import cells_of
@@ -51,9 +52,16 @@ def on_strands(
     enough = SEEN * 4 * LONG_MM * WIDE_MM / surfels.spacing_mm**2
     reach = np.array([LONG_MM, WIDE_MM, TALL_MM])
     cells = cells_of(places, surfels.place_mm, float(np.linalg.norm(reach)))
-    over_mm = kernels.best_strips(
+    over_mm, way = kernels.best_strips(
         places, outward, np.stack(ways_across(outward)), *cells,
         surfels.deviation_mm, surfels.count, reach, WAYS, systematic_mm, noise_mm, LEAST_MM, enough,
     )  # fmt: skip
-    on[asked[over_mm > 0]] = True
+    # as all cells of a window are part of a region, all of a strip that `maybe` belong to it are
+    found = over_mm > 0
+    tree = cKDTree(places)
+    for place, along, up in zip(places[found], way[found], outward[found], strict=True):
+        beside = np.array(tree.query_ball_point(place, LONG_MM))
+        off = places[beside] - place
+        across = np.linalg.norm(np.cross(off - np.outer(off @ up, up), along), axis=1)
+        on[asked[beside[(across < WIDE_MM) & (np.abs(off @ up) < TALL_MM)]]] = True
     return on

@@ -29,7 +29,7 @@ def best_strips(
     least: float,
     enough: float,
 ) -> Any:
-    """(k,) by how much the best strip through a place is over its limit.
+    """(k,) by how much the best strip through a place is over its limit, and (k, 3) its way.
 
     A strip lies in the plane of `across` (2, k, 3); `strip` (long, wide, tall: along `outward`)
     says how far it goes to each side of a place. Its limit is `systematic` and `noise` over the
@@ -38,6 +38,7 @@ def best_strips(
     strip's corner is away; `deviation` and `count` are of all its points.
     """
     out = np.full(len(places), -np.inf)
+    way = np.zeros((len(places), 3))
     for k in prange(len(places)):
         nx, ny, nz = outward[k, 0], outward[k, 1], outward[k, 2]
         ux, uy, uz = across[0, k, 0], across[0, k, 1], across[0, k, 2]
@@ -71,5 +72,10 @@ def best_strips(
         for w in range(ways):
             if weight[w] > enough:
                 limit = max(systematic + noise / np.sqrt(weight[w]), least)
-                out[k] = max(out[k], total[w] / weight[w] - limit)
-    return out
+                over = total[w] / weight[w] - limit
+                if over > out[k]:
+                    out[k] = over
+                    way[k, 0] = ux * cos[w] + vx * sin[w]
+                    way[k, 1] = uy * cos[w] + vy * sin[w]
+                    way[k, 2] = uz * cos[w] + vz * sin[w]
+    return out, way

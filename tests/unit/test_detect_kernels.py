@@ -129,7 +129,7 @@ def test_strips_every_way_are_plain_means(seed: int) -> None:
     reach, ways = np.array([2.5, 0.8, 1.5]), 8
     asked = points[:6]
     cells = cells_of(asked, points, float(np.linalg.norm(reach)))
-    found = strands_kernels.best_strips(
+    found, ways_found = strands_kernels.best_strips(
         asked,
         up,
         np.stack(ways_across(up)),
@@ -143,21 +143,24 @@ def test_strips_every_way_are_plain_means(seed: int) -> None:
         0.3,
         4.0,
     )
-    for place, normal, over in zip(asked, up, found, strict=True):
+    for place, normal, over, along in zip(asked, up, found, ways_found, strict=True):
         axis = np.eye(3)[np.argmin(np.abs(normal))]
         u = np.cross(normal, axis)
         u /= np.linalg.norm(u)
         away = points - place
         high, a, b = away @ normal, away @ u, away @ np.cross(normal, u)
-        best = -np.inf
+        best, way = -np.inf, np.zeros(3)
         for angle in np.pi * np.arange(ways) / ways:
             on = (np.abs(high) <= 1.5) & (np.hypot(a, b) <= 2.5)
             on &= np.abs(b * np.cos(angle) - a * np.sin(angle)) < 0.8
             n = count[on].sum()
             if n > 4:
                 mean = (deviation * count)[on].sum() / n
-                best = max(best, mean - max(0.1 + 0.5 / np.sqrt(n), 0.3))
+                if mean - max(0.1 + 0.5 / np.sqrt(n), 0.3) > best + 1e-9:
+                    best = mean - max(0.1 + 0.5 / np.sqrt(n), 0.3)
+                    way = u * np.cos(angle) + np.cross(normal, u) * np.sin(angle)
         assert over == best or abs(over - best) < 1e-9
+        assert np.allclose(along, way)
 
 
 @settings(max_examples=20, deadline=None)
