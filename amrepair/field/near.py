@@ -56,7 +56,7 @@ def cells_of(
     size_mm = high - low + 3.0 * within_mm
     # by a hair wider: what rounding puts into the next cell is looked for there
     cell_mm = max(1.0001 * within_mm, float(np.cbrt(np.prod(size_mm) / MOST_CELLS)))
-    shape = np.floor((high - low) / cell_mm).astype(np.int64) + 3
-    corner = low - cell_mm
+    corner = low - 1.0001 * cell_mm  # the lowest place must not round into the empty layer
+    shape = np.floor((high - corner) / cell_mm).astype(np.int64) + 2
     points = np.ascontiguousarray(points_mm)
     return *kernels.by_cell(asked_mm, points, corner, cell_mm, shape), corner, cell_mm, shape

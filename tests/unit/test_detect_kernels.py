@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
@@ -120,6 +120,7 @@ def test_columns_are_as_high_as_their_topmost_points(seed: int) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(seed=SEEDS)
+@example(seed=77032)  # the lowest place of all fell into the empty layer about the cells
 def test_strips_every_way_are_plain_means(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, deviation = rng.uniform(-4, 4, (500, 3)), rng.normal(size=500)
