@@ -160,6 +160,8 @@ def look(label: str, count: int, *, broken: bool, seed: int) -> Look:
         deviation_mm=scene.deviation_mm,
         label_of_point=flags,
         threshold_mm=THRESHOLD_MM,
+        smallest_mm=((5.0, 0.4), (21.0, 0.3)),
+        noise="One point is off by 0.03 mm.",
         threshold_source="4 sigma",
         normals=scene.normals if seed % 2 else None,
         unseen_mm=below[0][below[1][:, 2] < -0.5],

@@ -289,18 +289,13 @@ def detect(
         f"{count} {'region' if count == 1 else 'regions'} beyond {anomaly.threshold_mm:.3f} mm "
         f"({anomaly.threshold_source}); object score {anomaly.object_score:.3f} mm."
     )
-    for sentence in told_of(anomaly):
+    for sentence in anomaly.told():
         console.out.print(sentence)
     for region in regions:
         console.out.print(
             f"  {region.label.name.lower()} {region.type}: {region.volume_mm3:.1f} mm³, "
             f"{region.depth_mm:.2f} mm deep"
         )
-
-
-def told_of(anomaly: AnomalyMap) -> tuple[str, ...]:
-    """What belongs to the whole part or to whole views, in sentences."""
-    return () if anomaly.nuisance is None else anomaly.nuisance.told()
 
 
 def _told(anomaly: AnomalyMap, calibration: str | None) -> dict[str, Any]:
@@ -312,7 +307,7 @@ def _told(anomaly: AnomalyMap, calibration: str | None) -> dict[str, Any]:
     return {
         "noise": anomaly.noise.to_json(),
         "nuisance": None if anomaly.nuisance is None else anomaly.nuisance.to_json(),
-        "told": list(told_of(anomaly)),
+        "told": list(anomaly.told()),
         "options": asdict(anomaly.options),
         "calibration": calibration,
     }

@@ -126,3 +126,7 @@ class AnomalyMap:
     noise: Noise | None = None
     nuisance: Nuisance | None = None
     options: RegionOptions | None = None
+
+    def told(self) -> tuple[str, ...]:
+        """What belongs to the whole part or to whole views, in sentences."""
+        return () if self.nuisance is None else self.nuisance.told()

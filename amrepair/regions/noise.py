@@ -48,6 +48,18 @@ class Noise:
     smallest_mm: tuple[tuple[float, float], ...]
     source: str
 
+    def told(self) -> str:
+        """All but the smallest depths, in a sentence."""
+        words = [
+            f"One point is off by {self.sigma_mm:.3f} mm (standard deviation, from {self.source})",
+            f"{100 * self.tail_share:.1f} % of places by over {OUTLIER_SIGMAS:g} times that",
+        ]
+        if self.correlation_mm:
+            words.append(f"errors hang together over {self.correlation_mm:.1f} mm")
+        if self.view_disagreement_mm is not None:
+            words.append(f"views differ by {self.view_disagreement_mm:.3f} mm")
+        return "; ".join(words) + "."
+
     def to_json(self) -> dict[str, object]:
         """As results have it."""
         return {

@@ -244,6 +244,8 @@ def look_of(
         label_of_point=anomaly.label[shown],
         threshold_mm=anomaly.threshold_mm,
         threshold_source=anomaly.threshold_source,
+        smallest_mm=() if anomaly.noise is None else anomaly.noise.smallest_mm,
+        noise=" ".join(([anomaly.noise.told()] if anomaly.noise else []) + list(anomaly.told())),
         normals=None if scan.normals is None else build_from_template.rotate(scan.normals[shown]),
         unseen_mm=build_from_template.apply(unseen) if len(unseen) else None,
         missing=solid_mesh(plan.deficit.missing),

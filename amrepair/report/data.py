@@ -260,6 +260,10 @@ class Look:
         What the looks at one stop of a job have in common; they are compared with each other.
     scanned_points
         How many points the scan had, where `points_mm` are only some; 0 where they are all.
+    smallest_mm
+        Areas, mm², each with the least depth that the scan would show over it, mm.
+    noise
+        What the scan tells of its own errors and of the part as a whole, sentences.
     """
 
     label: str
@@ -279,6 +283,8 @@ class Look:
     height_map: HeightMap | None = None
     stop: str = ""
     scanned_points: int = 0
+    smallest_mm: tuple[tuple[float, float], ...] = ()
+    noise: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,6 +182,11 @@ def _look(look: Look, index: int, share: int, scale_mm: float, side: tuple[int, 
         "unseen": _unseen(look.unseen_mm),
         "beads": None if look.beads is None else _beads(look.beads, BEADS_TOTAL // share),
         "histogram": _histogram(look, scale_mm),
+        "noise": {
+            "told": html.escape(look.noise),
+            "area": [_rounded(area) for area, _ in look.smallest_mm],
+            "depth": [_rounded(depth) for _, depth in look.smallest_mm],
+        },
         "heights": None if look.height_map is None else _heights(look.height_map, share),
     }
 

@@ -137,6 +137,9 @@ def test_the_drawing_holds_the_data(data: ReportData, page: str) -> None:
         deviation = encode.decoded(shown["deviation"]).reshape(-1)
         assert np.abs(deviation - inside.deviation_mm[kept]).max() < 0.001
         assert sum(shown["histogram"]["counts"]) == len(inside.points_mm)
+        assert list(zip(shown["noise"]["area"], shown["noise"]["depth"], strict=True)) == list(
+            look.smallest_mm
+        )
     assert values["volumes"]["missing"] == [POCKET_MM3, 1.9]
     solid = values["looks"][0]["missing"]
     corners = encode.decoded(solid["vertices"])[encode.decoded(solid["faces"])]
@@ -370,6 +373,10 @@ def test_a_look_of_a_plan_carries_normals_and_outlines(
     assert shown.normals is not None
     kept = of_the_part(plan)[: len(scan)]
     assert np.abs(shown.normals - np.asarray(scan.normals)[kept]).max() < 0.02  # both in the bed's
+    # what the scan tells of its errors, and the least that it could show
+    assert shown.noise.startswith("One point is off by 0.0")
+    assert [area for area, _ in shown.smallest_mm] == sorted(a for a, _ in shown.smallest_mm)
+    assert all(0.1 < depth < 1.0 for _, depth in shown.smallest_mm)
     assert shown.height_map is not None
     (outline,) = shown.height_map.outlines_mm
     low, high = outline.min(axis=0), outline.max(axis=0)

@@ -275,6 +275,16 @@
         yaxis: line("Points", { type: "log", dtick: 1, exponentformat: "none", tickformat: ",d" }) }));
     $("histogram-note").textContent = number(h.counts.reduce((a, b) => a + b, 0), 0) + " points of the part, on a logarithmic scale. " + (h.beyond ? number(h.beyond, 0) + (h.beyond === 1 ? " point beyond the ends is" : " points beyond the ends are") + " in the outermost bars." : "");
   }
+  function noise(look) {
+    const n = look.noise, figure = $("noise-figure");
+    if (!figure) return;
+    figure.hidden = !n.area.length;
+    if (!n.area.length) return;
+    chart("noise", [{ type: "scatter", mode: "lines+markers", x: n.area, y: n.depth, line: { color: css("--ink-2") },
+      hovertemplate: "over %{x:.3~g} mm²: %{y:.2f} mm<extra></extra>" }],
+      flat({ xaxis: line("Area of a defect, mm²", { type: "log", dtick: 1 }), yaxis: line("Depth, mm", { rangemode: "tozero" }) }));
+    $("noise-note").textContent = plain(n.told);
+  }
   function heights(look) {
     const h = look.heights, figure = $("heights-figure");
     if (!figure) return;
@@ -383,7 +393,7 @@
     main.look = n;
     const look = data.looks[n], beads = look.beads;
     main.layer = beads ? beads.tops.length - 1 : 0;
-    boxes(); layerText(); legend(); histogram(look); heights(look);
+    boxes(); layerText(); legend(); histogram(look); noise(look); heights(look);
     $("scene-note").textContent = look.shown < look.total
       ? "Drawn: " + number(look.shown, 0) + " of the scan's " + number(look.total, 0) + " points" + (look.flagged ? ", those beyond the limit first." : ".") + " The others show the bed or stray reflections, or are left out to keep this file small; volumes and decisions use every point."
       : "All " + number(look.total, 0) + " points are drawn.";
@@ -396,7 +406,7 @@
     return scene.draw();
   }
   function theme() {
-    if (main) { main.draw(); histogram(data.looks[main.look]); heights(data.looks[main.look]); legend(); }
+    if (main) { main.draw(); histogram(data.looks[main.look]); noise(data.looks[main.look]); heights(data.looks[main.look]); legend(); }
     if (before) { before.draw(); after.draw(); }
     if ($("volumes-chart")) volumes();
     if ($("temperatures")) temperatures();
