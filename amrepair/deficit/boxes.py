@@ -54,7 +54,7 @@ def boxes_of(
         thick = float(np.percentile(known, 90)) if len(known) else 2.0
         thin = deep[film[group == g]]
         if len(thin) * s.cell_mm**2 > LEAST_FILM_MM2:
-            thick = min(thick, 1.5 * float(np.median(thin)))
+            thick = min(thick, float(np.median(thin)))  # so that samples lie in its lower half
         found.append((mine.min(axis=0) - BOX_MARGIN_MM, mine.max(axis=0) + BOX_MARGIN_MM, thick))
     if lines is not None:
         for a, b, high in zip(lines.start_mm, lines.end_mm, lines.height_mm, strict=True):

@@ -13,6 +13,7 @@ from scipy.stats import norm
 from amrepair.errors import InputError
 from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.fused import Surfels, make_surfels
+from amrepair.field.groups import CELLS_APART, GROUP_MM, group_points
 from amrepair.field.holes import UPRIGHT
 from amrepair.field.near import nearest_within
 from amrepair.field.scales import scales_of
@@ -456,5 +457,11 @@ def _label_surface(
         inside = surface_mm[open_] - limit_mm * seen.normals[open_]
         f_mm = template.distance(inside)
         empty = (evidence.cautious(inside, f_mm) > limit_mm / 2) & (f_mm < -limit_mm / 2)
-        label[open_[empty]] = int(Label.MISSING)
+        # what nobody saw is missing only as part of what was seen to be
+        reach_mm = max(GROUP_MM, CELLS_APART * surfels.cell_mm)
+        places_mm = np.concatenate([surfels.place_mm[missing], surface_mm[open_[empty]]])
+        group = group_points(places_mm, reach_mm=reach_mm)
+        told = int(missing.sum())
+        with_cells = np.isin(group[told:], group[:told])
+        label[open_[empty][with_cells]] = int(Label.MISSING)
     return label

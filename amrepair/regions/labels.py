@@ -41,22 +41,37 @@ def grown(
     labels = np.zeros(tolerance_mm.shape, bool)
     log_p = np.zeros(tolerance_mm.shape)
     tests = np.log(2 * len(levels))
-    for side, deep_mm in enumerate((-value_mm, value_mm)):
-        seeds = np.zeros(len(value_mm), bool)
+    for side, sign in enumerate((-1.0, 1.0)):
+        deep_mm = sign * value_mm
+        seeds, small = np.zeros((2, len(value_mm)), bool)
         for level in levels:
             if level.rejected[side].any():
                 surest = scales_kernels.surest(
                     level.scale.table, level.scale.count, level.rejected[side], level.log_p[side]
                 )[level.scale.of_base]
                 seeds |= surest < 0
+                if level.scale is scale:
+                    small |= surest < 0
                 log_p[side] = np.minimum(log_p[side], surest + tests)
-        through = deep_mm > low_mm[side]
+        deep = deep_mm > low_mm[side]
+        # beside a window whose median is beyond, too: a cell here and there leads nowhere
+        around_mm = sign * scale.median_mm[scale.of_base]
+        through = deep & _beside(scale, deep & (small | (around_mm > low_mm[side])))
         if side == 1:
             seeds[: len(strands)] |= strands
             through[: len(strands)] |= strands
         labels[side] = _reached(scale, seeds & through, through)
     labels[1] &= ~labels[0]
     return labels, np.minimum(log_p, 0.0)
+
+
+def _beside(scale: Scale, chosen: Bool[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
+    """(b,) whether a cell is chosen, or one that touches it."""
+    if not chosen.any():
+        return chosen
+    tree = cKDTree(scale.place_mm[np.unique(scale.of_base[chosen])])
+    away_mm, _ = tree.query(scale.place_mm, distance_upper_bound=CELLS_APART * scale.cell_mm)
+    return np.asarray(np.isfinite(away_mm)[scale.of_base])
 
 
 def _reached(
