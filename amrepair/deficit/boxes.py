@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.field.as_built import Evidence
-from amrepair.field.groups import CELLS_APART, GROUP_MM, group_points
+from amrepair.field.groups import group_points, touching_mm
 from amrepair.regions import AnomalyMap, Label
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.template.port import Template
@@ -42,7 +42,7 @@ def boxes_of(
         points = np.concatenate([points, _feet(evidence, which)])
         depth = np.concatenate([depth, np.full(len(which), np.nan)])
     film = np.pad(film, (0, len(points) - len(film)))
-    group = group_points(points, reach_mm=max(GROUP_MM, CELLS_APART * s.cell_mm))
+    group = group_points(points, reach_mm=touching_mm(s.cell_mm))
     found = []
     for g in range(int(group.max()) + 1 if len(group) else 0):
         mine = points[group == g]

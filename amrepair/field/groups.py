@@ -25,6 +25,11 @@ def group_points(
     return numbered[tuple(index.T)].astype(np.int64) - 1
 
 
+def touching_mm(cell_mm: float) -> float:
+    """How far apart pieces of one defect may lie in a field of such cells, mm."""
+    return max(GROUP_MM, CELLS_APART * cell_mm)
+
+
 def area_per_point(surface_mm: Float[np.ndarray, "m 3"]) -> float:
     """Rough area per template point, mm², from how many cells they fill."""
     if len(surface_mm) == 0:

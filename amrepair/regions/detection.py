@@ -13,7 +13,7 @@ from scipy.stats import norm
 from amrepair.errors import InputError
 from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.fused import Surfels, make_surfels
-from amrepair.field.groups import CELLS_APART, GROUP_MM, group_points
+from amrepair.field.groups import group_points, touching_mm
 from amrepair.field.holes import UPRIGHT
 from amrepair.field.near import nearest_within
 from amrepair.field.scales import scales_of
@@ -458,9 +458,8 @@ def _label_surface(
         f_mm = template.distance(inside)
         empty = (evidence.cautious(inside, f_mm) > limit_mm / 2) & (f_mm < -limit_mm / 2)
         # what nobody saw is missing only as part of what was seen to be
-        reach_mm = max(GROUP_MM, CELLS_APART * surfels.cell_mm)
         places_mm = np.concatenate([surfels.place_mm[missing], surface_mm[open_[empty]]])
-        group = group_points(places_mm, reach_mm=reach_mm)
+        group = group_points(places_mm, reach_mm=touching_mm(surfels.cell_mm))
         told = int(missing.sum())
         with_cells = np.isin(group[told:], group[:told])
         label[open_[empty][with_cells]] = int(Label.MISSING)

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.field import scales_kernels
 from amrepair.field.groups import CELLS_APART
+from amrepair.field.near import has_near
 from amrepair.field.scales import Scale
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import LEAST_SIGMA_MM, Level, usual_error_mm
@@ -28,9 +29,10 @@ def grown(
     `anywhere_mm` is δ where nothing more is allowed, `strands` are cells that stand out as strips.
     The second is the logarithm of the expected number of false regions, over all that is tested.
 
-    From every window that is significant a region grows through neighbouring cells of the field
-    for as long as they are beyond the noise and a share of the tolerance. Where more is allowed
-    than anywhere, by the job or by what sound parts differ by, all of that is none of a region.
+    From every window that is significant a region grows through touching cells of the field for as
+    long as they are beyond the noise and a share of the tolerance, and so is the median of a window
+    beside them. Where more is allowed than anywhere, by the job or by what sound parts differ by,
+    all of that is none of a region.
     """
     scale = levels[0].scale
     value_mm = scale.value_mm[scale.of_base]
@@ -69,9 +71,8 @@ def _beside(scale: Scale, chosen: Bool[np.ndarray, " b"]) -> Bool[np.ndarray, " 
     """(b,) whether a cell is chosen, or one that touches it."""
     if not chosen.any():
         return chosen
-    tree = cKDTree(scale.place_mm[np.unique(scale.of_base[chosen])])
-    away_mm, _ = tree.query(scale.place_mm, distance_upper_bound=CELLS_APART * scale.cell_mm)
-    return np.asarray(np.isfinite(away_mm)[scale.of_base])
+    cells_mm = scale.place_mm[np.unique(scale.of_base[chosen])]
+    return has_near(scale.place_mm, cells_mm, CELLS_APART * scale.cell_mm)[scale.of_base]
 
 
 def _reached(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.field.as_built import Evidence
-from amrepair.field.groups import CELLS_APART, GROUP_MM, area_per_point, group_points
+from amrepair.field.groups import area_per_point, group_points, touching_mm
 from amrepair.regions.anomaly import DefectType, Label, Region
 from amrepair.template.port import Template
 
@@ -42,7 +42,7 @@ def find_regions(
     ):
         which = np.flatnonzero(cells)
         points = np.concatenate([s.place_mm[which], extra])
-        group = group_points(points, reach_mm=max(GROUP_MM, CELLS_APART * s.cell_mm))
+        group = group_points(points, reach_mm=touching_mm(s.cell_mm))
         for g in range(int(group.max()) + 1 if len(group) else 0):
             mine = group == g
             own = which[mine[: len(which)]]
