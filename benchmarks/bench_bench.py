@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from amrepair.bench import METHODS, SynthOptions, run_bench, synthesize
-from amrepair.bench.dataset import Format
+from amrepair.bench.samples import Format
 from amrepair.simulate.part_files import part_names, part_path
 
 DEFAULT_METHODS = ("btf-raw", "btf-fpfh", "patchcore-fpfh", "patchcore-fpfh-raw")

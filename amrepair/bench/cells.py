@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from amrepair.bench.dataset import BenchClass, Format, Sample
 from amrepair.bench.method import DIAGONAL_MM, Model, class_input
 from amrepair.bench.metrics import Detection, detection
 from amrepair.bench.registry import make_method
+from amrepair.bench.samples import BenchClass, Format, Sample
 from amrepair.template.paper import PaperOptions
 from gcode.progress import Progress, silent
 
@@ -212,7 +212,8 @@ def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
         np.array([float(one["whole"]) for one in kept]),
     )
     labels = np.concatenate([one["label"] for one in kept])
-    point = detection(labels, np.concatenate([one["score"] for one in kept]))
+    told = labels >= 0  # of the rest nobody has said what they are
+    point = detection(labels[told], np.concatenate([one["score"] for one in kept])[told])
     residual = np.array([float(one["residual_mm"]) for one in kept])
     failed = np.array([not bool(one["aligned"]) for one in kept])
     judged = bool(np.isfinite(residual).any() or failed.any())

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from amrepair.bench.dataset import BenchClass, Format, read_points
 from amrepair.bench.metrics import CloudDistance
+from amrepair.bench.samples import BenchClass, Format
 
 if TYPE_CHECKING:
     import trimesh
@@ -98,7 +98,7 @@ def class_input(one: BenchClass, format: Format) -> ClassInput:
     """Read a class's normal data and scale it."""
     import trimesh
 
-    clouds = [read_points(path) for path in one.train]
+    clouds = [one.read_train(path) for path in one.train]
     diagonal = float(np.linalg.norm(np.ptp(clouds[0], axis=0)))
     scale = DIAGONAL_MM / diagonal
     mesh = None

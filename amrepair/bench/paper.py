@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.pam import CODE, PAPER, PamError, PamOptions, pam
 from amrepair.bench.baselines import Aligner
-from amrepair.bench.dataset import Format
 from amrepair.bench.house import class_template, repair_distance, top_mean
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
+from amrepair.bench.samples import Format
 from amrepair.consensus.cloud import planes, spacing_of
 from amrepair.template import MeshSdf
 from amrepair.template.paper import CODE as CODE_RECIPE

@@ -12,14 +12,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amrepair.bench.dataset import (
+from amrepair.bench.samples import (
+    GOOD,
     BenchClass,
     Cloud,
-    Format,
     Sample,
     class_folders,
     defect_word,
+    read_points,
     read_truth,
+    without_labels,
 )
 from amrepair.errors import InputError
 from amrepair.scans.pcd import count_of_pcd
@@ -57,21 +59,24 @@ def _sample(class_name: str, path: Path, truth: Path) -> Sample:
     return Sample(
         class_name=class_name,
         name=path.stem,
-        kind="good" if normal else defect_word(path.stem, DEFECTS),
+        kind=GOOD if normal else defect_word(path.stem, DEFECTS),
         cloud_path=path,
         truth_path=None if normal else truth / f"{path.stem}.txt",
-        format=Format.REAL3D,
+        read=load,
     )
 
 
-def load_anomalous(sample: Sample, truth_path: Path) -> Cloud:
-    """Geometry and labels from the txt alone, unless that is only a piece of the cloud.
+def load(sample: Sample) -> Cloud:
+    """Of anomalous samples geometry and labels from the txt alone, unless that is only a piece.
 
     Raises
     ------
     InputError
         If the txt has less than half of the cloud's points, or more than twice as many.
     """
+    truth_path = sample.truth_path
+    if truth_path is None:
+        return without_labels(read_points(sample.cloud_path))
     points, labels = read_truth(truth_path)
     count = count_of_pcd(sample.cloud_path)
     if not LEAST_OF_CLOUD * count <= len(points) <= count / LEAST_OF_CLOUD:

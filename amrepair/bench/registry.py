@@ -14,8 +14,8 @@ from amrepair.bench.baselines import (
     fpfh_features,
     raw_features,
 )
-from amrepair.bench.dataset import Format
 from amrepair.bench.method import Method
+from amrepair.bench.samples import Format
 from amrepair.errors import InputError
 from amrepair.template.paper import PaperOptions
 

@@ -22,9 +22,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from amrepair.bench.cells import Cell, Row, run_cell, write_whole
-from amrepair.bench.dataset import BenchData, open_dataset
+from amrepair.bench.dataset import open_dataset
 from amrepair.bench.paper import BENCH_PAPER
 from amrepair.bench.registry import METHODS, PAPER_METHOD, make_method
+from amrepair.bench.samples import BenchData
 from amrepair.bench.synth import MANIFEST
 from amrepair.bench.tables import as_csv, as_json, as_markdown
 from amrepair.errors import InputError
@@ -76,7 +77,7 @@ def run_bench(
     dataset
         Its folder.
     format
-        `anomaly-shapenet` or `real3d-ad`.
+        One of `Format`, by name.
     methods
         Names out of `METHODS`.
     out

@@ -18,15 +18,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from amrepair.bench.dataset import (
+from amrepair.bench.samples import (
+    GOOD,
     BenchClass,
     Cloud,
-    Format,
     Sample,
     class_folders,
     defect_word,
     read_points,
     read_truth,
+    without_labels,
 )
 from amrepair.errors import InputError
 
@@ -86,10 +87,10 @@ def _sample(class_name: str, path: Path, truth: Path) -> Sample:
     return Sample(
         class_name=class_name,
         name=path.stem,
-        kind="good" if normal else defect_word(word, DEFECTS),
+        kind=GOOD if normal else defect_word(word, DEFECTS),
         cloud_path=path,
         truth_path=None if normal else _truth_path(truth, class_name, path.stem),
-        format=Format.SHAPENET,
+        read=load,
     )
 
 
@@ -101,12 +102,14 @@ def _truth_path(truth: Path, class_name: str, stem: str) -> Path:
     return loose if loose.is_file() and not exact.is_file() else exact
 
 
-def load_anomalous(sample: Sample, truth_path: Path) -> Cloud:
+def load(sample: Sample) -> Cloud:
     """Geometry from the cloud, labels from the truth by coordinates."""
     points = read_points(sample.cloud_path)
-    rows, labels = read_truth(truth_path)
+    if sample.truth_path is None:
+        return without_labels(points)
+    rows, labels = read_truth(sample.truth_path)
     decimals = 7 if "vase" in sample.name else 6
-    return Cloud(points, match_labels(points, rows, labels, decimals, truth_path))
+    return Cloud(points, match_labels(points, rows, labels, decimals, sample.truth_path))
 
 
 def match_labels(

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.bench.dataset import Cloud, Format
+from amrepair.bench.samples import Cloud, Format
 from amrepair.bench.synth_defects import Defect, Part, damage, make_part
 from amrepair.bench.synth_views import (
     Rays,
@@ -155,12 +155,11 @@ def synthesize(
 
 
 def _layout(format: str) -> Format:
-    try:
-        return Format(format)
-    except ValueError as e:
+    if format not in SINGLE_VIEW_RATIO:
         raise InputError(
-            f"the format '{format}' is unknown; choose one of {', '.join(Format)}"
-        ) from e
+            f"a data set is written as {' or '.join(SINGLE_VIEW_RATIO)}, not as '{format}'"
+        )
+    return Format(format)
 
 
 def _class_names(paths: Sequence[Path], layout: Format) -> list[str]:

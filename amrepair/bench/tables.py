@@ -16,9 +16,9 @@ from dataclasses import asdict, fields
 import numpy as np
 
 from amrepair.bench.cells import Row
-from amrepair.bench.dataset import Format
 from amrepair.bench.metrics import mean_and_spread
 from amrepair.bench.registry import PAPER_METHOD, PUBLISHED, PUBLISHED_REPAIR
+from amrepair.bench.samples import Format
 from amrepair.template.paper import PAPER, PaperOptions
 
 AREAS = ("o_auroc", "p_auroc", "o_aupr", "p_aupr")
@@ -88,7 +88,7 @@ def as_json(
             for name, (mean, spread) in summary(rows, method).items()
         }
         own = [row for row in rows if row.method == method]
-        published = PUBLISHED[format].get(method, (None, None))
+        published = PUBLISHED.get(format, {}).get(method, (None, None))
         means.append(
             {
                 "method": method,
@@ -109,9 +109,11 @@ def as_json(
         "means": means,
         "published": {
             name: {"o_auroc": _share(o), "p_auroc": _share(p)}
-            for name, (o, p) in PUBLISHED[format].items()
+            for name, (o, p) in PUBLISHED.get(format, {}).items()
         },
-        "published_repair": dict(zip(("cd", "emd"), PUBLISHED_REPAIR[format], strict=True)),
+        "published_repair": dict(
+            zip(("cd", "emd"), PUBLISHED_REPAIR.get(format, (None, None)), strict=True)
+        ),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
     }
     return json.dumps(said, indent=1) + "\n"
@@ -151,7 +153,7 @@ def _plain(mean: float, digits: int) -> str:
 
 
 def _published(format: Format, method: str) -> str:
-    pair = PUBLISHED[format].get(method)
+    pair = PUBLISHED.get(format, {}).get(method)
     if pair is None:
         return "–"
     return " / ".join("–" if value is None else f"{value:.1f}" for value in pair)
@@ -215,12 +217,14 @@ def as_markdown(
             _published(format, method),
         ]
         lines.append("| " + " | ".join(cells) + " |")
-    others = [name for name in PUBLISHED[format] if name not in _methods(rows)]
+    others = [name for name in PUBLISHED.get(format, {}) if name not in _methods(rows)]
     lines += [
         f"| {name} (not run) " + "| – " * 10 + f"| {_published(format, name)} |" for name in others
     ]
-    cd, emd = PUBLISHED_REPAIR[format]
-    lines += ["", f"Published CD / EMD of the repair template: {cd} / {emd}.", ""]
+    if format in PUBLISHED_REPAIR:
+        cd, emd = PUBLISHED_REPAIR[format]
+        lines += ["", f"Published CD / EMD of the repair template: {cd} / {emd}."]
+    lines.append("")
     lines += [
         "CD and EMD of two samples of the same surface are not 0: at 16,000 points they sit on "
         "their sampling floor. To surface and from surface are mean distances of the repair "

@@ -15,7 +15,15 @@ METHOD_HELP = (
     "patchcore-pointmae or patchcore-pointbert; but for the first two also with +pam, aligned "
     "first. May be repeated."
 )
-FormatOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or real3d-ad.")]
+FormatOption = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        help="anomaly-shapenet, real3d-ad, 3d-adam, or folder for scans of your own. A folder that "
+        "is not there is answered with where to get the data set.",
+    ),
+]
+WrittenOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or real3d-ad.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -26,6 +34,7 @@ def add_to(app: typer.Typer) -> None:
             "amrepair bench out/synth --format anomaly-shapenet --method pasdf --out out/bench",
             "amrepair bench out/synth --format anomaly-shapenet --method pasdf "
             "--method btf-fpfh --out out/bench --jobs 2",
+            "amrepair bench my-scans --format folder --method pasdf --out out/mine",
         ),
     )(bench)
     app.command(
@@ -81,7 +90,7 @@ def bench(
 def synth(
     parts: Annotated[list[Path], typer.Argument(help="Meshes; each becomes a class.")],
     out: Annotated[Path, typer.Option(help="Folder of the data set.")],
-    layout: FormatOption,
+    layout: WrittenOption,
     seed: SeedOption = 0,
 ) -> None:
     """Make a data set with labelled defects from meshes."""

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from amrepair.bench.dataset import Format, Sample
+from amrepair.bench import shapenet
+from amrepair.bench.samples import Sample
 from amrepair.errors import InputError
 from amrepair.scans import Scan, write_ply
 from amrepair.template import MeshSdf, fit_template
@@ -191,7 +192,7 @@ def test_labels_of_the_wrong_length_are_refused(tmp_path: Path) -> None:
     truth = folder / "cup0_bulge0.txt"
     np.savetxt(truth, far, delimiter=",")
     sample = Sample(
-        "cup0", "cup0_bulge0", "bulge", folder / "test" / "cup0_bulge0.pcd", truth, Format.SHAPENET
+        "cup0", "cup0_bulge0", "bulge", folder / "test" / "cup0_bulge0.pcd", truth, shapenet.load
     )
     with pytest.raises(InputError, match=r"cup0_bulge0\.txt"):
         sample.load()

@@ -11,11 +11,11 @@ import pytest
 import trimesh
 
 from amrepair.align.pam import CODE, PAPER
-from amrepair.bench.dataset import Format
 from amrepair.bench.house import repair_distance
 from amrepair.bench.method import ClassInput
 from amrepair.bench.paper import BENCH_PAPER, make_pam_aligner, pam_options
 from amrepair.bench.runner import run_bench
+from amrepair.bench.samples import Format
 from amrepair.bench.synth import SynthOptions, synthesize
 from amrepair.errors import InputError
 from amrepair.frames import rotation_from_vector

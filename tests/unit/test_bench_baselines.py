@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amrepair.bench import METHODS
+from amrepair.bench import METHODS, shapenet
 from amrepair.bench.baselines import BankMethod, fpfh_features, raw_features, reweighted
 from amrepair.bench.cells import Cell, _judge
-from amrepair.bench.dataset import BenchClass, Format, Sample
 from amrepair.bench.features import coreset, fill_in, fpfh, nearest
 from amrepair.bench.method import ClassInput, noise_mm
 from amrepair.bench.metrics import auroc
 from amrepair.bench.paper import Target
 from amrepair.bench.registry import BASELINES, PUBLISHED, make_method
+from amrepair.bench.samples import BenchClass, Format, Sample
 from amrepair.bench.synth_views import random_rotation
 from amrepair.errors import InputError
 
@@ -166,7 +166,7 @@ def test_a_sample_that_pam_gave_up_on_is_badly_aligned_once(tmp_path: Path) -> N
     """Its last pose lies off as well: 20 of 15 were badly aligned."""
     names = ("off", "gone", "good")
     samples = tuple(
-        Sample("c0", name, name, tmp_path, None if name == "good" else tmp_path, Format.SHAPENET)
+        Sample("c0", name, name, tmp_path, None if name == "good" else tmp_path, shapenet.load)
         for name in names
     )
     one = BenchClass("c0", (), None, samples)

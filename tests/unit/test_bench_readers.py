@@ -1,4 +1,4 @@
-"""Both published layouts with their quirks, in small folders written exactly as they are."""
+"""Published layouts with their quirks, in small folders written exactly as they are."""
 
 from __future__ import annotations
 

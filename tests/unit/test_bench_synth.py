@@ -170,7 +170,7 @@ def test_what_cannot_be_made_is_refused(box_file: Path, tmp_path: Path) -> None:
         synthesize([], tmp_path / "x")
     with pytest.raises(InputError, match="same name"):
         synthesize([box_file, box_file], tmp_path / "x")
-    with pytest.raises(InputError, match="format 'csv' is unknown"):
+    with pytest.raises(InputError, match="not as 'csv'"):
         synthesize([box_file], tmp_path / "x", "csv")
     with pytest.raises(InputError, match="does not exist"):
         synthesize([tmp_path / "absent.stl"], tmp_path / "x")
