@@ -103,6 +103,8 @@ def main() -> None:
     )
     parser.add_argument("--defects", type=int, default=1)
     parser.add_argument("--normal", type=int, default=3)
+    parser.add_argument("--smallest", type=float, help="width of the smallest, of the diagonal")
+    parser.add_argument("--smooth", type=float, default=0.0, help="share without an edge")
     parser.add_argument("--points", type=int, default=SynthOptions().points)
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
@@ -120,7 +122,13 @@ def main() -> None:
     if said.defects:
         with tempfile.TemporaryDirectory() as scratch:
             out = said.out or Path(scratch)
-            options = SynthOptions(normal=said.normal, per_defect=said.defects, points=said.points)
+            options = SynthOptions(
+                normal=said.normal,
+                per_defect=said.defects,
+                points=said.points,
+                smallest_ratio=said.smallest,
+                smooth_ratio=said.smooth,
+            )
             data = out / "data"
             if not (data / "synth.json").is_file():
                 synthesize(said.parts, data, "anomaly-shapenet", 0, options=options)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.bench.samples import Cloud, Format
-from amrepair.bench.synth_defects import Defect, Part, damage, make_part
+from amrepair.bench.synth_defects import BULGE_RATIO, Defect, Part, Size, damage, make_part
 from amrepair.bench.synth_views import (
     Rays,
     Shape,
@@ -48,6 +48,7 @@ SIDE_POINTS = 4000
 LOOSENESS = 0.6  # of the view's direction about the defect's normal
 SINGLE_VIEW_RATIO = {Format.SHAPENET: 1 / 3, Format.REAL3D: 2 / 3}
 FIRST_NUMBER = 101  # Real3D-AD names start with a running number
+USUAL_RATIO = 2 * BULGE_RATIO[0]  # width of the smallest bulges of the data sets' own size
 REAL3D_WORDS = {Defect.CONCAVITY: "sink"}
 
 
@@ -65,6 +66,12 @@ class SynthOptions:
         Noise, relative to the part's diagonal.
     single_view_ratio
         Share of test samples from one sensor; None: a third, or two thirds in Real3D-AD's layout.
+    smallest_ratio
+        Width of the smallest bulges, relative to the part's diagonal; None: none is made smaller
+        than the data sets' own (8 to 16 %). Below that sizes are drawn evenly in their logarithm,
+        and other defects are as much smaller.
+    smooth_ratio
+        Share of bulges and concavities that run out smoothly, without an edge.
     """
 
     train: int = 4
@@ -73,6 +80,8 @@ class SynthOptions:
     points: int = 12_000
     sigma_ratio: float = SIGMA_RATIO
     single_view_ratio: float | None = None
+    smallest_ratio: float | None = None
+    smooth_ratio: float = 0.0
 
     def __post_init__(self) -> None:
         if min(self.train, self.normal, self.per_defect) < 1 or self.points < 500:
@@ -85,6 +94,20 @@ class SynthOptions:
             raise InputError(f"the noise ratio {self.sigma_ratio} is out of range 0…0.01")
         if self.single_view_ratio is not None and not 0 <= self.single_view_ratio <= 1:
             raise InputError(f"the share of single views {self.single_view_ratio} is not in 0…1")
+        if self.smallest_ratio is not None and not 0.01 <= self.smallest_ratio <= USUAL_RATIO:
+            raise InputError(
+                f"the smallest defect {self.smallest_ratio} is out of range 0.01…{USUAL_RATIO:g} "
+                "of the part's diagonal"
+            )
+        if not 0 <= self.smooth_ratio <= 1:
+            raise InputError(f"the share of smooth defects {self.smooth_ratio} is not in 0…1")
+
+    def size(self, rng: np.random.Generator) -> Size:
+        """How large the next defect is, and whether it has an edge."""
+        if self.smallest_ratio is None and self.smooth_ratio == 0:
+            return Size()
+        smallest = 1.0 if self.smallest_ratio is None else self.smallest_ratio / USUAL_RATIO
+        return Size(float(smallest ** rng.random()), bool(rng.random() < self.smooth_ratio))
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +310,8 @@ def _defective(
 ) -> _Made:
     """A defect that the view shows; another place or view is drawn until it does."""
     for attempt in range(MAX_VIEWS):
-        shape = damage(part, defect, rng)
+        size = options.size(rng)
+        shape = damage(part, defect, rng, size)
         made = _made(
             part,
             shape,
@@ -298,7 +322,8 @@ def _defective(
             single=single and attempt < MAX_SINGLE_VIEWS,
         )
         labels = made.cloud.labels
-        need = max(MIN_LABELLED, MIN_LABELLED_RATIO * len(labels))
+        # a view shows as much less of a smaller defect as that has less of a surface
+        need = max(MIN_LABELLED, MIN_LABELLED_RATIO * size.scale**2 * len(labels))
         if labels.sum() >= need and 1.0 - labels.mean() >= MIN_NORMAL_RATIO:
             return made
     raise InputError(

@@ -1,8 +1,9 @@
 """The six defects of the data sets, made on a solid: where the surface changed is known exactly.
 
 Bulge, concavity, hole, break and crack are booleans: each triangle knows which solid it came
-from. Bend moves vertices: each knows how far. Sizes follow the part's diagonal, depths the
-material that is there. It makes shapes; `synth_views` looks at them.
+from. Bend, and bulges and concavities that run out smoothly, move vertices: each knows how far.
+Sizes follow the part's diagonal, depths the material that is there. It makes shapes; `synth_views`
+looks at them.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ MIN_THICKNESS_RATIO = 0.008
 MIN_DEPTH_RATIO = 0.004
 ROUGHNESS_WAVES = 6
 SPLINTER_RATIO = 0.01
+# A smooth defect's surface is divided into so many edges a radius; smaller ones are made no finer.
+SMOOTH_EDGES, LEAST_SMOOTH_RATIO = 5.0, 0.02
 
 
 class Defect(StrEnum):
@@ -83,7 +86,27 @@ def make_part(
     return Part(solid, shape, seen, rays.thickness_mm(seen))
 
 
-def damage(part: Part, defect: Defect, rng: np.random.Generator) -> Shape:
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How large a defect is made, and whether it has an edge.
+
+    Attributes
+    ----------
+    scale
+        Of the usual size: at 1 bulges are 8 to 16 % of the part's diagonal wide.
+    smooth
+        Bulges and concavities run out into the surface, without an edge.
+    """
+
+    scale: float = 1.0
+    smooth: bool = False
+
+
+USUAL = Size()
+BULGE_RATIO = (0.04, 0.08)  # radius of bulges and concavities, of the part's diagonal
+
+
+def damage(part: Part, defect: Defect, rng: np.random.Generator, size: Size = USUAL) -> Shape:
     """The part with one defect.
 
     Raises
@@ -95,7 +118,7 @@ def damage(part: Part, defect: Defect, rng: np.random.Generator) -> Shape:
     for _ in range(MAX_ATTEMPTS):
         i = int(rng.integers(len(part.thickness_mm)))
         seed = Seed(part.seeds.points_mm[i], part.seeds.normals[i], float(part.thickness_mm[i]))
-        shape = make(part, seed, rng)
+        shape = make(part, seed, rng, size)
         if shape is not None and (shape.change_mm > 0).any():
             return shape
     raise InputError(
@@ -139,9 +162,11 @@ def _result(part: Part, solid: Any) -> Shape | None:
     return Shape(vertices, faces, change)
 
 
-def _bulge(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
-    radius_mm = rng.uniform(0.04, 0.08) * part.diagonal_mm
+def _bulge(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
+    radius_mm = size.scale * rng.uniform(*BULGE_RATIO) * part.diagonal_mm
     height_mm = rng.uniform(0.35, 0.7) * radius_mm
+    if size.smooth:
+        return _swelling(part, seed, radius_mm, height_mm)
     if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
         return None
     # the lump's lower half stays inside the material, or it would bulge on the far side too
@@ -150,17 +175,40 @@ def _bulge(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
     return _result(part, part.solid + dome.transform(_frame(seed, rng)).as_original())
 
 
-def _concavity(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
-    radius_mm = rng.uniform(0.04, 0.08) * part.diagonal_mm
+def _concavity(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
+    radius_mm = size.scale * rng.uniform(*BULGE_RATIO) * part.diagonal_mm
     depth_mm = min(rng.uniform(0.35, 0.7) * radius_mm, 0.6 * seed.thickness_mm)
     if depth_mm < MIN_DEPTH_RATIO * part.diagonal_mm:
         return None
+    if size.smooth:
+        return _swelling(part, seed, radius_mm, -depth_mm)
     lump = _lump(radius_mm, depth_mm, rng).transform(_frame(seed, rng))
     return _result(part, part.solid - lump.as_original())
 
 
-def _hole(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
-    radius_mm = rng.uniform(0.02, 0.045) * part.diagonal_mm
+def _swelling(part: Part, seed: Seed, radius_mm: float, height_mm: float) -> Shape | None:
+    """The surface moved along a seed's normal by a bump without an edge: h (1 − ρ²/r²)².
+
+    What faces away from the normal stays: the far side of a wall is none of the bump.
+    """
+    edge_mm = max(radius_mm, LEAST_SMOOTH_RATIO * part.diagonal_mm) / SMOOTH_EDGES
+    vertices, faces = manifold_arrays(part.solid.refine_to_length(edge_mm))
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = np.zeros((len(vertices), 3))
+    for corner in range(3):
+        np.add.at(facing, faces[:, corner], across)
+    offset = vertices - seed.point_mm
+    inside = (np.linalg.norm(offset, axis=1) < radius_mm) & (facing @ seed.normal > 0)
+    share = np.where(inside, 1.0 - (offset**2).sum(axis=1) / radius_mm**2, 0.0)
+    shift_mm = height_mm * share**2
+    if np.abs(shift_mm).max() < 0.5 * abs(height_mm):
+        return None  # no vertex lies near the seed
+    return Shape(vertices + shift_mm[:, None] * seed.normal, faces, np.abs(shift_mm)[faces])
+
+
+def _hole(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
+    radius_mm = size.scale * rng.uniform(0.02, 0.045) * part.diagonal_mm
     if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
         return None
     # through what is thin, blind in what is thick
@@ -175,13 +223,13 @@ def _hole(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
     return _result(part, part.solid - tool.transform(_frame(seed, rng)).as_original())
 
 
-def _crack(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+def _crack(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     diagonal_mm = part.diagonal_mm
-    depth_mm = min(rng.uniform(0.03, 0.06) * diagonal_mm, 0.7 * seed.thickness_mm)
+    depth_mm = min(size.scale * rng.uniform(0.03, 0.06) * diagonal_mm, 0.7 * seed.thickness_mm)
     if depth_mm < MIN_DEPTH_RATIO * diagonal_mm:
         return None
-    length_mm = rng.uniform(0.12, 0.25) * diagonal_mm
-    width_mm = rng.uniform(0.012, 0.02) * diagonal_mm
+    length_mm = size.scale * rng.uniform(0.12, 0.25) * diagonal_mm
+    width_mm = size.scale * rng.uniform(0.012, 0.02) * diagonal_mm
     knots = 9
     x = np.linspace(-0.5, 0.5, knots) * length_mm
     y = rng.uniform(-0.05, 0.05, knots) * length_mm
@@ -198,12 +246,12 @@ def _crack(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
     return _result(part, part.solid - blade.as_original())
 
 
-def _break(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+def _break(part: Part, _: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     """Everything beyond a rough plane is gone: 3 to 12 % of the volume."""
     diagonal_mm = part.diagonal_mm
     normal = rng.normal(size=3)
     normal /= np.linalg.norm(normal)
-    share = rng.uniform(0.03, 0.12)
+    share = size.scale**2 * rng.uniform(0.03, 0.12)  # an edge breaks off as its square
     height = part.shape.vertices_mm @ normal
     low, high = float(height.min()), float(height.max())
     volume = part.solid.volume()
@@ -214,7 +262,7 @@ def _break(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
     centre = part.shape.vertices_mm.mean(axis=0)
     on_plane = centre + (high - centre @ normal) * normal
     wave = _waves(rng, 1.0 / (0.05 * diagonal_mm))
-    rough_mm = 0.006 * diagonal_mm
+    rough_mm = 0.006 * size.scale * diagonal_mm
     block = m3.Manifold.cube((3 * diagonal_mm,) * 3, True).translate((0, 0, 1.5 * diagonal_mm))
 
     def roughen(x: np.ndarray) -> np.ndarray:
@@ -232,7 +280,7 @@ def _break(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
     return _result(part, m3.Manifold.compose(kept)) if kept else None
 
 
-def _bend(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
+def _bend(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     """The smaller end is bent about an axis across the part's longest direction."""
     diagonal_mm = part.diagonal_mm
     fine = part.solid.refine_to_length(diagonal_mm / 60)
@@ -246,7 +294,7 @@ def _bend(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
     side = np.cos(turn) * axes[:, 1] + np.sin(turn) * axes[:, 2]
     u, v = (vertices - middle) @ along, (vertices - middle) @ side
     start = float(np.quantile((surface - middle) @ along, rng.uniform(0.55, 0.75)))
-    angle_rad = np.deg2rad(rng.uniform(5.0, 10.0))
+    angle_rad = size.scale * np.deg2rad(rng.uniform(5.0, 10.0))
     zone_mm = 0.08 * diagonal_mm
     # an arc of length `zone`, then straight on: exact bending of the line v = 0
     reach = np.maximum(u - start, 0.0)
@@ -261,7 +309,7 @@ def _bend(part: Part, seed: Seed, rng: np.random.Generator) -> Shape | None:
     return Shape(vertices + shift, faces, change[faces])
 
 
-_MAKERS: dict[Defect, Callable[[Part, Seed, np.random.Generator], Shape | None]] = {
+_MAKERS: dict[Defect, Callable[[Part, Seed, np.random.Generator, Size], Shape | None]] = {
     Defect.BULGE: _bulge,
     Defect.CONCAVITY: _concavity,
     Defect.HOLE: _hole,

@@ -42,6 +42,8 @@ def add_to(app: typer.Typer) -> None:
         epilog=console.examples(
             "amrepair synth examples/parts/knob.stl --format anomaly-shapenet --out out/synth",
             "amrepair synth one.stl two.stl --format real3d-ad --seed 7 --out out/synth",
+            "amrepair synth part.stl --format anomaly-shapenet --smallest 0.01 --smooth 0.5 "
+            "--out out/hard",
         ),
     )(synth)
 
@@ -92,12 +94,23 @@ def synth(
     out: Annotated[Path, typer.Option(help="Folder of the data set.")],
     layout: WrittenOption,
     seed: SeedOption = 0,
+    smallest: Annotated[
+        float | None,
+        typer.Option(
+            help="Width of the smallest defects, share of the part's diagonal (0.01 to 0.08); "
+            "without it, those of the published sets."
+        ),
+    ] = None,
+    smooth: Annotated[
+        float, typer.Option(help="Share of bulges and concavities without an edge (0 to 1).")
+    ] = 0.0,
 ) -> None:
     """Make a data set with labelled defects from meshes."""
     with console.starting():
-        from amrepair.bench.synth import synthesize
+        from amrepair.bench.synth import SynthOptions, synthesize
 
+    options = SynthOptions(smallest_ratio=smallest, smooth_ratio=smooth)
     bars = console.Bars()
     with bars.shown():
-        made = synthesize(parts, out, layout, seed, progress=bars)
+        made = synthesize(parts, out, layout, seed, options=options, progress=bars)
     console.out.print(f"Data set: {made}")

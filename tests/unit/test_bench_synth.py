@@ -12,7 +12,7 @@ import trimesh
 
 from amrepair.bench.dataset import open_dataset
 from amrepair.bench.synth import SynthOptions, synthesize
-from amrepair.bench.synth_defects import Defect, Part, damage, make_part
+from amrepair.bench.synth_defects import Defect, Part, Size, damage, make_part
 from amrepair.bench.synth_views import Rays, look, sample_shape, sensor_towards, sensors_around
 from amrepair.errors import InputError
 from gcode.solids import as_manifold
@@ -148,6 +148,42 @@ def test_a_data_set_reads_back_with_poses_undone(
     assert np.linalg.matrix_rank(np.stack(turns).reshape(len(turns), 9)) > 5  # random turns
 
 
+@pytest.mark.parametrize("defect", [Defect.BULGE, Defect.CONCAVITY])
+def test_a_smooth_defect_has_no_edge(box: Part, defect: Defect) -> None:
+    shape = damage(box, defect, np.random.default_rng(3), Size(smooth=True))
+    points = sample_shape(shape, 40_000, np.random.default_rng(3))
+    off_mm = np.abs(box_distance(points.points_mm))
+    same = points.change_mm == 0
+    assert off_mm[same].max() < 1e-6
+    # moved along one normal: by no more than is said, and where the box is flat by just that
+    assert (off_mm[~same] <= points.change_mm[~same] + 1e-6).all()
+    assert off_mm.max() > 0.5
+    # a bump with an edge has none of its points near 0; this one runs out
+    assert (points.change_mm[~same] < 0.1 * points.change_mm.max()).mean() > 0.1
+
+
+@pytest.mark.parametrize("defect", [d for d in Defect if d is not Defect.BEND])
+def test_smaller_defects_change_less_of_the_surface(box: Part, defect: Defect) -> None:
+    shares = []
+    for scale in (1.0, 0.4):
+        shape = damage(box, defect, np.random.default_rng(2), Size(scale))
+        points = sample_shape(shape, 40_000, np.random.default_rng(2))
+        shares.append(float((points.change_mm > 0).mean()))
+    # a surface goes with the square of its width; depths are bounded by the material, so not quite
+    assert 0 < shares[1] < 0.5 * shares[0]
+
+
+def test_sizes_are_drawn_between_the_smallest_and_the_usual() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [SynthOptions(smallest_ratio=0.01, smooth_ratio=0.5).size(rng) for _ in range(2000)]
+    scales = np.log([size.scale for size in drawn])
+    assert scales.min() > np.log(0.125)
+    assert scales.max() < 0
+    assert abs(scales.mean() - np.log(0.125) / 2) < 0.05  # even in the logarithm, sd 0.6 / √2000
+    assert 0.45 < np.mean([size.smooth for size in drawn]) < 0.55
+    assert SynthOptions().size(rng) == Size()
+
+
 def test_same_seed_same_bytes(box_file: Path, tmp_path: Path) -> None:
     def digest(folder: Path) -> dict[str, str]:
         return {
@@ -176,6 +212,10 @@ def test_what_cannot_be_made_is_refused(box_file: Path, tmp_path: Path) -> None:
         synthesize([tmp_path / "absent.stl"], tmp_path / "x")
     with pytest.raises(InputError, match="at least one"):
         SynthOptions(normal=0)
+    with pytest.raises(InputError, match=r"out of range 0\.01…0\.08"):
+        SynthOptions(smallest_ratio=0.005)
+    with pytest.raises(InputError, match="not in 0…1"):
+        SynthOptions(smooth_ratio=2.0)
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "synth.json").write_text("{}")
     with pytest.raises(InputError, match="already"):
