@@ -1,7 +1,8 @@
 """`pasdf`, our own method: the class's template, robust alignment, a score on the field.
 
-It stands on `template` and `align`. The score averages the signed field over neighbours before
-taking its size: noise falls with the root of their number, a defect's offset does not.
+It stands on `template` and `align`. The score is in standard deviations of what sound parts leave
+there, noise and spread together, and averages the signed field over neighbours before taking its
+size: noise falls with the root of their number, a defect's offset does not.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from scipy.spatial import cKDTree
 from amrepair.align import align
 from amrepair.align.thinning import order_of
 from amrepair.bench.bodies import standing_pose
-from amrepair.bench.method import ClassInput, Model, Scores
+from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.consensus import fit_from_scans
 from amrepair.errors import AlignmentError
+from amrepair.frames import moved
 from amrepair.scans.scan import Scan
 from amrepair.template import (
     LearnedSdf,
@@ -34,6 +36,7 @@ from amrepair.template import (
 )
 from amrepair.template.paper import PAPER, PaperOptions
 from amrepair.template.port import Template
+from amrepair.template.sound import learn
 from amrepair.template.surface import sample_surface
 
 if TYPE_CHECKING:
@@ -46,6 +49,7 @@ _log = logging.getLogger(__name__)
 NEAR_NEIGHBOURS = 12
 WIDE_PASSES = 5  # means of means: as far as 64 neighbours, found in a quarter of the time
 WIDE_WEIGHT = 0.5
+LEAST_SIGMA_MM = 0.001 * DIAGONAL_MM
 TOP_RATIO = 0.004
 MIN_TOP = 12
 # Farther out than this share of the part nothing more is learned: clutter must not set the score.
@@ -53,6 +57,8 @@ MAX_OFFSET_RATIO = 0.15
 REPAIR_POINTS = 16_384
 SURFACE_SPACING_MM = 0.3  # of the extracted surface; at 0.5 thin walls are off by 2.5 times as much
 RETRIES = 3
+# Where the surface fused from clouds lies far off, the second look is from nearer by.
+LEARNING_ROUNDS = 2
 
 
 def class_template(
@@ -88,7 +94,16 @@ def _from_clouds(data: ClassInput, seed: int) -> LearnedSdf:
         Scan(cloud, data.sigma_mm, "scanner", source=f"{data.name}, training cloud {k}")
         for k, cloud in enumerate(data.clouds_mm)
     ]
-    return fit_from_scans(scans, seed=seed).template
+    made = fit_from_scans(scans, seed=seed)
+    template = made.template
+    placed = [
+        moved(cloud, pose)
+        for cloud, pose in zip(data.clouds_mm, made.poses, strict=True)
+        if pose is not None
+    ]
+    for _ in range(LEARNING_ROUNDS):
+        template, _ = learn(template, placed)
+    return template
 
 
 def _place(
@@ -154,13 +169,18 @@ def _mean_distance(mesh: trimesh.Trimesh, points_mm: Float[np.ndarray, "n 3"]) -
 
 
 def smoothed_score(
-    points_mm: Float[np.ndarray, "n 3"], offset_mm: Float[np.ndarray, " n"]
+    points_mm: Float[np.ndarray, "n 3"],
+    offset_mm: Float[np.ndarray, " n"],
+    sigma_mm: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """(n,) |mean of the signed offset over near neighbours|, with some of the wider context."""
+    """(n,) |mean offset over near neighbours|, with some of the wider context.
+
+    In standard deviations `sigma_mm` of what sound parts leave there.
+    """
     limit_mm = MAX_OFFSET_RATIO * float(np.linalg.norm(np.ptp(points_mm, axis=0)))
     order = order_of(points_mm)  # near points in a row are found sooner
     points = points_mm[order]
-    offset = np.clip(offset_mm[order], -limit_mm, limit_mm)
+    offset = (np.clip(offset_mm, -limit_mm, limit_mm) / sigma_mm)[order]
     count = min(NEAR_NEIGHBOURS, len(points))
     tree = cKDTree(points, balanced_tree=False)
     index = tree.query(points, k=[*range(1, count + 1)], workers=-1)[1]
@@ -194,7 +214,11 @@ class FieldModel:
         except AlignmentError:
             return Scores(np.zeros(len(points_mm)), np.inf, None, aligned=False)
         offset_mm = self.template.distance(placed)
-        score = smoothed_score(placed, offset_mm)
+        spread = getattr(self.template, "spread_mm", None)
+        spread_mm = np.zeros(len(placed)) if spread is None else spread(placed)
+        # without noise and spread (published clouds may have none) the unit does not matter
+        sigma_mm = np.hypot(max(self.sigma_mm, LEAST_SIGMA_MM), spread_mm)
+        score = smoothed_score(placed, offset_mm, sigma_mm)
         top = max(MIN_TOP, int(TOP_RATIO * len(score)))
         return Scores(score, top_mean(score, top), np.abs(offset_mm))
 
