@@ -246,7 +246,7 @@ def _crack(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shap
     return _result(part, part.solid - blade.as_original())
 
 
-def _break(part: Part, _: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
+def _break(part: Part, _seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     """Everything beyond a rough plane is gone: 3 to 12 % of the volume."""
     diagonal_mm = part.diagonal_mm
     normal = rng.normal(size=3)
