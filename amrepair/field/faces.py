@@ -138,8 +138,9 @@ class Faces:
             near.sideways_mm > BESIDE_SPACINGS * s + BESIDE_PER_HEIGHT * near.height_mm
         )
         ask = np.flatnonzero(far | (distance > self.occupancy.voxel_mm))
-        solid = self.occupancy.at(points_mm[ask])
-        solid = np.where(solid == 0, -np.sign(f_mm[ask]), solid)
+        told = self.occupancy.at(points_mm[ask])
+        designed = -np.sign(f_mm[ask])
+        solid = np.where((told == 0) | (designed < 0), designed, np.sign(told))
         decided = far[ask] | (best[ask] * solid > 0)
         best[ask[decided]] = -solid[decided] * distance[ask[decided]]
         return best

@@ -103,17 +103,13 @@ def test_strips_every_way_are_plain_means(seed: int) -> None:
     cells = cells_of(asked, points, float(np.linalg.norm(reach)))
     found, ways_found = strands_kernels.best_strips(
         asked,
-        up,
-        np.stack(ways_across(up)),
-        *cells,
+        np.stack([up, *ways_across(up)]),
+        cells,
         deviation,
         count,
         reach,
         ways,
-        0.1,
-        0.5,
-        0.3,
-        4.0,
+        np.array([0.1, 0.5, 0.3, 4.0]),
     )
     for place, normal, over, along in zip(asked, up, found, ways_found, strict=True):
         axis = np.eye(3)[np.argmin(np.abs(normal))]

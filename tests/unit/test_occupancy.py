@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import manifold3d as m3
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
+from amrepair.deficit import compute_deficit
 from amrepair.field.cut_kernels import least_cut
 from amrepair.field.occupancy import Broken, OccupancyOptions, find_occupancy
 from amrepair.frames import Transform
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf
 from tests import analytic
 
 PLACED = Transform.identity("build", "template")
@@ -81,7 +87,7 @@ def test_space_in_a_pit_is_empty_and_around_it_solid_whichever_way_its_planes_lo
     told = found.at(ask)
     known = clear & (told != 0)
     assert known.mean() > 0.5
-    assert (told[known] == truly[known]).mean() > 0.998
+    assert (told[known] * truly[known] > 0).mean() > 0.998
     sure = f_mm[off] < -1.0
     right = found.open_side(broken)[sure] * (-1.0 if turned else 1.0)
     assert (right > 0).mean() > 0.99
@@ -103,3 +109,65 @@ def test_a_large_box_has_larger_voxels_and_the_same_answer() -> None:
     assert int(found.designed.sum()) <= few.most_voxels
     gone_mm3 = float((found.designed & ~found.solid).sum()) * found.voxel_mm**3
     assert gone_mm3 == pytest.approx(500.0, rel=0.15)
+
+
+def seen_from(solid: m3.Manifold, way: tuple[float, float, float], seed: int) -> np.ndarray:
+    """(n, 3) points of one bare view of a solid from far away, with a silhouette and shadows."""
+    mesh = solid.to_mesh64()
+    shape = trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
+    points, faces = trimesh.sample.sample_surface(shape, int(shape.area / 0.3**2), seed=seed)
+    toward = np.array(way) / np.linalg.norm(way)
+    across = np.linalg.svd(toward[None])[2][1:]
+    pixel = np.floor(points @ across.T / 0.6).astype(np.int64)
+    _, pixel = np.unique(pixel, axis=0, return_inverse=True)
+    height = points @ toward
+    topmost = np.full(pixel.max() + 1, -np.inf)
+    np.maximum.at(topmost, pixel, height)
+    facing = shape.face_normals[faces] @ toward
+    seen = (facing > 0.15) & (height > topmost[pixel] - 0.6 / facing.clip(0.15))
+    noise = np.random.default_rng(seed).normal(scale=0.04, size=points.shape)
+    return np.asarray(points + noise)[seen]
+
+
+PARTS = Path(__file__).parents[2] / "examples" / "parts"
+
+
+def solid_of(name: str) -> tuple[trimesh.Trimesh, m3.Manifold]:
+    """An example part as mesh and as solid."""
+    mesh = trimesh.load_mesh(PARTS / name)
+    vertices = np.array(mesh.vertices, np.float64)
+    return mesh, m3.Manifold(m3.Mesh64(vertices, np.array(mesh.faces, dtype=np.uint64)))
+
+
+BRACKET = solid_of("bracket.stl")
+BRACKET_TEMPLATE = MeshSdf.from_mesh(BRACKET[0])
+VIEWS = ((0.4, 0.2, 0.9), (-0.7, 0.3, 0.6), (0.1, -0.8, 0.6))
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("off_mm", [0.0, 0.6])
+def test_a_bare_view_of_a_sound_part_tells_nothing_missing(
+    view: tuple[float, float, float], off_mm: float
+) -> None:
+    # regression: of one bare view 5,483 mm3 behind the silhouette were missing; where a scanner
+    # errs along an edge (0.6 mm over 3 mm of it) there is as much missing as it is off, no more
+    points = seen_from(BRACKET[1], view, seed=0)
+    ahead = points @ np.array(view)
+    dragged = ahead < np.quantile(ahead, 0.02)
+    toward = np.array(view) / np.linalg.norm(view)
+    scan = Scan(points - off_mm * dragged[:, None] * toward, 0.04, "template")
+    deficit = compute_deficit(scan, BRACKET_TEMPLATE, build_from_template=PLACED)
+    area_mm2 = float(dragged.sum()) * 0.3**2
+    assert deficit.missing_mm3 <= 1.5 * off_mm * area_mm2
+
+
+def test_a_cut_in_a_bare_view_with_a_silhouette_is_measured() -> None:
+    mesh, solid = BRACKET
+    corner = np.asarray(mesh.bounds)[1]
+    cut = m3.Manifold.cube((10, 10, 6), True).translate(tuple(corner - (5, 5, 1)))
+    gone = solid ^ cut
+    assert gone.volume() > 20.0
+    scan = Scan(seen_from(solid - cut, VIEWS[0], seed=0), 0.04, "template")
+    deficit = compute_deficit(scan, BRACKET_TEMPLATE, build_from_template=PLACED)
+    assert deficit.missing_mm3 == pytest.approx(gone.volume(), rel=0.15)
+    assert (deficit.missing ^ gone).volume() > 0.85 * gone.volume()
