@@ -182,7 +182,7 @@ def find_faces(
     is_broken &= is_broken[neighbours].mean(axis=1) > LONE_RATIO
     which = np.flatnonzero(is_broken)
     broken = Broken(place[which], plane[which], deviation[which])
-    spacing_mm = float(np.sqrt(np.median(area_mm2)))
+    spacing_mm = float(np.sqrt(np.median(area_mm2))) or surfels.spacing_mm  # 0: all in one place
     on_mm = np.concatenate([place[~is_broken], scan.points_mm[kept & ~chosen]])
     occupancy = find_occupancy(template, broken, on_mm, surface, spacing_mm=spacing_mm)
     given = None
