@@ -342,7 +342,6 @@ def plan_repair(
             else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
             rounded_up=None if site.laid is None else partial(_laid_beyond, site, placed),
-            up=placed.rotation[2],
             progress=progress,
         )
     with watch("deficit"):

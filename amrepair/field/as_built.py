@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from amrepair.field.faces import STRIP_COSINE, Faces, Patches, find_faces, nearest_planes
+from amrepair.field.faces import STRIP_COSINE, Faces, find_faces, nearest_planes
 from amrepair.field.fused import Surfels
-from amrepair.field.holes import UPRIGHT
 from amrepair.field.near import has_near
 from amrepair.frames import unit_vectors
 from amrepair.observe.rays import RangeImage, clearances
@@ -34,7 +33,7 @@ BACK_COSINE = -0.3
 # As far from template that is gone as a stub of it can be, and as deep inside as noise is not.
 STUB_CELLS = 2.5
 STUB_MM = 0.05
-# The template's surface in patches of this size closes what stands there.
+# The template's surface is looked at this finely.
 PATCH_MM = 0.4
 
 
@@ -168,7 +167,6 @@ def gather(
     images: tuple[RangeImage, ...],
     *,
     threshold_mm: float,
-    up: Float[np.ndarray, " 3"] = UPRIGHT,
 ) -> Evidence:
     """Collect the evidence of a scan whose off-template surfels and range images are known."""
     off = off | _strips(template, surfels, off)
@@ -182,10 +180,8 @@ def gather(
         normal[which] = _toward(surfels.planes(which), facing)
         surfels = surfels.halves_joined(which, normal[which])
     elif len(which):
-        spacing_mm = max(PATCH_MM, surfels.spacing_mm)
-        places, normals = template.surface_points(spacing_mm)
-        patches = Patches(places, normals * spacing_mm**2)
-        faces = find_faces(scan, template, surfels, off, patches, threshold_mm=threshold_mm, up=up)
+        surface = template.surface_points(max(PATCH_MM, surfels.spacing_mm))
+        faces = find_faces(scan, template, surfels, off, surface, threshold_mm=threshold_mm)
         nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
         normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
     return Evidence(surfels, off, normal, images, faces)

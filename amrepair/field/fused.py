@@ -6,7 +6,6 @@ and so a bead-sized average and a local plane. It decides nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -42,8 +41,8 @@ class Surfels:
         (s,) mean f of the points in each cell.
     count
         (s,) points in each cell.
-    wide_deviation_mm, wide_count
-        (s,) the same over the cell and its 26 neighbours: a bead-sized window.
+    wide_deviation_mm
+        (s,) the mean f over the cell and its 26 neighbours: a bead-sized window.
     spread_mm
         Robust standard deviation of f within a cell: the noise as the scan shows it.
     table
@@ -60,7 +59,6 @@ class Surfels:
     deviation_mm: Float[np.ndarray, " s"]
     count: Int[np.ndarray, " s"]
     wide_deviation_mm: Float[np.ndarray, " s"]
-    wide_count: Int[np.ndarray, " s"]
     spread_mm: float
     table: Int[np.ndarray, "s 27"]
     of_point: Int[np.ndarray, " n"]
@@ -71,16 +69,6 @@ class Surfels:
 
     def __len__(self) -> int:
         return len(self.place_mm)
-
-    def judged_by(
-        self, of: Callable[[Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
-    ) -> Surfels:
-        """The same with other deviations, made of each cell's own and of its window's."""
-        return replace(
-            self,
-            deviation_mm=of(self.deviation_mm),
-            wide_deviation_mm=of(self.wide_deviation_mm),
-        )
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -141,50 +129,6 @@ class Surfels:
             )
         )
 
-    def level_deviation(
-        self, pick: Bool[np.ndarray, " s"], *, window_mm: float, least: float, most_mm: float
-    ) -> Float[np.ndarray, " s"]:
-        """(s,) mean deviation of the picked cells in a square window, seen from above.
-
-        NaN for cells not picked, and where picked ones cover less than `least` of the window. No
-        cell counts for more than `most_mm`: a few deep ones are no low plane.
-        """
-        from scipy.ndimage import uniform_filter
-
-        found = np.full(len(self), np.nan)
-        if not pick.any():
-            return found
-        xy_mm = self.place_mm[pick, :2]
-        cell = np.floor((xy_mm - xy_mm.min(axis=0)) / self.cell_mm).astype(np.int64)
-        shape = tuple(cell.max(axis=0) + 1)
-        flat = np.ravel_multi_index(tuple(cell.T), shape)
-        size, wide = int(np.prod(shape)), 2 * int(0.5 * window_mm / self.cell_mm) + 1
-        held = np.clip(self.deviation_mm[pick], -most_mm, most_mm)
-        count, total = (
-            wide**2 * uniform_filter(np.reshape(sums, shape), wide, mode="constant")
-            for sums in (
-                np.bincount(flat, minlength=size).astype(np.float64),
-                np.bincount(flat, weights=held, minlength=size),
-            )
-        )
-        enough = count.ravel()[flat] > least * wide**2
-        mean_mm = total.ravel()[flat] / np.maximum(count.ravel()[flat], 1.0)
-        found[pick] = np.where(enough, mean_mm, np.nan)
-        return found
-
-    def grow(
-        self, seeds: Bool[np.ndarray, " s"], through: Bool[np.ndarray, " s"]
-    ) -> Bool[np.ndarray, " s"]:
-        """Cells reached from `seeds` by steps between neighbours that are in `through`."""
-        reached = seeds.copy()
-        front = np.flatnonzero(seeds)
-        while len(front):
-            near = np.unique(self.table[front])
-            near = near[near >= 0]
-            front = near[through[near] & ~reached[near]]
-            reached[front] = True
-        return reached
-
 
 def make_surfels(
     points_mm: Float[np.ndarray, "n 3"],
@@ -218,7 +162,6 @@ def make_surfels(
         deviation_mm=mean_f,
         count=count,
         wide_deviation_mm=wide[:, 0] / wide[:, 1],
-        wide_count=wide[:, 1].astype(np.int64),
         spread_mm=spread_mm,
         table=table,
         of_point=of_point,

@@ -14,7 +14,6 @@ from amrepair.errors import InputError
 from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.groups import group_points, touching_mm
-from amrepair.field.holes import UPRIGHT
 from amrepair.field.near import nearest_within
 from amrepair.field.scales import scales_of
 from amrepair.frames import unit_vectors
@@ -77,7 +76,6 @@ def detect(
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
     rounded_up: RoundedUp | None = None,
-    up: Float[np.ndarray, " 3"] = UPRIGHT,
     progress: Progress = silent,
 ) -> AnomalyMap:
     """Score and label a scan against its template.
@@ -100,8 +98,6 @@ def detect(
     rounded_up
         Of places and their deviations: how far out of the template the process itself was told to
         go there. So much is not excess.
-    up
-        Unit vector away from what the part stands on, template frame.
 
     Raises
     ------
@@ -148,7 +144,6 @@ def detect(
         missing | excess,
         seen.images,
         threshold_mm=min(_stray_limit_mm(levels[0], options, calibration), limit_mm),
-        up=up,
     )
     gone = np.zeros(len(surface_mm), bool)
     gone[seen.crossed] = labels[0, len(surfels) :]

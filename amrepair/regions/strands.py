@@ -53,8 +53,9 @@ def on_strands(
     reach = np.array([LONG_MM, WIDE_MM, TALL_MM])
     cells = cells_of(places, surfels.place_mm, float(np.linalg.norm(reach)))
     over_mm, way = kernels.best_strips(
-        places, outward, np.stack(ways_across(outward)), *cells,
-        surfels.deviation_mm, surfels.count, reach, WAYS, systematic_mm, noise_mm, LEAST_MM, enough,
+        places, np.stack([outward, *ways_across(outward)]), cells,
+        surfels.deviation_mm, surfels.count, reach, WAYS,
+        np.array([systematic_mm, noise_mm, LEAST_MM, enough]),
     )  # fmt: skip
     # as all cells of a window are part of a region, all of a strip that `maybe` belong to it are
     found = over_mm > 0

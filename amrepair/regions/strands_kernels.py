@@ -12,37 +12,29 @@ from gcode.compiled import njit, prange
 @njit(cache=True, nogil=True, parallel=True)
 def best_strips(
     places: Any,
-    outward: Any,
-    across: Any,
-    start: Any,
-    ordered: Any,
-    number: Any,
-    low: Any,
-    cell: float,
-    shape: Any,
+    frame: Any,
+    cells: Any,
     deviation: Any,
     count: Any,
     strip: Any,
     ways: int,
-    systematic: float,
-    noise: float,
-    least: float,
-    enough: float,
+    limit: Any,
 ) -> Any:
     """(k,) by how much the best strip through a place is over its limit, and (k, 3) its way.
 
-    A strip lies in the plane of `across` (2, k, 3); `strip` (long, wide, tall: along `outward`)
-    says how far it goes to each side of a place. Its limit is `systematic` and `noise` over the
-    root of its points, or `least`; with fewer points than `enough` it tells nothing. `start`,
-    `ordered`, `number`, `low`, `cell` and `shape` are of `near.cells_of`, with cells as wide as a
+    `frame` (3, k, 3) is the way outward at each place and two across it. `strip` (long, wide,
+    tall: outward) says how far a strip goes to each side of a place. Its `limit` is (systematic,
+    noise, least, enough): the first and the second over the root of its points, or the third; with
+    fewer points than the last it tells nothing. `cells` are of `near.cells_of`, as wide as a
     strip's corner is away; `deviation` and `count` are of all its points.
     """
+    start, ordered, number, low, cell, shape = cells
     out = np.full(len(places), -np.inf)
     way = np.zeros((len(places), 3))
     for k in prange(len(places)):
-        nx, ny, nz = outward[k, 0], outward[k, 1], outward[k, 2]
-        ux, uy, uz = across[0, k, 0], across[0, k, 1], across[0, k, 2]
-        vx, vy, vz = across[1, k, 0], across[1, k, 1], across[1, k, 2]
+        nx, ny, nz = frame[0, k, 0], frame[0, k, 1], frame[0, k, 2]
+        ux, uy, uz = frame[1, k, 0], frame[1, k, 1], frame[1, k, 2]
+        vx, vy, vz = frame[2, k, 0], frame[2, k, 1], frame[2, k, 2]
         total, weight = np.zeros(ways), np.zeros(ways)
         cos, sin = np.empty(ways), np.empty(ways)
         for w in range(ways):
@@ -70,9 +62,9 @@ def best_strips(
                             total[w] += f
                             weight[w] += c
         for w in range(ways):
-            if weight[w] > enough:
-                limit = max(systematic + noise / np.sqrt(weight[w]), least)
-                over = total[w] / weight[w] - limit
+            if weight[w] > limit[3]:
+                most = max(limit[0] + limit[1] / np.sqrt(weight[w]), limit[2])
+                over = total[w] / weight[w] - most
                 if over > out[k]:
                     out[k] = over
                     way[k, 0] = ux * cos[w] + vx * sin[w]

@@ -10,7 +10,6 @@ import trimesh
 import amrepair
 import gcode
 from amrepair.deficit import compute_deficit
-from amrepair.field.holes import is_lined, stood_on
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
@@ -63,28 +62,3 @@ def test_a_wide_break_over_a_foot_that_nobody_saw_is_no_ceiling(seed: int) -> No
     gone = part ^ broken
     assert deficit.missing_mm3 == pytest.approx(gone.volume(), rel=0.01)
     assert (deficit.missing ^ gone).volume() > 0.98 * gone.volume()
-
-
-@pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
-def test_what_a_part_stood_on_is_its_lowest_surface_where_none_of_it_was_seen(
-    way: tuple[float, float, float],
-) -> None:
-    up = np.array(way)
-    box = trimesh.creation.box((8.0, 6.0, 4.0)).subdivide_to_size(0.5)
-    places, vectors = box.triangles_center, box.face_normals * box.area_faces[:, None]
-    foot = box.face_normals @ up < -0.9
-    told = stood_on(places, vectors, ~foot, up)
-    assert np.array_equal(told, foot)
-    half = foot & (places @ np.roll(up, 1) > 0)
-    assert not stood_on(places, vectors, ~half, up).any()  # half of it was seen
-    assert not stood_on(places, vectors, np.ones(len(foot), bool), up).any()
-
-
-def test_a_view_from_above_leaves_walls_open_and_lines_none_of_them() -> None:
-    # regression: on a plate seen from above alone a worn edge closed all its walls: 21,742 of
-    # 1,116 mm3 were missing, once the foot was known to be there
-    rim = np.column_stack([np.linspace(0, 40, 81), np.zeros(81), np.full(81, 5.0)])
-    wall = rim - np.array([0.0, 0.0, 0.5])
-    face = rim[:20] + np.array([0.0, 0.5, -0.3])
-    assert not is_lined(wall, rim, face, spacing_mm=0.2)
-    assert is_lined(wall[:20], rim, face, spacing_mm=0.2)

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from amrepair.deficit import heights_kernels
-from amrepair.field import faces_kernels, turning_kernels
+from amrepair.field import faces_kernels
 from amrepair.field.fused import make_surfels
 from amrepair.field.near import cells_of
-from amrepair.field.winding import Shell
 from amrepair.frames import ways_across
 from amrepair.regions import strands_kernels
 from gcode.surfaces import HeightField
@@ -53,34 +52,6 @@ def test_points_are_moved_onto_the_planes_through_their_neighbours(
     alike = np.abs((normal * true_normal).sum(axis=1)) > 1.0 - 1e-6
     assert alike.mean() > 0.99
     np.testing.assert_allclose(place[alike], true_place[alike], atol=1e-4)
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=SEEDS)
-def test_area_by_way_is_what_faces_each_way(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    vectors, seen = rng.normal(size=(200, 3)), rng.random(200) < 0.5
-    ways = rng.normal(size=(16, 3))
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    area = np.linalg.norm(vectors, axis=1)
-    alike = vectors @ ways.T > 0.9 * area[:, None]
-    found = turning_kernels.area_by_way(vectors, seen, ways, 0.9)
-    np.testing.assert_allclose(found, np.stack([area @ alike, (area * seen) @ alike], axis=1))
-
-
-def test_the_winding_number_of_a_closed_ball_tells_its_sides() -> None:
-    k = np.arange(4000) + 0.5
-    z, angle = 1.0 - k / 2000, np.pi * (1.0 + 5.0**0.5) * k
-    r = np.sqrt(1.0 - z**2)
-    normal = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-    shell = Shell.of(6.0 * normal, normal * 4 * np.pi * 36.0 / 4000)
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-9.0, 9.0, (2000, 3))
-    off_mm = np.linalg.norm(points, axis=1) - 6.0
-    clear = np.abs(off_mm) > 0.5
-    inside = np.where(off_mm < 0, 1.0, 0.0)
-    # one dipole beyond two radii; what is decided by it is decided at 0.3 and 0.5
-    np.testing.assert_allclose(shell.winding(points)[clear], inside[clear], atol=0.1)
 
 
 @settings(max_examples=20, deadline=None)
@@ -132,17 +103,13 @@ def test_strips_every_way_are_plain_means(seed: int) -> None:
     cells = cells_of(asked, points, float(np.linalg.norm(reach)))
     found, ways_found = strands_kernels.best_strips(
         asked,
-        up,
-        np.stack(ways_across(up)),
-        *cells,
+        np.stack([up, *ways_across(up)]),
+        cells,
         deviation,
         count,
         reach,
         ways,
-        0.1,
-        0.5,
-        0.3,
-        4.0,
+        np.array([0.1, 0.5, 0.3, 4.0]),
     )
     for place, normal, over, along in zip(asked, up, found, ways_found, strict=True):
         axis = np.eye(3)[np.argmin(np.abs(normal))]

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from amrepair.deficit import compute_deficit
-from amrepair.field.holes import is_closed, spoken_of
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
@@ -70,18 +69,3 @@ def test_nothing_is_missing_below_a_deep_floor(view: str) -> None:
     deficit = compute_deficit(bare_view(gone, view), TEMPLATE, build_from_template=PLACED)
     assert (deficit.missing - gone).volume() < 0.1 * gone.volume()
     assert deficit.missing_mm3 > 0.4 * gone.volume()  # of walls that nobody saw some stays unseen
-
-
-def test_a_hole_that_no_broken_face_speaks_of_says_nothing() -> None:
-    pin, wall = np.array([[8.0, 6.0, 6.6]]), np.array([[0.0, 6.0, 1.0]])
-    floor, up = np.array([[8.0, 6.0, 5.0]]), np.array([[0.0, 0.0, 1.0]])
-    spoken, looked_at = spoken_of(TEMPLATE, np.concatenate([pin, wall]), floor, up, spacing_mm=0.2)
-    assert spoken.tolist() == looked_at.tolist() == [True, False]
-
-
-@pytest.mark.parametrize(("seen", "closed"), [((0.0, 0.0, -25.0), True), ((0.0, 0.0, 90.0), False)])
-def test_faces_close_a_whole_scan_and_no_view(
-    seen: tuple[float, float, float], closed: bool
-) -> None:
-    faces = np.array([[0.0, 0.0, 25.0]])
-    assert is_closed(np.array(seen), np.zeros(3), faces) is closed

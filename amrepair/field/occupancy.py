@@ -1,0 +1,464 @@
+"""Occupancy: which space around broken surface is solid, as the most probable labelling of voxels.
+
+Where solid meets empty there is surface. Along points of the scan it costs nothing; elsewhere as
+much as it is improbable that nobody saw it. The cheapest labelling is a minimum cut (Hornung &
+Kobbelt 2006; Labatut, Pons & Keriven 2009). It needs neither rays nor normals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from amrepair.field.cut_kernels import least_cut
+from amrepair.field.groups import group_points
+from amrepair.field.near import has_near, nearest_within
+from amrepair.frames import box_of, in_box, unit_vectors
+from amrepair.template.port import Template
+
+# Capacities are whole numbers of this share of a nat; none is larger than that many.
+UNIT_NATS, MOST_NATS = 0.01, 1e4
+# Surface faces a way if it is less than 45° askew to it.
+FACING_COSINE = 0.7
+# Before and behind a plane, in voxels: there its sides are looked up.
+LOOK_VOXELS = (0.75, 1.5, 2.5)
+# So many bare places make a hole, and so many broken ones are asked what they look out of.
+HOLE_PLACES, LOOKING = 5, 2000
+# A box holds at most so many times as many voxels as are to be labelled.
+BOX_RATIO = 30.0
+# Blocks of so many voxels a side whose middle is so many sides from the template's surface are
+# wholly in it or outside it: √3 / 2, and a little.
+BLOCK, FAR_BLOCKS = 4, 1.1
+
+
+@dataclass(frozen=True, slots=True)
+class OccupancyOptions:
+    """What the labelling is set to.
+
+    Attributes
+    ----------
+    voxel_spacings, most_voxels
+        Edge of a voxel in spacings of the scan, and how many there may be: else they are larger.
+    seen_spacings
+        Surface is seen where at least half as many points as expected lie within this.
+    gap_spacings
+        A hole of chance between points is no wider.
+    stray
+        Probability of a point that lies on no surface.
+    largest_cover
+        Nothing is seen for certain: at most with this probability.
+    deep_mm
+        So deep is a void that is as improbable as that nobody saw the surface over its mouth.
+    hole_mm, margin_mm
+        Unseen places so near to each other are one hole; space looked at around what is broken.
+    """
+
+    voxel_spacings: float = 1.5
+    most_voxels: int = 200_000
+    seen_spacings: float = 2.5
+    gap_spacings: float = 1.6
+    stray: float = 0.05
+    largest_cover: float = 0.999
+    deep_mm: float = 50.0
+    hole_mm: float = 1.0
+    margin_mm: float = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """Scanned surface that is not the template's; nobody knows which way its planes look.
+
+    Attributes
+    ----------
+    place_mm, plane
+        (q, 3) places, and unit normals of the planes through their neighbours.
+    f_mm
+        (q,) the template's distance there.
+    """
+
+    place_mm: Float[np.ndarray, "q 3"]
+    plane: Float[np.ndarray, "q 3"]
+    f_mm: Float[np.ndarray, " q"]
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Voxels of a box, template frame.
+
+    Attributes
+    ----------
+    low_mm, voxel_mm
+        Corner of the box, and edge of a voxel.
+    solid
+        (x, y, z) whether material is there.
+    designed
+        (x, y, z) whether it should be.
+    """
+
+    low_mm: Float[np.ndarray, " 3"]
+    voxel_mm: float
+    solid: Bool[np.ndarray, "x y z"]
+    designed: Bool[np.ndarray, "x y z"]
+
+    def at(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Of points in the template: positive where solid, negative where empty, 0 unknown."""
+        index, ok = _cells(points_mm, self.low_mm, self.voxel_mm, self.solid.shape)
+        said = np.zeros(len(points_mm))
+        said[ok] = self._told[tuple(index[ok].T)]
+        return said
+
+    @cached_property
+    def _told(self) -> Float[np.ndarray, "x y z"]:
+        """As voxels say; one that the template's surface cuts off, as those beside it in there."""
+        told = np.where(self.solid, np.float32(1.0), np.float32(-1.0))
+        beside = ndimage.uniform_filter(np.where(self.designed, told, np.float32(0.0)), 3)
+        return np.asarray(np.where(self.designed, told, np.where(np.abs(beside) > 1e-3, beside, 0)))
+
+    def open_side(self, faces: Broken) -> Float[np.ndarray, " q"]:
+        """(q,) positive where space ahead of a plane is empty, negative behind, 0 unknown.
+
+        Only on the same side of the template's surface: beyond that one surface more may lie.
+        """
+        side = np.zeros(len(faces.f_mm))
+        for step in LOOK_VOXELS:
+            for way in (-1.0, 1.0):
+                at_mm = faces.place_mm + way * step * self.voxel_mm * faces.plane
+                index, ok = _cells(at_mm, self.low_mm, self.voxel_mm, self.solid.shape)
+                at = tuple(index[ok].T)
+                same = self.designed[at] == (faces.f_mm[ok] < 0)
+                side[ok] -= way * np.where(same, np.where(self.solid[at], 1.0, -1.0), 0.0)
+        return side
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Voxels of a box: the template's distance at each, and the number of those to be labelled."""
+
+    low_mm: Float[np.ndarray, " 3"]
+    voxel_mm: float
+    f_mm: Float[np.ndarray, "x y z"]
+    number: Int[np.ndarray, "x y z"]
+
+    @property
+    def is_inside(self) -> Bool[np.ndarray, " v"]:
+        """(v,) whether the voxels to be labelled lie in the template."""
+        return np.asarray(self.f_mm[self.number >= 0] < 0)
+
+    def numbers_at(self, points_mm: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
+        """(k,) number of the voxel that holds each point, −1 where none does."""
+        index, ok = _cells(points_mm, self.low_mm, self.voxel_mm, self.number.shape)
+        found = np.full(len(points_mm), -1, np.int64)
+        found[ok] = self.number[tuple(index[ok].T)]
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Facets:
+    """Where two voxels meet of which one is to be labelled: numbers, axis, middle.
+
+    `one` lies before `other` on the axis; −1 is a voxel that is known to be empty.
+    """
+
+    one: Int[np.ndarray, " k"]
+    other: Int[np.ndarray, " k"]
+    axis: Int[np.ndarray, " k"]
+    middle_mm: Float[np.ndarray, "k 3"]
+    on_template: Bool[np.ndarray, " k"]
+
+
+def find_occupancy(
+    template: Template,
+    broken: Broken,
+    on_mm: Float[np.ndarray, "n 3"],
+    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
+    *,
+    spacing_mm: float,
+    options: OccupancyOptions | None = None,
+) -> Occupancy:
+    """Label the space around broken surface.
+
+    Parameters
+    ----------
+    on_mm
+        Points of the scan that lie on the template.
+    surface
+        Places evenly spread on the template's surface, and outward unit normals.
+    spacing_mm
+        Of the scan.
+    """
+    options = options or OccupancyOptions()
+    if len(broken.f_mm) == 0:
+        none = np.zeros((0, 0, 0), bool)
+        return Occupancy(np.zeros(3), spacing_mm, none, none)
+    places_mm, normals = surface
+    bare = ~has_near(places_mm, on_mm, options.gap_spacings * spacing_mm)
+    box_mm = _box(template, broken, places_mm[bare], spacing_mm, options)
+    grid = _grid(template, box_mm, float(broken.f_mm.max()), spacing_mm, options)
+    seen = _is_seen(places_mm, on_mm, spacing_mm, options)
+    unseen = _nats_unseen(normals, seen, (grid.voxel_mm / spacing_mm) ** 2, options)
+    here_mm = on_mm[in_box(on_mm, *box_mm)]
+    facets = _facets(grid)
+    nats = unseen[facets.axis]
+    nats *= _unexplained(facets, template, broken, here_mm, spacing_mm, grid.voxel_mm, options)
+    empty = _labelled(facets, nats, _told(grid, template, here_mm, spacing_mm, options))
+    designed = grid.f_mm < 0
+    solid = np.zeros(designed.shape, bool)
+    solid[grid.number >= 0] = ~empty
+    return Occupancy(grid.low_mm, grid.voxel_mm, _as_seen(solid, designed, grid, broken), designed)
+
+
+def _is_seen(
+    asked_mm: Float[np.ndarray, "k 3"],
+    on_mm: Float[np.ndarray, "n 3"],
+    spacing_mm: float,
+    options: OccupancyOptions,
+) -> Bool[np.ndarray, " k"]:
+    """Whether at least half as many points lie around each place as on surface that was seen.
+
+    Half, so that along a straight rim of what was seen neither side gains.
+    """
+    half = int(0.5 * np.pi * options.seen_spacings**2)
+    return has_near(asked_mm, on_mm, options.seen_spacings * spacing_mm, enough=half)
+
+
+def _box(
+    template: Template,
+    broken: Broken,
+    bare_mm: Float[np.ndarray, "h 3"],
+    spacing_mm: float,
+    options: OccupancyOptions,
+) -> Float[np.ndarray, "2 3"]:
+    """What is broken, holes in the seen surface that touch it, and where it looks out of others."""
+    reach_mm = max(options.hole_mm, 3.0 * spacing_mm)
+    # a bare place among covered ones is chance
+    holes_mm = bare_mm[has_near(bare_mm, bare_mm, reach_mm, enough=HOLE_PLACES)]
+    marked_mm = np.concatenate([broken.place_mm, holes_mm])
+    group = group_points(marked_mm, reach_mm=reach_mm)
+    touching = np.isin(group, np.unique(group[: len(broken.f_mm)]))
+    places = [marked_mm[touching]]
+    if len(holes_mm):
+        out_mm = _ways_out(template, broken, options)
+        places.append(out_mm[has_near(out_mm, holes_mm, reach_mm)])
+    box_mm = box_of(np.concatenate(places)) + options.margin_mm * np.array([[-1.0], [1.0]])
+    over_mm = max(float(broken.f_mm.max()), 0.0) + 2.0 * spacing_mm
+    low_mm, high_mm = template.bounds_mm + over_mm * np.array([[-1.0], [1.0]])
+    return np.clip(box_mm, low_mm, high_mm)
+
+
+def _ways_out(
+    template: Template, broken: Broken, options: OccupancyOptions
+) -> Float[np.ndarray, "e 3"]:
+    """Where lines from broken surface along its planes' normals first leave the template."""
+    some = slice(None, None, max(1, len(broken.f_mm) // LOOKING))
+    front_mm = np.concatenate([broken.place_mm[some]] * 2)
+    along = np.concatenate([broken.plane[some], -broken.plane[some]])
+    step_mm = 0.5 * options.hole_mm
+    out = []
+    for _ in range(int(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)) / step_mm) + 1):
+        front_mm = front_mm + step_mm * along
+        f_mm = template.distance(front_mm)
+        left = f_mm >= 0
+        out.append(front_mm[left] - f_mm[left, None] * along[left])
+        front_mm, along = front_mm[~left], along[~left]
+        if len(front_mm) == 0:
+            break
+    return np.concatenate(out)
+
+
+def _grid(
+    template: Template,
+    box_mm: Float[np.ndarray, "2 3"],
+    highest_mm: float,
+    spacing_mm: float,
+    options: OccupancyOptions,
+) -> _Grid:
+    """Voxels of a box, as fine as their number allows.
+
+    Those to be labelled lie in the template, or no farther outside it than the scan does.
+    """
+    extent_mm = np.maximum(np.ptp(box_mm, axis=0), 1e-6)
+    voxel_mm = options.voxel_spacings * spacing_mm
+    voxel_mm = max(voxel_mm, float(np.cbrt(np.prod(extent_mm) / (BOX_RATIO * options.most_voxels))))
+    while True:
+        shape = np.ceil(extent_mm / voxel_mm).astype(np.int64)
+        f_mm = _distances(template, box_mm[0], voxel_mm, shape)
+        asked = f_mm < (highest_mm + voxel_mm if highest_mm > 0 else 0.0)
+        count = int(asked.sum())
+        if count <= options.most_voxels:
+            break
+        voxel_mm *= 1.02 * (count / options.most_voxels) ** (1 / 3)
+    number = np.full(f_mm.shape, -1, np.int64)
+    number[asked] = np.arange(count)
+    return _Grid(box_mm[0], voxel_mm, f_mm, number)
+
+
+def _distances(
+    template: Template,
+    low_mm: Float[np.ndarray, " 3"],
+    voxel_mm: float,
+    shape: Int[np.ndarray, " 3"],
+) -> Float[np.ndarray, "x y z"]:
+    """The template's distance at each voxel's middle; far from its surface that of a block's."""
+    blocks = -(-shape // BLOCK)
+    middles = np.stack(np.indices(blocks), axis=-1).reshape(-1, 3) * BLOCK + 0.5 * BLOCK
+    coarse = template.distance(low_mm + voxel_mm * middles)
+    whole = coarse.reshape(blocks)
+    for axis in range(3):
+        whole = whole.repeat(BLOCK, axis=axis)
+    f_mm = whole[tuple(slice(size) for size in shape)].copy()
+    # no voxel of a block lies farther from its middle
+    near = np.argwhere(np.abs(f_mm) < FAR_BLOCKS * BLOCK * voxel_mm)
+    f_mm[tuple(near.T)] = template.distance(low_mm + voxel_mm * (near + 0.5))
+    return f_mm
+
+
+def _facets(grid: _Grid) -> _Facets:
+    """All facets of the voxels to be labelled, but for those on the box's own faces."""
+    found = []
+    for axis in range(3):
+        first = tuple(slice(None, -1 if k == axis else None) for k in range(3))
+        second = tuple(slice(1 if k == axis else None, None) for k in range(3))
+        one, other = grid.number[first], grid.number[second]
+        at = np.nonzero((one >= 0) | (other >= 0))
+        middle_mm = grid.low_mm + (np.stack(at, axis=1) + 0.5) * grid.voxel_mm
+        middle_mm[:, axis] += 0.5 * grid.voxel_mm
+        surface = (grid.f_mm[first][at] < 0) != (grid.f_mm[second][at] < 0)
+        found.append((one[at], other[at], np.full(len(at[0]), axis), middle_mm, surface))
+    return _Facets(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _nats_unseen(
+    normals: Float[np.ndarray, "m 3"],
+    seen: Bool[np.ndarray, " m"],
+    points: float,
+    options: OccupancyOptions,
+) -> Float[np.ndarray, "3 2"]:
+    """How improbable a facet is that nobody saw, by axis and by the way it faces (+, −), nats.
+
+    The scan saw of the template's surface that faces this way such a share: as probably it would
+    have seen this, with as many points as its area holds at the scan's density.
+    """
+    nats = np.zeros((3, 2))
+    for axis in range(3):
+        for k, way in enumerate((1.0, -1.0)):
+            cosine = way * normals[:, axis]
+            weight = np.where(cosine > FACING_COSINE, cosine**2, 0.0)
+            cover = float((weight * seen).sum() / weight.sum()) if weight.any() else 1.0
+            chance = min(cover, options.largest_cover) * (1.0 - np.exp(-points))
+            nats[axis, k] = -np.log1p(-chance)
+    return nats
+
+
+def _unexplained(
+    facets: _Facets,
+    template: Template,
+    broken: Broken,
+    on_mm: Float[np.ndarray, "n 3"],
+    spacing_mm: float,
+    voxel_mm: float,
+    options: OccupancyOptions,
+) -> Float[np.ndarray, "k 1"]:
+    """(k, 1) 0 where scanned points lie on a facet, 1 where none does.
+
+    On the template's surface its own points count, elsewhere those of what is broken.
+    """
+    share = np.ones(len(facets.one))
+    on, off = np.flatnonzero(facets.on_template), np.flatnonzero(~facets.on_template)
+    f_mm, gradient = template.distance_and_gradient(facets.middle_mm[on])
+    feet_mm = facets.middle_mm[on] - f_mm[:, None] * unit_vectors(gradient)
+    share[on] = ~_is_seen(feet_mm, on_mm, spacing_mm, options)
+    # steps of voxels lie beside the surface by up to about half of one
+    width_mm = options.gap_spacings * spacing_mm + 0.6 * voxel_mm
+    middle_mm = facets.middle_mm[off]
+    nearest = nearest_within(middle_mm, broken.place_mm, 1.4 * width_mm)
+    found = nearest >= 0
+    apart_mm = np.linalg.norm(middle_mm[found] - broken.place_mm[nearest[found]], axis=1)
+    share[off[found]] = -np.expm1(-((apart_mm / width_mm) ** 4))
+    return share[:, None]
+
+
+def _told(
+    grid: _Grid,
+    template: Template,
+    on_mm: Float[np.ndarray, "p 3"],
+    spacing_mm: float,
+    options: OccupancyOptions,
+) -> Float[np.ndarray, " v"]:
+    """(v,) what is known of each voxel by itself, nats: positive solid, negative empty.
+
+    As designed, a little; behind a point on the template's surface solid and before it empty, but
+    for strays; and beyond the box as designed.
+    """
+    inside = grid.is_inside
+    facet = (grid.voxel_mm / spacing_mm) ** 2
+    told = np.where(inside, 1.0, -1.0) * facet * grid.voxel_mm / options.deep_mm
+    f_mm, gradient = template.distance_and_gradient(on_mm)
+    outward = unit_vectors(gradient)
+    for way in (-0.5, 0.5):
+        at_mm = on_mm + (way * grid.voxel_mm - f_mm)[:, None] * outward
+        number = grid.numbers_at(at_mm)
+        number = number[number >= 0]
+        number = number[inside[number] == (way < 0)]
+        count = np.bincount(number, minlength=len(told))
+        told += np.sign(way) * count * np.log(options.stray)
+    for axis in range(3):
+        for end in (0, -1):
+            face = np.take(grid.number, end, axis=axis)
+            face = face[face >= 0]
+            told[face] += np.where(inside[face], facet, -facet)
+    return told
+
+
+def _labelled(
+    facets: _Facets, nats: Float[np.ndarray, "k 2"], told: Float[np.ndarray, " v"]
+) -> Bool[np.ndarray, " v"]:
+    """(v,) whether each voxel is empty in the cheapest labelling."""
+    count = len(told)
+    for mine, none, k in ((facets.one, facets.other, 0), (facets.other, facets.one, 1)):
+        edge = (mine >= 0) & (none < 0)  # what lies beyond is empty: solid ends here
+        told = told - np.bincount(mine[edge], nats[edge, k], minlength=count)
+    room = np.zeros((count, 6), np.int32)
+    neighbour = np.full((count, 6), -1, np.int32)
+    whole = np.round(nats / UNIT_NATS).astype(np.int32)
+    both = (facets.one >= 0) & (facets.other >= 0)
+    one, other, axis = facets.one[both], facets.other[both], facets.axis[both]
+    neighbour[one, 2 * axis], neighbour[other, 2 * axis + 1] = other, one
+    room[one, 2 * axis], room[other, 2 * axis + 1] = whole[both].T
+    rest = np.round(np.clip(told, -MOST_NATS, MOST_NATS) / UNIT_NATS).astype(np.int32)
+    return np.asarray(least_cut(neighbour, room, rest))
+
+
+def _as_seen(
+    solid: Bool[np.ndarray, "x y z"],
+    designed: Bool[np.ndarray, "x y z"],
+    grid: _Grid,
+    broken: Broken,
+) -> Bool[np.ndarray, "x y z"]:
+    """The same, but as designed where nothing that is broken touches what differs."""
+    found = solid.copy()
+    index, ok = _cells(broken.place_mm, grid.low_mm, grid.voxel_mm, solid.shape)
+    touched = np.zeros(solid.shape, bool)
+    touched[tuple(index[ok].T)] = True
+    touched = ndimage.binary_dilation(touched)
+    for differs in (designed & ~solid, solid & ~designed):
+        groups, count = ndimage.label(differs)
+        kept = np.zeros(count + 1, bool)
+        kept[groups[touched]] = True
+        alone = differs & ~kept[groups]
+        found[alone] = designed[alone]
+    return found
+
+
+def _cells(
+    points_mm: Float[np.ndarray, "n 3"],
+    low_mm: Float[np.ndarray, " 3"],
+    voxel_mm: float,
+    shape: tuple[int, ...],
+) -> tuple[Int[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Voxel of each point, and whether it lies in the box."""
+    index = np.floor((points_mm - low_mm) / voxel_mm).astype(np.int64)
+    return index, np.asarray(((index >= 0) & (index < np.array(shape))).all(axis=1))
