@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from amrepair.field.as_built import Evidence
 from amrepair.observe.nuisance import Nuisance
+from amrepair.observe.views import Contradiction
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
 
@@ -103,9 +104,9 @@ class AnomalyMap:
         What the labels rest on, for the deficit, and (s,) how far out of the template each surfel
         may be, by what normal parts differ and the process was told; None for a map read back
         from a file.
-    noise, nuisance, options
+    noise, nuisance, contradicting, options
         What the scan told of its errors, what belongs to the whole part (None where a calibration
-        stood in), and what the test was set to.
+        stood in), views that were left out, and what the test was set to.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -125,8 +126,10 @@ class AnomalyMap:
     top_threshold_mm: float = np.inf
     noise: Noise | None = None
     nuisance: Nuisance | None = None
+    contradicting: tuple[Contradiction, ...] = ()
     options: RegionOptions | None = None
 
     def told(self) -> tuple[str, ...]:
         """What belongs to the whole part or to whole views, in sentences."""
-        return () if self.nuisance is None else self.nuisance.told()
+        whole = () if self.nuisance is None else self.nuisance.told()
+        return (*(one.told() for one in self.contradicting), *whole)
