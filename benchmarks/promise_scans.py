@@ -1,8 +1,9 @@
 """Sound scans by number, real and simulated: the same number gives the same scan.
 
 Real ones are made of range images in their given places (see `real_scans`): single views, views
-merged, the part of a view on one side of a random plane, thinned or not, with the sensors or as a
-bare cloud. What the reference surface fails to follow is left out: a region there would be right.
+merged, the part of a view on one side of a random plane, thinned or not, as bare clouds or with
+their sensors, where the range images tell them. What the reference surface fails to follow is left
+out: a region there would be right.
 
 Simulated ones see a mesh from one sensor or from several around it, with independent noise, with
 errors that hang together over 2 to 5 mm and have heavy tails, or with a real scanner's residuals.
@@ -86,11 +87,13 @@ class RealScans:
         self._seen = []
         for view in self.views:
             as_read = read_scan(folder / view.image.name, frame="scanner")
-            assert as_read.sensors_mm is not None
-            # its rays are parallel from column to column: one sensor so far away sees the same
-            sensor = as_read.sensors_mm.mean(axis=0) * unit_mm
+            # rays that are parallel from column to column: one sensor so far away sees the same
+            sensor = None
+            if as_read.sensors_mm is not None:
+                sensor = view.pose[:3, :3] @ (as_read.sensors_mm.mean(axis=0) * unit_mm)
+                sensor = sensor + view.pose[:3, 3]
             edge = as_read.edge if as_read.edge is not None else np.zeros(len(as_read), np.uint8)
-            self._seen.append((view.pose[:3, :3] @ sensor + view.pose[:3, 3], edge))
+            self._seen.append((sensor, edge))
 
     def made(self, number: int) -> Sound:
         """The scan of a number."""
@@ -101,6 +104,7 @@ class RealScans:
         if kind != "merged":
             count, chosen = 1, np.array([(number // 3) % len(self.views)])
         share, bare = rng.choice(THINNED), rng.random() < 0.5
+        bare = bare or any(self._seen[k][0] is None for k in chosen)
         clouds, edges = [], []
         for k in chosen:
             keep = ~self._off[k] & (rng.random(len(self._off[k])) < share)

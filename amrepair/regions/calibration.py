@@ -95,6 +95,11 @@ class Calibration:
         start, scale, rate, told_by = self.tails[2 * statistic + side]
         return Tail(start, scale, rate * windows, told_by)
 
+    def told(self) -> str:
+        """Whose errors they are, in a sentence."""
+        scans = f"{self.scans} sound scan{'' if self.scans == 1 else 's'}"
+        return f"Judged by what {scans} left ('{self.name}')."
+
     @classmethod
     def learned(cls, name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
         """From the tested scales of scans of sound parts.

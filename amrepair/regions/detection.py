@@ -100,7 +100,7 @@ def detect(
     seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
     progress("detect", 1.0, 4.0)
     surfels, surface_mm = seen.surfels, seen.surface_mm
-    levels = _tested(sites, surfels, options, calibration)
+    levels = _tested(sites, options, calibration)
     noise = noise_of(levels, surfels, scan, options)
     strands = _strands(surfels, template, levels, options, calibration)
     tolerances_mm = tolerances(options, template)
@@ -149,40 +149,27 @@ def detect(
         evidence=evidence,
         surfel_label=surfel_label,
         surfel_higher_mm=np.maximum(allowed_mm[: len(surfels)], 0.0),
+        sites=sites,
         noise=noise,
         nuisance=nuisance,
         contradicting=contradicting,
+        calibration=calibration,
         options=options,
     )
 
 
-def judged_levels(
-    scan: Scan, template: Template, options: RegionOptions | None = None
-) -> tuple[Level, ...]:
-    """The tested scales of a scan, for a calibration to learn from.
+def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
+    """The tested scales of a scan of a sound part, for a calibration to learn from.
 
-    Parameters
-    ----------
-    scan
-        Of a sound part, in the template's frame.
-
-    Raises
-    ------
-    InputError
-        As `detect`.
+    As the scan itself tells, whatever calibration it was judged by.
     """
-    options = options or RegionOptions()
-
-    def observe(without: tuple[int, ...]) -> tuple[Observed, Sites]:
-        seen = observed(scan, template, options, None, None, without)
-        return seen, sites_of(seen, scan, template, options, None, None)
-
-    seen, sites, _, _ = agreed(observe, scan, options, whole_part=True)
-    return _tested(sites, seen.surfels, options, None)
+    assert anomaly.sites is not None
+    assert anomaly.options is not None
+    return _tested(anomaly.sites, anomaly.options, None)
 
 
 def _tested(
-    sites: Sites, surfels: Surfels, options: RegionOptions, calibration: Calibration | None
+    sites: Sites, options: RegionOptions, calibration: Calibration | None
 ) -> tuple[Level, ...]:
     """The test of every scale."""
     scales = scales_of(
@@ -190,7 +177,7 @@ def _tested(
         sites.normal,
         sites.value_mm,
         sites.weight,
-        cell_mm=surfels.cell_mm,
+        cell_mm=sites.cell_mm,
         widest_mm=options.widest_mm,
     )
     return tested(

@@ -47,8 +47,8 @@ class Sites:
 
     Attributes
     ----------
-    cells
-        How many of them are cells.
+    cells, cell_mm
+        How many of them are cells, and the edge of one.
     place_mm, normal, value_mm, weight
         (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are drawn to
         the template's surface by up to half a cell.
@@ -61,6 +61,7 @@ class Sites:
     """
 
     cells: int
+    cell_mm: float
     place_mm: Float[np.ndarray, "b 3"]
     normal: Float[np.ndarray, "b 3"]
     value_mm: Float[np.ndarray, " b"]
@@ -199,6 +200,7 @@ def sites_of(
         tolerance_mm[1] += rounded_up(place_mm, value_mm)
     return Sites(
         cells=len(surfels),
+        cell_mm=surfels.cell_mm,
         place_mm=np.concatenate([feet_mm, crossed_mm]),
         normal=np.concatenate([outward, seen.normals[seen.crossed]]),
         value_mm=value_mm,
