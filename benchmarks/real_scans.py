@@ -272,7 +272,7 @@ class Cases:
             told.update((folder / name).read_bytes())
         self.name = conf.stem
         self.folder = cache / f"{conf.stem}-{told.hexdigest()[:12]}"
-        self._source = (folder, conf, unit_mm)
+        self.source = (folder, conf, unit_mm)
         self.folder.mkdir(parents=True, exist_ok=True)
 
     @property
@@ -325,7 +325,7 @@ class Cases:
         return path
 
     def _make(self) -> None:
-        folder, conf, unit_mm = self._source
+        folder, conf, unit_mm = self.source
         views = read_views(folder, conf, unit_mm)
         closed_surface(views).export(self.part)
         points = np.vstack([view.points_mm for view in views])

@@ -307,6 +307,7 @@ def _told(anomaly: AnomalyMap, calibration: str | None) -> dict[str, Any]:
     return {
         "noise": anomaly.noise.to_json(),
         "nuisance": None if anomaly.nuisance is None else anomaly.nuisance.to_json(),
+        "contradicting_views": [one.to_json() for one in anomaly.contradicting],
         "told": list(anomaly.told()),
         "options": asdict(anomaly.options),
         "calibration": calibration,

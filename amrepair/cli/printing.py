@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,7 @@ from amrepair.cli.options import (
     PrinterOption,
     ProcessOption,
     SeedOption,
+    calibration_named,
 )
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
@@ -99,6 +101,14 @@ def loop(
         Path | None,
         typer.Option(help="File that 'amrepair calibrate' wrote; identity where left out."),
     ] = None,
+    sound: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="What 'amrepair calibrate --sound' learned and kept by this name; left out: "
+            "learned from the job's own first clean layers.",
+        ),
+    ] = None,
     scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
     out: Annotated[Path, typer.Option(help="Folder for result, scans, report.")] = Path("out/loop"),
     resume: Annotated[
@@ -131,6 +141,7 @@ def loop(
     with console.starting():
         from amrepair.cli import running
 
+    errors = calibration_named(sound)
     running.run(
         job_file,
         template,
@@ -146,6 +157,7 @@ def loop(
         approve=approve,
         scan_timeout_s=scan_timeout_s,
         leave_heaters=leave_heaters,
+        calibration=() if errors is None else astuple(errors),
         seed=seed,
         as_json=as_json,
     )

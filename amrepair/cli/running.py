@@ -24,6 +24,7 @@ from amrepair.loop import (
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
+from amrepair.loop.learning import told
 from amrepair.loop.limits import Limits
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.pace import Pace, layers_at
@@ -106,7 +107,7 @@ def run(
 ) -> None:
     """Run the loop from its beginning, or go on with a run.
 
-    `said` is the scan's time limit and the seed.
+    `said` is the scan's time limit, the calibration of its errors and the seed.
     """
     watch, bars = Stopwatch(), console.Bars()
     if resume is not None:
@@ -295,6 +296,7 @@ def _print(
                 tape=begun.tape,
                 pick_up=find,
                 silent_stops=SILENT_STOPS,
+                calibration=setting.scanners_errors,
                 seed=setting.seed,
                 watch=watch,
                 progress=page.watching(bars),
@@ -360,6 +362,8 @@ def _tell(
     else:
         for line in summary_of_result(result, within_tolerance=within):
             console.out.print(line)
+        if report.calibration is not None:
+            console.out.print(told(report.calibration))
         console.out.print(f"Report: {folder.file('report.html')}")
     if report.stopped:
         console.errors.print(

@@ -10,6 +10,7 @@ import numpy as np
 
 from amrepair.align import align
 from amrepair.errors import InputError
+from amrepair.regions import detect
 from amrepair.regions.calibration import Calibration, file_of, users_folder
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.significance import Level
@@ -38,7 +39,7 @@ def run(
                 cloud = read_scan(path, frame="scanner")
             pose = align(cloud, field, rng=np.random.default_rng(seed), progress=bars)
             with bars.stage(f"look at {path.name}"):
-                seen.append(judged_levels(cloud.moved(pose.template_from_scan), field))
+                seen.append(judged_levels(detect(cloud.moved(pose.template_from_scan), field)))
     found = Calibration.learned(name, seen)
     kept = found.save(folder)
     if as_json:

@@ -104,15 +104,15 @@ class Surfels:
         return replace(self, place_mm=place)
 
     def by_view(
-        self, sensor_index: Int[np.ndarray, " n"]
+        self, view_index: Int[np.ndarray, " n"]
     ) -> tuple[
         Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, " k"], Int[np.ndarray, " k"]
     ]:
         """Cell, view, mean deviation and number of points of each view's share of a cell."""
         has = self.of_point >= 0
-        views = int(sensor_index.max()) + 1
+        views = int(view_index.max()) + 1
         keys, index, count = np.unique(
-            self.of_point[has] * views + sensor_index[has], return_inverse=True, return_counts=True
+            self.of_point[has] * views + view_index[has], return_inverse=True, return_counts=True
         )
         mean = np.bincount(index, self.point_deviation_mm[has]) / count
         return keys // views, keys % views, mean, count

@@ -20,12 +20,14 @@ from amrepair.loop import travel
 from amrepair.loop.decide import Action, Decision
 from amrepair.loop.findings import early_action
 from amrepair.loop.kinds import typed
+from amrepair.loop.learning import Learning, to_json, told
 from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
 from amrepair.loop.memory import settled
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.situation import decide_look
 from amrepair.loop.tape import Sent, Tape, TapeEndsError, report_from_json, report_to_json
+from amrepair.regions.calibration import Calibration
 from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
 from amrepair.scans import Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram
@@ -59,6 +61,7 @@ class Run:
         tape: Tape,
         pick_up: PickUp | None,
         silent_stops: int,
+        calibration: Calibration | None,
         seed: int,
         watch: Stopwatch,
         progress: Progress,
@@ -69,6 +72,7 @@ class Run:
         self._record, self._keep_scan = record, keep_scan
         self._tape, self._pick_up, self._seed = tape, pick_up, seed
         self._watch, self._progress = watch, progress
+        self._learning = Learning(calibration)
         self._sent: list[Sent] = []
         self._next_line = 0
         self._looks: list[Look] = []
@@ -88,6 +92,7 @@ class Run:
             tuple(self._repair_prints),
             self._stopped,
             tuple(self._passed),
+            self._learning.calibration,
         )
 
     # ------------------------------------------------------------------ the job
@@ -224,6 +229,7 @@ class Run:
     def _look(self, stop: Stop, site: Site, parked: ModalState) -> Look:
         """Scan, plan, decide; what is to be printed is on the tape when this returns."""
         number, here = len(self._looks) + 1, [k for k in self._looks if k.stop == stop]
+        site = self._learning.judged_by(site)
         taped = self._tape.next("look")
         if taped is None:
             self._go_live()
@@ -245,10 +251,22 @@ class Run:
         if taped is None:
             self._record(look)
             self._tape.write("look", **look_to_json(look))
+        self._learn(look)
         last = stop.layer_index is None
         self._looks.append(look)
         self._unsettled.append(partial(settled, look, site, compared=bool(here) or last))
         return look
+
+    def _learn(self, look: Look) -> None:
+        """What the first clean layers tell of the scanner; said and on the tape, once."""
+        learned = self._learning.note(look.stop, look.plan, look.decision)
+        if learned is None or self._tape.only_read:
+            return
+        self._progress(f"learned: {told(learned)}", 1.0, 1.0)
+        if self._tape.peek() == "learned":
+            self._tape.next("learned")
+        elif self._tape.live:
+            self._tape.write("learned", calibration=to_json(learned))
 
     def settle(self) -> None:
         """Keep of the last looks what a report shows; while the job prints nothing waits for it."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from amrepair.errors import LoopError
 from amrepair.loop.decide import Decision
+from amrepair.regions.calibration import Calibration
 from amrepair.repair import MIN_REPAIR_MM3, RepairPlan
 from amrepair.scans import Scan
 from gcode.hosts.port import PrintReport
@@ -83,6 +84,9 @@ class LoopReport:
         Why the run was ended before the job was: parked, heaters off; empty if it was not.
     passed
         Stops that were passed by without a look: the scanner did not answer.
+    calibration
+        What the run learned of its scanner from its first clean layers, or was told of it; None
+        where it came to neither.
     """
 
     looks: tuple[Look, ...]
@@ -90,6 +94,7 @@ class LoopReport:
     repair_prints: tuple[PrintReport, ...]
     stopped: str = ""
     passed: tuple[Stop, ...] = ()
+    calibration: Calibration | None = None
 
     def at_stop(self, stop: Stop) -> tuple[Look, ...]:
         """The looks of one stop."""

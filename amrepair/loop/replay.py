@@ -102,6 +102,7 @@ def looks_of(
         max_iterations=setting.max_iterations,
         limits=Limits.of(run.setup.process) if setting.limited else None,
         tape=tape,
+        calibration=setting.scanners_errors,
         seed=setting.seed,
         watch=watch,
         progress=progress,

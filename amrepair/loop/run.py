@@ -17,6 +17,7 @@ from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, LoopReport, Stop
 from amrepair.loop.pace import Pace, Stops, had_trouble
 from amrepair.loop.tape import Tape, TapeEndsError
+from amrepair.regions.calibration import Calibration
 from amrepair.repair import RepairPlan, Site, Stopwatch
 from amrepair.scans import Scan, Scanner
 from gcode.check import CheckedProgram
@@ -48,6 +49,7 @@ def run_loop(
     tape: Tape | None = None,
     pick_up: PickUp | None = None,
     silent_stops: int = 0,
+    calibration: Calibration | None = None,
     seed: int = 0,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
@@ -84,6 +86,9 @@ def run_loop(
         So many stops in a row may be passed by where the scanner does not answer; the next such
         stop ends the run with its `ScannerError`. A scan that does not fit the part is taken once
         more, and then ends the run, parked.
+
+    calibration
+        What sound parts look like to this scanner; None: learned from the first clean layers.
 
     Raises
     ------
@@ -122,6 +127,7 @@ def run_loop(
         job, checked, printer, scanner, site_at,
         max_iterations=max_iterations, approve=approve, ask=ask, limits=limits, record=record,
         keep_scan=keep_scan, tape=tape or Tape(), pick_up=pick_up, silent_stops=silent_stops,
+        calibration=calibration,
         seed=seed, watch=watch or Stopwatch(), progress=progress,
     )  # fmt: skip
     try:

@@ -18,6 +18,7 @@ import trimesh
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
+from amrepair.regions.calibration import Calibration
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup, load_setup
@@ -49,6 +50,9 @@ class Setting:
         Layers that adaptive looks begin with (`pace`); 0 where there are none.
     leave_heaters
         The job may leave heaters on; else lines that switch them off are put at its end.
+    calibration
+        What sound parts look like to the scanner, where somebody named it: name, scans, widths,
+        wander and tails, as `Calibration` has them. Empty: the run learns from its first layers.
     """
 
     printer: str
@@ -71,6 +75,7 @@ class Setting:
     title: str = "job"
     copies: tuple[tuple[tuple[float, ...], ...], ...] = ()
     leave_heaters: bool = False
+    calibration: tuple[Any, ...] = ()
 
     @classmethod
     def of(
@@ -97,6 +102,11 @@ class Setting:
             copies=tuple(_rows(pose) for pose in copies),
             **others,
         )
+
+    @property
+    def scanners_errors(self) -> Calibration | None:
+        """The calibration that somebody named."""
+        return Calibration(*self.calibration) if self.calibration else None
 
     @property
     def placed(self) -> Transform:

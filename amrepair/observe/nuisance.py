@@ -99,6 +99,14 @@ class Nuisance:
             removed_mm = removed_mm + known
         return np.asarray(removed_mm)
 
+    def error_mm(
+        self, place_mm: Float[np.ndarray, "s 3"], normal: Float[np.ndarray, "s 3"]
+    ) -> Float[np.ndarray, " s"]:
+        """(s,) standard error of `removed_mm` by pose, scale and bow: √(J Σ Jᵀ)."""
+        shape = shape_columns(place_mm, normal, self.frame)
+        sigma = self.covariance[:VIEWS_AT, :VIEWS_AT]
+        return np.sqrt(np.maximum(((shape @ sigma) * shape).sum(axis=1), 0.0))
+
     def told(self) -> tuple[str, ...]:
         """Say in plain sentences what exceeds its prior; views count from 1."""
         return (*self._told_pose(), *self._told_scale(), *self._told_bow(), *self._told_views())

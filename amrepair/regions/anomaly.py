@@ -10,8 +10,11 @@ from jaxtyping import Float, Int
 
 from amrepair.field.as_built import Evidence
 from amrepair.observe.nuisance import Nuisance
+from amrepair.observe.views import Contradiction
+from amrepair.regions.calibration import NORMAL, Calibration
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
+from amrepair.regions.sites import Sites
 
 
 class Label(IntEnum):
@@ -103,9 +106,13 @@ class AnomalyMap:
         What the labels rest on, for the deficit, and (s,) how far out of the template each surfel
         may be, by what normal parts differ and the process was told; None for a map read back
         from a file.
-    noise, nuisance, options
+    sites
+        What the test looked at; None for a map read back from a file.
+    noise, nuisance, contradicting
         What the scan told of its errors, what belongs to the whole part (None where a calibration
-        stood in), and what the test was set to.
+        stood in), and views that were left out.
+    calibration, options
+        What stood in for the scan's own word on its errors, and what the test was set to.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -123,10 +130,16 @@ class AnomalyMap:
     surfel_higher_mm: Float[np.ndarray, " s"] | None = None
     top_z_mm: float | None = None
     top_threshold_mm: float = np.inf
+    sites: Sites | None = None
     noise: Noise | None = None
     nuisance: Nuisance | None = None
+    contradicting: tuple[Contradiction, ...] = ()
+    calibration: Calibration | None = None
     options: RegionOptions | None = None
 
     def told(self) -> tuple[str, ...]:
         """What belongs to the whole part or to whole views, in sentences."""
-        return () if self.nuisance is None else self.nuisance.told()
+        whole = () if self.nuisance is None else self.nuisance.told()
+        by = self.calibration
+        judged = () if by is None or by is NORMAL else (by.told(),)
+        return (*judged, *(one.told() for one in self.contradicting), *whole)

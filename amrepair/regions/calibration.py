@@ -20,7 +20,7 @@ from amrepair.errors import InputError
 if TYPE_CHECKING:
     from amrepair.regions.significance import Level
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,27 @@ class Tail:
         Beyond `start` peaks are exponential with mean `scale`; 0: as normal noise.
     peaks
         How many such peaks a scan has.
+    told_by
+        How many peaks told the scale: the fewer, the less sure it is.
     """
 
     start: float
     scale: float
     peaks: float
+    told_by: float
+
+    def log_expected(self, z: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+        """(s,) logarithm of how many peaks of sound places a scan has beyond each value.
+
+        An exponential whose mean is itself told by `told_by` peaks predicts a Lomax tail.
+        """
+        beyond = np.maximum(z - self.start, 0.0) / (self.told_by * self.scale)
+        return np.asarray(np.log(max(self.peaks, 1.0)) - self.told_by * np.log1p(beyond))
+
+    def exceeded_by(self, expected: float) -> float:
+        """Beyond which value a scan has so many peaks of sound places."""
+        ratio = max(self.peaks, 1.0) / expected
+        return self.start + self.told_by * self.scale * (ratio ** (1.0 / self.told_by) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +67,18 @@ class Calibration:
     width_mm
         (k,) widths of the windows that it knows.
     wander_mm
-        (k, c) standard deviation of window means, by width and by class of density, the densest
-        first.
+        (k, c) standard deviation of window means, by width and by how well they were seen, the
+        best first.
     tails
-        (statistic, side) → start, scale and peaks a window; statistic 0 is of three cells
-        together, 1 of window medians; side 0 missing, 1 excess.
+        (statistic, side) → start, scale, peaks a window and peaks in all; statistic 0 is of three
+        cells together, 1 of window medians; side 0 missing, 1 excess.
     """
 
     name: str
     scans: int
     width_mm: tuple[float, ...] = ()
     wander_mm: tuple[tuple[float, ...], ...] = ()
-    tails: tuple[tuple[float, float, float], ...] = ()
+    tails: tuple[tuple[float, float, float, float], ...] = ()
 
     def wander(self, width_mm: float, classes: int) -> Float[np.ndarray, " c"]:
         """(c,) standard deviation of means of windows so wide, by class; 0 where none is known."""
@@ -75,9 +91,14 @@ class Calibration:
     def tail(self, statistic: int, side: int, windows: int) -> Tail:
         """How the peaks of so many windows fall off."""
         if not self.tails:
-            return Tail(0.0, 0.0, 0.0)
-        start, scale, rate = self.tails[2 * statistic + side]
-        return Tail(start, scale, rate * windows)
+            return Tail(0.0, 0.0, 0.0, 0.0)
+        start, scale, rate, told_by = self.tails[2 * statistic + side]
+        return Tail(start, scale, rate * windows, told_by)
+
+    def told(self) -> str:
+        """Whose errors they are, in a sentence."""
+        scans = f"{self.scans} sound scan{'' if self.scans == 1 else 's'}"
+        return f"Judged by what {scans} left ('{self.name}')."
 
     @classmethod
     def learned(cls, name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
@@ -110,7 +131,7 @@ class Calibration:
                 windows = sum(len(level.scale) for level in every)
                 start = every[0].tails[side].start
                 mean_z = float(peaks.mean() - start) if len(peaks) else 0.0
-                tails.append((start, mean_z, len(peaks) / windows))
+                tails.append((start, mean_z, len(peaks) / windows, float(len(peaks))))
         return cls(name, len(scans), tuple(sorted(widths)), tuple(wander), tuple(tails))
 
     def save(self, folder: Path) -> Path:

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
-from amrepair.errors import InputError
 from amrepair.field.as_built import Evidence, gather, with_stubs
-from amrepair.field.fused import Surfels, make_surfels
+from amrepair.field.fused import Surfels
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.field.near import nearest_within
 from amrepair.field.scales import scales_of
-from amrepair.frames import unit_vectors
-from amrepair.observe.background import (
-    MAX_EXCESS_MM,
-    ON_PLANE_MM,
-    background,
-    refuse_wrong_scale,
-)
-from amrepair.observe.nuisance import Nuisance, fit_nuisance
-from amrepair.observe.rays import RangeImage, clearances, range_images
+from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
 from amrepair.regions.calibration import NORMAL, Calibration
 from amrepair.regions.labels import grown
@@ -32,38 +19,20 @@ from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import find_regions
 from amrepair.regions.significance import Level, tested
+from amrepair.regions.sites import (
+    PRESENT_CELLS,
+    Observed,
+    RoundedUp,
+    Sites,
+    agreed,
+    observed,
+    sites_of,
+    tolerances,
+)
 from amrepair.regions.strands import on_strands
 from amrepair.scans import Scan
-from amrepair.scans.range_grid import FLYING
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
-
-# Of places in the template's frame and their deviations: a length for each.
-RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
-# Normal parts lie within three standard deviations of what they differ by.
-TOLERATED_SPREADS = 3.0
-# A template point is present where scanned surface lies within so many cells of it.
-PRESENT_CELLS = 1.8
-
-
-@dataclass(frozen=True, slots=True)
-class Sites:
-    """Where the test looks: cells of the field, and template surface that rays saw through.
-
-    Attributes
-    ----------
-    place_mm, normal, value_mm, weight
-        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are drawn to
-        the template's surface by up to half a cell.
-    tolerance_mm
-        (2, b) δ for missing and for excess.
-    """
-
-    place_mm: Float[np.ndarray, "b 3"]
-    normal: Float[np.ndarray, "b 3"]
-    value_mm: Float[np.ndarray, " b"]
-    weight: Float[np.ndarray, " b"]
-    tolerance_mm: Float[np.ndarray, "2 b"]
 
 
 def detect(
@@ -117,19 +86,20 @@ def detect(
     """
     options = options or RegionOptions()
     progress("detect", 0.0, 4.0)
-    seen = _observed(scan, template, options, images, surface)
-    progress("detect", 1.0, 4.0)
-    surfels, surface_mm = seen.surfels, seen.surface_mm
-    sites = _sites(seen, template, options, top_z_mm, rounded_up)
+
+    def observe(without: tuple[int, ...]) -> tuple[Observed, Sites]:
+        seen = observed(scan, template, options, images, surface, without)
+        return seen, sites_of(seen, scan, template, options, top_z_mm, rounded_up)
+
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
     whole_part = top_z_mm is None and calibration is not NORMAL
-    nuisance, sites = (
-        _without_nuisance(sites, surfels, scan, options) if whole_part else (None, sites)
-    )
-    levels = _tested(sites, surfels, options, calibration)
+    seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
+    progress("detect", 1.0, 4.0)
+    surfels, surface_mm = seen.surfels, seen.surface_mm
+    levels = _tested(sites, options, calibration)
     noise = noise_of(levels, surfels, scan, options)
     strands = _strands(surfels, template, levels, options, calibration)
-    tolerances_mm = _tolerances(options, template)
+    tolerances_mm = tolerances(options, template)
     labels, log_p = grown(
         levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
     )
@@ -174,192 +144,27 @@ def detect(
         evidence=evidence,
         surfel_label=surfel_label,
         surfel_higher_mm=np.maximum(allowed_mm[: len(surfels)], 0.0),
+        sites=sites,
         noise=noise,
         nuisance=nuisance,
+        contradicting=contradicting,
+        calibration=calibration,
         options=options,
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Observed:
-    """What a scan shows of its template.
+def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
+    """The tested scales of a scan of a sound part, for a calibration to learn from.
 
-    Attributes
-    ----------
-    f_mm, keep
-        (n,) deviation of each point, and whether it is one of the part.
-    surfels
-        The points of the part, condensed.
-    images
-        What rays saw.
-    surface_mm, normals
-        (m, 3) each: the template's surface.
-    crossed, depth_mm
-        (c,) numbers of surface points with no scanned surface near that rays passed, and by how
-        much.
+    As the scan itself tells, whatever calibration it was judged by.
     """
-
-    f_mm: Float[np.ndarray, " n"]
-    keep: Bool[np.ndarray, " n"]
-    surfels: Surfels
-    images: tuple[RangeImage, ...]
-    surface_mm: Float[np.ndarray, "m 3"]
-    normals: Float[np.ndarray, "m 3"]
-    crossed: Int[np.ndarray, " c"]
-    depth_mm: Float[np.ndarray, " c"]
-
-
-def judged_levels(
-    scan: Scan, template: Template, options: RegionOptions | None = None
-) -> tuple[Level, ...]:
-    """The tested scales of a scan, for a calibration to learn from.
-
-    Parameters
-    ----------
-    scan
-        Of a sound part, in the template's frame.
-
-    Raises
-    ------
-    InputError
-        As `detect`.
-    """
-    options = options or RegionOptions()
-    seen = _observed(scan, template, options, None, None)
-    sites = _sites(seen, template, options, None, None)
-    _, sites = _without_nuisance(sites, seen.surfels, scan, options)
-    return _tested(sites, seen.surfels, options, None)
-
-
-def _observed(
-    scan: Scan,
-    template: Template,
-    options: RegionOptions,
-    images: tuple[RangeImage, ...] | None,
-    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None,
-) -> Observed:
-    """Deviations, rays, and what of the template they speak of."""
-    _refuse_other_frame(scan)
-    refuse_wrong_scale(scan, template)
-    with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
-        asked = None if images is not None else beside.submit(range_images, scan)
-        f_mm = template.distance(scan.points_mm)
-        surface_mm, normals = surface or template.surface_points(options.spacing_mm)
-        keep = ~background(scan, template, f_mm, surface_mm)
-        if scan.edge is not None:  # pixels that hang between two surfaces lie on neither
-            keep &= scan.edge & FLYING == 0
-        _refuse_nothing_near(scan, keep)
-        surfels = make_surfels(scan.points_mm, f_mm, keep)
-        seen = images or () if asked is None else asked.result()
-    if surfels.spacing_mm > options.spacing_mm:
-        surface_mm, normals = template.surface_points(surfels.spacing_mm)
-    crossed, depth_mm = _crossed(surface_mm, surfels, seen)
-    return Observed(f_mm, keep, surfels, seen, surface_mm, normals, crossed, depth_mm)
-
-
-def _refuse_other_frame(scan: Scan) -> None:
-    if scan.frame != "template":
-        raise InputError(
-            f"the scan {scan.source} is in frame '{scan.frame}'; align it to the template first"
-        )
-
-
-def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"]) -> None:
-    if not keep.any():
-        raise InputError(
-            f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the "
-            "template; check its frame, its unit and that it shows this part"
-        )
-
-
-def _crossed(
-    surface_mm: Float[np.ndarray, "m 3"], surfels: Surfels, images: tuple[RangeImage, ...]
-) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Template points with no scanned surface near that rays passed, and by how much, mm.
-
-    What is gone leaves no points of its own: the ray that should have ended there says so.
-    """
-    if not images:
-        return np.zeros(0, np.int64), np.zeros(0)
-    near = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
-    absent = np.flatnonzero(near < 0)
-    depth_mm = clearances(images, surface_mm[absent], -np.inf)[1]
-    passed = depth_mm > 0
-    return absent[passed], depth_mm[passed]
-
-
-def _sites(
-    seen: Observed,
-    template: Template,
-    options: RegionOptions,
-    top_z_mm: float | None,
-    rounded_up: RoundedUp | None,
-) -> Sites:
-    """Cells and crossed template points, each with what a sound part may depart there."""
-    surfels = seen.surfels
-    outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
-    # cells that noise alone put one above the other are one place
-    half_mm = 0.5 * surfels.cell_mm
-    aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
-    feet_mm = surfels.place_mm - aside_mm[:, None] * outward
-    crossed_mm = seen.surface_mm[seen.crossed]
-    value_mm = np.concatenate([surfels.deviation_mm, -seen.depth_mm])
-    typical = np.full(len(crossed_mm), float(np.median(surfels.count)))
-    anywhere_mm, top_mm = _tolerances(options, template)
-    tolerance_mm = np.full((2, len(value_mm)), anywhere_mm)
-    if top_z_mm is not None:
-        under = surfels.place_mm[:, 2] - top_z_mm
-        top = np.abs(surfels.deviation_mm - under) < ON_PLANE_MM
-        tolerance_mm[0, : len(surfels)][top] = top_mm
-    spread = getattr(template, "spread_mm", None)
-    place_mm = np.concatenate([surfels.place_mm, crossed_mm])
-    if spread is not None:
-        tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
-    if rounded_up is not None:
-        tolerance_mm[1] += rounded_up(place_mm, value_mm)
-    return Sites(
-        place_mm=np.concatenate([feet_mm, crossed_mm]),
-        normal=np.concatenate([outward, seen.normals[seen.crossed]]),
-        value_mm=value_mm,
-        weight=np.concatenate([surfels.count, typical]),
-        tolerance_mm=tolerance_mm,
-    )
-
-
-def _without_nuisance(
-    sites: Sites, surfels: Surfels, scan: Scan, options: RegionOptions
-) -> tuple[Nuisance, Sites]:
-    """What belongs to the whole part or to whole views, and the sites without it."""
-    n = len(surfels)
-    cell, view, value_mm, count = np.arange(n), None, sites.value_mm[:n], surfels.count
-    if scan.sensor_index is not None and int(scan.sensor_index.max()) > 0:
-        cell, view, value_mm, count = surfels.by_view(scan.sensor_index)
-    found = fit_nuisance(
-        sites.place_mm[cell],
-        sites.normal[cell],
-        value_mm,
-        count.astype(np.float64),
-        view=view,
-        tolerance_mm=float(np.median(sites.tolerance_mm)),
-        correlation_mm=options.correlation_mm,
-    )
-    share_mm = found.removed_mm(sites.place_mm[cell], sites.normal[cell], view)
-    value_mm = sites.value_mm.copy()
-    value_mm[:n] -= np.bincount(cell, count * share_mm, n) / np.bincount(cell, count, n)
-    return found, replace(sites, value_mm=value_mm)
-
-
-def _tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:
-    """δ anywhere, and under the plane of the layer just printed, mm."""
-    if options.tolerance_mm is not None:
-        return options.tolerance_mm, options.tolerance_mm
-    sigma_mm = options.registration_sigma_mm
-    anywhere_mm = options.allowance_mm + float(np.hypot(2 * sigma_mm, template.bias_mm))
-    return anywhere_mm, min(options.allowance_mm, options.top_allowance_mm) + sigma_mm
+    assert anomaly.sites is not None
+    assert anomaly.options is not None
+    return _tested(anomaly.sites, anomaly.options, None)
 
 
 def _tested(
-    sites: Sites, surfels: Surfels, options: RegionOptions, calibration: Calibration | None
+    sites: Sites, options: RegionOptions, calibration: Calibration | None
 ) -> tuple[Level, ...]:
     """The test of every scale."""
     scales = scales_of(
@@ -367,10 +172,17 @@ def _tested(
         sites.normal,
         sites.value_mm,
         sites.weight,
-        cell_mm=surfels.cell_mm,
+        cell_mm=sites.cell_mm,
         widest_mm=options.widest_mm,
     )
-    return tested(scales, sites.tolerance_mm, options, calibration=calibration)
+    return tested(
+        scales,
+        sites.tolerance_mm,
+        options,
+        facing=sites.facing,
+        pose_mm=sites.pose_mm,
+        calibration=calibration,
+    )
 
 
 def _strands(

@@ -13,7 +13,7 @@ from amrepair.field.groups import CELLS_APART
 from amrepair.field.near import has_near
 from amrepair.field.scales import Scale
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import LEAST_SIGMA_MM, Level, usual_error_mm
+from amrepair.regions.significance import LEAST_SIGMA_MM, Level
 
 
 def grown(
@@ -36,8 +36,8 @@ def grown(
     """
     scale = levels[0].scale
     value_mm = scale.value_mm[scale.of_base]
-    # what is normal where a place was seen as densely: a defect's own slopes are no noise
-    noise_mm = options.grow_sigmas * usual_error_mm(levels[0], options)[scale.of_base]
+    # what is normal where a place was seen as well: a defect's own slopes are no noise
+    noise_mm = options.grow_sigmas * levels[0].usual_mm[scale.of_base]
     more = tolerance_mm > anywhere_mm + LEAST_SIGMA_MM
     low_mm = np.where(more, tolerance_mm, options.grow_share * tolerance_mm) + noise_mm
     labels = np.zeros(tolerance_mm.shape, bool)

@@ -118,9 +118,9 @@ def _correlation_mm(scales: list[Scale]) -> float:
 
 def _between_views(surfels: Surfels, scan: Scan) -> float | None:
     """Standard deviation between views' means of one cell, of the cells that several saw."""
-    if scan.sensor_index is None or int(scan.sensor_index.max()) == 0:
+    if scan.view_index is None:
         return None
-    cell, _, mean, _ = surfels.by_view(scan.sensor_index)
+    cell, _, mean, _ = surfels.by_view(scan.view_index)
     beside = np.flatnonzero(cell[1:] == cell[:-1])
     if not len(beside):
         return None

@@ -50,9 +50,9 @@ class RegionOptions:
         A region goes on to where the mean deviation is this share of the tolerance.
     grow_sigmas
         … and beyond the noise by so many standard errors: 95 % of noise stays below.
-    density_step
-        Classes of how densely a place was seen, in octaves: aslant and at its edges a scanner
-        sees fewer points an area, and worse ones.
+    seen_step
+        Classes of how densely and how squarely a place was seen, in octaves: aslant and at its
+        edges a scanner sees fewer points an area, and worse ones.
     least_cells
         Cells from which the noise of a class is told; with fewer it is that of the class below.
         A scan with fewer in all cannot tell its noise: the profile's is used, and named.
@@ -78,7 +78,7 @@ class RegionOptions:
     longest_tail: float = 2.0
     grow_share: float = 0.5
     grow_sigmas: float = 2.0
-    density_step: float = 0.5
+    seen_step: float = 0.5
     least_cells: int = 30
     most_windows: int = 3000
     spacing_mm: float = 0.6

@@ -4,7 +4,7 @@ The null is a minimum-effect one, |mean deviation| ≤ δ (Murphy and Myors 1999
 part may depart by, so that noise alone hardly matters. Means over several scales are tested; the
 stated number of false regions is shared out over scales, signs and windows. The standard error of
 a mean comes from the scan itself: what neighbouring cells differ by, and by how much windows that
-were seen as densely depart as a whole, less what the process is known to leave. Where more places
+were seen as well depart as a whole, less what the process is known to leave. Where more places
 exceed the tolerance than can be real, their peaks tell the tail of the null (Efron 2004, by peaks
 over a threshold), but for those that stand out of it.
 """
@@ -47,6 +47,8 @@ class Level:
         (2, s) δ for missing and excess, and (s,) the standard error of the statistic.
     common_mm
         (s,) the part of it that averaging over a window does not lessen.
+    usual_mm
+        (s,) median standard error of the windows that were seen as well.
     z
         (2, s) standard errors beyond the tolerance: missing, excess.
     critical
@@ -56,7 +58,7 @@ class Level:
     log_p
         (2, s) natural logarithm of the expected number of false regions as high or higher.
     wander_mm
-        (c,) standard deviation of window means by class of density, the densest first.
+        (c,) standard deviation of window means by how well they were seen, the best first.
     tails, peaks
         For missing and excess: how peaks of sound places fall off, and the peaks themselves.
     """
@@ -65,6 +67,7 @@ class Level:
     tolerance_mm: Float[np.ndarray, "2 s"]
     error_mm: Float[np.ndarray, " s"]
     common_mm: Float[np.ndarray, " s"]
+    usual_mm: Float[np.ndarray, " s"]
     z: Float[np.ndarray, "2 s"]
     critical: Float[np.ndarray, " 2"]
     quantile: float
@@ -89,6 +92,8 @@ def tested(
     tolerance_mm: Float[np.ndarray, "2 b"],
     options: RegionOptions,
     *,
+    facing: Float[np.ndarray, " b"],
+    pose_mm: Float[np.ndarray, " b"],
     calibration: Calibration | None,
 ) -> tuple[Level, ...]:
     """Test every scale's medians, and the third deepest and highest cells of the first.
@@ -97,6 +102,11 @@ def tested(
     ----------
     tolerance_mm
         (2, b) δ of each cell of the field: for missing, for excess.
+    facing
+        (b,) cosine of the angle of incidence.
+    pose_mm
+        (b,) standard error of the deviation by what is left open of the pose and of the part's
+        size and bow.
     calibration
         What sound parts look like to this scanner; None: as the scan itself tells.
     """
@@ -104,18 +114,24 @@ def tested(
     levels = []
     for k, scale in enumerate(scales):
         size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
-        cells = (np.bincount(scale.of_base, side, len(scale)) / size for side in tolerance_mm)
-        delta = np.stack(
-            [scales_kernels.window_means(scale.table, scale.count, side) for side in cells]
+        cells = (
+            np.bincount(scale.of_base, told, len(scale)) / size
+            for told in (*tolerance_mm, facing, pose_mm)
         )
-        errors = _errors(
-            scale, options, calibration, options.most_wander * point_sigma_mm(scales[0])
+        *delta, faced, pose = (
+            scales_kernels.window_means(scale.table, scale.count, told) for told in cells
         )
-        if k == 0:
-            thirds = np.stack([-scale.low_mm, scale.high_mm])
-            levels.append(_level(scale, thirds, delta, errors, share, options, calibration, 0))
+        group = seen_class(scale, faced, options.seen_step)
+        most_mm = options.most_wander * point_sigma_mm(scales[0])
+        errors = _errors(scale, group, pose, options, calibration, most_mm)
         means = np.stack([-scale.median_mm, scale.median_mm])
-        levels.append(_level(scale, means, delta, errors, share, options, calibration, 1))
+        thirds = np.stack([-scale.low_mm, scale.high_mm])
+        for statistic, sides in ((0, thirds), (1, means))[0 if k == 0 else 1 :]:
+            levels.append(
+                _level(
+                    scale, sides, np.stack(delta), errors, share, options, calibration, statistic
+                )
+            )
     return tuple(levels)
 
 
@@ -130,13 +146,16 @@ class Errors:
     common_mm
         (s,) what a window's cells have in common.
     wander_mm
-        (c,) `common_mm` and `window_mm` together, by class of density.
+        (c,) standard deviation of window means, by how well they were seen.
+    group
+        (s,) class of how well each window was seen.
     """
 
     cell_mm: Float[np.ndarray, " s"]
     window_mm: Float[np.ndarray, " s"]
     common_mm: Float[np.ndarray, " s"]
     wander_mm: Float[np.ndarray, " c"]
+    group: Int[np.ndarray, " s"]
 
     @property
     def independent(self) -> float:
@@ -156,12 +175,16 @@ def point_sigma_mm(first: Scale) -> float:
 
 
 def _errors(
-    scale: Scale, options: RegionOptions, calibration: Calibration | None, most_mm: float
+    scale: Scale,
+    group: Int[np.ndarray, " s"],
+    pose_mm: Float[np.ndarray, " s"],
+    options: RegionOptions,
+    calibration: Calibration | None,
+    most_mm: float,
 ) -> Errors:
     """What neighbouring cells differ by, and by how much, at most, whole windows wander."""
-    group = density_class(scale, options.density_step)
     classes = int(group.max()) + 1
-    # what few neighbours tell by chance to be quiet is as noisy as places seen as densely
+    # what few neighbours tell by chance to be quiet is as noisy as places seen as well
     usual = _by_class(group, scale.noise_mm, classes, options)[group]
     cell = np.maximum(np.maximum(scale.noise_mm, usual), LEAST_SIGMA_MM)
     window = MEDIAN_LOSS * cell / np.sqrt(scale.count)
@@ -170,23 +193,21 @@ def _errors(
     else:
         wander = calibration.wander(3.0 * scale.cell_mm, classes)
     explained = options.process_sigma_mm**2 + window**2
-    common = np.sqrt(np.maximum(wander[group] ** 2 - explained, 0.0))
-    return Errors(cell, window, common, wander)
+    common = np.sqrt(np.maximum(wander[group] ** 2 - explained, 0.0) + pose_mm**2)
+    return Errors(cell, window, common, wander, group)
 
 
-def density_class(scale: Scale, step: float) -> Int[np.ndarray, " s"]:
-    """(s,) how densely each window was seen: octaves over `step` below the better half, which is 0.
+def seen_class(scale: Scale, facing: Float[np.ndarray, " s"], step: float) -> Int[np.ndarray, " s"]:
+    """(s,) how well each window was seen: octaves over `step` below the better half, which is 0.
 
-    Aslant and at edges a scanner sees fewer points an area, and errs more, and as a whole.
+    By how many points saw it or how squarely, whichever is the worse: aslant, at edges and at the
+    border of what was seen a scanner errs more, and as a whole.
     """
-    relative = scale.window_weight / float(np.median(scale.window_weight))
+    relative = np.minimum(
+        scale.window_weight / float(np.median(scale.window_weight)),
+        facing / float(np.median(facing)),
+    )
     return np.maximum(-np.floor(np.log2(relative) / step), 0.0).astype(np.int64)
-
-
-def usual_error_mm(level: Level, options: RegionOptions) -> Float[np.ndarray, " s"]:
-    """(s,) median standard error of the windows that were seen as densely."""
-    group = density_class(level.scale, options.density_step)
-    return _by_class(group, level.error_mm, int(group.max()) + 1, options)[group]
 
 
 def _by_class(
@@ -197,15 +218,15 @@ def _by_class(
 ) -> Float[np.ndarray, " c"]:
     """(c,) median of a value in each class.
 
-    Never less in one that was seen less densely, nor more by a larger factor than it was seen less
-    densely: aslant at an angle θ, both points and depth resolution go with cos θ.
+    Never less in one that was seen less well, nor more by a larger factor than the square of how
+    much less: at an angle θ of incidence errors of real views grow with 1/cos θ to 1/cos² θ.
     """
     found = np.zeros(classes)
     for k in range(classes):
         here = group == k
         if here.sum() >= options.least_cells:
             found[k] = float(np.median(value[here]))
-    most = found[0] * 2.0 ** (options.density_step * np.arange(classes))
+    most = found[0] * 4.0 ** (options.seen_step * np.arange(classes))
     return np.maximum.accumulate(np.minimum(found, most))
 
 
@@ -219,7 +240,7 @@ def _wander(
     """(c,) standard deviation of window means about what is normal some way off, by class.
 
     From the differences of windows that face the same way, farther apart than errors hang
-    together: a layer that lacks as a whole is no error. By how densely the worse one was seen.
+    together: a layer that lacks as a whole is no error. By how well the worse one was seen.
     """
     pick = np.arange(0, len(scale), max(len(scale) // options.most_windows, 1))
     pairs = cKDTree(scale.place_mm[pick]).query_pairs(options.far_mm, output_type="ndarray")
@@ -276,13 +297,12 @@ def _level(
         log_p[side] = np.log(n * ways) + together * norm.logsf(safe)
         critical[side] = quantile
         if tail.scale > 0:
-            count = max(tail.peaks, 1.0)
-            fallen = np.log(count) - (safe - tail.start) / tail.scale
-            log_p[side] = np.maximum(log_p[side], fallen)
-            critical[side] = max(quantile, tail.start + tail.scale * np.log(count / share))
+            log_p[side] = np.maximum(log_p[side], tail.log_expected(safe))
+            critical[side] = max(quantile, tail.exceeded_by(share))
+    usual_mm = _by_class(errors.group, error_mm, int(errors.group.max()) + 1, options)
     return Level(
-        scale, tolerance_mm, error_mm, errors.common_mm, z, critical, quantile, log_p,
-        errors.wander_mm, (tails[0], tails[1]), (peaks[0], peaks[1]),
+        scale, tolerance_mm, error_mm, errors.common_mm, usual_mm[errors.group], z, critical,
+        quantile, log_p, errors.wander_mm, (tails[0], tails[1]), (peaks[0], peaks[1]),
     )  # fmt: skip
 
 
@@ -303,13 +323,11 @@ def _tail(peaks: Float[np.ndarray, " p"], options: RegionOptions) -> Tail:
     Kimber 1982). The first outlier and all above it may be real.
     """
     if len(peaks) < 2 * RANK:  # the lower half is too few to tell a tail from
-        return Tail(options.tail_from, 0.0, float(len(peaks)))
+        return Tail(options.tail_from, 0.0, *2 * (float(len(peaks)),))
     beyond = peaks - options.tail_from
-    sound = len(beyond) // 2
-    while sound < len(beyond):
-        if beyond[sound] > beyond[:sound].mean() * np.log(sound / options.false_regions):
+    for sound in range(len(beyond) // 2, len(beyond) + 1):
+        scale = min(float(beyond[:sound].mean()), options.longest_tail)
+        tail = Tail(options.tail_from, scale, float(sound), float(sound))
+        if sound < len(beyond) and peaks[sound] > tail.exceeded_by(options.false_regions):
             break
-        sound += 1
-    return Tail(
-        options.tail_from, min(float(beyond[:sound].mean()), options.longest_tail), float(sound)
-    )
+    return tail

@@ -18,6 +18,7 @@ from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
 from amrepair.loop.decide import FINDINGS, STOPS
 from amrepair.loop.findings import reach_of
+from amrepair.loop.learning import to_json
 from amrepair.observe.background import BED_BAND_MM
 from amrepair.regions import Label
 from amrepair.repair import RepairPlan
@@ -169,6 +170,7 @@ def loop_result(
         "seed": seed,
         "versions": versions(setup),
         "stopped": report.stopped or None,
+        "learned": None if report.calibration is None else to_json(report.calibration),
         "passed_by": [stop.label for stop in report.passed],
         "stops": [_stop_row(look) for look in report.looks],
     }

@@ -109,6 +109,22 @@ class Scan:
     def __len__(self) -> int:
         return len(self.points_mm)
 
+    @property
+    def view_index(self) -> Int[np.ndarray, " n"] | None:
+        """(n,) which view saw each point; None where nobody knows, or all are of one.
+
+        A grid is a view, however many places its sensor passed; else a sensor is.
+        """
+        if self.grids is None:
+            index = self.sensor_index
+            return None if index is None or int(index.max()) == 0 else index
+        if len(self.grids) == 1:
+            return None
+        index = np.zeros(len(self), np.int64)
+        for k, grid in enumerate(self.grids):
+            index[grid.points] = k
+        return index
+
     def moved(self, target_from_source: Transform) -> Scan:
         """The same scan in another frame; normals and sensors move along, grid and flags stay."""
         if target_from_source.source != self.frame:

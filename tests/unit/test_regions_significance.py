@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from amrepair.cli.inspect import _refuse_too_noisy
 from amrepair.errors import InputError
 from amrepair.field.scales import FACING_COSINE, RANK, scales_of
 from amrepair.regions import Label, detect
-from amrepair.regions.calibration import NORMAL, Calibration
+from amrepair.regions.calibration import NORMAL, Calibration, Tail
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
@@ -83,7 +84,37 @@ def test_too_few_points_take_the_profiles_noise_and_say_so(ball: AnalyticTemplat
     noise = detect(Scan(points, 0.07, "template"), ball).noise
     assert noise is not None
     assert noise.sigma_mm == 0.07
-    assert "profile" in noise.source
+    assert "from the profile's, " in noise.told()
+    assert "too few to tell" in noise.told()
+
+
+def test_a_scan_too_noisy_for_what_is_asked_is_refused_with_what_it_could_show(
+    ball: AnalyticTemplate,
+) -> None:
+    points, normals = sample_surface(ball.body, 0.6, seed=2)
+    rng = np.random.default_rng(2)
+    noisy = points + rng.normal(scale=0.3, size=(len(points), 1)) * normals
+    found = detect(Scan(noisy, 0.04, "template"), ball)
+    assert found.noise is not None
+    area_mm2, depth_mm = min(found.noise.smallest_mm, key=lambda pair: pair[1])
+    with pytest.raises(InputError, match=f"{depth_mm:.2f} mm deep over {area_mm2:.0f} mm²"):
+        _refuse_too_noisy(found, 0.9 * depth_mm, Path("noisy.ply"))
+    _refuse_too_noisy(found, 1.1 * depth_mm, Path("noisy.ply"))
+    _refuse_too_noisy(found, None, Path("noisy.ply"))
+    # and it is no empty word: a defect as deep as that all over such a window is found
+    deep = np.where(np.linalg.norm(points[:, :2], axis=1) < np.sqrt(area_mm2 / 2), 2.0, 0.0)
+    noisy[points[:, 2] > 0] -= (depth_mm * deep[:, None] * normals)[points[:, 2] > 0]
+    assert len(detect(Scan(noisy, 0.04, "template"), ball).regions) == 1
+
+
+def test_few_peaks_tell_a_tail_less_surely_than_many() -> None:
+    """By hand: of one peak in a scan, Lomax's tail falls to 0.05 at m k (20^(1/k) − 1)."""
+    few, many = (Tail(1.0, 0.5, 1.0, told_by) for told_by in (6.0, 1e6))
+    assert few.exceeded_by(0.05) == pytest.approx(1.0 + 0.5 * 6 * (20 ** (1 / 6) - 1))
+    assert many.exceeded_by(0.05) == pytest.approx(1.0 + 0.5 * np.log(20), rel=1e-4)
+    for tail in (few, many):
+        z = np.array([tail.exceeded_by(0.01)])
+        assert np.exp(tail.log_expected(z)[0]) == pytest.approx(0.01)
 
 
 def test_windows_are_what_a_plain_loop_makes_of_them() -> None:
@@ -125,7 +156,7 @@ def test_scales_do_not_mix_the_sides_of_a_thin_wall() -> None:
 def test_a_calibration_is_kept_by_name_and_read_again(
     ball: AnalyticTemplate, tmp_path: Path
 ) -> None:
-    levels = [judged_levels(rough(ball, seed), ball) for seed in (11, 12, 13)]
+    levels = [judged_levels(detect(rough(ball, seed), ball)) for seed in (11, 12, 13)]
     learned = Calibration.learned("bench", levels)
     learned.save(tmp_path)
     again = Calibration.load("bench", tmp_path)

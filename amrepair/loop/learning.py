@@ -1,0 +1,87 @@
+"""What a run learns of its scanner from its own first clean layers.
+
+Until then, and where errors turn out to be normal, looks are judged by normal noise. A calibration
+that somebody named goes before all of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from amrepair.loop.decide import Action, Decision
+from amrepair.loop.looks import Stop
+from amrepair.regions.calibration import NORMAL, Calibration
+from amrepair.regions.detection import judged_levels
+from amrepair.regions.significance import Level
+from amrepair.repair import RepairPlan, Site
+
+FIRST_LOOKS = 3  # clean layers that are learned from
+OWN = "this run's first layers"
+
+
+class Learning:
+    """The calibration that a run's looks are judged by.
+
+    Parameters
+    ----------
+    given
+        What somebody named: nothing is learned then.
+    """
+
+    def __init__(self, given: Calibration | None = None) -> None:
+        self.calibration = given
+        self._seen: list[tuple[Level, ...]] = []
+        self._done = given is not None
+
+    def judged_by(self, site: Site) -> Site:
+        """What is expected, with what is known of the scanner's errors."""
+        if self.calibration is None or site.calibration is not NORMAL:
+            return site
+        return replace(site, calibration=self.calibration)
+
+    def note(self, stop: Stop, plan: RepairPlan, decision: Decision) -> Calibration | None:
+        """Learn from a look, if its layer is clean; what was learned, once that is enough."""
+        clean = decision.action is Action.GO_ON and not plan.anomaly.regions
+        if self._done or not clean or stop.layer_index is None:
+            return None
+        self._seen.append(judged_levels(plan.anomaly))
+        if len(self._seen) < FIRST_LOOKS:
+            return None
+        self._done = True
+        learned = NORMAL if _as_normal(self._seen) else Calibration.learned(OWN, self._seen)
+        self._seen = []
+        self.calibration = learned
+        return learned
+
+
+def _as_normal(seen: list[tuple[Level, ...]]) -> bool:
+    """Whether windows wander by no more than normal noise and the process leave, at any width."""
+    widths = zip(*(levels[1:] for levels in seen), strict=False)
+    return all(
+        float(np.median(np.concatenate([level.common_mm for level in one]))) == 0.0
+        for one in widths
+    )
+
+
+def told(calibration: Calibration) -> str:
+    """What was learned, in a sentence."""
+    if calibration is NORMAL:
+        return f"The first {FIRST_LOOKS} clean layers show normal noise and nothing else."
+    if calibration.name != OWN:
+        return calibration.told()
+    widths = ", ".join(
+        f"{wander[0]:.3f} mm over {width:g} mm"
+        for width, wander in zip(calibration.width_mm, calibration.wander_mm, strict=True)
+    )
+    return (
+        f"Learned from the first {calibration.scans} clean layers: local means of sound surface "
+        f"wander by {widths}."
+    )
+
+
+def to_json(calibration: Calibration) -> dict[str, Any]:
+    """As a run's record and its result have it."""
+    return {**asdict(calibration), "told": told(calibration)}

@@ -1,0 +1,47 @@
+"""Incidence: how squarely each place was looked at, from the sensors or from the surface alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.frames import unit_vectors
+from amrepair.observe.rays import MIN_COSINE
+
+# One view sees what faces it; this share of its places may seem not to, at edges and by noise.
+TURNED_AWAY = 0.03
+DIRECTIONS, FEW_PLACES = 1000, 1200  # 6° apart; so many places tell the way that they face
+
+
+def incidence(
+    normal: Float[np.ndarray, "n 3"], to_sensor: Float[np.ndarray, "n 3"] | None
+) -> Float[np.ndarray, " n"]:
+    """(n,) cosine of the angle of incidence, at least that of a grazing ray; 1 where nobody knows.
+
+    Parameters
+    ----------
+    normal
+        Outward unit normals of the template.
+    to_sensor
+        Ways to what saw each place; None: of a single view they are told by what it faces.
+    """
+    if to_sensor is None:
+        way = _way_of_one_view(normal)
+        if way is None:
+            return np.ones(len(normal))
+        return np.maximum(normal @ way, MIN_COSINE)
+    return np.maximum((unit_vectors(to_sensor) * normal).sum(axis=1), MIN_COSINE)
+
+
+def _way_of_one_view(normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"] | None:
+    """(3,) the way that all but a few places face; None where they were seen from more sides."""
+    if not len(normal):
+        return None
+    index = np.arange(DIRECTIONS) + 0.5
+    z, turn = 1.0 - 2.0 * index / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * index
+    flat = np.sqrt(1.0 - z**2)
+    ways = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    facing = normal[:: len(normal) // FEW_PLACES + 1] @ ways.T
+    least = np.quantile(facing, TURNED_AWAY, axis=0)
+    best = int(np.argmax(least))
+    return ways[best] if least[best] > 0.0 else None

@@ -1,0 +1,283 @@
+"""Sites: where the test looks, what it sees there, and what of that belongs to the whole part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from amrepair.errors import InputError
+from amrepair.field.fused import Surfels, make_surfels
+from amrepair.field.near import nearest_within
+from amrepair.frames import unit_vectors
+from amrepair.observe.background import (
+    MAX_EXCESS_MM,
+    ON_PLANE_MM,
+    background,
+    refuse_wrong_scale,
+)
+from amrepair.observe.basis import NuisanceOptions
+from amrepair.observe.incidence import incidence
+from amrepair.observe.nuisance import Nuisance, fit_nuisance
+from amrepair.observe.rays import RangeImage, clearances, range_images
+from amrepair.observe.views import Contradiction, contradictions
+from amrepair.regions.options import RegionOptions
+from amrepair.scans import Scan
+from amrepair.scans.range_grid import FLYING
+from amrepair.template.port import Template
+
+# Of places in the template's frame and their deviations: a length for each.
+RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
+# Which view says what of which cell, by how many points (`Surfels.by_view`).
+ByView = tuple[
+    Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, " k"], Int[np.ndarray, " k"]
+]
+# Normal parts lie within three standard deviations of what they differ by.
+TOLERATED_SPREADS = 3.0
+# A template point is present where scanned surface lies within so many cells of it.
+PRESENT_CELLS = 1.8
+
+
+@dataclass(frozen=True, slots=True)
+class Sites:
+    """Where the test looks: cells of the field, and template surface that rays saw through.
+
+    Attributes
+    ----------
+    cells, cell_mm
+        How many of them are cells, and the edge of one.
+    place_mm, normal, value_mm, weight
+        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are drawn to
+        the template's surface by up to half a cell.
+    tolerance_mm
+        (2, b) δ for missing and for excess.
+    facing
+        (b,) cosine of the angle of incidence.
+    pose_mm
+        (b,) standard error of the value by what is left open of the pose, the size and the bow.
+    """
+
+    cells: int
+    cell_mm: float
+    place_mm: Float[np.ndarray, "b 3"]
+    normal: Float[np.ndarray, "b 3"]
+    value_mm: Float[np.ndarray, " b"]
+    weight: Float[np.ndarray, " b"]
+    tolerance_mm: Float[np.ndarray, "2 b"]
+    facing: Float[np.ndarray, " b"]
+    pose_mm: Float[np.ndarray, " b"]
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """What a scan shows of its template.
+
+    Attributes
+    ----------
+    f_mm, keep
+        (n,) deviation of each point, and whether it is one of the part.
+    surfels
+        The points of the part, condensed.
+    images
+        What rays saw.
+    surface_mm, normals
+        (m, 3) each: the template's surface.
+    crossed, depth_mm
+        (c,) numbers of surface points with no scanned surface near that rays passed, and by how
+        much.
+    """
+
+    f_mm: Float[np.ndarray, " n"]
+    keep: Bool[np.ndarray, " n"]
+    surfels: Surfels
+    images: tuple[RangeImage, ...]
+    surface_mm: Float[np.ndarray, "m 3"]
+    normals: Float[np.ndarray, "m 3"]
+    crossed: Int[np.ndarray, " c"]
+    depth_mm: Float[np.ndarray, " c"]
+
+
+def observed(
+    scan: Scan,
+    template: Template,
+    options: RegionOptions,
+    images: tuple[RangeImage, ...] | None,
+    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None,
+    without: tuple[int, ...],
+) -> Observed:
+    """Deviations, rays, and what of the template they speak of; some views may be left out."""
+    _refuse_other_frame(scan)
+    refuse_wrong_scale(scan, template)
+    with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
+        asked = None if images is not None else beside.submit(range_images, scan)
+        f_mm = template.distance(scan.points_mm)
+        surface_mm, normals = surface or template.surface_points(options.spacing_mm)
+        keep = ~background(scan, template, f_mm, surface_mm)
+        if scan.edge is not None:  # pixels that hang between two surfaces lie on neither
+            keep &= scan.edge & FLYING == 0
+        if without:
+            keep &= ~np.isin(scan.view_index, without)
+        _refuse_nothing_near(scan, keep)
+        surfels = make_surfels(scan.points_mm, f_mm, keep)
+        seen = images or () if asked is None else asked.result()
+        if without and seen:
+            assert scan.sensors_mm is not None
+            sensors_mm = scan.sensors_mm[np.unique(scan.sensor_index[keep])]
+            seen = tuple(i for i in seen if np.isclose(sensors_mm, i.sensor_mm).all(axis=1).any())
+    if surfels.spacing_mm > options.spacing_mm:
+        surface_mm, normals = template.surface_points(surfels.spacing_mm)
+    crossed, depth_mm = _crossed(surface_mm, surfels, seen)
+    return Observed(f_mm, keep, surfels, seen, surface_mm, normals, crossed, depth_mm)
+
+
+def _refuse_other_frame(scan: Scan) -> None:
+    if scan.frame != "template":
+        raise InputError(
+            f"the scan {scan.source} is in frame '{scan.frame}'; align it to the template first"
+        )
+
+
+def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"]) -> None:
+    if not keep.any():
+        raise InputError(
+            f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the "
+            "template; check its frame, its unit and that it shows this part"
+        )
+
+
+def _crossed(
+    surface_mm: Float[np.ndarray, "m 3"], surfels: Surfels, images: tuple[RangeImage, ...]
+) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    """Template points with no scanned surface near that rays passed, and by how much, mm.
+
+    What is gone leaves no points of its own: the ray that should have ended there says so.
+    """
+    if not images:
+        return np.zeros(0, np.int64), np.zeros(0)
+    near = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
+    absent = np.flatnonzero(near < 0)
+    depth_mm = clearances(images, surface_mm[absent], -np.inf)[1]
+    passed = depth_mm > 0
+    return absent[passed], depth_mm[passed]
+
+
+def sites_of(
+    seen: Observed,
+    scan: Scan,
+    template: Template,
+    options: RegionOptions,
+    top_z_mm: float | None,
+    rounded_up: RoundedUp | None,
+) -> Sites:
+    """Cells and crossed template points, each with what a sound part may depart there."""
+    surfels = seen.surfels
+    outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
+    # cells that noise alone put one above the other are one place
+    half_mm = 0.5 * surfels.cell_mm
+    aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
+    feet_mm = surfels.place_mm - aside_mm[:, None] * outward
+    crossed_mm = seen.surface_mm[seen.crossed]
+    value_mm = np.concatenate([surfels.deviation_mm, -seen.depth_mm])
+    # what rays passed has no points of its own: it was seen as most places were
+    facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels)), scan))
+    typical, faced = (
+        np.full(len(crossed_mm), float(np.median(told))) for told in (surfels.count, facing)
+    )
+    anywhere_mm, top_mm = tolerances(options, template)
+    tolerance_mm = np.full((2, len(value_mm)), anywhere_mm)
+    if top_z_mm is not None:
+        under = surfels.place_mm[:, 2] - top_z_mm
+        top = np.abs(surfels.deviation_mm - under) < ON_PLANE_MM
+        tolerance_mm[0, : len(surfels)][top] = top_mm
+    spread = getattr(template, "spread_mm", None)
+    place_mm = np.concatenate([surfels.place_mm, crossed_mm])
+    if spread is not None:
+        tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
+    if rounded_up is not None:
+        tolerance_mm[1] += rounded_up(place_mm, value_mm)
+    return Sites(
+        cells=len(surfels),
+        cell_mm=surfels.cell_mm,
+        place_mm=np.concatenate([feet_mm, crossed_mm]),
+        normal=np.concatenate([outward, seen.normals[seen.crossed]]),
+        value_mm=value_mm,
+        weight=np.concatenate([surfels.count, typical]),
+        tolerance_mm=tolerance_mm,
+        facing=np.concatenate([facing, faced]),
+        pose_mm=np.zeros(len(value_mm)),
+    )
+
+
+def agreed(
+    observe: Callable[[tuple[int, ...]], tuple[Observed, Sites]],
+    scan: Scan,
+    options: RegionOptions,
+    whole_part: bool,
+) -> tuple[Observed, Sites, Nuisance | None, tuple[Contradiction, ...]]:
+    """What was observed without views that contradict the others, and without nuisance.
+
+    `whole_part`: what belongs to the whole part or to whole views is told and taken out.
+    """
+    out: tuple[Contradiction, ...] = ()
+    while True:
+        seen, sites = observe(tuple(one.view for one in out))
+        by_view = None if scan.view_index is None else seen.surfels.by_view(scan.view_index)
+        nuisance, sites, by_view = _without_nuisance(sites, by_view, options, whole_part)
+        if out or by_view is None:
+            return seen, sites, nuisance, out
+        cell, view, value_mm, count = by_view
+        feet = np.floor(sites.place_mm[cell] / seen.surfels.cell_mm).astype(np.int64)
+        place = np.unique(feet, axis=0, return_inverse=True)[1].ravel()
+        out = contradictions(
+            place,
+            view,
+            value_mm,
+            count,
+            point_sigma_mm=seen.surfels.spread_mm,
+            options=NuisanceOptions(),
+        )
+        if not out:
+            return seen, sites, nuisance, out
+
+
+def _without_nuisance(
+    sites: Sites, by_view: ByView | None, options: RegionOptions, whole_part: bool
+) -> tuple[Nuisance | None, Sites, ByView | None]:
+    """What belongs to the whole part or to whole views, and what was seen without it."""
+    if not whole_part:
+        return None, sites, by_view
+    n = sites.cells
+    cell, view, value_mm, count = by_view or (
+        np.arange(n),
+        None,
+        sites.value_mm[:n],
+        sites.weight[:n],
+    )
+    found = fit_nuisance(
+        sites.place_mm[cell],
+        sites.normal[cell],
+        value_mm,
+        count.astype(np.float64),
+        view=view,
+        tolerance_mm=float(np.median(sites.tolerance_mm)),
+        correlation_mm=options.correlation_mm,
+    )
+    share_mm = found.removed_mm(sites.place_mm[cell], sites.normal[cell], view)
+    removed_mm = np.bincount(cell, count * share_mm, n) / np.bincount(cell, count, n)
+    whole_mm = sites.value_mm.copy()
+    whole_mm[:n] -= removed_mm
+    pose_mm = found.error_mm(sites.place_mm, sites.normal)
+    told = None if by_view is None or view is None else (cell, view, value_mm - share_mm, count)
+    return found, replace(sites, value_mm=whole_mm, pose_mm=pose_mm), told
+
+
+def tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:
+    """δ anywhere, and under the plane of the layer just printed, mm."""
+    if options.tolerance_mm is not None:
+        return options.tolerance_mm, options.tolerance_mm
+    sigma_mm = options.registration_sigma_mm
+    anywhere_mm = options.allowance_mm + float(np.hypot(2 * sigma_mm, template.bias_mm))
+    return anywhere_mm, min(options.allowance_mm, options.top_allowance_mm) + sigma_mm
