@@ -20,8 +20,8 @@ import numpy as np
 import trimesh
 from skimage.measure import marching_cubes
 
-from amrepair.consensus import fit_from_scans
 from amrepair.frames import rotation_from_vector
+from amrepair.merge import fit_from_scans
 from amrepair.scans import Scan
 from amrepair.simulate.part_files import part_path
 from amrepair.template import MeshSdf, extract_mesh, load_mesh
@@ -140,8 +140,8 @@ def from_scans(exact: MeshSdf, points: int) -> None:
     on = np.abs(template.distance(surface_of(exact.mesh)[0]))
     print(f"- consensus: {seconds:.1f} s; field on the true surface {micrometres(on)} µm;")
     print(f"  fused mesh to the CAD and back {two_way(fused, exact)} µm", flush=True)
-    from amrepair.consensus.cloud import outward, planes, spacing_of
-    from amrepair.consensus.fuse import _poisson
+    from amrepair.merge.cloud import outward, planes, spacing_of
+    from amrepair.merge.fuse import _poisson
 
     placed = np.concatenate(
         [s.points_mm @ m[:3, :3].T + m[:3, 3] for s, m in zip(scans, made.poses, strict=True)]  # type: ignore[attr-defined]

@@ -23,11 +23,10 @@ from amrepair.bench.synth_views import (
     sample_shape,
     sensor_towards,
 )
-from amrepair.consensus.fit import _piece
-from amrepair.consensus.register import Placed, place_all
-from amrepair.consensus.together import Piece
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
+from amrepair.merge.place import Placement, place
+from amrepair.merge.views import View
 from amrepair.scans import Scan
 from amrepair.template import load_mesh
 
@@ -53,18 +52,18 @@ def main() -> None:
         rng = np.random.default_rng(options.seed)
         wall, cpu = time.perf_counter(), time.process_time()
         try:
-            pieces = [_piece(scan, rng) for scan, _ in made]
-            found = place_all(pieces, rng)
+            seen = [View.of(scan, rng) for scan, _ in made]
+            found = place(seen, rng)
         except AlignmentError as error:
             said = f"refused: {error}"
         else:
             off = off_mm(made, found)
             verdict = "WRONG" if off.max() > WRONG_MM else "right"
             said = f"{len(off)} of {len(made)} placed, {verdict}, off {off.round(3).tolist()} mm"
-            held = held_mm(made, pieces, found)
+            held = held_mm(made, seen, found)
             ratios += [true / sigma for sigma, true in held if sigma > 0.0]
             said += "; held " + ", ".join(f"{sigma:.3f}/{true:.3f}" for sigma, true in held)
-            said += "".join(f"; {made[k][0].source} {why}" for k, why in found.reasons.items())
+            said += "".join(f"; {made[k][0].source} {why}" for k, why in found.left_out.items())
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         print(f"{part.stem}: {said}; {wall:.0f} s, {cpu:.0f} s of processor time", flush=True)
     if ratios:
@@ -99,13 +98,13 @@ def views(part: Path, options: argparse.Namespace) -> Made:
     return made
 
 
-def off_mm(made: Made, found: Placed) -> np.ndarray:
+def off_mm(made: Made, found: Placement) -> np.ndarray:
     """(k,) of each placed view; in the frame of the one that most others agree with."""
     every = []
-    for home, base in zip(found.which, found.poses, strict=True):
+    for home, base in found.poses.items():
         common_from_part = base @ made[home][1]
         row = []
-        for k, pose in zip(found.which, found.poses, strict=True):
+        for k, pose in found.poses.items():
             scan, from_part = made[k]
             points = scan.points_mm[::40]
             truth = moved(points, common_from_part @ np.linalg.inv(from_part))
@@ -116,17 +115,18 @@ def off_mm(made: Made, found: Placed) -> np.ndarray:
     return np.asarray(table[int(np.argmin(np.median(table, axis=1)))])
 
 
-def held_mm(made: Made, pieces: list[Piece], found: Placed) -> list[tuple[float, float]]:
+def held_mm(made: Made, views: list[View], found: Placement) -> list[tuple[float, float]]:
     """Of each placed view, what is said of it and what is true, across its surface."""
-    home = int(np.argmin([np.trace(slack.covariance) for slack in found.slacks]))
-    common_from_part = found.poses[home] @ made[found.which[home]][1]
+    home = min(found.slacks, key=lambda k: float(np.trace(found.slacks[k].covariance)))
+    common_from_part = found.poses[home] @ made[home][1]
     told = []
-    for k, pose, slack in zip(found.which, found.poses, found.slacks, strict=True):
-        points, normals = pieces[k].points_mm[::40], pieces[k].normals[::40]
+    for k, pose in found.poses.items():
+        surface = views[k].surface
+        points, normals = surface.points_mm[::40], surface.normals[::40]
         truth = moved(points, common_from_part @ np.linalg.inv(made[k][1]))
         across = ((moved(points, pose) - truth) * (normals @ pose[:3, :3].T)).sum(axis=1)
-        is_home = slack is found.slacks[home]
-        told.append((0.0 if is_home else slack.sigma_mm, float(np.abs(across).max())))
+        said = 0.0 if k == home else found.slacks[k].sigma_mm
+        told.append((said, float(np.abs(across).max())))
     return told
 
 

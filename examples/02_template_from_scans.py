@@ -13,8 +13,8 @@ import numpy as np
 from _shared import mesh_of, out_folder, scan_of
 
 import amrepair
-from amrepair.consensus import fit_from_scans
 from amrepair.frames import rotation_from_vector
+from amrepair.merge import fit_from_scans
 from amrepair.template import MeshSdf, extract_mesh
 
 

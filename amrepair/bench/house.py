@@ -22,9 +22,9 @@ from amrepair.align.thinning import order_of
 from amrepair.bench.bodies import standing_pose
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
-from amrepair.consensus import fit_from_scans
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
+from amrepair.merge import fit_from_scans
 from amrepair.scans.scan import Scan
 from amrepair.template import (
     LearnedSdf,

@@ -22,7 +22,7 @@ from amrepair.bench.house import class_template, repair_distance, top_mean
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
 from amrepair.bench.samples import Format
-from amrepair.consensus.cloud import planes, spacing_of
+from amrepair.merge.cloud import planes, spacing_of
 from amrepair.template import MeshSdf
 from amrepair.template.paper import CODE as CODE_RECIPE
 from amrepair.template.paper import PaperOptions

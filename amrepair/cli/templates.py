@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from amrepair.cli.files import sort_inputs, write_mesh
-from amrepair.cli.options import SeedOption, sensors, with_settings
+from amrepair.cli.options import JsonOption, SeedOption, sensors, with_settings
 from amrepair.errors import InputError
 from gcode.cli import console
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from amrepair.merge import ScanFit
     from amrepair.template import LearnedSdf, NetworkSdf
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
@@ -31,6 +32,8 @@ def add_to(app: typer.Typer) -> None:
         "amrepair template fit part.stl -o part.safetensors",
         "amrepair template fit part.3mf -o part.safetensors --device cpu --seed 1",
         "amrepair template fit view*.ply -o part.safetensors --sensor-at 0,0,400",
+        "amrepair template fit view*.ply -o part.safetensors --poses poses.json --json",
+        "amrepair template fit turn*.ply -o part.safetensors --turntable 36",
     ),
 )
 def fit(
@@ -61,10 +64,24 @@ def fit(
             "find each other surely; PLY and PCD files may carry it.",
         ),
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where the scans stand: .conf (Stanford), .aln (MeshLab) or .json (file name to "
+            "4×4). A poses.json beside the scans is taken unasked. The scans decide: poses that "
+            "do not fit are found anew."
+        ),
+    ] = None,
+    turntable: Annotated[
+        float | None,
+        typer.Option(help="The scans are a turntable's, in their order, so many degrees apart."),
+    ] = None,
     seed: SeedOption = 0,
+    as_json: JsonOption = False,
 ) -> None:
     """Fit the signed distance field that scans are held against."""
     with console.starting():
+        from amrepair.merge import fit_mesh
         from amrepair.template import fit_template
         from amrepair.template.paper import VARIANTS
 
@@ -76,21 +93,32 @@ def fit(
     console.writable(output)
     bars = console.Bars()
     meshes, scans = sort_inputs(inputs)
-    if sensor_at and not scans:
-        raise InputError("--sensor-at belongs to scans, only meshes are given")
+    for given, option in ((sensor_at, "sensor-at"), (poses, "poses"), (turntable, "turntable")):
+        if given and not scans:
+            raise InputError(f"--{option} belongs to scans, only meshes are given")
     if scans and recipe == "paper" and not meshes:
         raise InputError("the recipe paper needs a mesh; fit the scans with --recipe fast")
     template: LearnedSdf | NetworkSdf
+    told: dict[str, Any] = {}
     with bars.shown():
         if scans and recipe == "fast":
-            template = _from_scans(scans, meshes, sensors(sensor_at), seed, bars)
+            made = _from_scans(scans, meshes, sensors(sensor_at), poses, turntable, seed, bars)
+            template, told = made.template, made.as_json([str(path) for path in scans])
+        elif recipe == "fast" and len(meshes) == 1:
+            template = fit_mesh(meshes[0], seed=seed, progress=bars)
         else:
             template = fit_template(
                 meshes, recipe=recipe, paper=settings, device=device, seed=seed, progress=bars
             )
     template.save(output)
+    notes = [note for note in template.metadata.get("notes", "").split("; ") if note]
+    if as_json:
+        console.show_json(
+            {"template": str(output), "bias_mm": template.bias_mm, "notes": notes, **told}
+        )
+        return
     console.errors.print(f"{output}: surface good to {template.bias_mm:.3f} mm (99 %)")
-    for note in filter(None, template.metadata.get("notes", "").split("; ")):
+    for note in notes:
         console.errors.print(f"  {note}")
 
 
@@ -98,12 +126,15 @@ def _from_scans(
     scans: list[Path],
     meshes: list[Path],
     places: np.ndarray | None,
+    poses: Path | None,
+    turntable_deg: float | None,
     seed: int,
     bars: console.Bars,
-) -> LearnedSdf:
+) -> ScanFit:
     import numpy as np
 
-    from amrepair.consensus import fit_from_scans
+    from amrepair.merge import fit_from_scans
+    from amrepair.merge.told import POSES_FILE, read_poses
     from amrepair.scans import read_scan
     from amrepair.template import load_mesh
 
@@ -120,7 +151,19 @@ def _from_scans(
         for path, place in zip(scans, each, strict=True)
     ]
     mesh = load_mesh(meshes[0]) if meshes else None
-    return fit_from_scans(clouds, mesh=mesh, seed=seed, progress=bars).template
+    if poses is not None and turntable_deg is not None:
+        raise InputError("--poses and --turntable both say where the scans stand; give one")
+    beside = scans[0].parent / POSES_FILE
+    if poses is None and turntable_deg is None and beside.is_file():
+        poses = beside
+    return fit_from_scans(
+        clouds,
+        mesh=mesh,
+        poses=None if poses is None else read_poses(poses),
+        turntable_deg=turntable_deg,
+        seed=seed,
+        progress=bars,
+    )
 
 
 @template_app.command(

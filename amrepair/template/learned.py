@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from amrepair.errors import TemplateError
 from amrepair.template import learned_kernels as kernels
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     import trimesh
 
 KIND = "grid"
+MOST_COVER_CELLS = 200  # of what is known, along the longest side: 8 MB
 _ARRAYS = ("base", "cells", "blocks", "vertices_mm", "faces")
 
 
@@ -141,6 +143,51 @@ class Tolerance:
 
 
 @dataclass(frozen=True, slots=True)
+class Coverage:
+    """Where nobody knows what the part's surface is like: no scan of it looked there.
+
+    Attributes
+    ----------
+    origin_mm, cell_mm
+        Corner and edge of the cells, template frame.
+    unseen
+        (x, y, z) cells that hold surface nobody saw, and those beside them.
+    unseen_mm2
+        Area of that surface.
+    """
+
+    origin_mm: Float[np.ndarray, " 3"]
+    cell_mm: float
+    unseen: Bool[np.ndarray, "x y z"]
+    unseen_mm2: float
+
+    @classmethod
+    def of(
+        cls,
+        places_mm: Float[np.ndarray, "n 3"],
+        area_mm2: Float[np.ndarray, " n"],
+        bounds_mm: Float[np.ndarray, "2 3"],
+        cell_mm: float,
+    ) -> Coverage:
+        """Of pieces of surface that nobody saw: where, and how large each is."""
+        cell_mm = max(cell_mm, float(np.ptp(bounds_mm, axis=0).max()) / MOST_COVER_CELLS)
+        origin = bounds_mm[0] - 2.0 * cell_mm
+        shape = np.ceil((bounds_mm[1] + 2.0 * cell_mm - origin) / cell_mm).astype(int)
+        unseen = np.zeros(tuple(shape), bool)
+        unseen[tuple(((places_mm - origin) / cell_mm).astype(int).T)] = True
+        unseen = ndimage.binary_dilation(unseen, np.ones((3, 3, 3)))
+        return cls(origin, cell_mm, unseen, float(area_mm2.sum()))
+
+    def unseen_at(self, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """(n,) whether the surface nearest to a place near it is unknown."""
+        index = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
+        inside = ((index >= 0) & (index < self.unseen.shape)).all(axis=1)
+        found = np.zeros(len(points_mm), bool)
+        found[inside] = self.unseen[tuple(index[inside].T)]
+        return found
+
+
+@dataclass(frozen=True, slots=True)
 class LearnedSdf:
     """A fitted template (`Template`).
 
@@ -154,6 +201,8 @@ class LearnedSdf:
         Recipe, hashes, seed, versions.
     tolerance
         Of templates that were learned from several scans.
+    coverage
+        Of templates whose surface is not known everywhere.
     """
 
     grid: Grid
@@ -161,6 +210,7 @@ class LearnedSdf:
     bias_mm: float
     metadata: dict[str, str] = field(default_factory=dict)
     tolerance: Tolerance | None = None
+    coverage: Coverage | None = None
 
     @property
     def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
@@ -178,8 +228,15 @@ class LearnedSdf:
         return self.grid.distance_and_gradient(points_mm)
 
     def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """(n,) standard deviation between normal parts, 0 where none is known."""
-        return np.zeros(len(points_mm)) if self.tolerance is None else self.tolerance.at(points_mm)
+        """(n,) standard deviation between normal parts: the part's size where nobody knows."""
+        found = np.zeros(len(points_mm)) if self.tolerance is None else self.tolerance.at(points_mm)
+        if self.coverage is not None:
+            # what is far from a surface that was guessed is still of it
+            f_mm, outward = self.distance_and_gradient(points_mm)
+            unseen = self.coverage.unseen_at(points_mm - f_mm[:, None] * outward)
+            size_mm = float(np.linalg.norm(np.ptp(self.bounds_mm, axis=0)))
+            found = np.where(unseen | self.coverage.unseen_at(points_mm), size_mm, found)
+        return found
 
     @property
     def grid_numbers(self) -> tuple[Any, ...]:
@@ -226,6 +283,11 @@ class LearnedSdf:
             arrays["spread_mm"] = self.tolerance.spread_mm.astype(np.float32)
             head["spread_origin_mm"] = self.tolerance.origin_mm.tolist()
             head["spread_cell_mm"] = self.tolerance.cell_mm
+        if self.coverage is not None:
+            arrays["unseen"] = self.coverage.unseen.astype(np.uint8)
+            head["unseen_origin_mm"] = self.coverage.origin_mm.tolist()
+            head["unseen_cell_mm"] = self.coverage.cell_mm
+            head["unseen_mm2"] = self.coverage.unseen_mm2
         write_template(path, arrays, head)
 
     @classmethod
@@ -260,6 +322,7 @@ class LearnedSdf:
             bias_mm=float(head["bias_mm"]),
             metadata=stored_metadata(head),
             tolerance=_stored_tolerance(arrays, head),
+            coverage=_stored_coverage(arrays, head),
         )
 
 
@@ -270,4 +333,15 @@ def _stored_tolerance(arrays: dict[str, np.ndarray], head: dict[str, Any]) -> To
         np.array(head["spread_origin_mm"], dtype=np.float64),
         float(head["spread_cell_mm"]),
         arrays["spread_mm"],
+    )
+
+
+def _stored_coverage(arrays: dict[str, np.ndarray], head: dict[str, Any]) -> Coverage | None:
+    if "unseen" not in arrays:
+        return None
+    return Coverage(
+        np.array(head["unseen_origin_mm"], dtype=np.float64),
+        float(head["unseen_cell_mm"]),
+        arrays["unseen"].astype(bool),
+        float(head["unseen_mm2"]),
     )

@@ -30,6 +30,11 @@ from gcode.solids import (
 if TYPE_CHECKING:
     import trimesh
 
+
+class OpenMeshError(TemplateError):
+    """A mesh that was read and bounds no volume: it has holes, or is not manifold."""
+
+
 _log = logging.getLogger(__name__)
 
 # Cracks narrower than this share of the extent are closed: 0.01 mm on a part of 100 mm.
@@ -86,7 +91,7 @@ def load_mesh(path: Path | str) -> trimesh.Trimesh:
         unit, or is not a surface that bounds a volume and cannot be made one.
     """
     path = Path(path)
-    mesh = _read(path)
+    mesh = read_mesh(path)
     if (across_mm := float(np.linalg.norm(mesh.extents))) < LEAST_PART_MM:
         raise TemplateError(
             f"the mesh {path.name} is {across_mm:.3g} mm across, and no part is smaller than "
@@ -102,7 +107,14 @@ def load_mesh(path: Path | str) -> trimesh.Trimesh:
     return closed
 
 
-def _read(path: Path) -> trimesh.Trimesh:
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """A mesh as its file has it, mm; closed or not.
+
+    Raises
+    ------
+    TemplateError
+        If the file is missing, of another kind, unreadable, or has no triangles.
+    """
     import trimesh
 
     if not path.is_file():
@@ -195,7 +207,7 @@ def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str]) -> Any:
 
     before = edge_census(np.asarray(mesh.faces))
     if before.open_ratio > MAX_OPEN_EDGE_RATIO:
-        raise TemplateError(
+        raise OpenMeshError(
             f"the mesh {source} is a soup of polygons: {before.open} of {before.total} edges are "
             f"open ({before.open_ratio:.0%}, the limit is {MAX_OPEN_EDGE_RATIO:.0%}); "
             "export a closed solid"
@@ -211,10 +223,11 @@ def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str]) -> Any:
         solid = as_manifold(mesh.vertices, _with_lids(np.asarray(mesh.faces)))
     if not is_valid(solid):
         after = edge_census(np.asarray(mesh.faces))
-        raise TemplateError(
+        raise OpenMeshError(
             f"the mesh {source} is not a closed surface and cannot be mended: {after.open} open "
             f"and {after.crowded} edges of more than two faces are left (0 allowed); "
-            "repair it in the program it came from"
+            "repair it in the program it came from, or let 'amrepair template fit' make a template "
+            "of it by its winding number"
         )
     added = len(mesh.faces)
     notes.append(

@@ -93,7 +93,7 @@ CASES: dict[str, Callable[[str, Path], None]] = {
     "07_custom_scanner": custom_scanner,
     "08_custom_defect": custom_defect,
 }
-NEEDS = {"02_template_from_scans": "amrepair.consensus", "05_octoprint": "gcode.hosts.octoprint"}
+NEEDS = {"02_template_from_scans": "amrepair.merge", "05_octoprint": "gcode.hosts.octoprint"}
 SLOW = {
     "02_template_from_scans",
     "03_layerwise_loop",

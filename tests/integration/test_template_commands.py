@@ -49,7 +49,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scans = [write_scan(folder / f"{k}.ply", "bracket", k, 2.0 * k) for k in range(3)]
     done = call("template", "fit", *scans, "-o", folder / "bracket.safetensors")
     assert done.returncode == 0, done.stderr
-    assert "consensus of 3 of 3 scans" in done.stderr
+    assert "3 of 3 scans merged" in done.stderr
     for scan in scans:
         scan.unlink()
     done = call("template", "fit", PARTS / "pebble.stl", "-o", folder / "pebble.safetensors")

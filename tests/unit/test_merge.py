@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from amrepair.consensus import fit_from_scans
-from amrepair.consensus.cloud import outward, planes, spacing_of
-from amrepair.consensus.fit import _piece
-from amrepair.consensus.fuse import Cloud, Fused, fuse
-from amrepair.consensus.register import place_all
 from amrepair.errors import AlignmentError, InputError, TemplateError
 from amrepair.frames import rotation_from_vector
+from amrepair.merge import fit_from_scans
+from amrepair.merge.cloud import outward, planes, spacing_of
+from amrepair.merge.fuse import Cloud, Fused, fuse
+from amrepair.merge.place import Placement, place
+from amrepair.merge.views import View
 from amrepair.regions import Label, detect
 from amrepair.regions.calibration import NORMAL
 from amrepair.scans import Scan
@@ -67,7 +67,13 @@ def joined(clouds: list[np.ndarray]) -> Cloud:
     points = np.concatenate(clouds)
     together = spacing_of(points)
     scan = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-    return Cloud(points, outward(points, normals, together), scan, len(clouds), together, SIGMA_MM)
+    facing = outward(points, normals, together)
+    return Cloud(points, facing, scan, len(clouds), together, SIGMA_MM, max(spacing))
+
+
+def placed_together(scans: list[Scan]) -> Placement:
+    rng = np.random.default_rng(0)
+    return place([View.of(scan, rng) for scan in scans], rng)
 
 
 def fused_error(fused: Fused, part: AnalyticTemplate, away: float = 0.0) -> np.ndarray:
@@ -98,11 +104,10 @@ def test_normals_point_outwards_also_in_the_hole(part: AnalyticTemplate) -> None
 
 def test_scans_find_each_other(part: AnalyticTemplate) -> None:
     scans = [placed(points_of(part, 15_000, s), s) for s in range(3)]
-    rng = np.random.default_rng(0)
-    found = place_all([_piece(scan, rng) for scan in scans], rng)
-    assert found.which == (0, 1, 2)
+    found = placed_together(scans)
+    assert set(found.poses) == {0, 1, 2}
     corners = np.array(part.bounds_mm)
-    for s, matrix in enumerate(found.poses):
+    for s, matrix in found.poses.items():
         turn, shift = pose(s)
         back = (corners @ turn.T + shift) @ matrix[:3, :3].T + matrix[:3, 3]
         assert np.abs(back - corners).max() < 0.02  # σ over the root of 12,000, and its lever
@@ -118,8 +123,9 @@ def test_a_template_from_scans_is_the_part(part: AnalyticTemplate, tmp_path: Pat
     assert np.quantile(error_mm, 0.9) < 0.05  # the rest is edges, rounded by a fit's radius
     assert made.sigma_mm == pytest.approx(SIGMA_MM, rel=0.25)
     assert made.fused.unseen_ratio < 0.002
+    assert made.template.coverage is None or not made.template.coverage.unseen_at(truth).any()
     assert made.template.solid().volume() == pytest.approx(part.body.volume(), rel=0.003)
-    assert "2 of 2 scans" in made.template.metadata["notes"]
+    assert "2 of 2 scans merged" in made.template.metadata["notes"]
     made.template.save(tmp_path / "t.safetensors")
     again = load_template(tmp_path / "t.safetensors")
     assert isinstance(again, LearnedSdf)
@@ -139,6 +145,9 @@ def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
     assert fused_error(fused, part).max() < 0.5  # specks at edges; the bulge has 1.5
     assert fused_error(fused, part).mean() < 0.015
     assert fused.overruled_ratio > 0
+    # the two that are defective stand out, each where it is
+    assert fused.outvoted_mm2[2] > 5.0 * fused.outvoted_mm2[:2].max()
+    assert np.linalg.norm(fused.outvoted_at_mm[2] - spot) < 3.0
 
 
 def test_where_normal_parts_differ_the_spread_says_so(part: AnalyticTemplate) -> None:
@@ -211,8 +220,7 @@ def halves(part: AnalyticTemplate, first_mm: float, second_mm: float) -> list[Sc
 
 
 def test_overlapping_partial_scans_find_each_other(part: AnalyticTemplate) -> None:
-    rng = np.random.default_rng(0)
-    found = place_all([_piece(scan, rng) for scan in halves(part, 34.0, 5.0)], rng)
+    found = placed_together(halves(part, 34.0, 5.0))
     turn, shift = pose(1)
     corners = np.array(part.bounds_mm)
     back = (corners @ turn.T + shift) @ found.poses[1][:3, :3].T + found.poses[1][:3, 3]
@@ -221,9 +229,8 @@ def test_overlapping_partial_scans_find_each_other(part: AnalyticTemplate) -> No
 
 def test_a_plate_is_not_laid_on_its_other_half(part: AnalyticTemplate) -> None:
     # regression: the pose of the largest overlap was taken, which turns one half onto the other
-    rng = np.random.default_rng(0)
     with pytest.raises(AlignmentError, match="contradict"):
-        place_all([_piece(scan, rng) for scan in halves(part, 26.0, 12.0)], rng)
+        placed_together(halves(part, 26.0, 12.0))
 
 
 @pytest.mark.slow

@@ -13,9 +13,11 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from amrepair.consensus import consensus_kernels as kernels
+from amrepair.merge import fuse_kernels as kernels
 
 PLANE_POINTS = 25  # that a plane is fitted to, on average
+# A plane's radius over the noise, at least: 4 of them tilt it by some 3°. And how often it grows.
+PLANE_NOISES, GROWTHS, GROWTH = 8.0, 3, 1.6
 DIRECTIONS = 256  # a deep hole is open in one direction of a hundred
 # Cells that look around themselves; the others are told by their neighbours.
 LOOKING = 4
@@ -87,12 +89,21 @@ class Planes:
 
 
 def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
-    """Fit a plane at each point.
+    """Fit a plane at each point, over more of the surface where the noise asks for it.
 
     On flat ground the least variance of m points is σ²/m χ² with m − 3 degrees of freedom; edges
     and curves only add to it, so a low quantile is compared.
     """
     radius_mm = float(np.sqrt(PLANE_POINTS / np.pi)) * spacing_mm
+    for _ in range(GROWTHS):
+        found = _planes(points_mm, radius_mm)
+        if radius_mm >= PLANE_NOISES * found.sigma_mm:
+            break
+        radius_mm = min(GROWTH * radius_mm, PLANE_NOISES * found.sigma_mm)
+    return found
+
+
+def _planes(points_mm: Float[np.ndarray, "n 3"], radius_mm: float) -> Planes:
     cells = Cells.of(points_mm, radius_mm)
     ordered = np.ascontiguousarray(points_mm[cells.order])
     found, least, count = kernels.local_planes(

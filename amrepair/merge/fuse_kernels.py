@@ -16,6 +16,7 @@ from gcode.compiled import njit, prange
 MAX_NEAR = 2048
 # The scans' own variance is taken off twice: at edges they differ by where their points fell.
 NOISE_FACTOR = 2.0
+LAST_BIT = 62
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -164,7 +165,7 @@ def _median(values, n):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def consensus_field(
+def fused_nodes(
     nodes, points, normals, scan, scans, low, cell, shape, start, radius, sigma, rounds,
     least_points, outlier_sigmas, outlier_mm,
 ):  # fmt: skip
@@ -172,7 +173,7 @@ def consensus_field(
 
     Returns (n,) f (NaN without support), (n,) variance between scans less what their noise makes
     (may be negative by chance; NaN where one scan alone decides), (n,) scans that were heard, (n,)
-    scans that were overruled.
+    scans that were overruled, a bit for each (the last bit for all beyond it).
     """
     n = len(nodes)
     field = np.full(n, np.nan)
@@ -254,7 +255,9 @@ def consensus_field(
                     banned[s] = True
                 else:
                     kept += 1
-            overruled[k] = who - kept
+            for s in range(scans):
+                if banned[s]:
+                    overruled[k] |= np.int64(1) << min(s, LAST_BIT)
             if kept >= 2:
                 mean = 0.0
                 for s in range(scans):

@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from amrepair.consensus import consensus_kernels as kernels
-from amrepair.consensus.cloud import Cells
 from amrepair.device import open3d
 from amrepair.errors import TemplateError
+from amrepair.merge import fuse_kernels as kernels
+from amrepair.merge.cloud import Cells
 from amrepair.template.extract import zero_level
+from amrepair.template.learned import Coverage
 from amrepair.template.mesh_file import manifold_arrays
 from amrepair.template.mesh_sdf import MeshSdf
 from gcode.solids import as_manifold, is_valid
@@ -28,16 +29,22 @@ if TYPE_CHECKING:
 
 LEAST_POINTS = 6  # in reach of a node, or it has no support
 ROUNDS = 3  # of the robust fit
-OUTLIER_SIGMAS, OUTLIER_MM = 5.0, 0.02
+OUTLIER_SIGMAS, OUTLIER_SPACINGS = 5.0, 0.05
 FAR_SPACINGS = 24.0  # how far along the normal another scan's surface contradicts a point
 FACING = 0.3
 MAX_NODES = 60_000_000
+BLOCK = 8  # nodes along its edge
 POISSON_DEPTH, POISSON_POINTS = 8, 150_000
+MOST_EDGES = 400  # of the grid, along the longest side
+OUTVOTED_TIMES = 2  # marks in a cell, or it is chance
+# Surface farther than so many of the sparsest scan's spacings from any point was not seen.
+SEEN_SPACINGS = 3.0
 SURE = 0.97  # share of a component's neighbours that must agree about its side
 DUST_RATIO = 1e-3  # closed pieces smaller than this share of the whole are clutter
 SPREAD_CELLS = 5  # nodes along the edge of a cell of the stored spread
+WANTED_SPACINGS = 0.05
 LEAST_NODES = 8  # that a cell's spread is pooled from
-LEAST_SPREAD_MM = 0.01  # below this chance cannot be told from disagreement
+LEAST_SPREAD_NOISES = 1 / 3  # below this chance cannot be told from disagreement
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +59,8 @@ class Cloud:
         (n,) which scan each point is of.
     scans
         How many there are.
+    spacing_mm, sparsest_mm
+        Of all together, and of the sparsest of them.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -60,6 +69,7 @@ class Cloud:
     scans: int
     spacing_mm: float
     sigma_mm: float
+    sparsest_mm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +113,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """The consensus.
+    """What placed scans say together.
 
     Attributes
     ----------
@@ -117,6 +127,12 @@ class Fused:
         Shares of the surface that no scan, or one alone, saw, and where a scan was overruled.
     rejected
         Points that other scans contradict.
+    outvoted_mm2
+        (scans,) the largest piece of surface on which each scan was outvoted by the others.
+    outvoted_at_mm
+        (scans, 3) where that is.
+    coverage
+        What no scan saw.
     """
 
     mesh: trimesh.Trimesh
@@ -126,6 +142,9 @@ class Fused:
     single_ratio: float
     overruled_ratio: float
     rejected: int
+    outvoted_mm2: Float[np.ndarray, " scans"]
+    outvoted_at_mm: Float[np.ndarray, "scans 3"]
+    coverage: Coverage
 
 
 def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None = None) -> Fused:
@@ -143,18 +162,19 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None 
     TemplateError
         If the points make no closed surface, or the grid would be too large.
     """
-    keep = ~_contradicted(cloud)
-    rejected = int((~keep).sum())
+    against, lonely = _contradicted(cloud)
+    keep = ~(against | lonely)
     points, normals, scan = cloud.points_mm[keep], cloud.normals[keep], cloud.scan[keep]
     radius_mm = reach_mm(cloud)
-    edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / 400.0)
+    edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
     low, shape, nodes, index = _band(points, edge, radius_mm, behind)
     cells = Cells.of(points, radius_mm)
-    field, excess, heard, overruled = kernels.consensus_field(
+    field, excess, heard, overruled = kernels.fused_nodes(
         nodes, np.ascontiguousarray(points[cells.order]),
         np.ascontiguousarray(normals[cells.order]), np.ascontiguousarray(scan[cells.order]),
         cloud.scans, cells.low_mm, cells.cell_mm, cells.shape, cells.start, radius_mm,
-        max(cloud.sigma_mm, 1e-4), ROUNDS, LEAST_POINTS, OUTLIER_SIGMAS, OUTLIER_MM,
+        max(cloud.sigma_mm, 1e-4 * cloud.spacing_mm), ROUNDS, LEAST_POINTS, OUTLIER_SIGMAS,
+        OUTLIER_SPACINGS * cloud.spacing_mm,
     )  # fmt: skip
     # a plane fitted to points far below says little about a node high above them
     field[np.abs(field) > 1.01 * radius_mm] = np.nan
@@ -162,33 +182,83 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None 
     grid[tuple(index.T)] = field
     seen = np.isfinite(grid)
     _fill(grid, seen, low, edge, (points, normals), behind)
-    mesh = _surface(grid, low, edge)
+    mesh = solid_surface(grid, low, edge)
     close = np.isfinite(field) & (np.abs(field) < edge)
-    spread = _spread(excess, close, index, low, edge, shape) if cloud.scans > 1 else None
+    spread = _spread(cloud, excess, close, index, low, edge, shape) if cloud.scans > 1 else None
+    area_mm2, at_mm = _outvoted(cloud, against, nodes[close], overruled[close], radius_mm)
+    coverage = _coverage(mesh, points, SEEN_SPACINGS * cloud.sparsest_mm)
     return Fused(
         mesh=mesh,
         spread=spread,
         standard_error_mm=_standard_error(cloud, spread, radius_mm),
-        unseen_ratio=_unseen(mesh, seen, low, edge),
+        unseen_ratio=coverage.unseen_mm2 / float(mesh.area),
         single_ratio=float((heard[close] == 1).mean()) if close.any() else 1.0,
         overruled_ratio=float((overruled[close] > 0).mean()) if close.any() else 0.0,
-        rejected=rejected,
+        rejected=int((~keep).sum()),
+        outvoted_mm2=area_mm2,
+        outvoted_at_mm=at_mm,
+        coverage=coverage,
     )
 
 
+def _outvoted(
+    cloud: Cloud,
+    against: Bool[np.ndarray, " n"],
+    nodes_mm: Float[np.ndarray, "k 3"],
+    overruled: Int[np.ndarray, " k"],
+    radius_mm: float,
+) -> tuple[Float[np.ndarray, " scans"], Float[np.ndarray, "scans 3"]]:
+    """The largest connected piece of surface on which each scan was outvoted, and its middle.
+
+    By points that other scans contradict, and by nodes at which a scan was overruled; counted in
+    cells of a fit's radius, each about its square.
+    """
+    area, at = np.zeros(cloud.scans), np.zeros((cloud.scans, 3))
+    low = cloud.points_mm.min(axis=0)
+    for s in range(cloud.scans):
+        own = cloud.points_mm[against & (cloud.scan == s)]
+        heard = nodes_mm[(overruled >> min(s, kernels.LAST_BIT)) & 1 == 1]
+        places = np.concatenate([own, heard])
+        cell, count = np.unique(
+            np.floor((places - low) / radius_mm).astype(np.int64), axis=0, return_counts=True
+        )
+        cell = cell[count >= OUTVOTED_TIMES]
+        if not len(cell):
+            continue
+        box = np.zeros(tuple(np.ptp(cell, axis=0) + 1), bool)
+        box[tuple((cell - cell.min(axis=0)).T)] = True
+        label, _ = ndimage.label(box, np.ones((3, 3, 3)))
+        sizes = np.bincount(label.ravel())[1:]
+        largest = np.argwhere(label == 1 + int(np.argmax(sizes))) + cell.min(axis=0)
+        area[s] = sizes.max() * radius_mm**2
+        at[s] = low + (largest.mean(axis=0) + 0.5) * radius_mm
+    return area, at
+
+
+def _coverage(
+    mesh: trimesh.Trimesh, points_mm: Float[np.ndarray, "n 3"], reach_mm: float
+) -> Coverage:
+    """Which of the surface no point lies near, in cells as wide as that reach."""
+    from scipy.spatial import cKDTree
+
+    centre, area = np.asarray(mesh.triangles_center), np.asarray(mesh.area_faces)
+    far = np.isinf(cKDTree(points_mm).query(centre, distance_upper_bound=reach_mm)[0])
+    return Coverage.of(centre[far], area[far], np.asarray(mesh.bounds), reach_mm)
+
+
 def reach_mm(cloud: Cloud) -> float:
-    """Radius of a fit: enough points to bring the noise to 5 µm, or to a twentieth of the spacing.
+    """Radius of a fit: enough points to bring the noise to a twentieth of the spacing.
 
     The kernel (1 − d²/r²)⁴ over a plane has 0.36 of its points' weight (Σw)²/Σw².
     """
-    wanted_mm = max(0.005, 0.05 * cloud.spacing_mm)
+    wanted_mm = WANTED_SPACINGS * cloud.spacing_mm
     least = max(24.0, 8.0 * cloud.scans)  # so that each scan alone has a word
     count = float(np.clip((cloud.sigma_mm / wanted_mm) ** 2 / 0.36, least, 120.0))
     return float(np.sqrt(count / np.pi)) * cloud.spacing_mm
 
 
-def _contradicted(cloud: Cloud) -> Bool[np.ndarray, " n"]:
-    """(n,) points in cells that hold next to nothing, or that most other scans contradict."""
+def _contradicted(cloud: Cloud) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """(n,) points that most other scans contradict; (n,) in cells that hold next to nothing."""
     cell_mm = 2.2 * cloud.spacing_mm * np.sqrt(cloud.scans)
     low = cloud.points_mm.min(axis=0) - 2 * cell_mm
     index = np.floor((cloud.points_mm - low) / cell_mm).astype(np.int64)
@@ -219,7 +289,7 @@ def _contradicted(cloud: Cloud) -> Bool[np.ndarray, " n"]:
         np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.float32), 3
     ).reshape(-1)
     lonely = (27.0 * around[places % int(np.prod(shape))] < LEAST_POINTS) & (support == 0)
-    return (against | lonely)[surfel]
+    return against[surfel], lonely[surfel]
 
 
 def _band(
@@ -282,8 +352,29 @@ def _fill(
         return
     asked = np.isin(parts, [outer, *doubtful]) & ~seen if behind is None else ~seen
     closing = behind if behind is not None else _poisson(*oriented)
+    _ask(grid, asked, closing, low, edge)
+
+
+def _ask(
+    grid: Float[np.ndarray, "x y z"],
+    asked: Bool[np.ndarray, "x y z"],
+    closing: MeshSdf,
+    low: Float[np.ndarray, " 3"],
+    edge: float,
+) -> None:
+    """Distances to a surface at some nodes, in place: exact near it, of its side elsewhere.
+
+    A block whose middle lies farther off than its half diagonal holds none of the surface.
+    """
+    block = np.argwhere(asked) // BLOCK
+    blocks, of_block = np.unique(block, axis=0, return_inverse=True)
+    half_mm = 0.5 * np.sqrt(3.0) * BLOCK * edge
+    far = closing.distance(low + edge * (BLOCK * blocks + 0.5 * (BLOCK - 1)))
+    found = np.copysign(edge, far)[of_block.ravel()].astype(np.float32)
+    near = (np.abs(far) <= half_mm)[of_block.ravel()]
     where = np.argwhere(asked)
-    grid[asked] = closing.distance(low + edge * where).astype(np.float32)
+    found[near] = closing.distance(low + edge * where[near])
+    grid[asked] = found
 
 
 def _poisson(points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> MeshSdf:
@@ -304,7 +395,7 @@ def _poisson(points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
     return MeshSdf.from_mesh(made)
 
 
-def _surface(
+def solid_surface(
     grid: Float[np.ndarray, "x y z"], low: Float[np.ndarray, " 3"], edge: float
 ) -> trimesh.Trimesh:
     """Marching cubes, without dust; a valid solid."""
@@ -337,6 +428,7 @@ def _surface(
 
 
 def _spread(
+    cloud: Cloud,
     excess: Float[np.ndarray, " k"],
     close: Bool[np.ndarray, " k"],
     index: Int[np.ndarray, "k 3"],
@@ -354,7 +446,7 @@ def _spread(
     pooled = np.bincount(key, weights=excess[used], minlength=cells) / np.maximum(count, 1)
     pooled[count < LEAST_NODES] = 0.0
     found = np.sqrt(np.maximum(pooled, 0.0)).astype(np.float32)
-    found[found < LEAST_SPREAD_MM] = 0.0
+    found[found < LEAST_SPREAD_NOISES * cloud.sigma_mm] = 0.0
     grown = ndimage.maximum_filter(found.reshape(tuple(size)), size=3)
     return Spread(low - 0.5 * edge, SPREAD_CELLS * edge, grown)
 
@@ -367,16 +459,3 @@ def _standard_error(cloud: Cloud, spread: Spread | None, radius_mm: float) -> fl
         return float(noise_mm)
     high = float(np.quantile(spread.values_mm[spread.values_mm > 0], 0.99))
     return float(np.hypot(noise_mm, high / np.sqrt(cloud.scans)))
-
-
-def _unseen(
-    mesh: trimesh.Trimesh,
-    seen: Bool[np.ndarray, "x y z"],
-    low: Float[np.ndarray, " 3"],
-    edge: float,
-) -> float:
-    """Share of the surface's area in cells where no scan had support."""
-    index = np.rint((np.asarray(mesh.triangles_center) - low) / edge).astype(np.int64)
-    index = np.clip(index, 0, np.array(seen.shape) - 1)
-    area = np.asarray(mesh.area_faces)
-    return float(area[~seen[tuple(index.T)]].sum() / area.sum())

@@ -2,7 +2,7 @@
 
 One system of normal equations over the graph of overlaps: what slips against the rest as a group
 (views from below, on each other) does not wait for its members one by one. It refines poses that
-`assemble` and `propose` found; it does not find any.
+`groups` found; it does not find any.
 
 How sure a pose is needs care in two places. A plane's normal is an estimate, and squares of its
 noise look like knowledge of directions in which the faces tell nothing; the normals of the two
@@ -18,11 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from amrepair.align.registration import bounded_inverse
-from amrepair.consensus.views import loss_weight
 from amrepair.frames import motion_about, moved
+from amrepair.merge.views import View, loss_weight
 
 SAMPLED, LEAST_SAMPLED = 48_000, 4_000  # points of all scans together; of each
 ROUNDS = 15
@@ -30,8 +29,11 @@ SHRINK = 0.6
 WITHIN_SPACINGS = 4.0  # of the other scan: farther apart are no pair
 AGREES = 0.9  # cosine of the normals of a pair: edges are blends of two faces
 LEAST_PAIRS = 100  # of two scans, or they say nothing of each other
-STILL_MM = 2e-4
-SCALE_SIGMAS, FIRST_SIGMAS, FIRST_SPACINGS = 4.0, 10.0, 0.5  # of the Geman–McClure loss
+STILL_SPACINGS = 1e-3  # a smaller step ends it
+# Scale of the Geman–McClure loss: of the noise; at first, of the residuals' median and the spacing,
+# so that poses find together which the groups left a millimetre apart. And the least, of a spacing:
+# scans without noise differ by rounding.
+SCALE_NOISES, FIRST_MEDIANS, FIRST_SPACINGS, LEAST_SPACINGS = 4.0, 4.0, 0.5, 5e-3
 DAMPING = 1e-7
 # Residuals of one facing within this share of the part err alike.
 PATCH_RATIO = 0.04
@@ -43,35 +45,6 @@ LOOKED_AT = 20_000  # points of a scan, for where its surface is held worst
 FREE_RATIO = 1e-6
 # Slips of more than so many spacings are contradicted by what the sensors saw through.
 HELD_SPACINGS = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class Piece:
-    """A scan as registration needs it, in its own frame.
-
-    Attributes
-    ----------
-    normals
-        (n, 3) unit normals; to the sensor's side where `faces`, else of either sign.
-    rough_mm
-        (n,) how far the points around lie from the plane, beyond the noise.
-    tree
-        Of the points.
-    sensors_mm, sensor_index
-        (k, 3) and (n,): where the sensors stood, and which saw each point; None where the file
-        does not say.
-    """
-
-    name: str
-    points_mm: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    rough_mm: Float[np.ndarray, " n"]
-    spacing_mm: float
-    sigma_mm: float
-    tree: cKDTree
-    sensors_mm: Float[np.ndarray, "k 3"] | None = None
-    sensor_index: Int[np.ndarray, " n"] | None = None
-    faces: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,20 +106,20 @@ class _Pairs:
 
 
 def together(
-    pieces: Sequence[Piece], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
+    views: Sequence[View], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
 ) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
     """All poses but the first, refined jointly; and the residual's root mean square, mm."""
     found = [np.array(pose) for pose in poses]
-    sample = _samples(pieces, rng)
-    last_mm = _scale_mm(pieces)
-    scale_mm = max(
-        FIRST_SIGMAS / SCALE_SIGMAS * last_mm, FIRST_SPACINGS * max(p.spacing_mm for p in pieces)
-    )
-    rmse_mm = 0.0
+    sample = _samples(views, rng)
+    last_mm, spacing_mm = _scale_mm(views), max(view.spacing_mm for view in views)
+    scale_mm = rmse_mm = 0.0
     for _ in range(ROUNDS):
-        pairs = _pairs(pieces, found, sample)
+        pairs = _pairs(views, found, sample)
         if len(pairs.of) < LEAST_PAIRS:
             break
+        if scale_mm == 0.0:
+            median_mm = float(np.median(np.abs(pairs.height_mm)))
+            scale_mm = max(last_mm, FIRST_MEDIANS * median_mm, FIRST_SPACINGS * spacing_mm)
         weight = loss_weight(pairs.height_mm, scale_mm)
         rmse_mm = float(np.sqrt((weight * pairs.height_mm**2).sum() / weight.sum()))
         centre, size_mm = _frame(pairs)
@@ -158,39 +131,45 @@ def together(
         step = -np.linalg.solve(free, push[6:]).reshape(-1, 6)
         for k, own in enumerate(step, 1):
             found[k] = motion_about(centre, own[:3] / size_mm, own[3:]) @ found[k]
-        if float(np.abs(step).max()) < STILL_MM and scale_mm <= last_mm:
+        if float(np.abs(step).max()) < STILL_SPACINGS * spacing_mm and scale_mm <= last_mm:
             break
         scale_mm = max(last_mm, SHRINK * scale_mm)
     return found, rmse_mm
 
 
 def slacks(
-    pieces: Sequence[Piece], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
+    views: Sequence[View], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
 ) -> list[Slack]:
     """How surely each refined pose is held, against the scan against which most are held best."""
-    count = len(pieces)
-    pairs = _pairs(pieces, poses, _samples(pieces, rng))
-    weight = loss_weight(pairs.height_mm, _scale_mm(pieces))
+    count = len(views)
+    pairs = _pairs(views, poses, _samples(views, rng))
+    weight = loss_weight(pairs.height_mm, _scale_mm(views))
     centre, size_mm = _frame(pairs)
     along = _jacobian(pairs.points_mm, pairs.planes, centre, size_mm)
     instrument = _jacobian(pairs.points_mm, pairs.own, centre, size_mm)
     information, _ = _equations(pairs, along, instrument, weight, count)
-    scatter = _scatter(pieces, pairs, instrument, weight)
+    scatter = _scatter(views, pairs, instrument, weight)
     open_ = [_open(information, scatter, home) for home in range(count)]
     best = min(open_, key=lambda blocks: float(np.median([np.trace(b) for b in blocks])))
     return [
-        _slack(piece, pose, block, centre, size_mm)
-        for piece, pose, block in zip(pieces, poses, best, strict=True)
+        _slack(view, pose, block, centre, size_mm)
+        for view, pose, block in zip(views, poses, best, strict=True)
     ]
 
 
-def _samples(pieces: Sequence[Piece], rng: np.random.Generator) -> list[Int[np.ndarray, " _"]]:
-    each = max(LEAST_SAMPLED, SAMPLED // len(pieces))
-    return [rng.permutation(len(p.points_mm))[:each] for p in pieces]
+def _reach_mm(view: View, other: View) -> float:
+    """How far apart a point and the nearest one of its own surface may lie."""
+    noise_mm = float(np.hypot(view.sigma_mm, other.sigma_mm))
+    return WITHIN_SPACINGS * other.spacing_mm + SCALE_NOISES * noise_mm
 
 
-def _scale_mm(pieces: Sequence[Piece]) -> float:
-    return SCALE_SIGMAS * max(1e-3, *(p.sigma_mm for p in pieces))
+def _samples(views: Sequence[View], rng: np.random.Generator) -> list[Int[np.ndarray, " _"]]:
+    each = max(LEAST_SAMPLED, SAMPLED // len(views))
+    return [rng.permutation(len(p.surface.points_mm))[:each] for p in views]
+
+
+def _scale_mm(views: Sequence[View]) -> float:
+    return max(max(SCALE_NOISES * v.sigma_mm, LEAST_SPACINGS * v.spacing_mm) for v in views)
 
 
 def _frame(pairs: _Pairs) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -209,32 +188,34 @@ def _jacobian(
 
 
 def _pairs(
-    pieces: Sequence[Piece],
+    views: Sequence[View],
     poses: Sequence[Float[np.ndarray, "4 4"]],
     sample: Sequence[Int[np.ndarray, " _"]],
 ) -> _Pairs:
     """Sampled points of each scan with the nearest planes of every other that face their way."""
     found: list[tuple[np.ndarray, ...]] = []
-    for k, piece in enumerate(pieces):
-        own = moved(piece.points_mm[sample[k]], poses[k])
-        facing = piece.normals[sample[k]] @ poses[k][:3, :3].T
-        for r, other in enumerate(pieces):
+    for k, view in enumerate(views):
+        own = moved(view.surface.points_mm[sample[k]], poses[k])
+        facing = view.surface.normals[sample[k]] @ poses[k][:3, :3].T
+        for r, other in enumerate(views):
             if r == k:
                 continue
             local = moved(own, np.linalg.inv(poses[r]))
-            reach, index = other.tree.query(
-                local, distance_upper_bound=WITHIN_SPACINGS * other.spacing_mm, workers=-1
+            reach, index = other.surface.tree.query(
+                local, distance_upper_bound=_reach_mm(view, other), workers=-1
             )
             near = np.flatnonzero(np.isfinite(reach))
             index = index[near]
-            plane = other.normals[index] @ poses[r][:3, :3].T
+            plane = other.surface.normals[index] @ poses[r][:3, :3].T
             cosine = (plane * facing[near]).sum(axis=1)
-            signed = piece.faces and other.faces
+            signed = bool(view.looks.each and other.looks.each)
             agrees = (cosine if signed else np.abs(cosine)) > AGREES
             near, index, plane = near[agrees], index[agrees], plane[agrees]
-            height = ((local[near] - other.points_mm[index]) * other.normals[index]).sum(axis=1)
+            height = (
+                (local[near] - other.surface.points_mm[index]) * other.surface.normals[index]
+            ).sum(axis=1)
             turned = facing[near] * np.sign(cosine[agrees])[:, None]
-            rough = np.maximum(piece.rough_mm[sample[k]][near], other.rough_mm[index])
+            rough = np.maximum(view.rough_mm[sample[k]][near], other.rough_mm[index])
             of = np.full(len(near), k)
             found.append((of, np.full(len(near), r), own[near], plane, turned, height, rough))
     return _Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))
@@ -279,15 +260,15 @@ def _add(total: Float[np.ndarray, "n n"], k: int, r: int, block: Float[np.ndarra
 
 
 def _scatter(
-    pieces: Sequence[Piece],
+    views: Sequence[View],
     pairs: _Pairs,
     instrument: Float[np.ndarray, "q 6"],
     weight: Float[np.ndarray, " q"],
 ) -> Float[np.ndarray, "n n"]:
     """Covariance of what the residuals push at: by patches, with what a patch may share."""
-    count = len(pieces)
-    spacing = np.array([p.spacing_mm for p in pieces])
-    sigma = np.array([p.sigma_mm for p in pieces])
+    count = len(views)
+    spacing = np.array([p.spacing_mm for p in views])
+    sigma = np.array([p.sigma_mm for p in views])
     first, second = np.minimum(pairs.of, pairs.other), np.maximum(pairs.of, pairs.other)
     low = pairs.points_mm.min(axis=0)
     edge_mm = PATCH_RATIO * float(np.linalg.norm(np.ptp(pairs.points_mm, axis=0)))
@@ -332,16 +313,16 @@ def _open(
 
 
 def _slack(
-    piece: Piece,
+    view: View,
     pose: Float[np.ndarray, "4 4"],
     covariance: Float[np.ndarray, "6 6"],
     centre_mm: Float[np.ndarray, " 3"],
     size_mm: float,
 ) -> Slack:
-    some = slice(None, None, len(piece.points_mm) // LOOKED_AT + 1)
-    points = moved(piece.points_mm[some], pose)
-    normals = piece.normals[some] @ pose[:3, :3].T
-    most_mm = HELD_SPACINGS * piece.spacing_mm
+    some = slice(None, None, len(view.surface.points_mm) // LOOKED_AT + 1)
+    points = moved(view.surface.points_mm[some], pose)
+    normals = view.surface.normals[some] @ pose[:3, :3].T
+    most_mm = HELD_SPACINGS * view.spacing_mm
     made = Slack(covariance, centre_mm, size_mm, most_mm, 0.0, np.array([0.0, 0.0, 1.0]))
     sigma = made.across(points, normals)
     worst = int(np.argmax(sigma))

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from manifold3d import Manifold
 
-from amrepair.consensus.fit import _piece, _said, _weak
-from amrepair.consensus.fuse import Cloud, Spread
-from amrepair.consensus.register import Placed
-from amrepair.consensus.together import Piece, slacks, together
 from amrepair.frames import moved, rotation_from_vector
+from amrepair.merge.fit import _said_weak
+from amrepair.merge.fuse import Cloud, Spread
+from amrepair.merge.joint import slacks, together
+from amrepair.merge.views import Surface, View
 from amrepair.scans import Scan
 from tests.analytic import box, difference, sample_surface
 
@@ -25,20 +26,23 @@ SLOPES = Manifold.cylinder(10.0, 15.0, 10.0, 5)  # of a pyramid: any three hold 
 
 def look(
     body: Manifold, seed: int, way: tuple[float, float, float], deepest: float = -0.05
-) -> Piece:
+) -> View:
     """Points of the faces that look that way or across it, in the part's frame."""
     points, normals = sample_surface(body, SPACING_MM, seed=seed)
     rng = np.random.default_rng(seed)
     keep = normals @ np.array(way) >= deepest
     keep &= rng.random(len(points)) < 0.8
     noisy = points[keep] + rng.normal(0.0, SIGMA_MM, (int(keep.sum()), 3))
-    piece = _piece(Scan(noisy, SIGMA_MM, "scanner", source=f"look{seed}"), rng)
+    far = 1_000.0 * np.array(way) + noisy.mean(axis=0)
+    told = Scan(noisy, SIGMA_MM, "scanner", sensors_mm=far[None],
+                sensor_index=np.zeros(len(noisy), np.int64), source=f"look{seed}")  # fmt: skip
+    view = View.of(told, rng)
     # each estimated normal to the side of the true one
     order = np.lexsort(noisy.T[::-1])
     true = normals[keep][order]
-    side = np.sign((piece.normals * true).sum(axis=1))
-    return Piece(piece.name, piece.points_mm, piece.normals * side[:, None], piece.rough_mm,
-                 piece.spacing_mm, piece.sigma_mm, piece.tree, faces=True)  # fmt: skip
+    side = np.sign((view.surface.normals * true).sum(axis=1))
+    return replace(view, surface=Surface.of(view.surface.points_mm,
+                                            view.surface.normals * side[:, None]))  # fmt: skip
 
 
 def shifted(shift: Sequence[float] | np.ndarray, turn_rad: float = 0.0) -> np.ndarray:
@@ -82,8 +86,8 @@ def test_what_is_said_of_poses_is_true() -> None:
         said = slacks(pieces, poses, rng)
         home = int(np.argmin([np.trace(slack.covariance) for slack in said]))
         for k in {0, 1, 2} - {home}:
-            here, normals = moved(pieces[k].points_mm, poses[k]), pieces[k].normals
-            off = here - moved(pieces[k].points_mm, poses[home])
+            here, normals = moved(pieces[k].surface.points_mm, poses[k]), pieces[k].surface.normals
+            off = here - moved(pieces[k].surface.points_mm, poses[home])
             across = np.abs((off * (normals @ poses[k][:3, :3].T)).sum(axis=1))
             ratios.append(float(across.max()) / said[k].sigma_mm)
     assert np.mean(np.array(ratios) <= 3.0) >= 0.97
@@ -110,12 +114,10 @@ def test_both_sides_of_a_thin_wall_are_no_pair() -> None:
 
 def test_a_weak_scan_is_named_with_direction_and_size() -> None:
     pieces = [look(WALLS, 0, UP), look(WALLS, 1, DOWN)]
-    poses = (np.eye(4), np.eye(4))
-    said = tuple(slacks(pieces, list(poses), np.random.default_rng(0)))
-    placed = Placed((0, 1), poses, SIGMA_MM, (), slacks=said)
-    scans = [Scan(p.points_mm, SIGMA_MM, "scanner", source=p.name) for p in pieces]
-    weak = _weak(placed, SIGMA_MM)
-    sentences = _said(scans, placed, weak)
+    said = slacks(pieces, [np.eye(4), np.eye(4)], np.random.default_rng(0))
+    weak = {k: slack for k, slack in enumerate(said) if slack.sigma_mm > SIGMA_MM}
+    scans = [Scan(p.surface.points_mm, SIGMA_MM, "scanner", source=p.name) for p in pieces]
+    sentences = _said_weak(scans, weak)
     assert len(sentences) == 1
     name = pieces[next(iter(weak))].name
     assert sentences[0].startswith(f"{name} is held along (")
@@ -130,7 +132,7 @@ def test_tolerance_grows_where_only_a_weak_scan_looked() -> None:
     points.append(rng.uniform((0, 0, 0), (30, 10, 1), (6_000, 3)))
     scan = np.repeat([0, 1, 2], [len(p) for p in points])
     every = np.concatenate(points)
-    cloud = Cloud(every, np.tile([0.0, 0.0, 1.0], (len(every), 1)), scan, 3, 0.2, SIGMA_MM)
+    cloud = Cloud(every, np.tile([0.0, 0.0, 1.0], (len(every), 1)), scan, 3, 0.2, SIGMA_MM, 0.2)
     spread = Spread(np.zeros(3), 1.0, np.full((30, 10, 1), 0.03, np.float32))
     wider = spread.widened(cloud, np.where(scan == 2, 0.2, 0.0))
     assert wider.values_mm[:8] == pytest.approx(0.03)

@@ -8,10 +8,39 @@ import numpy as np
 from gcode.compiled import njit, prange
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pixel(point, sensor, axes, scale, distance, sheet):
+    """Of a place: its pixel, how deep it lies along the middle ray, and its own ray.
+
+    Within a moving sheet of light (`sheet`) rays do not spread along its way, axis 1.
+    """
+    x, y, z = point[0] - sensor[0], point[1] - sensor[1], point[2] - sensor[2]
+    depth = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
+    down = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
+    u = int(np.floor((axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z) / depth * scale))
+    v = int(np.floor(down / (distance if sheet else depth) * scale))
+    if sheet:
+        x, y, z = x - down * axes[1, 0], y - down * axes[1, 1], z - down * axes[1, 2]
+    return u, v, depth, x, y, z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pixels(points, sensor, axes, scale, distance, sheet):
+    """(n,) columns and rows of places in a sensor's image, and how far off they are."""
+    n = len(points)
+    u, v, reach = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
+    for k in range(n):
+        u[k], v[k], _, x, y, z = _pixel(points[k], sensor, axes, scale, distance, sheet)
+        reach[k] = np.sqrt(x * x + y * y + z * z)
+    return u, v, reach
+
+
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def seen_through(points, normals, asked, sensor, axes, distance, pixel, first, least, outside,
-                 within, edge_on, found):  # fmt: skip
+                 within, edge_on, sheet, silhouette, found):  # fmt: skip
     """Say of the places asked about whether the sensor saw through them; in `found`.
+
+    Beside the silhouette it saw through, too, where that is believed (`silhouette`).
 
     `normals` is empty, or of surface there: what stands edge-on to the rays may be there unseen.
     """
@@ -20,32 +49,29 @@ def seen_through(points, normals, asked, sensor, axes, distance, pixel, first, l
     has_normals = len(normals) > 0
     for q in prange(len(asked)):
         k = asked[q]
-        x, y, z = points[k, 0] - sensor[0], points[k, 1] - sensor[1], points[k, 2] - sensor[2]
+        u, v, depth, x, y, z = _pixel(points[k], sensor, axes, scale, distance, sheet)
         reach = np.sqrt(x * x + y * y + z * z)
         if has_normals:
             along = abs(x * normals[k, 0] + y * normals[k, 1] + z * normals[k, 2])
             if along <= edge_on * reach:
                 found[k] = False
                 continue
-        depth = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
         if depth <= 1e-6 * distance:
             found[k] = False  # behind the sensor nobody looked
             continue
-        u = int(np.floor((axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z) / depth * scale))
-        v = int(np.floor((axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z) / depth * scale))
         u -= first[0]
         v -= first[1]
         i, j = min(max(u, 0), rows - 1), min(max(v, 0), columns - 1)
         beyond = max(abs(u - i), abs(v - j))
         beside = (outside[i + 1, j + 1] + beyond) * pixel * reach / distance
-        found[k] = beside > within or (
+        found[k] = (silhouette and beside > within) or (
             beyond == 0 and np.isfinite(least[i, j]) and reach < least[i, j] - within
         )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, first, last, edge_on, within,
-                   hidden):  # fmt: skip
+def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, distance, first, last,
+                   edge_on, within, sheet, hidden):  # fmt: skip
     """Say which places lie behind surface that is edge-on to the sensor's rays; in `hidden[asked]`.
 
     Pixels from `first` to `last` are looked at, as far as there are places in them.
@@ -53,9 +79,13 @@ def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, first, las
     count = len(points)
     pixel = np.empty((count, 2), dtype=np.int64)
     inside = np.empty(count, dtype=np.bool_)
+    far = np.empty(count)
     low, high = last.copy(), first - 1
     for k in range(count):
-        pixel[k, 0], pixel[k, 1], _ = _pixel(points[k], sensor, axes, scale)
+        pixel[k, 0], pixel[k, 1], _, x, y, z = _pixel(
+            points[k], sensor, axes, scale, distance, sheet
+        )
+        far[k] = np.sqrt(x * x + y * y + z * z)
         inside[k] = np.all(pixel[k] >= first) and np.all(pixel[k] <= last)
         if inside[k]:
             low, high = np.minimum(low, pixel[k]), np.maximum(high, pixel[k])
@@ -65,12 +95,11 @@ def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, first, las
     least = np.full((rows, columns), np.inf)
     limit = edge_on * edge_on
     for q in range(len(veil)):
-        x, y, z = veil[q, 0] - sensor[0], veil[q, 1] - sensor[1], veil[q, 2] - sensor[2]
+        u, v, depth, x, y, z = _pixel(veil[q], sensor, axes, scale, distance, sheet)
         square = x * x + y * y + z * z
         along = x * normals[q, 0] + y * normals[q, 1] + z * normals[q, 2]
         if along * along > limit * square:
             continue
-        u, v, depth = _pixel(veil[q], sensor, axes, scale)
         u, v = u - low[0], v - low[1]
         if depth <= 0.0 or u < -1 or v < -1 or u > rows or v > columns:
             continue
@@ -82,16 +111,5 @@ def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, first, las
     for k in range(count):
         if not inside[k]:
             continue
-        x, y, z = points[k, 0] - sensor[0], points[k, 1] - sensor[1], points[k, 2] - sensor[2]
         before = least[pixel[k, 0] - low[0], pixel[k, 1] - low[1]]
-        hidden[asked[k]] = np.sqrt(x * x + y * y + z * z) > before + within
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _pixel(point, sensor, axes, scale):
-    """Of a place: its pixel, and how deep it lies along the middle ray."""
-    x, y, z = point[0] - sensor[0], point[1] - sensor[1], point[2] - sensor[2]
-    depth = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
-    u = int(np.floor((axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z) / depth * scale))
-    v = int(np.floor((axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z) / depth * scale))
-    return u, v, depth
+        hidden[asked[k]] = far[k] > before + within

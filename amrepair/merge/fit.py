@@ -1,0 +1,347 @@
+"""`fit_from_scans`: a template from sound scans or views, with or without the part's mesh."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+import amrepair
+from amrepair.align import align
+from amrepair.errors import AlignmentError, InputError
+from amrepair.merge.cloud import outward, spacing_of
+from amrepair.merge.fuse import Cloud, Fused, fuse
+from amrepair.merge.joint import Slack
+from amrepair.merge.options import MergeOptions
+from amrepair.merge.place import Placement, place
+from amrepair.merge.views import LEAST_POINTS, View
+from amrepair.scans import Scan
+from amrepair.template import LearnedSdf, MeshSdf
+from amrepair.template.fit import fit_fast
+from amrepair.template.learned import Coverage, Tolerance
+from gcode.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import trimesh
+
+# Of one point's noise: a template that follows what is finer is larger, slower, and no truer (4
+# scans of 200,000 points, noise 30 µm: 8.8 µm off, 8.2 so).
+FOLLOWED = 0.5
+SIZE_JUMP = 3.0  # scans of one part in one unit differ by less
+METRE_MM, LEAST_PART_MM = 1000.0, 1.0  # no printed part is smaller: its numbers are metres
+# A scan that is held worse than its points are noisy is named. So is one that was outvoted on more
+# surface than chance marks: so many spacings square, that share of the part's area, and so many
+# times what the scans have in the median (where a scanner errs, each is outvoted somewhere).
+OUTVOTED_SPACINGS, OUTVOTED_SHARE, OUTVOTED_TIMES = 20.0, 1e-3, 5.0
+TOLD_SHARE = 0.002  # of the surface: less that is unseen, or guessed, is not told
+
+
+@dataclass(frozen=True, slots=True)
+class ScanFit:
+    """A template from scans, and what went into it.
+
+    Attributes
+    ----------
+    poses
+        (4, 4) template from scan, None for scans that were left out; scan in mm.
+    left_out
+        By number of a scan: why.
+    outvoted
+        By number of a scan: the mm² on which the others outvoted it.
+    notes
+        Sentences for the user.
+    """
+
+    template: LearnedSdf
+    fused: Fused
+    poses: tuple[Float[np.ndarray, "4 4"] | None, ...]
+    sigma_mm: float
+    rmse_mm: float
+    left_out: Mapping[int, str]
+    outvoted: Mapping[int, float]
+    notes: tuple[str, ...]
+
+    def as_json(self, scans: Sequence[str]) -> dict[str, Any]:
+        """What `template fit --json` prints of it."""
+        return {
+            "scans": [
+                {
+                    "file": name,
+                    "pose": None if pose is None else pose.tolist(),
+                    "left_out": self.left_out.get(k),
+                    "outvoted_mm2": self.outvoted.get(k, 0.0),
+                }
+                for k, (name, pose) in enumerate(zip(scans, self.poses, strict=True))
+            ],
+            "noise_mm": self.sigma_mm,
+            "rmse_mm": self.rmse_mm,
+            "unseen_mm2": self.fused.coverage.unseen_mm2,
+            "unseen_ratio": self.fused.unseen_ratio,
+        }
+
+
+def fit_from_scans(
+    scans: Sequence[Scan],
+    *,
+    mesh: trimesh.Trimesh | None = None,
+    poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
+    turntable_deg: float | None = None,
+    options: MergeOptions | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> ScanFit:
+    """Fit a template to sound scans of one part.
+
+    Parameters
+    ----------
+    scans
+        Noisy, overlapping, partial, each in a frame of its own; the template's frame is the first
+        scan's (of those that could be placed), or the mesh's. A part that would be smaller than a
+        millimetre is taken for one in metres, and that is said.
+    mesh
+        The nominal shape: scans are aligned to it, and it stands where no scan looked.
+    poses
+        By file name, (4, 4) common frame from scan, in the scans' unit: where to begin.
+    turntable_deg
+        The scans are a turntable's, in their order, so far apart.
+
+    Raises
+    ------
+    InputError
+        If there are too few points, or the scans' sizes tell of different units.
+    AlignmentError
+        If most scans do not fit each other, or none fits the mesh.
+    TemplateError
+        If they enclose no solid.
+    """
+    scans, unit_mm = _in_millimetres(scans)
+    _refuse(scans)
+    rng = np.random.default_rng(seed)
+    views = []
+    for k, scan in enumerate(scans):
+        progress("measure scans", float(k), float(len(scans)))
+        views.append(View.of(scan, rng))
+    nominal = None if mesh is None else MeshSdf.from_mesh(mesh)
+    if nominal is None:
+        placed = place(
+            views, rng, told=poses, unit_mm=unit_mm, turntable_deg=turntable_deg,
+            options=options, progress=progress,
+        )  # fmt: skip
+    else:
+        placed = _on_mesh(scans, nominal, rng)
+    progress("fuse scans", 0.0, 1.0)
+    cloud = _joined(views, placed)
+    fused = fuse(cloud, behind=nominal)
+    progress("fuse scans", 1.0, 1.0)
+    weak = {k: s for k, s in placed.slacks.items() if s.sigma_mm > cloud.sigma_mm}
+    outvoted = _outvoted(cloud, fused, list(placed.poses))
+    notes = (
+        *(["the scans are taken as metres: as millimetres the part would be smaller than one"]
+          if unit_mm != 1.0 else []),
+        *_notes(scans, placed, fused, nominal),
+        *_said_outvoted(scans, fused, list(placed.poses), outvoted),
+        *_said_weak(scans, weak),
+    )  # fmt: skip
+    made = fit_fast(
+        MeshSdf.from_mesh(fused.mesh),
+        seed=seed,
+        least_residual_mm=FOLLOWED * cloud.sigma_mm,
+        metadata=_metadata(scans, notes, seed),
+        progress=progress,
+    )
+    return ScanFit(
+        template=_with_tolerance(made, cloud, fused, placed, weak, nominal),
+        fused=fused,
+        poses=tuple(placed.poses.get(k) for k in range(len(scans))),
+        sigma_mm=cloud.sigma_mm,
+        rmse_mm=placed.rmse_mm,
+        left_out=placed.left_out,
+        outvoted=outvoted,
+        notes=notes,
+    )
+
+
+def _in_millimetres(scans: Sequence[Scan]) -> tuple[list[Scan], float]:
+    """The scans in mm, and what their unit is."""
+    sizes = [float(np.linalg.norm(np.ptp(scan.points_mm, axis=0))) for scan in scans]
+    if not scans or max(sizes) >= LEAST_PART_MM:
+        return list(scans), 1.0
+    return [
+        replace(
+            scan,
+            points_mm=METRE_MM * scan.points_mm,
+            sensors_mm=None if scan.sensors_mm is None else METRE_MM * scan.sensors_mm,
+        )
+        for scan in scans
+    ], METRE_MM
+
+
+def _refuse(scans: Sequence[Scan]) -> None:
+    if not scans:
+        raise InputError("a template from scans needs at least one scan; none was given")
+    for scan in scans:
+        if len(scan) < LEAST_POINTS:
+            raise InputError(
+                f"the scan {scan.source} has {len(scan)} points; a template needs at least "
+                f"{LEAST_POINTS:,} of each scan"
+            )
+    sizes = [float(np.linalg.norm(np.ptp(scan.points_mm, axis=0))) for scan in scans]
+    usual = float(np.median(sizes))
+    for scan, size in zip(scans, sizes, strict=True):
+        if not usual / SIZE_JUMP < size < usual * SIZE_JUMP:
+            hint = " (metres for millimetres?)" if size < usual / 100 else ""
+            raise InputError(
+                f"the scan {scan.source} is {size:.3g} mm across, the scans' median is "
+                f"{usual:.3g} mm: they cannot be the same part in the same unit{hint}; convert "
+                "or remove it"
+            )
+
+
+def _on_mesh(scans: Sequence[Scan], nominal: MeshSdf, rng: np.random.Generator) -> Placement:
+    """Each scan on the nominal shape; those that do not fit it are left out."""
+    poses: dict[int, np.ndarray] = {}
+    left_out: dict[int, str] = {}
+    squares = []
+    for k, scan in enumerate(scans):
+        try:
+            found = align(scan, nominal, rng=rng)
+        except AlignmentError as error:
+            left_out[k] = f"does not fit the mesh ({error})"
+            continue
+        poses[k] = np.array(found.template_from_scan.matrix)
+        squares.append(found.rmse_mm**2)
+    if 2 * len(left_out) >= len(scans):
+        raise AlignmentError(
+            f"{len(left_out)} of {len(scans)} scans do not fit the mesh: "
+            f"{next(iter(left_out.values()))}"
+        )
+    return Placement(poses, float(np.sqrt(np.mean(squares))), left_out)
+
+
+def _joined(views: Sequence[View], placed: Placement) -> Cloud:
+    """All placed points with outward normals."""
+    chosen = {k: views[k] for k in placed.poses}
+    points = [v.surface.points_mm @ placed.poses[k][:3, :3].T + placed.poses[k][:3, 3]
+              for k, v in chosen.items()]  # fmt: skip
+    normals = [v.surface.normals @ placed.poses[k][:3, :3].T for k, v in chosen.items()]
+    scan = np.repeat(np.arange(len(chosen)), [len(p) for p in points])
+    spacings = np.array([view.spacing_mm for view in chosen.values()])
+    every, facing = np.concatenate(points), np.concatenate(normals)
+    # where the scans overlap little, the joint cloud is no denser than one of them
+    spacing_mm = max(float((spacings**-2.0).sum() ** -0.5), spacing_of(every))
+    sure = np.concatenate([view.sure for view in chosen.values()])
+    if not sure.all():
+        facing = np.where(sure[:, None], facing, outward(every, facing, spacing_mm))
+    sigma_mm = max(view.sigma_mm for view in chosen.values())
+    return Cloud(every, facing, scan, len(chosen), spacing_mm, sigma_mm, float(spacings.max()))
+
+
+def _outvoted(cloud: Cloud, fused: Fused, which: Sequence[int]) -> dict[int, float]:
+    """By number of a scan: the mm² on which it was outvoted, where that is no chance."""
+    least_mm2 = max(
+        OUTVOTED_SPACINGS * cloud.sparsest_mm**2,
+        OUTVOTED_SHARE * float(fused.mesh.area),
+        OUTVOTED_TIMES * float(np.median(fused.outvoted_mm2)),
+    )
+    return {
+        k: float(area)
+        for k, area in zip(which, fused.outvoted_mm2, strict=True)
+        if area > least_mm2
+    }
+
+
+def _with_tolerance(
+    made: LearnedSdf,
+    cloud: Cloud,
+    fused: Fused,
+    placed: Placement,
+    weak: Mapping[int, Slack],
+    nominal: MeshSdf | None,
+) -> LearnedSdf:
+    """The template with how far sound parts differ, and where nobody knows."""
+    spread = fused.spread
+    if spread is not None and weak:
+        slack_mm = np.zeros(len(cloud.points_mm))
+        for place_, k in enumerate(placed.poses):
+            if k in weak:
+                own = cloud.scan == place_
+                slack_mm[own] = weak[k].across(cloud.points_mm[own], cloud.normals[own])
+        spread = spread.widened(cloud, slack_mm)
+    known = nominal is not None or fused.coverage.unseen_mm2 == 0.0
+    coverage: Coverage | None = None if known else fused.coverage
+    return replace(
+        made,
+        bias_mm=float(np.hypot(made.bias_mm, 2.0 * fused.standard_error_mm)),
+        tolerance=None
+        if spread is None
+        else Tolerance(spread.origin_mm, spread.cell_mm, spread.values_mm),
+        coverage=coverage,
+    )
+
+
+def _metadata(scans: Sequence[Scan], notes: Sequence[str], seed: int) -> dict[str, str]:
+    return {
+        "recipe": "fast",
+        "seed": str(seed),
+        "version": amrepair.__version__,
+        "notes": "; ".join(notes),
+        "scans": json.dumps([{"source": s.source, "sha256": _sha256(s)} for s in scans]),
+    }
+
+
+def _notes(
+    scans: Sequence[Scan], placed: Placement, fused: Fused, nominal: MeshSdf | None
+) -> list[str]:
+    used = len(placed.poses)
+    notes = [f"{used} of {len(scans)} scans merged"]
+    notes += [f"{scans[k].source} {why}, and was left out" for k, why in placed.left_out.items()]
+    if fused.unseen_ratio > TOLD_SHARE:
+        whose = (
+            "is the mesh's" if nominal is not None
+            else "is closed by a guess, is unknown, and is never called missing"
+        )  # fmt: skip
+        notes.append(
+            f"{fused.coverage.unseen_mm2:,.0f} mm² ({fused.unseen_ratio:.1%}) of the surface was "
+            f"seen by no scan and {whose}"
+        )
+    if used > 1 and fused.single_ratio > 0.05:
+        notes.append(f"{fused.single_ratio:.0%} of the surface was seen by one scan only")
+    if fused.rejected:
+        notes.append(f"{fused.rejected} points contradicted by other scans were left out")
+    return notes
+
+
+def _said_outvoted(
+    scans: Sequence[Scan], fused: Fused, which: Sequence[int], outvoted: Mapping[int, float]
+) -> list[str]:
+    said = []
+    for place_, k in enumerate(which):
+        if k in outvoted:
+            x, y, z = fused.outvoted_at_mm[place_]
+            said.append(
+                f"{scans[k].source} differs from the others over {outvoted[k]:,.0f} mm² about "
+                f"({x:.1f}, {y:.1f}, {z:.1f}) mm (the template's frame) and was outvoted there: "
+                "look at that part, or that scan"
+            )
+    return said
+
+
+def _said_weak(scans: Sequence[Scan], weak: Mapping[int, Slack]) -> list[str]:
+    return [
+        f"{scans[k].source} is held along ({x:.2f}, {y:.2f}, {z:.2f}) to "
+        f"{slack.sigma_mm:.2f} mm only (standard deviation, the template's frame), since it shares "
+        "hardly a face across that with the others. What it alone saw there may be off by three "
+        "times that, and is tolerated as far. Add a view that shows faces across that direction "
+        "beside faces that the others show"
+        for k, slack in weak.items()
+        for x, y, z in [slack.axis]
+    ]
+
+
+def _sha256(scan: Scan) -> str:
+    return hashlib.sha256(np.ascontiguousarray(scan.points_mm).tobytes()).hexdigest()

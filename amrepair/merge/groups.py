@@ -1,0 +1,193 @@
+"""From poses of pairs to groups of views that hold together: the pose graph, grown by agreement.
+
+Every view begins as a group of its own. The two groups that are surest of each other become one,
+then the next: most of the smaller on what the other saw, next to nothing of any view in another's
+free space, and no second pose nearly as good. A pair that is wrong contradicts what the other pairs
+of its groups say, and is outvoted (cycles: Zach, Klopschitz and Pollefeys, CVPR 2010). What never
+becomes sure stays a group of its own, and is said.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.merge.match import (
+    FreeSpace,
+    apart,
+    distinct,
+    featured,
+    searched,
+)
+from amrepair.merge.options import MergeOptions
+from amrepair.merge.views import Fit, Placed, View, joined, judged, settled
+from gcode.progress import Progress, silent
+
+TRIED = 4  # poses of two groups that are looked at closely
+GROUP_POINTS = 3_000  # of each view, that groups are settled on
+STEPS = 8
+
+Pairs = dict[tuple[int, int], list[Fit]]
+
+
+@dataclass(slots=True)
+class Graph:
+    """Views, the poses that their pairs propose, and the groups so far.
+
+    Attributes
+    ----------
+    pairs
+        By numbers i < j: poses of view j in view i's frame, best first.
+    groups
+        Each by number: (4, 4) the group's frame from the view.
+    """
+
+    views: Sequence[View]
+    size_mm: float
+    options: MergeOptions
+    pairs: Pairs = field(default_factory=dict)
+    groups: list[Placed] = field(default_factory=list)
+    _judged: dict[tuple[frozenset[int], frozenset[int], int], list[Fit]] = field(
+        default_factory=dict
+    )
+
+    def proposed(self, fixed: Placed, moving: Placed) -> list[Float[np.ndarray, "4 4"]]:
+        """Poses of one group in the other's frame, those that most pairs speak for first."""
+        found: list[tuple[float, np.ndarray]] = []
+        for i, j in itertools.product(fixed, moving):
+            for fit in self.pairs.get((min(i, j), max(i, j)), []):
+                pose = fit.pose if i < j else np.linalg.inv(fit.pose)
+                whole = fixed[i] @ pose @ np.linalg.inv(moving[j])
+                found.append((max(fit.score, 0.01 * fit.overlap), whole))
+        surface = joined(self.views, moving, GROUP_POINTS)
+        near_mm = self.options.same_size * self.size_mm
+        kept = apart([p for _, p in sorted(found, key=lambda f: -f[0])], surface, near_mm)
+        votes = [
+            sum(score for score, pose in found if len(apart([one, pose], surface, near_mm)) == 1)
+            for one in kept
+        ]
+        return [kept[k] for k in np.argsort(-np.array(votes), kind="stable")[:TRIED]]
+
+    def ways(self, fixed: Placed, moving: Placed) -> list[Fit]:
+        """How one group may lie on another, settled and judged by all that both saw; best first."""
+        asked = sum((min(i, j), max(i, j)) in self.pairs for i in fixed for j in moving)
+        key = frozenset(fixed), frozenset(moving), asked
+        if key in self._judged:
+            return self._judged[key]
+        poses = self.proposed(fixed, moving)
+        fits: list[Fit] = []
+        if poses:
+            whole, own = (joined(self.views, g, GROUP_POINTS) for g in (fixed, moving))
+            spacing_mm = max(self.views[k].thin_spacing_mm for k in (*fixed, *moving))
+            reach_mm = self.options.reach_spacings * spacing_mm
+            within = np.geomspace(2.0 * reach_mm, reach_mm, STEPS)
+            for pose in poses:
+                there = settled(whole, own, pose, within, GROUP_POINTS)
+                fits.append(judged(self.views, fixed, moving, there, self.options))
+            fits = self._ranked(distinct(fits, own, self.options.same_size * self.size_mm))
+        self._judged[key] = fits
+        return fits
+
+    def _ranked(self, fits: Sequence[Fit]) -> list[Fit]:
+        """Those that may be taken before those that may not, then by score."""
+        return sorted(fits, key=lambda fit: (fit.why_not(self.options) != "", -fit.score))
+
+    def why_not(self, fits: Sequence[Fit]) -> str:
+        """Why the best of some fits is not to be trusted; nothing where it is."""
+        if not fits:
+            return "fits none of the others"
+        reason = fits[0].why_not(self.options)
+        if reason:
+            return reason
+        if any(fits[0].rivals(fit, self.options) for fit in fits[1:]):
+            return "fits the others in more than one way"
+        return ""
+
+    def grow(self, progress: Progress) -> None:
+        """Join groups, the surest first, as long as any two are sure."""
+        while len(self.groups) > 1:
+            progress("place views", float(len(self.views) - len(self.groups)),
+                     float(len(self.views)))  # fmt: skip
+            best: tuple[float, int, int, Fit] | None = None
+            for a, b in itertools.combinations(range(len(self.groups)), 2):
+                fixed, moving = self._sides(a, b)
+                fits = self.ways(self.groups[fixed], self.groups[moving])
+                if self.why_not(fits):
+                    continue
+                margin = fits[0].score - (fits[1].score if len(fits) > 1 else 0.0)
+                if best is None or margin > best[0]:
+                    best = margin, fixed, moving, fits[0]
+            if best is None:
+                return
+            _, fixed, moving, fit = best
+            self.groups[fixed] |= {k: fit.pose @ p for k, p in self.groups[moving].items()}
+            del self.groups[moving]
+            self.even(max(fixed - (moving < fixed), 0))
+
+    def _sides(self, a: int, b: int) -> tuple[int, int]:
+        """The larger group stays."""
+        return (a, b) if len(self.groups[a]) >= len(self.groups[b]) else (b, a)
+
+    def even(self, number: int) -> None:
+        """Share out what a group's poses disagree, each but the first against all others."""
+        group = self.groups[number]
+        for k in list(group)[1:]:
+            others = {m: pose for m, pose in group.items() if m != k}
+            reach_mm = self.options.reach_spacings * self.views[k].thin_spacing_mm
+            whole = joined(self.views, others, GROUP_POINTS)
+            within = np.array([1.0, 1.0]) * reach_mm
+            group[k] = settled(whole, self.views[k].thin, group[k], within, GROUP_POINTS)
+
+
+def grouped(
+    views: Sequence[View],
+    size_mm: float,
+    options: MergeOptions,
+    *,
+    begun: Placed | None = None,
+    progress: Progress = silent,
+) -> Graph:
+    """Groups of views that hold together, the largest first.
+
+    Parameters
+    ----------
+    begun
+        Poses that are known already, and hold.
+    """
+    known = begun or {}
+    first = [dict(known)] if known else []
+    graph = Graph(views, size_mm, options)
+    graph.groups = first + [{k: np.eye(4)} for k in range(len(views)) if k not in known]
+    spaces: dict[int, FreeSpace] = {}
+    _ask(graph, "match features", lambda i, j: featured(views, i, j, size_mm, options), progress)
+    graph.grow(progress)
+    if len(graph.groups) > 1:
+        _ask(
+            graph,
+            "try every rotation",
+            lambda i, j: searched(views, spaces, i, j, size_mm, options),
+            progress,
+        )
+        graph.grow(progress)
+    graph.groups.sort(key=lambda group: (-len(group), min(group)))
+    return graph
+
+
+def _ask(
+    graph: Graph, stage: str, find: Callable[[int, int], list[Fit]], progress: Progress
+) -> None:
+    """Poses of all pairs of views that are in different groups."""
+    home = {k: g for g, group in enumerate(graph.groups) for k in group}
+    wanted = [
+        p for p in itertools.combinations(range(len(graph.views)), 2) if home[p[0]] != home[p[1]]
+    ]
+    for done, (i, j) in enumerate(wanted):
+        progress(stage, float(done), float(len(wanted)))
+        more = [*graph.pairs.get((i, j), []), *find(i, j)]
+        near_mm = graph.options.same_size * graph.size_mm
+        graph.pairs[i, j] = distinct(more, graph.views[j].thin, near_mm)
+    graph._judged.clear()
