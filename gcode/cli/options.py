@@ -14,6 +14,16 @@ if TYPE_CHECKING:
     from gcode.profiles import PrintSetup
     from gcode.reader import Job
     from gcode.slicing.layers import LayerGrid
+    from gcode.surfaces import HeightField
+
+AS_BUILT_CELL_MM = 0.2
+AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
+
+AsBuiltOption = Annotated[
+    Path | None,
+    typer.Option(help="What stands on the bed: a mesh, or a height map (.npz, .tif, .npy)."),
+]
+FileArgument = Annotated[Path, typer.Argument(help="G-code file.")]
 
 PrinterOption = Annotated[
     str,
@@ -111,3 +121,16 @@ def grid_of(job: Path | None, setup: PrintSetup) -> LayerGrid:
         [layer.z_mm for layer in job_of(job, setup).layers],
         layer_height_mm=setup.process.layer_height_mm,
     )
+
+
+def standing_on_bed(path: Path) -> HeightField:
+    """A height field from a height map, or from a mesh with room around it."""
+    from gcode.solids import SUFFIXES, read_solid
+    from gcode.surfaces import HeightField
+
+    if path.suffix.lower() not in SUFFIXES:
+        if not path.is_file():
+            raise InputError(f"{path}: there is no such file.")
+        return HeightField.read(path)
+    solid = read_solid(path)
+    return HeightField.from_manifold(solid, AS_BUILT_CELL_MM, margin_mm=AROUND_MM)
