@@ -8,7 +8,6 @@ from gcode.cli import console
 from gcode.cli.judging import (
     LeaveHeatersOption,
     refusal_json,
-    setup_to_judge,
     tell_warnings,
     warnings_json,
 )
@@ -17,11 +16,10 @@ from gcode.cli.options import (
     FileArgument,
     JsonOption,
     OwnMaterialOption,
-    PrinterOption,
     program_text,
     standing_on_bed,
 )
-from gcode.profiles import DEFAULT_PRINTER
+from gcode.cli.owning import JobPrinterOption, other_printer, setup_to_judge
 
 
 def add_to(app: typer.Typer) -> None:
@@ -29,6 +27,7 @@ def add_to(app: typer.Typer) -> None:
     app.command(
         "check",
         epilog=console.examples(
+            "gcode check job.gcode",
             "gcode check job.gcode --printer ender_3",
             "gcode check job.gcode --printer creality_k1_max --material petg",
             "gcode check repair.gcode --as-built standing.stl --json",
@@ -38,7 +37,7 @@ def add_to(app: typer.Typer) -> None:
 
 def check(
     file: FileArgument,
-    printer: PrinterOption = DEFAULT_PRINTER,
+    printer: JobPrinterOption = None,
     material: OwnMaterialOption = None,
     as_built: AsBuiltOption = None,
     leave_heaters: LeaveHeatersOption = False,
@@ -53,8 +52,9 @@ def check(
         from gcode.check import judge, policy_of
         from gcode.moves import Program
 
-    setup = setup_to_judge(printer, material)
-    program = Program(program_text(file), setup.printer.dialect)
+    text = program_text(file)
+    setup = setup_to_judge(text, file, printer, material)
+    program = Program(text, setup.printer.dialect)
     field = standing_on_bed(as_built) if as_built is not None else None
     bars = console.Bars()
     with bars.shown():
@@ -63,16 +63,20 @@ def check(
             leave_heaters=leave_heaters, progress=bars,
         )  # fmt: skip
     refusals = verdict.refusals
+    other = other_printer(text, file, setup.printer) if printer is not None else None
     if as_json:
         console.show_json(
             {
                 "ok": not refusals,
                 "printer": setup.printer.id,
                 "sha256": program.sha256,
+                "other_printer": other,
                 "refusals": [refusal_json(refusal) for refusal in refusals],
                 **warnings_json(verdict.report, "warnings"),
             }
         )
+    elif refusals and other is not None:
+        console.errors.print(f"{other}.", markup=False)
     elif refusals:
         for refusal in refusals[:20]:
             console.errors.print(str(refusal), markup=False)
@@ -80,6 +84,8 @@ def check(
             console.errors.print(f"and {len(refusals) - 20} more")
     else:
         tell_warnings(file, verdict.report)
+        if other is not None:
+            console.errors.print(f"{file}: warning: {other}.", markup=False)
         console.out.print(
             f"{file}: nothing {'else ' if verdict.report.warnings else ''}speaks against it on "
             f"{setup.printer.name}."

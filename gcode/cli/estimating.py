@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import typer
 
 from gcode.cli import console
 from gcode.cli.options import FileArgument, JsonOption, program_text
+from gcode.cli.owning import JobPrinterOption, job_setup
 
 
 def add_to(app: typer.Typer) -> None:
@@ -23,22 +22,19 @@ def add_to(app: typer.Typer) -> None:
 
 def estimate(
     file: FileArgument,
-    printer: Annotated[
-        str | None, typer.Option(help="Printer profile; a plain machine where left out.")
-    ] = None,
+    printer: JobPrinterOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Tell how long a program takes and what it uses; heating left out."""
     with console.starting():
         from gcode.estimate import estimate as estimate_program
         from gcode.moves import Program
-        from gcode.profiles import load_printer
 
+    text = program_text(file)
+    machine = job_setup(text, file, printer, None)[0].printer
     bars = console.Bars()
     with bars.shown():
-        machine = load_printer(printer) if printer is not None else None
-        dialect = machine.dialect if machine is not None else "marlin"
-        found = estimate_program(Program(program_text(file), dialect), machine, progress=bars)
+        found = estimate_program(Program(text, machine.dialect), machine, progress=bars)
     result = {
         "print_time_s": round(found.print_time_s, 1),
         "filament_mm": round(found.filament_mm, 2),

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gcode.cli import console
-from gcode.profiles import DEFAULT_MATERIAL
 
 if TYPE_CHECKING:
     from gcode.check import CheckReport, Refusal
-    from gcode.profiles import PrintSetup
 
 LeaveHeatersOption = Annotated[
     bool,
@@ -47,11 +45,3 @@ def refusal_json(refusal: Refusal) -> dict[str, Any]:
         "value": refusal.value,
         "limit": refusal.limit,
     }
-
-
-def setup_to_judge(printer: str, material: str | None) -> PrintSetup:
-    """Profiles to judge by; of a filament that nobody named only the hotend's limit is known."""
-    from gcode.profiles import load_setup
-
-    setup = load_setup(printer, material or DEFAULT_MATERIAL)
-    return setup if material is not None else setup.melting_all()

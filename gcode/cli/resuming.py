@@ -8,9 +8,14 @@ from typing import Annotated
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
+from gcode.cli.options import JsonOption, program_text
+from gcode.cli.owning import (
+    JobMaterialOption,
+    JobPrinterOption,
+    job_setup,
+    told_if_for_another,
+)
 from gcode.errors import InputError
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
 
 
 def add_to(app: typer.Typer) -> None:
@@ -33,8 +38,8 @@ def resume_at_command(
     layer: Annotated[
         int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
     ] = None,
-    printer: PrinterOption = DEFAULT_PRINTER,
-    material: MaterialOption = DEFAULT_MATERIAL,
+    printer: JobPrinterOption = None,
+    material: JobMaterialOption = None,
     standing: Annotated[
         Path | None,
         typer.Option(help="Height map (.npz) to write: what must stand there, for --as-built."),
@@ -44,7 +49,6 @@ def resume_at_command(
     """Make a checked job from a layer on: heated, primed, lowered onto the part, Z not homed."""
     with console.starting():
         from gcode.moves import Program
-        from gcode.profiles import load_setup
         from gcode.resumption import resume_at
 
     console.writable(output)
@@ -52,11 +56,12 @@ def resume_at_command(
         if standing.suffix != ".npz":
             raise InputError(f"{standing}: what stands there is written as .npz; rename it.")
         console.writable(standing)
-    setup = load_setup(printer, material)
+    text = program_text(job)
+    setup, _ = job_setup(text, job, printer, material)
     bars = console.Bars()
-    with bars.shown():
+    with bars.shown(), told_if_for_another(text, job, setup.printer):
         made = resume_at(
-            Program(program_text(job), setup.printer.dialect),
+            Program(text, setup.printer.dialect),
             setup,
             z_mm=z_mm,
             layer=layer,

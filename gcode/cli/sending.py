@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gcode.cli import console
-from gcode.cli.judging import LeaveHeatersOption, setup_to_judge, tell_warnings, warnings_json
+from gcode.cli.judging import LeaveHeatersOption, tell_warnings, warnings_json
 from gcode.cli.options import (
     AsBuiltOption,
     FileArgument,
     JsonOption,
     OwnMaterialOption,
-    PrinterOption,
     program_text,
     standing_on_bed,
 )
+from gcode.cli.owning import JobPrinterOption, setup_to_judge, told_if_for_another
 from gcode.errors import GcodeError, InputError, ReadError
-from gcode.profiles import DEFAULT_PRINTER
 
 if TYPE_CHECKING:
     from gcode.check import CheckReport
@@ -50,7 +49,7 @@ def send(
             "keys by OCTOPRINT_API_KEY, MOONRAKER_API_KEY."
         ),
     ],
-    printer: PrinterOption = DEFAULT_PRINTER,
+    printer: JobPrinterOption = None,
     material: OwnMaterialOption = None,
     as_built: AsBuiltOption = None,
     resume: Annotated[
@@ -93,16 +92,18 @@ def send(
     from gcode.hosts.serial import SerialPrinter
     from gcode.moves import Program
 
-    setup = setup_to_judge(printer, material)
+    text = program_text(file)
+    setup = setup_to_judge(text, file, printer, material)
     field = standing_on_bed(as_built) if as_built is not None else None
-    program = Program(program_text(file), setup.printer.dialect)
+    program = Program(text, setup.printer.dialect)
     bars = console.Bars()
     with ThreadPoolExecutor(1) as beside, bars.shown():  # nobody waits for the estimate alone
         cost = beside.submit(_cost_of, program, setup.printer)
-        checked = check_program(
-            program, setup, as_built=field, policy=policy_of(program),
-            leave_heaters=leave_heaters, progress=bars,
-        )  # fmt: skip
+        with told_if_for_another(text, file, setup.printer):
+            checked = check_program(
+                program, setup, as_built=field, policy=policy_of(program),
+                leave_heaters=leave_heaters, progress=bars,
+            )  # fmt: skip
     tell_warnings(file, checked.report)
     console.errors.print(
         f"{file} on {setup.printer.name}: {what_it_does(program, cost.result())}.", markup=False

@@ -180,6 +180,7 @@ class PrinterProfile(_Profile):
     macros: tuple[str, ...] = ()  # commands of this machine beyond its firmware's own
     start_macro: StartMacro | None = None
     end_macro: str | None = None  # switches both heaters off
+    slicer_names: tuple[str, ...] = ()  # as slicers call it; capitals, no spaces or dashes, * any
 
     @field_validator("start_gcode", "end_gcode", mode="before")
     @classmethod

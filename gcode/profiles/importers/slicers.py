@@ -178,7 +178,7 @@ _PRUSA_NAMES: dict[str, Kind] = {
     "filament_settings_id": "materials",
     "print_settings_id": "processes",
 }
-_REASONS = {
+REASONS = {
     **dict.fromkeys(
         ("filament_type", "printer_model"), "it only chose the profile that is inherited from"
     ),
@@ -231,7 +231,7 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
                 f"{path} has none of {', '.join(_TELLTALES)}; export it by PrusaSlicer's "
                 f"File, Export, Export Config."
             )
-        return Source(path.stem, kinds, values, _PRUSA_NAMES, _REASONS)
+        return Source(path.stem, kinds, values, _PRUSA_NAMES, REASONS)
     if preset not in presets:
         shown = ", ".join(repr(name) for name in presets if "*" not in name)
         raise InputError(
@@ -239,7 +239,7 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
         )
     kind, _, name = preset.partition(":")
     values = _inherited(parser, path, preset, ())
-    return Source(name, (_PRUSA_KINDS[kind],), values, missing=_REASONS)
+    return Source(name, (_PRUSA_KINDS[kind],), values, missing=REASONS)
 
 
 def _inherited(
@@ -286,7 +286,7 @@ def read_orca(path: Path, text: str, chain: tuple[Path, ...] = ()) -> Source:
         del values["inherits"]
     del values["type"]
     missing = {"inherits": "its parent is not beside the file: what that sets is not known here"}
-    return Source(path.stem, (kind,), values, {"name": kind}, {**_REASONS, **missing})
+    return Source(path.stem, (kind,), values, {"name": kind}, {**REASONS, **missing})
 
 
 def _text(value: Any) -> str:
