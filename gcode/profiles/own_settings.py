@@ -29,6 +29,15 @@ _READS = {
     "klipper": {"klipper", "marlin"},
     "reprap": {"reprap"},
 }
+# What one would ask first, and what no slicer tells.
+_WORDS = {
+    "bed_size_mm": "bed",
+    "max_z_mm": "height",
+    "nozzle_diameter_mm": "nozzle",
+    "max_speed_mm_s": "speeds",
+    "max_hotend_c": "temperature limits",
+    "envelope": "tool head",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +97,11 @@ class OwnSettings:
     def in_words(self, setup: PrintSetup) -> str:
         """One sentence: what was taken from where."""
         printer, made = setup.printer, self.found.profiles[0]
+        untold = [words for key, words in _WORDS.items() if key not in made.values]
         return (
             f"{self.job}: no --printer is given, so its own settings"
             f"{f' ({self.slicer})' if self.slicer else ''} are taken: {_described(printer)}; "
-            f"what they do not tell, the tool head's shape among it, is {made.inherits}'s"
+            f"what they do not tell ({', '.join(untold)}) is {made.inherits}'s"
         )
 
     def differs_from(self, printer: PrinterProfile) -> str | None:

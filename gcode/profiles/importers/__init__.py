@@ -191,6 +191,7 @@ def _parent(kind: Kind, source: Source, rules: dict[str, Rule]) -> str:
         source.values.get("printer_model", ""),
         source.values.get("printer_settings_id", ""),
         source.values.get("TARGET_MACHINE.NAME", ""),
+        source.values.get("definition", ""),
         source.name,
     )
     if known is not None:

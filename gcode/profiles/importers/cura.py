@@ -124,7 +124,7 @@ _RULES: dict[str, Rule] = {
     "infill_overlap": Rule("processes", "infill_overlap_ratio", percent),
 }
 CURA = {key: _steady(rule) for key, rule in _RULES.items()}
-_NAMES: dict[str, Kind] = {"TARGET_MACHINE.NAME": "printers"}
+_NO_MACHINE = frozenset({"fdmprinter", "custom"})  # definitions of anybody's printer
 
 
 def read_cura(name: str, text: str) -> Source | None:
@@ -140,11 +140,14 @@ def read_cura(name: str, text: str) -> Source | None:
     if "FLAVOR" not in values or not ({"TARGET_MACHINE.NAME", "Layer height"} & set(values)):
         return None
     values |= _changed(name, text)
+    names: dict[str, Kind] = {"TARGET_MACHINE.NAME": "printers"}
+    if "TARGET_MACHINE.NAME" not in values and values.get("definition") not in _NO_MACHINE:
+        names = {"definition": "printers"}
     missing = {"definition": "it only chose the profile that is inherited from"}
     missing |= dict.fromkeys(
         ("GENERATOR.NAME", "GENERATOR.VERSION"), "it tells the slicer, and nothing of the machine"
     )
-    return Source(name, ("printers", "materials", "processes"), values, _NAMES, missing)
+    return Source(name, ("printers", "materials", "processes"), values, names, missing)
 
 
 def _changed(name: str, text: str) -> dict[str, str]:
