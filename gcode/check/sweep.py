@@ -82,6 +82,17 @@ def sweep(
     return refusals, float(-(body.max() + BODY_SLACK_MM)) if len(body) else np.inf
 
 
+def deepest_along(
+    places_mm: Float[np.ndarray, "n 3"], printer: PrinterProfile, as_built: HeightField
+) -> Float[np.ndarray, " n"]:
+    """(n,) how deep the head is in what stands there, the tip at each place; ≤ 0: it is clear."""
+    nothing = np.zeros(len(places_mm))
+    tallest_mm, lowest_mm = as_built.top_mm, float(places_mm[:, 2].min())
+    slices = [p for p in printer.envelope if p.z_from_mm <= tallest_mm - lowest_mm]
+    found = _Swept(places_mm, places_mm, nothing, nothing).over(as_built, slices, grows=False)
+    return np.full(len(places_mm), -np.inf) if found is None else found[0]
+
+
 @dataclass(frozen=True, slots=True)
 class _Swept:
     """Moves: (n, 3) start and end, (n,) plastic and width."""

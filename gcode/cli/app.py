@@ -16,6 +16,7 @@ from gcode.cli import (
     resuming,
     sending,
     slicing,
+    stacking,
 )
 from gcode.errors import GcodeError
 
@@ -50,6 +51,7 @@ slicing.add_to(app)
 checking.add_to(app)
 estimating.add_to(app)
 resuming.add_to(app)
+stacking.add_to(app)
 sending.add_to(app)
 emulating.add_to(app)
 app.add_typer(profiles_app, name="profiles")
