@@ -286,7 +286,7 @@ def pose_of_job(job: Path | None, template: Path, setup: PrintSetup) -> str:
     if len(words) > 1:
         return f"{job} prints {len(words)} of it, at --part-pose {' or '.join(words)}: say which"
     return (
-        f"{job} prints it at --part-pose {words[0]}: say --part-pose job if it stands there still"
+        f"{job} prints it at --part-pose {words[0]}: say so (or: job) if it stands there still"
     )
 
 
