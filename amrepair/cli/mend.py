@@ -132,6 +132,7 @@ def repair(
         raise InputError("--part-pose job takes the place from the job; name it by --job JOB.gcode")
     text = program_text(job) if job is not None else None
     setup, _ = job_setup(text, job or "", printer, material, process)
+    _ = setup.printer.head  # refused before any work
     if scan_frame == "unknown" and pose is None:
         hint = pose_of_job(job, template, setup)
         raise InputError(
@@ -285,9 +286,7 @@ def pose_of_job(job: Path | None, template: Path, setup: PrintSetup) -> str:
     words = [_typed(placed) for placed in copies]
     if len(words) > 1:
         return f"{job} prints {len(words)} of it, at --part-pose {' or '.join(words)}: say which"
-    return (
-        f"{job} prints it at --part-pose {words[0]}: say so (or: job) if it stands there still"
-    )
+    return f"{job} prints it at --part-pose {words[0]}: say so (or: job) if it stands there still"
 
 
 def where_the_job_prints_it(

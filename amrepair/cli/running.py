@@ -171,6 +171,7 @@ def _new_run(
     """Read, check and write down what a run begins with."""
     text = program_text(job_file)
     setup, own = job_setup(text, job_file, *named)
+    _ = setup.printer.head  # refused before any work
     pose = read_calibration(calibration)
     _scanner(said["scanner"], pose, said["scan_timeout_s"], setup)  # refused before any work
     folder = RunFolder(out)

@@ -135,6 +135,8 @@ def judge(
         raise InputError(
             f"There is no dialect '{program.dialect}' to check; there are {', '.join(COMMANDS)}."
         )
+    if as_built is not None:
+        _ = setup.printer.head  # nobody judges what a head of unknown shape would hit
     lines = program.text.split("\n")
     top_mm = as_built.top_mm if as_built is not None else None
     one = Judge(program, setup, top_mm, initial, policy)

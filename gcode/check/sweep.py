@@ -42,7 +42,7 @@ def sweep(
     lowest_mm = float(min(start[:, 2].min(), end[:, 2].min()))
     tallest_mm = max(as_built.top_mm, float(end[:, 2].max()))
     # what stays above everything when the tip is lowest cannot touch
-    slices = [p for p in printer.envelope if p.z_from_mm <= tallest_mm - lowest_mm]
+    slices = [p for p in printer.head if p.z_from_mm <= tallest_mm - lowest_mm]
     if not slices:
         return [], np.inf
     pushed = moves.pushed_mm3
@@ -88,7 +88,7 @@ def deepest_along(
     """(n,) how deep the head is in what stands there, the tip at each place; ≤ 0: it is clear."""
     nothing = np.zeros(len(places_mm))
     tallest_mm, lowest_mm = as_built.top_mm, float(places_mm[:, 2].min())
-    slices = [p for p in printer.envelope if p.z_from_mm <= tallest_mm - lowest_mm]
+    slices = [p for p in printer.head if p.z_from_mm <= tallest_mm - lowest_mm]
     found = _Swept(places_mm, places_mm, nothing, nothing).over(as_built, slices, grows=False)
     return np.full(len(places_mm), -np.inf) if found is None else found[0]
 

@@ -25,6 +25,7 @@ def add_to(app: typer.Typer) -> None:
         epilog=console.examples(
             "gcode resume-at job.gcode --layer 41 --printer prusa_mk3s -o rest.gcode",
             "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
+            "gcode resume-at job.gcode --layer 41 --without lid_copy_2 -o rest.gcode",
         ),
     )(resume_at_command)
 
@@ -37,6 +38,10 @@ def resume_at_command(
     ] = None,
     layer: Annotated[
         int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
+    ] = None,
+    without: Annotated[
+        str | None,
+        typer.Option(help="An object of the job of which nothing more is printed."),
     ] = None,
     printer: JobPrinterOption = None,
     material: JobMaterialOption = None,
@@ -65,6 +70,7 @@ def resume_at_command(
             setup,
             z_mm=z_mm,
             layer=layer,
+            without=without,
             title=job.name,
             progress=bars,
         )
@@ -77,6 +83,7 @@ def resume_at_command(
             {
                 "gcode": str(output),
                 "layer": made.layer.index,
+                "without": without,
                 "z_mm": round(made.layer.z_mm, 4),
                 "first_line": made.first_line,
                 "standing_mm": round(made.standing.top_mm, 4),
@@ -89,7 +96,8 @@ def resume_at_command(
         )
         return
     console.out.print(
-        f"{output}: {job.name} from layer {made.layer.index} ({made.layer.z_mm:g} mm) on, line "
+        f"{output}: {job.name}{f' without {without}' if without else ''} from layer "
+        f"{made.layer.index} ({made.layer.z_mm:g} mm) on, line "
         f"{made.first_line + 1}; {made.standing.top_mm:g} mm must stand there, and Z must be true; "
         f"primed {made.primed}; checked."
     )

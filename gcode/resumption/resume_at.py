@@ -8,6 +8,7 @@ there on, unchanged. The result is judged by the checker with what stands there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,6 +20,7 @@ from gcode.progress import Progress, silent
 from gcode.reader import Job, read_job
 from gcode.reader.job import JobLayer
 from gcode.resumption.head import Head, height_over, prime, pulled_back_mm, temperatures
+from gcode.resumption.leaving_out import lines_without
 from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import standing_field
 from gcode.surfaces import HeightField
@@ -58,6 +60,7 @@ def resume_at(
     *,
     z_mm: float | None = None,
     layer: int | None = None,
+    without: str | None = None,
     title: str = "a job",
     progress: Progress = silent,
 ) -> Resumption:
@@ -71,6 +74,8 @@ def resume_at(
         Height of what stands there; the layers up to it are left out.
     layer
         Instead of a height: index of the first layer to be printed, from 0.
+    without
+        An object of the job of which nothing more is printed; what stands of it stays.
 
     Raises
     ------
@@ -99,7 +104,9 @@ def resume_at(
     primed = prime(head, field, setup.printer)
     head.come_down(pulled_back_mm(job, line))
     head.restore(settings)
-    body = program.text.rstrip().split("\n")[line:]
+    body: Sequence[str] = program.text.rstrip().split("\n")[line:]
+    if without is not None:
+        body = lines_without(job, line, without, setup.printer)
     text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
     whole = Program(text, program.dialect)
     return Resumption(

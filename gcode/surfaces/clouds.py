@@ -86,7 +86,8 @@ def _ply(path: Path, data: bytes) -> Float[np.ndarray, "n 3"]:
         raise InputError(f"{path} is no PLY: it has no header from 'ply' to 'end_header'.")
     body = data[data.index(b"\n", stop) + 1 :]
     header = data[:stop].decode("ascii", "replace").splitlines()
-    form, elements = "", []
+    form = ""
+    elements: list[tuple[str, int, list[list[str]]]] = []
     for line in header[1:]:
         words = line.split()
         if words[:1] == ["format"]:
