@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,7 +15,7 @@ from amrepair.errors import InputError
 from gcode.cli import console
 
 if TYPE_CHECKING:
-    from amrepair.postprocess import Marked, Target
+    from amrepair.postprocess import Marked
 
 EVERY = 20  # layers, where nothing else is asked for: 4 mm
 
@@ -87,7 +87,7 @@ def postprocess(
     except OSError as error:
         raise InputError(f"{file} cannot be read ({error.strerror})") from error
     text = decoded(data, str(file))
-    reader = cast("Target", target) if target else target_of(text, file.name, os.environ)
+    reader = target if target is not None else target_of(text, file.name, os.environ)
     asked = Asked(every, tuple(at_z or ()), adaptive, covers_mm2, final, command)
     marked = mark(text, file.name, reader, asked)
     if marked.places:

@@ -40,9 +40,9 @@ def from_points(points_mm: Float[np.ndarray, "n 3"], cell_mm: float, *, what: st
         raise InputError(
             f"{what} spreads over {nx * cell_mm:.0f} × {ny * cell_mm:.0f} mm; is it in millimetres?"
         )
-    z_mm = np.full(ny * nx, -np.inf)
-    np.maximum.at(z_mm, index[:, 1] * nx + index[:, 0], points_mm[:, 2])
-    z_mm = z_mm.reshape(ny, nx)
+    highest = np.full(ny * nx, -np.inf)
+    np.maximum.at(highest, index[:, 1] * nx + index[:, 0], points_mm[:, 2])
+    z_mm = highest.reshape(ny, nx)
     seen = np.isfinite(z_mm)
     return HeightField(origin, cell_mm, _filled(z_mm, seen), seen)
 
