@@ -34,6 +34,10 @@ READ_ERRORS = (
 LARGEST_MM = 1e6  # a kilometre: what is welded is counted in hundred-millionths of a millimetre
 
 
+class NotClosedError(InputError):
+    """A mesh that bounds no volume."""
+
+
 def read_solid(path: Path) -> Any:
     """A `manifold3d.Manifold` from a mesh file.
 
@@ -69,7 +73,7 @@ def read_solid(path: Path) -> Any:
         raise InputError(f"{path}: the mesh has no extent; export it again.")
     solid = first_closed(vertices, faces)[0]
     if solid is None:
-        raise InputError(
+        raise NotClosedError(
             f"{path}: the mesh is no closed surface (NotManifold), nor when vertices within "
             f"{WELD_RATIO * extent:.2g} mm are joined; repair it first."
         )

@@ -14,6 +14,7 @@ from amrepair.cli import (
     inspect,
     live,
     mend,
+    postprocessing,
     printing,
     replaying,
     simulation,
@@ -52,6 +53,7 @@ templates.add_to(app)
 inspect.add_to(app)
 mend.add_to(app)
 printing.add_to(app)
+postprocessing.add_to(app)
 calibration.add_to(app)
 replaying.add_to(app)
 benchmark.add_to(app)

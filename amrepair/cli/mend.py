@@ -14,8 +14,6 @@ from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.options import (
     CalibrationOption,
     JsonOption,
-    MaterialOption,
-    PrinterOption,
     ProcessOption,
     SeedOption,
     SensorOption,
@@ -25,17 +23,21 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import AmrepairError, InputError
 from gcode.cli import console
-from gcode.cli.options import grid_of
+from gcode.cli.options import grid_of, program_text
+from gcode.cli.owning import JobMaterialOption, JobPrinterOption, job_setup
 from gcode.errors import GcodeError
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+from gcode.profiles import DEFAULT_PROCESS
 
 if TYPE_CHECKING:
+    from amrepair.frames import Transform
     from amrepair.repair import RepairPlan
     from amrepair.template.port import Template
     from amrepair.turning import Turn
+    from gcode.profiles import PrintSetup
 
 # A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
+OF_JOB = "job"  # as --part-pose
 # Less than this share out of reach is not worth turning the part over.
 WORTH_TURNING_RATIO = 0.05
 # A foot higher or lower than this is worth a word: no calibration and no squashed layer does it.
@@ -51,6 +53,8 @@ def add_to(app: typer.Typer) -> None:
             "--standing standing.npz --report report.html",
             "amrepair repair scan.ply --template part.stl -o repair.gcode "
             "--scan-frame unknown --part-pose 100,80,0,90",
+            "amrepair repair scan.ply --template part.stl -o repair.gcode "
+            "--scan-frame unknown --job job.gcode --part-pose job",
             "amrepair repair scan.ply --template part.stl -o repair.gcode --printer ender_3 "
             "--material petg --job job.gcode",
         ),
@@ -61,8 +65,8 @@ def repair(
     scan: Annotated[Path, typer.Argument(help="Scan of the damaged part, mm.")],
     template: TemplateOption,
     output: Annotated[Path, typer.Option("-o", "--output", help="Repair program to write.")],
-    printer: PrinterOption = DEFAULT_PRINTER,
-    material: MaterialOption = DEFAULT_MATERIAL,
+    printer: JobPrinterOption = None,
+    material: JobMaterialOption = None,
     process: ProcessOption = DEFAULT_PROCESS,
     scan_frame: Annotated[
         str,
@@ -75,7 +79,8 @@ def repair(
         str | None,
         typer.Option(
             "--part-pose",
-            help="X,Y,Z,RZ: place of the part's own origin on the bed, mm, and its turn, degrees.",
+            help="X,Y,Z,RZ: place of the part's own origin on the bed, mm, and its turn, degrees; "
+            "or job: it stands still where --job prints it.",
         ),
     ] = None,
     on_fixture: Annotated[
@@ -120,12 +125,16 @@ def repair(
     from amrepair.template import open_template
     from amrepair.turning import turns_named, turns_of
     from gcode.cli.words import what_it_does
-    from gcode.profiles import load_setup
 
     if scan_frame not in FRAMES:
         raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
+    if pose == OF_JOB and job is None:
+        raise InputError("--part-pose job takes the place from the job; name it by --job JOB.gcode")
+    text = program_text(job) if job is not None else None
+    setup, _ = job_setup(text, job or "", printer, material, process)
+    _ = setup.printer.head  # refused before any work
     if scan_frame == "unknown" and pose is None:
-        hint = pose_of_job(job, template, (printer, material, process))
+        hint = pose_of_job(job, template, setup)
         raise InputError(
             "--scan-frame unknown needs --part-pose X,Y,Z,RZ: an aligned shape does not say where "
             f"the part stands on the bed; {hint}"
@@ -135,8 +144,7 @@ def repair(
         raise InputError(f"{standing}: what stands there is written as .npz; rename it")
     for path in filter(None, (output, report, standing)):
         console.writable(path)
-    placed = part_pose(pose) if pose is not None else None
-    setup = load_setup(printer, material, process)
+    placed = part_pose(pose) if pose is not None and pose != OF_JOB else None
     known_errors = calibration_named(calibration)
     watch, bars = Stopwatch(), console.Bars()
     frame = "build" if scan_frame == "build" else "scanner"
@@ -146,6 +154,9 @@ def repair(
             grid = grid_of(job, setup)
         with watch("template"):
             field = open_template(template, progress=bars)
+        if pose == OF_JOB and job is not None:
+            with watch("locate"):
+                field, placed = where_the_job_prints_it(job, field, setup)
         guess = placed.inverse() if placed is not None and frame == "build" else None
         site = Site(
             field,
@@ -251,38 +262,74 @@ def _taken_for_granted(result: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def pose_of_job(job: Path | None, template: Path, ids: tuple[str, str, str]) -> str:
+def pose_of_job(job: Path | None, template: Path, setup: PrintSetup) -> str:
     """What to type as the pose, where a job tells where it prints the part: a hint, no answer.
 
     The job cannot know whether the part was taken off meanwhile, so somebody has to say it.
     """
-    from amrepair.loop.locate import is_upright, locate_parts
+    from amrepair.loop.locate import is_upright
     from amrepair.template import open_template
-    from gcode.cli.options import job_of
-    from gcode.profiles import load_setup
 
     if job is None:
         return "with --job JOB.gcode this message tells where that job prints the part"
-    setup = load_setup(*ids)
     bars = console.Bars()
     try:
         with bars.shown():
-            field = open_template(template, progress=bars)
-            copies = locate_parts(
-                job_of(job, setup), field, layer_height_mm=setup.process.layer_height_mm
-            )
+            copies = _copies(job, open_template(template, progress=bars), setup)
     except (AmrepairError, GcodeError) as error:
         return f"{job} does not tell, either: {error}"
     if not is_upright(copies[0]):
-        return f"{job} prints it lying in another way than its own file has it"
-    words = []
-    for placed in copies:
-        x, y, z = placed.translation_mm
-        turn_deg = math.degrees(math.atan2(placed.matrix[1, 0], placed.matrix[0, 0]))
-        words.append(f"{x:.3f},{y:.3f},{z:.3f},{turn_deg:.2f}")
+        return (
+            f"{job} prints it lying in another way than its own file has it: say --part-pose job "
+            "if it lies there still"
+        )
+    words = [_typed(placed) for placed in copies]
     if len(words) > 1:
         return f"{job} prints {len(words)} of it, at --part-pose {' or '.join(words)}: say which"
-    return f"{job} prints it at --part-pose {words[0]}: say so if it stands there still"
+    return f"{job} prints it at --part-pose {words[0]}: say so (or: job) if it stands there still"
+
+
+def where_the_job_prints_it(
+    job: Path, template: Template, setup: PrintSetup
+) -> tuple[Template, Transform]:
+    """The template as a job lays it on the bed, and where; the place is told for next time.
+
+    Raises
+    ------
+    InputError
+        If the job prints several of it.
+    AlignmentError
+        If the job prints another part.
+    """
+    from amrepair.loop.locate import is_upright, stood
+
+    copies = _copies(job, template, setup)
+    if len(copies) > 1:
+        places = " or ".join(map(_typed, copies))
+        raise InputError(
+            f"{job} prints {len(copies)} of the part; say which by --part-pose {places}"
+        )
+    if is_upright(copies[0]):
+        said = f"it stands at --part-pose {_typed(copies[0])}"
+    else:
+        said = "it lies in another way than its own file has it"
+    console.errors.print(f"{job} prints the part: {said}.", markup=False)
+    return stood(template, copies)
+
+
+def _copies(job: Path, template: Template, setup: PrintSetup) -> tuple[Transform, ...]:
+    """Where a job prints the part."""
+    from amrepair.loop.locate import locate_parts
+    from gcode.cli.options import job_of
+
+    return locate_parts(job_of(job, setup), template, layer_height_mm=setup.process.layer_height_mm)
+
+
+def _typed(placed: Transform) -> str:
+    """A pose as --part-pose takes it."""
+    x, y, z = placed.translation_mm
+    turn_deg = math.degrees(math.atan2(placed.matrix[1, 0], placed.matrix[0, 0]))
+    return f"{x:.3f},{y:.3f},{z:.3f},{turn_deg:.2f}"
 
 
 def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:

@@ -17,8 +17,6 @@ from amrepair.cli.live import (
 )
 from amrepair.cli.options import (
     JsonOption,
-    MaterialOption,
-    PrinterOption,
     ProcessOption,
     SeedOption,
     calibration_named,
@@ -27,7 +25,8 @@ from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
 from gcode.cli.judging import LeaveHeatersOption
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+from gcode.cli.owning import JobMaterialOption, JobPrinterOption
+from gcode.profiles import DEFAULT_PROCESS
 
 APPROVALS = ("ask", "auto")
 
@@ -69,8 +68,8 @@ def loop(
             "'gcode emulate --motion FILE' has printed."
         ),
     ] = None,
-    printer: PrinterOption = DEFAULT_PRINTER,
-    material: MaterialOption = DEFAULT_MATERIAL,
+    printer: JobPrinterOption = None,
+    material: JobMaterialOption = None,
     process: ProcessOption = DEFAULT_PROCESS,
     approve: Annotated[
         str | None,

@@ -42,15 +42,17 @@ from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check, policy_of
 from gcode.cli import console
 from gcode.cli.judging import tell_warnings, warnings_json
-from gcode.cli.options import job_of
+from gcode.cli.options import program_text
+from gcode.cli.owning import job_setup, told_if_for_another
 from gcode.errors import JournalError
 from gcode.hosts import connect
 from gcode.hosts.journal import Journal, default_path
-from gcode.profiles import PrintSetup, load_setup
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, PrintSetup
 from gcode.progress import Progress, silent
-from gcode.reader import Job
+from gcode.reader import Job, job_for
 
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
+PROFILES = "profiles"  # in the run's folder: those of the job's own settings
 SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
 
 
@@ -92,7 +94,7 @@ def run(
     job_file: Path | None,
     template: Path | None,
     out: Path,
-    ids: tuple[str, str, str],
+    named: tuple[str | None, str | None, str],
     looks: Looks,
     calibration: Path | None,
     shown: Page,
@@ -119,7 +121,7 @@ def run(
             _given(job_file, "JOB"),
             _given(template, "--template"),
             out,
-            ids,
+            named,
             looks,
             calibration,
             watch,
@@ -160,7 +162,7 @@ def _new_run(
     job_file: Path,
     template: Path,
     out: Path,
-    ids: tuple[str, str, str],
+    named: tuple[str | None, str | None, str],
     looks: Looks,
     calibration: Path | None,
     watch: Stopwatch,
@@ -168,7 +170,9 @@ def _new_run(
     **said: Any,
 ) -> _Begun:
     """Read, check and write down what a run begins with."""
-    setup = load_setup(*ids)
+    text = program_text(job_file)
+    setup, own = job_setup(text, job_file, *named)
+    _ = setup.printer.head  # refused before any work
     pose = read_calibration(calibration)
     _scanner(said["scanner"], pose, said["scan_timeout_s"], setup)  # refused before any work
     folder = RunFolder(out)
@@ -178,13 +182,14 @@ def _new_run(
             f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume {out}') "
             "or name another folder with --out"
         )
-    job = job_of(job_file, setup)
+    job = job_for(text, setup.printer)
     fixed = range(looks.every - 1, len(job.layers) - 1, looks.every) if looks.every else []
     pace = (looks.every or ADAPTIVE_LAYERS) if looks.adaptive else 0
     layers = [*looks.at_layers, *layers_at(job, looks.at_mm), *([] if pace else fixed)]
     stops = plan_stops(job, layers)
     with bars.shown():
-        checked = _judged(job, setup, leave_heaters=said["leave_heaters"], progress=bars)
+        with told_if_for_another(text, job_file, setup.printer):
+            checked = _judged(job, setup, leave_heaters=said["leave_heaters"], progress=bars)
         with watch("template"):
             field = open_template(template, progress=bars)
         with watch("locate"):
@@ -195,6 +200,11 @@ def _new_run(
     tell_warnings(job_file, checked.report)
     if expected is not field:
         console.errors.print(_how_it_stands(placed))
+    ids = (
+        own.keep(out / PROFILES, *named[1:])
+        if own is not None
+        else (named[0] or DEFAULT_PRINTER, named[1] or DEFAULT_MATERIAL, named[2])
+    )
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
         copies=() if expected is field else placed, by_beads=True,

@@ -6,7 +6,8 @@ import math
 import re
 from dataclasses import dataclass
 
-from gcode.check.findings import Policy, Refusal, Text
+from gcode.check.contact import Contact, contact_of
+from gcode.check.findings import Moves, Policy, Refusal, Text
 from gcode.check.proof import CheckedProgram, CheckReport, _prove
 from gcode.check.rules import Judge
 from gcode.check.sweep import sweep
@@ -31,10 +32,16 @@ class Verdict:
         In the program's order; empty where nothing speaks against it.
     report
         What was judged, by which policy, with its warnings and what was added at the end.
+    contact
+        Where the head first touches what stands there; None where it does not, or nothing stands.
+    moves
+        All moves with known ends, for a picture.
     """
 
     refusals: tuple[Refusal, ...]
     report: CheckReport
+    contact: Contact | None = None
+    moves: Moves | None = None
 
 
 def policy_of(program: Program) -> Policy:
@@ -128,6 +135,8 @@ def judge(
         raise InputError(
             f"There is no dialect '{program.dialect}' to check; there are {', '.join(COMMANDS)}."
         )
+    if as_built is not None:
+        _ = setup.printer.head  # nobody judges what a head of unknown shape would hit
     lines = program.text.split("\n")
     top_mm = as_built.top_mm if as_built is not None else None
     one = Judge(program, setup, top_mm, initial, policy)
@@ -144,11 +153,14 @@ def judge(
     one.end(lines, leave_heaters=leave_heaters)
     progress("check", float(len(lines)), float(len(lines)))
     refusals, clearance_mm = list(one.refusals), math.inf
+    contact = None
     if as_built is not None:
         progress("sweep", 0.0, 1.0)
         hits, clearance_mm = sweep(one.moves, lines, setup.printer, as_built)
         progress("sweep", 1.0, 1.0)
         refusals += hits
+        if hits:
+            contact = contact_of(hits[0], one.moves, setup.printer, as_built)
     refusals.sort(key=lambda refusal: refusal.line)
     report = CheckReport(
         commands=one.commands,
@@ -159,4 +171,4 @@ def judge(
         warnings=one.warnings.told(),
         added=one.added,
     )
-    return Verdict(tuple(refusals), report)
+    return Verdict(tuple(refusals), report, contact, one.moves)

@@ -77,7 +77,7 @@ class Judge(Motion):
         """Judge one line."""
         self._line, self._text = number, raw
         command = raw.partition(";")[0].strip()
-        if not command:
+        if not command or command.startswith("@"):  # a host's own: the link sends none of it
             return
         self.commands += 1
         if not _PLAIN.match(command):

@@ -42,7 +42,7 @@ def sweep(
     lowest_mm = float(min(start[:, 2].min(), end[:, 2].min()))
     tallest_mm = max(as_built.top_mm, float(end[:, 2].max()))
     # what stays above everything when the tip is lowest cannot touch
-    slices = [p for p in printer.envelope if p.z_from_mm <= tallest_mm - lowest_mm]
+    slices = [p for p in printer.head if p.z_from_mm <= tallest_mm - lowest_mm]
     if not slices:
         return [], np.inf
     pushed = moves.pushed_mm3
@@ -80,6 +80,17 @@ def sweep(
         )
     body = worst[np.isfinite(worst) & ~tip[which]]
     return refusals, float(-(body.max() + BODY_SLACK_MM)) if len(body) else np.inf
+
+
+def deepest_along(
+    places_mm: Float[np.ndarray, "n 3"], printer: PrinterProfile, as_built: HeightField
+) -> Float[np.ndarray, " n"]:
+    """(n,) how deep the head is in what stands there, the tip at each place; ≤ 0: it is clear."""
+    nothing = np.zeros(len(places_mm))
+    tallest_mm, lowest_mm = as_built.top_mm, float(places_mm[:, 2].min())
+    slices = [p for p in printer.head if p.z_from_mm <= tallest_mm - lowest_mm]
+    found = _Swept(places_mm, places_mm, nothing, nothing).over(as_built, slices, grows=False)
+    return np.full(len(places_mm), -np.inf) if found is None else found[0]
 
 
 @dataclass(frozen=True, slots=True)

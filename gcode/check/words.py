@@ -29,10 +29,10 @@ COMMANDS: dict[str, frozenset[str]] = {
         "TEMPERATURE_WAIT TURN_OFF_HEATERS "
         "QUAD_GANTRY_LEVEL SET_GCODE_OFFSET EXCLUDE_OBJECT_DEFINE EXCLUDE_OBJECT_START "
         "EXCLUDE_OBJECT_END SET_PRINT_STATS_INFO CLEAR_PAUSE PRINT_START PRINT_END START_PRINT "
-        "END_PRINT".split()
+        "END_PRINT PAUSE AMREPAIR_SCAN".split()
     ),
     "reprap": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M116 M144 M207 M290 M561 M562 M566 M568 "
-                        "M572 M376 M557 M558 M593".split()),
+                        "M572 M376 M557 M558 M593 M0 M1 M226".split()),
 }  # fmt: skip
 # What measures or moves against the bed with a probe or the nozzle: never over a standing part.
 PROBES = frozenset(

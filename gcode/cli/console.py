@@ -224,6 +224,8 @@ def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None
         if getattr(sys, stream) is None:
             setattr(sys, stream, Path(os.devnull).open("w"))  # noqa: SIM115  until the end
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    for library in ("trimesh", "tifffile"):  # they log tracebacks; what is wrong we tell once
+        logging.getLogger(library).setLevel(logging.CRITICAL)
     sys.exit(_exit_code(app, name, known))  # no error is alive any more, nor what it held
 
 

@@ -1,7 +1,8 @@
-"""`gcode profiles import`: another program's profile as one of ours."""
+"""`gcode profiles import` and `find`: other programs' profiles as ours."""
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,15 +24,23 @@ def add_to(app: typer.Typer) -> None:
     app.command(
         "import",
         epilog=console.examples(
+            "gcode profiles import job.gcode --out mine",
             "gcode profiles import printer.cfg --out mine",
             "gcode profiles import PrusaSlicer_config_bundle.ini --preset printer:NAME",
         ),
     )(import_)
+    app.command(
+        "find",
+        epilog=console.examples("gcode profiles find", "gcode profiles find --all --json"),
+    )(find)
 
 
 def import_(
     file: Annotated[
-        Path, typer.Argument(help="PrusaSlicer .ini, OrcaSlicer .json, Klipper printer.cfg.")
+        Path,
+        typer.Argument(
+            help="PrusaSlicer .ini, OrcaSlicer .json, Klipper printer.cfg, or a slicer's job."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the TOML files.")] = Path(),
     preset: Annotated[
@@ -63,6 +72,49 @@ def import_(
         console.show_json(_result(found, paths))
     else:
         _show(found, paths)
+
+
+def find(
+    everything: Annotated[
+        bool, typer.Option("--all", help="Those that came with the slicers, too.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """List the presets of installed slicers, with what imports them."""
+    from gcode.profiles.finding import configuration_folders, find_presets
+
+    found = find_presets()
+    shown = [preset for preset in found if preset.own or everything]
+    if as_json:
+        console.show_json(
+            {
+                "presets": [
+                    {
+                        "slicer": p.slicer, "kind": p.kind, "name": p.name, "path": str(p.path),
+                        "preset": p.preset, "own": p.own,
+                    }
+                    for p in shown
+                ],
+                "with_the_slicers": sum(not preset.own for preset in found),
+            }
+        )  # fmt: skip
+        return
+    for p in shown:
+        option = f" --preset {shlex.quote(p.preset)}" if p.preset else ""
+        console.out.print(f"{p.slicer} {p.kind}: {p.name}", markup=False)
+        console.out.print(
+            f"  gcode profiles import {shlex.quote(str(p.path))}{option}", markup=False
+        )
+    others = len(found) - len(shown)
+    if not found:
+        places = ", ".join(str(path) for _, path in configuration_folders()) or "none"
+        console.out.print(
+            f"No preset of PrusaSlicer, OrcaSlicer or a relative of theirs is installed here "
+            f"(configuration folders found: {places}).",
+            markup=False,
+        )
+    elif others:
+        console.out.print(f"{others} came with the slicers: --all lists them.", markup=False)
 
 
 def _result(found: ImportedFile, paths: list[Path]) -> dict[str, Any]:

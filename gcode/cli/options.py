@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,19 @@ if TYPE_CHECKING:
     from gcode.profiles import PrintSetup
     from gcode.reader import Job
     from gcode.slicing.layers import LayerGrid
+    from gcode.surfaces import HeightField
+
+AS_BUILT_CELL_MM = 0.2
+AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
+
+AsBuiltOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="What stands on the bed, in its frame: a mesh, a point cloud (.ply, .pcd, .xyz), or a "
+        "height map (.npz, .tif, .npy)."
+    ),
+]
+FileArgument = Annotated[Path, typer.Argument(help="G-code file.")]
 
 PrinterOption = Annotated[
     str,
@@ -111,3 +125,39 @@ def grid_of(job: Path | None, setup: PrintSetup) -> LayerGrid:
         [layer.z_mm for layer in job_of(job, setup).layers],
         layer_height_mm=setup.process.layer_height_mm,
     )
+
+
+def standing_on_bed(path: Path) -> HeightField:
+    """A height field from a height map, a scan in the bed's frame, or a mesh with room around it.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    from gcode.solids import SUFFIXES, NotClosedError, read_solid, read_triangles
+    from gcode.surfaces import HeightField, clouds, scanned
+
+    suffix = path.suffix.lower()
+    if suffix in clouds.SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
+        return scanned.from_points(clouds.read_points(path), AS_BUILT_CELL_MM, what=str(path))
+    if suffix not in SUFFIXES:
+        if not path.is_file():
+            raise InputError(f"{path}: there is no such file.")
+        return HeightField.read(path)
+    try:
+        solid = read_solid(path)
+    except NotClosedError:  # as scanners' meshes are
+        vertices, faces = read_triangles(path)
+        return scanned.from_open_mesh(vertices, faces, AS_BUILT_CELL_MM, what=str(path))
+    return HeightField.from_manifold(solid, AS_BUILT_CELL_MM, margin_mm=AROUND_MM)
+
+
+def _has_faces(path: Path) -> bool:
+    """Whether a PLY is a mesh: its header names faces, and more than none."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(65536).partition(b"end_header")[0].decode("ascii", "replace")
+    except OSError:
+        return False
+    return re.search(r"^element face [1-9]", head, re.MULTILINE) is not None

@@ -8,9 +8,26 @@ from typing import Annotated
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
+from gcode.cli.options import JsonOption, program_text
+from gcode.cli.owning import (
+    JobMaterialOption,
+    JobPrinterOption,
+    job_setup,
+    told_if_for_another,
+)
 from gcode.errors import InputError
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(
+        "resume-at",
+        epilog=console.examples(
+            "gcode resume-at job.gcode --layer 41 --printer prusa_mk3s -o rest.gcode",
+            "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
+            "gcode resume-at job.gcode --layer 41 --without lid_copy_2 -o rest.gcode",
+        ),
+    )(resume_at_command)
 
 
 def resume_at_command(
@@ -22,8 +39,12 @@ def resume_at_command(
     layer: Annotated[
         int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
     ] = None,
-    printer: PrinterOption = DEFAULT_PRINTER,
-    material: MaterialOption = DEFAULT_MATERIAL,
+    without: Annotated[
+        str | None,
+        typer.Option(help="An object of the job of which nothing more is printed."),
+    ] = None,
+    printer: JobPrinterOption = None,
+    material: JobMaterialOption = None,
     standing: Annotated[
         Path | None,
         typer.Option(help="Height map (.npz) to write: what must stand there, for --as-built."),
@@ -33,7 +54,6 @@ def resume_at_command(
     """Make a checked job from a layer on: heated, primed, lowered onto the part, Z not homed."""
     with console.starting():
         from gcode.moves import Program
-        from gcode.profiles import load_setup
         from gcode.resumption import resume_at
 
     console.writable(output)
@@ -41,14 +61,16 @@ def resume_at_command(
         if standing.suffix != ".npz":
             raise InputError(f"{standing}: what stands there is written as .npz; rename it.")
         console.writable(standing)
-    setup = load_setup(printer, material)
+    text = program_text(job)
+    setup, _ = job_setup(text, job, printer, material)
     bars = console.Bars()
-    with bars.shown():
+    with bars.shown(), told_if_for_another(text, job, setup.printer):
         made = resume_at(
-            Program(program_text(job), setup.printer.dialect),
+            Program(text, setup.printer.dialect),
             setup,
             z_mm=z_mm,
             layer=layer,
+            without=without,
             title=job.name,
             progress=bars,
         )
@@ -61,6 +83,7 @@ def resume_at_command(
             {
                 "gcode": str(output),
                 "layer": made.layer.index,
+                "without": without,
                 "z_mm": round(made.layer.z_mm, 4),
                 "first_line": made.first_line,
                 "standing_mm": round(made.standing.top_mm, 4),
@@ -73,7 +96,8 @@ def resume_at_command(
         )
         return
     console.out.print(
-        f"{output}: {job.name} from layer {made.layer.index} ({made.layer.z_mm:g} mm) on, line "
+        f"{output}: {job.name}{f' without {without}' if without else ''} from layer "
+        f"{made.layer.index} ({made.layer.z_mm:g} mm) on, line "
         f"{made.first_line + 1}; {made.standing.top_mm:g} mm must stand there, and Z must be true; "
         f"primed {made.primed}; checked."
     )

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from gcode.hosts.port import PrintableProgram
+from gcode.protocol import command_in
 
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 _NAME = re.compile(r"([GM])\s*0*(\d+)")
@@ -47,9 +48,7 @@ def batches_of(
 ) -> Iterator[tuple[list[int], list[str]]]:
     """Lines to send and their numbers in the program, those of `size` lines at a time."""
     for start in range(first, end, size):
-        lines = [
-            line.partition(";")[0].strip() for line in checked.lines(start, min(end, start + size))
-        ]
+        lines = [command_in(line) for line in checked.lines(start, min(end, start + size))]
         yield (
             [start + offset for offset, line in enumerate(lines) if line],
             [line for line in lines if line],
@@ -62,7 +61,7 @@ def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tup
     for start in range(first, end, step):
         stop = min(end, start + step)
         for offset, line in enumerate(checked.lines(start, stop)):
-            command = line.partition(";")[0].strip()
+            command = command_in(line)
             if command:
                 yield start + offset, command
 

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from gcode.errors import ProfileError
+
 DialectName = Literal["marlin", "prusa", "klipper", "reprap"]
 Positive = Annotated[float, Field(gt=0)]
 Ratio = Annotated[float, Field(ge=0, le=1)]
@@ -173,18 +175,36 @@ class PrinterProfile(_Profile):
     park_mm: Xyz
     prime_mm: Xyz
     prime_length_mm: Annotated[float, Field(ge=0)]
-    envelope: tuple[EnvelopeSlice, ...]
+    envelope: tuple[EnvelopeSlice, ...]  # empty: nobody has measured it
     baud: int = 115200
     start_gcode: tuple[str, ...]
     end_gcode: tuple[str, ...]
     macros: tuple[str, ...] = ()  # commands of this machine beyond its firmware's own
     start_macro: StartMacro | None = None
     end_macro: str | None = None  # switches both heaters off
+    slicer_names: tuple[str, ...] = ()  # as slicers call it; capitals, no spaces or dashes, * any
 
     @field_validator("start_gcode", "end_gcode", mode="before")
     @classmethod
     def _lines(cls, value: Any) -> Any:
         return value.strip().splitlines() if isinstance(value, str) else value
+
+    @property
+    def head(self) -> tuple[EnvelopeSlice, ...]:
+        """The tool head's shape, for whoever goes near what stands there.
+
+        Raises
+        ------
+        ProfileError
+            If nobody has measured it.
+        """
+        if not self.envelope:
+            raise ProfileError(
+                f"The shape of {self.name}'s tool head is not known (its 'envelope' is empty), so "
+                "nothing can be printed on or beside what stands there; measure it, and write it "
+                "into a profile of your own that inherits this one."
+            )
+        return self.envelope
 
     @property
     def reach_box_mm(self) -> tuple[float, float, float, float]:

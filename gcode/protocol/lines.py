@@ -166,6 +166,12 @@ def numbered(number: int, text: bytes) -> bytes:
     return b"%b*%d\n" % (body, reduce(xor, body))
 
 
+def command_in(line: str) -> str:
+    """What a program's line says to the printer: no comment, and nothing that is a host's (@ …)."""
+    command = line.partition(";")[0].strip()
+    return "" if command.startswith("@") else command
+
+
 def wire_text(command: str) -> bytes:
     """Strip a G-code line to what goes on the wire: no comment, no space around, ASCII.
 

@@ -1,9 +1,10 @@
-"""From a job and a height to a job that goes on from there.
+"""From a job and what stands on the bed to a job that goes on, or begins, on top of it.
 
 It makes text and has it checked; it knows no printer's port and no journal (`hosts.resume` goes on
 with a job whose printer is still there).
 """
 
+from gcode.resumption.print_onto import Stacked, print_onto
 from gcode.resumption.resume_at import Resumption, resume_at
 
-__all__ = ["Resumption", "resume_at"]
+__all__ = ["Resumption", "Stacked", "print_onto", "resume_at"]

@@ -40,3 +40,19 @@ def standing_field(beads: Beads, line: int, printer: PrinterProfile) -> HeightFi
     return HeightField(
         np.array([x0, y0]), CELL_MM, z_mm.reshape(ny, nx), np.ones((ny, nx), dtype=bool)
     )
+
+
+def over_reach(field: HeightField, printer: PrinterProfile) -> HeightField:
+    """What stands in a field, on the whole reach of the nozzle; bare bed beyond the field."""
+    x0, y0, x1, y1 = printer.reach_box_mm
+    nx, ny = int(np.ceil((x1 - x0) / CELL_MM)), int(np.ceil((y1 - y0) / CELL_MM))
+    x_mm, y_mm = field.centres_mm()
+    ix = np.floor((x_mm - x0) / CELL_MM).astype(np.int64)
+    iy = np.floor((y_mm - y0) / CELL_MM).astype(np.int64)
+    inside_x, inside_y = (ix >= 0) & (ix < nx), (iy >= 0) & (iy < ny)
+    cells = (iy[inside_y][:, None] * nx + ix[inside_x]).ravel()
+    z_mm = np.zeros(ny * nx)
+    np.maximum.at(z_mm, cells, field.z_mm[np.ix_(inside_y, inside_x)].ravel())
+    return HeightField(
+        np.array([x0, y0]), CELL_MM, z_mm.reshape(ny, nx), np.ones((ny, nx), dtype=bool)
+    )

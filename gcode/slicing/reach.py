@@ -92,7 +92,7 @@ class Reach:
         high_mm = field.top_mm - lowest_tip_mm
         self.obstacles = tuple(
             Obstacle(part, least_tip(part, field, window, finer))
-            for part in printer.envelope
+            for part in printer.head
             if part.z_from_mm <= high_mm
         )
         self.field = field.crop(window_mm or field.box_mm)

@@ -7,7 +7,11 @@ description) and `.npy` (heights alone). It holds one height per column: undercu
 from __future__ import annotations
 
 import json
+import logging
 import math
+import struct
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +24,13 @@ from jaxtyping import Bool, Float, Int
 from gcode.errors import InputError
 from gcode.surfaces import raster_kernels as kernels
 
+# What NumPy's, zip's and TIFF's readers raise on damaged files.
+READ_ERRORS = (
+    ValueError, ArithmeticError, LookupError, TypeError, AttributeError, OSError, EOFError,
+    NotImplementedError, RuntimeError, MemoryError, SyntaxError, AssertionError,
+    struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError,
+)  # fmt: skip
+MOST_READ_CELLS = 20_000_000  # of a file: a bed of 400 mm in cells of 0.1 mm, and then some
 MAX_CELLS = 60_000_000  # half a gigabyte of heights: beyond that a cell size is a mistake
 
 
@@ -274,18 +285,29 @@ class HeightField:
         origin = origin_mm if origin_mm is not None else placement.get("origin_mm", (0.0, 0.0))
         if cell is None:
             raise InputError(f"{path}: the height map does not say its cell size; pass one in mm.")
-        if not float(cell) > 0 or z_mm.ndim != 2 or z_mm.size == 0:
+        try:
+            cell, origin = float(cell), np.asarray(origin, float).reshape(2)
+        except (TypeError, ValueError) as e:
+            raise InputError(f"{path}: its placement is {cell!r} at {origin!r}, no numbers.") from e
+        if (
+            not 0 < cell < math.inf
+            or not np.isfinite(origin).all()
+            or z_mm.ndim != 2
+            or z_mm.size == 0
+        ):
             raise InputError(
                 f"{path}: a height map needs two dimensions and a cell above 0 mm, "
                 f"not shape {z_mm.shape} and cell {cell} mm."
             )
         finite = np.isfinite(z_mm)
+        if seen is not None and seen.shape != z_mm.shape:
+            raise InputError(f"{path}: it has heights {z_mm.shape} and says of {seen.shape}, seen.")
         if not finite.any():
             raise InputError(f"{path}: the height map holds no finite height.")
         solid_mm = float(z_mm[finite].max()) if unseen_z_mm is None else unseen_z_mm
         return cls(
-            origin_mm=np.asarray(origin, float).reshape(2),
-            cell_mm=float(cell),
+            origin_mm=origin,
+            cell_mm=cell,
             z_mm=np.where(finite, z_mm, solid_mm),
             seen=finite if seen is None else seen & finite,
         )
@@ -428,25 +450,67 @@ def _read_heights(
 ) -> tuple[Float[np.ndarray, ...], dict[str, Any], Bool[np.ndarray, ...] | None]:
     """Heights, placement and seen mask of a file, as far as it carries them."""
     suffix = path.suffix.lower()
+    readers = {".npz": _read_npz, ".tif": _read_tiff, ".tiff": _read_tiff, ".npy": _read_npy}
+    if suffix not in readers:
+        raise InputError(f"{path}: a height map is a .npz, .tif or .npy file, not '{suffix}'.")
     try:
-        if suffix == ".npz":
-            with np.load(path) as archive:
-                placement = {
-                    "cell_mm": float(archive["cell_mm"]),
-                    "origin_mm": archive["origin_mm"].tolist(),
-                }
-                return archive["z_mm"].astype(np.float64), placement, archive["seen"].astype(bool)
-        if suffix in {".tif", ".tiff"}:
-            with tifffile.TiffFile(path) as tiff:
-                page = tiff.pages[0]
-                heights = page.asarray().astype(np.float64)
-                try:
-                    placement = json.loads(getattr(page, "description", "") or "{}")
-                except json.JSONDecodeError:
-                    placement = {}
-            return heights, placement if isinstance(placement, dict) else {}, None
-        if suffix == ".npy":
-            return np.load(path).astype(np.float64), {}, None
-    except (OSError, ValueError, KeyError, tifffile.TiffFileError) as e:
-        raise InputError(f"{path}: the height map cannot be read ({e}).") from e
-    raise InputError(f"{path}: a height map is a .npz, .tif or .npy file, not '{suffix}'.")
+        return readers[suffix](path)
+    except READ_ERRORS as e:
+        what = " ".join(str(e).split())[:120] or type(e).__name__
+        raise InputError(f"{path}: the height map cannot be read ({what}).") from e
+
+
+def _read_npz(
+    path: Path,
+) -> tuple[Float[np.ndarray, ...], dict[str, Any], Bool[np.ndarray, ...] | None]:
+    with zipfile.ZipFile(path) as packed:
+        for info in packed.infolist():
+            with packed.open(info) as member:
+                _refuse_more_than_it_holds(path, member, info.file_size)
+    with np.load(path) as archive:
+        placement = {
+            "cell_mm": float(archive["cell_mm"]),
+            "origin_mm": archive["origin_mm"].tolist(),
+        }
+        z_mm = archive["z_mm"].astype(np.float64, copy=False)
+        return z_mm, placement, archive["seen"].astype(bool)
+
+
+def _read_npy(path: Path) -> tuple[Float[np.ndarray, ...], dict[str, Any], None]:
+    with path.open("rb") as file:
+        _refuse_more_than_it_holds(path, file, path.stat().st_size)
+    return np.load(path).astype(np.float64, copy=False), {}, None
+
+
+def _refuse_more_than_it_holds(path: Path, file: Any, size_bytes: int) -> None:
+    """Refuse an array of NumPy's that promises more than there is, before room is made for it."""
+    version = np.lib.format.read_magic(file)
+    read_header = getattr(np.lib.format, f"read_array_header_{version[0]}_0")
+    shape, _, kind = read_header(file)
+    cells = math.prod(shape)
+    if cells * kind.itemsize > size_bytes:
+        raise ValueError(f"it promises {cells:,} numbers and is too short for them")
+    _refuse_too_many(cells)
+
+
+def _refuse_too_many(cells: int) -> None:
+    if cells > MOST_READ_CELLS:
+        raise ValueError(f"it has {cells:,} cells, the limit is {MOST_READ_CELLS:,}")
+
+
+def _read_tiff(path: Path) -> tuple[Float[np.ndarray, ...], dict[str, Any], None]:
+    said = logging.getLogger("tifffile")
+    level = said.level
+    said.setLevel(logging.CRITICAL)  # what it finds odd is told once, by us
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            page = tiff.pages[0]
+            _refuse_too_many(math.prod(page.shape))
+            heights = page.asarray().astype(np.float64, copy=False)
+            try:
+                placement = json.loads(getattr(page, "description", "") or "{}")
+            except json.JSONDecodeError:
+                placement = {}
+    finally:
+        said.setLevel(level)
+    return heights, placement if isinstance(placement, dict) else {}, None

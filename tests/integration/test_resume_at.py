@@ -328,6 +328,7 @@ def test_bad_calls_end_in_one_sentence_and_write_nothing(
     job, out = tmp_path / "job.gcode", tmp_path / "out.gcode"
     job.write_text(tower(4.0).text)
     words = [str(out) if word == "OUT" else word for word in words]
+    words += ["--printer", "prusa_mk3s"]
     monkeypatch.setattr(sys, "argv", ["gcode", "resume-at", str(job), *words])
     with pytest.raises(SystemExit) as end:
         main()

@@ -314,14 +314,13 @@ def test_a_job_tells_what_to_type_as_the_pose(
     job, part = tmp_path / "job.gcode", tmp_path / "part.stl"
     path = plan_part(solid.rotate((0, 0, 90)).translate((100.0, 90.0, 0.0)), SETUP).toolpath
     job.write_text(write(path, SETUP, title="L").text)
-    ids = ("prusa_mk3s", "pla", "repair_0.20")
-    words = re.search(r"--part-pose (\S+): say so", pose_of_job(job, part, ids))
+    words = re.search(r"--part-pose (\S+): say so", pose_of_job(job, part, SETUP))
     assert words is not None
     told = [float(word) for word in words.group(1).split(",")]
     assert told == pytest.approx([100.0, 90.0, 0.0, 90.0], abs=0.1)
-    assert "--job" in pose_of_job(None, part, ids)
+    assert "--job" in pose_of_job(None, part, SETUP)
     part.write_text("no job")
-    assert "does not tell" in pose_of_job(part, part, ids)
+    assert "does not tell" in pose_of_job(part, part, SETUP)
 
 
 def test_a_program_that_lays_nothing_is_told_too() -> None:

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
-from gcode.cli.app import send
+from gcode.cli.sending import send
 from gcode.errors import JournalError, LinkError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import supervisor

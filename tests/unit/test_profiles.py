@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gcode.check import find_refusals
 from gcode.errors import ProfileError
+from gcode.moves import Program
 from gcode.profiles import (
     expand_script,
     kind_of,
@@ -19,6 +21,8 @@ from gcode.profiles import (
     load_process,
     load_setup,
 )
+from gcode.profiles.machines import machine_named
+from gcode.surfaces import HeightField
 
 
 @pytest.mark.parametrize("name", list_profiles("printers"))
@@ -29,7 +33,7 @@ def test_every_shipped_printer_loads_and_fits_its_own_bed(name: str) -> None:
         assert x0 <= x <= x1
         assert y0 <= y <= y1
         assert 0 <= z <= printer.max_z_mm
-    assert printer.envelope[0].z_from_mm == 0
+    assert not printer.envelope or printer.envelope[0].z_from_mm == 0
     assert len(printer.sha256) == 64
 
 
@@ -46,7 +50,14 @@ def test_every_shipped_figure_says_where_it_is_from(path: Path) -> None:
             assert len(comment) > 20, paragraph
 
 
-@pytest.mark.parametrize("name", list_profiles("printers"))
+MEASURED = [name for name in list_profiles("printers") if load_printer(name).envelope]
+
+
+def test_heads_that_were_measured_stay_measured() -> None:
+    assert len(MEASURED) == 10
+
+
+@pytest.mark.parametrize("name", MEASURED)
 def test_every_shipped_nozzle_is_a_cone(name: str) -> None:
     # regression: up to 0.8 mm over the tip it was no wider than its flat, 1 mm
     flat, cone, hexagon = load_printer(name).envelope[:3]
@@ -234,3 +245,26 @@ def test_a_profile_that_breaks_its_own_limits_is_refused(
     own.write_text(f'inherits = "generic_klipper"\n{text}\n')
     with pytest.raises(ProfileError, match=f"mine.toml: the profile breaks its own .*{said}"):
         load_printer(own)
+
+
+def test_a_head_that_nobody_has_measured_goes_near_nothing() -> None:
+    printer = load_printer("ender_3_v3_ke")
+    assert printer.envelope == ()
+    setup = load_setup("ender_3_v3_ke")
+    lines = ["G90", "G1 Z20 F600", "G1 X30 Y105 F6000", ""]
+    assert find_refusals(Program("\n".join(["G28", *lines]), "klipper"), setup) == ()
+    program = Program("\n".join(["G28 X Y", *lines]), "klipper")
+    with pytest.raises(ProfileError, match="shape of Creality Ender-3 V3 KE's tool head"):
+        find_refusals(program, setup, as_built=HeightField.flat((50.0, 50.0), 1.0, z_mm=3.0))
+    with pytest.raises(ProfileError, match="measure it"):
+        _ = printer.head
+
+
+def test_slicers_names_are_not_inherited() -> None:
+    """Else the parent's jobs would be taken for the child's machine."""
+    assert load_printer("creality_k1c").slicer_names != load_printer("creality_k1").slicer_names
+    known = {name: p for p in list_profiles("printers") for name in load_printer(p).slicer_names}
+    assert machine_named("Creality Ender-3 V3 KE 0.4 nozzle") == "ender_3_v3_ke"
+    assert machine_named("Creality Ender-3 V3") is None, "another machine"
+    for pattern, profile in known.items():
+        assert machine_named(pattern.replace("*", "")) == profile

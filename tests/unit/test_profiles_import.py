@@ -205,7 +205,7 @@ def test_an_orca_machine_with_its_parent_beside_it(tmp_path: Path) -> None:
     assert "envelope" in found.notes[-1]
     (tmp_path / "base.json").unlink()
     lonely = read(tmp_path, "mine.json", json.dumps(own))
-    assert "its parent is not beside the file" in reasons(lonely)["inherits"]
+    assert "its parent is neither beside the file" in reasons(lonely)["inherits"]
 
 
 @pytest.mark.parametrize(

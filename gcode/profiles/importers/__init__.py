@@ -1,4 +1,5 @@
-"""Other programs' profiles, read only: PrusaSlicer `.ini`, OrcaSlicer JSON, Klipper `printer.cfg`.
+"""Other programs' profiles, read only: PrusaSlicer `.ini`, OrcaSlicer JSON, Klipper `printer.cfg`,
+and the settings that slicers write into their jobs.
 
 What the source does not know (the tool head's envelope, where to park and prime) is inherited from
 a shipped profile and said; every key of the source is mapped or listed with the reason. Nothing is
@@ -16,35 +17,39 @@ from typing import Any
 from pydantic import ValidationError
 
 from gcode.errors import InputError, ProfileError
+from gcode.profiles.importers.jobs import SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER, bed_note, finish, read_klipper
 from gcode.profiles.importers.rules import Imported, Left, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
+from gcode.profiles.machines import machine_named
 from gcode.profiles.names import Kind, list_profiles
+from gcode.profiles.own_limits import own_fault
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
 from gcode.profiles.store import content_of
 
-__all__ = ["Imported", "ImportedFile", "Left", "Mapped", "import_profiles", "to_toml"]
+__all__ = [
+    "Imported",
+    "ImportedFile",
+    "Left",
+    "Mapped",
+    "import_job",
+    "import_profiles",
+    "to_toml",
+    "write_profiles",
+]
 
 _MODELS: dict[Kind, type[PrinterProfile | MaterialProfile | ProcessProfile]] = {
     "printers": PrinterProfile,
     "materials": MaterialProfile,
     "processes": ProcessProfile,
 }
-_MARKS = {
-    "prusa_mk3s": "MK3",
-    "prusa_mk4": "MK4",
-    "prusa_mini": "MINI",
-    "ender_3": "ENDER3",
-    "creality_k1": "CREALITYK1",
-    "voron_2_4": "VORON2.4",
-}
-"""Shipped machines, by what their names hold once spaces and dashes are left out."""
 _GENERIC = {
     "marlin": "generic_marlin",
     "klipper": "generic_klipper",
     "reprap": "generic_reprap",
     "prusa": "prusa_mk3s",
 }
+_GENERIC_IDS = frozenset(v for v in _GENERIC.values() if v.startswith("generic"))
 ASK_FOR = (
     "bed_size_mm",
     "max_z_mm",
@@ -100,9 +105,18 @@ def import_profiles(
         If a value is outside what our profiles allow.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        kind = "replace" if path.suffix.lower() in SUFFIXES else "strict"
+        text = path.read_text(encoding="utf-8-sig", errors=kind)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read as text ({error}).") from error
+    if path.suffix.lower() in SUFFIXES:
+        found = import_job(str(path), text, inherits=inherits)
+        if found is None:
+            raise InputError(
+                f"{path}: no slicer has written its settings into this job; PrusaSlicer, "
+                "OrcaSlicer, Bambu Studio, Creality Print and Cura do."
+            )
+        return found
     rules, source = _read(path, text, preset)
     if inherits is not None and len(source.kinds) > 1:
         raise InputError(
@@ -120,6 +134,37 @@ def import_profiles(
     return ImportedFile(str(path), made, left, tuple(notes))
 
 
+def import_job(name: str, text: str, *, inherits: str | None = None) -> ImportedFile | None:
+    """The settings that a slicer wrote into a job, as profiles; None where it wrote none.
+
+    A setting that our profiles do not allow is left, with the reason, and inherited: whoever has
+    only the job cannot correct it.
+
+    Parameters
+    ----------
+    inherits
+        The printer profile to take from what the job does not know; that of its model where left
+        out, or a generic one.
+
+    Raises
+    ------
+    InputError
+        If the settings are cut.
+    """
+    settings = read_settings(Path(name).name, text)
+    if settings is None:
+        return None
+    rules, source = settings
+    parents = {kind: _parent(kind, source, rules) for kind in source.kinds}
+    parents["printers"] = inherits or parents["printers"]
+    made, left = apply(source, rules, parents)
+    notes, more = [], list(left)
+    for profile in made:
+        notes += _settle(profile)
+        more += _within_range(profile)
+    return ImportedFile(name, made, tuple(more), tuple(notes))
+
+
 def _read(path: Path, text: str, preset: str | None) -> tuple[dict[str, Rule], Source]:
     suffix = path.suffix.lower()
     if suffix == ".json":
@@ -130,7 +175,7 @@ def _read(path: Path, text: str, preset: str | None) -> tuple[dict[str, Rule], S
         return PRUSA, read_prusa(path, text, preset)
     raise InputError(
         f"{path}: its ending is {suffix or 'missing'}; give a PrusaSlicer .ini, an OrcaSlicer "
-        f".json or a Klipper printer.cfg."
+        f".json, a Klipper printer.cfg or a slicer's job (.gcode)."
     )
 
 
@@ -142,12 +187,16 @@ def _parent(kind: Kind, source: Source, rules: dict[str, Rule]) -> str:
         return named if named in list_profiles("materials") else "pla"
     if rules is KLIPPER:
         return _GENERIC["klipper"]
-    model = f"{source.values.get('printer_model', '')} {source.name}".upper()
-    model = re.sub(r"[\s_-]", "", model)
-    for profile, mark in _MARKS.items():
-        if mark in model:
-            return profile
-    flavour = source.values.get("gcode_flavor", "marlin")
+    known = machine_named(
+        source.values.get("printer_model", ""),
+        source.values.get("printer_settings_id", ""),
+        source.values.get("TARGET_MACHINE.NAME", ""),
+        source.values.get("definition", ""),
+        source.name,
+    )
+    if known is not None:
+        return known
+    flavour = source.values.get("gcode_flavor", source.values.get("FLAVOR", "marlin")).lower()
     # their "reprap" is what nobody chose, and no RepRapFirmware
     dialect = {"reprapfirmware": "reprap", "reprap": "marlin"}.get(flavour, flavour)
     return _GENERIC.get(dialect, _GENERIC["marlin"])
@@ -161,8 +210,9 @@ def _settle(made: Imported) -> list[str]:
             made.values[key] = {**above[key], **value}
     if made.kind != "printers":
         return []
-    if above["dialect"] == "prusa" and made.values.get("dialect") == "marlin":
-        made.values["dialect"] = "prusa"  # PrusaSlicer calls Prusa's firmware Marlin
+    if made.inherits not in _GENERIC_IDS and made.values.get("dialect") == "marlin":
+        # slicers call Prusa's firmware Marlin, and older ones and Cura Klipper, too
+        made.values["dialect"] = above["dialect"]
     merged = {**above, **made.values}
     notes = []
     size_mm, top_mm = merged["bed_size_mm"], merged["max_z_mm"]
@@ -195,10 +245,49 @@ def _validate(path: Path, made: Imported) -> None:
         ) from error
 
 
+def _within_range(made: Imported) -> list[Left]:
+    """Drop what the schema, or a printer's own limits, do not allow; it is inherited then."""
+    dropped: list[Left] = []
+    while (fault := _fault(made)) is not None:
+        key, why = fault
+        if key not in made.values:
+            raise ProfileError(f"{made.name}: key '{key}': {why}; report this.")
+        del made.values[key]
+        gone = [row for row in made.mapped if row.key.partition(".")[0] == key]
+        made.mapped = [row for row in made.mapped if row not in gone]
+        dropped += [Left(row.source_key, row.source_value, why) for row in gone]
+    return dropped
+
+
+def _fault(made: Imported) -> tuple[str, str] | None:
+    """The first key of a profile's own that is not allowed, and why."""
+    content = {**content_of(made.kind, made.inherits), **made.values, "id": "x", "name": made.name}
+    try:
+        profile = _MODELS[made.kind].model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        return str(first["loc"][0]), f"{first['input']!r} is out of range ({first['msg']})"
+    fault = own_fault(profile) if isinstance(profile, PrinterProfile) else None
+    if fault is None:
+        return None
+    key = next((key for key in made.values if f"'{key}'" in fault), None)
+    return (key, f"it breaks the machine's limits: {fault}") if key is not None else None
+
+
+def write_profiles(found: ImportedFile, folder: Path) -> dict[Kind, Path]:
+    """Write an import as TOML files, one folder for each kind; where they lie."""
+    paths: dict[Kind, Path] = {}
+    for made in found.profiles:
+        paths[made.kind] = folder / made.kind / file_name(made)
+        paths[made.kind].parent.mkdir(parents=True, exist_ok=True)
+        paths[made.kind].write_text(to_toml(made, found.source), encoding="utf-8")
+    return paths
+
+
 def file_name(made: Imported) -> str:
     """Return the file name, and so the ID, of an imported profile."""
     slug = re.sub(r"[^a-z0-9.]+", "_", made.name.lower()).strip("_.")
-    return f"{slug or 'imported'}.toml"
+    return f"{slug or 'imported'}{'_own' if slug == made.inherits else ''}.toml"
 
 
 def to_toml(made: Imported, source: str) -> str:

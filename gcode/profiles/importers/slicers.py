@@ -178,7 +178,7 @@ _PRUSA_NAMES: dict[str, Kind] = {
     "filament_settings_id": "materials",
     "print_settings_id": "processes",
 }
-_REASONS = {
+REASONS = {
     **dict.fromkeys(
         ("filament_type", "printer_model"), "it only chose the profile that is inherited from"
     ),
@@ -231,7 +231,7 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
                 f"{path} has none of {', '.join(_TELLTALES)}; export it by PrusaSlicer's "
                 f"File, Export, Export Config."
             )
-        return Source(path.stem, kinds, values, _PRUSA_NAMES, _REASONS)
+        return Source(path.stem, kinds, values, _PRUSA_NAMES, REASONS)
     if preset not in presets:
         shown = ", ".join(repr(name) for name in presets if "*" not in name)
         raise InputError(
@@ -239,7 +239,7 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
         )
     kind, _, name = preset.partition(":")
     values = _inherited(parser, path, preset, ())
-    return Source(name, (_PRUSA_KINDS[kind],), values, missing=_REASONS)
+    return Source(name, (_PRUSA_KINDS[kind],), values, missing=REASONS)
 
 
 def _inherited(
@@ -277,16 +277,36 @@ def read_orca(path: Path, text: str, chain: tuple[Path, ...] = ()) -> Source:
             f"{path} is no OrcaSlicer preset: its 'type' is none of {', '.join(_ORCA_KINDS)}."
         )
     values = {key: _text(value) for key, value in content.items()}
-    parent = path.parent / f"{values.get('inherits', '')}.json"
-    if values.get("inherits") and parent.is_file():
+    parent = _parent_file(path, values.get("inherits", ""))
+    if parent is not None:
         if parent in chain:
             raise InputError(f"{path}: 'inherits' runs in a circle; remove one link.")
         above = read_orca(parent, parent.read_text(encoding="utf-8"), (*chain, path))
         values = {**above.values, **values}
         del values["inherits"]
     del values["type"]
-    missing = {"inherits": "its parent is not beside the file: what that sets is not known here"}
-    return Source(path.stem, (kind,), values, {"name": kind}, {**_REASONS, **missing})
+    missing = {
+        "inherits": "its parent is neither beside the file nor among its slicer's presets: what "
+        "that sets is not known here"
+    }
+    return Source(path.stem, (kind,), values, {"name": kind}, {**REASONS, **missing})
+
+
+def _parent_file(path: Path, name: str) -> Path | None:
+    """The preset that one inherits: beside it, or among its slicer's own presets.
+
+    A user's preset lies in `user/ACCOUNT/machine/`, and what it inherits in
+    `system/VENDOR/machine/` of the same configuration folder.
+    """
+    if not name:
+        return None
+    beside = path.parent / f"{name}.json"
+    if beside.is_file():
+        return beside
+    for folder in path.resolve().parents:
+        if folder.name in {"user", "system"}:
+            return next(iter(sorted((folder.parent / "system").glob(f"**/{name}.json"))), None)
+    return None
 
 
 def _text(value: Any) -> str:

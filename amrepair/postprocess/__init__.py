@@ -1,0 +1,10 @@
+"""Marks in a slicer's job where looks belong, as a script that the slicer runs after slicing.
+
+It reads the job and adds lines; every line that was there stays as it is, byte for byte. It looks
+at nothing and repairs nothing: that is for whoever is told by the marks (`loop`, a host's macro).
+"""
+
+from amrepair.postprocess.mark import Asked, Marked, mark
+from amrepair.postprocess.words import TARGETS, Target, target_of
+
+__all__ = ["TARGETS", "Asked", "Marked", "Target", "mark", "target_of"]

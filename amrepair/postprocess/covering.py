@@ -1,0 +1,46 @@
+"""How much of what lies open after a layer the next one covers for ever: it cannot be seen again.
+
+Sparse infill stays open for many layers and is closed by one: that is when a look is worth most.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from gcode.reader import Job
+from gcode.surfaces import raster_kernels
+
+CELL_MM = 0.4  # about a bead
+MOST_CELLS = 4_000_000
+
+
+def covered_mm2(job: Job) -> Float[np.ndarray, " layers"]:
+    """(layers,) area that each layer closes: open within the outline of the layer before, mm².
+
+    Cells that a layer's beads cover and the layer's before did not, though its outline goes round
+    them.
+    """
+    beads = job.beads
+    low = np.minimum(beads.start_mm, beads.end_mm)[:, :2].min(axis=0) - CELL_MM
+    high = np.maximum(beads.start_mm, beads.end_mm)[:, :2].max(axis=0) + CELL_MM
+    cell_mm = max(CELL_MM, float(np.sqrt(np.prod(high - low) / MOST_CELLS)))
+    nx, ny = (int(v) for v in np.ceil((high - low) / cell_mm))
+    bounds = np.searchsorted(beads.layer, np.arange(len(job.layers) + 1))
+    areas, open_before = np.zeros(len(job.layers)), np.zeros((ny, nx), bool)
+    for layer in range(len(job.layers)):
+        part = slice(int(bounds[layer]), int(bounds[layer + 1]))
+        laid = (
+            raster_kernels.beside_lines(
+                np.ascontiguousarray(beads.start_mm[part, :2]),
+                np.ascontiguousarray(beads.end_mm[part, :2]),
+                0.5 * beads.width_mm[part] + 0.25 * cell_mm,
+                np.zeros(part.stop - part.start),
+                low, cell_mm, ny, nx,
+            )
+            > -np.inf
+        )  # fmt: skip
+        areas[layer] = float((laid & open_before).sum()) * cell_mm**2
+        open_before = ndimage.binary_fill_holes(laid) & ~laid
+    return areas

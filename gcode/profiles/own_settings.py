@@ -1,0 +1,190 @@
+"""What a job says of the printer and the material that it was sliced for.
+
+It reads the settings that a slicer wrote into the job (`importers.jobs`), makes profiles of them,
+and tells whether a profile is of another machine. It judges no move.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from gcode.profiles.importers import ImportedFile, import_job, write_profiles
+from gcode.profiles.importers.jobs import generator
+from gcode.profiles.machines import machine_named
+from gcode.profiles.names import DEFAULT_PROCESS
+from gcode.profiles.schema import PrinterProfile
+from gcode.profiles.setup import PrintSetup, load_setup
+
+SAME_BED_RATIO = 0.05  # slicers and makers give one bed a few millimetres more or less
+SAME_NOZZLE_MM = 0.01
+_POINT = re.compile(r"(-?\d+(?:\.\d+)?)x(-?\d+(?:\.\d+)?)")
+# Firmware that understands another's words for what a job holds: Prusa's is a Marlin, and slicers
+# that know no Klipper write Marlin's words for it.
+_READS = {
+    "marlin": {"marlin", "prusa"},
+    "prusa": {"prusa", "marlin"},
+    "klipper": {"klipper", "marlin"},
+    "reprap": {"reprap"},
+}
+# What one would ask first, and what no slicer tells.
+_WORDS = {
+    "bed_size_mm": "bed",
+    "max_z_mm": "height",
+    "nozzle_diameter_mm": "nozzle",
+    "max_speed_mm_s": "speeds",
+    "max_hotend_c": "temperature limits",
+    "envelope": "tool head",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class OwnSettings:
+    """A job's own settings.
+
+    Attributes
+    ----------
+    job
+        The job's name.
+    slicer
+        Which program wrote it, as it says itself; empty where it does not.
+    machine
+        The shipped profile of the job's printer; None where none is known.
+    bed_size_mm
+        How far the slicer's bed goes in X and Y; None where the job does not tell.
+    """
+
+    job: str
+    slicer: str
+    found: ImportedFile
+    machine: str | None
+    bed_size_mm: tuple[float, float] | None
+
+    @property
+    def printer_name(self) -> str:
+        """What the slicer calls the printer."""
+        return self.found.profiles[0].name
+
+    @property
+    def flow_is_told(self) -> bool:
+        """Whether the job says how fast its filament may be melted."""
+        return "max_volumetric_mm3_s" in self.found.profiles[1].values
+
+    def setup(self, material: str | None = None, process: str | None = None) -> PrintSetup:
+        """Printer and, where none is named, material of the job.
+
+        Parameters
+        ----------
+        process
+            The process of our own that repairs are sliced with; its default where left out.
+        """
+        with tempfile.TemporaryDirectory(prefix="gcode-job-") as folder:
+            return load_setup(*self.keep(Path(folder), material, process))
+
+    def keep(
+        self, folder: Path, material: str | None = None, process: str | None = None
+    ) -> tuple[str, str, str]:
+        """Write the profiles into a folder; the three paths or IDs to load."""
+        paths = write_profiles(self.found, folder)
+        return (
+            str(paths["printers"]),
+            material or str(paths["materials"]),
+            process or DEFAULT_PROCESS,
+        )
+
+    def in_words(self, setup: PrintSetup) -> str:
+        """One sentence: what was taken from where."""
+        printer, made = setup.printer, self.found.profiles[0]
+        untold = [words for key, words in _WORDS.items() if key not in made.values]
+        return (
+            f"{self.job}: no --printer is given, so its own settings"
+            f"{f' ({self.slicer})' if self.slicer else ''} are taken: {_described(printer)}; "
+            f"what they do not tell ({', '.join(untold)}) is {made.inherits}'s"
+        )
+
+    def differs_from(self, printer: PrinterProfile) -> str | None:
+        """One sentence if the job was sliced for another machine; None where it may be this one."""
+        values = self.found.profiles[0].values
+        why = []
+        if self.bed_size_mm is not None and any(
+            abs(job - own) > SAME_BED_RATIO * own
+            for job, own in zip(self.bed_size_mm, printer.bed_size_mm, strict=True)
+        ):
+            why.append(f"a bed of {_bed(self.bed_size_mm)}, not {_bed(printer.bed_size_mm)}")
+        nozzle_mm = values.get("nozzle_diameter_mm")
+        if nozzle_mm is not None and abs(nozzle_mm - printer.nozzle_diameter_mm) > SAME_NOZZLE_MM:
+            why.append(f"a nozzle of {nozzle_mm:g} mm, not {printer.nozzle_diameter_mm:g} mm")
+        dialect = values.get("dialect")
+        if dialect is not None and dialect not in _READS[printer.dialect]:
+            why.append(f"{dialect}, not {printer.dialect}")
+        given = machine_named(printer.name)
+        known = self.machine is not None and given is not None
+        if not why and not (known and self.machine != given):
+            return None
+        reasons = f" ({'; '.join(why)})" if why else ""
+        remedy = f"--printer {self.machine}" if self.machine else "a profile of that printer"
+        return (
+            f"{self.job} was sliced for another printer than {printer.name}: for "
+            f"'{self.printer_name}'{reasons}; give {remedy}, leave --printer out to take the "
+            "job's own settings, or slice it for this one"
+        )
+
+
+def own_settings(text: str, name: str) -> OwnSettings | None:
+    """What a job's slicer wrote into it; None where there is nothing.
+
+    Parameters
+    ----------
+    text
+        The whole job.
+    name
+        What it is called in messages.
+
+    Raises
+    ------
+    InputError
+        If the settings are cut.
+    """
+    found = import_job(name, text)
+    if found is None:
+        return None
+    made = found.profiles[0]
+    outline = [row.source_value for row in made.mapped if row.key == "bed_size_mm"]
+    outline += [row.source_value for row in found.left if row.source_key == "bed_shape"]
+    machine = None if made.inherits.startswith("generic") else made.inherits
+    size_mm = _extent(outline[0]) if outline else None
+    if size_mm is None and (told := made.values.get("bed_size_mm")) is not None:
+        size_mm = (told[0], told[1])
+    if machine is not None and not _named(made.name, found, machine):
+        machine = None  # a dialect's stand-in, no machine that the job names
+    return OwnSettings(Path(name).name, generator(text), found, machine, size_mm)
+
+
+def _named(name: str, found: ImportedFile, machine: str) -> bool:
+    models = [row.source_value for row in found.left if row.source_key == "printer_model"]
+    return machine_named(*models, name) == machine
+
+
+def _extent(outline: str) -> tuple[float, float] | None:
+    """From the least to the greatest X and Y of an outline `0x0,250x0,…`, from the origin on."""
+    points = [(float(x), float(y)) for x, y in _POINT.findall(outline)]
+    if len(points) < 3:
+        return None
+    sides = []
+    for values in zip(*points, strict=True):
+        low, high = min(values), max(values)
+        sides.append(high - low if low < -SAME_BED_RATIO * (high - low) else high)
+    return sides[0], sides[1]
+
+
+def _described(printer: PrinterProfile) -> str:
+    return (
+        f"{printer.name}, bed {_bed(printer.bed_size_mm)}, {printer.max_z_mm:g} mm high, nozzle "
+        f"{printer.nozzle_diameter_mm:g} mm, {printer.dialect}"
+    )
+
+
+def _bed(size_mm: tuple[float, float]) -> str:
+    return f"{size_mm[0]:g} × {size_mm[1]:g} mm"

@@ -1,0 +1,168 @@
+"""The lines that bring a cold machine to where a job's nozzle is, over what stands on the bed.
+
+Z is never homed. It lifts, homes X and Y above everything, heats, primes beside the part, comes
+straight down, and says again what the job had set.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gcode.dialects import number
+from gcode.errors import InputError
+from gcode.moves import ModalState
+from gcode.profiles import PrinterProfile, PrintSetup
+from gcode.reader import Job
+from gcode.resumption.settings import Settings
+from gcode.slicing.room import bare_place, room_for_line
+from gcode.surfaces import HeightField
+from gcode.units import filament_area_mm2, mm_min_from_mm_s
+
+LIFT_MM = 10.0
+LEAST_LIFT_MM = 2.0
+PRIME_MM3_S = 4.0
+
+
+def prime(head: Head, field: HeightField, printer: PrinterProfile) -> str:
+    """Prime where there is room; says where that was."""
+    place = room_for_line(field, printer, head.prime_length_mm)
+    if place is not None:
+        head.prime_on_bed(*place)
+        return "on the bed"
+    aside = bare_place(field, printer)
+    if aside is None:
+        raise InputError(
+            "There is no bare place on the bed to prime at; take something off the bed and leave "
+            "it out of the job."
+        )
+    head.prime_in_air(*aside)
+    return "in the air"
+
+
+def temperatures(settings: Settings, setup: PrintSetup) -> tuple[float, float]:
+    """The job's own; the material's where a macro keeps them to itself."""
+    hotend_c = settings.hotend_c or setup.material.hotend_c
+    bed_c = setup.material.bed_c if settings.bed_c is None else settings.bed_c
+    return hotend_c, min(bed_c, setup.printer.max_bed_c)
+
+
+def height_over(top_mm: float, state: ModalState, printer: PrinterProfile) -> float:
+    """Height at which the nozzle passes over everything."""
+    top_mm = max(top_mm, state.position_mm[2])
+    clear_mm = min(top_mm + LIFT_MM, printer.max_z_mm)
+    if clear_mm < top_mm + LEAST_LIFT_MM:
+        raise InputError(
+            f"The part stands {top_mm:g} mm high and the nozzle goes up to {printer.max_z_mm:g} "
+            f"mm: there is no room to home X and Y above it, {LEAST_LIFT_MM:g} mm are needed."
+        )
+    return round(clear_mm, 3)
+
+
+def pulled_back_mm(job: Job, line: int) -> float:
+    """Filament that the job has pulled back and not yet pushed out again."""
+    pulled_mm = 0.0
+    pushed = job.moves()[1][:line]
+    for step in pushed[np.flatnonzero(pushed)]:
+        pulled_mm = max(0.0, pulled_mm - float(step))
+    return pulled_mm
+
+
+class Head:
+    """The lines that bring the machine to where the job's nozzle was."""
+
+    def __init__(self, setup: PrintSetup, state: ModalState, *, clear_mm: float) -> None:
+        self.lines: list[str] = []
+        self._state, self._clear_mm = state, clear_mm
+        self._printer = setup.printer
+        self._area_mm2 = filament_area_mm2(setup.printer.filament_diameter_mm)
+        self._section_mm2 = 0.5 * setup.printer.max_bead_section_mm2
+        self._flow_mm3_s = min(PRIME_MM3_S, setup.max_volumetric_mm3_s)
+        self._travel = f" F{_feed(setup.printer.travel_speed_mm_s)}"
+        self._z_feed = f" F{_feed(setup.printer.z_speed_mm_s)}"
+
+    @property
+    def prime_length_mm(self) -> float:
+        """Length of the line that the profile's priming filament makes."""
+        return self._printer.prime_length_mm * self._area_mm2 / self._section_mm2
+
+    def comment(self, *texts: str) -> None:
+        """Comments."""
+        self.lines += [f"; {text}" for text in texts]
+
+    def lift_and_home(self, settings: Settings) -> None:
+        """Above everything, then X and Y; never Z."""
+        self.lines += ["G21", "G90", "M83", "G92 E0"]
+        self.lines += [f"G1 Z{number(self._clear_mm, 3)}{self._z_feed}", "G28 X Y"]
+        if settings.levelled and self._printer.dialect == "marlin":
+            self.lines.append("M420 S1")  # Marlin's G28 switches the mesh off (G28.md)
+
+    def heat(self, hotend_c: float, bed_c: float) -> None:
+        """Bed first, the nozzle above the bed's edge meanwhile."""
+        x, y, _ = self._printer.park_mm
+        if bed_c > 0:
+            self.lines.append(f"M140 S{number(bed_c, 1)}")
+        self.lines.append(f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}")
+        if bed_c > 0:
+            self.lines.append(f"M190 S{number(bed_c, 1)}")
+        self.lines += [f"M104 S{number(hotend_c, 1)}", f"M109 S{number(hotend_c, 1)}"]
+        if self._state.tool:
+            self.lines.append(f"T{self._state.tool}")
+
+    def prime_on_bed(self, x: float, y: float, dx: float, dy: float) -> None:
+        """A line on the bed, then up again."""
+        length_mm, e_mm = self.prime_length_mm, self._printer.prime_length_mm
+        self.lines += [
+            f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}",
+            f"G1 Z{number(self._printer.prime_mm[2], 3)}{self._z_feed}",
+            f"G1 X{number(x + dx * length_mm, 3)} Y{number(y + dy * length_mm, 3)}"
+            f" E{number(e_mm, 5)} F{_feed(self._flow_mm3_s / self._section_mm2)}",
+        ]
+        self._leave()
+
+    def prime_in_air(self, x: float, y: float) -> None:
+        """What is pushed out falls on the bare bed."""
+        e_mm = self._printer.prime_length_mm
+        speed_mm_s = self._flow_mm3_s / self._area_mm2
+        self.lines += [
+            f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}",
+            f"G1 E{number(e_mm, 5)} F{_feed(speed_mm_s)}",
+        ]
+        self._leave()
+
+    def _leave(self) -> None:
+        self._filament(-self._printer.retraction_mm)
+        self.lines.append(f"G1 Z{number(self._clear_mm, 3)}{self._z_feed}")
+
+    def _filament(self, length_mm: float) -> None:
+        if abs(length_mm) >= 5e-6:
+            feed = _feed(self._printer.retraction_speed_mm_s)
+            self.lines.append(f"G1 E{number(length_mm, 5)} F{feed}")
+
+    def come_down(self, pulled_mm: float) -> None:
+        """Over everything, then straight down, the filament as the job had it."""
+        x, y, z = self._state.position_mm
+        self.lines += [
+            f"G1 X{number(x, 5)} Y{number(y, 5)}{self._travel}",
+            f"G1 Z{number(z, 5)}{self._z_feed}",
+        ]
+        self._filament(self._printer.retraction_mm - pulled_mm)
+
+    def restore(self, settings: Settings) -> None:
+        """Limits, fan, extruder position, feed and modes, as the job set them."""
+        state = self._state
+        self.lines += settings.commands
+        self.lines.append(
+            f"M106 S{round(255 * state.fan_ratio)}" if state.fan_ratio > 0 else "M107"
+        )
+        self.lines.append(f"G92 E{number(state.e_mm, 5)}")
+        if state.feed_mm_s > 0:
+            self.lines.append(f"G1 F{number(mm_min_from_mm_s(state.feed_mm_s), 1)}")
+        if not state.absolute_xyz:
+            self.lines.append("G91")
+        self.lines.append("M82" if state.absolute_e else "M83")  # after G90 and G91, always
+        if not state.units_mm:
+            self.lines.append("G20")
+
+
+def _feed(speed_mm_s: float) -> str:
+    return number(max(1.0, mm_min_from_mm_s(speed_mm_s)), 0)

@@ -1,0 +1,154 @@
+"""A job moved up to stand on a part that stands on the bed already.
+
+Every height of the job is raised by what stands under its first layer; X and Y stay. Z is not
+homed; the beginning is as in `resume_at`, and the checker judges all of it with the part.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcode.check import CheckedProgram, check, policy_of
+from gcode.dialects import number
+from gcode.errors import InputError
+from gcode.moves import Program
+from gcode.profiles import PrintSetup
+from gcode.progress import Progress, silent
+from gcode.reader import Job, read_job
+from gcode.resumption.head import Head, height_over, prime, pulled_back_mm, temperatures
+from gcode.resumption.settings import settings_before
+from gcode.resumption.standing import over_reach
+from gcode.surfaces import HeightField
+
+STEP_MM = 0.5  # along the first layer's beads
+FLAT_RATIO = 0.5  # of a layer: what the first one bridges or is pressed into
+HELD_RATIO = 0.98  # of the first layer that must lie on something
+TOP_PERCENT = 95.0  # what is higher are single points of a scan's noise
+_MOVE = re.compile(r"^\s*[Gg][0123](?!\d)")
+_Z = re.compile(r"([Zz])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
+_RELATIVE = re.compile(r"^\s*G9([01])\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Stacked:
+    """A checked program that prints a job onto a part.
+
+    Attributes
+    ----------
+    raised_mm
+        How much higher it prints.
+    uneven_mm
+        How far what is under its first layer lies below that height, at most where it is held.
+    """
+
+    checked: CheckedProgram
+    raised_mm: float
+    uneven_mm: float
+    hotend_c: float
+    bed_c: float
+    primed: str
+
+
+def print_onto(
+    program: Program,
+    setup: PrintSetup,
+    standing: HeightField,
+    *,
+    title: str = "a job",
+    progress: Progress = silent,
+) -> Stacked:
+    """Move a job up onto what stands there.
+
+    Parameters
+    ----------
+    program
+        The whole job, of any slicer, placed in X and Y where it is to stand on the part.
+    standing
+        What stands on the bed, build frame.
+
+    Raises
+    ------
+    InputError
+        If nothing stands under the job's first layer, it is not flat, or there is no room above.
+    CheckRefusedError
+        If the checker refuses what comes out.
+    """
+    job = read_job(
+        program, filament_diameter_mm=setup.printer.filament_diameter_mm, progress=progress
+    )
+    raised_mm, uneven_mm = _height_under(job, standing)
+    line = job.layers[0].first_line
+    state, settings = job.state_after(line), settings_before(job, line)
+    x, y, z = state.position_mm
+    state = replace(state, position_mm=(x, y, z + raised_mm))
+    hotend_c, bed_c = temperatures(settings, setup)
+    head = Head(setup, state, clear_mm=height_over(standing.top_mm, state, setup.printer))
+    head.comment(
+        f"{title}, raised by {raised_mm:g} mm onto what stands there",
+        "Z is not homed: the printer has been on all the time, or has been told its Z anew",
+    )
+    head.lift_and_home(settings)
+    head.heat(hotend_c, bed_c)
+    primed = prime(head, over_reach(standing, setup.printer), setup.printer)
+    head.come_down(pulled_back_mm(job, line))
+    head.restore(settings)
+    lines = program.text.rstrip().split("\n")[line:]
+    body = _raised(lines, raised_mm, absolute=state.absolute_xyz, first=line)
+    text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
+    whole = Program(text, program.dialect)
+    checked = check(whole, setup, as_built=standing, policy=policy_of(program), progress=progress)
+    return Stacked(checked, raised_mm, uneven_mm, hotend_c, bed_c, primed)
+
+
+def _height_under(job: Job, standing: HeightField) -> tuple[float, float]:
+    """How high the first layer is to be raised, and how uneven what is under it is."""
+    beads = job.beads
+    own = beads.layer == 0
+    start, end = beads.start_mm[own], beads.end_mm[own]
+    lengths = np.linalg.norm(end - start, axis=1)
+    count = np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
+    owner = np.repeat(np.arange(len(count)), count)
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    places = start[owner] + (end - start)[owner] * ((step + 0.5) / count[owner])[:, None]
+    under_mm = standing.sample(places[:, :2])
+    top_mm = float(np.percentile(under_mm, TOP_PERCENT))
+    layer_mm = max(job.layers[0].height_mm, 0.05)
+    if top_mm < layer_mm:
+        raise InputError(
+            f"Nothing stands under the job's first layer (the highest is {top_mm:.2f} mm); place "
+            "the job in X and Y where the part stands, in the slicer."
+        )
+    low_mm = top_mm - FLAT_RATIO * layer_mm
+    held = under_mm >= low_mm
+    share = float(held.mean())
+    if share < HELD_RATIO:
+        raise InputError(
+            f"{1 - share:.0%} of the job's first layer would hang in the air: what stands under it "
+            f"is {under_mm.min():.2f} to {top_mm:.2f} mm high, half a layer "
+            f"({FLAT_RATIO * layer_mm:.2f} mm) may be uneven; slice it without skirt and brim, or "
+            "move it onto a flat."
+        )
+    return round(top_mm, 3), round(top_mm - float(under_mm[held].min()), 3)
+
+
+def _raised(lines: list[str], by_mm: float, *, absolute: bool, first: int) -> list[str]:
+    """Lines with their absolute heights raised."""
+    out = []
+    for number_, line in enumerate(lines, first + 1):
+        code, mark, comment = line.partition(";")
+        mode = _RELATIVE.match(code)
+        if mode is not None:
+            absolute = mode.group(1) == "0"
+        shifts = code.strip().upper().startswith("G92") and _Z.search(code) is not None
+        if shifts or code.strip().upper().startswith(("G20", "G28")):
+            raise InputError(
+                f"Line {number_} ({code.strip()!r}) changes what a height means, and cannot be "
+                "raised; slice the job without it."
+            )
+        if absolute and _MOVE.match(code):
+            code = _Z.sub(lambda m: f"{m.group(1)}{number(float(m.group(2)) + by_mm, 5)}", code)
+        out.append(f"{code}{mark}{comment}")
+    return out
