@@ -21,6 +21,7 @@ from gcode.cli.options import (
     program_text,
 )
 from gcode.cli.resuming import resume_at_command
+from gcode.cli.touching import touch_command
 from gcode.errors import GcodeError, InputError, ReadError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS, list_profiles
 
@@ -56,6 +57,13 @@ app.command(
         "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
     ),
 )(resume_at_command)
+app.command(
+    "touch",
+    epilog=console.examples(
+        "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin "
+        "--port /dev/ttyACM0",
+    ),
+)(touch_command)
 importing.add_to(profiles_app)
 
 

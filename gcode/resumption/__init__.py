@@ -5,5 +5,6 @@ with a job whose printer is still there).
 """
 
 from gcode.resumption.resume_at import Resumption, resume_at
+from gcode.resumption.touch import Touching, TouchOptions, plan_touch
 
-__all__ = ["Resumption", "resume_at"]
+__all__ = ["Resumption", "TouchOptions", "Touching", "plan_touch", "resume_at"]

@@ -89,13 +89,13 @@ def resume_at(
     diameter_mm = setup.printer.filament_diameter_mm
     job = read_job(program, filament_diameter_mm=diameter_mm, progress=progress)
     progress("what stands", 0.0, 1.0)
-    first = _first_layer(job, z_mm, layer)
+    first = first_layer(job, z_mm, layer)
     line = first.first_line
     state, settings = job.state_after(line), settings_before(job, line)
     field = standing_field(job.beads, line, setup.printer)
     progress("what stands", 1.0, 1.0)
     hotend_c, bed_c = _temperatures(settings, setup)
-    head = _Head(setup, state, clear_mm=_clear_mm(field.top_mm, state, setup.printer))
+    head = _Head(setup, state, clear_mm=clear_mm(field.top_mm, state, setup.printer))
     head.comment(
         f"{title}, from layer {first.index} on, whose top is at {first.z_mm:g} mm",
         f"up to {field.top_mm:g} mm the part stands there already",
@@ -136,7 +136,8 @@ def _prime(head: _Head, field: HeightField, printer: PrinterProfile) -> str:
     return "in the air"
 
 
-def _first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:
+def first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:
+    """The first layer that is left to print, by the height that stands there or its index."""
     layers = job.layers
     if (z_mm is None) == (index is None):
         raise InputError("Say either a height or a layer to go on from, one of the two.")
@@ -171,7 +172,7 @@ def _temperatures(settings: Settings, setup: PrintSetup) -> tuple[float, float]:
     return hotend_c, min(bed_c, setup.printer.max_bed_c)
 
 
-def _clear_mm(top_mm: float, state: ModalState, printer: PrinterProfile) -> float:
+def clear_mm(top_mm: float, state: ModalState, printer: PrinterProfile) -> float:
     """Height at which the nozzle passes over everything."""
     top_mm = max(top_mm, state.position_mm[2])
     clear_mm = min(top_mm + LIFT_MM, printer.max_z_mm)
