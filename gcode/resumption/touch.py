@@ -18,7 +18,7 @@ from gcode.check import CheckedProgram, Touch, check
 from gcode.dialects import number
 from gcode.errors import InputError
 from gcode.moves import Program
-from gcode.profiles import PrintSetup
+from gcode.profiles import PrinterProfile, PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import read_job
 from gcode.reader.job import Beads, JobLayer
@@ -129,17 +129,7 @@ def plan_touch(
         If the checker refuses the touches.
     """
     printer, options = setup.printer, options or TouchOptions()
-    if printer.dialect not in TOUCHING_DIALECTS:
-        raise InputError(
-            f"{printer.id} speaks {printer.dialect}, whose probing goes as deep as its own "
-            f"configuration says: nothing could stop it above the part; set Z by hand, with paper "
-            f"between nozzle and part, or use a printer with G38.2 (Marlin, RepRapFirmware)."
-        )
-    if not 2 * options.doubt_mm <= above_mm <= LIFT_MM:
-        raise InputError(
-            f"--above-mm is {above_mm:g}; turn Z by hand until the nozzle stands "
-            f"{2 * options.doubt_mm:g} to {LIFT_MM:g} mm above the part's top."
-        )
+    _refuse_impossible(printer, above_mm, options)
     job = read_job(program, filament_diameter_mm=printer.filament_diameter_mm, progress=progress)
     first = first_layer(job, z_mm, layer)
     last = job.layers[first.index - 1]
@@ -166,6 +156,21 @@ def plan_touch(
         standing=field,
         options=options,
     )
+
+
+def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchOptions) -> None:
+    """Raise where the firmware has no such touch, or the nozzle stands too low or too high."""
+    if printer.dialect not in TOUCHING_DIALECTS:
+        raise InputError(
+            f"{printer.id} speaks {printer.dialect}, whose probing goes as deep as its own "
+            f"configuration says: nothing could stop it above the part; set Z by hand, with paper "
+            f"between nozzle and part, or use a printer with G38.2 (Marlin, RepRapFirmware)."
+        )
+    if not 2 * options.doubt_mm <= above_mm <= LIFT_MM:
+        raise InputError(
+            f"--above-mm is {above_mm:g}; turn Z by hand until the nozzle stands "
+            f"{2 * options.doubt_mm:g} to {LIFT_MM:g} mm above the part's top."
+        )
 
 
 def _text(
