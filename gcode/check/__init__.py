@@ -5,7 +5,7 @@ It shares no code with slicing, writer and reader, so that their mistakes are no
 """
 
 from gcode.check.checker import Verdict, check, find_refusals, judge, policy_of
-from gcode.check.findings import Policy, Refusal, Warned
+from gcode.check.findings import Policy, Refusal, Touch, Warned
 from gcode.check.proof import CheckedProgram, CheckReport
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "CheckedProgram",
     "Policy",
     "Refusal",
+    "Touch",
     "Verdict",
     "Warned",
     "check",

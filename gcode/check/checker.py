@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from gcode.check.contact import Contact, contact_of
-from gcode.check.findings import Moves, Policy, Refusal, Text
+from gcode.check.findings import Moves, Policy, Refusal, Text, Touch
 from gcode.check.proof import CheckedProgram, CheckReport, _prove
 from gcode.check.rules import Judge
 from gcode.check.sweep import sweep
@@ -72,6 +72,7 @@ def check(
     initial: ModalState | None = None,
     policy: Policy = Policy.STRICT,
     leave_heaters: bool = False,
+    touches: tuple[Touch, ...] = (),
     progress: Progress = silent,
 ) -> CheckedProgram:
     """Judge a program.
@@ -90,6 +91,8 @@ def check(
         the program leaves on are switched off by lines at its end.
     leave_heaters
         The program may leave its heaters on.
+    touches
+        Where the program may feel for what stands there (G38.2), and how deep; nowhere else.
 
     Raises
     ------
@@ -108,7 +111,7 @@ def check(
     """
     verdict = judge(
         program, setup, as_built=as_built, initial=initial, policy=policy,
-        leave_heaters=leave_heaters, progress=progress,
+        leave_heaters=leave_heaters, touches=touches, progress=progress,
     )  # fmt: skip
     refusals = verdict.refusals
     if refusals:
@@ -128,6 +131,7 @@ def judge(
     initial: ModalState | None = None,
     policy: Policy = Policy.STRICT,
     leave_heaters: bool = False,
+    touches: tuple[Touch, ...] = (),
     progress: Progress = silent,
 ) -> Verdict:
     """What `check` goes by, for whoever wants to know and not to print."""
@@ -139,7 +143,7 @@ def judge(
         _ = setup.printer.head  # nobody judges what a head of unknown shape would hit
     lines = program.text.split("\n")
     top_mm = as_built.top_mm if as_built is not None else None
-    one = Judge(program, setup, top_mm, initial, policy)
+    one = Judge(program, setup, top_mm, initial, policy, touches)
     text = Text.of(program.text)
     number, said = 1, 0
     while number <= len(lines):

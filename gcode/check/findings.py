@@ -11,6 +11,26 @@ from jaxtyping import Bool, Float, Int, UInt8
 MOST_SHOWN = 60  # characters of a line in a message
 
 
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """A touch of what stands on the bed that its caller has planned.
+
+    Attributes
+    ----------
+    x_mm, y_mm
+        Where, build frame.
+    surface_mm
+        Height of what is to be felt there.
+    lowest_mm
+        No touch may be told to go deeper.
+    """
+
+    x_mm: float
+    y_mm: float
+    surface_mm: float
+    lowest_mm: float
+
+
 class Policy(StrEnum):
     """Whose program it is, and so what is refused.
 

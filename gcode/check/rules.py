@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 
-from gcode.check import limits, waits
-from gcode.check.findings import Policy
+from gcode.check import limits, touches, waits
+from gcode.check.findings import Policy, Touch
 from gcode.check.motion import INCH_MM, PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
     COMMANDS,
@@ -61,8 +61,10 @@ class Judge(Motion):
         standing_top_mm: float | None,
         initial: ModalState | None,
         policy: Policy = Policy.STRICT,
+        planned: tuple[Touch, ...] = (),
     ) -> None:
         super().__init__(program, setup, standing_top_mm, initial, policy)
+        self._touches = planned
         self.added: tuple[str, ...] = ()
         macros = {macro.split(maxsplit=1)[0].upper() for macro in setup.printer.macros}
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
@@ -71,6 +73,8 @@ class Judge(Motion):
         self._heats_unsaid = False  # whether a macro ran that may have heated something
         self._waited_s, self._waited_at = 0.0, -1
         self._known = COMMANDS[program.dialect] | macros | {name.upper() for name in own}
+        if planned and program.dialect in touches.DIALECTS:
+            self._known |= {touches.COMMAND}
         self._tool: str | None = None
 
     def read(self, number: int, raw: str) -> None:
@@ -226,6 +230,8 @@ class Judge(Motion):
             self._dwell(words)
         elif name == "G28":
             self._home(words)
+        elif name == touches.COMMAND:
+            self._touch(words)
         elif name in PROBES and self._occupied:
             self._refuse("probing over a standing part", name, "nothing may stand there")
         elif name in {"G90", "G91"}:
@@ -380,6 +386,18 @@ class Judge(Motion):
         for axis in axes:
             self._homed[axis] = True
             self._place[axis] = None  # the place of an end stop is the firmware's business
+
+    def _touch(self, words: dict[str, float | None]) -> None:
+        """The head is swept down to what it is to feel."""
+        told = {letter: None if v is None else v * self._unit for letter, v in words.items()}
+        planned = touches.planned_at(self._touches, self._place)
+        wrong = touches.refusal_of(planned, told, self._place[2], self._text, self._hotend_c)
+        if not self._absolute:
+            self._refuse("touch that is not straight down", "G91", "G90")
+        elif wrong is not None:
+            self._refuse(*wrong)
+        elif planned is not None:
+            self._move({"Z": planned.surface_mm / self._unit, "F": words["F"]})
 
     def _homes_above(self, z_mm: float | None) -> None:
         """X and Y are homed across the bed: above all that stands there."""

@@ -17,6 +17,7 @@ from gcode.cli import (
     sending,
     slicing,
     stacking,
+    touching,
 )
 from gcode.errors import GcodeError
 
@@ -51,6 +52,7 @@ slicing.add_to(app)
 checking.add_to(app)
 estimating.add_to(app)
 resuming.add_to(app)
+touching.add_to(app)
 stacking.add_to(app)
 sending.add_to(app)
 emulating.add_to(app)

@@ -9,10 +9,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from gcode.firmware.contact import Contact
 from gcode.firmware.core import FirmwareCore
 from gcode.firmware.faults import parse_faults
 from gcode.firmware.serve import FRAME, PtyServer
 from gcode.profiles import PrinterProfile
+from gcode.surfaces import HeightField
 
 
 def _recorder(path: str) -> Callable[[bytes], None]:
@@ -40,6 +42,13 @@ def main() -> None:
     )
     if options["advanced_ok"]:
         core.enable_advanced_ok()
+    if options["standing"]:
+        core.machine.contact = Contact(
+            HeightField.read(Path(options["standing"])),
+            lost_mm=options["lost_mm"],
+            dead=options["dead_probe"],
+            seed=options["seed"],
+        )
     server = PtyServer(core, Path(options["link"]), control=control)
     control.sendall(FRAME.pack(b"a", 2) + b"{}")
     try:

@@ -12,6 +12,7 @@ import random
 import re
 from collections.abc import Callable
 
+from gcode.firmware.damage import Wire
 from gcode.firmware.faults import Fault, FaultScript
 from gcode.firmware.framing import RENUMBERED, unframed
 from gcode.firmware.machine import Machine
@@ -56,6 +57,10 @@ class FirmwareCore:
         self._numbers = self.variant.numbers
         if "ignore_checksums" in self.faults.always:
             self._numbers = "ignore"
+        damage = self.faults.always.get("damage")
+        self.wire: Wire | None = None
+        if damage is not None:
+            self.wire = Wire(_value(damage, 0.005), self._numbers, seed=seed)
         self._resend_ok = "resend_without_ok" not in self.faults.always
         self._rx = bytearray()
         self._out = bytearray()
@@ -89,6 +94,8 @@ class FirmwareCore:
         self._wall_s = wall_s
         if self.machine.killed:
             return
+        if self.wire is not None:
+            data = self.wire.to_printer(bytes(self._rx).rpartition(b"\n")[2], data)
         self._rx += data
         if self.variant.emergency_parser and self.machine.wait is not None:
             self._emergency()
@@ -132,7 +139,7 @@ class FirmwareCore:
             return b""
         data = bytes(self._out)
         self._out.clear()
-        return data
+        return data if self.wire is None else self.wire.to_host(data)
 
     @property
     def busy(self) -> bool:

@@ -38,6 +38,8 @@ KINDS: dict[str, str] = {
     "runout": "filament runs out: the firmware pauses for s seconds (default 20)",
     "disconnect": "the port vanishes for s seconds (default 0.2)",
     "slow_reader": "the printer reads one line each s seconds (default 0.001)",
+    "damage": "each byte is damaged on its way, in both directions, with probability s (default "
+    "0.005); never so that neither side could notice",
     "ignore_checksums": "number and checksum are stripped unread",
 }
 

@@ -52,6 +52,8 @@ class Machine(Mechanics):
         for name in dir(self):
             if re.fullmatch(r"_[gm]\d+", name):
                 table[name[1:].upper().encode()] = getattr(self, name)
+        if self.variant.name not in ("marlin", "reprap"):
+            table.pop(b"G38")  # neither Prusa's firmware nor Klipper has it
         for name in _IGNORED:
             table.setdefault(name.encode(), self._ignore)
         if not self.variant.emergency_parser and self.variant.name == "klipper":
@@ -141,6 +143,28 @@ class Machine(Mechanics):
 
         self.wait_for(self.planner.drained_s(self.clock_s) + 45.0, then=probed)
 
+    def _g38(self, rest: bytes) -> None:
+        """Go straight to a Z until something is touched (G38.2), or say that nothing was.
+
+        Marlin's G38.cpp; RepRapFirmware's own words differ, and begin with `Error:` as well.
+        """
+        (_, _, target_mm), _ = self.target_of(words_of(rest))
+        drained_s = self.planner.drained_s(self.clock_s)
+        here = (self.x, self.y, self.z)
+        met_mm = None if self.contact is None else self.contact.met_at_mm(self.x, self.y)
+        touched = met_mm is not None and target_mm <= met_mm <= self.z
+        end_mm = met_mm if touched and met_mm is not None else min(target_mm, self.z)
+
+        def stopped() -> None:
+            self.z = end_mm
+            self.record_jump(here)
+            if self.contact is not None:
+                self.contact.note(self.x, self.y, self.z)
+            if not touched:
+                self.replies.append(f"{self.variant.error_prefix}Failed to reach target")
+
+        self.wait_for(drained_s + (here[2] - end_mm) / self.feed_mm_s, then=stopped)
+
     def _g90(self, rest: bytes) -> None:
         self.absolute = True
         if self.variant.modes_follow_g90 == "both":
@@ -157,6 +181,8 @@ class Machine(Mechanics):
             if letter in words:
                 native = (self.x, self.y, self.z)[axis]
                 self.offset[axis] = words[letter] * self.unit_mm - native
+                if self.variant.name == "reprap":
+                    self.unhomed.discard(letter)  # GCodes::SetPositions takes them for homed
         if "E" in words:
             self.e = words["E"] * self.unit_mm
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from gcode.firmware.contact import Contact
 from gcode.firmware.planner import Planner
 from gcode.firmware.thermal import BED, HOTEND, Heater
 from gcode.firmware.variants import Variant
@@ -64,6 +65,7 @@ class Mechanics:
         self.clock_s = 0.0
         self.planner = self._new_planner()
         self.power_up()
+        self.contact: Contact | None = None  # where the nozzle feels what it touches
         self.let_go = 0  # how often moves came after the motors had been let go
 
     def power_up(self) -> None:

@@ -41,6 +41,9 @@ class EmulatedPrinterProcess:
         Let the printer's clock jump over heating and moves; else it follows the wall's.
     record
         File that every command carried out is appended to, one a line.
+    standing, lost_mm, dead_probe
+        A height map (.npz) of what stands on the bed, which the nozzle feels; how much higher than
+        the firmware's own zero the nozzle truly is; and whether its probe never triggers.
     """
 
     def __init__(
@@ -53,6 +56,9 @@ class EmulatedPrinterProcess:
         seed: int = 0,
         record: Path | None = None,
         advanced_ok: bool = False,
+        standing: Path | None = None,
+        lost_mm: float = 0.0,
+        dead_probe: bool = False,
     ) -> None:
         script = parse_faults(faults) if isinstance(faults, str) else faults
         self._folder = tempfile.TemporaryDirectory(prefix="gcode-emulate-")
@@ -66,6 +72,9 @@ class EmulatedPrinterProcess:
             "record": str(record) if record is not None else "",
             "link": self.port,
             "advanced_ok": advanced_ok,
+            "standing": str(standing) if standing is not None else "",
+            "lost_mm": lost_mm,
+            "dead_probe": dead_probe,
         }
         self._answers: queue.SimpleQueue[dict[str, object] | None] = queue.SimpleQueue()
         self._motion: list[MotionBatch] = []

@@ -213,6 +213,8 @@ class PtyServer:
                     "fan_ratio": machine.fan_ratio,
                     "position_mm": [machine.x, machine.y, machine.z],
                     "buffered": len(machine.planner.blocks),
+                    "logical_z_mm": machine.z + machine.offset[2],
+                    "deepest_mm": machine.contact.deepest_mm if machine.contact else 0.0,
                 }
             ).encode(),
         )

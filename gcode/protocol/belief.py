@@ -1,7 +1,9 @@
 """Which of a printer's claims are believed: requests for a line, numbers in an `ok`.
 
 A claim may be an echo of what is settled, garbled, or out of a firmware's own confusion. What is
-believed can only ever send a line again under its own number, or end the link.
+believed can only ever send a line again under its own number, or end the link. A claim that makes
+no sense is asked again: noise says something else the next time, a printer that has lost its place
+says the same.
 """
 
 from __future__ import annotations
@@ -38,6 +40,8 @@ class Belief:
         Received for certain: cannot be asked for again.
     stale
         A request for this number may be an echo: of a line that was sent twice.
+    told_place
+        The line that the printer asked for last when it was asked which.
     """
 
     __slots__ = (
@@ -45,36 +49,56 @@ class Belief:
         "_number_faults",
         "_refused",
         "_refused_at",
+        "_refused_number",
+        "_refused_same",
         "_same",
         "_timing",
         "proven",
         "stale",
+        "told_place",
     )
 
     def __init__(self, timing: LinkTiming, number: int = 0) -> None:
         self._timing = timing
         self.proven = number
         self.stale: int | None = None
+        self.told_place: int | None = None
         self._last = -1
         self._same = self._refused = self._refused_at = self._number_faults = 0
+        self._refused_number: int | None = None
+        self._refused_same = 0
 
     def confirm(self, number: int) -> None:
         """Take note of a proof that the printer has received every line up to `number`."""
         self.proven = number
-        self._refused = self._number_faults = 0
-        self.stale = None
+        self._refused = self._refused_same = self._number_faults = 0
+        self.stale = self.told_place = None
 
     def progress(self) -> None:
         """Take note that a line was acknowledged."""
         self._same = 0
 
-    def of_resend(self, number: int, ledger: Ledger, *, rewinding: bool) -> Judgement:
-        """Judge a request for line `number`; `rewinding` while one is being served."""
+    def of_resend(
+        self, number: int, ledger: Ledger, *, rewinding: bool, said_last: int | None = None
+    ) -> Judgement:
+        """Judge a request for line `number`.
+
+        Parameters
+        ----------
+        rewinding
+            One is being served.
+        said_last
+            The line that the printer has just said it took last.
+        """
         if not rewinding and number == self.stale and number < ledger.cursor:
             self.stale = None
             return Judgement(Verdict.ECHO)
+        if said_last is not None and said_last + 1 != number:
+            return self._refusal(
+                f"the printer took line {said_last} last and asks for {number}", None, ledger
+            )
         if (why := self._why_impossible(number, ledger)) is not None:
-            return self._refusal(why, ledger)
+            return self._refusal(why, number, ledger)
         if number != self._last:
             self._same = 0
         if not rewinding:  # a burst of requests counts once
@@ -95,12 +119,18 @@ class Belief:
             return f"line {number} is not in the last {ledger.kept} lines any more"
         return None
 
-    def _refusal(self, why: str, ledger: Ledger) -> Judgement:
+    def _refusal(self, why: str, number: int | None, ledger: Ledger) -> Judgement:
         if ledger.acked - self._refused_at >= 2:
-            self._refused = 0  # it has made progress since: that one was noise
+            self._refused = self._refused_same = 0  # it has made progress since: noise
+        same = number is not None and number == self._refused_number
+        self._refused_same = self._refused_same + 1 if same else 1
+        self._refused_number = number
         self._refused_at = ledger.acked
         self._refused += 1
-        ends = self._refused >= self._timing.max_refused
+        ends = (
+            self._refused >= self._timing.max_refused
+            or self._refused_same >= self._timing.max_refused_same
+        )
         return Judgement(Verdict.END if ends else Verdict.REFUSE, why)
 
     def of_ok(self, number: int | None, ledger: Ledger) -> int | None:

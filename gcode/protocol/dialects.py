@@ -28,6 +28,10 @@ class LinkDialect:
     motors_off_s
         How long after the last move the motors are let go, and with them the certainty of where
         the nozzle is; infinity where they keep a part of their current.
+    question
+        Where a repeated line would be carried out again, yet none is lost on its way: a question
+        whose answer shows that every line before it was carried out, so that a lost answer may be
+        asked for. Empty where a line may be lost, too: then nothing can be proved.
     hold_motors
         Command after which they are held for good; empty where there is none.
     """
@@ -40,6 +44,7 @@ class LinkDialect:
     buffered_lines: int = 80
     motors_off_s: float = 120.0
     hold_motors: str = ""
+    question: bytes = b""
 
 
 LINK_DIALECTS: dict[str, LinkDialect] = {
@@ -48,14 +53,18 @@ LINK_DIALECTS: dict[str, LinkDialect] = {
     # DEFAULT_STEPPER_DEACTIVE_TIME 120; `M84 S0` sets the time to never (M18_M84.cpp).
     "marlin": LinkDialect("marlin", True, True, 95, 120, hold_motors="M84 S0"),
     "prusa": LinkDialect("prusa", True, True, 95, 120, hold_motors="M84 S0"),
-    # gcode.py strips N and checksum unread; a pseudo-terminal loses nothing, so a lost answer
-    # means a lost host process: nothing can be proved and nothing is sent again. Its look-ahead
-    # is seconds long (toolhead.py, BUFFER_TIME_HIGH 2 s): 1000 of the shortest moves.
+    # gcode.py strips N and checksum unread, and carries lines out one after another; a
+    # pseudo-terminal loses nothing, so what it took was carried out, unless Klipper started anew:
+    # it is at zero, then, and refuses to move until it is homed. No line is sent again. Its
+    # look-ahead is seconds long (toolhead.py, BUFFER_TIME_HIGH 2 s): 1000 of the shortest moves.
     # M84 takes no S there: it lets go at once. After [idle_timeout], 600 s, a move is refused
     # until all axes are homed.
-    "klipper": LinkDialect("klipper", False, False, 4095, 4095, 1000, motors_off_s=600.0),
+    "klipper": LinkDialect(
+        "klipper", False, False, 4095, 4095, 1000, motors_off_s=600.0, question=b"M114"
+    ),
     # RepRapFirmware 3.6 drops a line with a bad checksum silently and executes a repeated
-    # number again: a line without an answer cannot be sent twice.
+    # number again (StringParser::LineFinished): a line without an answer cannot be sent twice,
+    # nor does an answer to a later question tell whether it was dropped.
     # An idle motor keeps 30 % of its current (M906 I30) and its place.
     "reprap": LinkDialect("reprap", True, False, 255, 255, motors_off_s=float("inf")),
 }

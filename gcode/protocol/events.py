@@ -51,6 +51,13 @@ class Probed:
 
 
 @dataclass(frozen=True, slots=True)
+class Proved:
+    """The printer said, twice in one answer, that it has received every line up to `number`."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
 class Busy:
     """The printer works on a long command (`processing`, `paused for user`, …)."""
 
@@ -78,9 +85,13 @@ class UnknownCommand:
 
 @dataclass(frozen=True, slots=True)
 class LineError:
-    """An `Error:` about the transmission itself. The wording is not to be trusted."""
+    """An `Error:` about the transmission itself. The wording is not to be trusted.
+
+    `last` is the number of the last line that the printer says it took, where it says so.
+    """
 
     text: str
+    last: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +207,7 @@ Event = (
     | ResendRequested
     | ResendRefused
     | Probed
+    | Proved
     | Busy
     | Waiting
     | Echo

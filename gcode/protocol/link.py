@@ -11,7 +11,8 @@ What it promises: with a firmware that verifies line numbers and checksums, ever
 `send` is executed exactly once and in order, whatever is lost, garbled or said twice, or the
 link ends in `LOST` and names the interval that is uncertain. The ground: a line and its number
 belong together for ever, so sending it again is idempotent; and no reply is believed beyond what
-that allows. With any other firmware nothing is ever sent twice.
+that allows: an answer that makes no sense is asked for again. With any other firmware no line is
+ever sent twice.
 
 What it does not do: judge G-code, know what a job is, retry by reopening, or sleep.
 """
@@ -24,13 +25,13 @@ from collections.abc import Sequence
 from gcode.errors import LocalProtocolError
 from gcode.protocol.belief import Verdict
 from gcode.protocol.events import (
-    Acknowledged,
     Busy,
     CommandFailed,
     Event,
     Greeted,
     LineError,
     Ok,
+    PositionReport,
     PrinterReset,
     Resend,
     ResendRefused,
@@ -50,10 +51,12 @@ PLAIN_OK = b"ok\n"
 _OKS = re.compile(rb"(?:ok N\d{1,10} P\d+ B\d+\n)+")
 _OK_NUMBER = re.compile(rb"N(\d+)")
 
+_MOVES = frozenset(("G0 ", "G1 ", "G2 ", "G3 "))
+
 # Looked up once: Python 3.11 takes 0.1 µs to find a member of an enumeration, ten times a line.
 _GREETING, _IDLE, _WAITING = State.GREETING, State.IDLE, State.WAITING
-_REWINDING, _PROBING = State.REWINDING, State.PROBING
-_SENT, _ACKED, _DRAINED = Signal.SENT, Signal.ACKED, Signal.DRAINED
+_REWINDING, _PROBING, _ASKING = State.REWINDING, State.PROBING, State.ASKING
+_SENT = Signal.SENT
 
 
 class Link(Recovery):
@@ -161,6 +164,7 @@ class Link(Recovery):
             When the last was written or acknowledged, whatever came last.
         """
         self._ledger.add_moves(written, answered)
+        self._moved = True
         if answered:
             self._belief.progress()
             self._probing_since_s = None
@@ -190,6 +194,7 @@ class Link(Recovery):
         else:
             line = wire_line(number, command.command, self.dialect)
         ledger.add(line)
+        self._moved = self._moved or line.command[:3] in _MOVES
         self.state = TRANSITIONS[self.state][_SENT]
         self._listen_anew(now_s)
         return line[2]
@@ -205,7 +210,9 @@ class Link(Recovery):
     def next_deadline_s(self) -> float:
         """When `tick` has something to do; infinity if never."""
         state = self.state
-        if state is _WAITING or state is _PROBING or state is _GREETING:
+        if state is _WAITING or state is _PROBING:
+            return min(self._deadline_s, self._half_line_s)
+        if state is _GREETING or state is _ASKING:
             return self._deadline_s
         return self._rewind_until_s if state is _REWINDING else NEVER_S
 
@@ -216,6 +223,25 @@ class Link(Recovery):
         """
         if self.idle:
             self._belief.confirm(self._ledger.last)
+
+    def ask_place(self, now_s: float) -> bytes:
+        """Ask the printer which line it took last: a line that must bounce, which changes nothing.
+
+        Until the answer makes sense it is asked again. `Proved` tells that every line was
+        received; lines that were not are sent again, and then it may be asked anew.
+
+        Raises
+        ------
+        LocalProtocolError
+            If lines are under way, or the firmware verifies no numbers.
+        """
+        if not self.dialect.verifies:
+            raise LocalProtocolError(f"{self.dialect.name} verifies no line numbers.")
+        self._go(Signal.ASK)
+        self._questions = 0
+        self._said_last = self._belief.told_place = None
+        self._ask_place(now_s)
+        return self.take_output()
 
     def ask_soon(self, now_s: float) -> None:
         """Ask again in a moment: the caller may have lost an answer itself (an interrupt)."""
@@ -229,6 +255,10 @@ class Link(Recovery):
             else:
                 self._events.append(Unrecognised(raw))
                 self._doubt(now_s)
+        if self._inbox.empty:
+            self._half_line_s = NEVER_S
+        elif self._half_line_s == NEVER_S:  # an ok that lost its end is followed by nothing
+            self._half_line_s = now_s + self.timing.doubt_s
         if self.state is _REWINDING and self._rewind_at_once:
             self._rewind(now_s)
         events, self._events = self._events, []
@@ -242,6 +272,8 @@ class Link(Recovery):
             self._rewind(now_s)
         elif self.state is _GREETING:
             self._greet_again(now_s)
+        elif self.state is _ASKING:
+            self._ask_place(now_s)
         elif self.state in (_WAITING, _PROBING):
             self._silence(now_s)
         events, self._events = self._events, []
@@ -264,6 +296,9 @@ class Link(Recovery):
             self._doubt(now_s, self.timing.resend_grace_s)
         elif isinstance(reply, LineError):
             self._events.append(reply)
+            self._said_last = reply.last
+            if self.state is _GREETING:
+                self._refuse_greeting(now_s)
             # Some ask for no resend (OctoPrint#2226); the others' request follows at once.
             self._doubt(now_s, self.timing.resend_grace_s)
         elif isinstance(reply, PrinterReset):
@@ -284,11 +319,18 @@ class Link(Recovery):
             self._doubt(now_s)
         else:
             self._events.append(reply)
-            if isinstance(reply, TemperatureReport) and self._ledger.slow_under_way:
+            if isinstance(reply, PositionReport) and self._asked_question:
+                self._on_answer(reply, now_s)
+            elif isinstance(reply, TemperatureReport) and self._ledger.slow_under_way:
                 self._listen_anew(now_s)  # the reports of M109 and M190
 
     def _on_ok(self, ok: Ok, now_s: float) -> None:
         self._events.extend(ok.more)  # type: ignore[arg-type]
+        self._said_last = None
+        if self.state is _GREETING and now_s < self._swallow_until_s:
+            self._swallow_until_s = -1.0
+            self._spare("belongs to a greeting that was refused")
+            return
         if self.state is _GREETING:
             self._go(Signal.GREETED)
             self._probing_since_s = None
@@ -304,6 +346,10 @@ class Link(Recovery):
         if self.state not in (_WAITING, _PROBING):
             self._spare("nothing was under way")
             return
+        if self._asked_question:
+            self._spare("the answer to a question tells more")
+            self._hear_out(now_s)
+            return
         if now_s < self._swallow_until_s:
             self._swallow_until_s = -1.0
             self._spare("belongs to a stale resend request")
@@ -316,34 +362,22 @@ class Link(Recovery):
         else:
             self._acknowledge(number, now_s)
 
-    def _acknowledge(self, number: int, now_s: float) -> None:
-        ledger, belief = self._ledger, self._belief
-        if self.state is _PROBING:
-            # The line was sent twice; one copy earned this ok, the other may earn a request
-            # for the next line, which must not be served.
-            belief.stale = ledger.cursor
-        ledger.acknowledge(number)
-        belief.progress()
-        self._probing_since_s = None
-        self._events.append(Acknowledged(number))
-        if number == ledger.last:
-            self._go(_DRAINED)
-            self._deadline_s = NEVER_S
-            return
-        self._go(_ACKED)
-        self._transmit()
-        self._listen_anew(now_s)
-
     def _on_resend(self, number: int, now_s: float) -> None:
+        said_last, self._said_last = self._said_last, None
         if not self.dialect.verifies or Signal.RESEND not in TRANSITIONS[self.state]:
             self._events.append(ResendRequested(number, served=False))
             if self.state is _GREETING:
-                self._deadline_s = min(self._deadline_s, now_s + self.timing.resend_grace_s)
+                self._refuse_greeting(now_s)
             elif not self.dialect.verifies and not self.ended:
                 self._lose(f"the printer asked for line {number}, which may be executed already")
             return
+        if self.state is _ASKING:
+            self._on_place(number, said_last, now_s)
+            return
         rewinding = self.state is _REWINDING
-        verdict, why = self._belief.of_resend(number, self._ledger, rewinding=rewinding)
+        verdict, why = self._belief.of_resend(
+            number, self._ledger, rewinding=rewinding, said_last=said_last
+        )
         if verdict is Verdict.SERVE:
             self._serve(number, now_s)
         elif verdict is Verdict.ECHO:

@@ -7,14 +7,17 @@ It holds what one conversation has come to; what is said and what is sent is the
 from __future__ import annotations
 
 from gcode.errors import LocalProtocolError
-from gcode.protocol.belief import Belief
+from gcode.protocol.belief import Belief, Verdict
 from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
 from gcode.protocol.events import (
     Acknowledged,
     Event,
     LinkLost,
+    PositionReport,
     PrinterReset,
     Probed,
+    Proved,
+    ResendRefused,
     ResendRequested,
     SpareOk,
 )
@@ -25,6 +28,8 @@ from gcode.protocol.timing import LinkTiming
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
 
 NEVER_S = float("inf")
+_BOUNCES_AHEAD = 8
+"""So far is the number of a line that must bounce ahead of the next one."""
 
 
 class Recovery:
@@ -57,8 +62,13 @@ class Recovery:
         self._rewind_until_s = 0.0
         self._rewind_at_once = False
         self._heard_s = 0.0
-        self._deadline_s = NEVER_S
+        self._deadline_s = self._half_line_s = NEVER_S
         self._probing_since_s: float | None = None
+        self._said_last: int | None = None
+        self._questions = 0
+        self._answered = False  # the dialect's question
+        self._moved = False
+        self._told: PositionReport | None = None
 
     @property
     def idle(self) -> bool:
@@ -87,6 +97,11 @@ class Recovery:
         number = self._ledger.last
         return b"\n" + numbered(number, b"M110 N%d" % number)
 
+    def _refuse_greeting(self, now_s: float) -> None:
+        """Take the hello itself for damaged: the `ok` that follows is none of its own."""
+        self._swallow_until_s = now_s + self.timing.resend_grace_s
+        self._deadline_s = min(self._deadline_s, now_s + self.timing.resend_grace_s)
+
     def _serve(self, number: int, now_s: float) -> None:
         """Make ready to send again from line `number`, once older answers are in."""
         ledger = self._ledger
@@ -99,6 +114,37 @@ class Recovery:
         self._rewind_until_s = now_s + self.timing.resend_grace_s
         self._rewind_at_once = False
         self._go(Signal.RESEND)
+
+    def _on_place(self, number: int, said_last: int | None, now_s: float) -> None:
+        """Take the answer to the question which line the printer is at.
+
+        Only one that says it twice, by the last line and by the next, or the same as the answer
+        before, is believed.
+        """
+        ledger, belief = self._ledger, self._belief
+        certain = number == belief.told_place if said_last is None else said_last + 1 == number
+        belief.told_place = number
+        judgement = belief.of_resend(number, ledger, rewinding=True, said_last=said_last)
+        if judgement.verdict is Verdict.SERVE and certain:
+            if number == ledger.last + 1:
+                belief.confirm(ledger.last)
+                self._events.append(Proved(ledger.last))
+            self._serve(number, now_s)
+        elif judgement.verdict is Verdict.END:
+            self._events.append(ResendRefused(number, judgement.why))
+            self._lose(judgement.why)
+        else:
+            self._events.append(ResendRefused(number, judgement.why or "it said so once only"))
+            self._deadline_s = now_s + self.timing.resend_grace_s
+
+    def _ask_place(self, now_s: float) -> None:
+        """Put a line on the wire that must bounce; its refusal tells what was taken last."""
+        if self._questions >= self.timing.max_questions:
+            self._lose("the printer does not say which line it took last")
+            return
+        self._questions += 1
+        self._out += b"\n" + numbered(self._ledger.last + 1 + _BOUNCES_AHEAD, b"M105")
+        self._deadline_s = now_s + self.timing.doubt_s
 
     def _rewind(self, now_s: float) -> None:
         """Send again from the line asked for, now that all older answers are in."""
@@ -114,6 +160,7 @@ class Recovery:
             return
         self._go(Signal.REWOUND)
         self._belief.stale = ledger.cursor + 1
+        self._out += b"\n"  # ends a half line, should the one before have lost its end
         self._transmit()
         self._listen_anew(now_s)
 
@@ -127,6 +174,10 @@ class Recovery:
     # ------------------------------------------------------------------ time
 
     def _silence(self, now_s: float) -> None:
+        self._half_line_s = NEVER_S
+        if self._answered:
+            self._acknowledge(self._ledger.last, now_s)
+            return
         since_s = self._probing_since_s
         if since_s is None:
             since_s = self._probing_since_s = self._heard_s
@@ -135,16 +186,43 @@ class Recovery:
         if now_s - since_s >= limit_s:
             self._lose(f"no answer to line {self._ledger.acked + 1} for {now_s - since_s:.1f} s")
             return
-        if not self.dialect.verifies:
-            # Nothing can be sent twice here: wait, and in the end stop.
+        number = self._ledger.cursor - 1
+        if self.dialect.verifies:
+            self._out += b"\n" + self._ledger.data(number)
+        elif self.dialect.question and self.window == 1:
+            self._out += 2 * (self.dialect.question + b"\n")
+        else:
+            # Nothing can be sent twice here, nor proved: wait, and in the end stop.
             self._deadline_s = since_s + limit_s
             return
-        number = self._ledger.cursor - 1
-        self._out += self._ledger.data(number)
         self.probes += 1
         self._events.append(Probed(number))
+        self._told = None
         self._go(Signal.SILENCE)
         self._deadline_s = now_s + min(self._silence_s(), max(limit_s / 8, self.timing.doubt_s))
+
+    @property
+    def _asked_question(self) -> bool:
+        """Whether the dialect's question is under way, so that an `ok` may belong to it."""
+        return self.state is State.PROBING and not self.dialect.verifies
+
+    def _on_answer(self, report: PositionReport, now_s: float) -> None:
+        """Take an answer to the dialect's question.
+
+        A firmware that started anew is at zero: after a move that is no proof of anything. Two
+        answers must agree, as none has a checksum.
+        """
+        before, self._told = self._told, report
+        if report != before:
+            return
+        at_zero = not any((report.x_mm, report.y_mm, report.z_mm, report.e_mm))
+        self._answered = self._answered or not (at_zero and self._moved)
+        self._hear_out(now_s)
+
+    def _hear_out(self, now_s: float) -> None:
+        """Wait until everything is said that was asked for."""
+        if self._answered:
+            self._deadline_s = now_s + self.timing.resend_grace_s
 
     def _greet_again(self, now_s: float) -> None:
         if now_s - self._hello_at_s >= self.timing.give_up_s:
@@ -160,6 +238,25 @@ class Recovery:
         self._heard_s = now_s
         self._probing_since_s = None
         self._deadline_s = now_s + self._silence_s()
+
+    def _acknowledge(self, number: int, now_s: float) -> None:
+        ledger, belief = self._ledger, self._belief
+        if self.state is State.PROBING and self.dialect.verifies:
+            # The line was sent twice; one copy earned this ok, the other may earn a request
+            # for the next line, which must not be served.
+            belief.stale = ledger.cursor
+        ledger.acknowledge(number)
+        belief.progress()
+        self._probing_since_s = None
+        self._answered = False
+        self._events.append(Acknowledged(number))
+        if number == ledger.last:
+            self._go(Signal.DRAINED)
+            self._deadline_s = NEVER_S
+            return
+        self._go(Signal.ACKED)
+        self._transmit()
+        self._listen_anew(now_s)
 
     def _doubt(self, now_s: float, after_s: float | None = None) -> None:
         """Something is odd: wait only shortly before asking again."""

@@ -73,6 +73,7 @@ _BANNER = re.compile(
 _LINE_ERROR = re.compile(
     r"checksum|line number|expected line|last line|format error", re.IGNORECASE
 )
+_LAST_LINE = re.compile(r"last line: ?(\d{1,9})", re.IGNORECASE)
 # Errors that no command of ours caused and that hurt no print (Marlin, SD card).
 _HARMLESS_ERROR = re.compile(r"volume\.init|openRoot|SD card|workDir|no media", re.IGNORECASE)
 _FATAL = re.compile(
@@ -176,7 +177,8 @@ def _error(text: str) -> Reply:
     if _FATAL.search(text):
         return CommandFailed(text, fatal=True)
     if _LINE_ERROR.search(text):
-        return LineError(text)
+        last = _LAST_LINE.search(text)
+        return LineError(text, int(last.group(1)) if last else None)
     if _HARMLESS_ERROR.search(text):
         return Echo(f"Error:{text}")
     if text.lower().startswith("unknown command"):

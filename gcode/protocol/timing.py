@@ -1,4 +1,4 @@
-"""How long the link waits for what, and how often it tries."""
+"""How long the link waits for what, and how often it asks again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class LinkTiming:
-    """How long the link waits, s.
+    """How long the link waits, s, and how often it asks again before it gives up.
 
     Attributes
     ----------
@@ -24,6 +24,18 @@ class LinkTiming:
         Unanswered probes for this long: the link is lost.
     slow_give_up_s
         The same while a slow command is under way.
+    max_resends
+        Requests for one line in a row that are served; ten, as OctoPrint has it.
+    max_refused
+        Requests in a row that make no sense, each answered by asking again. As many: at one
+        damaged byte in 200 one request in twenty is damaged, ten in a row are one in 10^13.
+    max_refused_same
+        The same senseless number in a row, which is no noise: the printer started anew without
+        a word, or somebody else has counted on. Damage that hits the same digit in the same way
+        three times in a row is one in 10^9.
+    max_questions
+        Questions in a row for the line that the printer is at. An answer of 80 bytes is damaged
+        every third time, then: ten in a row are one in 10^5.
     """
 
     silence_s: float = 8.0
@@ -33,4 +45,6 @@ class LinkTiming:
     give_up_s: float = 60.0
     slow_give_up_s: float = 1800.0
     max_resends: int = 10
-    max_refused: int = 3
+    max_refused: int = 10
+    max_refused_same: int = 3
+    max_questions: int = 10

@@ -9,8 +9,10 @@ Rules
   is sent again on its own; numbering starts afresh and the job must be resumed by proof.
 * `REWINDING` holds the line until the answers already under way have arrived; only then is
   anything sent again (no endless off-by-one, OctoPrint#470).
+* `ASKING` has sent a line that must bounce, with nothing under way: its refusal tells which line
+  the printer took last. It is asked again until an answer makes sense.
 * `PROBING` has sent the last line a second time. With a firmware that verifies numbers that is
-  idempotent; for all others `SILENCE` leads to `LOST`.
+  idempotent; for Klipper it has sent a question instead; for all others `SILENCE` leads to `LOST`.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ class State(StrEnum):
     IDLE = "idle"
     WAITING = "waiting"
     REWINDING = "rewinding"
+    ASKING = "asking"
     PROBING = "probing"
     HALTED = "halted"
     LOST = "lost"
@@ -42,6 +45,7 @@ class Signal(StrEnum):
     RESEND = "resend"
     REWOUND = "rewound"
     SILENCE = "silence, the last line sent again"
+    ASK = "asked which line it is at"
     GIVE_UP = "give up"
     HALT = "halt"
     RESET = "reset"
@@ -68,6 +72,7 @@ TRANSITIONS: dict[State, dict[Signal, State]] = {
         **_END,
         Signal.SENT: State.WAITING,
         Signal.RESEND: State.REWINDING,  # an earlier ok was no ok
+        Signal.ASK: State.ASKING,
     },
     State.WAITING: {
         **_END,
@@ -82,6 +87,11 @@ TRANSITIONS: dict[State, dict[Signal, State]] = {
         Signal.RESEND: State.REWINDING,
         Signal.REWOUND: State.WAITING,
         Signal.DRAINED: State.IDLE,
+    },
+    State.ASKING: {
+        **_END,
+        Signal.ASK: State.ASKING,
+        Signal.RESEND: State.REWINDING,
     },
     State.PROBING: {
         **_END,

@@ -6,5 +6,14 @@ with a job whose printer is still there).
 
 from gcode.resumption.print_onto import Stacked, print_onto
 from gcode.resumption.resume_at import Resumption, resume_at
+from gcode.resumption.touch import Touching, TouchOptions, plan_touch
 
-__all__ = ["Resumption", "Stacked", "print_onto", "resume_at"]
+__all__ = [
+    "Resumption",
+    "Stacked",
+    "TouchOptions",
+    "Touching",
+    "plan_touch",
+    "print_onto",
+    "resume_at",
+]

@@ -87,7 +87,7 @@ def resume_at(
     diameter_mm = setup.printer.filament_diameter_mm
     job = read_job(program, filament_diameter_mm=diameter_mm, progress=progress)
     progress("what stands", 0.0, 1.0)
-    first = _first_layer(job, z_mm, layer)
+    first = first_layer(job, z_mm, layer)
     line = first.first_line
     state, settings = job.state_after(line), settings_before(job, line)
     field = standing_field(job.beads, line, setup.printer)
@@ -120,7 +120,7 @@ def resume_at(
     )
 
 
-def _first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:
+def first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:
     layers = job.layers
     if (z_mm is None) == (index is None):
         raise InputError("Say either a height or a layer to go on from, one of the two.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -49,6 +50,9 @@ OTHERS = (
     *("G28 X", "G4 P700", "M400", "M105", "M106 S128", "M117 hours", "M109 S40", "M140 S30"),
     *("G92 E0", "M83", "T0", "G1 X5", "G0 Y7 F3000", "M118 E1 here", "M204 P900", "G2 X9 Y9 I2 J2"),
 )
+
+
+QUESTIONS = (b"M105", b"M114")
 
 
 def program(count: int) -> list[str]:
@@ -125,7 +129,7 @@ def test_where_it_cannot_go_on_it_stops_and_names_the_true_interval(
 
 @settings(max_examples=80)
 @given(
-    lines=programs(),
+    lines=programs().map(lambda lines: ["G1 X1 F600", *lines]),
     faults=fault_scripts(UNNUMBERED),
     end=st.tuples(st.integers(5, 45), st.sampled_from(("lose_ok", *ENDING))),
     firmware=st.sampled_from(["klipper", "reprap"]),
@@ -140,22 +144,76 @@ def test_without_numbers_it_stops_and_names_the_true_interval(
     seed: int,
     by_moves: bool,
 ) -> None:
-    """Nothing is sent twice: whatever is lost ends the link, between what it says."""
+    """Nothing is sent twice: what cannot be asked for ends the link, between what it says."""
     script = faults + f"\nline {end[0]} {end[1]}"
+    if firmware == "klipper":  # nothing is lost on the way through a pseudo-terminal
+        faults = faults.replace("drop_in", "lose_ok")
+        script = faults + f"\nline {end[0] + 4} {end[1]}"  # after the first move, or it is at zero
     talk = Conversation(script, dialect=firmware, firmware=firmware, seed=seed, by_moves=by_moves)
     lines = [line for line in lines if line != "M105"]  # that is the hello of one of them
     done = talk.job(["G28", *lines])
-    executed = [line.decode("latin-1") for line in talk.executed if line != b"M105"]
+    executed = [line.decode("latin-1") for line in talk.executed if line not in QUESTIONS]
     if "corrupt_in" in faults:  # carried out as it came: no firmware of these can tell
         assert len(executed) <= talk.link.last_sent
         return
-    assert executed == talk.given[: len(executed)]
+    given = [line for line in talk.given if line != "M114"]
+    assert executed == given[: len(executed)]
     if done:
-        assert executed == talk.given
+        assert executed == given
     elif talk.lost is not None:
-        assert talk.lost.last_acked <= len(executed) <= talk.lost.last_sent
+        acked, sent = (
+            sum(line != "M114" for line in talk.given[:number])
+            for number in (talk.lost.last_acked, talk.lost.last_sent)
+        )
+        assert acked <= len(executed) <= sent
     else:
         assert any(isinstance(e, ev.CommandFailed) and e.fatal for e in talk.events)
+
+
+def _through_a_damaged_wire(
+    firmware: str, seed: int, *, count: int, window: int = 1, by_moves: bool = False
+) -> Conversation:
+    """Print beads through a wire that damages one byte in 200 each way; what came of it."""
+    talk = Conversation(
+        "always damage s=0.005",
+        dialect=firmware,
+        firmware=firmware,
+        window=window,
+        seed=seed,
+        by_moves=by_moves,
+    )
+    lines = ["G28", "M302 P1", "M83"]
+    lines += [
+        f"G1 X{i % 180} Y{i * 7 % 180} E{0.02 + i % 7 * 0.01:.3f} F6000" for i in range(count)
+    ]
+    assert talk.job(lines), talk.lost
+    talk.core.drain()
+    executed = [line.decode() for line in talk.executed if line not in QUESTIONS]
+    assert executed == lines  # once and in order
+    filament_mm = sum(talk.core.machine.planner.executed[6::9])
+    assert filament_mm == pytest.approx(sum(0.02 + i % 7 * 0.01 for i in range(count)), abs=1e-6)
+    assert talk.core.wire is not None
+    assert talk.core.wire.damaged > count / 200  # of an ok's 3 bytes, and of a line's 30
+    return talk
+
+
+@pytest.mark.parametrize("firmware", ["marlin", "prusa", "klipper"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_damaged_byte_in_200_loses_nothing_and_prints_nothing_twice(
+    firmware: str, seed: int
+) -> None:
+    _through_a_damaged_wire(firmware, seed, count=300)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("firmware", ["marlin", "prusa", "klipper"])
+@pytest.mark.parametrize(("window", "by_moves"), [(1, False), (1, True), (4, True)])
+def test_a_damaged_byte_in_200_on_200_wires(firmware: str, window: int, by_moves: bool) -> None:
+    if firmware == "klipper":
+        window = 1  # as it is asked its questions
+    for seed in range(200):
+        _through_a_damaged_wire(firmware, seed, count=1000, window=window, by_moves=by_moves)
 
 
 @settings(max_examples=60)

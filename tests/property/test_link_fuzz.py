@@ -104,7 +104,7 @@ def fuzz_host(fuzzer: Fuzzer, count: int) -> None:
             rng.choice(("marlin", "marlin", "klipper", "reprap")), window=rng.choice((1, 4))
         )
         now_s = 0.0
-        given = set(link.hello(now_s).split(b"\n"))
+        given = {link.dialect.question, *link.hello(now_s).split(b"\n")}
         for _ in range(rng.choice((5, 40))):
             done += 1
             data = fuzzer.bytes(REPLIES)

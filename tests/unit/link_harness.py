@@ -113,8 +113,24 @@ class Conversation:
                 self.link.confirm()
                 return True
             self.settle(0.3)
+            if self.link.dialect.verifies and not self.prove_place():
+                return False
             self.asked, self.written_off = 0, self.reports()
         raise AssertionError("M114 is never answered")
+
+    def prove_place(self) -> bool:
+        """Have the printer say which line it took last, until that is the last there is."""
+        for _ in range(20):
+            self.core.feed(self.link.ask_place(self.now_s), self.now_s)
+            asked_at = len(self.events)
+            while not self.link.idle and not self.link.ended:
+                self.exchange()
+            if self.link.ended:
+                return False
+            if any(isinstance(event, ev.Proved) for event in self.events[asked_at:]):
+                self.asked, self.written_off = 0, self.reports()
+                return True
+        raise AssertionError("it never says the last line")
 
     def reports(self) -> int:
         return sum(isinstance(event, ev.PositionReport) for event in self.events)

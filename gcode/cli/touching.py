@@ -1,0 +1,84 @@
+"""The command `gcode touch`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gcode.cli import console
+from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(
+        "touch",
+        epilog=console.examples(
+            "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin "
+            "--port /dev/ttyACM0",
+        ),
+    )(touch_command)
+
+
+def touch_command(
+    job: Annotated[Path, typer.Argument(help="The whole job's G-code, of any slicer.")],
+    port: Annotated[str, typer.Option(help="Device path of the printer.")],
+    above_mm: Annotated[
+        float,
+        typer.Option(
+            help="How high the nozzle stands above the part's top now, mm, by eye, within 1 mm: "
+            "2 to 10. Turn Z by hand until it does."
+        ),
+    ],
+    z_mm: Annotated[
+        float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
+    ] = None,
+    layer: Annotated[
+        int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
+    ] = None,
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
+    as_json: JsonOption = False,
+) -> None:
+    """Find Z anew on a standing part after a power loss: the cold nozzle feels for a flat.
+
+    The nozzle itself must feel contact (a load cell, a strain gauge, a contact in the nozzle), and
+    the firmware must have G38.2. Z is never homed onto the part; 'gcode resume-at' goes on.
+    """
+    with console.starting():
+        from gcode.hosts.serial import SerialPrinter
+        from gcode.hosts.touching import touch_z
+        from gcode.moves import Program
+        from gcode.profiles import load_setup
+        from gcode.resumption.touch import plan_touch
+
+    setup = load_setup(printer, material)
+    bars = console.Bars()
+    with bars.shown():
+        program = Program(program_text(job), setup.printer.dialect)
+        plan = plan_touch(program, setup, above_mm=above_mm, z_mm=z_mm, layer=layer, progress=bars)
+        with SerialPrinter(port, dialect=setup.printer.dialect) as machine:
+            found = touch_z(machine, plan, above_mm, progress=bars)
+    if as_json:
+        console.show_json(
+            {
+                "layer": plan.layer.index + 1,
+                "top_mm": round(plan.layer.z_mm, 4),
+                "places_mm": plan.places_mm.round(2).tolist(),
+                "flat_mm": round(plan.flat_mm, 2),
+                "first_shift_mm": round(found.first_shift_mm, 4),
+                "shift_mm": round(found.shift_mm, 4),
+                "apart_mm": round(found.apart_mm, 4),
+                "uncertainty_mm": round(found.uncertainty_mm, 4),
+            }
+        )
+        return
+    console.out.print(
+        f"Z is true to ±{found.uncertainty_mm:.3f} mm: the part's top was felt at "
+        f"{plan.layer.z_mm:g} mm, twice, {found.apart_mm:.3f} mm apart; by eye it was "
+        f"{found.first_shift_mm:+.2f} mm off. The motors are held; go on by: gcode resume-at "
+        f"{job} --layer {plan.layer.index + 1}"
+    )

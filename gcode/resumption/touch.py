@@ -1,0 +1,242 @@
+"""Z found anew on a standing part by touching a flat of it that its job knows.
+
+Nobody knows Z after a power loss, and homing it would drive the nozzle into the part. The job tells
+where the last layer is solid, and how high; there the nozzle itself feels for it (G38.2), never
+deeper than planned. It makes the programs; `hosts.touching` carries them out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from gcode.check import CheckedProgram, Touch, check
+from gcode.dialects import number
+from gcode.errors import InputError
+from gcode.moves import Program
+from gcode.profiles import PrinterProfile, PrintSetup
+from gcode.progress import Progress, silent
+from gcode.reader import read_job
+from gcode.reader.job import Beads, JobLayer
+from gcode.resumption.head import LIFT_MM, height_over
+from gcode.resumption.resume_at import first_layer
+from gcode.resumption.settings import settings_before
+from gcode.resumption.standing import standing_field
+from gcode.surfaces import HeightField
+from gcode.units import mm_min_from_mm_s
+
+CELL_MM = 0.2
+FLAT_SLACK_MM = 0.01
+"""Beads of one layer lie at one height, within the digits of the text; a spiral's do not."""
+TOUCHING_DIALECTS = ("marlin", "reprap")
+"""Those with a touch that is told how deep it may go: Marlin's G38.2 (G38_PROBE_TARGET), and
+RepRapFirmware's. Klipper's PROBE goes down to the `position_min` of its own configuration, and
+Prusa's firmware has G30 alone, which ends at a depth of its own as well."""
+
+
+@dataclass(frozen=True, slots=True)
+class TouchOptions:
+    """Physical sizes of a touch.
+
+    Attributes
+    ----------
+    doubt_mm
+        How well a nozzle's height is told by eye and a ruler.
+    over_mm
+        How far below that a first touch goes on before it is given up.
+    fine_mm
+        The same of touches after the first, when the height is known.
+    flat_mm
+        Least diameter of a flat: the end of a nozzle (1 mm) and a millimetre on each side, for
+        where X and Y are homed to.
+    feed_mm_s
+        Half of Z_PROBE_FEEDRATE_FAST in Marlin's Configuration.h (4 mm/s).
+    sigma_mm
+        Standard deviation of one touch, as Marlin's M48 tells it for good probes.
+    agree_mm
+        Most by which two touches may differ: what they feel is no flat, or something gives way.
+    coverage
+        The stated uncertainty is so many standard deviations.
+    """
+
+    doubt_mm: float = 1.0
+    over_mm: float = 0.5
+    fine_mm: float = 0.3
+    flat_mm: float = 3.0
+    feed_mm_s: float = 2.0
+    sigma_mm: float = 0.01
+    agree_mm: float = 0.1
+    coverage: float = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Touching:
+    """What to touch, and the programs that do.
+
+    Attributes
+    ----------
+    layer
+        The last complete layer, whose top is felt.
+    places_mm
+        (2, 2) XY of the two touches, build frame; the first of all is at the first.
+    flat_mm
+        Diameter of the largest disc that is solid there.
+    coarse
+        One touch, when the height is known by eye.
+    fine
+        Both touches, when it is known by the first.
+    standing
+        What stands there.
+    """
+
+    layer: JobLayer
+    places_mm: Float[np.ndarray, "2 2"]
+    flat_mm: float
+    coarse: CheckedProgram
+    fine: CheckedProgram
+    standing: HeightField
+    options: TouchOptions
+
+
+def plan_touch(
+    program: Program,
+    setup: PrintSetup,
+    *,
+    above_mm: float,
+    z_mm: float | None = None,
+    layer: int | None = None,
+    options: TouchOptions | None = None,
+    progress: Progress = silent,
+) -> Touching:
+    """Plan how Z is found anew on what stands of a job.
+
+    Parameters
+    ----------
+    above_mm
+        How high the nozzle stands above the part's top now, by eye, within `options.doubt_mm`.
+    z_mm, layer
+        As for `resume_at`: height of what stands there, or the first layer to be printed.
+
+    Raises
+    ------
+    InputError
+        If the firmware has no such touch, the nozzle is too low or too high, the job has no such
+        layer or it no flat.
+    CheckRefusedError
+        If the checker refuses the touches.
+    """
+    printer, options = setup.printer, options or TouchOptions()
+    _refuse_impossible(printer, above_mm, options)
+    job = read_job(program, filament_diameter_mm=printer.filament_diameter_mm, progress=progress)
+    first = first_layer(job, z_mm, layer)
+    last = job.layers[first.index - 1]
+    places_mm, across_mm = _flat(job.beads, last, options)
+    field = standing_field(job.beads, first.first_line, printer)
+    # Marlin's G28 switches the mesh off (G28.md), and the job goes on with it
+    meshed = settings_before(job, first.first_line).levelled and printer.dialect == "marlin"
+    high_mm = height_over(field.top_mm, job.state_after(first.first_line), printer)
+
+    def made(where: Float[np.ndarray, "k 2"], below_mm: float) -> CheckedProgram:
+        touches = tuple(
+            Touch(float(x), float(y), last.z_mm, last.z_mm - below_mm) for x, y in where
+        )
+        text = _text(touches, setup, high_mm, options, meshed=meshed)
+        whole = Program(text, program.dialect)
+        return check(whole, setup, as_built=field, touches=touches, progress=progress)
+
+    return Touching(
+        layer=last,
+        places_mm=places_mm,
+        flat_mm=across_mm,
+        coarse=made(places_mm[:1], options.doubt_mm + options.over_mm),
+        fine=made(places_mm, options.fine_mm),
+        standing=field,
+        options=options,
+    )
+
+
+def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchOptions) -> None:
+    """Raise where the firmware has no such touch, or the nozzle stands too low or too high."""
+    if printer.dialect not in TOUCHING_DIALECTS:
+        raise InputError(
+            f"{printer.id} speaks {printer.dialect}, whose probing goes as deep as its own "
+            f"configuration says: nothing could stop it above the part; set Z by hand, with paper "
+            f"between nozzle and part, or use a printer with G38.2 (Marlin, RepRapFirmware)."
+        )
+    if not 2 * options.doubt_mm <= above_mm <= LIFT_MM:
+        raise InputError(
+            f"--above-mm is {above_mm:g}; turn Z by hand until the nozzle stands "
+            f"{2 * options.doubt_mm:g} to {LIFT_MM:g} mm above the part's top."
+        )
+
+
+def _text(
+    touches: tuple[Touch, ...],
+    setup: PrintSetup,
+    high_mm: float,
+    options: TouchOptions,
+    *,
+    meshed: bool,
+) -> str:
+    """Above everything, X and Y homed; over each place, down to it, and up again."""
+    z_feed = f" F{number(mm_min_from_mm_s(setup.printer.z_speed_mm_s), 0)}"
+    travel = f" F{number(mm_min_from_mm_s(setup.printer.travel_speed_mm_s), 0)}"
+    feed = f" F{number(mm_min_from_mm_s(options.feed_mm_s), 0)}"
+    up = f"G1 Z{number(high_mm, 3)}{z_feed}"
+    lines = ["; Z found anew: heaters off, never deeper than planned", "G21", "G90", "M83", up]
+    lines += ["G28 X Y", "M420 S1"] if meshed else ["G28 X Y"]
+    for touch in touches:
+        lines += [
+            f"G1 X{number(touch.x_mm, 3)} Y{number(touch.y_mm, 3)}{travel}",
+            f"G38.2 Z{number(touch.lowest_mm, 3)}{feed}",
+            up,
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _flat(
+    beads: Beads, layer: JobLayer, options: TouchOptions
+) -> tuple[Float[np.ndarray, "2 2"], float]:
+    """Two places on the largest flat of a layer, and how wide it is there, mm."""
+    origin, solid = _solid(beads, layer)
+    inside_mm = CELL_MM * ndimage.distance_transform_edt(solid) if solid.size else np.zeros((1, 1))
+    row, column = np.unravel_index(int(inside_mm.argmax()), inside_mm.shape)
+    across_mm = 2.0 * float(inside_mm[row, column])
+    if across_mm < options.flat_mm:
+        raise InputError(
+            f"The last layer that stands there (top at {layer.z_mm:g} mm) is solid over "
+            f"{across_mm:.1f} mm at most, and a touch needs a flat of {options.flat_mm:g} mm; set "
+            f"Z by hand, with paper between nozzle and part."
+        )
+    islands, _ = ndimage.label(inside_mm >= 0.5 * options.flat_mm)
+    rows, columns = np.nonzero(islands == islands[row, column])
+    away = np.hypot(rows - row, columns - column)
+    other = int(away.argmax())
+    cells = np.array([[column, row], [columns[other], rows[other]]], dtype=float)
+    return origin + (cells + 0.5) * CELL_MM, across_mm
+
+
+def _solid(
+    beads: Beads, layer: JobLayer
+) -> tuple[Float[np.ndarray, " 2"], Bool[np.ndarray, "ny nx"]]:
+    """Where a layer's beads lie side by side at its height: origin, mm, and cells."""
+    pick = (beads.layer == layer.index) & (np.abs(beads.end_mm[:, 2] - layer.z_mm) <= FLAT_SLACK_MM)
+    start, end = beads.start_mm[pick][:, :2], beads.end_mm[pick][:, :2]
+    if not len(start):
+        return np.zeros(2), np.zeros((0, 0), dtype=bool)
+    half_mm = 0.5 * float(np.median(beads.width_mm[pick]))
+    steps = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / (0.5 * CELL_MM)), 1.0)
+    count = (steps + 1).astype(np.int64)
+    owner = np.repeat(np.arange(len(count)), count)
+    share = (np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)) / steps[owner]
+    points = start[owner] + share[:, None] * (end - start)[owner]
+    rim = 2 * math.ceil(half_mm / CELL_MM) + 1
+    origin = np.floor(points.min(axis=0) / CELL_MM) * CELL_MM - rim * CELL_MM
+    cells = ((points - origin) / CELL_MM).astype(np.int64)
+    free = np.ones(cells.max(axis=0)[::-1] + 1 + rim, dtype=bool)
+    free[cells[:, 1], cells[:, 0]] = False
+    return origin, CELL_MM * ndimage.distance_transform_edt(free) <= half_mm
