@@ -8,6 +8,7 @@ import typer
 
 import amrepair
 from amrepair.cli import (
+    batching,
     benchmark,
     calibration,
     health,
@@ -54,6 +55,7 @@ mend.add_to(app)
 printing.add_to(app)
 calibration.add_to(app)
 replaying.add_to(app)
+batching.add_to(app)
 benchmark.add_to(app)
 health.add_to(app)
 live.add_to(app)
