@@ -12,12 +12,15 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from amrepair.batch.executors import MOST_ATTEMPTS, given_up
 from amrepair.batch.options import Outcome, Task, Work
 from amrepair.errors import InputError, MissingDependencyError
 from gcode.process import one_thread
+
+if TYPE_CHECKING:
+    from amrepair.batch.work import Bench
 
 # Tasks under way a worker: one that is done and one that waits, so that none is idle meanwhile.
 DEPTH = 2
@@ -53,7 +56,7 @@ class OnRay:
             _Holder
         )
         bare = replace(work, templates=tuple(replace(t, path=Path()) for t in work.templates))
-        self._actors = [holder.remote(bare, self._shared) for _ in range(count)]
+        self._actors = [holder.remote(bare) for _ in range(count)]
 
     def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
         """Never more than two tasks a worker are under way."""
@@ -66,7 +69,7 @@ class OnRay:
                 more = task is not None
                 if task is not None:
                     actor = free.pop(0)
-                    under_way[actor.do.remote(task)] = (actor, task)
+                    under_way[actor.do.remote(task, self._shared)] = (actor, task)
             if not under_way:
                 return
             done, _ = self._ray.wait(list(under_way), num_returns=1)
@@ -94,15 +97,19 @@ class OnRay:
 class _Holder:
     """An actor: a bench with templates that came by reference."""
 
-    def __init__(self, work: Work, references: Sequence[Any]) -> None:
-        from amrepair.batch.work import Bench
-
-        contents = _loaded().get(list(references))
+    def __init__(self, work: Work) -> None:
+        self._work = work
         self._folder = tempfile.TemporaryDirectory(prefix="amrepair-ray-")
-        self._bench = Bench(replace(work, templates=_laid_down(work, contents, self._folder.name)))
+        self._bench: Bench | None = None
 
-    def do(self, task: Task) -> Outcome:
-        """Judge one scan."""
+    def do(self, task: Task, references: Sequence[Any]) -> Outcome:
+        """Judge one scan; an actor that was started again fetches the templates again."""
+        if self._bench is None:
+            from amrepair.batch.work import Bench
+
+            contents = _loaded().get(list(references))
+            placed = _laid_down(self._work, contents, self._folder.name)
+            self._bench = Bench(replace(self._work, templates=placed))
         return self._bench.do(task)
 
 

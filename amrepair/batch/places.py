@@ -7,6 +7,7 @@ an object when all of it has come.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -122,17 +123,20 @@ class Store:
 
     def write(self, name: str, data: bytes) -> None:
         """Put an object; the store shows it when it is whole."""
-        self._system.pipe_file(f"{self._base}/{name}", data)
+        with _as_os_errors():
+            self._system.pipe_file(f"{self._base}/{name}", data)
 
     def read(self, name: str) -> bytes:
         """All of an object."""
-        return bytes(self._system.cat_file(f"{self._base}/{name}"))
+        with _as_os_errors():
+            return bytes(self._system.cat_file(f"{self._base}/{name}"))
 
     def names(self, folder: str) -> set[str]:
         """Names of the objects directly below a folder."""
         self._system.invalidate_cache()
         try:
-            found = self._system.ls(f"{self._base}/{folder}", detail=False)
+            with _as_os_errors():
+                found = self._system.ls(f"{self._base}/{folder}", detail=False)
         except FileNotFoundError:
             return set()
         return {PurePosixPath(one).name for one in found}
@@ -157,7 +161,8 @@ def listed(uri: str) -> list[tuple[str, str]]:
     else:
         system, base = _system_of(uri.rstrip("/"))
         scheme = uri.split("://", 1)[0]
-        found_names = [str(one) for one in system.find(base)]
+        with _as_os_errors():
+            found_names = [str(one) for one in system.find(base)]
         named = [(one[len(base) + 1 :], f"{scheme}://{one}") for one in found_names]
     hidden = [n for n, _ in named if any(part.startswith(".") for part in n.split("/"))]
     return sorted(one for one in named if one[0] not in set(hidden))
@@ -172,7 +177,7 @@ def digest_of(uri: str) -> tuple[str, int]:
         If it cannot be read.
     """
     digest, size = hashlib.sha256(), 0
-    with _opened(uri) as stream:
+    with _as_os_errors(), _opened(uri) as stream:
         while chunk := stream.read(_CHUNK_BYTES):
             digest.update(chunk)
             size += len(chunk)
@@ -187,7 +192,7 @@ def at_hand(uri: str) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory(prefix="amrepair-batch-") as folder:
         path = Path(folder) / f"scan{suffix_of(uri)}"
-        with _opened(uri) as stream, path.open("wb") as copy:
+        with _as_os_errors(), _opened(uri) as stream, path.open("wb") as copy:
             while chunk := stream.read(_CHUNK_BYTES):
                 copy.write(chunk)
         yield path
@@ -198,6 +203,17 @@ def _opened(uri: str) -> Any:
         return Path(uri).open("rb")
     system, path = _system_of(uri)
     return system.open(path, "rb")
+
+
+@contextmanager
+def _as_os_errors() -> Iterator[None]:
+    """What a store's own library raises, as what a disk would."""
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        raise OSError(errno.EIO, " ".join(str(error).split())) from error
 
 
 def _system_of(uri: str) -> tuple[Any, str]:
