@@ -11,6 +11,7 @@ from amrepair.cli import (
     batching,
     benchmark,
     calibration,
+    fleeting,
     health,
     inspect,
     live,
@@ -59,6 +60,7 @@ batching.add_to(app)
 benchmark.add_to(app)
 health.add_to(app)
 live.add_to(app)
+fleeting.add_to(app)
 
 
 def main() -> None:
