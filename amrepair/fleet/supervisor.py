@@ -160,7 +160,7 @@ class Seat:
 
     def _ended(self, code: int, now_s: float) -> None:
         said = read_note(self.folder / "loop.out") or {}
-        why = str(said.get("error") or said.get("stopped") or "")
+        why = str(said.get("error") or said.get("stopped") or "").removeprefix("amrepair: ")
         if self.stopping or code == INTERRUPTED:
             self.stopping = False
             self.state = State.STOPPED
