@@ -1,7 +1,7 @@
 """`run_batch`: read what is asked, skip what is known, hand out the rest, write what it came to.
 
     out/results/ab/…json     one for each scan's content, written whole
-    out/results/ab/…npz      its sums for the heat map; for `repair`: …gcode
+    out/results/ab/…gcode    with `repair`: its program
     out/table.csv, .parquet  a row for each scan, sorted by name
     out/overview.html, batch.json
 
@@ -10,6 +10,7 @@ A second run with the same arguments does only what is left.
 
 from __future__ import annotations
 
+import base64
 import errno
 import json
 import tempfile
@@ -234,12 +235,15 @@ def _keep(place: Place, outcome: Outcome, books: _Books) -> None:
         books.passing[outcome.scan_id] = outcome.sentence
         return
     for name, data in outcome.files.items():
+        if name == SUMS:
+            continue
         place.write(_path_of(outcome.scan_id, Path(name).suffix), data)
     said = {
         "scan_id": outcome.scan_id,
         "sentence": outcome.sentence,
         "figures": outcome.figures,
-        "files": sorted(outcome.files),
+        "program": PROGRAM in outcome.files,
+        "sums": base64.b64encode(outcome.files.get(SUMS, b"")).decode(),
         "cost": outcome.cost,
     }
     text = json.dumps(said, separators=(",", ":"), ensure_ascii=False)
@@ -265,7 +269,7 @@ def _written(
 ) -> BatchReport:
     """Table and overview of all that there is."""
     rows = []
-    kept: dict[str, Mapping[str, Any]] = {}
+    last, result = "", {}
     for number, entry in enumerate(entries):
         progress("table", float(number), float(len(entries)))
         name = books.id_of.get(entry.name, "")
@@ -273,13 +277,12 @@ def _written(
             said = books.sentence_of.get(entry.name) or books.passing[name]
             rows.append(row_of(entry, name, {}, said))
             continue
-        if name not in kept:
-            kept[name] = json.loads(place.read(_path_of(name, ".json")))
-        result = kept[name]
-        gcode = _path_of(name, ".gcode") if PROGRAM in result["files"] else ""
+        if name != last:  # names of one content need not follow each other: it is read again
+            last, result = name, json.loads(place.read(_path_of(name, ".json")))
+        gcode = _path_of(name, ".gcode") if result["program"] else ""
         rows.append(row_of(entry, name, result["figures"], result["sentence"], gcode))
-        if SUMS in result["files"]:  # a scan that was handed in twice counts twice
-            sums = CellSums.from_bytes(place.read(_path_of(name, ".npz")))
+        if result["sums"]:  # a scan that was handed in twice counts twice
+            sums = CellSums.from_bytes(base64.b64decode(result["sums"]))
             parts[result["figures"]["template"]].add(sums)
     progress("table", 1.0, 1.0)
     notes = []

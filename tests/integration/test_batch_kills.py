@@ -130,19 +130,23 @@ def patient(true: Callable[[], object], process: subprocess.Popen[bytes] | None 
 
 
 def children_of(parent: int, named: bytes) -> list[int]:
-    """Processes below one, whose command line has a word."""
-    below, found = {parent}, []
-    entries = sorted(int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit())
-    for pid in entries:
-        try:
-            words = Path(f"/proc/{pid}/cmdline").read_bytes()
-            stat = Path(f"/proc/{pid}/stat").read_text()
-        except OSError:
-            continue
-        if int(stat.rpartition(")")[2].split()[1]) in below:
-            below.add(pid)
-            if named in words:
-                found.append(pid)
+    """Processes below one, however far, whose command line has a word."""
+    parent_of, words_of = {}, {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words_of[int(entry.name)] = (entry / "cmdline").read_bytes()
+                stat = (entry / "stat").read_text()
+            except OSError:
+                continue
+            parent_of[int(entry.name)] = int(stat.rpartition(")")[2].split()[1])
+    found = []
+    for pid, words in words_of.items():
+        above = pid
+        while above in parent_of and above != parent:
+            above = parent_of[above]
+        if above == parent and pid != parent and named in words:
+            found.append(pid)
     return found
 
 
