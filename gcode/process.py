@@ -41,6 +41,24 @@ def prepare() -> None:
     mallopt(_ARENA_MAX, _ARENAS)
 
 
+_THREAD_COUNTS = (
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+)
+
+
+def one_thread() -> dict[str, str]:
+    """What the environment of a process says whose libraries are to use one thread each.
+
+    Read when they are loaded: it is set before. Where as many processes work as there are cores,
+    further threads only wait for each other; and sums of several threads differ in their last
+    digits from those of one.
+    """
+    return dict.fromkeys(_THREAD_COUNTS, "1")
+
+
 def gives_back(long_task: Callable[P, R]) -> Callable[P, R]:
     """Of a long task: what memory is kept is given back to the system at its end.
 

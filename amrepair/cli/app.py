@@ -8,8 +8,10 @@ import typer
 
 import amrepair
 from amrepair.cli import (
+    batching,
     benchmark,
     calibration,
+    fleeting,
     health,
     inspect,
     live,
@@ -56,9 +58,11 @@ printing.add_to(app)
 postprocessing.add_to(app)
 calibration.add_to(app)
 replaying.add_to(app)
+batching.add_to(app)
 benchmark.add_to(app)
 health.add_to(app)
 live.add_to(app)
+fleeting.add_to(app)
 
 
 def main() -> None:

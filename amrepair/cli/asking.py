@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from amrepair.errors import InputError
+from amrepair.fleet.desk import Desk
 from amrepair.loop import Decision
 from amrepair.repair import RepairPlan
 from amrepair.report.text import plan_lines
@@ -41,6 +42,34 @@ class Terminal:
                         markup=False,
                     )
             return confirmed("Go on all the same (no ends the run)?")
+
+
+class AtDesk(console.Bars):
+    """Asks by notes in a folder, and tells its progress there: somebody else has the terminal.
+
+    Parameters
+    ----------
+    desk
+        Of a supervisor's.
+    """
+
+    def __init__(self, desk: Desk) -> None:
+        super().__init__()
+        self._desk = desk
+
+    def __call__(self, stage: str, done: float, total: float) -> None:
+        """Report that `done` of `total` of `stage` is finished."""
+        self._desk.progress(stage, done, total)
+
+    def to_print(self, plan: RepairPlan) -> bool:
+        """Tell what would be printed, and wait for a word."""
+        return self._desk.ask("Print this repair?", plan_lines(plan))
+
+    def to_go_on(self, decision: Decision) -> bool:
+        """Tell why the run rests, and wait for a word."""
+        own = [v for v in decision.verdicts if v.action is decision.action]
+        lines = [f"{v.finding.type}: {v.reason}" for v in own] or [decision.reason]
+        return self._desk.ask("Go on all the same (no ends the run)?", lines)
 
 
 def confirmed(question: str) -> bool:

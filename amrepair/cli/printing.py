@@ -127,6 +127,13 @@ def loop(
         ),
     ] = False,
     leave_heaters: LeaveHeatersOption = False,
+    desk: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for another program that supervises the run: progress and questions are "
+            "in its status.json, answers are taken from its answer.json."
+        ),
+    ] = None,
     view: ViewOption = False,
     view_host: HostOption = LOOPBACK,
     view_port: PortOption = VIEW_PORT,
@@ -137,6 +144,8 @@ def loop(
     """Print a job; at chosen layers and at the end scan, repair what is missing, go on."""
     if approve not in (None, *APPROVALS):
         raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
+    if desk is not None and view:
+        raise InputError("--desk and --view are two places to ask at; leave one out")
     with console.starting():
         from amrepair.cli import running
 
@@ -148,7 +157,7 @@ def loop(
         (printer, material, process),
         running.Looks(every, adaptive, tuple(at_layer or ()), tuple(at_mm or ())),
         calibration,
-        running.Page(view, view_host, view_port, token),
+        running.Page(view, view_host, view_port, token, desk),
         resume=resume,
         pose_confirmed=pose_confirmed,
         port=port,

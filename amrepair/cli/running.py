@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from amrepair.cli.asking import Terminal
+from amrepair.cli.asking import AtDesk, Terminal
 from amrepair.cli.live import NoView, ShownRun, live_view
 from amrepair.cli.warmth import ThermalLog
 from amrepair.errors import InputError, LoopError
+from amrepair.fleet.desk import Desk
 from amrepair.frames import Transform
 from amrepair.loop import (
     MAX_ITERATIONS,
@@ -88,6 +89,7 @@ class Page:
     host: str
     port: int
     token: str | None
+    desk: Path | None = None
 
 
 def run(
@@ -111,7 +113,8 @@ def run(
 
     `said` is the scan's time limit, the calibration of its errors and the seed.
     """
-    watch, bars = Stopwatch(), console.Bars()
+    watch = Stopwatch()
+    bars = console.Bars() if shown.desk is None else AtDesk(Desk(shown.desk))
     if resume is not None:
         if job_file is not None:
             raise InputError("--resume takes the job from the run's folder; leave JOB out")
@@ -132,14 +135,19 @@ def run(
             **said,
         )
     ask = begun.setting.approve == "ask"
-    with live_view(
-        shown.view,
-        ask=ask,
-        title=begun.setting.title,
-        host=shown.host,
-        port=shown.port,
-        token=shown.token,
-    ) as page:
+    # whoever supervises it ends it by SIGTERM, with nobody at a terminal
+    polite = console.signals_end_it() if shown.desk is not None else nullcontext()
+    with (
+        polite,
+        live_view(
+            shown.view,
+            ask=ask,
+            title=begun.setting.title,
+            host=shown.host,
+            port=shown.port,
+            token=shown.token,
+        ) as page,
+    ):
         report, warmth = _print(
             begun,
             page,
@@ -280,7 +288,8 @@ def _print(
     if not going_on:
         machine.connect()
     page.drives(machine.pause, machine.resume)
-    word, warmth = Terminal(bars), ThermalLog(machine.temperatures)
+    word = bars if isinstance(bars, AtDesk) else Terminal(bars)
+    warmth = ThermalLog(machine.temperatures)
     shown = page.recording(begun.folder.record)
 
     def recorded(look: Look) -> None:

@@ -16,7 +16,15 @@ from typing import Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from gcode.errors import InputError
@@ -25,6 +33,7 @@ from gcode.profiles.names import Kind, list_profiles
 NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130
 READER_GONE = 141  # as of a program that SIGPIPE ended: 128 + 13
+RATE_DIGITS = 10.0  # from here on a rate is told in whole numbers
 COUNTED = 2  # stages of fewer steps are told in per cent alone
 
 
@@ -59,6 +68,16 @@ class _TimeLeft(TimeRemainingColumn):
         return Text(f"for {spent_s // 60}:{spent_s % 60:02d}", style="progress.remaining")
 
 
+class _Rate(ProgressColumn):
+    """How many a second, where they are counted."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        if not task.fields["count"] or not speed:
+            return Text("")
+        return Text(f"{speed:.1f}/s" if speed < RATE_DIGITS else f"{speed:.0f}/s")
+
+
 class Bars:
     """A bar for every stage on a terminal; nothing where there is none."""
 
@@ -69,6 +88,7 @@ class Bars:
             BarColumn(),
             TextColumn("{task.fields[share]:>5}"),
             TextColumn("{task.fields[count]}"),
+            _Rate(),
             _TimeLeft(elapsed_when_finished=True),
             console=errors,
         )

@@ -121,6 +121,7 @@ def resume_at(
 
 
 def first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:
+    """The first layer that is left to print, by the height that stands there or its index."""
     layers = job.layers
     if (z_mm is None) == (index is None):
         raise InputError("Say either a height or a layer to go on from, one of the two.")

@@ -1,0 +1,27 @@
+"""Batch: many scans of one part or of several, judged by many workers, each of them once.
+
+A result is kept under the hash of what it follows from, so that a batch that was killed goes on
+where it was. It judges no scan by itself: `align`, `regions` and `repair` do.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gcode.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from amrepair.batch.options import BatchOptions, Kind
+    from amrepair.batch.run import BatchReport, run_batch
+
+__all__ = ["BatchOptions", "BatchReport", "Kind", "run_batch"]
+
+# Loaded when first used: a worker sets its threads before numpy is there.
+_HOMES = {
+    "BatchOptions": ("amrepair.batch.options", "BatchOptions"),
+    "BatchReport": ("amrepair.batch.run", "BatchReport"),
+    "Kind": ("amrepair.batch.options", "Kind"),
+    "run_batch": ("amrepair.batch.run", "run_batch"),
+}
+
+__getattr__, __dir__ = lazy_names(globals(), _HOMES)

@@ -1,0 +1,87 @@
+"""The port of an executor, and the one that works in this process.
+
+An executor takes tasks one by one, never many more than it has workers, and yields outcomes in
+whatever order they come. It knows nothing of results on disks: the supervisor keeps them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Protocol, runtime_checkable
+
+from amrepair.batch.options import Outcome, Task, Work
+from amrepair.errors import InputError
+
+NAMES = ("process", "serial", "ray")
+# A task that took so many workers with it is given up: it, and not they, is what is wrong.
+MOST_ATTEMPTS = 3
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """Somebody who does tasks."""
+
+    def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
+        """An outcome for each task, as they are done."""
+        ...
+
+    def close(self) -> None:
+        """Let the workers go; what they were doing is dropped."""
+        ...
+
+
+class Serial:
+    """This process."""
+
+    def __init__(self, work: Work) -> None:
+        self._work = work
+
+    def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
+        """One after another."""
+        from amrepair.batch.work import Bench
+
+        bench = Bench(self._work)
+        for task in tasks:
+            yield bench.do(task)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def make_executor(
+    name: str, work: Work, *, workers: int | None = None, address: str | None = None
+) -> Executor:
+    """An executor by name.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name, or Ray's cluster cannot be used.
+    MissingDependencyError
+        If Ray is not installed.
+    """
+    if name not in NAMES:
+        raise InputError(f"--executor is {name!r}; it is one of {', '.join(NAMES)}")
+    if address is not None and name != "ray":
+        raise InputError(f"--address belongs to --executor ray, the executor is {name}")
+    count = workers or len(os.sched_getaffinity(0))
+    if name == "serial":
+        return Serial(work)
+    if name == "process":
+        from amrepair.batch.pool import Pool
+
+        return Pool(work, workers=count)
+    from amrepair.batch.on_ray import OnRay
+
+    return OnRay(work, workers=workers if address is not None else count, address=address)
+
+
+def given_up(task: Task, attempts: int) -> Outcome:
+    """Of a task that its workers do not survive."""
+    return Outcome(
+        task.scan_id,
+        sentence=f"{{scan}} ended its worker {attempts} times (out of memory?); try it alone, or "
+        "with fewer --workers",
+        lasting=False,
+    )
