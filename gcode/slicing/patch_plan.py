@@ -45,7 +45,7 @@ class PatchPasses:
     @property
     def beads_mm3(self) -> float:
         """Plastic in all beads."""
-        return sum(chain.volume_mm3 for one in self.passes for chain in one.chains)
+        return float(sum(chain.volume_mm3 for one in self.passes for chain in one.chains))
 
     def hem_mm3(self, model: PatchModel) -> float:
         """What was laid in the air beside rims."""
