@@ -256,6 +256,9 @@ class ProcessProfile(_Profile):
     acceleration_mm_s2: Positive
     infill_overlap_ratio: Ratio = 0.15
     max_gap_layers: Annotated[float, Field(ge=1, le=4)] = 2.0
+    # of ways to lay a patch the best fills most, less what is too much and the time that it takes
+    repair_spill_weight: Annotated[float, Field(ge=0, le=10)] = 1.0  # to a volume that is filled
+    repair_worth_mm3_s: Annotated[float, Field(ge=0, le=1)] = 0.002  # to fill for each second more
     nonplanar_top: bool = False  # patches end along gentle slopes instead of in steps
     surface_allowance_mm: Annotated[float, Field(ge=0, le=1)] = 0.05
     unasked_max_mm3: Positive = 500.0  # the most that a repair may be printed of without asking

@@ -19,7 +19,8 @@ from gcode.moves import (
 )
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import width_of
-from gcode.slicing.patch_beads import Chain, surely_free
+from gcode.slicing.patch_beads import Chain
+from gcode.slicing.patch_free import surely_free
 from gcode.slicing.patch_model import NEAR_MM, PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.pen import Pen

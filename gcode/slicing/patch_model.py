@@ -1,4 +1,4 @@
-"""What a patch is planned on: columns over a deficit, and what has been laid on them so far."""
+"""What a patch is planned on: columns over a deficit, and where the head may be over them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from gcode.profiles import PrintSetup
-from gcode.slicing.job import Unprintable
 from gcode.slicing.job_lines import JobColumns, JobLines
 from gcode.slicing.layers import mesh_of
 from gcode.slicing.reach import Reach
@@ -21,6 +20,12 @@ FINE_CELLS = 250_000
 MARGIN_MM = 3.0
 # A bead thicker than this share of the bore no longer presses onto its floor.
 MOST_THICK_NOZZLES = 0.8
+# In bores: a strand that nothing holds falls as far as this onto a floor, as one purged in the air
+# does, and lies where it was laid. Deeper down it is anybody's guess.
+DROP_NOZZLES = 6.0
+# From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which is
+# 2.5 bores across (E3D V6): not to its very rim.
+SPREAD_NOZZLES = 1.125
 SEAM_MM = 1.0  # around a loop's seam, as far as old material hides it
 TIP_CELLS = 2  # in one of the field, each way
 JOB_LAYER_MM = 0.5  # a job's layer may end so far above the deficit that it belongs to
@@ -28,7 +33,7 @@ NEAR_MM = 1.0  # a travel as short as this needs no lift
 
 
 class PatchModel:
-    """Columns over the deficit: what is wanted, what is there, what has been laid."""
+    """Columns over the deficit: what is wanted, what is there, where the tip may go."""
 
     def __init__(
         self,
@@ -62,20 +67,11 @@ class PatchModel:
         # columns sample the solid; its own volume is exact
         self.weight = float(deficit.volume()) / columns_mm3 if columns_mm3 > 0 else 1.0
         self.top_mm = kernels.column_top(offsets, self._z, -np.inf).reshape(self.shape)
-        self.planar_top_mm = self.top_mm  # lower where another pass ends the column
         self.points_mm = self._centres()
         floor_mm = as_built.sample(self.points_mm).reshape(self.shape)
         self.floor_mm = floor_mm
         self.beside_mm = ndimage.uniform_filter(floor_mm, round(2 * SEAM_MM / self.cell_mm) + 1)
-        self.surface_mm = floor_mm.copy()
-        self.laid_mm = np.zeros(self.shape)
-        self.sunk_mm = np.zeros(self.shape)  # given up under a bridge
-        self.hem = np.zeros(self.shape, dtype=bool)  # laid in the air beside a rim
-        self.given_up = np.zeros(self.shape, dtype=bool)  # too little of it is in reach
-        self.lost: list[Unprintable] = []
         self.job: JobColumns | None = None
-        # up to where the job's own lines are laid again
-        self.done_mm = np.full(self.shape, -np.inf)
         # along the surface itself it is not as the job had it
         if lines is not None and len(lines.rim) and not setup.process.nonplanar_top:
             wanted = np.isfinite(self.top_mm)
@@ -84,6 +80,8 @@ class PatchModel:
                 lines, wanted, self.points_mm, self.cell_mm, low_mm, high_mm + JOB_LAYER_MM
             )
         self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
+        self.drop_mm = DROP_NOZZLES * setup.printer.nozzle_diameter_mm
+        self.spread_mm = SPREAD_NOZZLES * setup.printer.nozzle_diameter_mm
         self._printer = setup.printer
         self._window_mm = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
         self.reach = self.reach_of(as_built)
@@ -116,10 +114,6 @@ class PatchModel:
         )
         return np.maximum(below.reshape(self.shape), 0.0)
 
-    def left_below(self, z_mm: float) -> Float[np.ndarray, "ny nx"]:
-        """The same, less what has been laid or given up; negative where more was laid."""
-        return self.wanted_below(z_mm) - self.laid_mm - self.sunk_mm
-
     @property
     def need_mm(self) -> Float[np.ndarray, "ny nx"]:
         """How high the tip must at least be over each column."""
@@ -132,11 +126,6 @@ class PatchModel:
         ix, iy = np.floor((point_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
         return int(iy), int(ix)
 
-    @property
-    def hem_mm3(self) -> float:
-        """What was laid in the air beside rims."""
-        return float(self.laid_mm[self.hem].sum()) * self.cell_mm**2
-
     def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the nozzle may be, from an answer of `reach`."""
         return self.reach.free_in_cells(self._tip_cells, reach).reshape(self.shape)
@@ -147,10 +136,6 @@ class PatchModel:
         inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
         cells = np.where(inside[:, None], cells, 0)
         return np.asarray(inside & np.isfinite(self.top_mm[cells[:, 0], cells[:, 1]]))
-
-    def surface(self) -> HeightField:
-        """The as-built field with the patch on it."""
-        return self.raised(self.laid_mm > 0, self.surface_mm)
 
     def raised(
         self, columns: Bool[np.ndarray, "ny nx"], to_mm: Float[np.ndarray, "ny nx"]

@@ -15,9 +15,11 @@ from scipy import ndimage
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import divided
 from gcode.slicing.job import MOST_NOZZLES
-from gcode.slicing.patch_beads import Chain, surely_free
+from gcode.slicing.patch_beads import Chain
+from gcode.slicing.patch_free import surely_free
 from gcode.slicing.patch_model import NEAR_MM, PatchModel
 from gcode.slicing.patch_passes import Pass
+from gcode.slicing.patch_state import PatchState
 from gcode.slicing.reach import Reach
 from gcode.surfaces import raster_kernels
 
@@ -33,16 +35,22 @@ class Stage:
 
 
 def stages_of(
-    passes: list[Pass], model: PatchModel, setup: PrintSetup, start_mm: Float[np.ndarray, " 2"]
+    passes: list[Pass],
+    state: PatchState,
+    model: PatchModel,
+    setup: PrintSetup,
+    start_mm: Float[np.ndarray, " 2"],
 ) -> list[Stage]:
     """Split passes into stages, the regions' lowest tops first, and then what is nearest.
 
     Parameters
     ----------
+    state
+        After all passes.
     start_mm
         (2,) where the nozzle comes from.
     """
-    regions = _by_region(passes, _regions(model), model)
+    regions = _by_region(passes, _regions(state, model), model)
     if len(regions) <= 1:
         return [Stage(tuple(passes), model.reach)] if passes else []
     groups: list[set[int]] = []
@@ -78,9 +86,9 @@ def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reac
     return model.reach_of(field.raised(stands_mm))
 
 
-def _regions(model: PatchModel) -> Int[np.ndarray, "ny nx"]:
+def _regions(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
     """Which connected region columns belong to, from 1; those close together are one."""
-    near = ndimage.distance_transform_edt(model.laid_mm <= 0) * model.cell_mm <= 0.5 * NEAR_MM
+    near = ndimage.distance_transform_edt(state.laid_mm <= 0) * model.cell_mm <= 0.5 * NEAR_MM
     return np.asarray(ndimage.label(near)[0], dtype=np.int64)
 
 

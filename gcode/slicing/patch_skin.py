@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from gcode.slicing.patch_beads import ROUNDED_MM, ROUNDING_MM, STEP_MM, shares_of_step
+from gcode.slicing.patch_free import ROUNDED_MM, ROUNDING_MM, STEP_MM, shares_of_step
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField

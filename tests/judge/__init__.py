@@ -5,12 +5,13 @@ head. It lays the beads voxel by voxel and says what was filled, what fell besid
 head ran into.
 """
 
-from tests.judge.head import MK3S_HEAD, HeadSlice, reachable
+from tests.judge.head import HEADS, MK3S_HEAD, HeadSlice, reachable
 from tests.judge.judge import Verdict, judge
 from tests.judge.text import Steps, read_steps
 from tests.judge.voxels import Voxels, occupancy
 
 __all__ = [
+    "HEADS",
     "MK3S_HEAD",
     "HeadSlice",
     "Steps",

@@ -34,6 +34,22 @@ MK3S_HEAD = (
     HeadSlice(6.0, box_mm=(-24.0, -32.0, 24.0, 22.0)),
     HeadSlice(20.0, box_mm=(-31.0, -40.0, 34.0, 31.0)),
 )
+_V6 = MK3S_HEAD[:3]
+# The same nozzle under other bodies: a heater block of 20×16 mm in its sock, ducts that end 6 mm
+# over the tip, and the carriages as Cura's definitions have them: Creality's base
+# (machine_head_with_fans_polygon, gantry_height 25), and Voron's (gantry_height 30).
+_BLOCK = (
+    HeadSlice(4.5, box_mm=(-12.0, -18.0, 16.0, 12.0)),
+    HeadSlice(6.0, box_mm=(-26.0, -32.0, 30.0, 30.0)),
+)
+ENDER_HEAD = (*_V6, *_BLOCK, HeadSlice(25.0, box_mm=(-26.0, -32.0, 32.0, 34.0)))
+VORON_HEAD = (*_V6, *_BLOCK, HeadSlice(30.0, box_mm=(-40.0, -70.0, 40.0, 80.0)))
+HEADS = {
+    "prusa_mk3s": MK3S_HEAD,
+    "ender_3": ENDER_HEAD,
+    "creality_k1": ENDER_HEAD,
+    "voron_2_4": VORON_HEAD,
+}
 
 
 def grown(
@@ -93,36 +109,44 @@ def _highest_under(tops, under, corner, shape):  # type: ignore[no-untyped-def]
     return out
 
 
+def least_tip(
+    tops_mm: np.ndarray, window: tuple[slice, slice], cell_mm: float, head: tuple[HeadSlice, ...]
+) -> np.ndarray:
+    """How high the tip must at least be, by column of a window."""
+    least = [grown(tops_mm, cell_mm, part, window) - part.above_mm for part in head]
+    return np.asarray(np.max(least, axis=0))
+
+
 def reachable(
     missing: np.ndarray,
     stands: np.ndarray,
     low_z_mm: float,
     size_z_mm: float,
-    tops_mm: np.ndarray,
-    window: tuple[slice, slice],
+    least_mm: np.ndarray,
     cell_mm: float,
-    head: tuple[HeadSlice, ...],
     *,
     bead_mm: float,
     layer_mm: float,
     allowed_mm: float,
+    tip_layers: float = 0.5,
+    held: bool = True,
 ) -> np.ndarray:
     """Missing voxels that a bead gets to: half its width from a free tip, and not over air.
 
-    A layer down, what stands or is filled must lie within a bead's width.
+    `least_mm` is what `least_tip` says. A layer down, what stands or is filled must lie within a
+    bead's width; without `held` that is not asked, and what the head alone reaches is told. The tip
+    is looked for `tip_layers` layers over what it covers: half of one on average, a whole one at
+    most.
     """
     reach = np.zeros(missing.shape, bool)
-    least_mm = np.max(
-        [grown(tops_mm, cell_mm, part, window) - part.above_mm for part in head], axis=0
-    )
     below = max(1, round(layer_mm / size_z_mm))
     for k in range(missing.shape[2]):
         if not missing[:, :, k].any():
             continue
-        tip_mm = low_z_mm + (k + 1) * size_z_mm + 0.5 * layer_mm  # a bead lies below its tip
+        tip_mm = low_z_mm + (k + 1) * size_z_mm + tip_layers * layer_mm  # a bead lies below its tip
         free = tip_mm >= least_mm - allowed_mm
         near = ndimage.distance_transform_edt(~free) * cell_mm <= 0.5 * bead_mm
-        if low_z_mm + (k - below) * size_z_mm > 0 and k >= below:
+        if held and low_z_mm + (k - below) * size_z_mm > 0 and k >= below:
             floor = stands[:, :, k - below] | reach[:, :, k - below]
             near &= ndimage.distance_transform_edt(~floor) * cell_mm <= bead_mm
         reach[:, :, k] = missing[:, :, k] & near

@@ -10,7 +10,7 @@ import trimesh
 from numba import njit
 from scipy import ndimage
 
-from tests.judge.head import MK3S_HEAD, HeadSlice, reachable, under_cone
+from tests.judge.head import MK3S_HEAD, HeadSlice, least_tip, reachable, under_cone
 from tests.judge.text import Steps, read_steps
 from tests.judge.voxels import Voxels, column_tops, occupancy
 
@@ -38,6 +38,27 @@ class Verdict:
     widest_mm: float
     deepest_contact_mm: float
     contact_line: int
+    # the same with the tip a whole layer over what it covers
+    reachable_high_mm3: float
+    filled_high_mm3: float
+    # the same, whether anything holds it or not: what the head alone allows
+    reachable_open_mm3: float
+    filled_open_mm3: float
+
+    @property
+    def open_ratio(self) -> float:
+        """Of what is missing, the share that the head alone allows."""
+        return self.reachable_open_mm3 / max(self.missing_mm3, 1e-9)
+
+    @property
+    def filled_open_ratio(self) -> float:
+        """Of what the head alone allows."""
+        return self.filled_open_mm3 / max(self.reachable_open_mm3, 1e-9)
+
+    @property
+    def filled_high_ratio(self) -> float:
+        """Of what the head reaches from a whole layer up."""
+        return self.filled_high_mm3 / max(self.reachable_high_mm3, 1e-9)
 
     @property
     def filled_ratio(self) -> float:
@@ -86,9 +107,13 @@ def judge(
     window = (slice(corner[0], high_at[0]), slice(corner[1], high_at[1]))
     before, aim = occupancy(stands, box), occupancy(wanted, box)
     missing = aim & ~before
-    reach = reachable(
-        missing, before, low[2], FINE_MM[2], tops, window, cell, head,
-        bead_mm=bead_mm, layer_mm=HANGING_MM, allowed_mm=0.1,
+    least = least_tip(tops, window, cell, head)
+    reach, high_reach, open_reach = (
+        reachable(
+            missing, before, low[2], FINE_MM[2], least, cell, bead_mm=bead_mm,
+            layer_mm=HANGING_MM, allowed_mm=0.1, tip_layers=layers, held=held,
+        )
+        for layers, held in ((0.5, True), (1.0, True), (1.0, False))
     )  # fmt: skip
     contact, line = _contact(steps, tops, field_low, cell, head)
     state = before.astype(np.uint8)
@@ -117,6 +142,10 @@ def judge(
         widest_mm=widest,
         deepest_contact_mm=contact,
         contact_line=line,
+        reachable_high_mm3=high_reach.sum() * v,
+        filled_high_mm3=(laid & high_reach).sum() * v,
+        reachable_open_mm3=open_reach.sum() * v,
+        filled_open_mm3=(laid & open_reach).sum() * v,
     )
 
 

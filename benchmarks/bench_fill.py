@@ -1,0 +1,179 @@
+"""How much of what the head can reach a patch fills: cuts × printers, under the outside judge.
+
+    AMREPAIR_DATA=… python benchmarks/bench_fill.py                  # all cases, a table
+    python benchmarks/bench_fill.py --cases notch pit --printers voron_2_4 --cell-mm 0.1
+
+The deficit is the true one (a boolean of two solids) and so is the field of what stands there: what
+is lost here is lost in planning, not in a scan. `tests/judge`, which shares no code with the
+packages, says what its own head reaches and what the text's beads fill.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import manifold3d
+import numpy as np
+
+from gcode.check import find_refusals
+from gcode.profiles import PrintSetup, load_setup
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import slice_patch
+from gcode.surfaces import HeightField
+from gcode.writer import write
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from benchmarks.bench_judge import make_cut, mesh_of
+from tests.judge import HEADS, judge
+
+Solid = manifold3d.Manifold
+CELL_MM = 0.1  # as a repair's field of what stands there has it
+BESIDE_MM = 8.0  # as in a repair
+SIZE_MM = (44.0, 34.0, 12.0)
+AT_MM = (95.0, 85.0, 0.0)
+PRINTERS = ("prusa_mk3s", "ender_3", "voron_2_4", "creality_k1")
+# of real parts, by the seeds of bench_judge
+REAL = (("prusa-x-carriage-back", "notch", 3), ("frame-guide", "corner", 1))
+
+
+def _box(size: tuple[float, float, float], at: tuple[float, float, float]) -> Any:
+    return Solid.cube(size).translate(at)
+
+
+def _tilted(deg: float, deep_mm: float) -> Any:
+    tool = Solid.cube((80.0, 80.0, 30.0), True).translate((0.0, 0.0, 15.0))
+    return tool.rotate((0.0, deg, 0.0)).translate((40.0, 17.0, 12.0 - deep_mm))
+
+
+TOOLS = {
+    "notch": _box((14.0, 12.0, 20.0), (15.0, -1.0, 8.0)),
+    "notch, turned": _box((14.0, 12.0, 20.0), (0.0, 0.0, 0.0))
+    .rotate((0.0, 0.0, 20.0)).translate((17.0, -4.0, 8.6)),
+    "pit": _box((13.0, 11.0, 20.0), (15.0, 11.0, 9.0)),
+    "round pit": Solid.cylinder(20.0, 6.5, 6.5, 96).translate((22.0, 17.0, 8.53)),
+    "corner": _box((16.0, 14.0, 20.0), (34.0, -4.0, 8.0)),
+    "corner, aslant": Solid.cube((20.0, 20.0, 40.0), True)
+    .rotate((0.0, 0.0, 45.0)).translate((44.0, 0.0, 28.5)),
+    "worn top": _tilted(12.0, 2.0),
+    "worn top, steep": _tilted(30.0, 2.5),
+    "slot": _box((2.5, 16.0, 20.0), (20.0, 9.0, 9.0)),
+    "deep notch": _box((20.0, 14.0, 20.0), (12.0, -1.0, 7.0)),
+    "slot, wider": _box((4.0, 16.0, 20.0), (20.0, 9.0, 9.5)),
+    "shallow slot": _box((1.6, 16.0, 20.0), (20.0, 9.0, 11.0)),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """What was wanted, what is left of it, and what is gone."""
+
+    whole: Any
+    rest: Any
+    piece: Any
+
+
+def case_of(name: str) -> Case | None:
+    """A block with a cut, or a cut of a real part, named part:kind:seed."""
+    if ":" in name:
+        part, kind, seed = name.split(":")
+        cut = make_cut(part, kind, int(seed))
+        return None if cut is None else Case(cut.whole, cut.rest, cut.piece)
+    block = Solid.cube(SIZE_MM).translate(AT_MM)
+    tool = TOOLS[name].translate(AT_MM)
+    return Case(block, block - tool, block ^ tool)
+
+
+def run(name: str, setup: PrintSetup, cell_mm: float) -> dict[str, Any] | None:
+    """A case's figures."""
+    case = case_of(name)
+    if case is None:
+        return None
+    as_built = HeightField.from_manifold(case.rest, cell_mm, margin_mm=BESIDE_MM)
+    start_s = time.process_time()
+    plan = slice_patch(
+        case.piece, setup, as_built=as_built, grid=LayerGrid.from_setup(setup), standalone=True
+    )
+    spent_s = time.process_time() - start_s
+    program = write(plan.toolpath, setup, title="bench", resume=None, restore=False)
+    refused = find_refusals(program, setup, as_built=as_built)
+    verdict = judge(
+        program.text,
+        mesh_of(case.rest),
+        mesh_of(case.whole),
+        np.asarray(case.piece.bounding_box()).reshape(2, 3),
+        head=HEADS[setup.printer.id],
+        nozzle_mm=setup.printer.nozzle_diameter_mm,
+    )
+    causes: dict[str, float] = {}
+    for left in (*plan.unreachable, *plan.unprintable):
+        causes[left.reason] = causes.get(left.reason, 0.0) + left.volume_mm3
+    return {
+        "case": name,
+        "printer": setup.printer.id,
+        "missing_mm3": case.piece.volume(),
+        "reached": verdict.reachable_ratio,
+        "open": verdict.open_ratio,
+        "filled": verdict.filled_ratio,
+        "filled_high": verdict.filled_high_ratio,
+        "filled_open": verdict.filled_open_ratio,
+        "filled_mm3": verdict.filled_mm3,
+        "outside": verdict.outside_ratio,
+        "in_air_mm3": verdict.in_air_mm3,
+        "widest_mm": verdict.widest_mm,
+        "contact_mm": verdict.deepest_contact_mm if plan.beads_mm3 else 0.0,
+        "declared": plan.reachable_mm3 / case.piece.volume(),
+        "beads_mm3": plan.beads_mm3,
+        "refused": len(refused),
+        "seconds": spent_s,
+        "left_mm3": causes,
+    }
+
+
+def line_of(row: dict[str, Any]) -> str:
+    """A case as a row of the table."""
+    left = "; ".join(f"{v:.0f}: {k}" for k, v in row["left_mm3"].items() if v >= 0.5)
+    return (
+        f"| {row['case']} | {row['printer']} | {row['missing_mm3']:.0f} | {row['reached']:.2f},"
+        f" {row['open']:.2f} | {row['declared']:.2f} | {row['filled']:.3f},"
+        f" {row['filled_high']:.3f}, {row['filled_open']:.3f} | {row['outside']:.3f},"
+        f" {row['in_air_mm3']:.1f} | {row['contact_mm']:.2f} |"
+        f" {row['refused']} | {row['seconds']:.2f} | {left} |"
+    )
+
+
+HEADER = (
+    "| cut | printer | missing, mm³ | judge's head reaches: where something holds, at all |"
+    " declared | filled of what is held, half a layer up, a whole one; of all | outside, and in"
+    " the air, mm³ | contact, mm | refused | processor, s |"
+    " left out, mm³, and why |\n|---|---|---|---|---|---|---|---|---|---|---|"
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    every = [*TOOLS, *(":".join(map(str, real)) for real in REAL)]
+    parser.add_argument("--cases", nargs="+", default=every)
+    parser.add_argument("--printers", nargs="+", default=PRINTERS, choices=PRINTERS)
+    parser.add_argument("--cell-mm", type=float, default=CELL_MM)
+    parser.add_argument("--results", type=Path, help="a line of JSON each, besides the table")
+    args = parser.parse_args()
+    print(HEADER)
+    for name in args.cases:
+        for printer in args.printers:
+            row = run(name, load_setup(printer=printer), args.cell_mm)
+            if row is None:
+                continue
+            print(line_of(row), flush=True)
+            if args.results:
+                with args.results.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""What is due at one height of a patch: how thick, column by column, and over what it hangs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from gcode.slicing.patch_beads import LEAST_THICK_MM, TO_WALL_MM
+from gcode.slicing.patch_free import ROUNDING_MM
+from gcode.slicing.patch_heights import DEEP_RATIO, Height
+from gcode.slicing.patch_model import PatchModel
+from gcode.slicing.patch_state import PatchState
+
+# The floor was measured, the deficit computed from it: they agree within this.
+AGREE_MM = 0.04
+ROUNDED_OFF_MM = 0.02  # more than the mean of a scan's noise
+HOLD_MM = 0.45  # a line's width: how far a bead may hang over a hole beside what holds it
+# From a tip in the air, as far as its bead covers a rim; less of one is not worth a line.
+HEM_MM, RIM_MM2 = 0.35, 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Due:
+    """Thickness to lay by column, what is given up below where it is laid, and where in the air."""
+
+    thick_mm: Float[np.ndarray, "ny nx"]
+    sunk_mm: Float[np.ndarray, "ny nx"]
+    hem: Bool[np.ndarray, "ny nx"]
+
+
+def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
+    """Thickness to lay by column now: the gap, where waiting would make it too deep for a bead.
+
+    Where it is too deep already (the nozzle could not get down there), a layer is drawn over it
+    as far as a bead holds on to what stands beside it, or falls onto the floor; what lies under it
+    is lost, and said.
+    """
+    below = model.wanted_below(at.z_mm)
+    wanted = below - state.laid_mm - state.sunk_mm
+    # a hole that the nozzle could not get into ends below: nothing is laid over what is above it
+    lower = model.wanted_below(at.z_mm - at.most_mm)
+    wanted = np.where(below - lower > ROUNDING_MM, wanted, 0.0)
+    gap = at.z_mm - state.surface_mm
+    thick = np.clip(np.minimum(gap, wanted + AGREE_MM), 0.0, None)
+    last = np.minimum(state.planar_top_mm, at.following_mm) <= at.z_mm + ROUNDING_MM
+    due = (at.following_mm - state.surface_mm > at.most_mm) | last
+    active = at.here & due & (wanted > LEAST_THICK_MM / 2) & (thick >= LEAST_THICK_MM)
+    # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
+    active &= state.planar_top_mm > at.z_mm - 0.5 * at.layer_mm
+    return _lidded(model, at, thick, active, active & (gap > at.deep_mm), gap)
+
+
+def due_of_job(
+    model: PatchModel, state: PatchState, at: Height, planned: Bool[np.ndarray, "ny nx"]
+) -> Due:
+    """Thickness to lay now where the job laid something at this height: up to it, as the job did.
+
+    On a slope the job's steps are what was there, not the smooth surface that the deficit has.
+    """
+    assert model.job is not None
+    gap = at.z_mm - state.surface_mm
+    wanted = state.left_below(model, at.z_mm)
+    deep = gap > at.deep_mm
+    thick = np.where(deep, np.minimum(gap, np.maximum(wanted + AGREE_MM, at.layer_mm)), gap)
+    thick = np.clip(thick, 0.0, None)
+    after = np.unique(at.following_mm[np.isfinite(at.following_mm)])
+    again = model.job.at(float(after[0])) if len(after) else None
+    last = ~again if again is not None else np.ones_like(planned)
+    due = last | (at.following_mm - state.surface_mm > at.most_mm)
+    # the shallow rim of what a scan rounded off counts: line by line it makes up a bead; beside
+    # it noise would
+    least_mm = np.where(wanted > ROUNDING_MM, ROUNDED_OFF_MM, LEAST_THICK_MM)
+    active = planned & due & (thick >= least_mm)
+    active &= ~deep | (wanted > LEAST_THICK_MM / 2)  # beside the part all is deep
+    return _lidded(model, at, thick, active, deep & active, gap)
+
+
+def hemmed(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
+    """With half a line beside rims that the head gets to from outside alone.
+
+    A wall keeps it off a gap in another one, but not off the air in front: there a line laid half
+    upon the rim begins what the next ones grow from. Without it all above would stay open.
+    """
+    wanted, outside = due.thick_mm > 0, ~np.isfinite(model.top_mm)
+    air = outside & ((at.z_mm - state.surface_mm > at.deep_mm) | state.hem)
+    if not wanted.any() or not air.any():
+        return due
+    free = model.free_at(at.reach)
+    # a row of columns holds no line
+    served = ndimage.binary_opening(wanted & free, np.ones((2, 2)))
+    unserved = wanted & ~beside(served, wanted, HEM_MM, model.cell_mm)
+    if not unserved.any():
+        return due
+    rim = unserved & beside(air & free, unserved, HEM_MM, model.cell_mm)
+    label, count = ndimage.label(rim, np.ones((3, 3)))
+    area_mm2 = np.bincount(label.ravel(), minlength=count + 1) * model.cell_mm**2
+    rim &= area_mm2[label] >= RIM_MM2
+    if not rim.any():
+        return due
+    hem = air & beside(rim, rim, HEM_MM, model.cell_mm)
+    return replace(due, thick_mm=np.where(hem, at.layer_mm, due.thick_mm), hem=hem)
+
+
+def _lidded(
+    model: PatchModel,
+    at: Height,
+    thick: Float[np.ndarray, "ny nx"],
+    active: Bool[np.ndarray, "ny nx"],
+    deep: Bool[np.ndarray, "ny nx"],
+    gap: Float[np.ndarray, "ny nx"],
+) -> Due:
+    """Over what is too deep a layer is drawn, as far as a bead holds on to what stands beside.
+
+    What the head cannot get over holds on from a little farther away: beads begin no nearer to it
+    than the flat around the bore lets them. A strand that nothing holds falls: where the floor is
+    near enough it lies under the nozzle all the same. Counted is only what a layer holds, wherever
+    it comes to lie, so that none of it is too much.
+    """
+    sunk = np.zeros(model.shape)
+    if deep.any():
+        # from the edge of what holds it, not from the middle of its last column
+        hang_mm = HOLD_MM + 0.5 * model.cell_mm
+        holds = (active & ~deep) | (gap < at.most_mm)
+        held = beside(holds, deep, hang_mm, model.cell_mm)
+        blocked = ~model.free_at(at.reach)
+        held |= beside(holds & blocked, deep, hang_mm + TO_WALL_MM, model.cell_mm)
+        falls = deep & (gap <= model.drop_mm)
+        held |= falls & beside(~blocked, falls, model.spread_mm, model.cell_mm)
+        lidded = np.minimum(thick, at.layer_mm)
+        sunk = np.where(deep & held, thick - lidded, 0.0)
+        thick = np.where(deep & held, lidded, thick)
+        active = active & (~deep | held)
+    return Due(np.where(active, thick, 0.0), sunk, np.zeros(model.shape, dtype=bool))
+
+
+def beside(
+    what: Bool[np.ndarray, "ny nx"],
+    asked: Bool[np.ndarray, "ny nx"],
+    within_mm: float,
+    cell_mm: float,
+) -> Bool[np.ndarray, "ny nx"]:
+    """Which columns lie within a distance of others; found for those asked about at least."""
+    near = np.zeros_like(what)
+    if not asked.any():
+        return near
+    margin = int(np.ceil(within_mm / cell_mm)) + 1
+    rows, columns = (
+        slice(max(int(at.min()) - margin, 0), int(at.max()) + margin + 1) for at in asked.nonzero()
+    )
+    apart = ndimage.distance_transform_edt(~what[rows, columns])
+    near[rows, columns] = apart * cell_mm <= within_mm + 1e-9
+    return near
+
+
+def strips_along_walls(
+    thick: Float[np.ndarray, "ny nx"],
+    z_mm: float | Float[np.ndarray, "ny nx"],
+    model: PatchModel,
+    state: PatchState,
+) -> Bool[np.ndarray, "ny nx"]:
+    """Columns to fill that lie along a wall: it stands up to the nozzle, or higher."""
+    walls = (state.surface_mm > z_mm - AGREE_MM) & (thick <= 0)
+    # what is drawn over a hollow hangs: nothing presses it aside
+    asked = (thick > 0) & (z_mm - state.surface_mm <= DEEP_RATIO * model.most_mm)
+    return beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked

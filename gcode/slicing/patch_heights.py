@@ -1,0 +1,161 @@
+"""The heights of a patch's passes: the job's layers, flat tops, and where the head gets in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from gcode.profiles import PrintSetup
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch_beads import LEAST_THICK_MM
+from gcode.slicing.patch_free import ROUNDING_MM
+from gcode.slicing.patch_model import PatchModel
+from gcode.slicing.patch_state import PatchState
+
+# A gap of more than this share of the thickest bead is not filled from above: up to there a strand
+# of one line width, round (π/4 d² = width × gap), still reaches its floor. On a steep slope the
+# head keeps the tip this far off.
+DEEP_RATIO = 1.6
+# Of columns over a hollow, as many as open to the head at one height are worth a pass there.
+OPENING_MM2 = 1.0
+OPENS_BELOW_MM = 0.1  # half a layer: over less of a hollow the last pass goes anyway
+# A flat top: as much area, as wide, within so little height.
+FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
+ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
+
+
+@dataclass(frozen=True, slots=True)
+class Height:
+    """One height of passes.
+
+    Attributes
+    ----------
+    z_mm, index
+        Of the tip, and its number from below.
+    here
+        Columns that are filled at it.
+    following_mm
+        Where each column's next pass is.
+    most_mm, deep_mm
+        The thickest bead, and the deepest gap that is filled from above.
+    layer_mm
+        Of the job.
+    reach
+        Where the tip may be, on the cells of `Reach`.
+    """
+
+    z_mm: float
+    index: int
+    here: Bool[np.ndarray, "ny nx"]
+    following_mm: Float[np.ndarray, "ny nx"]
+    most_mm: float
+    deep_mm: float
+    layer_mm: float
+    reach: Bool[np.ndarray, "_ry _rx"]
+
+
+@dataclass(frozen=True, slots=True)
+class Heights:
+    """All heights of a patch, from the floor up; `ends` is where flat tops end their columns."""
+
+    tops_mm: Float[np.ndarray, " n"]
+    flats_mm: Float[np.ndarray, " m"]
+    openings_mm: Float[np.ndarray, " k"]
+    ends_mm: Float[np.ndarray, "ny nx"]
+    most_mm: float
+    layer_mm: float
+
+    @classmethod
+    def of(
+        cls, model: PatchModel, grid: LayerGrid, setup: PrintSetup, *, openings: bool
+    ) -> Heights:
+        """Of a patch; without `openings`, none but those of the job's layers and of flat tops."""
+        low_mm, high_mm = float(model.box[2]), float(model.box[5])
+        tops = grid.tops_to(high_mm)
+        tops = tops[tops > low_mm + 1e-6]
+        if len(tops) == 0 or tops[-1] < high_mm - 1e-6:
+            tops = np.append(tops, high_mm)
+        # the last pass ends with the deficit, not above it, unless the job has a layer there
+        if model.job is None or model.job.at(float(tops[-1])) is None:
+            tops[-1] = min(tops[-1], high_mm)
+        most_mm = min(model.most_mm, setup.process.max_gap_layers * grid.layer_height_mm)
+        flats = _flats(model, tops) if model.job is None else np.zeros(0)
+        ends = np.full(model.shape, np.inf)  # where a flat top lies, off the job's layers
+        for flat_mm in flats:
+            ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
+        others = np.sort(np.concatenate([tops, flats]))
+        opened = _openings(model, others, most_mm) if openings else np.zeros(0)
+        return cls(tops, flats, opened, ends, most_mm, grid.layer_height_mm)
+
+    @property
+    def all_mm(self) -> Float[np.ndarray, " n"]:
+        """From the floor up."""
+        return np.sort(np.concatenate([self.tops_mm, self.flats_mm, self.openings_mm]))
+
+    def at(self, index: int, state: PatchState, model: PatchModel) -> Height:
+        """One of them, when so much has been laid."""
+        z_mm = float(self.all_mm[index])
+        on_grid = not (np.abs(self.flats_mm - z_mm) < ROUNDING_MM).any()
+        later = self.tops_mm[self.tops_mm > z_mm + ROUNDING_MM]
+        following = np.minimum(self.ends_mm, float(later[0]) if len(later) else np.inf)
+        here = self.ends_mm > z_mm + ROUNDING_MM if on_grid else self.ends_mm == z_mm
+        deep_mm = DEEP_RATIO * self.most_mm
+        if (np.abs(self.openings_mm - z_mm) < ROUNDING_MM).any():
+            here &= following - state.surface_mm > deep_mm
+        reach = model.reach.at(z_mm)
+        return Height(z_mm, index, here, following, self.most_mm, deep_mm, self.layer_mm, reach)
+
+
+def _flats(model: PatchModel, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """Heights at which flat areas of the deficit end between the job's layers.
+
+    They get a pass of their own there: the nozzle's flat makes the surface, at its own height.
+    """
+    tops = model.top_mm
+    steps = np.round(tops[np.isfinite(tops)] / FLAT_MM).astype(np.int64)
+    if not len(steps):
+        return np.zeros(0)
+    area_mm2 = np.bincount(steps - steps.min()) * model.cell_mm**2
+    often = np.flatnonzero(ndimage.convolve1d(area_mm2, np.ones(3), mode="constant") >= FLAT_MM2)
+    least = np.ones((round(FLAT_WIDE_MM / model.cell_mm),) * 2)
+    found: list[float] = []
+    for step in often[np.argsort(-area_mm2[often])] + steps.min():
+        z_mm = float(step * FLAT_MM)
+        if np.abs(np.array([*tops_mm, *found]) - z_mm).min() < LEAST_THICK_MM:
+            continue
+        # no rim or slope that passes through this height
+        at = np.abs(tops - z_mm) <= ON_FLAT_MM
+        (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in at.nonzero())
+        flat = np.zeros_like(at)
+        flat[y0:y1, x0:x1] = ndimage.binary_opening(at[y0:y1, x0:x1], least)
+        if flat.sum() * model.cell_mm**2 >= FLAT_MM2:
+            found.append(float(np.median(tops[flat])))
+    return np.array(found)
+
+
+def _openings(
+    model: PatchModel, tops_mm: Float[np.ndarray, " n"], most_mm: float
+) -> Float[np.ndarray, " m"]:
+    """Heights between other passes at which the head first gets in over much that is hollow.
+
+    There beads grow out from what holds them by one more line before the next layer of the job:
+    what lies under them is lost, and up to a layer less of it.
+    """
+    need_mm = model.need_mm
+    later = np.searchsorted(tops_mm, need_mm - ROUNDING_MM)
+    first_mm = np.append(tops_mm, np.inf)[later]  # of the other passes, where the head is in
+    hollow = first_mm - model.floor_mm > DEEP_RATIO * most_mm
+    hollow &= np.isfinite(model.top_mm) & (need_mm < model.top_mm - OPENS_BELOW_MM)
+    steps = np.ceil(need_mm[hollow] / FLAT_MM).astype(np.int64)
+    if not len(steps):
+        return np.zeros(0)
+    area_mm2 = np.bincount(steps - steps.min()) * model.cell_mm**2
+    found: list[float] = []
+    for step in np.flatnonzero(area_mm2 >= OPENING_MM2)[::-1] + steps.min():
+        z_mm = float(step * FLAT_MM)
+        if np.abs(np.array([*tops_mm, *found]) - z_mm).min() >= LEAST_THICK_MM:
+            found.append(z_mm)
+    return np.array(found)

@@ -1,0 +1,115 @@
+"""The plan of a patch: every way to lay it that is worth a try, and the best by what it fills."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcode.profiles import PrintSetup
+from gcode.progress import Progress
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch_heights import Heights
+from gcode.slicing.patch_model import PatchModel
+from gcode.slicing.patch_passes import Pass, plan_pass, plan_skin, skin_served
+from gcode.slicing.patch_skin import skin_of
+from gcode.slicing.patch_state import PatchState
+
+# Of the plastic, what may be laid in the air beside rims; about twice as much lies outside then.
+MOST_HEM = 0.025
+
+
+@dataclass(frozen=True, slots=True)
+class PlanOptions:
+    """A way to lay a patch.
+
+    Attributes
+    ----------
+    hems
+        Begun from the air beside a rim too, where that is the only way.
+    openings
+        With passes between the job's layers where the head first gets in.
+    """
+
+    hems: bool = True
+    openings: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class PatchPasses:
+    """Passes from the floor up, and the columns after them."""
+
+    passes: tuple[Pass, ...]
+    state: PatchState
+
+    @property
+    def beads_mm3(self) -> float:
+        """Plastic in all beads."""
+        return float(sum(chain.volume_mm3 for one in self.passes for chain in one.chains))
+
+    def hem_mm3(self, model: PatchModel) -> float:
+        """What was laid in the air beside rims."""
+        return float(self.state.laid_mm[self.state.hem].sum()) * model.cell_mm**2
+
+    def worth_mm3(self, model: PatchModel, setup: PrintSetup) -> float:
+        """What is filled, less what is too much, and less the time that it takes.
+
+        By the process's weights: `repair_spill_weight`, and `repair_worth_mm3_s` for each second.
+        """
+        wanted = model.wanted_below(np.inf)
+        cell_mm3 = model.cell_mm**2 * model.weight
+        filled = float(np.minimum(self.state.laid_mm, wanted).sum()) * cell_mm3
+        spilt = float(np.maximum(self.state.laid_mm - wanted, 0.0).sum()) * cell_mm3
+        length_mm = sum(
+            float(np.hypot(*np.diff(chain.xy_mm, axis=0).T).sum())
+            for one in self.passes
+            for chain in one.chains
+        )
+        process = setup.process
+        seconds = length_mm / process.repair_speed_mm_s
+        return filled - process.repair_spill_weight * spilt - process.repair_worth_mm3_s * seconds
+
+
+def best_plan(
+    model: PatchModel, grid: LayerGrid, setup: PrintSetup, progress: Progress
+) -> PatchPasses:
+    """The best of the ways to lay a patch, of those that lay little enough in the air."""
+    first = PlanOptions()
+    tried = {first: plan(model, grid, setup, progress, options=first)}
+    if len(Heights.of(model, grid, setup, openings=True).openings_mm):
+        other = PlanOptions(openings=False)
+        tried[other] = plan(model, grid, setup, progress, options=other)
+    for options, found in list(tried.items()):
+        if found.hem_mm3(model) > MOST_HEM * found.beads_mm3:
+            del tried[options]
+            without = replace(options, hems=False)
+            tried[without] = plan(model, grid, setup, progress, options=without)
+    return max(tried.values(), key=lambda found: found.worth_mm3(model, setup))
+
+
+def plan(
+    model: PatchModel,
+    grid: LayerGrid,
+    setup: PrintSetup,
+    progress: Progress,
+    *,
+    options: PlanOptions,
+) -> PatchPasses:
+    """Passes from the floor up, in one way."""
+    heights = Heights.of(model, grid, setup, openings=options.openings)
+    state = PatchState.begun(model)
+    skin = None
+    if setup.process.nonplanar_top:
+        skin = skin_served(model, state, skin_of(model, ~np.isfinite(heights.ends_mm)), setup)
+    if skin is not None:
+        state = replace(state, planar_top_mm=skin.planar_top_mm(model, heights.tops_mm))
+    passes: list[Pass] = []
+    count = len(heights.all_mm)
+    for k in range(count):
+        one, state = plan_pass(model, state, heights.at(k, state, model), setup, hems=options.hems)
+        passes += [one] if one is not None else []
+        progress("slice patch", float(k + 1), float(count))
+    if skin is not None:
+        one, state = plan_skin(model, state, skin, heights.most_mm, count, setup)
+        passes += [one] if one is not None else []
+    return PatchPasses(tuple(passes), state)

@@ -1,0 +1,72 @@
+"""What has been laid on a patch's columns so far: immutable, each pass makes the next one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gcode.slicing.job import Unprintable
+from gcode.slicing.patch_model import PatchModel
+from gcode.surfaces import HeightField
+
+
+@dataclass(frozen=True, slots=True)
+class PatchState:
+    """Columns of a patch after some passes.
+
+    Attributes
+    ----------
+    surface_mm
+        Height predicted over each column; over a bridge the nozzle's, whatever lies open below.
+    laid_mm, sunk_mm
+        Thickness laid on each column, and given up under what hangs over it.
+    done_mm
+        Up to where the job's own lines are laid again.
+    planar_top_mm
+        Where each column ends for passes at one height.
+    hem
+        Columns laid in the air beside a rim.
+    lost
+        What was found too thin, pass by pass.
+    """
+
+    surface_mm: Float[np.ndarray, "ny nx"]
+    laid_mm: Float[np.ndarray, "ny nx"]
+    sunk_mm: Float[np.ndarray, "ny nx"]
+    done_mm: Float[np.ndarray, "ny nx"]
+    planar_top_mm: Float[np.ndarray, "ny nx"]
+    hem: Bool[np.ndarray, "ny nx"]
+    lost: tuple[Unprintable, ...] = ()
+
+    @classmethod
+    def begun(cls, model: PatchModel) -> PatchState:
+        """Before the first pass."""
+        nothing = np.zeros(model.shape)
+        return cls(
+            surface_mm=model.floor_mm,
+            laid_mm=nothing,
+            sunk_mm=nothing,
+            done_mm=np.full(model.shape, -np.inf),
+            planar_top_mm=model.top_mm,
+            hem=np.zeros(model.shape, dtype=bool),
+        )
+
+    def left_below(self, model: PatchModel, z_mm: float) -> Float[np.ndarray, "ny nx"]:
+        """Thickness wanted below a height and not laid or given up; negative where more was."""
+        return model.wanted_below(z_mm) - self.laid_mm - self.sunk_mm
+
+    def without(self, model: PatchModel, columns: Bool[np.ndarray, "ny nx"]) -> PatchState:
+        """As if nothing had been laid on some columns."""
+        nothing = np.where(columns, 0.0, 1.0)
+        return replace(
+            self,
+            surface_mm=np.where(columns, model.floor_mm, self.surface_mm),
+            laid_mm=self.laid_mm * nothing,
+            sunk_mm=self.sunk_mm * nothing,
+        )
+
+    def surface(self, model: PatchModel) -> HeightField:
+        """The as-built field with the patch on it."""
+        return model.raised(self.laid_mm > 0, self.surface_mm)

@@ -1,0 +1,72 @@
+"""The patch planner's state and its choice among ways to lay a patch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import manifold3d as m3
+import numpy as np
+import pytest
+
+from gcode.profiles import PrintSetup, load_setup
+from gcode.progress import silent
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch_heights import Heights
+from gcode.slicing.patch_model import PatchModel
+from gcode.slicing.patch_passes import plan_pass
+from gcode.slicing.patch_plan import PlanOptions, best_plan, plan
+from gcode.slicing.patch_state import PatchState
+from gcode.surfaces import HeightField
+
+SETUP = load_setup()
+GRID = LayerGrid.from_setup(SETUP)
+BLOCK = m3.Manifold.cube((20.0, 20.0, 6.15)).translate((60.0, 60.0, 0.0))
+PIT = m3.Manifold.cube((11.0, 11.0, 3.6)).translate((64.5, 64.5, 2.55))
+
+
+@pytest.fixture(scope="module")
+def model() -> PatchModel:
+    field = HeightField.from_manifold(BLOCK - PIT, 0.2, margin_mm=8.0)
+    return PatchModel(PIT, SETUP, field)
+
+
+def test_a_pass_leaves_the_state_before_it_as_it_was(model: PatchModel) -> None:
+    heights = Heights.of(model, GRID, SETUP, openings=True)
+    before = PatchState.begun(model)
+    told = [np.array(before.surface_mm), np.array(before.laid_mm), np.array(before.sunk_mm)]
+    state, laid_mm3 = before, 0.0
+    for k in range(len(heights.all_mm)):
+        one, after = plan_pass(model, state, heights.at(k, state, model), SETUP, hems=True)
+        assert (after is state) == (one is None)
+        assert (after.laid_mm >= state.laid_mm).all()
+        assert (after.surface_mm >= state.surface_mm - 1e-9).all()
+        laid_mm3 += sum(chain.volume_mm3 for chain in one.chains) if one else 0.0
+        state = after
+    columns_mm3 = float(state.laid_mm.sum()) * model.cell_mm**2 * model.weight
+    assert laid_mm3 == pytest.approx(columns_mm3, rel=0.05)
+    for kept, now in zip(told, (before.surface_mm, before.laid_mm, before.sunk_mm), strict=True):
+        np.testing.assert_array_equal(kept, now)
+
+
+def _with(setup: PrintSetup, **weights: float) -> PrintSetup:
+    return replace(setup, process=setup.process.model_copy(update=weights))
+
+
+def test_the_best_way_is_laid_by_the_process_s_weights(model: PatchModel) -> None:
+    ways = [
+        plan(model, GRID, SETUP, silent, options=PlanOptions(openings=openings))
+        for openings in (True, False)
+    ]
+    assert len({len(way.passes) for way in ways}) == 2
+    chosen = best_plan(model, GRID, SETUP, silent)
+    assert chosen.worth_mm3(model, SETUP) == max(way.worth_mm3(model, SETUP) for way in ways)
+    # each second costs what the profile says
+    free, dear = (_with(SETUP, repair_worth_mm3_s=worth) for worth in (0.0, 1.0))
+    for way in ways:
+        length_mm = sum(
+            float(np.hypot(*np.diff(chain.xy_mm, axis=0).T).sum())
+            for one in way.passes
+            for chain in one.chains
+        )
+        cost_mm3 = way.worth_mm3(model, free) - way.worth_mm3(model, dear)
+        assert cost_mm3 == pytest.approx(length_mm / SETUP.process.repair_speed_mm_s)
