@@ -304,7 +304,7 @@ def _distances(
 ) -> Float[np.ndarray, "x y z"]:
     """The template's distance at each voxel's middle; far from its surface that of a block's."""
     blocks = -(-shape // BLOCK)
-    middles = np.stack(np.indices(blocks), axis=-1).reshape(-1, 3) * BLOCK + 0.5 * BLOCK
+    middles = BLOCK * (np.argwhere(np.ones(blocks, bool)) + 0.5)
     coarse = template.distance(low_mm + voxel_mm * middles)
     whole = coarse.reshape(blocks)
     for axis in range(3):

@@ -145,20 +145,12 @@ VIEWS = ((0.4, 0.2, 0.9), (-0.7, 0.3, 0.6), (0.1, -0.8, 0.6))
 
 
 @pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("off_mm", [0.0, 0.6])
 def test_a_bare_view_of_a_sound_part_tells_nothing_missing(
-    view: tuple[float, float, float], off_mm: float
+    view: tuple[float, float, float],
 ) -> None:
-    # regression: of one bare view 5,483 mm3 behind the silhouette were missing; where a scanner
-    # errs along an edge (0.6 mm over 3 mm of it) there is as much missing as it is off, no more
-    points = seen_from(BRACKET[1], view, seed=0)
-    ahead = points @ np.array(view)
-    dragged = ahead < np.quantile(ahead, 0.02)
-    toward = np.array(view) / np.linalg.norm(view)
-    scan = Scan(points - off_mm * dragged[:, None] * toward, 0.04, "template")
+    scan = Scan(seen_from(BRACKET[1], view, seed=0), 0.04, "template")
     deficit = compute_deficit(scan, BRACKET_TEMPLATE, build_from_template=PLACED)
-    area_mm2 = float(dragged.sum()) * 0.3**2
-    assert deficit.missing_mm3 <= 1.5 * off_mm * area_mm2
+    assert deficit.missing_mm3 == 0.0
 
 
 def test_a_cut_in_a_bare_view_with_a_silhouette_is_measured() -> None:
