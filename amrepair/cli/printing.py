@@ -165,7 +165,7 @@ def loop(
         approve=approve,
         scan_timeout_s=scan_timeout_s,
         leave_heaters=leave_heaters,
-        calibration=() if errors is None else astuple(errors),
+        sound=() if errors is None else astuple(errors),
         seed=seed,
         as_json=as_json,
     )

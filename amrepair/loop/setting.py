@@ -50,7 +50,7 @@ class Setting:
         Layers that adaptive looks begin with (`pace`); 0 where there are none.
     leave_heaters
         The job may leave heaters on; else lines that switch them off are put at its end.
-    calibration
+    sound
         What sound parts look like to the scanner, where somebody named it: name, scans, widths,
         wander and tails, as `Calibration` has them. Empty: the run learns from its first layers.
     """
@@ -75,7 +75,7 @@ class Setting:
     title: str = "job"
     copies: tuple[tuple[tuple[float, ...], ...], ...] = ()
     leave_heaters: bool = False
-    calibration: tuple[Any, ...] = ()
+    sound: tuple[Any, ...] = ()
 
     @classmethod
     def of(
@@ -106,7 +106,7 @@ class Setting:
     @property
     def scanners_errors(self) -> Calibration | None:
         """The calibration that somebody named."""
-        return Calibration(*self.calibration) if self.calibration else None
+        return Calibration(*self.sound) if self.sound else None
 
     @property
     def placed(self) -> Transform:

@@ -106,7 +106,7 @@ def tested(
         (b,) cosine of the angle of incidence.
     pose_mm
         (b,) standard error of the deviation by what is left open of the pose and of the part's
-        size and bow.
+        size and bow, and by what views say differently.
     calibration
         What sound parts look like to this scanner; None: as the scan itself tells.
     """

@@ -23,7 +23,7 @@ from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import RangeImage, clearances, range_images
-from amrepair.observe.views import Contradiction, contradictions
+from amrepair.observe.views import MAD_TO_SIGMA, Contradiction, contradictions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
@@ -57,7 +57,8 @@ class Sites:
     facing
         (b,) cosine of the angle of incidence.
     pose_mm
-        (b,) standard error of the value by what is left open of the pose, the size and the bow.
+        (b,) standard error of the value by what is left open of the pose, the size and the bow,
+        and by what views say differently.
     """
 
     cells: int
@@ -119,12 +120,14 @@ def observed(
         if scan.edge is not None:  # pixels that hang between two surfaces lie on neither
             keep &= scan.edge & FLYING == 0
         if without:
+            assert scan.view_index is not None
             keep &= ~np.isin(scan.view_index, without)
         _refuse_nothing_near(scan, keep)
         surfels = make_surfels(scan.points_mm, f_mm, keep)
         seen = images or () if asked is None else asked.result()
         if without and seen:
             assert scan.sensors_mm is not None
+            assert scan.sensor_index is not None
             sensors_mm = scan.sensors_mm[np.unique(scan.sensor_index[keep])]
             seen = tuple(i for i in seen if np.isclose(sensors_mm, i.sensor_mm).all(axis=1).any())
     if surfels.spacing_mm > options.spacing_mm:
@@ -225,7 +228,9 @@ def agreed(
     while True:
         seen, sites = observe(tuple(one.view for one in out))
         by_view = None if scan.view_index is None else seen.surfels.by_view(scan.view_index)
-        nuisance, sites, by_view = _without_nuisance(sites, by_view, options, whole_part)
+        nuisance, sites, by_view = _without_nuisance(
+            sites, by_view, options, whole_part, seen.surfels.spread_mm
+        )
         if out or by_view is None:
             return seen, sites, nuisance, out
         cell, view, value_mm, count = by_view
@@ -244,7 +249,11 @@ def agreed(
 
 
 def _without_nuisance(
-    sites: Sites, by_view: ByView | None, options: RegionOptions, whole_part: bool
+    sites: Sites,
+    by_view: ByView | None,
+    options: RegionOptions,
+    whole_part: bool,
+    point_sigma_mm: float,
 ) -> tuple[Nuisance | None, Sites, ByView | None]:
     """What belongs to the whole part or to whole views, and what was seen without it."""
     if not whole_part:
@@ -270,8 +279,36 @@ def _without_nuisance(
     whole_mm = sites.value_mm.copy()
     whole_mm[:n] -= removed_mm
     pose_mm = found.error_mm(sites.place_mm, sites.normal)
-    told = None if by_view is None or view is None else (cell, view, value_mm - share_mm, count)
+    told = None
+    if view is not None:
+        told = cell, view, value_mm - share_mm, count
+        views_mm = _between_views_mm(cell, value_mm - share_mm, count, n, point_sigma_mm)
+        pose_mm[:n] = np.hypot(pose_mm[:n], views_mm)
     return found, replace(sites, value_mm=whole_mm, pose_mm=pose_mm), told
+
+
+def _between_views_mm(
+    cell: Int[np.ndarray, " k"],
+    value_mm: Float[np.ndarray, " k"],
+    count: Int[np.ndarray, " k"],
+    cells: int,
+    point_sigma_mm: float,
+) -> Float[np.ndarray, " s"]:
+    """(s,) standard error of each cell by what views say differently of one place.
+
+    The views' own component of the variance, without the points' noise, over how many saw it.
+    """
+    views = np.bincount(cell, minlength=cells)
+    several = views[cell] > 1
+    if not several.any():
+        return np.zeros(cells)
+    mean_mm = np.bincount(cell, value_mm, cells) / np.maximum(views, 1)
+    number = views[cell][several]
+    off_mm = (value_mm - mean_mm[cell])[several] * np.sqrt(number / (number - 1.0))
+    spread_mm = MAD_TO_SIGMA * float(np.median(np.abs(off_mm)))
+    noise_mm = point_sigma_mm * float(np.median(1.0 / np.sqrt(count[several])))
+    own_mm = np.sqrt(max(spread_mm**2 - noise_mm**2, 0.0))
+    return np.asarray(own_mm / np.sqrt(np.maximum(views, 1)))
 
 
 def tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:

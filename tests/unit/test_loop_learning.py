@@ -68,7 +68,7 @@ def _run(
         small.setup, ("prusa_mk3s", "pla", "repair_0.20"), stops=stops,
         build_from_template=small.placed, by_beads=False, seed=0, max_iterations=3,
         build_from_scanner=Transform.identity("build", "scanner"),
-        calibration=() if given is None else astuple(given),
+        sound=() if given is None else astuple(given),
     )  # fmt: skip
     keep(folder, setting, small.job.program.text, small.template)
     said: list[str] = []
