@@ -138,7 +138,7 @@ def from_scans(exact: MeshSdf, points: int) -> None:
     made, seconds = timed(lambda: fit_from_scans(scans))
     template, fused = made.template, made.fused.mesh  # type: ignore[attr-defined]
     on = np.abs(template.distance(surface_of(exact.mesh)[0]))
-    print(f"- consensus: {seconds:.1f} s; field on the true surface {micrometres(on)} µm;")
+    print(f"- merged: {seconds:.1f} s; field on the true surface {micrometres(on)} µm;")
     print(f"  fused mesh to the CAD and back {two_way(fused, exact)} µm", flush=True)
     from amrepair.merge.cloud import outward, planes, spacing_of
     from amrepair.merge.fuse import _poisson

@@ -71,7 +71,7 @@ def class_template(
 ) -> LearnedSdf | NetworkSdf:
     """The class's template; fitted once for each seed, then read from the cache.
 
-    A class without a normal mesh gets the consensus of its training clouds.
+    A class without a normal mesh gets a template of its training clouds together.
     """
     words = "" if recipe == "fast" else hashlib.sha256(repr(paper).encode()).hexdigest()[:8]
     path = cache / f"{data.name}-{recipe}{words}-{seed}.safetensors"

@@ -89,7 +89,7 @@ class Spread:
     def widened(self, cloud: Cloud, slack_mm: Float[np.ndarray, " n"]) -> Spread:
         """With what the scans' own poses leave open.
 
-        Where several scans saw the surface, that of the middle one: the consensus is theirs.
+        Where several scans saw the surface, that of the middle one: the mean is theirs.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class Fused:
     spread
         None where one scan alone was given.
     standard_error_mm
-        99th percentile over the surface of the consensus's own uncertainty.
+        99th percentile over the surface of the mean's own uncertainty.
     unseen_ratio, single_ratio, overruled_ratio
         Shares of the surface that no scan, or one alone, saw, and where a scan was overruled.
     rejected
@@ -452,7 +452,7 @@ def _spread(
 
 
 def _standard_error(cloud: Cloud, spread: Spread | None, radius_mm: float) -> float:
-    """How well the consensus is known at the 99th percentile: noise, and scans that differ."""
+    """How well the surface is known at the 99th percentile: noise, and scans that differ."""
     near = 0.36 * np.pi * (radius_mm / cloud.spacing_mm) ** 2
     noise_mm = cloud.sigma_mm / np.sqrt(max(near, 1.0))
     if spread is None or not (spread.values_mm > 0).any():

@@ -40,8 +40,12 @@ class Graph:
 
     Attributes
     ----------
+    search
+        Tries every rotation of a pair.
     pairs
         By numbers i < j: poses of view j in view i's frame, best first.
+    searched
+        Pairs that have been.
     groups
         Each by number: (4, 4) the group's frame from the view.
     """
@@ -49,7 +53,9 @@ class Graph:
     views: Sequence[View]
     size_mm: float
     options: MergeOptions
+    search: Callable[[int, int], list[Fit]] = lambda _i, _j: []
     pairs: Pairs = field(default_factory=dict)
+    searched: set[tuple[int, int]] = field(default_factory=set)
     groups: list[Placed] = field(default_factory=list)
     _judged: dict[tuple[frozenset[int], frozenset[int], int], list[Fit]] = field(
         default_factory=dict
@@ -124,9 +130,32 @@ class Graph:
             if best is None:
                 return
             _, fixed, moving, fit = best
+            if self._has_rival(fixed, moving):
+                continue
             self.groups[fixed] |= {k: fit.pose @ p for k, p in self.groups[moving].items()}
             del self.groups[moving]
             self.even(max(fixed - (moving < fixed), 0))
+
+    def _has_rival(self, fixed: int, moving: int) -> bool:
+        """Whether every rotation of the pair that shares most proposes more; asked once a pair.
+
+        Features find one pose of a part that lies on itself in several, and say nothing of these.
+        """
+        between = [(min(i, j), max(i, j)) for i in self.groups[fixed] for j in self.groups[moving]]
+        best = max((p for p in between if self.pairs.get(p)),
+                   key=lambda p: self.pairs[p][0].score)  # fmt: skip
+        if best in self.searched or len(between) > len(self.views):
+            return False  # many pairs agree already: a symmetry would have to be of all of them
+        self.add(best, self.search(*best))
+        self.searched.add(best)
+        return True
+
+    def add(self, pair: tuple[int, int], fits: Sequence[Fit]) -> None:
+        """More poses of a pair."""
+        near_mm = self.options.same_size * self.size_mm
+        every = [*self.pairs.get(pair, []), *fits]
+        self.pairs[pair] = distinct(every, self.views[pair[1]].thin, near_mm)
+        self._judged.clear()
 
     def _sides(self, a: int, b: int) -> tuple[int, int]:
         """The larger group stays."""
@@ -160,18 +189,16 @@ def grouped(
     """
     known = begun or {}
     first = [dict(known)] if known else []
-    graph = Graph(views, size_mm, options)
-    graph.groups = first + [{k: np.eye(4)} for k in range(len(views)) if k not in known]
     spaces: dict[int, FreeSpace] = {}
+    graph = Graph(
+        views, size_mm, options, lambda i, j: searched(views, spaces, i, j, size_mm, options)
+    )
+    graph.groups = first + [{k: np.eye(4)} for k in range(len(views)) if k not in known]
     _ask(graph, "match features", lambda i, j: featured(views, i, j, size_mm, options), progress)
     graph.grow(progress)
     if len(graph.groups) > 1:
-        _ask(
-            graph,
-            "try every rotation",
-            lambda i, j: searched(views, spaces, i, j, size_mm, options),
-            progress,
-        )
+        _ask(graph, "try every rotation", graph.search, progress)
+        graph.searched |= set(graph.pairs)
         graph.grow(progress)
     graph.groups.sort(key=lambda group: (-len(group), min(group)))
     return graph
@@ -187,7 +214,5 @@ def _ask(
     ]
     for done, (i, j) in enumerate(wanted):
         progress(stage, float(done), float(len(wanted)))
-        more = [*graph.pairs.get((i, j), []), *find(i, j)]
-        near_mm = graph.options.same_size * graph.size_mm
-        graph.pairs[i, j] = distinct(more, graph.views[j].thin, near_mm)
-    graph._judged.clear()
+        if (i, j) not in graph.searched:
+            graph.add((i, j), find(i, j))

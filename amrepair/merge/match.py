@@ -80,13 +80,13 @@ def featured(
     views: Sequence[View], i: int, j: int, size_mm: float, options: MergeOptions
 ) -> list[Fit]:
     """Poses of view j in view i's frame that features propose (of whole scans their boxes too)."""
-    whole = not views[i].looks.each and not views[j].looks.each
-    ask = poses_between if whole else by_features
-    guesses = ask(views[j].surface.points_mm, views[i].surface.points_mm, size_mm)
+    source, target = views[j].surface.points_mm, views[i].surface.points_mm
+    if not views[i].looks.each and not views[j].looks.each:
+        guesses = list(poses_between(source, target, size_mm))
+        return _fitted(views, i, j, guesses, FEATURES_WITHIN, size_mm, options)
     found: list[Fit] = []
-    for guess in guesses if not whole else [list(guesses)]:
-        some = guess if whole else [guess]
-        found += _fitted(views, i, j, some, FEATURES_WITHIN, size_mm, options)
+    for guess in by_features(source, target, size_mm):
+        found += _fitted(views, i, j, [guess], FEATURES_WITHIN, size_mm, options)
         if any(f.overlap >= SURE_OVERLAP and not f.why_not(options) for f in found):
             break  # finer features said so: coarser ones say no more
     return distinct(found, views[j].thin, options.same_size * size_mm)

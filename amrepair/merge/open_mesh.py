@@ -57,7 +57,7 @@ class OpenMeshOptions:
     cells: int = 256
     small_hole_ratio: float = 0.01
     least_followed: float = 0.9
-    patches_per_cell: float = 2.0
+    patches_per_cell: float = 1.5
 
 
 def fit_mesh(
@@ -128,7 +128,8 @@ def _closed(
     areas, _ = triangle_areas_normals(vertices, faces)
     count = count_for_spacing(areas, edge / options.patches_per_cell)
     points, normals, _ = sample_surface(vertices, faces, count=count)
-    shell = Shell.of(points, normals * (float(areas.sum()) / count))
+    # winding numbers have no unit: in cells, the tree's leaves hold a few pieces each
+    shell = Shell.of(points / edge, normals * (float(areas.sum()) / count / edge**2))
     tree = TriangleTree.of(vertices, faces)
     grid, low = _field(tree, shell, _rims(vertices, faces, edge), vertices, edge, progress)
     try:
@@ -200,10 +201,10 @@ def _field(
     low = vertices.min(axis=0) - 4.0 * edge
     blocks = np.ceil((vertices.max(axis=0) + 4.0 * edge - low) / (BLOCK * edge)).astype(int) + 1
     close = np.zeros(tuple(BLOCK * blocks), bool)
-    close[tuple(np.rint((shell.place_mm - low) / edge).astype(int).T)] = True
+    close[tuple(np.rint(shell.place_mm - low / edge).astype(int).T)] = True
     close = ndimage.binary_dilation(close, iterations=2)
     every = np.argwhere(np.ones(tuple(blocks), bool))
-    middle = 0.5 - shell.winding(low + edge * (BLOCK * every + 0.5 * (BLOCK - 1)))
+    middle = 0.5 - shell.winding(low / edge + BLOCK * every + 0.5 * (BLOCK - 1))
     cut = close.reshape([n for b in blocks for n in (b, BLOCK)]).any(axis=(1, 3, 5)).ravel()
     cut |= np.abs(middle) < SURE_WINDING
     grid = np.repeat(np.repeat(np.repeat(
@@ -214,7 +215,7 @@ def _field(
         progress("winding number", float(done * BLOCKS_AT_ONCE), float(len(every)))
         some = every[first : first + BLOCKS_AT_ONCE][cut[first : first + BLOCKS_AT_ONCE]]
         nodes = (BLOCK * some[:, None] + inner).reshape(-1, 3)
-        grid[tuple(nodes.T)] = 0.5 - shell.winding(low + edge * nodes)
+        grid[tuple(nodes.T)] = 0.5 - shell.winding(low / edge + nodes)
     near = np.argwhere(close)
     places = low + edge * near
     found = tree.nearest(places)

@@ -31,7 +31,7 @@ GRAZING, GRAZING_COUNTS = 0.12, 0.5
 HIDDEN_RATIO, ABOVE_LEAST = 0.02, 0.01
 # No view's least share was above this (0.031 at most); whole scans of ten parts had 0.088 and more.
 VIEW_RATIO = 0.05
-MOST_GUESSES = 5
+MOST_GUESSES = 10
 FEW_GUESSES, RING_RAD = 8, 0.16  # fewer are widened to what lies beside them
 DISTANCES = (2.0, 8.0)  # of the view's diagonal: nearer and farther than scanners stand
 LEAST_SEEN = 100  # points of one sensor, or it saw nothing to speak of

@@ -1,0 +1,103 @@
+"""What no scan saw is unknown, in merged scans and in meshes with holes: it is never missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.errors import TemplateError
+from amrepair.merge import fit_from_scans, fit_mesh
+from amrepair.regions import detect
+from amrepair.scans import Scan
+from amrepair.template import LearnedSdf, load_template
+from tests.analytic import box, cylinder, difference, sample_surface, union
+
+PART = difference(
+    union(box((0, 0, 0), (40, 25, 8)), cylinder((30, 15, 4), 6, 14)), cylinder((10, 9, -1), 4, 12)
+)
+HOLES_MM = np.array([[20.0, 20.0, 8.0], [30.0, 15.0, 18.0], [0.0, 12.0, 4.0], [25.0, 5.0, 0.0]])
+RADIUS_MM = 4.2  # four of them take over 5 % of the surface
+
+
+def cloud(count: int, seed: int) -> np.ndarray:
+    spacing_mm = float(np.sqrt(PART.body.surface_area() / count))
+    points, _ = sample_surface(PART.body, spacing_mm, seed=seed)
+    return points + np.random.default_rng(seed).normal(0.0, 0.03, points.shape)
+
+
+def in_holes(points: np.ndarray) -> np.ndarray:
+    far = np.linalg.norm(points[:, None] - HOLES_MM, axis=2).min(axis=1)
+    return np.asarray(far < RADIUS_MM)
+
+
+def test_a_merged_scan_with_holes_is_a_template_that_knows_them(tmp_path: Path) -> None:
+    points = cloud(40_000, 0)
+    seen = points[~in_holes(points)]
+    assert 1.0 - len(seen) / len(points) > 0.05
+    made = fit_from_scans([Scan(seen, 0.03, "scanner", source="merged")])
+    assert "seen by no scan" in made.template.metadata["notes"]
+    made.template.save(tmp_path / "t.safetensors")
+    template = load_template(tmp_path / "t.safetensors")
+    assert isinstance(template, LearnedSdf)
+    assert template.coverage is not None
+    truth, _ = sample_surface(PART.body, 0.5, seed=3)
+    far = np.linalg.norm(truth[:, None] - HOLES_MM, axis=2).min(axis=1)
+    unseen = template.coverage.unseen_at(truth)
+    assert unseen[far < RADIUS_MM - 1.0].mean() > 0.95
+    assert unseen[far > RADIUS_MM + 2.5].mean() < 0.02
+    # a sound part, and one that lacks what lies in a hole: nothing is said of what nobody knows
+    sound = cloud(40_000, 7)
+    lacking = sound[~in_holes(sound)]
+    for some in (sound, lacking):
+        assert not detect(Scan(some, 0.03, "template"), template).regions
+    # elsewhere a defect is found as ever
+    dented = sound.copy()
+    at = np.linalg.norm(dented - (5.0, 20.0, 8.0), axis=1) < 2.5
+    dented[at & (dented[:, 2] > 7.5), 2] -= 1.0
+    assert len(detect(Scan(dented, 0.03, "template"), template).regions) == 1
+
+
+@pytest.mark.parametrize("crowded", [False, True])
+def test_a_scanned_mesh_with_holes_is_closed_and_said(tmp_path: Path, crowded: bool) -> None:
+    ball = trimesh.creation.icosphere(5, 20.0)
+    centres = ball.triangles_center
+    large = np.linalg.norm(centres - (0.0, 0.0, 20.0), axis=1) < 5.0
+    small = np.zeros(len(centres), bool)
+    small[np.argmax(centres[:, 0])] = True
+    faces = ball.faces[~(large | small)]
+    vertices = np.array(ball.vertices)
+    if crowded:  # a fin: edges of three faces, which no mending by edges resolves
+        fin = np.array([[0, 1, len(vertices)]])
+        fin[0, :2] = faces[len(faces) // 2][:2]
+        vertices = np.vstack([vertices, 1.02 * vertices[fin[0, :1]]])
+        faces = np.vstack([faces, fin])
+    path = tmp_path / "scan.ply"
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    template = fit_mesh(path)
+    notes = template.metadata["notes"]
+    assert "1 large holes" in notes
+    assert template.coverage is not None
+    cut_mm2 = float(ball.area_faces[large].sum())
+    assert template.coverage.unseen_mm2 == pytest.approx(cut_mm2, rel=0.25)
+    rng = np.random.default_rng(0)
+    way = rng.normal(size=(20_000, 3))
+    way *= 20.0 / np.linalg.norm(way, axis=1, keepdims=True)
+    # of a place off the lid its foot on it counts: nobody knows how far the surface bulges
+    unseen = template.spread_mm(way) > 20.0
+    far = np.linalg.norm(way - (0.0, 0.0, 20.0), axis=1)
+    assert unseen[far < 4.0].all()
+    assert not unseen[far > 8.0].any()
+    off = np.abs(template.distance(way[far > 6.0]))
+    assert np.quantile(off, 0.99) < max(0.05, template.bias_mm)
+    assert template.solid().volume() == pytest.approx(ball.volume, rel=0.02)
+
+
+def test_triangles_that_bound_nothing_are_still_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    soup = trimesh.Trimesh(rng.uniform(0, 30, (300, 3)), np.arange(300).reshape(-1, 3))
+    soup.export(tmp_path / "soup.stl")
+    with pytest.raises(TemplateError, match=r"soup\.stl"):
+        fit_mesh(tmp_path / "soup.stl")
