@@ -13,7 +13,7 @@ from gcode.reader import Job
 from gcode.surfaces import raster_kernels
 
 CELL_MM = 0.4  # about a bead
-MOST_CELLS = 4_000_000
+MOST_CELLS = 1_000_000  # of a layer: a bed of 400 mm, some hundredths of a second
 
 
 def covered_mm2(job: Job) -> Float[np.ndarray, " layers"]:

@@ -87,6 +87,8 @@ class Places:
 
     def _best(self, layer: int, start: int, stop: int, beside: tuple[int, ...]) -> Place | None:
         """Of the lines [start, stop] the one with the plastic pulled back, farthest from walls."""
+        if stop < start:  # layers that overlap in the text: no line is between them
+            return None
         lines: Int[np.ndarray, " c"] = np.arange(start, stop + 1)
         at = np.array([self._position_mm(int(line)) for line in lines])
         filament_mm = self._filament_mm[lines]

@@ -11,9 +11,11 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from gcode.errors import InputError
-from gcode.surfaces.heightfield import MAX_CELLS, HeightField
+from gcode.surfaces.heightfield import HeightField
 
 OUTLINE_CELLS = 3  # gaps this wide in what was seen are within the scan's outline
+WIDEST_MM = 1000.0  # of a bed, and what stands around it
+MOST_CELLS = 8_000_000  # some seconds to close the holes of: a bed of 560 mm in cells of 0.2 mm
 UNDER_MM = 2.0  # points so far below the bed are of another frame
 
 
@@ -33,13 +35,10 @@ def from_points(points_mm: Float[np.ndarray, "n 3"], cell_mm: float, *, what: st
         If the points are not in the bed's frame, or spread too far for the cells.
     """
     _refuse_below(points_mm, what)
+    _refuse_wide(points_mm, cell_mm, what)
     origin = np.floor(points_mm[:, :2].min(axis=0) / cell_mm) * cell_mm
     index = np.floor((points_mm[:, :2] - origin) / cell_mm).astype(np.int64)
     nx, ny = (int(v) + 1 for v in index.max(axis=0))
-    if nx * ny > MAX_CELLS:
-        raise InputError(
-            f"{what} spreads over {nx * cell_mm:.0f} × {ny * cell_mm:.0f} mm; is it in millimetres?"
-        )
     highest = np.full(ny * nx, -np.inf)
     np.maximum.at(highest, index[:, 1] * nx + index[:, 0], points_mm[:, 2])
     z_mm = highest.reshape(ny, nx)
@@ -56,6 +55,7 @@ def from_open_mesh(
 ) -> HeightField:
     """The top of a scanner's mesh, which has holes, as `from_points`."""
     _refuse_below(vertices_mm, what)
+    _refuse_wide(vertices_mm, cell_mm, what)
     bare = HeightField.from_mesh(vertices_mm, faces, cell_mm, ground_mm=-np.inf)
     seen = np.isfinite(bare.z_mm)
     return HeightField(bare.origin_mm, cell_mm, _filled(bare.z_mm, seen), seen)
@@ -67,6 +67,17 @@ def _refuse_below(points_mm: Float[np.ndarray, "n 3"], what: str) -> None:
         raise InputError(
             f"{what} reaches {-low_mm:.1f} mm below the bed: it is not in the bed's frame; "
             "calibrate the scanner, or move the scan so that the bed is at Z 0."
+        )
+
+
+def _refuse_wide(points_mm: Float[np.ndarray, "n 3"], cell_mm: float, what: str) -> None:
+    low, high = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
+    x_mm, y_mm = (float(v) for v in high - low)
+    if max(x_mm, y_mm) > WIDEST_MM or x_mm * y_mm > MOST_CELLS * cell_mm**2:
+        raise InputError(
+            f"{what} spreads over {x_mm:.3g} × {y_mm:.3g} mm, the limit is {WIDEST_MM:g} mm, or "
+            f"{MOST_CELLS / 1e6:g} million cells of {cell_mm:g} mm; is it in millimetres, and of "
+            "the bed alone?"
         )
 
 

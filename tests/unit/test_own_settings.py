@@ -161,7 +161,7 @@ def test_a_job_tells_its_printer_and_material(
 
 
 def test_a_shipped_machine_is_known_by_the_name_in_the_job() -> None:
-    for name, machine in (("CR-K1 Max", "creality_k1_max"), ("Creality K1C", None)):
+    for name, machine in (("CR-K1 Max", "creality_k1_max"), ("Creality K1 SE", None)):
         own = own_settings(ORCA.replace("Machine X", name), "job.gcode")
         assert own is not None
         assert own.machine == machine
