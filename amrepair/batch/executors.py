@@ -14,8 +14,6 @@ from amrepair.batch.options import Outcome, Task, Work
 from amrepair.errors import InputError
 
 NAMES = ("process", "serial", "ray")
-# A task that took so many workers with it is given up: it, and not they, is what is wrong.
-MOST_ATTEMPTS = 3
 
 
 @runtime_checkable
@@ -75,13 +73,3 @@ def make_executor(
     from amrepair.batch.on_ray import OnRay
 
     return OnRay(work, workers=workers if address is not None else count, address=address)
-
-
-def given_up(task: Task, attempts: int) -> Outcome:
-    """Of a task that its workers do not survive."""
-    return Outcome(
-        task.scan_id,
-        sentence=f"{{scan}} ended its worker {attempts} times (out of memory?); try it alone, or "
-        "with fewer --workers",
-        lasting=False,
-    )

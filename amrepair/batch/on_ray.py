@@ -14,8 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amrepair.batch.executors import MOST_ATTEMPTS, given_up
-from amrepair.batch.options import Outcome, Task, Work
+from amrepair.batch.options import MOST_ATTEMPTS, Outcome, Task, Work, given_up
 from amrepair.errors import InputError, MissingDependencyError
 from gcode.process import one_thread
 

@@ -26,6 +26,10 @@ class Kind(StrEnum):
     REPAIR = "repair"
 
 
+# A task that took so many workers with it is given up: it, and not they, is what is wrong.
+MOST_ATTEMPTS = 3
+
+
 @dataclass(frozen=True, slots=True)
 class BatchOptions:
     """What is done to each scan; part of every result's name.
@@ -147,3 +151,13 @@ class Outcome:
 def scan_id(fingerprint: str, sha256: str, suffix: str) -> str:
     """Name of a result: the scan's bytes, how they are read, and what is done to them."""
     return hashlib.sha256(f"{fingerprint}\n{sha256}\n{suffix}".encode()).hexdigest()[:32]
+
+
+def given_up(task: Task, attempts: int) -> Outcome:
+    """Of a task that its workers do not survive."""
+    return Outcome(
+        task.scan_id,
+        sentence=f"{{scan}} ended its worker {attempts} times (out of memory?); try it alone, or "
+        "with fewer --workers",
+        lasting=False,
+    )

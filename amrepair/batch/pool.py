@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from amrepair.batch.executors import MOST_ATTEMPTS, given_up
-from amrepair.batch.options import Outcome, Task, Work
+from amrepair.batch.options import MOST_ATTEMPTS, Outcome, Task, Work, given_up
 from amrepair.errors import AmrepairError
 from gcode.process import end_with_parent, one_thread
 

@@ -11,7 +11,8 @@ import numpy as np
 from amrepair.align import align
 from amrepair.errors import InputError
 from amrepair.regions import detect
-from amrepair.regions.calibration import Calibration, file_of, users_folder
+from amrepair.regions.calibrating import calibrated
+from amrepair.regions.calibration import file_of, users_folder
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.significance import Level
 from amrepair.scans import read_scan
@@ -40,7 +41,7 @@ def run(
             pose = align(cloud, field, rng=np.random.default_rng(seed), progress=bars)
             with bars.stage(f"look at {path.name}"):
                 seen.append(judged_levels(detect(cloud.moved(pose.template_from_scan), field)))
-    found = Calibration.learned(name, seen)
+    found = calibrated(name, seen)
     kept = found.save(folder)
     if as_json:
         console.show_json({**asdict(found), "file": str(kept)})

@@ -13,6 +13,7 @@ import numpy as np
 
 from amrepair.loop.decide import Action, Decision
 from amrepair.loop.looks import Stop
+from amrepair.regions.calibrating import calibrated
 from amrepair.regions.calibration import NORMAL, Calibration
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.significance import Level
@@ -51,7 +52,7 @@ class Learning:
         if len(self._seen) < FIRST_LOOKS:
             return None
         self._done = True
-        learned = NORMAL if _as_normal(self._seen) else Calibration.learned(OWN, self._seen)
+        learned = NORMAL if _as_normal(self._seen) else calibrated(OWN, self._seen)
         self._seen = []
         self.calibration = learned
         return learned

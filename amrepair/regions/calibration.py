@@ -7,18 +7,14 @@ by how densely they were seen, and how the peaks over the tolerance fall off.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import InputError
-
-if TYPE_CHECKING:
-    from amrepair.regions.significance import Level
 
 VERSION = 2
 
@@ -99,40 +95,6 @@ class Calibration:
         """Whose errors they are, in a sentence."""
         scans = f"{self.scans} sound scan{'' if self.scans == 1 else 's'}"
         return f"Judged by what {scans} left ('{self.name}')."
-
-    @classmethod
-    def learned(cls, name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
-        """From the tested scales of scans of sound parts.
-
-        Raises
-        ------
-        InputError
-            If there is none.
-        """
-        if not scans:
-            raise InputError("a calibration needs a scan of a sound part at least; name one")
-        widths: dict[float, list[Float[np.ndarray, " c"]]] = {}
-        for levels in scans:
-            for level in levels[1:]:
-                width_mm = round(3.0 * level.scale.cell_mm, 1)
-                widths.setdefault(width_mm, []).append(level.wander_mm)
-        wander = []
-        for found in (widths[width] for width in sorted(widths)):
-            classes = max(len(table) for table in found)
-            whole = [np.append(t, np.full(classes - len(t), t[-1])) for t in found]
-            mean = np.sqrt(np.square(whole).mean(axis=0))
-            wander.append(tuple(float(v) for v in np.maximum.accumulate(mean)))
-        tails = []
-        for statistic in (0, 1):
-            for side in (0, 1):
-                some = [levels[0:1] if statistic == 0 else levels[1:] for levels in scans]
-                every = [level for levels in some for level in levels]
-                peaks = np.concatenate([level.peaks[side] for level in every])
-                windows = sum(len(level.scale) for level in every)
-                start = every[0].tails[side].start
-                mean_z = float(peaks.mean() - start) if len(peaks) else 0.0
-                tails.append((start, mean_z, len(peaks) / windows, float(len(peaks))))
-        return cls(name, len(scans), tuple(sorted(widths)), tuple(wander), tuple(tails))
 
     def save(self, folder: Path) -> Path:
         """Write it into the user's folder; the whole file or nothing.

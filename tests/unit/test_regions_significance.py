@@ -13,6 +13,7 @@ from amrepair.cli.inspect import _refuse_too_noisy
 from amrepair.errors import InputError
 from amrepair.field.scales import FACING_COSINE, RANK, scales_of
 from amrepair.regions import Label, detect
+from amrepair.regions.calibrating import calibrated
 from amrepair.regions.calibration import NORMAL, Calibration, Tail
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.options import RegionOptions
@@ -157,7 +158,7 @@ def test_a_calibration_is_kept_by_name_and_read_again(
     ball: AnalyticTemplate, tmp_path: Path
 ) -> None:
     levels = [judged_levels(detect(rough(ball, seed), ball)) for seed in (11, 12, 13)]
-    learned = Calibration.learned("bench", levels)
+    learned = calibrated("bench", levels)
     learned.save(tmp_path)
     again = Calibration.load("bench", tmp_path)
     assert again == learned
