@@ -10,6 +10,7 @@ import trimesh
 
 from amrepair.errors import TemplateError
 from amrepair.merge import fit_from_scans, fit_mesh
+from amrepair.merge.open_mesh import OpenMeshOptions
 from amrepair.regions import detect
 from amrepair.scans import Scan
 from amrepair.template import LearnedSdf, load_template
@@ -76,7 +77,7 @@ def test_a_scanned_mesh_with_holes_is_closed_and_said(tmp_path: Path, crowded: b
         faces = np.vstack([faces, fin])
     path = tmp_path / "scan.ply"
     trimesh.Trimesh(vertices, faces, process=False).export(path)
-    template = fit_mesh(path)
+    template = fit_mesh(path, options=OpenMeshOptions(cells=96))
     notes = template.metadata["notes"]
     assert "1 large holes" in notes
     assert template.coverage is not None
@@ -100,4 +101,4 @@ def test_triangles_that_bound_nothing_are_still_refused(tmp_path: Path) -> None:
     soup = trimesh.Trimesh(rng.uniform(0, 30, (300, 3)), np.arange(300).reshape(-1, 3))
     soup.export(tmp_path / "soup.stl")
     with pytest.raises(TemplateError, match=r"soup\.stl"):
-        fit_mesh(tmp_path / "soup.stl")
+        fit_mesh(tmp_path / "soup.stl", options=OpenMeshOptions(cells=64))

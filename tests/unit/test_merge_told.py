@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from amrepair.errors import InputError
 from amrepair.frames import moved, rotation_from_vector
-from amrepair.merge.match import apart
 from amrepair.merge.place import place
 from amrepair.merge.told import _about, of_views, read_poses
 from amrepair.merge.views import View
@@ -103,10 +102,8 @@ def test_a_told_pose_that_is_wrong_is_found_anew() -> None:
     found = place(views, rng, told=told)
     assert set(found.poses) == {0, 1, 2}
     for k, pose in enumerate(poses):
-        back = moved(views[k].thin.points_mm, found.poses[k] @ pose) - views[k].thin.points_mm
         there = moved(views[k].thin.points_mm, found.poses[k])
         true = moved(views[k].thin.points_mm, np.linalg.inv(pose))
-        assert back.shape == there.shape
         assert np.abs(there - true).max() < 0.05
 
 
@@ -138,4 +135,3 @@ def test_a_depth_camera_with_a_millimetre_of_noise_finds_its_views() -> None:
     corners = 3.0 * np.array([[0, 0, 0], [40, 25, 8], [0, 25, 0], [40, 0, 8]], float)
     # of thousands of points with 1 mm of noise each
     assert np.abs(moved(corners, found.poses[1] @ poses[1]) - corners).max() < 0.5
-    assert len(apart([found.poses[1], found.poses[1]], views[1].thin, 0.1)) == 1
