@@ -1,7 +1,7 @@
 """A patch: beads that fill a deficit on top of a rough floor, and nothing else.
 
 Passes lie on the job's own layers, from the floor up. At every place a bead is as thick as the gap
-between its nozzle and the surface predicted after the earlier passes (idea 8 of the design), and
+between its nozzle and the surface predicted after the earlier passes, and
 a place is filled when waiting for the next layer would leave a gap too deep for one bead. What the
 nozzle cannot reach, and what is too thin for it, is listed with its volume.
 """

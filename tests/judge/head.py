@@ -36,8 +36,8 @@ MK3S_HEAD = (
 )
 _V6 = MK3S_HEAD[:3]
 # The same nozzle under other bodies: a heater block of 20×16 mm in its sock, ducts that end 6 mm
-# over the tip, and the carriages as Cura's definitions have them: Creality's base
-# (machine_head_with_fans_polygon, gantry_height 25), and Voron's (gantry_height 30).
+# over the tip, and carriages about as large as slicers have them. Not checked against drawings:
+# they tell whether a body decides, not what these machines exactly reach.
 _BLOCK = (
     HeadSlice(4.5, box_mm=(-12.0, -18.0, 16.0, 12.0)),
     HeadSlice(6.0, box_mm=(-26.0, -32.0, 30.0, 30.0)),
