@@ -15,7 +15,7 @@ from gcode.cli import console
 if TYPE_CHECKING:
     import numpy as np
 
-    from amrepair.merge import ScanFit
+    from amrepair.merge import ScanFit, SoundFit
     from amrepair.template import LearnedSdf, NetworkSdf
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
@@ -31,6 +31,7 @@ def add_to(app: typer.Typer) -> None:
     epilog=console.examples(
         "amrepair template fit part.stl -o part.safetensors",
         "amrepair template fit part.3mf -o part.safetensors --device cpu --seed 1",
+        "amrepair template fit part.stl sound*.ply -o part.safetensors",
         "amrepair template fit view*.ply -o part.safetensors --sensor-at 0,0,400",
         "amrepair template fit view*.ply -o part.safetensors --poses poses.json --json",
         "amrepair template fit turn*.ply -o part.safetensors --turntable 36",
@@ -40,7 +41,8 @@ def fit(
     inputs: Annotated[
         list[Path],
         typer.Argument(
-            help="A mesh of the part as it should be, or normal scans of it, or both; mm."
+            help="A mesh of the part as it should be, or sound scans of it, or both: then the "
+            "mesh's field learns what sound parts leave on it; mm."
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Template file (.safetensors).")],
@@ -130,10 +132,10 @@ def _from_scans(
     turntable_deg: float | None,
     seed: int,
     bars: console.Bars,
-) -> ScanFit:
+) -> ScanFit | SoundFit:
     import numpy as np
 
-    from amrepair.merge import fit_from_scans
+    from amrepair.merge import fit_from_scans, learn_from_scans
     from amrepair.merge.told import POSES_FILE, read_poses
     from amrepair.scans import read_scan
     from amrepair.template import load_mesh
@@ -150,7 +152,11 @@ def _from_scans(
         read_scan(path, frame="scanner", sensor_at=place)
         for path, place in zip(scans, each, strict=True)
     ]
-    mesh = load_mesh(meshes[0]) if meshes else None
+    if meshes:
+        for given, option in ((poses, "poses"), (turntable_deg, "turntable")):
+            if given is not None:
+                raise InputError(f"--{option} belongs to scans without a mesh; leave one out")
+        return learn_from_scans(clouds, load_mesh(meshes[0]), seed=seed, progress=bars)
     if poses is not None and turntable_deg is not None:
         raise InputError("--poses and --turntable both say where the scans stand; give one")
     beside = scans[0].parent / POSES_FILE
@@ -158,7 +164,6 @@ def _from_scans(
         poses = beside
     return fit_from_scans(
         clouds,
-        mesh=mesh,
         poses=None if poses is None else read_poses(poses),
         turntable_deg=turntable_deg,
         seed=seed,

@@ -1,4 +1,4 @@
-"""`fit_from_scans`: a template from sound scans or views, with or without the part's mesh."""
+"""`fit_from_scans`: a template from sound scans or views, without the part's mesh."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 import amrepair
-from amrepair.align import align
-from amrepair.errors import AlignmentError, InputError
+from amrepair.errors import InputError
 from amrepair.merge.cloud import outward, spacing_of
 from amrepair.merge.fuse import Cloud, Fused, fuse
 from amrepair.merge.joint import Slack
@@ -27,7 +26,7 @@ from amrepair.template.learned import Coverage, Tolerance
 from gcode.progress import Progress, silent
 
 if TYPE_CHECKING:
-    import trimesh
+    pass
 
 # Of one point's noise: a template that follows what is finer is larger, slower, and no truer (4
 # scans of 200,000 points, noise 30 µm: 8.8 µm off, 8.2 so).
@@ -88,7 +87,6 @@ class ScanFit:
 def fit_from_scans(
     scans: Sequence[Scan],
     *,
-    mesh: trimesh.Trimesh | None = None,
     poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
     turntable_deg: float | None = None,
     options: MergeOptions | None = None,
@@ -101,10 +99,8 @@ def fit_from_scans(
     ----------
     scans
         Noisy, overlapping, partial, each in a frame of its own; the template's frame is the first
-        scan's (of those that could be placed), or the mesh's. A part that would be smaller than a
-        millimetre is taken for one in metres, and that is said.
-    mesh
-        The nominal shape: scans are aligned to it, and it stands where no scan looked.
+        scan's (of those that could be placed). A part that would be smaller than a millimetre is
+        taken for one in metres, and that is said.
     poses
         By file name, (4, 4) common frame from scan, in the scans' unit: where to begin.
     turntable_deg
@@ -115,7 +111,7 @@ def fit_from_scans(
     InputError
         If there are too few points, or the scans' sizes tell of different units.
     AlignmentError
-        If most scans do not fit each other, or none fits the mesh.
+        If most scans do not fit each other.
     TemplateError
         If they enclose no solid.
     """
@@ -126,24 +122,20 @@ def fit_from_scans(
     for k, scan in enumerate(scans):
         progress("measure scans", float(k), float(len(scans)))
         views.append(View.of(scan, rng))
-    nominal = None if mesh is None else MeshSdf.from_mesh(mesh)
-    if nominal is None:
-        placed = place(
-            views, rng, told=poses, unit_mm=unit_mm, turntable_deg=turntable_deg,
-            options=options, progress=progress,
-        )  # fmt: skip
-    else:
-        placed = _on_mesh(scans, nominal, rng)
+    placed = place(
+        views, rng, told=poses, unit_mm=unit_mm, turntable_deg=turntable_deg,
+        options=options, progress=progress,
+    )  # fmt: skip
     progress("fuse scans", 0.0, 1.0)
     cloud = _joined(views, placed)
-    fused = fuse(cloud, behind=nominal)
+    fused = fuse(cloud)
     progress("fuse scans", 1.0, 1.0)
     weak = {k: s for k, s in placed.slacks.items() if s.sigma_mm > cloud.sigma_mm}
     outvoted = _outvoted(cloud, fused, list(placed.poses))
     notes = (
         *(["the scans are taken as metres: as millimetres the part would be smaller than one"]
           if unit_mm != 1.0 else []),
-        *_notes(scans, placed, fused, nominal),
+        *_notes(scans, placed, fused),
         *_said_outvoted(scans, fused, list(placed.poses), outvoted),
         *_said_weak(scans, weak),
     )  # fmt: skip
@@ -155,7 +147,7 @@ def fit_from_scans(
         progress=progress,
     )
     return ScanFit(
-        template=_with_tolerance(made, cloud, fused, placed, weak, nominal),
+        template=_with_tolerance(made, cloud, fused, placed, weak),
         fused=fused,
         poses=tuple(placed.poses.get(k) for k in range(len(scans))),
         sigma_mm=cloud.sigma_mm,
@@ -202,27 +194,6 @@ def _refuse(scans: Sequence[Scan]) -> None:
             )
 
 
-def _on_mesh(scans: Sequence[Scan], nominal: MeshSdf, rng: np.random.Generator) -> Placement:
-    """Each scan on the nominal shape; those that do not fit it are left out."""
-    poses: dict[int, np.ndarray] = {}
-    left_out: dict[int, str] = {}
-    squares = []
-    for k, scan in enumerate(scans):
-        try:
-            found = align(scan, nominal, rng=rng)
-        except AlignmentError as error:
-            left_out[k] = f"does not fit the mesh ({error})"
-            continue
-        poses[k] = np.array(found.template_from_scan.matrix)
-        squares.append(found.rmse_mm**2)
-    if 2 * len(left_out) >= len(scans):
-        raise AlignmentError(
-            f"{len(left_out)} of {len(scans)} scans do not fit the mesh: "
-            f"{next(iter(left_out.values()))}"
-        )
-    return Placement(poses, float(np.sqrt(np.mean(squares))), left_out)
-
-
 def _joined(views: Sequence[View], placed: Placement) -> Cloud:
     """All placed points with outward normals."""
     chosen = {k: views[k] for k in placed.poses}
@@ -261,7 +232,6 @@ def _with_tolerance(
     fused: Fused,
     placed: Placement,
     weak: Mapping[int, Slack],
-    nominal: MeshSdf | None,
 ) -> LearnedSdf:
     """The template with how far sound parts differ, and where nobody knows."""
     spread = fused.spread
@@ -272,8 +242,7 @@ def _with_tolerance(
                 own = cloud.scan == place_
                 slack_mm[own] = weak[k].across(cloud.points_mm[own], cloud.normals[own])
         spread = spread.widened(cloud, slack_mm)
-    known = nominal is not None or fused.coverage.unseen_mm2 == 0.0
-    coverage: Coverage | None = None if known else fused.coverage
+    coverage: Coverage | None = None if fused.coverage.unseen_mm2 == 0.0 else fused.coverage
     return replace(
         made,
         bias_mm=float(np.hypot(made.bias_mm, 2.0 * fused.standard_error_mm)),
@@ -294,20 +263,14 @@ def _metadata(scans: Sequence[Scan], notes: Sequence[str], seed: int) -> dict[st
     }
 
 
-def _notes(
-    scans: Sequence[Scan], placed: Placement, fused: Fused, nominal: MeshSdf | None
-) -> list[str]:
+def _notes(scans: Sequence[Scan], placed: Placement, fused: Fused) -> list[str]:
     used = len(placed.poses)
     notes = [f"{used} of {len(scans)} scans merged"]
     notes += [f"{scans[k].source} {why}, and was left out" for k, why in placed.left_out.items()]
     if fused.unseen_ratio > TOLD_SHARE:
-        whose = (
-            "is the mesh's" if nominal is not None
-            else "is closed by a guess, is unknown, and is never called missing"
-        )  # fmt: skip
         notes.append(
             f"{fused.coverage.unseen_mm2:,.0f} mm² ({fused.unseen_ratio:.1%}) of the surface was "
-            f"seen by no scan and {whose}"
+            "seen by no scan and is closed by a guess, is unknown, and is never called missing"
         )
     if used > 1 and fused.single_ratio > 0.05:
         notes.append(f"{fused.single_ratio:.0%} of the surface was seen by one scan only")

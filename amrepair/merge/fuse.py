@@ -147,15 +147,13 @@ class Fused:
     coverage: Coverage
 
 
-def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None = None) -> Fused:
+def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
     """Fuse placed scans.
 
     Parameters
     ----------
     voxel_mm
         Edge of the grid; None follows the points.
-    behind
-        The nominal shape, for what no scan saw; None closes it smoothly.
 
     Raises
     ------
@@ -167,7 +165,7 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None 
     points, normals, scan = cloud.points_mm[keep], cloud.normals[keep], cloud.scan[keep]
     radius_mm = reach_mm(cloud)
     edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
-    low, shape, nodes, index = _band(points, edge, radius_mm, behind)
+    low, shape, nodes, index = _band(points, edge, radius_mm)
     cells = Cells.of(points, radius_mm)
     field, excess, heard, overruled = kernels.fused_nodes(
         nodes, np.ascontiguousarray(points[cells.order]),
@@ -181,7 +179,7 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None, behind: MeshSdf | None 
     grid = np.full(tuple(shape), np.nan, dtype=np.float32)
     grid[tuple(index.T)] = field
     seen = np.isfinite(grid)
-    _fill(grid, seen, low, edge, (points, normals), behind)
+    _fill(grid, seen, low, edge, (points, normals))
     mesh = solid_surface(grid, low, edge)
     close = np.isfinite(field) & (np.abs(field) < edge)
     spread = _spread(cloud, excess, close, index, low, edge, shape) if cloud.scans > 1 else None
@@ -293,15 +291,12 @@ def _contradicted(cloud: Cloud) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray
 
 
 def _band(
-    points_mm: Float[np.ndarray, "n 3"], edge: float, radius_mm: float, behind: MeshSdf | None
+    points_mm: Float[np.ndarray, "n 3"], edge: float, radius_mm: float
 ) -> tuple[
     Float[np.ndarray, " 3"], Int[np.ndarray, " 3"], Float[np.ndarray, "k 3"], Int[np.ndarray, "k 3"]
 ]:
     """Grid and its nodes near the points."""
     low, high = points_mm.min(axis=0), points_mm.max(axis=0)
-    if behind is not None:
-        low = np.minimum(low, behind.bounds_mm[0])
-        high = np.maximum(high, behind.bounds_mm[1])
     low = low - 4 * edge - radius_mm
     shape = np.ceil((high + 4 * edge + radius_mm - low) / edge).astype(np.int64) + 1
     if float(np.prod(shape.astype(np.float64))) > MAX_NODES:
@@ -323,9 +318,8 @@ def _fill(
     low: Float[np.ndarray, " 3"],
     edge: float,
     oriented: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
-    behind: MeshSdf | None,
 ) -> None:
-    """Give the nodes without support a side: of their neighbours, or of the surface behind."""
+    """Give the nodes without support a side: their neighbours', or that of a smooth closure."""
     parts, count = ndimage.label(~seen)
     positive = np.zeros(count + 1)
     touching = np.zeros(count + 1)
@@ -348,11 +342,9 @@ def _fill(
     grid[~seen] = side[parts[~seen]]
     is_leaking = share[outer] < SURE and touching[outer] > 0
     doubtful = [k for k in range(1, count + 1) if not clear[k] and k != outer]
-    if behind is None and not is_leaking and not doubtful:
-        return
-    asked = np.isin(parts, [outer, *doubtful]) & ~seen if behind is None else ~seen
-    closing = behind if behind is not None else _poisson(*oriented)
-    _ask(grid, asked, closing, low, edge)
+    if is_leaking or doubtful:
+        asked = np.isin(parts, [outer, *doubtful]) & ~seen
+        _ask(grid, asked, _poisson(*oriented), low, edge)
 
 
 def _ask(

@@ -18,8 +18,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from amrepair.errors import TemplateError
-from amrepair.field.winding import Shell
 from amrepair.merge.fuse import solid_surface
+from amrepair.merge.winding import Shell
 from amrepair.template import LearnedSdf, MeshSdf, load_mesh
 from amrepair.template.fit import fit_fast
 from amrepair.template.fitting import made_from

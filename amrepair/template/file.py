@@ -117,6 +117,7 @@ def require_kind(path: Path, found: object, wanted: str) -> None:
 # What a template's file says of how it was made.
 KNOWN_METADATA = (
     "recipe", "seed", "part_sha256", "version", "notes", "settings", "steps", "scans",
+    "learned_from",
 )  # fmt: skip
 
 

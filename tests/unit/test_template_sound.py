@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from amrepair.errors import InputError
+from amrepair.merge import learn_from_scans
 from amrepair.regions import detect
 from amrepair.regions.anomaly import Label
 from amrepair.regions.options import RegionOptions
@@ -118,6 +120,35 @@ def test_prior_of_variances_is_found_again() -> None:
     found_freedom, found = _common(seen, np.full(40_000, freedom))
     assert found_freedom == pytest.approx(prior_freedom, rel=0.1)
     assert found == pytest.approx(prior, rel=0.02)
+
+
+def test_scans_in_poses_of_their_own_are_laid_first_and_a_foreign_one_is_left_out() -> None:
+    rng = np.random.default_rng(5)
+    box = trimesh.creation.box(extents=SIZE_MM)
+    box = box.difference(trimesh.creation.box(extents=(6, 6, 30)).apply_translation((12, 8, 0)))
+    scans = []
+    for seed in range(4):
+        clean = np.asarray(trimesh.sample.sample_surface(box, 30_000, seed=seed)[0])
+        if seed < 3:
+            low = clean[:, 2] < -SIZE_MM[2] / 2 + FOOT_HIGH_MM
+            side = low & (np.abs(clean[:, 1]) > SIZE_MM[1] / 2 - 1e-6)
+            clean[side, 1] += FOOT_MM * np.sign(clean[side, 1])
+        else:
+            clean *= (0.5, 1.3, 2.0)  # another part
+        turn = Rotation.random(random_state=rng).as_matrix()
+        points = clean @ turn.T + rng.uniform(-50, 50, 3) + rng.normal(0, SIGMA_MM, clean.shape)
+        scans.append(Scan(points, SIGMA_MM, "scanner", source=f"scan {seed}"))
+    fit = learn_from_scans(scans, box)
+    assert list(fit.left_out) == [3]
+    assert [pose is None for pose in fit.poses] == [False, False, False, True]
+    foot = np.array([[x, y, -7.5] for x in (-10.0, 0.0, 10.0) for y in (-15.25, 15.25)])
+    # 0.25 mm by the drawing; the foot's upper edge is blurred over the distance between sites
+    assert np.abs(fit.template.distance(foot)).max() < 0.5 * FOOT_MM
+    high = np.array([[0.0, 15.0, 4.0], [0.0, -15.0, 4.0], [-20.0, 3.0, 2.0]])
+    assert np.abs(fit.template.distance(high)).max() < 0.03
+    said = fit.as_json([scan.source for scan in scans])
+    assert [bool(row["left_out"]) for row in said["scans"]] == [False, False, False, True]
+    assert "learned from 3 of 4 scans" in fit.notes[0]
 
 
 def test_scans_that_say_nothing_are_refused(drawn: LearnedSdf) -> None:
