@@ -21,10 +21,11 @@ from scipy.stats import norm
 
 from amrepair.field import scales_kernels
 from amrepair.field.scales import FACING_COSINE, RANK, Scale
-from amrepair.field.scales_kernels import PAIR_MEDIAN
 from amrepair.regions.calibration import Calibration, Tail
 from amrepair.regions.options import RegionOptions
 
+# A quarter of the differences of two standard normal values are smaller: √2 Φ⁻¹(5/8).
+PAIR_QUARTILE = float(np.sqrt(2.0) * norm.ppf(0.625))
 # Standard error of a median, of that of a mean, for normal noise: √(π/2).
 MEDIAN_LOSS = float(np.sqrt(np.pi / 2))
 # Coordinates in files are rounded to micrometres; no error is smaller.
@@ -215,8 +216,9 @@ def _by_class(
     value: Float[np.ndarray, " n"],
     classes: int,
     options: RegionOptions,
+    share: float = 0.5,
 ) -> Float[np.ndarray, " c"]:
-    """(c,) median of a value in each class.
+    """(c,) of a value in each class, what a share of them is below: the median, unless said.
 
     Never less in one that was seen less well, nor more by a larger factor than the square of how
     much less: at an angle θ of incidence errors of real views grow with 1/cos θ to 1/cos² θ.
@@ -225,7 +227,7 @@ def _by_class(
     for k in range(classes):
         here = group == k
         if here.sum() >= options.least_cells:
-            found[k] = float(np.median(value[here]))
+            found[k] = float(np.quantile(value[here], share))
     most = found[0] * 4.0 ** (options.seen_step * np.arange(classes))
     return np.maximum.accumulate(np.minimum(found, most))
 
@@ -249,8 +251,9 @@ def _wander(
     alike = (scale.normal[one] * scale.normal[other]).sum(axis=1) > FACING_COSINE
     kept = alike & (apart_mm > 0.5 * options.far_mm)
     one, other = one[kept], other[kept]
-    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_MEDIAN
-    found = _by_class(np.maximum(group[one], group[other]), off_mm, classes, options)
+    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_QUARTILE
+    # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
+    found = _by_class(np.maximum(group[one], group[other]), off_mm, classes, options, 0.25)
     # a bent part wanders too, but no scanner does so smoothly and so far
     return found * min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
 

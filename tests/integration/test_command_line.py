@@ -333,7 +333,8 @@ def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
     placed.export(tmp_path / "placed.stl")
     job, drop, out = tmp_path / "job.gcode", tmp_path / "scans", tmp_path / "run"
     drop.mkdir()
-    assert call("slice", tmp_path / "placed.stl", "-o", job, program="gcode").returncode == 0
+    words = ["slice", tmp_path / "placed.stl", "--place", "keep", "-o", job]
+    assert call(*words, program="gcode").returncode == 0
     stop = threading.Event()
 
     def scan() -> None:
