@@ -55,6 +55,8 @@ class OccupancyOptions:
         So deep is a void that is as improbable as that nobody saw the surface over its mouth.
     hole_mm, margin_mm
         Unseen places so near to each other are one hole; space looked at around what is broken.
+    bead_mm, least_seen
+        No broken edge is thinner than a bead, and so much of it at least is seen.
     """
 
     voxel_spacings: float = 1.5
@@ -66,6 +68,8 @@ class OccupancyOptions:
     deep_mm: float = 50.0
     hole_mm: float = 1.0
     margin_mm: float = 1.5
+    bead_mm: float = 0.4
+    least_seen: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +212,8 @@ def find_occupancy(
     designed = grid.f_mm < 0
     solid = np.zeros(designed.shape, bool)
     solid[grid.number >= 0] = ~empty
-    return Occupancy(grid.low_mm, grid.voxel_mm, _as_seen(solid, designed, grid, broken), designed)
+    solid = _as_seen(solid, designed, grid, broken, spacing_mm, options)
+    return Occupancy(grid.low_mm, grid.voxel_mm, solid, designed)
 
 
 def _is_seen(
@@ -437,18 +442,34 @@ def _as_seen(
     designed: Bool[np.ndarray, "x y z"],
     grid: _Grid,
     broken: Broken,
+    spacing_mm: float,
+    options: OccupancyOptions,
 ) -> Bool[np.ndarray, "x y z"]:
-    """The same, but as designed where nothing that is broken touches what differs."""
+    """The same, but as designed where too little that is broken bounds what differs.
+
+    What hides a part of the surface hides all of it at once, so that no number of unseen places is
+    evidence of a void. A void that takes an area M of the template's surface has a broken edge: if
+    it goes right through, around M/2, at least as long as a circle's and a bead thick.
+    """
     found = solid.copy()
     index, ok = _cells(broken.place_mm, grid.low_mm, grid.voxel_mm, solid.shape)
-    touched = np.zeros(solid.shape, bool)
-    touched[tuple(index[ok].T)] = True
-    touched = ndimage.binary_dilation(touched)
+    at = tuple(index[ok].T)
+    cross = ndimage.generate_binary_structure(3, 1)
     for differs in (designed & ~solid, solid & ~designed):
         groups, count = ndimage.label(differs)
-        kept = np.zeros(count + 1, bool)
-        kept[groups[touched]] = True
-        alone = differs & ~kept[groups]
+        # a broken place lies in what differs or in a voxel beside it
+        beside = ndimage.grey_dilation(groups, footprint=cross)
+        broken_mm2 = np.bincount(beside[at], minlength=count + 1) * spacing_mm**2
+        least_mm2 = np.zeros(count + 1)
+        if differs[designed].any():
+            mouth = np.zeros(solid.shape, np.int64)
+            for axis in range(3):
+                for way in (1, -1):
+                    mouth += ~np.roll(designed, way, axis=axis)
+            mouth_mm2 = np.bincount(groups[differs], mouth[differs], count + 1) * grid.voxel_mm**2
+            around_mm = 2.0 * np.sqrt(np.pi * 0.5 * mouth_mm2)
+            least_mm2 = options.least_seen * options.bead_mm * around_mm
+        alone = differs & ~((broken_mm2 > 0) & (broken_mm2 >= least_mm2))[groups]
         found[alone] = designed[alone]
     return found
 

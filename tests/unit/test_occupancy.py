@@ -163,3 +163,27 @@ def test_a_cut_in_a_bare_view_with_a_silhouette_is_measured() -> None:
     deficit = compute_deficit(scan, BRACKET_TEMPLATE, build_from_template=PLACED)
     assert deficit.missing_mm3 == pytest.approx(gone.volume(), rel=0.15)
     assert (deficit.missing ^ gone).volume() > 0.85 * gone.volume()
+
+
+def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
+    """Regression: a dozen stray points, and half a plate that nobody saw was 7,131 mm³ missing."""
+    size = np.array([80.0, 60.0, 4.0])
+    plate = MeshSdf.from_mesh(trimesh.creation.box(extents=size))
+    rng = np.random.default_rng(0)
+    top = np.column_stack([rng.uniform(-0.5, 0.5, (9_600, 2)) * size[:2], np.full(9_600, 2.0)])
+    seen = top[top[:, 0] < 12.0]
+    strays = np.column_stack([rng.uniform(24, 26, 12), rng.uniform(-1, 1, 12), np.zeros(12)])
+    broken = Broken(strays, np.tile([0.0, 0.0, 1.0], (12, 1)), plate.distance(strays))
+    emptied_mm3 = []
+    for least_seen in (0.0, OccupancyOptions().least_seen):
+        found = find_occupancy(
+            plate,
+            broken,
+            seen,
+            plate.surface_points(0.7),
+            spacing_mm=0.7,
+            options=OccupancyOptions(least_seen=least_seen),
+        )
+        emptied_mm3.append(float((found.designed & ~found.solid).sum()) * found.voxel_mm**3)
+    assert emptied_mm3[0] > 5_000.0  # what the labels alone would say
+    assert emptied_mm3[1] == 0.0
