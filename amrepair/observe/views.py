@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.observe.basis import NuisanceOptions
+from amrepair.observe.robust import MAD_TO_SIGMA
 
-MAD_TO_SIGMA = 1.4826  # of a Gaussian
 LEAST_PLACES = 30  # that a view shares with others: fewer tell nothing of it
 # Two views contradict each other alike, within so much: the template says which of them is off.
 ALIKE = 1.1

@@ -23,10 +23,12 @@ from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import RangeImage, clearances, range_images
-from amrepair.observe.views import MAD_TO_SIGMA, Contradiction, contradictions
+from amrepair.observe.robust import MAD_TO_SIGMA
+from amrepair.observe.views import Contradiction, contradictions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
+from amrepair.template.learned import TOLERATED_SPREADS
 from amrepair.template.port import Template
 
 # Of places in the template's frame and their deviations: a length for each.
@@ -35,8 +37,6 @@ RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[
 ByView = tuple[
     Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, " k"], Int[np.ndarray, " k"]
 ]
-# Normal parts lie within three standard deviations of what they differ by.
-TOLERATED_SPREADS = 3.0
 # A template point is present where scanned surface lies within so many cells of it.
 PRESENT_CELLS = 1.8
 

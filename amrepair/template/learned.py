@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     import trimesh
 
 KIND = "grid"
+# Sound parts lie within three standard deviations of what they differ by.
+TOLERATED_SPREADS = 3.0
 MOST_COVER_CELLS = 200  # of what is known, along the longest side: 8 MB
 _ARRAYS = ("base", "cells", "blocks", "vertices_mm", "faces")
 

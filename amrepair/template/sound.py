@@ -25,11 +25,10 @@ from scipy.stats import norm, t
 
 from amrepair.errors import InputError
 from amrepair.frames import unit_vectors
-from amrepair.template.learned import Grid, LearnedSdf, Tolerance
+from amrepair.template.learned import TOLERATED_SPREADS, Grid, LearnedSdf, Tolerance
 
 BESIDE = [1, 2, 3, 4, 5]  # a site and its four neighbours, nearest first
 NORMAL_MAD = 0.6745  # median absolute deviation of a standard normal
-TOLERATED_SPREADS = 3.0  # what is within three standard deviations of sound parts is sound
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,8 +77,8 @@ class Head:
         self._area_mm2 = filament_area_mm2(setup.printer.filament_diameter_mm)
         self._section_mm2 = 0.5 * setup.printer.max_bead_section_mm2
         self._flow_mm3_s = min(PRIME_MM3_S, setup.max_volumetric_mm3_s)
-        self._travel = f" F{_feed(setup.printer.travel_speed_mm_s)}"
-        self._z_feed = f" F{_feed(setup.printer.z_speed_mm_s)}"
+        self._travel = f" F{feed(setup.printer.travel_speed_mm_s)}"
+        self._z_feed = f" F{feed(setup.printer.z_speed_mm_s)}"
 
     @property
     def prime_length_mm(self) -> float:
@@ -115,7 +115,7 @@ class Head:
             f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}",
             f"G1 Z{number(self._printer.prime_mm[2], 3)}{self._z_feed}",
             f"G1 X{number(x + dx * length_mm, 3)} Y{number(y + dy * length_mm, 3)}"
-            f" E{number(e_mm, 5)} F{_feed(self._flow_mm3_s / self._section_mm2)}",
+            f" E{number(e_mm, 5)} F{feed(self._flow_mm3_s / self._section_mm2)}",
         ]
         self._leave()
 
@@ -125,7 +125,7 @@ class Head:
         speed_mm_s = self._flow_mm3_s / self._area_mm2
         self.lines += [
             f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}",
-            f"G1 E{number(e_mm, 5)} F{_feed(speed_mm_s)}",
+            f"G1 E{number(e_mm, 5)} F{feed(speed_mm_s)}",
         ]
         self._leave()
 
@@ -135,8 +135,8 @@ class Head:
 
     def _filament(self, length_mm: float) -> None:
         if abs(length_mm) >= 5e-6:
-            feed = _feed(self._printer.retraction_speed_mm_s)
-            self.lines.append(f"G1 E{number(length_mm, 5)} F{feed}")
+            speed = feed(self._printer.retraction_speed_mm_s)
+            self.lines.append(f"G1 E{number(length_mm, 5)} F{speed}")
 
     def come_down(self, pulled_mm: float) -> None:
         """Over everything, then straight down, the filament as the job had it."""
@@ -164,5 +164,6 @@ class Head:
             self.lines.append("G20")
 
 
-def _feed(speed_mm_s: float) -> str:
+def feed(speed_mm_s: float) -> str:
+    """A speed as F has it, mm/min, never 0."""
     return number(max(1.0, mm_min_from_mm_s(speed_mm_s)), 0)

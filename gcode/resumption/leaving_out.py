@@ -17,7 +17,7 @@ from gcode.errors import InputError
 from gcode.moves import ModalState
 from gcode.profiles import PrinterProfile
 from gcode.reader import Job, JobObjects, objects_of
-from gcode.units import mm_min_from_mm_s
+from gcode.resumption.head import feed
 
 _MOVE = re.compile(r"^\s*[Gg]0*[0123](?!\d)")
 LEAST_MM = 5e-4
@@ -80,10 +80,10 @@ def _gaps(job: Job, objects: JobObjects, index: int, first: int) -> Sequence[tup
 def _across(job: Job, start: int, stop: int, printer: PrinterProfile) -> list[str]:
     """From the state before a gap to that after it."""
     before, after = job.state_after(start), job.state_after(stop)
-    travel = f" F{_feed(printer.travel_speed_mm_s)}"
+    travel = f" F{feed(printer.travel_speed_mm_s)}"
     x, y, z = after.position_mm
     over = [f"G1 X{number(x, 5)} Y{number(y, 5)}{travel}"]
-    lift = [f"G1 Z{number(z, 5)} F{_feed(printer.z_speed_mm_s)}"]
+    lift = [f"G1 Z{number(z, 5)} F{feed(printer.z_speed_mm_s)}"]
     moves = [*lift, *over] if z > before.position_mm[2] else [*over, *lift]
     return ["G90", "M83", *_filament(job, start, stop, printer), *moves, *_modes(after)]
 
@@ -94,7 +94,7 @@ def _filament(job: Job, start: int, stop: int, printer: PrinterProfile) -> list[
     more_mm = _pulled_back(pushed_mm[:stop]) - _pulled_back(pushed_mm[:start])
     if abs(more_mm) < LEAST_MM:
         return []
-    return [f"G1 E{number(-more_mm, 5)} F{_feed(printer.retraction_speed_mm_s)}"]
+    return [f"G1 E{number(-more_mm, 5)} F{feed(printer.retraction_speed_mm_s)}"]
 
 
 def _pulled_back(pushed_mm: np.ndarray) -> float:
@@ -106,11 +106,7 @@ def _pulled_back(pushed_mm: np.ndarray) -> float:
 def _modes(after: ModalState) -> list[str]:
     said = [f"G92 E{number(after.e_mm, 5)}"]
     if after.feed_mm_s > 0:
-        said.append(f"G1 F{_feed(after.feed_mm_s)}")
+        said.append(f"G1 F{feed(after.feed_mm_s)}")
     if not after.absolute_xyz:
         said.append("G91")
     return [*said, "M82" if after.absolute_e else "M83"]
-
-
-def _feed(speed_mm_s: float) -> str:
-    return number(max(1.0, mm_min_from_mm_s(speed_mm_s)), 0)
