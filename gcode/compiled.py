@@ -5,6 +5,11 @@ two kinds of arrays at the same moment take the same number, and either then loa
 compiled, with wrong results and no error. Here every process names its files itself. And a kernel
 is compiled again when any of the kernels has changed: it may have another one's code in its own.
 
+A kernel that may add up in any order (`fastmath`) and is called by another is inlined there
+(`inline="always"`). Else the process that compiles both uses the code that stands alone, and a
+process that loads the caller from disk the caller's copy, which adds up in another order: the same
+scan, judged twice, differed in its fourteenth digit.
+
 Threads are OpenMP's, and sleep while they wait. Where numba finds a TBB it takes that first, whose
 threads spin: beside one other busy process an alignment took six times as long, and a process that
 was done did not end for minutes.

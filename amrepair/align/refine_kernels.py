@@ -24,7 +24,7 @@ DAMPING = 1e-9
 GO_ON, CONVERGED, ENOUGH = 0, 1, 2  # how a step may end
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(turned, f, gradient, scale, outside):
     """(6, 6) JᵀWJ and (6,) JᵀWf of the Geman–McClure loss; rotations about the points' origin.
 

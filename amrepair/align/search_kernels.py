@@ -45,7 +45,7 @@ def _trimmed(along, trim, ends):
     ends[0], ends[1] = low[trim], high[trim]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _at_nodes(turned, px, py, pz, values, shape, cap):
     """Sum of |f|, each up to the cap, at the nodes nearest to the points moved by p.
 
@@ -64,7 +64,7 @@ def _at_nodes(turned, px, py, pz, values, shape, cap):
     return total
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath=True)
 def starts(points, rotations, box, values, shape, cap, gap, most):
     """(k, most, 3) the places that fit best, box in box: from side on side to side on side.
 
@@ -139,7 +139,7 @@ def field_at(x, y, z, values, nx, ny, nz):
     return front + (back - front) * u + away, gx, gy, gz
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _between_nodes(points, r, p, values, shape, cap):
     """Sum of |f|, each up to the cap."""
     most, total = np.float32(cap), np.float32(0.0)
@@ -157,7 +157,7 @@ def _between_nodes(points, r, p, values, shape, cap):
     return total
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath=True)
 def misfits(points, rotations, places, values, shape, cap):
     """(k,) the mean of |f|, each up to the cap, in every pose."""
     found = np.empty(len(rotations))
@@ -167,7 +167,7 @@ def misfits(points, rotations, places, values, shape, cap):
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _accumulate(points, r, p, values, shape, scale, cap, h, b):
     """Normal equations of the Geman–McClure loss at a pose, and the sum of |f| up to the cap."""
     square, most, total = np.float32(scale * scale), np.float32(cap), np.float32(0.0)
@@ -210,7 +210,7 @@ def _accumulate(points, r, p, values, shape, scale, cap, h, b):
     return total
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath=True)
 def descend(points, rotations, places, values, shape, scales, cap):
     """Move every pose downhill, one Gauss–Newton step for each scale; in place.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 from pathlib import Path
 from typing import Any
@@ -83,3 +84,38 @@ def test_threads_are_those_that_sleep_while_they_wait() -> None:
     signs_kernels.spread(size, np.ones(size.shape, dtype=np.int8), 0.5)
     assert numba.threading_layer() == "omp"
     assert os.environ["OMP_WAIT_POLICY"] == "passive"
+
+
+def test_sums_in_any_order_have_one_machine_code() -> None:
+    """A `fastmath` kernel that another one calls is inlined there.
+
+    Otherwise the process that compiles it has it twice, alone and within its caller, each adding
+    up in an order of its own; it uses the first, and whoever loads the caller from disk the second.
+    """
+    root = Path(compiled.__file__).parents[1]
+    files = [
+        file for room in ("amrepair", "gcode") for file in (root / room).rglob("*.py")
+        if "njit" in file.read_text()
+    ]  # fmt: skip
+    trees = [ast.parse(file.read_text()) for file in files]
+    assert len(trees) > 30
+    called: set[str] = set()
+    reordering: set[str] = set()
+    for function in (n for tree in trees for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)):
+        options = {
+            word.arg: ast.literal_eval(word.value)
+            for decorator in function.decorator_list
+            if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) == "njit"
+            for word in decorator.keywords
+        }
+        if not options:
+            continue
+        called |= {
+            ast.unparse(n.func).rsplit(".")[-1]
+            for n in ast.walk(function)
+            if isinstance(n, ast.Call)
+        }
+        if options.get("fastmath") and options.get("inline") != "always":
+            reordering.add(function.name)
+    assert reordering, "the kernels of the search"
+    assert not reordering & called
