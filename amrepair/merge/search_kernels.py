@@ -16,7 +16,7 @@ BEHIND = 2.0  # scales: deeper behind the other's surface nothing pulls
 PULL = 0.5  # of surface that lies behind, beside what lies in free space
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _row(x, y, z, gx, gy, gz, f, weight, h, b, j):
     """One equation: f at a place (x, y, z) about the turn's centre, and its gradient there."""
     j[0], j[1], j[2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
@@ -28,7 +28,7 @@ def _row(x, y, z, gx, gy, gz, f, weight, h, b, j):
             h[i, k] += w * j[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _weight(f, scale, along):
     """Of an equation: Geman–McClure; none where hidden surface faces another way or lies deep."""
     if f <= 0.0 and (f < -BEHIND * scale or along < FACING):
@@ -37,7 +37,7 @@ def _weight(f, scale, along):
     return w * w if f > 0.0 else PULL * w * w
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _both(points, normals, others, other_normals, field, other_field, cells, r, p, scale, cap, h,
           b, j):  # fmt: skip
     """Equations of both views at a pose; mean of what is in free space, and of what agrees.
@@ -92,7 +92,7 @@ def _both(points, normals, others, other_normals, field, other_field, cells, r, 
     return free / cap / count, agreed / count
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath=True)
 def reconcile(points, normals, others, other_normals, field, other_field, cells, rotations, places,
               scales, cap, reach):  # fmt: skip
     """Move every pose downhill, one Gauss–Newton step for each scale; in place.
