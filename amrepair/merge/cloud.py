@@ -45,6 +45,11 @@ class Cells:
     order: Int[np.ndarray, " n"]
     start: Int[np.ndarray, " cells1"]
 
+    @property
+    def grid(self) -> kernels.Grid:
+        """As the kernels take them."""
+        return kernels.Grid(self.low_mm, self.cell_mm, self.shape, self.start)
+
     @classmethod
     def of(cls, points_mm: Float[np.ndarray, "n 3"], cell_mm: float) -> Cells:
         """Sort points; two empty layers of cells lie around them."""
@@ -106,9 +111,7 @@ def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
 def _planes(points_mm: Float[np.ndarray, "n 3"], radius_mm: float) -> Planes:
     cells = Cells.of(points_mm, radius_mm)
     ordered = np.ascontiguousarray(points_mm[cells.order])
-    found, least, count = kernels.local_planes(
-        ordered, cells.low_mm, cells.cell_mm, cells.shape, cells.start, radius_mm
-    )
+    found, least, count = kernels.local_planes(ordered, cells.grid, radius_mm)
     normals, variance = np.empty_like(found), np.empty(len(found))
     normals[cells.order], variance[cells.order] = found, least
     enough = count >= 8

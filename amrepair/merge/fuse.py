@@ -170,9 +170,11 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
     field, excess, heard, overruled = kernels.fused_nodes(
         nodes, np.ascontiguousarray(points[cells.order]),
         np.ascontiguousarray(normals[cells.order]), np.ascontiguousarray(scan[cells.order]),
-        cloud.scans, cells.low_mm, cells.cell_mm, cells.shape, cells.start, radius_mm,
-        max(cloud.sigma_mm, 1e-4 * cloud.spacing_mm), ROUNDS, LEAST_POINTS, OUTLIER_SIGMAS,
-        OUTLIER_SPACINGS * cloud.spacing_mm,
+        cloud.scans, cells.grid,
+        kernels.Rules(
+            radius_mm, max(cloud.sigma_mm, 1e-4 * cloud.spacing_mm), ROUNDS, LEAST_POINTS,
+            OUTLIER_SIGMAS, OUTLIER_SPACINGS * cloud.spacing_mm,
+        ),
     )  # fmt: skip
     # a plane fitted to points far below says little about a node high above them
     field[np.abs(field) > 1.01 * radius_mm] = np.nan

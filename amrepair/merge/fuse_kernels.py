@@ -7,7 +7,10 @@ Points are sorted by cell; `start[c]` is the first of cell c, cells are numbered
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float, Int
 
 from amrepair.eigen_kernels import least_axis
 from gcode.compiled import njit, prange
@@ -19,9 +22,30 @@ NOISE_FACTOR = 2.0
 LAST_BIT = 62
 
 
+class Grid(NamedTuple):
+    """Cells that points are sorted by: corner, edge, how many, and where each one's begin."""
+
+    low: Float[np.ndarray, " 3"]
+    cell: float
+    shape: Int[np.ndarray, " 3"]
+    start: Int[np.ndarray, " cells1"]
+
+
+class Rules(NamedTuple):
+    """Of a fit: its radius, the noise, its rounds, the least points, and who is overruled, mm."""
+
+    radius: float
+    sigma: float
+    rounds: int
+    least_points: int
+    outlier_sigmas: float
+    outlier_mm: float
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def local_planes(points, low, cell, shape, start, radius):
+def local_planes(points, grid, radius):
     """(n, 3) unit normals of planes through the points within `radius`, (n,) least variances."""
+    low, cell, shape, start = grid
     n = len(points)
     normals = np.zeros((n, 3))
     least = np.zeros(n)
@@ -164,11 +188,135 @@ def _median(values, n):
     return values[half] if n % 2 else 0.5 * (values[half - 1] + values[half])
 
 
+@njit(cache=True, nogil=True)
+def _gathered(place, points, normals, grid, radius, near, weight, height):
+    """Points within a radius of a place: how many; their numbers, weights and signed heights."""
+    ix = int(np.floor((place[0] - grid.low[0]) / grid.cell))
+    iy = int(np.floor((place[1] - grid.low[1]) / grid.cell))
+    iz = int(np.floor((place[2] - grid.low[2]) / grid.cell))
+    shape, limit, m = grid.shape, radius * radius, 0
+    if min(ix, iy, iz) < 1 or ix > shape[0] - 2 or iy > shape[1] - 2 or iz > shape[2] - 2:
+        return 0
+    for cx in range(ix - 1, ix + 2):
+        for cy in range(iy - 1, iy + 2):
+            first = (cx * shape[1] + cy) * shape[2] + iz - 1
+            for q in range(grid.start[first], grid.start[first + 3]):
+                x, y, z = place[0] - points[q, 0], place[1] - points[q, 1], place[2] - points[q, 2]
+                d = x * x + y * y + z * z
+                if d < limit and m < MAX_NEAR:
+                    near[m] = q
+                    weight[m] = (1.0 - d / limit) ** 4
+                    height[m] = x * normals[q, 0] + y * normals[q, 1] + z * normals[q, 2]
+                    m += 1
+    return m
+
+
+@njit(cache=True, nogil=True)
+def _each_alone(scan, weight, height, sigma, value, noise):
+    """Mean height of each scan and its standard deviation, in place; NaN of fewer than 3 points.
+
+    The deviation is of the scan's own scatter: at edges that is more than noise.
+    """
+    scans = len(value)
+    total, number = np.zeros(scans), np.zeros(scans, np.int64)
+    value[:], noise[:] = 0.0, 0.0
+    for j in range(len(scan)):
+        s = scan[j]
+        total[s] += weight[j]
+        value[s] += weight[j] * height[j]
+        number[s] += 1
+    for s in range(scans):
+        value[s] = value[s] / total[s] if number[s] >= 3 else np.nan
+    for j in range(len(scan)):
+        s = scan[j]
+        off = height[j] - value[s]
+        noise[s] += weight[j] * weight[j] * (off * off + sigma * sigma)
+    for s in range(scans):
+        noise[s] = np.sqrt(noise[s]) / total[s] if number[s] >= 3 else np.nan
+
+
+@njit(cache=True, nogil=True)
+def _overruled(value, noise, rules, banned):
+    """Scans that differ from the median of all, in `banned`; how many were heard; the variance.
+
+    That between the others, less what their noise makes; NaN where one alone is left.
+    """
+    scans, who = len(value), 0
+    said = np.empty(scans)
+    for s in range(scans):
+        if not np.isnan(value[s]):
+            said[who] = value[s]
+            who += 1
+    if who < 2:
+        return who, np.nan
+    middle = _median(said, who)
+    for s in range(who):
+        said[s] = abs(said[s] - middle)
+    scale = 1.4826 * _median(said, who)
+    kept, mean, variance = 0, 0.0, 0.0
+    for s in range(scans):
+        bound = max(rules.outlier_sigmas * max(scale, noise[s]), rules.outlier_mm)
+        banned[s] = who >= 3 and abs(value[s] - middle) > bound
+        kept += not (np.isnan(value[s]) or banned[s])
+    if kept < 2:
+        return who, np.nan
+    for s in range(scans):
+        if not (np.isnan(value[s]) or banned[s]):
+            mean += value[s] / kept
+    for s in range(scans):
+        if not (np.isnan(value[s]) or banned[s]):
+            chance = NOISE_FACTOR * noise[s] ** 2 * (kept - 1) / kept
+            variance += (value[s] - mean) ** 2 - chance
+    return who, variance / (kept - 1)
+
+
+@njit(cache=True, nogil=True)
+def _together(near, weight, height, normals, radius, rounds):
+    """Robust implicit moving least squares, which keep edges (Öztireli 2009)."""
+    f = gx = gy = gz = 0.0
+    for turn in range(rounds):
+        top = bottom = ax = ay = az = 0.0
+        for j in range(len(near)):
+            q, w = near[j], weight[j]
+            if turn > 0:
+                off = (height[j] - f) / (0.5 * radius)
+                x, y, z = normals[q, 0] - gx, normals[q, 1] - gy, normals[q, 2] - gz
+                w *= np.exp(-off * off - (x * x + y * y + z * z) / 0.25)
+            top += w * height[j]
+            bottom += w
+            ax, ay, az = ax + w * normals[q, 0], ay + w * normals[q, 1], az + w * normals[q, 2]
+        if bottom < 1e-12:
+            break
+        f = top / bottom
+        norm = max(np.sqrt(ax * ax + ay * ay + az * az), 1e-12)
+        gx, gy, gz = ax / norm, ay / norm, az / norm
+    return f
+
+
+@njit(cache=True, nogil=True)
+def _at_node(place, points, normals, scan, scans, grid, rules):
+    """Of one node, what `fused_nodes` returns."""
+    near, weight, height = np.empty(MAX_NEAR, np.int64), np.empty(MAX_NEAR), np.empty(MAX_NEAR)
+    m = _gathered(place, points, normals, grid, rules.radius, near, weight, height)
+    if m < rules.least_points:
+        return np.nan, np.nan, 0, np.int64(0)
+    near, weight, height = near[:m], weight[:m], height[:m]
+    whose = scan[near]
+    value, noise, banned = np.empty(scans), np.empty(scans), np.zeros(scans, np.bool_)
+    _each_alone(whose, weight, height, rules.sigma, value, noise)
+    heard, excess = _overruled(value, noise, rules, banned)
+    bits = np.int64(0)
+    for s in range(scans):
+        if banned[s]:
+            bits |= np.int64(1) << min(s, LAST_BIT)
+    for j in range(m):
+        if banned[whose[j]]:
+            weight[j] = 0.0
+    return _together(near, weight, height, normals, rules.radius, rules.rounds), excess, heard, bits
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def fused_nodes(
-    nodes, points, normals, scan, scans, low, cell, shape, start, radius, sigma, rounds,
-    least_points, outlier_sigmas, outlier_mm,
-):  # fmt: skip
+def fused_nodes(nodes, points, normals, scan, scans, grid, rules):
     """Signed distance at nodes by robust moving least squares, and how far scans disagree.
 
     Returns (n,) f (NaN without support), (n,) variance between scans less what their noise makes
@@ -176,128 +324,10 @@ def fused_nodes(
     scans that were overruled, a bit for each (the last bit for all beyond it).
     """
     n = len(nodes)
-    field = np.full(n, np.nan)
-    excess = np.full(n, np.nan)
-    heard = np.zeros(n, np.int64)
-    overruled = np.zeros(n, np.int64)
-    limit = radius * radius
+    field, excess = np.empty(n), np.empty(n)
+    heard, overruled = np.empty(n, np.int64), np.empty(n, np.int64)
     for k in prange(n):
-        ix = int(np.floor((nodes[k, 0] - low[0]) / cell))
-        iy = int(np.floor((nodes[k, 1] - low[1]) / cell))
-        iz = int(np.floor((nodes[k, 2] - low[2]) / cell))
-        if (
-            ix < 1
-            or iy < 1
-            or iz < 1
-            or ix > shape[0] - 2
-            or iy > shape[1] - 2
-            or iz > shape[2] - 2
-        ):
-            continue
-        near = np.empty(MAX_NEAR, np.int64)
-        weight = np.empty(MAX_NEAR)
-        height = np.empty(MAX_NEAR)
-        m = 0
-        for cx in range(ix - 1, ix + 2):
-            for cy in range(iy - 1, iy + 2):
-                first = (cx * shape[1] + cy) * shape[2] + iz - 1
-                for q in range(start[first], start[first + 3]):
-                    x = nodes[k, 0] - points[q, 0]
-                    y = nodes[k, 1] - points[q, 1]
-                    z = nodes[k, 2] - points[q, 2]
-                    d = x * x + y * y + z * z
-                    if d < limit and m < MAX_NEAR:
-                        near[m] = q
-                        weight[m] = (1.0 - d / limit) ** 4
-                        height[m] = x * normals[q, 0] + y * normals[q, 1] + z * normals[q, 2]
-                        m += 1
-        if m < least_points:
-            continue
-        # what each scan says alone
-        total = np.zeros(scans)
-        square = np.zeros(scans)
-        value = np.zeros(scans)
-        number = np.zeros(scans, np.int64)
-        for j in range(m):
-            s = scan[near[j]]
-            total[s] += weight[j]
-            value[s] += weight[j] * height[j]
-            number[s] += 1
-        said = np.empty(scans)
-        who = 0
-        for s in range(scans):
-            if number[s] >= 3:
-                value[s] /= total[s]
-                said[who] = value[s]
-                who += 1
-        # variance of each scan's mean, from its own scatter: at edges more than noise
-        for j in range(m):
-            s = scan[near[j]]
-            off = height[j] - value[s]
-            square[s] += weight[j] * weight[j] * (off * off + sigma * sigma)
-        for s in range(scans):
-            if number[s] >= 3:
-                square[s] = np.sqrt(square[s]) / total[s]
-        heard[k] = who
-        banned = np.zeros(scans, np.bool_)
-        if who >= 2:
-            middle = _median(said, who)
-            for s in range(who):
-                said[s] = abs(said[s] - middle)
-            scale = 1.4826 * _median(said, who)
-            kept = 0
-            for s in range(scans):
-                if number[s] < 3:
-                    continue
-                noise = square[s]
-                bound = max(outlier_sigmas * max(scale, noise), outlier_mm)
-                if who >= 3 and abs(value[s] - middle) > bound:
-                    banned[s] = True
-                else:
-                    kept += 1
-            for s in range(scans):
-                if banned[s]:
-                    overruled[k] |= np.int64(1) << min(s, LAST_BIT)
-            if kept >= 2:
-                mean = 0.0
-                for s in range(scans):
-                    if number[s] >= 3 and not banned[s]:
-                        mean += value[s] / kept
-                variance = 0.0
-                for s in range(scans):
-                    if number[s] >= 3 and not banned[s]:
-                        noise = square[s]
-                        variance += (value[s] - mean) ** 2 - NOISE_FACTOR * noise**2 * (
-                            kept - 1
-                        ) / kept
-                excess[k] = variance / (kept - 1)
-        # together: robust implicit moving least squares, which keeps edges (Öztireli 2009)
-        f = 0.0
-        gx = gy = gz = 0.0
-        for turn in range(rounds):
-            top = 0.0
-            bottom = 0.0
-            ax = ay = az = 0.0
-            for j in range(m):
-                q = near[j]
-                if banned[scan[q]]:
-                    continue
-                w = weight[j]
-                if turn > 0:
-                    off = (height[j] - f) / (0.5 * radius)
-                    x = normals[q, 0] - gx
-                    y = normals[q, 1] - gy
-                    z = normals[q, 2] - gz
-                    w *= np.exp(-off * off - (x * x + y * y + z * z) / 0.25)
-                top += w * height[j]
-                bottom += w
-                ax += w * normals[q, 0]
-                ay += w * normals[q, 1]
-                az += w * normals[q, 2]
-            if bottom < 1e-12:
-                break
-            f = top / bottom
-            norm = max(np.sqrt(ax * ax + ay * ay + az * az), 1e-12)
-            gx, gy, gz = ax / norm, ay / norm, az / norm
-        field[k] = f
+        field[k], excess[k], heard[k], overruled[k] = _at_node(
+            nodes[k], points, normals, scan, scans, grid, rules
+        )
     return field, excess, heard, overruled

@@ -174,7 +174,7 @@ def _search(
         own = _sample(first, space, step.points, rng)
         others = _sample(second, other, step.points, rng)
         scores = kernels.reconcile(
-            *own, *others, space.field, other.field, CELLS, rotations, places,
+            kernels.Pair(*own, *others, space.field, other.field, CELLS), rotations, places,
             np.geomspace(step.first, step.last, step.steps) * size, CAP * size, 0.5 * size,
         )  # fmt: skip
         order = np.argsort(free_counts * scores[:, 0] - scores[:, 1], kind="stable")

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float
 
 from amrepair.align.pose_kernels import step_down
 from amrepair.align.search_kernels import field_at
@@ -16,9 +19,22 @@ BEHIND = 2.0  # scales: deeper behind the other's surface nothing pulls
 PULL = 0.5  # of surface that lies behind, beside what lies in free space
 
 
+class Pair(NamedTuple):
+    """Two views, in cells about their grids' middle: points, normals and field of each."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    others: Float[np.ndarray, "m 3"]
+    other_normals: Float[np.ndarray, "m 3"]
+    field: Float[np.ndarray, " k"]
+    other_field: Float[np.ndarray, " k"]
+    cells: int
+
+
 @njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _row(x, y, z, gx, gy, gz, f, weight, h, b, j):
-    """One equation: f at a place (x, y, z) about the turn's centre, and its gradient there."""
+def _row(place, gradient, f, weight, h, b, j):
+    """One equation: f at a place about the turn's centre, and its gradient there."""
+    (x, y, z), (gx, gy, gz) = place, gradient
     j[0], j[1], j[2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
     j[3], j[4], j[5] = gx, gy, gz
     for i in range(6):
@@ -38,12 +54,12 @@ def _weight(f, scale, along):
 
 
 @njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _both(points, normals, others, other_normals, field, other_field, cells, r, p, scale, cap, h,
-          b, j):  # fmt: skip
+def _both(pair, r, p, scale, cap, h, b, j):
     """Equations of both views at a pose; mean of what is in free space, and of what agrees.
 
-    Points in cells about the grids' middle; `others` move by (r, p) into the frame of `points`.
+    The other view's points move by (r, p) into the frame of the first one's.
     """
+    points, normals, others, other_normals, field, other_field, cells = pair
     n, c = np.float32(cells), np.float32(0.5 * (cells - 1))
     for i in range(6):
         b[i] = 0.0
@@ -68,7 +84,7 @@ def _both(points, normals, others, other_normals, field, other_field, cells, r, 
             agreed += 1.0 - abs(f) / scale
         weight = _weight(float(f), scale, along)
         if weight > 0.0:
-            _row(x, y, z, float(gx), float(gy), float(gz), float(f), weight, h, b, j)
+            _row((x, y, z), (float(gx), float(gy), float(gz)), float(f), weight, h, b, j)
     for q in range(points.shape[0]):
         # in the other's frame, where the other is at rest
         u, v, w = points[q, 0] - p[0], points[q, 1] - p[1], points[q, 2] - p[2]
@@ -87,14 +103,13 @@ def _both(points, normals, others, other_normals, field, other_field, cells, r, 
             agreed += 1.0 - abs(f) / scale
         weight = _weight(float(f), scale, along)
         if weight > 0.0:
-            _row(u, v, w, -gx, -gy, -gz, float(f), weight, h, b, j)
+            _row((u, v, w), (-gx, -gy, -gz), float(f), weight, h, b, j)
     count = points.shape[0] + others.shape[0]
     return free / cap / count, agreed / count
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath=True)
-def reconcile(points, normals, others, other_normals, field, other_field, cells, rotations, places,
-              scales, cap, reach):  # fmt: skip
+def reconcile(pair, rotations, places, scales, cap, reach):
     """Move every pose downhill, one Gauss–Newton step for each scale; in place.
 
     Returns (k, 2) the mean of what stands in free space, up to the cap and as its share, and of
@@ -105,11 +120,7 @@ def reconcile(points, normals, others, other_normals, field, other_field, cells,
         r, p = rotations[k], places[k]
         h, b, j = np.empty((6, 6)), np.empty(6), np.empty(6)
         for step in range(len(scales)):
-            _both(points, normals, others, other_normals, field, other_field, cells, r, p,
-                  scales[step], cap, h, b, j)  # fmt: skip
+            _both(pair, r, p, scales[step], cap, h, b, j)
             step_down(r, p, h, b, DAMPING, 1e-9, WIDEST_TURN_RAD, reach)
-        scores[k, 0], scores[k, 1] = _both(
-            points, normals, others, other_normals, field, other_field, cells, r, p, scales[-1],
-            cap, h, b, j,
-        )  # fmt: skip
+        scores[k, 0], scores[k, 1] = _both(pair, r, p, scales[-1], cap, h, b, j)
     return scores

@@ -58,22 +58,15 @@ class Look:
 
     Attributes
     ----------
-    sensor_mm
-        (3,) where it stood; of a sheet of light that moved along, the middle of its way.
-    axes
-        (3, 3) rows: across, down, along; of a sheet, `down` is its way.
-    sheet
-        1 where rays do not spread along `down`: they run within the sheet; else 0.
+    camera
+        Its sensor; of a sheet of light that moved along, the middle of its way.
     near_mm
         (u, v) least distance in each pixel, infinite where there is no point.
     outside_px
         (u + 2, v + 2) pixels to the silhouette, 0 in it.
     """
 
-    sensor_mm: Float[np.ndarray, " 3"]
-    axes: Float[np.ndarray, "3 3"]
-    sheet: int
-    distance_mm: float
+    camera: kernels.Camera
     pixel_mm: float
     first: Int[np.ndarray, " 2"]
     near_mm: Float[np.ndarray, "u v"]
@@ -99,10 +92,8 @@ class Look:
         if way is not None:
             axes = np.stack([np.cross(way, axes[2]), way, axes[2]])
         sheet = int(way is not None)
-        u, v, reach = kernels.pixels(
-            np.ascontiguousarray(points_mm), sensor_mm, axes, distance_mm / pixel_mm, distance_mm,
-            sheet,
-        )  # fmt: skip
+        camera = kernels.Camera(sensor_mm, axes, distance_mm / pixel_mm, distance_mm, sheet)
+        u, v, reach = kernels.pixels(np.ascontiguousarray(points_mm), camera)
         pixel = np.stack([u, v], axis=1)
         first = pixel.min(axis=0) - 3
         pixel -= first
@@ -114,8 +105,7 @@ class Look:
             CLOSING:-CLOSING, CLOSING:-CLOSING
         ]
         outside_px = np.asarray(ndimage.distance_transform_edt(~np.pad(seen, 1)))
-        return cls(sensor_mm, axes, sheet, distance_mm, pixel_mm, first, near_mm, outside_px,
-                   edge_on, {})  # fmt: skip
+        return cls(camera, pixel_mm, first, near_mm, outside_px, edge_on, {})
 
     def mark(
         self,
@@ -128,9 +118,8 @@ class Look:
     ) -> None:
         """Say of the places asked about whether the sensor saw through them by a tolerance."""
         kernels.seen_through(
-            points_mm, normals, asked, self.sensor_mm, self.axes, self.distance_mm, self.pixel_mm,
-            self.first, self._least(within_mm), self.outside_px, within_mm, self.edge_on,
-            self.sheet, silhouette, found,
+            points_mm, normals, asked, self.camera, self.first, self._least(within_mm),
+            self.outside_px, within_mm, self.edge_on, silhouette, found,
         )  # fmt: skip
 
     def veiled(
@@ -144,11 +133,13 @@ class Look:
         hidden = np.zeros(len(points_mm), dtype=bool)
         size = np.array(self.near_mm.shape)
         if len(asked):
+            there = self.camera._replace(
+                sensor=moved(self.camera.sensor[None], veil.pose)[0],
+                axes=self.camera.axes @ veil.pose[:3, :3].T,
+            )
             kernels.behind_edge_on(
-                moved(points_mm[asked], veil.pose), asked, veil.points_mm, veil.normals,
-                moved(self.sensor_mm[None], veil.pose)[0], self.axes @ veil.pose[:3, :3].T,
-                self.distance_mm / self.pixel_mm, self.distance_mm, self.first - size,
-                self.first + 2 * size, self.edge_on, within_mm, self.sheet, hidden,
+                moved(points_mm[asked], veil.pose), asked, veil.points_mm, veil.normals, there,
+                self.first - size, self.first + 2 * size, self.edge_on, within_mm, hidden,
             )  # fmt: skip
         return hidden
 
@@ -214,7 +205,7 @@ class Looks:
     @property
     def sensors_mm(self) -> Float[np.ndarray, "k 3"]:
         """(k, 3) where they stood, or may have."""
-        return np.array([look.sensor_mm for look in self.each]).reshape(-1, 3)
+        return np.array([look.camera.sensor for look in self.each]).reshape(-1, 3)
 
 
 NOWHERE = Looks((), False)

@@ -3,17 +3,33 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float
 
 from gcode.compiled import njit, prange
 
 
+class Camera(NamedTuple):
+    """Of a range image: where its sensor stood, its axes (rows: across, down, along), its focal
+    length in pixels, how far off the part is, and whether it is a moving sheet of light.
+    """
+
+    sensor: Float[np.ndarray, " 3"]
+    axes: Float[np.ndarray, "3 3"]
+    scale: float
+    distance: float
+    sheet: int
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pixel(point, sensor, axes, scale, distance, sheet):
+def _pixel(point, camera):
     """Of a place: its pixel, how deep it lies along the middle ray, and its own ray.
 
-    Within a moving sheet of light (`sheet`) rays do not spread along its way, axis 1.
+    Within a moving sheet of light rays do not spread along its way, axis 1.
     """
+    sensor, axes, scale, distance, sheet = camera
     x, y, z = point[0] - sensor[0], point[1] - sensor[1], point[2] - sensor[2]
     depth = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
     down = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
@@ -25,53 +41,51 @@ def _pixel(point, sensor, axes, scale, distance, sheet):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pixels(points, sensor, axes, scale, distance, sheet):
+def pixels(points, camera):
     """(n,) columns and rows of places in a sensor's image, and how far off they are."""
     n = len(points)
     u, v, reach = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
     for k in range(n):
-        u[k], v[k], _, x, y, z = _pixel(points[k], sensor, axes, scale, distance, sheet)
+        u[k], v[k], _, x, y, z = _pixel(points[k], camera)
         reach[k] = np.sqrt(x * x + y * y + z * z)
     return u, v, reach
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def seen_through(points, normals, asked, sensor, axes, distance, pixel, first, least, outside,
-                 within, edge_on, sheet, silhouette, found):  # fmt: skip
+def seen_through(points, normals, asked, camera, first, least, outside, within, edge_on,
+                 silhouette, found):  # fmt: skip
     """Say of the places asked about whether the sensor saw through them; in `found`.
 
     Beside the silhouette it saw through, too, where that is believed (`silhouette`).
 
     `normals` is empty, or of surface there: what stands edge-on to the rays may be there unseen.
     """
-    scale = distance / pixel
     rows, columns = least.shape
     has_normals = len(normals) > 0
     for q in prange(len(asked)):
         k = asked[q]
-        u, v, depth, x, y, z = _pixel(points[k], sensor, axes, scale, distance, sheet)
+        u, v, depth, x, y, z = _pixel(points[k], camera)
         reach = np.sqrt(x * x + y * y + z * z)
         if has_normals:
             along = abs(x * normals[k, 0] + y * normals[k, 1] + z * normals[k, 2])
             if along <= edge_on * reach:
                 found[k] = False
                 continue
-        if depth <= 1e-6 * distance:
+        if depth <= 1e-6 * camera.distance:
             found[k] = False  # behind the sensor nobody looked
             continue
         u -= first[0]
         v -= first[1]
         i, j = min(max(u, 0), rows - 1), min(max(v, 0), columns - 1)
         beyond = max(abs(u - i), abs(v - j))
-        beside = (outside[i + 1, j + 1] + beyond) * pixel * reach / distance
+        beside = (outside[i + 1, j + 1] + beyond) * reach / camera.scale
         found[k] = (silhouette and beside > within) or (
             beyond == 0 and np.isfinite(least[i, j]) and reach < least[i, j] - within
         )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, distance, first, last,
-                   edge_on, within, sheet, hidden):  # fmt: skip
+def behind_edge_on(points, asked, veil, normals, camera, first, last, edge_on, within, hidden):
     """Say which places lie behind surface that is edge-on to the sensor's rays; in `hidden[asked]`.
 
     Pixels from `first` to `last` are looked at, as far as there are places in them.
@@ -82,9 +96,7 @@ def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, distance, 
     far = np.empty(count)
     low, high = last.copy(), first - 1
     for k in range(count):
-        pixel[k, 0], pixel[k, 1], _, x, y, z = _pixel(
-            points[k], sensor, axes, scale, distance, sheet
-        )
+        pixel[k, 0], pixel[k, 1], _, x, y, z = _pixel(points[k], camera)
         far[k] = np.sqrt(x * x + y * y + z * z)
         inside[k] = np.all(pixel[k] >= first) and np.all(pixel[k] <= last)
         if inside[k]:
@@ -95,7 +107,7 @@ def behind_edge_on(points, asked, veil, normals, sensor, axes, scale, distance, 
     least = np.full((rows, columns), np.inf)
     limit = edge_on * edge_on
     for q in range(len(veil)):
-        u, v, depth, x, y, z = _pixel(veil[q], sensor, axes, scale, distance, sheet)
+        u, v, depth, x, y, z = _pixel(veil[q], camera)
         square = x * x + y * y + z * z
         along = x * normals[q, 0] + y * normals[q, 1] + z * normals[q, 2]
         if along * along > limit * square:

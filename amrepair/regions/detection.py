@@ -122,9 +122,12 @@ def detect(
     progress("detect", 3.0, 4.0)
     score = np.abs(seen.f_mm)
     k = min(options.top_k, int(seen.keep.sum()))
+    gone_p_value = np.ones(len(surface_mm))
+    gone_p_value[seen.crossed] = np.exp(log_p[0, len(surfels) :])
     regions = find_regions(
-        evidence, missing, excess, surface_mm, surface_label, template, p_value=np.exp(log_p)
-    )
+        evidence, missing, excess, surface_mm, surface_label, template,
+        p_value=np.exp(log_p), gone_p_value=gone_p_value,
+    )  # fmt: skip
     progress("detect", 4.0, 4.0)
     surfel_label = np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0))
     allowed_mm = sites.tolerance_mm[1] - sites.tolerance_mm[0]

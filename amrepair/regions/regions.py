@@ -28,17 +28,20 @@ def find_regions(
     template: Template,
     *,
     p_value: Float[np.ndarray, "2 b"],
+    gone_p_value: Float[np.ndarray, " m"],
 ) -> tuple[Region, ...]:
     """Regions of both kinds, largest first.
 
-    `p_value` is of each cell (and crossed template point), for missing and for excess.
+    `p_value` is of each cell (and crossed template point), for missing and for excess;
+    `gone_p_value` of each surface point, 1 where no ray passed it.
     """
     s = evidence.surfels
-    gone = surface_mm[surface_label == int(Label.MISSING)]
+    labelled = surface_label == int(Label.MISSING)
+    gone, gone_p = surface_mm[labelled], gone_p_value[labelled]
     area_each = area_per_point(surface_mm)
     found: list[Region] = []
     for side, (label, cells, extra) in enumerate(
-        ((Label.MISSING, missing, gone), (Label.EXCESS, excess, np.zeros((0, 3))))
+        ((Label.MISSING, missing, gone), (Label.EXCESS, excess, gone[:0]))
     ):
         which = np.flatnonzero(cells)
         points = np.concatenate([s.place_mm[which], extra])
@@ -50,7 +53,8 @@ def find_regions(
             if len(own) == 0 and n_gone * area_each < MIN_AREA_MM2:
                 continue
             region = _region(label, s.deviation_mm[own], points[mine], s.cell_mm, template)
-            found.append(replace(region, p_value=float(p_value[side, own].min(initial=1.0))))
+            sure = np.append(p_value[side, own], gone_p[: len(extra)][mine[len(which) :]])
+            found.append(replace(region, p_value=float(sure.min(initial=1.0))))
     return tuple(sorted(found, key=lambda r: -r.volume_mm3))
 
 

@@ -39,6 +39,8 @@ ByView = tuple[
 ]
 # A template point is present where scanned surface lies within so many cells of it.
 PRESENT_CELLS = 1.8
+# How deep rays pass below a template point is found to this power of two.
+DEPTH_HALVINGS = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +89,8 @@ class Observed:
     surface_mm, normals
         (m, 3) each: the template's surface.
     crossed, depth_mm
-        (c,) numbers of surface points with no scanned surface near that rays passed, and by how
-        much.
+        (c,) numbers of surface points with no scanned surface near that rays passed, and how deep
+        below them.
     """
 
     f_mm: Float[np.ndarray, " n"]
@@ -132,7 +134,7 @@ def observed(
             seen = tuple(i for i in seen if np.isclose(sensors_mm, i.sensor_mm).all(axis=1).any())
     if surfels.spacing_mm > options.spacing_mm:
         surface_mm, normals = template.surface_points(surfels.spacing_mm)
-    crossed, depth_mm = _crossed(surface_mm, surfels, seen)
+    crossed, depth_mm = _crossed(surface_mm, normals, surfels, seen)
     return Observed(f_mm, keep, surfels, seen, surface_mm, normals, crossed, depth_mm)
 
 
@@ -152,19 +154,31 @@ def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"]) -> None:
 
 
 def _crossed(
-    surface_mm: Float[np.ndarray, "m 3"], surfels: Surfels, images: tuple[RangeImage, ...]
+    surface_mm: Float[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "m 3"],
+    surfels: Surfels,
+    images: tuple[RangeImage, ...],
 ) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Template points with no scanned surface near that rays passed, and by how much, mm.
+    """Template points with no scanned surface near that rays passed, and how deep below them, mm.
 
-    What is gone leaves no points of its own: the ray that should have ended there says so.
+    What is gone leaves no points of its own: the ray that should have ended there says so. A ray
+    that grazes an edge sees far beyond it, whatever hair's breadth it passed inside: what counts
+    is how deep below the template's surface rays still pass, found by bisection.
     """
     if not images:
         return np.zeros(0, np.int64), np.zeros(0)
     near = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     absent = np.flatnonzero(near < 0)
-    depth_mm = clearances(images, surface_mm[absent], -np.inf)[1]
-    passed = depth_mm > 0
-    return absent[passed], depth_mm[passed]
+    beyond_mm = clearances(images, surface_mm[absent], -np.inf)[1]
+    crossed, beyond_mm = absent[beyond_mm > 0], beyond_mm[beyond_mm > 0]
+    passed_mm, stopped_mm = np.zeros(len(crossed)), 2.0 * beyond_mm
+    for _ in range(DEPTH_HALVINGS):
+        middle_mm = 0.5 * (passed_mm + stopped_mm)
+        below_mm = surface_mm[crossed] - middle_mm[:, None] * normals[crossed]
+        passes = clearances(images, below_mm, -np.inf)[1] > 0
+        passed_mm = np.where(passes, middle_mm, passed_mm)
+        stopped_mm = np.where(passes, stopped_mm, middle_mm)
+    return crossed, passed_mm
 
 
 def sites_of(
@@ -282,8 +296,10 @@ def _without_nuisance(
     told = None
     if view is not None:
         told = cell, view, value_mm - share_mm, count
-        views_mm = _between_views_mm(cell, value_mm - share_mm, count, n, point_sigma_mm)
-        pose_mm[:n] = np.hypot(pose_mm[:n], views_mm)
+        one_mm, views = _between_views_mm(cell, value_mm - share_mm, count, n, point_sigma_mm)
+        # what rays passed one view says
+        views = np.append(views, np.ones(len(pose_mm) - n))
+        pose_mm = np.hypot(pose_mm, one_mm / np.sqrt(views))
     return found, replace(sites, value_mm=whole_mm, pose_mm=pose_mm), told
 
 
@@ -293,22 +309,21 @@ def _between_views_mm(
     count: Int[np.ndarray, " k"],
     cells: int,
     point_sigma_mm: float,
-) -> Float[np.ndarray, " s"]:
-    """(s,) standard error of each cell by what views say differently of one place.
+) -> tuple[float, Int[np.ndarray, " s"]]:
+    """Standard error of one view by what several say differently of one place; views a cell.
 
-    The views' own component of the variance, without the points' noise, over how many saw it.
+    The views' own component of the variance, without the points' noise.
     """
     views = np.bincount(cell, minlength=cells)
     several = views[cell] > 1
     if not several.any():
-        return np.zeros(cells)
+        return 0.0, np.maximum(views, 1)
     mean_mm = np.bincount(cell, value_mm, cells) / np.maximum(views, 1)
     number = views[cell][several]
     off_mm = (value_mm - mean_mm[cell])[several] * np.sqrt(number / (number - 1.0))
     spread_mm = MAD_TO_SIGMA * float(np.median(np.abs(off_mm)))
     noise_mm = point_sigma_mm * float(np.median(1.0 / np.sqrt(count[several])))
-    own_mm = np.sqrt(max(spread_mm**2 - noise_mm**2, 0.0))
-    return np.asarray(own_mm / np.sqrt(np.maximum(views, 1)))
+    return float(np.sqrt(max(spread_mm**2 - noise_mm**2, 0.0))), np.maximum(views, 1)
 
 
 def tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:
