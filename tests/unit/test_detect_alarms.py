@@ -8,6 +8,7 @@ import pytest
 from amrepair.regions import Label, detect
 from amrepair.regions.calibration import NORMAL
 from amrepair.regions.options import RegionOptions
+from amrepair.regions.sites import observed
 from amrepair.scans import Scan
 from tests.analytic import box, cylinder, difference, sample_surface
 
@@ -99,3 +100,40 @@ def test_a_strand_is_told_at_twice_the_noise(seed: int) -> None:
     middle = 0.5 * (boxes[:, 0].min(axis=0) + boxes[:, 1].max(axis=0))
     assert np.abs(middle[:2] - (12, 10)).max() < 1.5
     assert np.linalg.norm(np.ptp(boxes.reshape(-1, 3), axis=0)[:2]) > 8.0
+
+
+def test_strays_below_surface_that_is_there_are_no_void() -> None:
+    # regression: pixels of one view that grazes an edge lay up to 2 mm below what three views saw
+    plate = box((0, 0, 0), (40, 30, 6))
+    rng = np.random.default_rng(5)
+    points = sample_surface(plate.body, 0.5, seed=5)[0]
+    points = points + rng.normal(0, SIGMA_MM, points.shape)
+    inside = (np.abs(points[:, :2] - (20, 15)) < 2.5).all(axis=1) & (points[:, 2] > 3.0)
+    deep = np.column_stack([rng.uniform((17.5, 12.5), (22.5, 17.5), (30, 2)), np.full(30, 6.0)])
+    deep[:, 2] -= rng.uniform(0.6, 1.9, 30)
+    with_surface = Scan(np.concatenate([points, deep]), SIGMA_MM, "template")
+    assert detect(with_surface, plate).regions == ()
+    without = Scan(np.concatenate([points[~inside], deep]), SIGMA_MM, "template")
+    assert [region.label for region in detect(without, plate).regions] == [Label.MISSING]
+
+
+@pytest.mark.parametrize(("gone_mm", "floor_mm"), [(0.3, 10.0), (5.0, 10.0), (5.0, 3.0)])
+def test_a_ray_past_an_edge_counts_by_how_deep_it_passed_not_how_far_it_saw(
+    gone_mm: float, floor_mm: float
+) -> None:
+    # regression: a part 0.1 mm too short lacked as much as the floor lies below its edge
+    plate = box((0, 0, 0), (12, 10, 4))
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-4, 12, 0.1), np.arange(0.05, 10, 0.1)))
+    high = np.where(x < gone_mm, -floor_mm, 4.0)
+    points = np.column_stack([x, y, high])
+    sensor = np.array([[6.0, 5.0, 3000.0]])
+    scan = Scan(
+        points, 0.01, "template", sensors_mm=sensor,
+        sensor_index=np.zeros(len(points), np.int64),
+    )  # fmt: skip
+    seen = observed(scan, plate, RegionOptions(), None, None, ())
+    side = np.abs(seen.surface_mm[seen.crossed, 0]) < 1e-6
+    assert side.sum() > 20
+    # a pixel holds 0.1 mm, and its neighbours are asked too
+    assert seen.depth_mm[side].max() < gone_mm + 0.05
+    assert np.median(seen.depth_mm[side]) > gone_mm - 0.35
