@@ -38,9 +38,9 @@ BESIDE = 2.0  # spacings of the cloud: a point of the surface has one of it so n
 TARGET_POINTS = 20_000  # of the template's cloud: as many as the largest test clouds need
 
 
-def pam_options(format: Format) -> PamOptions:
+def pam_options(format: str) -> PamOptions:
     """The paper's, or the released code's where only parts of the surface are seen."""
-    return CODE if format is Format.REAL3D else PAPER
+    return CODE if format == Format.REAL3D else PAPER
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,7 @@ def run_bench(
     dataset
         Its folder.
     format
-        One of `Format`, by name.
+        A name in `LAYOUTS`.
     methods
         Names out of `METHODS`.
     out

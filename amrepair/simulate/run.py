@@ -21,10 +21,9 @@ from amrepair.frames import Transform
 from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, Tape, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.repair import RepairPlan, Stopwatch
-from amrepair.simulate.defects import Defect, PlacedDefect
+from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
-from amrepair.simulate.placement import place
 from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
 from amrepair.simulate.stage import DefectTruth, Stage
 from amrepair.simulate.world import World
