@@ -160,8 +160,8 @@ def check_torch() -> Finding:
             "torch",
             State.BAD,
             f"cannot be loaded ({error})",
-            "pip install --force-reinstall torch (for a machine without a GPU: "
-            "--index-url https://download.pytorch.org/whl/cpu); only fitting templates needs it",
+            "pip install --force-reinstall torch (for a machine without a GPU with the --index-url "
+            "that PyTorch's installation page gives for CPU); only fitting templates needs it",
         )
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
