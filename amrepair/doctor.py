@@ -1,4 +1,4 @@
-"""Doctor: whether this machine can do what amrepair asks of it, and how to mend what cannot.
+"""Doctor: whether this machine can do what amrepair asks of it, and how to fix what it cannot.
 
 It looks and reports; it installs, changes and repairs nothing. Each check is one function that
 returns a `Finding`. Only the standard library is imported up here: the doctor must be able to speak

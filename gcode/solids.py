@@ -176,7 +176,7 @@ def first_closed(
 ) -> tuple[Any, Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The first closed solid among the file's own triangles, welded ever more; None if none is.
 
-    With it come vertices and faces as they were welded last, for those who mend.
+    With it come vertices and faces as they were welded last, for a later repair of the mesh.
 
     As they are: a file that shares vertices means it, and bodies that touch stay apart. Then equal
     vertices are one, as STL needs; then those that single precision may have parted.

@@ -9,10 +9,10 @@ from typing import Any
 
 import typer
 
-from amrepair.cli.asking import AtDesk, Terminal
+from amrepair.cli.approval import AtDesk, Terminal
 from amrepair.cli.live import NoView, ShownRun, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
-from amrepair.cli.warmth import ThermalLog
+from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import InputError, LoopError
 from amrepair.fleet.desk import Desk
 from amrepair.frames import Transform
@@ -148,7 +148,7 @@ def run(
             token=shown.token,
         ) as page,
     ):
-        report, warmth = _print(
+        report, thermal = _print(
             begun,
             page,
             watch,
@@ -157,7 +157,7 @@ def run(
             going_on=resume is not None,
             pose=pose_confirmed,
         )
-    _tell(begun, report, warmth, watch, bars, as_json=as_json)
+    _tell(begun, report, thermal, watch, bars, as_json=as_json)
 
 
 def _given(value: Any, name: str) -> Any:
@@ -290,12 +290,12 @@ def _print(
         machine.connect()
     page.drives(machine.pause, machine.resume)
     word = bars if isinstance(bars, AtDesk) else Terminal(bars)
-    warmth = ThermalLog(machine.temperatures)
+    thermal = ThermalLog(machine.temperatures)
     shown = page.recording(begun.folder.record)
 
     def recorded(look: Look) -> None:
         shown(look)
-        warmth.note()
+        thermal.note()
 
     try:
         with bars.shown():
@@ -321,7 +321,7 @@ def _print(
                 watch=watch,
                 progress=page.watching(bars),
             )
-        return report, warmth.series(_noted(setting.port))
+        return report, thermal.series(_noted(setting.port))
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "
@@ -349,7 +349,7 @@ def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:
 def _tell(
     begun: _Begun,
     report: LoopReport,
-    warmth: tuple[TemperatureSeries, ...],
+    thermal: tuple[TemperatureSeries, ...],
     watch: Stopwatch,
     bars: console.Bars,
     *,
@@ -374,7 +374,7 @@ def _tell(
             setup=setup,
             about={"job": setting.title},
             expected=_placed_solid(begun.template, setting.placed),
-            temperatures=warmth,
+            temperatures=thermal,
         )
         write_report(data, folder.file("report.html"))
     if as_json:

@@ -1,4 +1,4 @@
-"""A simulated run: slice a part, print it on an emulated printer, break it, let the loop mend it.
+"""A simulated run: slice a part, print it on an emulated printer, break it, let the loop repair it.
 
 Everything between the G-code and the nozzle is real: the serial adapter, a pseudo-terminal, the
 protocol, the emulated firmware. Only plastic and light are simulated (`world`, `scanner`).
@@ -269,7 +269,7 @@ def simulate_run(
     watch: Stopwatch | None = None,
     progress: Progress = silent,
 ) -> SimulatedRun:
-    """Print the job on an emulated printer and let the loop mend what goes wrong.
+    """Print the job on an emulated printer and let the loop repair what goes wrong.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""`PlannedSdf`: what a layer should look like, from the job's own beads (idea 2 of the design).
+"""`PlannedSdf`: what a layer should look like, from the job's own beads.
 
 Sparse infill is no defect: the expected solid is the union of the beads that were planned, told
 as a distance field between voxels of about a layer's height. Only the last millimetres below the

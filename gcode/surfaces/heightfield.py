@@ -47,7 +47,7 @@ class HeightField:
         Edge of a square cell.
     z_mm
         (ny, nx) height of the top surface; 0 is the bed. Unseen cells carry the height that
-        is safe for collisions (idea 7 of the design: unseen is solid), and are False in `seen`.
+        is safe for collisions, since unseen may be solid, and are False in `seen`.
     seen
         (ny, nx) whether a sensor measured the cell.
 
