@@ -155,7 +155,7 @@ def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
     import manifold3d
 
-    # copies: the binding takes no read-only arrays, and trimesh's are
+    # Arrays are copied: the binding takes no read-only ones, and trimesh's are read-only.
     return manifold3d.Manifold(
         manifold3d.Mesh64(
             np.array(vertices_mm, dtype=np.float64, order="C"),
@@ -193,7 +193,7 @@ def first_closed(
             return solid, vertices_mm, faces
     import trimesh
 
-    # slivers without area may hold a surface together, so they go last
+    # Slivers without area may hold a surface together, so they are removed last.
     faces = faces[trimesh.Trimesh(vertices_mm, faces, process=False).nondegenerate_faces()]
     solid = as_manifold(vertices_mm, faces)
     return solid if is_valid(solid) else None, vertices_mm, faces

@@ -81,7 +81,7 @@ class Target:
         """(n,) distance to the normal surface, mm."""
         if self.exact is not None:
             return self.exact.unsigned_distance(points_mm)
-        # to the nearest point alone it is half the cloud's spacing wherever the points lie
+        # The distance to the nearest point alone would be half the cloud's spacing in any case.
         distance, index = cKDTree(self.cloud_mm).query(points_mm, workers=-1)
         offset = points_mm - self.cloud_mm[index]
         height = np.abs((offset * self._normals[index]).sum(axis=1))

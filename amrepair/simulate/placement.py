@@ -124,7 +124,7 @@ def under_extrusion(
     flow = defect.values["flow"]
     diameter_mm = defect.values["diameter"] * scale
     ranges = _layer_ranges(defect, tops_mm, rng)
-    # where a face ends within the range its thin film is within any tolerance: others first
+    # Where a face ends within the range, its thin film is within any tolerance: others go first.
     for layers in sorted(ranges, key=lambda r: not _even(part, r, tops_mm)):
         room = _solid_through(part, layers, tops_mm)
         if room.area() < 1.0:
@@ -269,7 +269,7 @@ def chip(
         if volume_mm3 < 0.1 * whole_mm3 or volume_mm3 < 3.0:
             continue
         pieces = (part - bite).decompose()
-        # what falls off with it would lie loose on the bed: not a chip
+        # A piece that falls off with the bite would lie loose on the bed: that is no chip.
         if sum(abs(piece.volume()) > _CRUMB_MM3 for piece in pieces) > whole:
             continue
         box = np.array(broken.bounding_box()).reshape(2, 3)
