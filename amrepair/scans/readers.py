@@ -137,7 +137,7 @@ def _with_word(
         sensors = np.asarray(sensor_at, dtype=np.float64).reshape(-1, 3)
         if index is None or int(index.max()) >= len(sensors):
             if len(sensors) > 1:
-                # A wrong ray would cross the part and call it empty; the nearest sensor is but a guess.
+                # A wrong ray would cross the part and call it empty, so none is guessed.
                 raise InputError(
                     f"{scan.source}: {len(sensors)} sensor positions are given, but the file does "
                     "not say which of them saw each point; give one, or a PLY with a 'sensor' "
