@@ -148,7 +148,7 @@ def run(
             token=shown.token,
         ) as page,
     ):
-        report, thermal = _print(
+        report, warmth = _print(
             begun,
             page,
             watch,
@@ -157,7 +157,7 @@ def run(
             going_on=resume is not None,
             pose=pose_confirmed,
         )
-    _tell(begun, report, thermal, watch, bars, as_json=as_json)
+    _tell(begun, report, warmth, watch, bars, as_json=as_json)
 
 
 def _given(value: Any, name: str) -> Any:
@@ -290,12 +290,12 @@ def _print(
         machine.connect()
     page.drives(machine.pause, machine.resume)
     word = bars if isinstance(bars, AtDesk) else Terminal(bars)
-    thermal = ThermalLog(machine.temperatures)
+    warmth = ThermalLog(machine.temperatures)
     shown = page.recording(begun.folder.record)
 
     def recorded(look: Look) -> None:
         shown(look)
-        thermal.note()
+        warmth.note()
 
     try:
         with bars.shown():
@@ -321,7 +321,7 @@ def _print(
                 watch=watch,
                 progress=page.watching(bars),
             )
-        return report, thermal.series(_noted(setting.port))
+        return report, warmth.series(_noted(setting.port))
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "
@@ -349,7 +349,7 @@ def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:
 def _tell(
     begun: _Begun,
     report: LoopReport,
-    thermal: tuple[TemperatureSeries, ...],
+    warmth: tuple[TemperatureSeries, ...],
     watch: Stopwatch,
     bars: console.Bars,
     *,
@@ -374,7 +374,7 @@ def _tell(
             setup=setup,
             about={"job": setting.title},
             expected=_placed_solid(begun.template, setting.placed),
-            temperatures=thermal,
+            temperatures=warmth,
         )
         write_report(data, folder.file("report.html"))
     if as_json:

@@ -167,7 +167,7 @@ def _solid_masks(sections: list[Any], setup: PrintSetup) -> list[Any | None]:
                 buried = buried ^ (sections[j] if 0 <= j < n else empty)
             if buried.is_empty():
                 break
-        # Solid areas reach a little under their neighbours, so that they bond.
+        # solid areas reach a little under their neighbours, so that they hold on
         out.append(offset(sections[i] - buried, process.line_width_mm))
     return out
 
@@ -270,7 +270,7 @@ def _merged(lost: list[Unprintable]) -> tuple[Unprintable, ...]:
 def _begin(pen: Pen, setup: PrintSetup, top_mm: float) -> None:
     script = expand_script(setup.printer.start_gcode, setup, max_layer_z=top_mm)
     pen.add(Script(script, "start"))
-    # Where the scripts end is unknown, so the first travel lifts before it goes across.
+    # the scripts' own last place is unknown: the first travel lifts before it goes across
     pen.position_mm = np.array([*setup.printer.prime_mm[:2], max(1.0, setup.printer.z_hop_mm)])
 
 
