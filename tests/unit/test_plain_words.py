@@ -57,3 +57,23 @@ def test_every_benchmark_that_a_page_names_is_here() -> None:
         assert named
         for path in named:
             assert (ROOT / path).is_file(), path
+
+
+def test_every_word_of_the_glossary_is_used() -> None:
+    """And has the field's word beside it, and one line that says what it is."""
+    text = (ROOT / "docs" / "reference" / "glossary.md").read_text(encoding="utf-8")
+    used = "\n".join(
+        path.read_text(encoding="utf-8").lower()
+        for folder in ("gcode", "amrepair")
+        for path in (ROOT / folder).rglob("*.py")
+    )
+    rows = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| ")]
+    rows = [row for row in rows if row[0].strip() != "here"]
+    assert len(rows) > 40
+    for here, field, meaning in rows:
+        assert field.strip()
+        assert meaning.strip()
+        name = re.sub(r" ?\(.*\)", "", here.strip())
+        for word in re.split(r", | / ", name):
+            stem = word.split()[-1].removesuffix("s")
+            assert stem in used, word
