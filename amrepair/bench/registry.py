@@ -80,7 +80,7 @@ PUBLISHED_REPAIR: dict[str, tuple[float, float]] = {
 def make_method(
     name: str, *, checkpoint: Path | None = None, paper: PaperOptions | None = None
 ) -> Method:
-    """A method by its name on the command line.
+    """Return the method that has this name on the command line.
 
     Parameters
     ----------

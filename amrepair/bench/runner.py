@@ -41,7 +41,7 @@ LAYOUT_VERSION = 2
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What a run came to.
+    """The results of a benchmark run.
 
     Attributes
     ----------

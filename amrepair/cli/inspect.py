@@ -175,7 +175,7 @@ def from_library(
 
 
 def chosen_part(known: Recognition) -> dict[str, Any]:
-    """What results say of a choice."""
+    """A choice of a part, as results record it."""
     return {
         "template": known.name,
         "confidence": round(known.confidence, 4),

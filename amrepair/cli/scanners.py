@@ -20,7 +20,7 @@ MAKER = "open_scanner"  # the function that a scanner's file defines
 
 @dataclass(frozen=True, slots=True)
 class Bed:
-    """What a scanner is opened for.
+    """The bed that a scanner looks at, and how.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class OwnScanner:
         return self.scanner.build_from_scanner
 
     def scan(self, request: ScanRequest) -> Scan:
-        """Ask it.
+        """Return what the scanner measures.
 
         Raises
         ------

@@ -44,7 +44,7 @@ class Defect:
 
 @dataclass(frozen=True, slots=True)
 class Printed:
-    """What a defect is to find its place on.
+    """The print on which a defect is to be placed.
 
     Attributes
     ----------

@@ -77,7 +77,7 @@ class PreparedRun:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedRun:
-    """What became of it.
+    """The result of a simulated run.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ _MOST_REPORTS = 5000
 
 
 class FirmwareCore:
-    """A printer that talks.
+    """An emulated printer: bytes of the host in, bytes of the firmware out.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ class Machine(Mechanics):
         return table
 
     def _ignore(self, rest: bytes) -> None:
-        """Nothing an emulated machine could show."""
+        """Accept a command whose effect an emulated machine cannot show."""
 
     def _g1(self, rest: bytes) -> None:
         x, y, z, de = self.x, self.y, self.z, 0.0

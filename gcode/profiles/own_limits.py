@@ -58,7 +58,7 @@ class _Start:
         self._absolute, self._absolute_e = True, True
 
     def wrong_with(self, line: str) -> Iterator[str]:
-        """What in the next line breaks a limit."""
+        """The limits that the next line breaks, as phrases."""
         command = line.partition(";")[0].strip().upper()
         name, _, rest = command.partition(" ")
         words = {letter: float(value) for letter, value in _WORD.findall(rest)}

@@ -68,7 +68,7 @@ EDGE_MM = 5.0
 
 @dataclass(frozen=True, slots=True)
 class ImportedFile:
-    """What one file came to.
+    """What was imported from one file.
 
     Attributes
     ----------
