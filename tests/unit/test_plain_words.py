@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-WORDS = {"README.md": 700, "docs/measurements.md": 2500, "docs/reference/glossary.md": 1200}
+WORDS = {"README.md": 700, "docs/measurements.md": 2500, "docs/reference/glossary.md": 1500}
 FOLDERS = ("gcode", "amrepair", "benchmarks", "examples", "tests", "docs", "profiles")
 TEXTS = {".py", ".md", ".toml", ".yml", ".css", ".js"}
 # documents that a reader of this repository does not have, and hosts of package indexes
