@@ -1,4 +1,4 @@
-"""Doctor: whether this machine can do what amrepair asks of it, and how to mend what cannot.
+"""Doctor: whether this machine can do what amrepair asks of it, and how to fix what it cannot.
 
 It looks and reports; it installs, changes and repairs nothing. Each check is one function that
 returns a `Finding`. Only the standard library is imported up here: the doctor must be able to speak
@@ -160,8 +160,8 @@ def check_torch() -> Finding:
             "torch",
             State.BAD,
             f"cannot be loaded ({error})",
-            "pip install --force-reinstall torch (for a machine without a GPU: "
-            "--index-url https://download.pytorch.org/whl/cpu); only fitting templates needs it",
+            "pip install --force-reinstall torch (for a machine without a GPU with the --index-url "
+            "that PyTorch's installation page gives for CPU); only fitting templates needs it",
         )
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)

@@ -152,7 +152,7 @@ def _stands(solid: manifold3d.Manifold) -> bool:
     hull = MultiPoint(np.concatenate([np.asarray(c) for c in foot.to_polygons()])).convex_hull
     mesh = solid.to_mesh64()
     corners = np.asarray(mesh.vert_properties)[:, :3][np.asarray(mesh.tri_verts, dtype=np.int64)]
-    # signed tetrahedra from the origin
+    # The centre of mass is that of signed tetrahedra from the origin.
     volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     centre = (volume[:, None] * corners.sum(axis=1)).sum(axis=0) / (4.0 * volume.sum())
     return bool(hull.buffer(-TIPPING_MM).contains(Point(float(centre[0]), float(centre[1]))))

@@ -34,6 +34,8 @@ from gcode.process import prepare
 
 prepare()  # as the command lines do
 
+import measured_page
+
 from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.simulate.defects import parse_defect
@@ -211,13 +213,15 @@ def figures(report: LoopReport, truth: DefectTruth, layers: Sequence[int]) -> di
     }
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown: by defect and in all."""
-    lines = [
-        "| defect | cases | filled, mean | worst | surface, mean | worst | added, mean | worst "
-        "| repairs, most |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+PAGE_HEADER = (
+    "defect", "cases", "filled, mean", "worst", "surface, mean", "worst", "added, mean", "worst",
+    "repairs, most",
+)  # fmt: skip
+
+
+def page_rows(rows: list[dict[str, Any]]) -> list[tuple[object, ...]]:
+    """By defect and in all."""
+    told: list[tuple[object, ...]] = []
     for kind in (*DEFECTS, "all"):
         mine = [row for row in rows if kind in {row["defect"], "all"}]
         if not mine:
@@ -227,13 +231,14 @@ def table(rows: list[dict[str, Any]]) -> str:
             for key in ("filled_ratio", "surface_ratio", "added_ratio", "iterations")
         }
         mean = {key: statistics.fmean(found) for key, found in values.items()}
-        lines.append(
-            f"| {kind} | {len(mine)} | {mean['filled_ratio']:.3f} | "
-            f"{min(values['filled_ratio']):.3f} | {mean['surface_ratio']:.3f} | "
-            f"{min(values['surface_ratio']):.3f} | {mean['added_ratio']:.3f} | "
-            f"{max(values['added_ratio']):.3f} | {max(values['iterations'])} |"
-        )
-    return "\n".join(lines)
+        worst = {
+            "filled_ratio": min(values["filled_ratio"]),
+            "surface_ratio": min(values["surface_ratio"]),
+            "added_ratio": max(values["added_ratio"]),
+        }
+        figures = [f"{value:.3f}" for key in worst for value in (mean[key], worst[key])]
+        told.append((kind, len(mine), *figures, max(values["iterations"])))
+    return told
 
 
 def main() -> None:
@@ -247,6 +252,7 @@ def main() -> None:
     parser.add_argument("--wire", action="store_true", help="through the serial adapter, all of it")
     parser.add_argument("--scanner", default=DEFAULT_SCANNER, help="of the world, or recorded:FILE")
     parser.add_argument("--table", action="store_true")
+    measured_page.add_page_option(parser)
     args = parser.parse_args()
     load_world().scanner(args.scanner)  # refused before any work
     args.results.parent.mkdir(parents=True, exist_ok=True)
@@ -263,8 +269,11 @@ def main() -> None:
         with args.results.open("a") as file:
             file.write(json.dumps(row) + "\n")
         print(json.dumps(row), flush=True)
+    told = page_rows([row for row in rows if row["part"] in args.parts])
     if args.table:
-        print(table([row for row in rows if row["part"] in args.parts]))
+        print(measured_page.table(PAGE_HEADER, told))
+    if args.page:
+        measured_page.write_rows("bench_closed_loop", PAGE_HEADER, told)
 
 
 if __name__ == "__main__":

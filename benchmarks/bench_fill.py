@@ -147,6 +147,15 @@ def line_of(row: dict[str, Any]) -> str:
     )
 
 
+PAGE_HEADER = ("cut", "head reaches", "declared", "filled of that", "outside, %")
+
+
+def page_row(row: dict[str, Any]) -> tuple[object, ...]:
+    """Shares of the piece; what is filled, and what lies outside, of what the head reaches."""
+    shares = (f"{row['open']:.2f}", f"{row['declared']:.2f}", f"{row['filled_open']:.3f}")
+    return (row["case"], *shares, f"{100 * row['outside']:.1f}")
+
+
 HEADER = (
     "| cut | printer | missing, mm³ | judge's head reaches: where something holds, at all |"
     " declared | filled of what is held, half a layer up, a whole one; of all | outside, and in"
@@ -162,17 +171,25 @@ def main() -> None:
     parser.add_argument("--printers", nargs="+", default=PRINTERS, choices=PRINTERS)
     parser.add_argument("--cell-mm", type=float, default=CELL_MM)
     parser.add_argument("--results", type=Path, help="a line of JSON each, besides the table")
+    parser.add_argument("--page", action="store_true", help="of the first printer's blocks")
     args = parser.parse_args()
     print(HEADER)
+    told: list[tuple[object, ...]] = []
     for name in args.cases:
         for printer in args.printers:
             row = run(name, load_setup(printer=printer), args.cell_mm)
             if row is None:
                 continue
             print(line_of(row), flush=True)
+            if printer == args.printers[0] and name in TOOLS:
+                told.append(page_row(row))
             if args.results:
                 with args.results.open("a") as file:
                     file.write(json.dumps(row) + "\n")
+    if args.page:
+        from measured_page import write_rows  # beside this script
+
+        write_rows("bench_fill", PAGE_HEADER, told)
 
 
 if __name__ == "__main__":

@@ -314,6 +314,40 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+PAGE_HEADER = (
+    "reached of the piece", "cuts", "0.95 filled", "filled, median", "mean", "least",
+    "outside, most", "over 5%", "contact, mm", "declared off",
+)  # fmt: skip
+
+
+def page_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[object, ...]]:
+    """Cuts of which the judge's head reaches `FULL_MM3`, by the share of the piece that it is."""
+    told: list[tuple[object, ...]] = []
+    for least in (0.8, 0.5, 0.3):
+        mine = [
+            row for row in rows
+            if "filled" in row and row["reached_mm3"] >= FULL_MM3 and row["reached"] >= least
+        ]  # fmt: skip
+        if not mine:
+            continue
+        filled = [row["filled"] for row in mine]
+        told.append(
+            (
+                f"{least:g} and more",
+                len(mine),
+                sum(share >= 0.95 for share in filled),
+                f"{statistics.median(filled):.3f}",
+                f"{statistics.fmean(filled):.3f}",
+                f"{min(filled):.3f}",
+                f"{max(row['outside'] for row in mine):.1%}",
+                sum(row["outside"] > 0.05 for row in mine),
+                f"{max(row['contact_mm'] or 0.0 for row in mine):.2f}",
+                sum(declared_off(row) > 0.05 for row in mine),
+            )
+        )
+    return told
+
+
 def said(row: dict[str, Any]) -> str:
     """A case in a line."""
     if "deficit_mm3" not in row:
@@ -340,6 +374,7 @@ def main() -> None:
     parser.add_argument("--within-s", type=float, default=np.inf, help="begin none after this")
     parser.add_argument("--case", nargs=3, metavar=("PART", "KIND", "SEED"))
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--page", action="store_true", help="rows of docs/measurements.md")
     args = parser.parse_args()
     lines = args.results.read_text().splitlines() if args.results.is_file() else []
     rows = [json.loads(line) for line in lines]
@@ -363,6 +398,10 @@ def main() -> None:
             rows.append(row)
     if args.table:
         print(table(rows))
+    if args.page:
+        from measured_page import write_rows  # beside this script
+
+        write_rows("bench_judge", PAGE_HEADER, page_rows(rows))
 
 
 if __name__ == "__main__":

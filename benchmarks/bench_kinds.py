@@ -269,11 +269,21 @@ def scene(part: Part, setup: PrintSetup) -> tuple[Job, Stop, Transform, Site]:
     return job, stop, placed, sites(job, template, placed, setup, by_beads=False)(stop)
 
 
+PAGE_HEADER = ("part", "kinds", "looks at each", "right", "least right of a kind")
+
+
+def page_row(part: str, table: dict[str, Counter[str]], seeds: int) -> tuple[object, ...]:
+    """What share of all looks, and of the kind with the fewest, was given its own kind."""
+    shares = [found[kind] / seeds for kind, found in table.items()]
+    return part, len(shares), seeds, f"{np.mean(shares):.0%}", f"{min(shares):.0%}"
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--part", choices=("block", "ring"), default="block")
     options.add_argument("--seeds", type=int, default=20)
     options.add_argument("--only", choices=KINDS)
+    options.add_argument("--page", action="store_true", help="a row of docs/measurements.md")
     said = options.parse_args()
     setup, part = load_setup(), part_called(said.part)
     job, stop, placed, site = scene(part, setup)
@@ -313,6 +323,10 @@ def main() -> None:
     for kind, values in sure.items():
         if values:
             print(f"confidence of {kind}: median {np.median(values):.2f}")
+    if said.page and said.only is None:
+        from measured_page import write_rows  # beside this script
+
+        write_rows("bench_kinds", PAGE_HEADER, [page_row(said.part, table, said.seeds)])
 
 
 if __name__ == "__main__":

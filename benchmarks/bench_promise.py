@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import measured_page
 import numpy as np
 import trimesh
 from promise_scans import RealScans, SimulatedScans, Sound
@@ -160,38 +161,65 @@ def usable(parts: Sequence[Path]) -> list[Path]:
     return [part for part in parts if trimesh.load_mesh(part).is_watertight]
 
 
-def table(rows: Sequence[Row], stated: float) -> str:
+HEADER = (
+    "scans", "judged", "refused", "astray", "with regions", "false regions a scan (95 %)",
+    "stated", "missing over 1 mm³",
+)  # fmt: skip
+PAGE_HEADER = ("scans", "judged", "with regions", "false a scan (95 %)", "largest missing, mm³")
+
+
+def rows_of(rows: Sequence[Row], stated: float) -> list[tuple[object, ...]]:
     """False regions a scan by kind, beside what is stated."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         for name in ("all", row["kind"].split(" of ")[0], row["object"]):
             groups.setdefault(name, []).append(row)
-    lines = [
-        "| scans | judged | refused | astray | with regions | false regions a scan (95 %) | stated "
-        "| missing over 1 mm³ |",
-        "|---|" + "---|" * 7,
-    ]
+    told: list[tuple[object, ...]] = []
     for name, group in groups.items():
         refused = sum("refused" in row for row in group)
         laid = [row for row in group if "refused" not in row]
         fair = [row for row in laid if row["off_mm"] <= ASTRAY_MM]
         if not fair:
             continue
-        false = sum(row["false"] for row in fair)
-        low, high = interval(false, len(fair))
-        missing = [
-            region["volume_mm3"]
-            for row in fair
-            for region in row["regions"]
-            if region["label"] == "missing" and region["volume_mm3"] > 1.0
-        ]
+        missing = missing_of(fair)
         worst = f"{len(missing)}, largest {max(missing):.0f} mm³" if missing else "0"
-        lines.append(
-            f"| {name} | {len(fair)} | {refused} | {len(laid) - len(fair)} "
-            f"| {sum(row['false'] > 0 for row in fair)} "
-            f"| {false / len(fair):.3f} ({low:.3f} to {high:.3f}) | {stated:g} | {worst} |"
+        hit = sum(row["false"] > 0 for row in fair)
+        told.append(
+            (name, len(fair), refused, len(laid) - len(fair), hit, rate(fair), f"{stated:g}", worst)
         )
-    return "\n".join(lines)
+    return told
+
+
+def rate(rows: Sequence[Row]) -> str:
+    """False regions a scan, and the interval of 95 %."""
+    false = sum(row["false"] for row in rows)
+    low, high = interval(false, len(rows))
+    return f"{false / len(rows):.3f} ({low:.3f} to {high:.3f})"
+
+
+def missing_of(rows: Sequence[Row]) -> list[float]:
+    """Volumes over 1 mm³ that are said to be missing."""
+    regions = [region for row in rows for region in row["regions"] if region["label"] == "missing"]
+    return [region["volume_mm3"] for region in regions if region["volume_mm3"] > 1.0]
+
+
+def page_rows(rows: Sequence[Row], name: str) -> list[tuple[object, ...]]:
+    """Of all scans of an object, or of simulated ones, and of each kind of them."""
+    laid = [row for row in rows if row.get("off_mm", np.inf) <= ASTRAY_MM]
+    groups: dict[str, list[Row]] = {name: laid}
+    for row in laid:
+        groups.setdefault(f"{name}, {row['kind'].split(',')[0]}", []).append(row)
+    return [
+        (
+            name,
+            len(fair),
+            sum(row["false"] > 0 for row in fair),
+            rate(fair),
+            f"{max(missing_of(fair), default=0.0):.0f}",
+        )
+        for name, fair in groups.items()
+        if fair
+    ]
 
 
 def arguments() -> argparse.Namespace:
@@ -206,6 +234,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("out/promise"), help="lines of JSON")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "amrepair-real")
     parser.add_argument("--report", action="store_true", help="the tables of what is there alone")
+    measured_page.add_page_option(parser)
     return parser.parse_args()
 
 
@@ -229,7 +258,11 @@ def main() -> None:
                 parts += [Path(data) / "parts" / f"{name}.stl" for name in PARTS]
             recording = recording_of(cases, args.out / f"{cases.name}.npz")
             run_simulated(usable(parts), recording, kept, numbers)
-        print(f"\n{kind}, {kept.path}\n\n{table(kept.rows, stated)}")
+        table = measured_page.table(HEADER, rows_of(kept.rows, stated))
+        print(f"\n{kind}, {kept.path}\n\n{table}")
+        if args.page:
+            named = page_rows(kept.rows, kind if kind == "simulated" else cases.name)
+            measured_page.write_rows("bench_promise", PAGE_HEADER, named)
 
 
 if __name__ == "__main__":

@@ -30,9 +30,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import measured_page
 import numpy as np
 from real_scans import Cases, Dent, Surface, moved, read_points
-from real_tables import Row, tables
+from real_tables import PAGE_HEADER, Row, page_row, tables
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -281,6 +282,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--with", dest="options", default="", help="options for detect, quoted")
     parser.add_argument("--limit-s", type=float, default=300.0, help="for one scan")
     parser.add_argument("--format", choices=("markdown", "json"), default="markdown")
+    measured_page.add_page_option(parser)
     return parser.parse_args()
 
 
@@ -317,6 +319,8 @@ def main() -> None:
             f"Python {platform.python_version()}; cases in {made.folder}\n"
         )
         print(tables(rows))
+    if args.page:
+        measured_page.write_rows("bench_real", PAGE_HEADER, [page_row(rows, made.name)])
 
 
 if __name__ == "__main__":

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import statistics
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 Row = dict[str, Any]
 GOAL_VIEW_MM, GOAL_S, GOAL_GB, GOAL_VOLUME, GOAL_DEPTH_MM = 0.35, 3.0, 1.5, 0.1, 1.5
+PAGE_KINDS = ("sound", "dents", "view", "load")
 
 
 def tables(rows: Sequence[Row]) -> str:
@@ -77,6 +79,31 @@ def _dent_table(dents: Sequence[Row]) -> str:
 
 def _deep(dents: Sequence[Row]) -> list[Row]:
     return [dent for dent in dents if dent["depth_mm"] >= GOAL_DEPTH_MM]
+
+
+PAGE_HEADER = (
+    "object", "merged: false", "baseline", "views: false, mean", "baseline", "views laid, worst mm",
+    "dents found", "detection, s", "memory, GB",
+)  # fmt: skip
+
+
+def page_row(rows: Sequence[Row], name: str) -> tuple[object, ...]:
+    """An object's figures; dents are those of `GOAL_DEPTH_MM` and more."""
+    kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in PAGE_KINDS}
+
+    def of(kind: str, key: str, count: Callable[[Sequence[float]], float]) -> str:
+        values = [row.get(key, np.inf) for row in kinds[kind]]
+        return f"{count(values):.3g}" if values else "–"
+
+    deep = _deep([dent for row in kinds["dents"] for dent in row.get("dents", ())])
+    return (
+        name,
+        of("sound", "false", max), of("sound", "base_false", max),
+        of("view", "false", statistics.fmean), of("view", "base_false", statistics.fmean),
+        of("view", "off_mm", max),
+        f"{sum(dent['found'] for dent in deep)} of {len(deep)}",
+        of("load", "stages_s", max), of("load", "peak_gb", max),
+    )  # fmt: skip
 
 
 def _goal_table(rows: Sequence[Row], dents: Sequence[Row]) -> str:

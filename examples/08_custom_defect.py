@@ -17,7 +17,7 @@ from _shared import mesh_of, out_folder
 import gcode
 from amrepair.loop import plan_stops
 from amrepair.report.folder import RunFolder
-from amrepair.simulate.defects import DefectKind, PlacedDefect
+from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.run import prepare_run, simulate_run
 from amrepair.template import MeshSdf
 
@@ -30,7 +30,7 @@ def scratch(part: m3.Manifold, *, width_mm: float, depth_mm: float) -> PlacedDef
     trough = m3.Manifold.batch_hull([stylus.translate((x, y, top)) for x, y in ends])
     box = np.array(trough.bounding_box()).reshape(2, 3)
     return PlacedDefect(
-        kind=DefectKind.CHIP,  # the nearest name for reports
+        kind="chip",  # the nearest name for reports
         layers=(),  # it happens to the finished part
         flow_regions=np.zeros((0, 9)),
         removed=trough,

@@ -60,7 +60,7 @@ def keep_safely(kept: Any) -> None:
         A `numba.core.caching.IndexDataCacheFile` that has not loaded anything yet.
     """
     base = kept._data_name(0).removesuffix(".0.nbc")
-    # a forked process has the token of its parent, but not its number
+    # A forked process has its parent's token, but a process number of its own.
     kept._data_name = lambda number: f"{base}.{os.getpid():x}-{_TOKEN}.{number}.nbc"
     kept._source_stamp = (*kept._source_stamp, kernels_stamp())
 

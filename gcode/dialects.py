@@ -1,7 +1,8 @@
-"""How moves are spelled: one table of the firmwares' words.
+"""How firmwares read moves: one table, for all that write or read programs.
 
-The order of modes matters: in Marlin G90 and G91 set the extruder's mode too, so M82 or M83 comes
-after them, in every dialect. What the link must know of a firmware is in `protocol.dialects`.
+The writer puts M82 or M83 after G90 and G91 in every dialect, since in Marlin these set the
+extruder's mode too. What the link must know of a firmware is in `protocol.dialects`; the checker,
+which must not share a mistake with the writer, has a table of its own in `check.words`.
 """
 
 from __future__ import annotations
@@ -21,20 +22,30 @@ class Dialect:
         Command for the acceleration of printing moves, `{a}` in mm/s².
     line_limit
         Characters of a command that the firmware takes.
+    g90_sets_e
+        G90 and G91 set the extruder's mode too.
+    g91_moves_e
+        G91 makes E relative while it lasts, whatever M82 says.
+    reads
+        Other dialects whose jobs it understands.
     """
 
     name: str
     acceleration: str
     line_limit: int
+    g90_sets_e: bool = False
+    g91_moves_e: bool = False
+    reads: frozenset[str] = frozenset()
 
 
 DIALECTS: dict[str, Dialect] = {
     # Marlin M204 P: printing acceleration (marlinfw.org/docs/gcode/M204.html); MAX_CMD_SIZE 96
-    "marlin": Dialect("marlin", "M204 P{a}", 95),
-    # Prusa-Firmware keeps M204 P from Marlin 1.1
-    "prusa": Dialect("prusa", "M204 P{a}", 95),
-    # Klipper knows M204 S alone (klipper3d.org/G-Codes.html)
-    "klipper": Dialect("klipper", "M204 S{a}", 4095),
+    "marlin": Dialect("marlin", "M204 P{a}", 95, g90_sets_e=True, reads=frozenset({"prusa"})),
+    # Prusa-Firmware keeps M204 P from Marlin 1.1; it is a Marlin
+    "prusa": Dialect("prusa", "M204 P{a}", 95, reads=frozenset({"marlin"})),
+    # Klipper knows M204 S alone (klipper3d.org/G-Codes.html); for G91 see its gcode_move.py.
+    # Slicers that know no Klipper write Marlin's words for it.
+    "klipper": Dialect("klipper", "M204 S{a}", 4095, g91_moves_e=True, reads=frozenset({"marlin"})),
     "reprap": Dialect("reprap", "M204 P{a}", 255),
 }
 

@@ -155,7 +155,7 @@ def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
     import manifold3d
 
-    # copies: the binding takes no read-only arrays, and trimesh's are
+    # Arrays are copied: the binding takes no read-only ones, and trimesh's are read-only.
     return manifold3d.Manifold(
         manifold3d.Mesh64(
             np.array(vertices_mm, dtype=np.float64, order="C"),
@@ -176,7 +176,7 @@ def first_closed(
 ) -> tuple[Any, Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The first closed solid among the file's own triangles, welded ever more; None if none is.
 
-    With it come vertices and faces as they were welded last, for those who mend.
+    With it come vertices and faces as they were welded last, for a later repair of the mesh.
 
     As they are: a file that shares vertices means it, and bodies that touch stay apart. Then equal
     vertices are one, as STL needs; then those that single precision may have parted.
@@ -193,7 +193,7 @@ def first_closed(
             return solid, vertices_mm, faces
     import trimesh
 
-    # slivers without area may hold a surface together, so they go last
+    # Slivers without area may hold a surface together, so they are removed last.
     faces = faces[trimesh.Trimesh(vertices_mm, faces, process=False).nondegenerate_faces()]
     solid = as_manifold(vertices_mm, faces)
     return solid if is_valid(solid) else None, vertices_mm, faces

@@ -208,7 +208,7 @@ def _refuse_mirrored(
     """Refuse a left hand where a right hand was meant: its mirror image fits far better."""
     mirrored = explained_if_mirrored(points_mm, found, template, rng)
     if 1.0 - mirrored < MIRRORED_BETTER * (1.0 - ratio):
-        # a scan of another part may lie better mirrored, too
+        # A scan of another part may also fit better mirrored.
         said = "shows the mirror image of" if mirrored >= DOUBTFUL else "does not fit"
         raise AlignmentError(
             f"the scan {scan.source} {said} its template: mirrored, "
@@ -302,7 +302,7 @@ def _part_only(
     placed = moved(points_mm, matrix)
     near = in_box(placed, low - 3.0, high + 3.0)
     above = placed[:, 2] > low[2] + 0.35
-    # a flat part seen from below has no other points: then all of the box count
+    # A flat part seen from below has no other points: then all points in the box count.
     keep = near & above if (near & above).sum() >= LEAST_POINTS else near
     return points_mm[keep]
 

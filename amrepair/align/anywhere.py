@@ -208,7 +208,7 @@ def pose_from_anywhere(
     was_thorough = hunt.share < CLEARED
     if was_thorough:
         progress("align", 0.2, 1.0)
-        # what was laid wrong may look like clutter: more rotations are tried of all of it first
+        # A part that was laid wrong may look like clutter: more rotations of it are tried first.
         hunt.take(_worth_refining(clouds, field, THOROUGH))
     of_all = hunt.found
     if hunt.share < CLEARED:
@@ -233,7 +233,7 @@ def pose_from_anywhere(
         off_mm = template.distance(clouds.dense_mm @ without[:3, :3].T + without[:3, 3])
         clearer = float((np.abs(off_mm) <= inlier_mm).mean()) + CLEARER_BY
         if share > CLEARED or share > max(least_ratio, clearer):
-            # what was left out lies on the part as well: it was no clutter
+            # What was left out fits the part as well, so it was no clutter.
             hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = (
                 clouds, whole, 0.0, points_mm
             )  # fmt: skip
@@ -244,7 +244,7 @@ def pose_from_anywhere(
         hunt.take(hunt.twins())
     progress("align", 0.9, 1.0)
     best, others = _best_and_others(hunt)
-    # not of the thinned cloud: few scattered points fill as many voxels as many on the surface
+    # The thinned cloud will not do: few scattered points fill as many voxels as many on a surface.
     sample = hunt.part_mm[rng.permutation(len(hunt.part_mm))[:DENSE_POINTS]]
     residual = template.distance(sample @ best.matrix[:3, :3].T + best.matrix[:3, 3])
     ratio = float((np.abs(residual) <= inlier_mm).mean())

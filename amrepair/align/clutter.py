@@ -70,7 +70,7 @@ def without_clutter(points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generato
     sigma_mm = float(np.median(across[surface]))
     bed = _bed(cloud, normals, surface, sigma_mm, rng)
     if bed is not None and (surface & ~bed).sum() >= LEAST_LEFT:
-        # what is left of the bed's rim and noise is scattered now
+        # What is left of the bed's rim and noise is scattered by now.
         masks.append(surface & ~bed)
     masks += _pieces(cloud, masks[-1], GAP_FACTOR * usual_mm)
     found: list[Kept] = []

@@ -38,7 +38,7 @@ def _kiss(
 ) -> Float[np.ndarray, "4 4"] | None:
     import kiss_matcher
 
-    # about their own centres: the matcher computes in single precision
+    # Points are taken about their own centres, since the matcher computes in single precision.
     source, target = points_mm.mean(axis=0), surface_mm.mean(axis=0)
     matcher = kiss_matcher.KISSMatcher(
         kiss_matcher.KISSMatcherConfig(voxel_size=voxel_mm, enable_noise_bound_clamping=False)

@@ -61,7 +61,7 @@ def motions(
     """(6,) how much each motion is hindered (Σ f² / σ² after a step of 1 mm), and the motions."""
     centre = cloud_mm.mean(axis=0)
     reach_mm = float(np.linalg.norm(cloud_mm - centre, axis=1).max())
-    # rotations in units of the motion of the farthest point
+    # Rotations are measured by the motion of the farthest point.
     unit = np.array([1.0 / reach_mm] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(pose.information * np.outer(unit, unit))
     return values, [Motion(unit[:3] * one[:3], one[3:]) for one in vectors.T]
@@ -123,7 +123,7 @@ def best_turns(
             if family is None:
                 continue
             known.append(family)
-            # a feature that decides is small: where it is seen its points lie off this pose
+            # A feature that decides is small: where it is seen, its points lie off this pose.
             off = judged_mm[np.abs(pose.residual_mm) > max(CLEAR_MM, CLEAR_SIGMAS * sigma_mm)]
             for judges in (cloud, off[:: len(off) // SWEPT_POINTS + 1]):
                 if len(judges) >= LEAST_JUDGES:
@@ -158,7 +158,7 @@ def _turned(
     `share` is of the points that resist, were all of them moved by as much as the farthest.
     """
     rate = float(np.linalg.norm(motion.turn))
-    # the radius is no more than the diagonal
+    # The radius is at most the diagonal.
     if rate < 1e-9 or share > MOST_RESISTING * (rate * diagonal_mm) ** 2:
         return None
     axis = motion.turn / rate

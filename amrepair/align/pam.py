@@ -169,7 +169,7 @@ def pam(
     """
     o3d = open3d()
     o3d.utility.random.seed(int(rng.integers(2**31)))
-    # its warnings go to standard output, which belongs to the caller
+    # The library prints warnings to standard output, which belongs to the caller.
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     middle, start = target_mm.mean(axis=0), source_mm.mean(axis=0)
     radius_mm = float(np.linalg.norm(target_mm - middle, axis=1).max())
@@ -327,7 +327,7 @@ def align_paper(
     matrix = found.matrix if guess is None else found.matrix @ guess.matrix
     placed = scan.points_mm @ matrix[:3, :3].T + matrix[:3, 3]
     residual_mm, gradient = template.distance_and_gradient(placed)
-    # it cannot place a scan better than its own last search radius
+    # The method cannot place a scan better than its own last search radius.
     reach = options.icp_voxels if options.icp else options.ransac_voxels
     limit_mm = max(INLIER_MM, reach * options.voxel * found.radius_mm)
     inlier = np.abs(residual_mm) <= limit_mm

@@ -24,7 +24,7 @@ FIRST_ITERATIONS, LEFT_FACTOR, ENOUGH_SIGMAS = 10, 1.6, 0.05
 FIRST_RATIO = 0.005  # scale of the loss to begin with, of the diagonal
 SAME_FIT_MM = 0.005  # scores that differ by less are alike
 APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
-PLAUSIBLE = 0.6  # a mean distance above this share of the cap is no fit that more points would mend
+PLAUSIBLE = 0.6  # a mean distance above this share of the cap is no fit, with more points either
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""Refinement on the field: robust Gauss–Newton on the template's own distance (idea 3).
+"""Refinement on the field: robust Gauss–Newton on the template's own distance.
 
-No correspondences: a point's residual is f(x), its direction the field's gradient. The loss is
-Geman–McClure with a scale that shrinks from the error of the guess to the noise; a prior keeps
-what the scan does not determine where the guess had it.
+No point is matched with another: a point's residual is f(x), its direction the field's gradient.
+The loss is Geman–McClure with a scale that shrinks from the error of the guess to the noise; a
+prior keeps what the scan does not determine where the guess had it.
 """
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ def search(
         Poses to start from instead of all rotations.
     """
     cell_mm = field.cell_mm
-    # the densest first: thinner ones are made of it
+    # The densest cloud comes first, since thinner ones are made from it.
     clouds = [cloud.to(stage.points) / cell_mm for stage in effort.stages[::-1]][::-1]
     centre = clouds[0].mean(axis=0)
     diagonal = field.diagonal_mm / cell_mm
@@ -214,7 +214,7 @@ def search(
         places = rotations @ centre + (shifts - field.origin_mm) / cell_mm
     scores = np.zeros(len(rotations))
     for stage, points in zip(effort.stages, clouds, strict=True):
-        # about its own centroid each: turning and moving are then apart
+        # Each cloud is taken about its own centroid, which decouples rotation and translation.
         middle = points.mean(axis=0)
         places = places + rotations @ (middle - centre)
         centre = middle

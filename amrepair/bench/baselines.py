@@ -136,7 +136,7 @@ def reweighted(
     near = np.argsort(around, kind="stable")[1:REWEIGHT_NEIGHBOURS]  # but itself
     gaps = np.linalg.norm(bank[near] - features[worst], axis=1) / np.sqrt(bank.shape[1])
     own = distance[worst] / np.sqrt(bank.shape[1])
-    # a softmax, shifted so that large distances do not overflow
+    # The softmax is shifted so that large distances do not overflow.
     top = max(float(gaps.max()), float(own))
     weight = 1.0 - np.exp(own - top) / np.exp(gaps - top).sum()
     return float(weight * distance[worst])

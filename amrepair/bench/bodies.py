@@ -343,7 +343,7 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     only = (on[0] & ~on[1], on[1] & ~on[0])
     if min(which.sum() for which in only) < LEAST_PIECE * on.shape[1]:
         return None
-    # planes that hold the axis: the one with fewest points on the wrong side
+    # Of the planes through the axis, the one with the fewest points on the wrong side is taken.
     u, v = ways_across(axis)
     angles = 2.0 * np.pi * np.arange(ANGLES) / ANGLES
     normals = np.outer(np.cos(angles), u) + np.outer(np.sin(angles), v)
@@ -391,7 +391,7 @@ def _hinge(
     gap = rotation @ middle + shift - middle
     along = float(gap @ axis)
     across = gap - along * axis
-    # the fixed point of a plane rotation, seen from the middle
+    # This is the fixed point of a plane rotation, relative to the middle.
     through = middle + 0.5 * (across + np.cross(axis, across) / np.tan(0.5 * angle))
     if abs(along) > HINGE_RATIO * scene.diagonal_mm:
         return None

@@ -23,7 +23,7 @@ import numpy as np
 from amrepair.bench.method import DIAGONAL_MM, Model, class_input
 from amrepair.bench.metrics import Detection, detection
 from amrepair.bench.registry import make_method
-from amrepair.bench.samples import BenchClass, Format, Sample
+from amrepair.bench.samples import BenchClass, Sample
 from amrepair.template.paper import PaperOptions
 from gcode.progress import Progress, silent
 
@@ -75,7 +75,7 @@ class Cell:
 
     method: str
     one: BenchClass
-    format: Format
+    format: str
     seed: int
     out: Path
     checkpoint: Path | None = None

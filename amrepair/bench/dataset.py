@@ -1,6 +1,6 @@
 """Layouts of data sets by name: who reads them, and where they are to be had.
 
-A new layout is a module with a function that finds classes in a folder, and a row here.
+A new layout is a function that finds classes in a folder, and a row of `LAYOUTS`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Layout:
     source: str
 
 
-LAYOUTS = {
+LAYOUTS: dict[str, Layout] = {
     Format.SHAPENET: Layout(
         shapenet.find_classes,
         "a folder with train/ and test/",
@@ -69,15 +69,16 @@ def open_dataset(root: Path, format: str) -> BenchData:
     root
         Its folder (or a folder or two above the classes).
     format
-        One of `Format`, by name.
+        A name in `LAYOUTS`.
 
     Raises
     ------
     InputError
         If the format is unknown, or the folder holds nothing of that layout.
     """
-    layout = format_named(format)
-    about = LAYOUTS[layout]
+    if format not in LAYOUTS:
+        raise InputError(f"the format '{format}' is unknown; choose one of {', '.join(LAYOUTS)}")
+    about = LAYOUTS[format]
     root = Path(root)
     if not root.is_dir():
         raise InputError(
@@ -86,7 +87,7 @@ def open_dataset(root: Path, format: str) -> BenchData:
     classes = about.find_classes(root)
     if not classes:
         raise InputError(
-            f"{root}: no class of the {layout} layout is here ({about.what_it_needs}); "
+            f"{root}: no class of the {format} layout is here ({about.what_it_needs}); "
             "give the data set's root, or another --format"
         )
     for one in classes:
@@ -94,20 +95,4 @@ def open_dataset(root: Path, format: str) -> BenchData:
             raise InputError(f"{root}: the class {one.name} has no training cloud")
         if not one.test:
             raise InputError(f"{root}: the class {one.name} has no test cloud in test/")
-    return BenchData(layout, root, tuple(sorted(classes, key=lambda c: c.name)))
-
-
-def format_named(name: str) -> Format:
-    """The layout of that name.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    try:
-        return Format(name)
-    except ValueError as e:
-        raise InputError(
-            f"the format '{name}' is unknown; choose one of {', '.join(Format)}"
-        ) from e
+    return BenchData(str(format), root, tuple(sorted(classes, key=lambda c: c.name)))

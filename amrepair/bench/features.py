@@ -60,7 +60,7 @@ def nearest(
     for start in range(0, len(queries), QUERY_ROWS):
         part = queries[start : start + QUERY_ROWS].astype(np.float32)
         index[start : start + QUERY_ROWS] = np.argmin(bank_squared - 2 * part @ bank.T, axis=1)
-    # the expanded square cancels badly; the distance itself is computed directly
+    # The expanded square loses digits by cancellation, so the distance is computed directly.
     gap = queries.astype(np.float64) - bank[index]
     return np.linalg.norm(gap, axis=1), index
 

@@ -216,7 +216,7 @@ class FieldModel:
         offset_mm = self.template.distance(placed)
         spread = getattr(self.template, "spread_mm", None)
         spread_mm = np.zeros(len(placed)) if spread is None else spread(placed)
-        # without noise and spread (published clouds may have none) the unit does not matter
+        # Published clouds may have neither noise nor spread; the unit does not matter then.
         sigma_mm = np.hypot(max(self.sigma_mm, LEAST_SIGMA_MM), spread_mm)
         score = smoothed_score(placed, offset_mm, sigma_mm)
         top = max(MIN_TOP, int(TOP_RATIO * len(score)))

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from amrepair.bench.metrics import CloudDistance
-from amrepair.bench.samples import BenchClass, Format
+from amrepair.bench.samples import BenchClass
 
 if TYPE_CHECKING:
     import trimesh
@@ -42,7 +42,7 @@ class ClassInput:
     """
 
     name: str
-    format: Format
+    format: str
     clouds_mm: tuple[Float[np.ndarray, "_ 3"], ...]
     mesh: trimesh.Trimesh | None
     sigma_mm: float
@@ -94,7 +94,7 @@ class Method(Protocol):
         ...
 
 
-def class_input(one: BenchClass, format: Format) -> ClassInput:
+def class_input(one: BenchClass, format: str) -> ClassInput:
     """Read a class's normal data and scale it."""
     import trimesh
 

@@ -92,7 +92,7 @@ def detection(labels: Shaped[np.ndarray, " n"], scores: Shaped[np.ndarray, " m"]
     hits, alarms = _steps(truth, values)
     hit_steps = np.diff(hits, prepend=0).astype(np.float64)
     alarm_steps = np.diff(alarms, prepend=0).astype(np.float64)
-    # trapezoid: items of one tie count half against each other
+    # By the trapezoid rule items with equal scores count half against each other.
     area = float((alarm_steps * (hits - hit_steps / 2)).sum())
     precision = hits / (hits + alarms)
     return Detection(

@@ -38,9 +38,9 @@ BESIDE = 2.0  # spacings of the cloud: a point of the surface has one of it so n
 TARGET_POINTS = 20_000  # of the template's cloud: as many as the largest test clouds need
 
 
-def pam_options(format: Format) -> PamOptions:
+def pam_options(format: str) -> PamOptions:
     """The paper's, or the released code's where only parts of the surface are seen."""
-    return CODE if format is Format.REAL3D else PAPER
+    return CODE if format == Format.REAL3D else PAPER
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class Target:
         """(n,) distance to the normal surface, mm."""
         if self.exact is not None:
             return self.exact.unsigned_distance(points_mm)
-        # to the nearest point alone it is half the cloud's spacing wherever the points lie
+        # The distance to the nearest point alone would be half the cloud's spacing in any case.
         distance, index = cKDTree(self.cloud_mm).query(points_mm, workers=-1)
         offset = points_mm - self.cloud_mm[index]
         height = np.abs((offset * self._normals[index]).sum(axis=1))

@@ -30,7 +30,7 @@ METHODS = (
 )
 
 # O-AUROC and P-AUROC, %; None where the paper prints none.
-PUBLISHED: dict[Format, dict[str, tuple[float | None, float | None]]] = {
+PUBLISHED: dict[str, dict[str, tuple[float | None, float | None]]] = {
     Format.SHAPENET: {
         "pasdf-paper": (90.0, 89.7),
         "btf-raw": (49.3, 55.0),
@@ -71,13 +71,16 @@ PUBLISHED: dict[Format, dict[str, tuple[float | None, float | None]]] = {
     },
 }
 # CD and EMD of the repair template, with positional encoding.
-PUBLISHED_REPAIR = {Format.REAL3D: (0.0203, 0.0110), Format.SHAPENET: (0.0445, 0.0228)}
+PUBLISHED_REPAIR: dict[str, tuple[float, float]] = {
+    Format.REAL3D: (0.0203, 0.0110),
+    Format.SHAPENET: (0.0445, 0.0228),
+}
 
 
 def make_method(
     name: str, *, checkpoint: Path | None = None, paper: PaperOptions | None = None
 ) -> Method:
-    """A method by its name on the command line.
+    """Return the method that has this name on the command line.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ LAYOUT_VERSION = 2
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What a run came to.
+    """The results of a benchmark run.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ def run_bench(
     dataset
         Its folder.
     format
-        One of `Format`, by name.
+        A name in `LAYOUTS`.
     methods
         Names out of `METHODS`.
     out

@@ -23,7 +23,7 @@ UNKNOWN = -1  # the label of a point of which nobody has said whether it is anom
 
 
 class Format(StrEnum):
-    """Layouts, by their names on the command line."""
+    """The layouts that amrepair brings, by their names on the command line."""
 
     SHAPENET = "anomaly-shapenet"
     REAL3D = "real3d-ad"
@@ -132,7 +132,7 @@ class BenchClass:
 class BenchData:
     """A data set as found on disk, classes sorted by name."""
 
-    format: Format
+    format: str
     root: Path
     classes: tuple[BenchClass, ...]
 

@@ -230,7 +230,7 @@ def _make_all(
     ratio = SINGLE_VIEW_RATIO[layout] if share is None else share
     for i in range(options.train):
         rng = np.random.default_rng([*key, 1, i])
-        # the first one lies as the mesh does
+        # The first cloud lies as the mesh does.
         yield _made(
             part, part.shape, options, rng, kind="good", index=i, role="train", at_rest=i == 0
         )
@@ -322,7 +322,7 @@ def _defective(
             single=single and attempt < MAX_SINGLE_VIEWS,
         )
         labels = made.cloud.labels
-        # a view shows as much less of a smaller defect as that has less of a surface
+        # The share that a view must show falls with the defect's surface.
         need = max(MIN_LABELLED, MIN_LABELLED_RATIO * size.scale**2 * len(labels))
         if labels.sum() >= need and 1.0 - labels.mean() >= MIN_NORMAL_RATIO:
             return made

@@ -169,7 +169,7 @@ def _bulge(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shap
         return _swelling(part, seed, radius_mm, height_mm)
     if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
         return None
-    # the lump's lower half stays inside the material, or it would bulge on the far side too
+    # The lump's lower half stays inside the material, or the far side would bulge, too.
     floor_mm = min(height_mm, 0.9 * seed.thickness_mm)
     dome = _lump(radius_mm, height_mm, rng).trim_by_plane((0.0, 0.0, 1.0), -floor_mm)
     return _result(part, part.solid + dome.transform(_frame(seed, rng)).as_original())
@@ -211,7 +211,7 @@ def _hole(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
     radius_mm = size.scale * rng.uniform(0.02, 0.045) * part.diagonal_mm
     if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
         return None
-    # through what is thin, blind in what is thick
+    # The hole goes through thin walls and is blind in thick ones.
     depth_mm = min(1.1 * seed.thickness_mm, 0.12 * part.diagonal_mm)
     wave = _waves(rng, 1.2)
     tool = m3.Manifold.cylinder(1.0, 1.0, 1.0, 48).translate((0.0, 0.0, -1.0))
@@ -238,8 +238,8 @@ def _crack(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shap
         [np.stack([x, y - half], axis=1), np.stack([x, y + half], axis=1)[::-1]]
     )
     section = m3.CrossSection([outline])
-    # a zigzag slit; it reaches above the seed so as to clear a curved surface
-    # full width outside, a third of it at the bottom: its walls can be seen
+    # This is a zigzag slit. It reaches above the seed so as to clear a curved surface.
+    # Its width falls to a third at the bottom, so that its walls can be seen.
     blade = section.extrude(depth_mm + width_mm, scale_top=(0.9, 0.3))
     blade = blade.rotate((180.0, 0.0, 0.0)).translate((0.0, 0.0, width_mm))
     blade = blade.transform(_frame(seed, rng))
@@ -275,7 +275,7 @@ def _break(part: Part, _seed: Seed, rng: np.random.Generator, size: Size) -> Sha
     left = part.solid - sheet.transform(frame).as_original()
     if not is_valid(left):
         return None
-    # splinters fall off; whole bodies of a part in several pieces stay
+    # Splinters are dropped; whole bodies of a part in several pieces stay.
     kept = [body for body in left.decompose() if body.volume() > SPLINTER_RATIO * volume]
     return _result(part, m3.Manifold.compose(kept)) if kept else None
 
@@ -285,7 +285,7 @@ def _bend(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
     diagonal_mm = part.diagonal_mm
     fine = part.solid.refine_to_length(diagonal_mm / 60)
     vertices, faces = manifold_arrays(fine)
-    # shares of the surface, not of vertices: those crowd where the mesh is finely divided
+    # Shares are of the surface and not of vertices, which crowd where the mesh is fine.
     surface = sample_shape(part.shape, BEND_POINTS, rng).points_mm
     middle = surface.mean(axis=0)
     axes = np.linalg.svd((surface - middle).T @ (surface - middle))[0]
@@ -296,7 +296,7 @@ def _bend(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
     start = float(np.quantile((surface - middle) @ along, rng.uniform(0.55, 0.75)))
     angle_rad = size.scale * np.deg2rad(rng.uniform(5.0, 10.0))
     zone_mm = 0.08 * diagonal_mm
-    # an arc of length `zone`, then straight on: exact bending of the line v = 0
+    # The line v = 0 is bent exactly: an arc of length `zone`, then straight on.
     reach = np.maximum(u - start, 0.0)
     phi = angle_rad * np.minimum(reach / zone_mm, 1.0)
     radius_mm = zone_mm / angle_rad

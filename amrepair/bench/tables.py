@@ -18,7 +18,6 @@ import numpy as np
 from amrepair.bench.cells import Row
 from amrepair.bench.metrics import mean_and_spread
 from amrepair.bench.registry import PAPER_METHOD, PUBLISHED, PUBLISHED_REPAIR
-from amrepair.bench.samples import Format
 from amrepair.template.paper import PAPER, PaperOptions
 
 AREAS = ("o_auroc", "p_auroc", "o_aupr", "p_aupr")
@@ -74,7 +73,7 @@ def recipe_note(paper: PaperOptions) -> str:
 
 def as_json(
     rows: Sequence[Row],
-    format: Format,
+    format: str,
     *,
     synthetic: bool,
     complete: bool,
@@ -152,7 +151,7 @@ def _plain(mean: float, digits: int) -> str:
     return "–" if math.isnan(mean) else f"{mean:.{digits}f}"
 
 
-def _published(format: Format, method: str) -> str:
+def _published(format: str, method: str) -> str:
     pair = PUBLISHED.get(format, {}).get(method)
     if pair is None:
         return "–"
@@ -176,7 +175,7 @@ def in_short(rows: Sequence[Row]) -> str:
 
 def as_markdown(
     rows: Sequence[Row],
-    format: Format,
+    format: str,
     *,
     synthetic: bool,
     complete: bool,

@@ -15,7 +15,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Entry point; where a library is missing, it says which and how to mend it."""
+    """Entry point; where a library is missing, it says which and how to fix it."""
     try:
         from amrepair.cli.app import main as run
 

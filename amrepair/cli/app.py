@@ -15,9 +15,9 @@ from amrepair.cli import (
     health,
     inspect,
     live,
-    mend,
     postprocessing,
     printing,
+    repairing,
     replaying,
     simulation,
     templates,
@@ -53,7 +53,7 @@ def _root(
 simulation.add_to(app)
 templates.add_to(app)
 inspect.add_to(app)
-mend.add_to(app)
+repairing.add_to(app)
 printing.add_to(app)
 postprocessing.add_to(app)
 calibration.add_to(app)

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from amrepair.cli.scanners import Bed, open_scanner
 from amrepair.errors import InputError
+from amrepair.frames import Transform
 from amrepair.loop.calibrate import calibrate, target_solid, write_calibration
-from amrepair.scans import Scan, ScanRequest, WatchedFolderScanner, read_scan
+from amrepair.scans import Scan, ScanRequest, read_scan
 from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
@@ -108,11 +110,10 @@ def _scan(setup: PrintSetup, source: Source, bars: console.Bars) -> Scan:
         if port is not None or scanner is not None:
             raise InputError("--scan is a scan that there is; leave --port and --scanner out")
         return read_scan(scan, frame="scanner")
-    if port is None or scanner is None or not scanner.startswith("watch:"):
-        raise InputError(
-            "give --port and --scanner watch:DIR to print and scan the target, or --scan FILE"
-        )
-    eye = WatchedFolderScanner(Path(scanner.removeprefix("watch:")), timeout_s=source.timeout_s)
+    if port is None or scanner is None:
+        raise InputError("give --port and --scanner to print and scan the target, or --scan FILE")
+    nowhere = Transform.identity("build", "scanner")  # where it hangs is what is sought
+    eye = open_scanner(scanner, Bed(nowhere, source.timeout_s, setup))
     checked = _target(setup)
     machine = connect(
         port,

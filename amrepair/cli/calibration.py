@@ -57,7 +57,11 @@ def calibrate_command(
         str | None, typer.Option(help="Print the target there: device path, or a server's.")
     ] = None,
     scanner: Annotated[
-        str | None, typer.Option(help="watch:DIR: where the scan of the target will be dropped.")
+        str | None,
+        typer.Option(
+            help="watch:DIR: where the scan of the target will be dropped; or python:FILE, a "
+            "scanner of your own."
+        ),
     ] = None,
     scan: Annotated[
         Path | None, typer.Option(help="Scan of a target, or layer, that stands there already.")

@@ -1,4 +1,4 @@
-"""`amrepair doctor`: what this machine lacks, and how to mend it."""
+"""`amrepair doctor`: what this machine lacks, and how to fix it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def doctor(as_json: JsonOption = False) -> None:
-    """Check Python, libraries, torch, open3d, profiles, ports, disk and cache; say how to mend.
+    """Check Python, libraries, torch, open3d, profiles, ports, disk and cache; say how to fix.
 
     Exit 0 where every command can work, 2 where one cannot.
     """

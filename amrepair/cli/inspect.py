@@ -123,7 +123,7 @@ def align(
             moved = cloud.moved(found.template_from_scan)
             with bars.stage("write"):
                 console.write_whole(output, lambda path: write_ply(moved, path))
-    # the pose is an input of other programs: all its digits
+    # Other programs take the pose as input, so that it keeps all digits.
     result: dict[str, Any] = {
         "template_from_scan": found.template_from_scan.matrix.tolist(),
         "rmse_mm": found.rmse_mm,
@@ -175,7 +175,7 @@ def from_library(
 
 
 def chosen_part(known: Recognition) -> dict[str, Any]:
-    """What results say of a choice."""
+    """A choice of a part, as results record it."""
     return {
         "template": known.name,
         "confidence": round(known.confidence, 4),

@@ -64,8 +64,8 @@ def loop(
     scanner: Annotated[
         str | None,
         typer.Option(
-            help="watch:DIR, a folder that scans are dropped in; or simulated:FILE, of what "
-            "'gcode emulate --motion FILE' has printed."
+            help="watch:DIR, a folder that scans are dropped in; python:FILE, a scanner of your "
+            "own; or simulated:FILE, of what 'gcode emulate --motion FILE' has printed."
         ),
     ] = None,
     printer: JobPrinterOption = None,

@@ -9,9 +9,10 @@ from typing import Any
 
 import typer
 
-from amrepair.cli.asking import AtDesk, Terminal
+from amrepair.cli.approval import AtDesk, Terminal
 from amrepair.cli.live import NoView, ShownRun, live_view
-from amrepair.cli.warmth import ThermalLog
+from amrepair.cli.scanners import Bed, known_scanner, open_scanner
+from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import InputError, LoopError
 from amrepair.fleet.desk import Desk
 from amrepair.frames import Transform
@@ -37,7 +38,6 @@ from amrepair.repair import Stopwatch
 from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
-from amrepair.scans import Scanner, WatchedFolderScanner
 from amrepair.template import open_template
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check, policy_of
@@ -182,7 +182,7 @@ def _new_run(
     setup, own = job_setup(text, job_file, *named)
     _ = setup.printer.head  # refused before any work
     pose = read_calibration(calibration)
-    _scanner(said["scanner"], pose, said["scan_timeout_s"], setup)  # refused before any work
+    known_scanner(said["scanner"])  # refused before any work
     folder = RunFolder(out)
     before = read_events(out)
     if before and before[-1].get("event") != "end":
@@ -281,8 +281,9 @@ def _print(
     find = None
     if going_on:
         find = pick_up(machine, release_c=setup.material.bed_release_c, pose_confirmed=pose)
-    eye = _scanner(
-        setting.scanner, setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed
+    eye = open_scanner(
+        setting.scanner,
+        Bed(setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed),
     )
     page.show_run(begun.job, _placed_solid(begun.template, setting.placed))
     if not going_on:
@@ -393,31 +394,6 @@ def _tell(
         raise typer.Exit(LoopError.exit_code)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
-
-
-def _scanner(
-    spec: str, pose: Transform, timeout_s: float, setup: PrintSetup, seed: int = 0
-) -> Scanner:
-    kind, _, where = spec.partition(":")
-    if kind == "watch" and where:
-        return WatchedFolderScanner(Path(where), build_from_scanner=pose, timeout_s=timeout_s)
-    if kind == "simulated" and where:
-        from amrepair.simulate.live import PrintedScanner
-        from amrepair.simulate.parameters import DEFAULT_SCANNER, load_world
-        from gcode.firmware.motion import MotionFile
-
-        return PrintedScanner(
-            MotionFile(Path(where)),
-            printer=setup.printer,
-            pose=pose,
-            told=load_world(),
-            scanner=DEFAULT_SCANNER,
-            seed=seed,
-        )
-    raise InputError(
-        f"--scanner is {spec!r}; give watch:DIR, or simulated:FILE with the motion of an emulated "
-        "printer ('gcode emulate --motion FILE')"
-    )
 
 
 def _placed_solid(template: Template, placed: Transform) -> Any:

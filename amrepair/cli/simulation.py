@@ -105,7 +105,7 @@ def simulate(
         from amrepair.repair import Stopwatch
         from amrepair.report import write_report
         from amrepair.report.folder import RunFolder
-        from amrepair.simulate.defects import DefectKind, parse_defect
+        from amrepair.simulate.defects import parse_defect
         from amrepair.simulate.parameters import load_world
         from amrepair.simulate.part_files import bracket_path
         from amrepair.simulate.run import place_on_bed, prepare_run, simulate_run
@@ -113,7 +113,7 @@ def simulate(
 
     watch, bars = Stopwatch(), console.Bars()
     defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
-    defects = [d for d in defects if d.kind is not DefectKind.NONE]
+    defects = [d for d in defects if d.kind != "none"]
     setup = load_setup(printer, material, process)
     told = load_world(world)
     told.scanner(scanner)  # refused before any work

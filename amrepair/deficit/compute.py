@@ -1,7 +1,8 @@
 """The deficit: template minus as-built, with a tolerance, as solids in the build frame.
 
-Idea 6 of the design, in the distance field: erode the template by τ, subtract the as-built part,
-grow back, clip to template minus as-built. What is thinner than τ counts only where detection's
+Template minus scan leaves a thin connected shell of noise. So the distance field of the template
+is eroded by τ, the as-built part is subtracted, and what is left is grown back and clipped to
+template minus as-built. What is thinner than τ counts only where detection's
 averages say so. Empty space counts only where a ray crossed it or scanned surface bounds it.
 """
 

@@ -118,7 +118,7 @@ def with_rising_rims(
     designed_mm: Float[np.ndarray, "ny nx"],
     spacing_mm: float,
 ) -> HeightField:
-    """The as-built field, tops that rise towards an edge going on up to it, or to the design.
+    """The as-built field, tops that rise towards an edge extended up to it, or to the template.
 
     Solids round off a sharp rim: its last columns read as high as what lies some points farther in,
     up to 0.3 mm too low for a worn edge that rises at 45°. A plane through what lies beyond their

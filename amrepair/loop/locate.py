@@ -95,7 +95,7 @@ def locate_parts(
 
     What is connected as seen from above is one thing, skirts, brims and supports left aside. The
     centre lines of the outer walls lie half a bead inside the part, so they are registered to that
-    level of its field (idea 12 of the design). Of poses that fit alike the part is turned least.
+    level of its field. Of poses that fit alike the part is turned least.
 
     Returns
     -------

@@ -193,7 +193,7 @@ class WatchedFolderScanner:
                 path, frame="scanner", sigma_mm=self._sigma_mm, sensor_at=self._sensor_at
             )
         except (InputError, OSError) as e:
-            # it may be half written still: a change of size or time brings it back
+            # The file may still be half written; a change of size or time brings it back.
             return None, f"{path.name} cannot be read: {e}"
         self._digests.add(digest)
         self._forget(path)

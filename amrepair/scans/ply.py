@@ -156,7 +156,7 @@ def _refuse_promises(header: PlyHeader, have_bytes: int, path: Path) -> None:
                 f"with {names})"
             )
         need += element.least_bytes(text=header.order == "")
-        # the last value of a text needs no end of line
+        # The last value of a text file needs no end of line.
         refuse_short(path, f"{element.count} of {element.name}", need - 1, have_bytes)
 
 

@@ -84,7 +84,7 @@ def _station(
     seen = ~np.isnan(by_row).any(axis=2) & (by_row != 0).any(axis=2)
     if not np.isfinite(by_row[seen]).all():
         raise InputError(f"{path}: the PTX file has a point at infinity; it is damaged")
-    # some programs write points in the common frame already: no matrix, but a place
+    # Some programs write points in the common frame already: they give a place and no matrix.
     moved = bool(np.abs(matrix - np.eye(4)).max() > 0)
     build = _rigid(matrix, path) if moved else None
     points_mm = by_row[seen] * MM_PER_M

@@ -137,7 +137,7 @@ def _with_word(
         sensors = np.asarray(sensor_at, dtype=np.float64).reshape(-1, 3)
         if index is None or int(index.max()) >= len(sensors):
             if len(sensors) > 1:
-                # a wrong ray crosses the part and calls it empty: the nearest is only a guess
+                # A wrong ray would cross the part and call it empty, so none is guessed.
                 raise InputError(
                     f"{scan.source}: {len(sensors)} sensor positions are given, but the file does "
                     "not say which of them saw each point; give one, or a PLY with a 'sensor' "
@@ -184,7 +184,7 @@ def _from_columns(
     if set(normal_names) <= set(columns):
         raw = np.stack([columns[name] for name in normal_names], axis=1)
         length = np.linalg.norm(raw, axis=1, keepdims=True)
-        # a cloud with absent normals carries zeros or NaN: then it has none
+        # A cloud without normals may carry zeros or NaN in their place.
         if len(raw) and np.isfinite(length).all() and (length > 1e-6).mean() > 0.99:
             normals = raw / np.maximum(length, 1e-12)
     index: Int[np.ndarray, " n"] | None = None

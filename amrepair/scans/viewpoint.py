@@ -123,7 +123,7 @@ def viewpoint_of(
     best = min(good, key=lambda fit: fit.rms)
     straight = [fit for fit in good if fit.kind != "pushbroom"]
     if straight and best.kind == "pushbroom":
-        # a sheet has more to fit with: it must do clearly better
+        # A sheet of rays has more parameters, so it must fit clearly better.
         simpler = min(straight, key=lambda fit: fit.rms)
         if best.rms * options.times_better > simpler.rms:
             best = simpler
@@ -142,7 +142,7 @@ def _pixels(points: Float[np.ndarray, "n 3"], grid: RangeGrid, most: int) -> _Pi
     rows, columns = np.nonzero(grid.index >= 0)
     every = max(1, len(rows) // most)
     rows, columns = rows[::every], columns[::every]
-    # fewer than a dozen fit anything
+    # Fewer than a dozen points fit any model.
     if len(rows) < 12 or np.ptp(rows) == 0 or np.ptp(columns) == 0:
         return None
     xyz = points[grid.index[rows, columns]]
@@ -165,7 +165,7 @@ def _even(image: Float[np.ndarray, "2 m"], place: Float[np.ndarray, "2 m"]) -> n
     at = np.stack([np.ones(image.shape[1]), *image], axis=1)
     fit = np.linalg.lstsq(at, place.T, rcond=None)[0]
     step = fit[1:].T
-    # columns and rows that run the same way, to a degree, are no image
+    # Where columns and rows run the same way to within a degree, the grid is no image.
     if not abs(np.linalg.det(step)) > 0.02 * np.prod(np.linalg.norm(step, axis=0)):
         return None
     return np.asarray(np.linalg.solve(step, place - (at @ fit).T))

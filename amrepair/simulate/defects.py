@@ -1,94 +1,94 @@
-"""Defects: what can be asked for, how it is written, and what it becomes once it has a place.
+"""Kinds of defects of the simulated world: one table of what each is told and where it goes.
 
-A defect is text (`void:diameter=8,layers=4`) until `placement.place` finds room for it on a part;
-then it is a `PlacedDefect` that the world can act out. Nothing here looks at scans.
+A defect is text (`void:diameter=8,layers=4`) until `place` finds room for it on a part; then it is
+a `PlacedDefect` that the world can act out. A new kind is a row of `KINDS`. Nothing here looks at
+scans.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from enum import StrEnum
+from collections.abc import Callable
+from dataclasses import dataclass
 from types import MappingProxyType
 
-import manifold3d
+import manifold3d as m3
 import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import InputError
+from amrepair.simulate import placement
+from amrepair.simulate.placed import Defect, Option, PlacedDefect, Printed
+from gcode.reader.job import Beads
 
+__all__ = ["KINDS", "Defect", "Kind", "Option", "PlacedDefect", "Printed", "parse_defect", "place"]
 
-class DefectKind(StrEnum):
-    """What can go wrong with a print."""
-
-    VOID = "void"
-    MISSING_BEADS = "missing_beads"
-    UNDER_EXTRUSION = "under_extrusion"
-    CHIP = "chip"
-    BLOB = "blob"
-    NONE = "none"
+_SHRINK = tuple(0.85**k for k in range(9))  # down to a quarter of the size asked for
 
 
 @dataclass(frozen=True, slots=True)
-class Option:
-    """One key of a defect: its default, range and meaning."""
-
-    default: float
-    low: float
-    high: float
-    meaning: str
-
-
-# A void's default, 9 mm × 4 layers of 0.2 mm, is 51 mm³; a chip's or blob's is a few dozen.
-OPTIONS: dict[DefectKind, dict[str, Option]] = {
-    DefectKind.VOID: {
-        "diameter": Option(10.0, 2.0, 40.0, "mm across"),
-        "layers": Option(4.0, 1.0, 40.0, "layers not extruded"),
-        "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
-        "wall": Option(2.0, 0.0, 20.0, "mm to the part's wall"),
-    },
-    DefectKind.MISSING_BEADS: {
-        "beads": Option(4.0, 1.0, 40.0, "neighbouring lines skipped in every layer"),
-        "length": Option(12.0, 2.0, 100.0, "mm of each line skipped, at most"),
-        "layers": Option(2.0, 1.0, 40.0, "layers affected"),
-        "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
-    },
-    DefectKind.UNDER_EXTRUSION: {
-        "flow": Option(0.5, 0.0, 0.95, "flow left, of 1"),
-        "layers": Option(3.0, 1.0, 40.0, "layers affected"),
-        "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
-        "diameter": Option(0.0, 0.0, 200.0, "mm across; 0: the whole layer"),
-    },
-    DefectKind.CHIP: {
-        "size": Option(8.0, 1.5, 40.0, "mm across"),
-        "depth": Option(1.4, 0.3, 20.0, "mm deep"),
-        "roughness": Option(0.15, 0.0, 1.0, "mm, standard deviation of the fracture"),
-    },
-    DefectKind.BLOB: {
-        "size": Option(4.0, 1.0, 20.0, "mm across"),
-        "height": Option(1.0, 0.2, 10.0, "mm above the top"),
-    },
-    DefectKind.NONE: {},
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Defect:
-    """A defect as asked for, without a place.
+class Kind:
+    """A kind of defect.
 
     Attributes
     ----------
-    kind
-        What goes wrong.
-    values
-        Every option of that kind, defaults filled in.
+    options
+        What it is told: the keys of its text.
+    place
+        Finds its place: the defect, what it goes on, a generator that chooses among the places,
+        and a factor of at most 1 by which it is smaller than was asked for; None where there is
+        no room for it.
     """
 
-    kind: DefectKind
-    values: MappingProxyType[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    options: dict[str, Option]
+    place: Callable[[Defect, Printed, np.random.Generator, float], PlacedDefect | None]
 
-    def __str__(self) -> str:
-        options = ",".join(f"{key}={value:g}" for key, value in self.values.items())
-        return f"{self.kind}:{options}" if options else str(self.kind)
+
+# A void of default size is some 50 mm³; a chip or blob a few dozen.
+KINDS: dict[str, Kind] = {
+    "void": Kind(
+        {
+            "diameter": Option(10.0, 2.0, 40.0, "mm across"),
+            "layers": Option(4.0, 1.0, 40.0, "layers not extruded"),
+            "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
+            "wall": Option(2.0, 0.0, 20.0, "mm to the part's wall"),
+        },
+        placement.void,
+    ),
+    "missing_beads": Kind(
+        {
+            "beads": Option(4.0, 1.0, 40.0, "neighbouring lines skipped in every layer"),
+            "length": Option(12.0, 2.0, 100.0, "mm of each line skipped, at most"),
+            "layers": Option(2.0, 1.0, 40.0, "layers affected"),
+            "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
+        },
+        placement.missing_beads,
+    ),
+    "under_extrusion": Kind(
+        {
+            "flow": Option(0.5, 0.0, 0.95, "flow left, of 1"),
+            "layers": Option(3.0, 1.0, 40.0, "layers affected"),
+            "layer": Option(-1.0, -1.0, 100000.0, "last layer, counted from 0; -1: seeded"),
+            "diameter": Option(0.0, 0.0, 200.0, "mm across; 0: the whole layer"),
+        },
+        placement.under_extrusion,
+    ),
+    "chip": Kind(
+        {
+            "size": Option(8.0, 1.5, 40.0, "mm across"),
+            "depth": Option(1.4, 0.3, 20.0, "mm deep"),
+            "roughness": Option(0.15, 0.0, 1.0, "mm, standard deviation of the fracture"),
+        },
+        placement.chip,
+    ),
+    "blob": Kind(
+        {
+            "size": Option(4.0, 1.0, 20.0, "mm across"),
+            "height": Option(1.0, 0.2, 10.0, "mm above the top"),
+        },
+        placement.blob,
+    ),
+    "none": Kind({}, placement.nowhere),
+}
 
 
 def parse_defect(text: str) -> Defect:
@@ -99,14 +99,10 @@ def parse_defect(text: str) -> Defect:
     InputError
         If type, key or value is not one that there is.
     """
-    name, _, tail = text.strip().partition(":")
-    try:
-        kind = DefectKind(name)
-    except ValueError as error:
-        raise InputError(
-            f"there is no defect type {name!r}; there are {', '.join(DefectKind)}"
-        ) from error
-    options = OPTIONS[kind]
+    kind, _, tail = text.strip().partition(":")
+    if kind not in KINDS:
+        raise InputError(f"there is no defect type {kind!r}; there are {', '.join(KINDS)}")
+    options = KINDS[kind].options
     values = {key: option.default for key, option in options.items()}
     for item in filter(None, (part.strip() for part in tail.split(","))):
         key, equals, word = (piece.strip() for piece in item.partition("="))
@@ -127,33 +123,42 @@ def parse_defect(text: str) -> Defect:
     return Defect(kind, MappingProxyType(values))
 
 
-@dataclass(frozen=True, slots=True)
-class PlacedDefect:
-    """A defect with a place on a part.
+def place(
+    defect: Defect,
+    part: m3.Manifold,
+    tops_mm: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    *,
+    beads: Beads | None = None,
+) -> PlacedDefect:
+    """Find a place for a defect.
 
-    Attributes
+    Parameters
     ----------
-    kind
-        What goes wrong.
-    layers
-        Indices of the layers whose flow it changes, rising; none for a defect of the whole part.
-    flow_regions
-        (n, 9) ellipses where the flow changes: x, y, cos, sin, half-axes, z above, z up to,
-        factor; build frame, mm. The world reads them.
-    removed, added
-        Solids of the build frame that break off, or are added to, the finished part.
-    box_mm
-        (2, 3) box around it, build frame.
+    defect
+        What is asked for.
+    part
+        The solid that is printed, build frame.
+    tops_mm
+        (n,) heights of the layers' tops, rising.
+    rng
+        Chooses among the places.
+    beads
+        The job's beads, for defects that skip some of them.
+
+    Raises
+    ------
+    InputError
+        If the part has no room for it, even at a quarter of its size.
     """
-
-    kind: DefectKind
-    layers: tuple[int, ...]
-    flow_regions: Float[np.ndarray, "n 9"]
-    removed: manifold3d.Manifold | None
-    added: manifold3d.Manifold | None
-    box_mm: Float[np.ndarray, "2 3"]
-
-    @property
-    def last_layer(self) -> int | None:
-        """The layer after which it is scanned and repaired; None: once the part is finished."""
-        return self.layers[-1] if self.layers else None
+    printed = Printed(part, np.asarray(tops_mm), beads)
+    for scale in _SHRINK:
+        placed = KINDS[defect.kind].place(defect, printed, rng, scale)
+        if placed is not None:
+            return placed
+    box = part.bounding_box()
+    raise InputError(
+        f"the part of {box[3] - box[0]:.1f}×{box[4] - box[1]:.1f}×{box[5] - box[2]:.1f} mm has no "
+        f"room for the defect {defect}, even at {_SHRINK[-1]:.0%} of its size; "
+        "ask for a smaller one"
+    )

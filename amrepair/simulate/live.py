@@ -98,7 +98,7 @@ class PrintedScanner:
             If nothing stands there: no motion has come, or the file is another printer's.
         """
         batch = noisy_flow(self._motion.take(), self._flow_rng, self._flow)
-        # what is printed between two looks of one stop is a repair: the part has cooled
+        # What is printed between two scans of one stop is a repair: the part has cooled by then.
         self.world.deposit(batch, onto_cold=request.label in self._looked)
         self._looked.add(request.label)
         return self._scanner.scan(request)

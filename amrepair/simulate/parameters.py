@@ -211,7 +211,7 @@ class WorldParameters:
         """
         recording = self.recording(name)
         if recording is not None:
-            # what it says of its noise, as a data sheet would; the noise itself is replayed
+            # The scanner states its noise as a data sheet would; the noise itself is replayed.
             told = {"sigma_mm": recording.sigma_mm, "slope_power": 0.0, "outlier_ratio": 0.0}
             return self.scanner().model_copy(update=told)
         if name not in self.scanners:

@@ -5,17 +5,14 @@ Works on sections of the solid in the build frame. It neither prints nor repairs
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import manifold3d as m3
 import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.errors import InputError
-from amrepair.simulate.defects import Defect, DefectKind, PlacedDefect
+from amrepair.simulate.placed import Defect, PlacedDefect, Printed
 from gcode.reader.job import Beads
 
-_SHRINK = tuple(0.85**k for k in range(9))  # down to a quarter of the size asked for
 _LEAST_ROOM_MM2 = 0.02
 _TRIES = 60
 _CRUMB_MM3 = 0.05  # too small to be found, let alone printed
@@ -23,57 +20,6 @@ _EVERYWHERE_MM = 1e9
 EVEN_RATIO = 0.97
 # Skipped lines: shorter ones are pieces of curves. Flow stops on the centre line and no wider.
 _LEAST_LINE_MM, _LINE_MM = 3.0, 0.05
-
-
-def place(
-    defect: Defect,
-    part: m3.Manifold,
-    tops_mm: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
-    *,
-    beads: Beads | None = None,
-) -> PlacedDefect:
-    """Find a place for a defect.
-
-    Parameters
-    ----------
-    defect
-        What is asked for.
-    part
-        The solid that is printed, build frame.
-    tops_mm
-        (n,) heights of the layers' tops, rising.
-    rng
-        Chooses among the places.
-    beads
-        The job's beads, for defects that skip some of them.
-
-    Raises
-    ------
-    InputError
-        If the part has no room for it, even at a quarter of its size.
-    """
-    finders: dict[DefectKind, Callable[..., PlacedDefect | None]] = {
-        DefectKind.VOID: _void,
-        DefectKind.UNDER_EXTRUSION: _under_extrusion,
-        DefectKind.CHIP: _chip,
-        DefectKind.BLOB: _blob,
-    }
-    if defect.kind is DefectKind.NONE:
-        return PlacedDefect(defect.kind, (), np.zeros((0, 9)), None, None, np.zeros((2, 3)))
-    for scale in _SHRINK:
-        if defect.kind is DefectKind.MISSING_BEADS:
-            placed = _missing_beads(defect, part, np.asarray(tops_mm), rng, scale, beads)
-        else:
-            placed = finders[defect.kind](defect, part, np.asarray(tops_mm), rng, scale)
-        if placed is not None:
-            return placed
-    box = part.bounding_box()
-    raise InputError(
-        f"the part of {box[3] - box[0]:.1f}×{box[4] - box[1]:.1f}×{box[5] - box[2]:.1f} mm has no "
-        f"room for the defect {defect}, even at {_SHRINK[-1]:.0%} of its size; "
-        "ask for a smaller one"
-    )
 
 
 def _layer_ranges(
@@ -138,13 +84,18 @@ def _triangles(area: m3.CrossSection) -> Float[np.ndarray, "n 3 2"]:
     return corners[np.asarray(m3.triangulate(polygons))].reshape(-1, 3, 2)
 
 
-def _void(
-    defect: Defect,
-    part: m3.Manifold,
-    tops_mm: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
-    scale: float,
+def nowhere(
+    defect: Defect, printed: Printed, rng: np.random.Generator, scale: float
+) -> PlacedDefect:
+    """No defect at all."""
+    return PlacedDefect(defect.kind, (), np.zeros((0, 9)), None, None, np.zeros((2, 3)))
+
+
+def void(
+    defect: Defect, printed: Printed, rng: np.random.Generator, scale: float
 ) -> PlacedDefect | None:
+    """An ellipse in the middle of the part where nothing is extruded."""
+    part, tops_mm = printed.part, printed.tops_mm
     diameter_mm = defect.values["diameter"] * scale
     long_mm, short_mm = 0.5 * diameter_mm, 0.5 * diameter_mm * rng.uniform(0.7, 1.0)
     wall_mm = defect.values["wall"] * min(1.0, scale * 1.25)
@@ -165,17 +116,15 @@ def _void(
     return None
 
 
-def _under_extrusion(
-    defect: Defect,
-    part: m3.Manifold,
-    tops_mm: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
-    scale: float,
+def under_extrusion(
+    defect: Defect, printed: Printed, rng: np.random.Generator, scale: float
 ) -> PlacedDefect | None:
+    """Layers, or a circle in them, with less flow."""
+    part, tops_mm = printed.part, printed.tops_mm
     flow = defect.values["flow"]
     diameter_mm = defect.values["diameter"] * scale
     ranges = _layer_ranges(defect, tops_mm, rng)
-    # where a face ends within the range its thin film is within any tolerance: others first
+    # Where a face ends within the range, its thin film is within any tolerance: others go first.
     for layers in sorted(ranges, key=lambda r: not _even(part, r, tops_mm)):
         room = _solid_through(part, layers, tops_mm)
         if room.area() < 1.0:
@@ -197,15 +146,11 @@ def _under_extrusion(
     return None
 
 
-def _missing_beads(
-    defect: Defect,
-    part: m3.Manifold,
-    tops_mm: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
-    scale: float,
-    beads: Beads | None,
+def missing_beads(
+    defect: Defect, printed: Printed, rng: np.random.Generator, scale: float
 ) -> PlacedDefect | None:
     """Stretches of the job's own lines around one place that are not extruded."""
+    part, tops_mm, beads = printed.part, printed.tops_mm, printed.beads
     if beads is None:
         raise InputError(f"the defect {defect} skips beads, but there is no job to skip them in")
     count = max(1, round(defect.values["beads"] * scale))
@@ -296,14 +241,11 @@ def _bite(
     return (cap + column.translate((0.0, 0.0, -1e-3))).translate(tuple(centre_mm))
 
 
-def _chip(
-    defect: Defect,
-    part: m3.Manifold,
-    tops_mm: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
-    scale: float,
+def chip(
+    defect: Defect, printed: Printed, rng: np.random.Generator, scale: float
 ) -> PlacedDefect | None:
     """A bite off an edge of the top: its middle lies on the outline near the top."""
+    part = printed.part
     radius_mm = 0.5 * defect.values["size"] * scale
     height_mm = float(part.bounding_box()[5])
     deep_mm = min(defect.values["depth"] * scale, radius_mm, 0.4 * height_mm)
@@ -327,7 +269,7 @@ def _chip(
         if volume_mm3 < 0.1 * whole_mm3 or volume_mm3 < 3.0:
             continue
         pieces = (part - bite).decompose()
-        # what falls off with it would lie loose on the bed: not a chip
+        # A piece that falls off with the bite would lie loose on the bed: that is no chip.
         if sum(abs(piece.volume()) > _CRUMB_MM3 for piece in pieces) > whole:
             continue
         box = np.array(broken.bounding_box()).reshape(2, 3)
@@ -337,16 +279,13 @@ def _chip(
     return None
 
 
-def _blob(
-    defect: Defect,
-    part: m3.Manifold,
-    tops_mm: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
-    scale: float,
+def blob(
+    defect: Defect, printed: Printed, rng: np.random.Generator, scale: float
 ) -> PlacedDefect | None:
+    """A dome on the top of the part."""
+    part, top_mm = printed.part, float(printed.tops_mm[-1])
     radius_mm = 0.5 * defect.values["size"] * scale
     height_mm = defect.values["height"] * scale
-    top_mm = float(tops_mm[-1])
     room = part.slice(top_mm - 0.1).offset(-0.3 * radius_mm, m3.JoinType.Round)
     centre = random_point(room, rng)
     if centre is None:

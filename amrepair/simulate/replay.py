@@ -76,7 +76,7 @@ class Replay:
         by_edge = known & (recording.edge_mm < EDGE_MM)
         away = known & ~by_edge
         found = [_kind(recording, mask) for mask in (away, by_edge)]
-        # a recording without edges has nothing to say of them
+        # A recording without edges says nothing about them.
         any_kind = next(kind for kind in found if kind is not None)
         self._kinds = [kind or any_kind for kind in found]
 
@@ -136,7 +136,7 @@ class Replay:
             np.bincount(block, cosine) / count,
             np.bincount(block, by_edge) / count,
         )
-        # in the order of their blocks, so that a block's points lie together
+        # Points are sorted by block, so that a block's points lie together.
         order, ends = np.argsort(block, kind="stable"), np.cumsum(count)
         out, left = np.zeros(len(plane_mm)), np.ones(len(count), dtype=bool)
         while left.any():
@@ -198,7 +198,7 @@ def _kind(recording: Recording, mask: Bool[np.ndarray, "k ny nx"]) -> _Kind | No
         if not there.any():
             continue
         away, nearest[:, k] = ndimage.distance_transform_edt(~there, return_indices=True)
-        # beyond the raster there is nothing: places clipped to its border meet nothing
+        # Beyond the raster there is nothing: places clipped to its border hit nothing.
         reach[k] = ndimage.uniform_filter(away * pitch, size, mode="constant", cval=BLOCK_MM)
         reach[k][[0, -1]], reach[k][:, [0, -1]] = np.inf, np.inf
         value = recording.cosine[k][nearest[0, k], nearest[1, k]]

@@ -1,4 +1,4 @@
-"""A simulated run: slice a part, print it on an emulated printer, break it, let the loop mend it.
+"""A simulated run: slice a part, print it on an emulated printer, break it, let the loop repair it.
 
 Everything between the G-code and the nozzle is real: the serial adapter, a pseudo-terminal, the
 protocol, the emulated firmware. Only plastic and light are simulated (`world`, `scanner`).
@@ -21,10 +21,9 @@ from amrepair.frames import Transform
 from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, Tape, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.repair import RepairPlan, Stopwatch
-from amrepair.simulate.defects import Defect, PlacedDefect
+from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
-from amrepair.simulate.placement import place
 from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
 from amrepair.simulate.stage import DefectTruth, Stage
 from amrepair.simulate.world import World
@@ -78,7 +77,7 @@ class PreparedRun:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedRun:
-    """What became of it.
+    """The result of a simulated run.
 
     Attributes
     ----------
@@ -270,7 +269,7 @@ def simulate_run(
     watch: Stopwatch | None = None,
     progress: Progress = silent,
 ) -> SimulatedRun:
-    """Print the job on an emulated printer and let the loop mend what goes wrong.
+    """Print the job on an emulated printer and let the loop repair what goes wrong.
 
     Parameters
     ----------

@@ -252,7 +252,7 @@ class SimulatedScanner:
         low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
         inward = 0.5 * (low + high) - sensor[:2]
         far_mm = float(np.hypot(*inward))
-        # seen from above every direction is as good: Y, across a laser's line
+        # Seen from above every direction is as good as another; Y lies across a laser's line.
         aside = np.array([-inward[1], inward[0]]) / far_mm if far_mm > 1.0 else np.array([0.0, 1.0])
         eye = sensor + np.append(self.model.baseline_mm * aside, 0.0)
         return np.asarray(

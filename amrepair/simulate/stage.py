@@ -31,7 +31,7 @@ LEAST_MISSING_MM = 0.02
 
 @dataclass(frozen=True, slots=True)
 class DefectTruth:
-    """What became of one defect, by the world's own truth.
+    """How much of one defect was repaired, as the simulated world itself shows.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Stage:
 
     @property
     def truth(self) -> tuple[DefectTruth, ...]:
-        """What became of every defect that has happened."""
+        """The state of every defect that has happened."""
         return tuple(
             DefectTruth(
                 kind=str(wound.defect.kind),
@@ -209,7 +209,7 @@ class Stage:
                 begun.missing.append(own)
 
     def _measure(self, label: str) -> None:
-        """How much of this stop's missing volume is solid now, and how well it sits."""
+        """How much of this stop's missing volume is solid now, and how even its surface is."""
         wounds = [wound for wound in self._wounds if wound.label == label]
         if not wounds:
             return

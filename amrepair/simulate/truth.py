@@ -48,7 +48,7 @@ class Difference:
         return Difference(self.missing.clipped(box_mm), self.excess.clipped(box_mm))
 
     def thicker_than(self, length_mm: float) -> Difference:
-        """Only where it is taller than `length_mm`: what a bead could mend."""
+        """Only where it is taller than `length_mm`: what a bead could fill."""
         return Difference(self.missing.thicker_than(length_mm), self.excess.thicker_than(length_mm))
 
     def filled_mm3(self, world: Standing) -> float:

@@ -83,7 +83,7 @@ class World:
         )
         self._near, self._counts = _neighbours(cell_mm, nozzle_diameter_mm, self.bead)
         self._state = np.zeros(STATE_SIZE)
-        # what every column's top was before the layer that last touched it, and which that was
+        # For each column: the layer that last touched it, and its top before that layer.
         self._before = np.zeros(self.columns.shape, dtype=np.float32)
         self._stamp = np.zeros(self.columns.shape, dtype=np.int32)
         self._pulled_mm = 0.0  # filament retracted and not yet pushed back

@@ -1,4 +1,4 @@
-"""A template cut by a horizontal plane: the part printed so far (idea 1 of the design).
+"""A template cut by a horizontal plane: the part printed so far.
 
 f_k(x) = max(f(x), z − z_k): exact inside and on the surface, a lower bound outside.
 """

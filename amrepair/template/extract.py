@@ -108,7 +108,7 @@ def band_field(
     centre = template.distance(low_mm + (block_index + 0.5) * edge_mm - 0.5 * voxel_mm) - level_mm
     far = np.copysign(np.float32(edge_mm), centre).astype(np.float32).reshape(blocks)
     field = np.empty(shape, dtype=np.float32)
-    # cells of block (i, j, k) are at [i, :, j, :, k, :]
+    # The cells of block (i, j, k) are at [i, :, j, :, k, :].
     cells = field.reshape([n for count in blocks for n in (int(count), BLOCK_CELLS)])
     cells[:] = far[:, None, :, None, :, None]
     near = block_index[np.abs(centre) <= BAND_SAFETY * 0.5 * np.sqrt(3.0) * edge_mm]
@@ -121,6 +121,6 @@ def band_field(
         i, j, k = some.T
         cells[i, :, j, :, k, :] = values.reshape(-1, *[BLOCK_CELLS] * 3)
     for face in (field[0], field[-1], field[:, 0], field[:, -1], field[:, :, 0], field[:, :, -1]):
-        # a network that was taught too little has its zero level beyond the part's box
+        # An undertrained network can have its zero level beyond the part's box.
         np.maximum(face, np.float32(voxel_mm), out=face)
     return field, low_mm

@@ -151,7 +151,7 @@ class LaidBeads:
         counts = (ends - begins)[rising]
         low = np.array([height_mm[order][begins[k] : ends[k]].min() for k in rising])
         step = np.diff(top[rising], prepend=0.0)
-        # what is laid beside lower layers (copies one by one) is as high as its own beads
+        # Copies printed one by one lie beside lower layers; there beads have their own height.
         layer_mm = np.where((step > 1e-3) & (step < low), step, low)
         return cls(
             start[again],

@@ -233,7 +233,7 @@ class LearnedSdf:
         """(n,) standard deviation between normal parts: the part's size where nobody knows."""
         found = np.zeros(len(points_mm)) if self.tolerance is None else self.tolerance.at(points_mm)
         if self.coverage is not None:
-            # what is far from a surface that was guessed is still of it
+            # A place off the surface is unseen, too, where the surface nearest to it was not seen.
             f_mm, outward = self.distance_and_gradient(points_mm)
             unseen = self.coverage.unseen_at(points_mm - f_mm[:, None] * outward)
             size_mm = float(np.linalg.norm(np.ptp(self.bounds_mm, axis=0)))

@@ -241,7 +241,7 @@ def _with_lids(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
     """Faces with a fan of triangles over every small loop of open edges."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     both = {(int(a), int(b)) for a, b in edges}
-    # a lid runs the open edges the other way round
+    # A lid uses the open edges in the opposite direction.
     following: dict[int, list[int]] = {}
     for a, b in sorted(both):
         if (b, a) not in both:

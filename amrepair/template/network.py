@@ -139,7 +139,7 @@ class NetworkSdf:
             answer = self._answer(inside)
             (slope,) = torch.autograd.grad(answer.sum(), inside)
             found[chunk] = answer.detach().numpy() + norm
-            # clamped coordinates no longer move the network's answer, but the way there
+            # Along clamped coordinates the network is constant and the distance to the cube grows.
             gradient[chunk] = np.where(beyond != 0, 0.0, slope.numpy())
             gradient[chunk] += beyond / np.maximum(norm, 1e-12)[:, None]
         return found * self.radius_mm, gradient

@@ -1,4 +1,4 @@
-"""`PlannedSdf`: what a layer should look like, from the job's own beads (idea 2 of the design).
+"""`PlannedSdf`: what a layer should look like, from the job's own beads.
 
 Sparse infill is no defect: the expected solid is the union of the beads that were planned, told
 as a distance field between voxels of about a layer's height. Only the last millimetres below the
@@ -84,7 +84,7 @@ class PlannedSdf:
         low = np.minimum(start, end).min(axis=0) - [reach, reach, 0.0]
         low[2] = (np.minimum(start[:, 2], end[:, 2]) - height).min()
         high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
-        # faces of voxels lie on the last layer's top
+        # The voxels are placed so that faces of theirs lie on the last layer's top.
         levels = int(np.ceil((top_mm - low[2]) / voxel_mm - 1e-6))
         above, below = (int(np.ceil(margin / voxel_mm)) for margin in (MARGIN_MM, BELOW_MM))
         foot_mm = top_mm - levels * voxel_mm

@@ -37,7 +37,7 @@ class Template(Protocol):
         ...
 
     def below_z(self, z_mm: float) -> Template:
-        """The part printed so far: max(f, z − z_k) (idea 1 of the design)."""
+        """The part printed so far: max(f, z − z_k)."""
         ...
 
     def surface_points(

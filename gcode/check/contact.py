@@ -66,7 +66,7 @@ def contact_of(
         [start + shares * (end - start) for start, end in zip(starts, ends, strict=True)]
     )
     depth_mm = deepest_along(places, printer, as_built)
-    # what the job itself has laid is not in the field: then the middle of the move stands for it
+    # What the job itself has laid is not in the field; the middle of the move stands for it.
     at = int(np.argmax(depth_mm > 0)) if (depth_mm > 0).any() else len(places) // 2
     x, y, z = places[at]
     return Contact(refusal.line, (float(x), float(y), float(z)), refusal.what, refusal.value)

@@ -77,7 +77,7 @@ class Motion:
         self._stood = initial is not None or standing_top_mm is not None
         state = initial
         self._place: list[float | None] = [None] * 3 if state is None else [*state.position_mm]
-        # a standing part on a machine that is not switched off: its Z is still true
+        # A part stands on a machine that was not switched off, so Z is still true.
         self._homed = [state is not None] * 2 + [self._stood]
         self._absolute = state.absolute_xyz if state else True
         self._absolute_e = state.absolute_e if state else True

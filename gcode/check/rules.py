@@ -166,7 +166,7 @@ class Judge(Motion):
             if name != "TURN_OFF_HEATERS":
                 self._place = [None] * 3  # it goes where it parks
         elif name == "SET_HEATER_TEMPERATURE":
-            # without a target Klipper takes 0
+            # Where no target is given, Klipper takes 0.
             target_c = self._number(given.get("TARGET", "0"))
             self._heat(KLIPPER_HEATERS.get(given.get("HEATER", ""), "M141"), {"S": target_c})
         elif name == "SET_PRESSURE_ADVANCE":
@@ -366,7 +366,7 @@ class Judge(Motion):
             self._chamber_c = value_c
         else:
             self._hotend_c = value_c
-            # waited for, or cooling from now on
+            # The heater was waited for, or cools from now on.
             if name == "M109" or value_c < self._ready_c:
                 self._ready_c = value_c
 

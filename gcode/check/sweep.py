@@ -41,7 +41,7 @@ def sweep(
     start, end, line = moves.start_mm, moves.end_mm, moves.line
     lowest_mm = float(min(start[:, 2].min(), end[:, 2].min()))
     tallest_mm = max(as_built.top_mm, float(end[:, 2].max()))
-    # what stays above everything when the tip is lowest cannot touch
+    # A slice that stays above everything when the tip is lowest cannot touch anything.
     slices = [p for p in printer.head if p.z_from_mm <= tallest_mm - lowest_mm]
     if not slices:
         return [], np.inf
@@ -146,7 +146,7 @@ class _Swept:
         laid = self.pushed_mm3 > 0
         if not slices or not laid.any():
             return None
-        # what is laid is hit only by what comes far enough below it afterwards
+        # A bead is hit only by a part of the head that later comes far enough below its top.
         low_mm = self.low_mm
         later_mm = np.minimum.accumulate(low_mm[::-1])[::-1]
         drop_mm = float((self.end_mm[laid, 2] - later_mm[laid]).max())

@@ -46,13 +46,13 @@ def emulate(
     ] = None,
 ) -> None:
     """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
-    from gcode.dialects import DIALECTS
     from gcode.firmware import serve_forever
     from gcode.firmware.faults import parse_faults
+    from gcode.firmware.variants import VARIANTS
     from gcode.profiles import load_printer
 
-    if firmware not in DIALECTS:
-        raise InputError(f"--firmware is {firmware!r}; it is one of {', '.join(DIALECTS)}.")
+    if firmware not in VARIANTS:
+        raise InputError(f"--firmware is {firmware!r}; it is one of {', '.join(VARIANTS)}.")
     script = parse_faults(plain_text(faults)) if faults is not None else None
     machine = load_printer(printer)
     with tempfile.TemporaryDirectory(prefix="gcode-emulate-") as folder:

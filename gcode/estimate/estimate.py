@@ -80,7 +80,7 @@ def estimate(
     low = np.minimum(job.beads.start_mm, job.beads.end_mm).min(axis=0)
     high = np.maximum(job.beads.start_mm, job.beads.end_mm).max(axis=0)
     x0, y0, z0, x1, y1, z1 = (float(v) for v in (*low, *high))
-    # what was pulled back must first come forward again before it counts
+    # Filament that was retracted must come forward again before more of it counts.
     position = np.cumsum(pushed)
     used_mm = float(np.maximum.accumulate(np.maximum(position, 0.0))[-1])
     progress("estimate", 1.0, 1.0)

@@ -27,7 +27,7 @@ _MOST_REPORTS = 5000
 
 
 class FirmwareCore:
-    """A printer that talks.
+    """An emulated printer: bytes of the host in, bytes of the firmware out.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class FirmwareCore:
                 return
             end = rx.find(b"\n")
             if end < 0:
-                if len(rx) > 4 * MAX_CMD_SIZE and self.variant.name != "klipper":
+                if len(rx) > 4 * MAX_CMD_SIZE and self.variant.family != "klipper":
                     del rx[:-MAX_CMD_SIZE]
                 return
             line = bytes(rx[:end])
@@ -161,7 +161,7 @@ class FirmwareCore:
         command = raw.partition(b";")[0].strip()
         if not command:
             return
-        if self.variant.name != "klipper" and len(command) >= MAX_CMD_SIZE:
+        if self.variant.family != "klipper" and len(command) >= MAX_CMD_SIZE:
             command = command[: MAX_CMD_SIZE - 1]  # cut silently, as the firmware does
         checked = self._accept(command, faults)
         if checked is None:

@@ -14,7 +14,7 @@ Numbers = Literal["verify", "checksum", "ignore"]
 
 
 class Unframed(NamedTuple):
-    """What is left of a line.
+    """A line without its number and checksum.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ class Machine(Mechanics):
         if re.fullmatch(rb"T\d", command):
             return True
         text = command.decode("latin-1")
-        name = text.split(" ")[0] if self.variant.name == "klipper" else text
+        name = text.split(" ")[0] if self.variant.family == "klipper" else text
         self.replies.append(self.variant.unknown.format(command=name))
         return False
 
@@ -52,16 +52,16 @@ class Machine(Mechanics):
         for name in dir(self):
             if re.fullmatch(r"_[gm]\d+", name):
                 table[name[1:].upper().encode()] = getattr(self, name)
-        if self.variant.name not in ("marlin", "reprap"):
+        if self.variant.family not in ("marlin", "reprap"):
             table.pop(b"G38")  # neither Prusa's firmware nor Klipper has it
         for name in _IGNORED:
             table.setdefault(name.encode(), self._ignore)
-        if not self.variant.emergency_parser and self.variant.name == "klipper":
+        if not self.variant.emergency_parser and self.variant.family == "klipper":
             table.pop(b"M108")
         return table
 
     def _ignore(self, rest: bytes) -> None:
-        """Nothing an emulated machine could show."""
+        """Accept a command whose effect an emulated machine cannot show."""
 
     def _g1(self, rest: bytes) -> None:
         x, y, z, de = self.x, self.y, self.z, 0.0
@@ -181,7 +181,7 @@ class Machine(Mechanics):
             if letter in words:
                 native = (self.x, self.y, self.z)[axis]
                 self.offset[axis] = words[letter] * self.unit_mm - native
-                if self.variant.name == "reprap":
+                if self.variant.family == "reprap":
                     self.unhomed.discard(letter)  # GCodes::SetPositions takes them for homed
         if "E" in words:
             self.e = words["E"] * self.unit_mm
@@ -202,7 +202,7 @@ class Machine(Mechanics):
 
     def _m84(self, rest: bytes) -> None:
         words = words_of(rest)
-        if "S" in words and self.variant.name != "klipper":
+        if "S" in words and self.variant.family != "klipper":
             self.motors_off_s = words["S"] or math.inf
         else:
             self.planner.moved_s = -math.inf
@@ -258,7 +258,7 @@ class Machine(Mechanics):
 
     def _m115(self, rest: bytes) -> None:
         line = self.variant.firmware_line.format(machine=self.profile.name)
-        if self.variant.name == "klipper":
+        if self.variant.family == "klipper":
             self.ok_text = " " + line
             return
         self.replies.append(line)

@@ -165,7 +165,7 @@ class Mechanics:
             self.unhomed = set("XYZ")
 
     def _cold(self) -> None:
-        if self.variant.name == "klipper":
+        if self.variant.family == "klipper":
             self.replies.append("!! Extrude below minimum temp")
         else:
             self.replies.append(f"{self.variant.echo_prefix} cold extrusion prevented")
@@ -238,7 +238,7 @@ class Mechanics:
             heater.set_target(0.0, self.clock_s)
         self.fan_ratio = 0.0
         self.wait = None
-        if self.variant.name == "klipper":
+        if self.variant.family == "klipper":
             self.replies.append(f"!! Shutdown due to {why or 'M112 command'}")
         else:
             if why:
@@ -256,7 +256,7 @@ class Mechanics:
     def temperatures(self) -> str:
         """The text of a temperature report."""
         hotend, bed, now_s = self.hotend, self.bed, self.clock_s
-        if self.variant.name == "klipper":
+        if self.variant.family == "klipper":
             return (
                 f"B:{bed.temperature_c(now_s):.1f} /{bed.target_c:.1f} "
                 f"T0:{hotend.temperature_c(now_s):.1f} /{hotend.target_c:.1f}"
@@ -273,7 +273,7 @@ class Mechanics:
             for native, offset in zip((self.x, self.y, self.z), self.offset, strict=True)
         ]
         text = f"X:{x:.3f} Y:{y:.3f} Z:{z:.3f} E:{self.e:.4f}"
-        if self.variant.name in ("marlin", "prusa"):
+        if self.variant.family in ("marlin", "prusa"):
             steps = (int(self.x * 80), int(self.y * 80), int(self.z * 400))
             text += f" Count X:{steps[0]} Y:{steps[1]} Z:{steps[2]}"
         return text

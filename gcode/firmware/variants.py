@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-FirmwareName = Literal["marlin", "prusa", "klipper", "reprap"]
+Family = Literal["marlin", "prusa", "klipper", "reprap"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,6 +17,8 @@ class Variant:
 
     Attributes
     ----------
+    family
+        The firmware that it is, or is a relative of, in all that no other field says.
     numbers
         `verify`: number and checksum must be right; `checksum`: only the checksum, a bad line is
         dropped silently; `ignore`: both are stripped unread.
@@ -28,7 +30,8 @@ class Variant:
         while it lasts and M83 persists (Klipper); `independent`: they leave it alone.
     """
 
-    name: FirmwareName
+    name: str
+    family: Family
     banner: tuple[str, ...]
     firmware_line: str
     capabilities: tuple[tuple[str, bool], ...]
@@ -60,6 +63,7 @@ _MARLIN_CAPABILITIES = (
 VARIANTS: dict[str, Variant] = {
     "marlin": Variant(
         name="marlin",
+        family="marlin",
         banner=(
             "start",
             "echo:Marlin 2.1.2",
@@ -84,6 +88,7 @@ VARIANTS: dict[str, Variant] = {
     # MK3S: Prusa-Firmware, where only M82 and M83 set the extruder's mode.
     "prusa": Variant(
         name="prusa",
+        family="prusa",
         banner=("start", "echo: 3.13.3-7094", "echo: Last Updated: (emulated)"),
         firmware_line="FIRMWARE_NAME:Prusa-Firmware 3.13.3 (emulated) based on Marlin "
         "PROTOCOL_VERSION:1.0 MACHINE_TYPE:{machine} EXTRUDER_COUNT:1",
@@ -106,6 +111,7 @@ VARIANTS: dict[str, Variant] = {
     ),
     "klipper": Variant(
         name="klipper",
+        family="klipper",
         banner=("// Klipper state: Ready",),
         firmware_line="FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12.0-emulated",
         capabilities=(),
@@ -123,6 +129,7 @@ VARIANTS: dict[str, Variant] = {
     ),
     "reprap": Variant(
         name="reprap",
+        family="reprap",
         banner=("RepRapFirmware for emulated boards is up and running.",),
         firmware_line="FIRMWARE_NAME: RepRapFirmware for emulated boards FIRMWARE_VERSION: 3.6.0 "
         "ELECTRONICS: emulated",

@@ -72,7 +72,7 @@ def connect(
 
 
 def _web_printer(port: str, wire_log: Path | None) -> Printer:
-    # loaded here: a printer on a cable needs none of the web's libraries
+    # The web's libraries are loaded here, since a printer on a cable needs none of them.
     from gcode.hosts.secret import find_key
     from gcode.hosts.web import Address
 

@@ -110,7 +110,7 @@ class SerialConversation:
     def _set_up_port(self) -> None:
         """Clear HUPCL: closing the port must not drop DTR and so reset the printer.
 
-        And say how long a read waits, where one waits (`beaten_path`): VTIME, tenths of a second.
+        And say how long a read waits, where one waits (`fast_path`): VTIME, tenths of a second.
         """
         import termios
 

@@ -14,10 +14,10 @@ from gcode.errors import JournalError, LinkError, LocalProtocolError
 from gcode.hosts.conversation import SerialConversation
 from gcode.hosts.jobbook import JobBook
 from gcode.hosts.journal import Journal
+from gcode.hosts.line_query import last_number
 from gcode.hosts.lock import PortLock
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
 from gcode.hosts.supervisor import make_safe
-from gcode.hosts.whereabouts import last_number
 from gcode.protocol import LinkTiming
 from gcode.protocol import events as ev
 

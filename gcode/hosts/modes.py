@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
+from gcode.dialects import dialect_of
 from gcode.hosts.port import PrintableProgram
 from gcode.protocol import command_in
 
@@ -91,10 +92,10 @@ def follow(modes: Modes, text: str, dialect: str) -> Modes:
     name = match.group(1) + match.group(2)
     words = {letter: float(value) for letter, value in _WORD.findall(command[match.end() :])}
     if name in ("G0", "G1", "G2", "G3"):
-        return _move(modes, words, g91_moves_e=dialect == "klipper")
+        return _move(modes, words, g91_moves_e=dialect_of(dialect).g91_moves_e)
     if name in ("G90", "G91"):
         absolute = name == "G90"
-        if dialect == "marlin":
+        if dialect_of(dialect).g90_sets_e:
             return replace(modes, absolute=absolute, absolute_e=absolute)
         return replace(modes, absolute=absolute)
     if name in ("M82", "M83"):

@@ -113,7 +113,7 @@ class OctoPrintSession(ServerSession[ServerState]):
         """
         if not self.listening:
             self.listen()
-        # the flags first: a print that ends in between is then under way, not lost
+        # The flags are asked first: a print that ends in between is then under way, not lost.
         answer = self.request("GET", "/api/printer", params={"exclude": "temperature,sd"})
         flags = self._flags(answer)
         report = self.get("/api/job")

@@ -53,7 +53,7 @@ class Capabilities:
 
 @dataclass(frozen=True, slots=True)
 class PrintReport:
-    """What became of one `print` call.
+    """The result of one `print` call.
 
     Attributes
     ----------

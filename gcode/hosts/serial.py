@@ -1,7 +1,7 @@
 """A printer on a serial port or pseudo-terminal: prints programs, pauses, goes on.
 
 The port and the questions are `conversation`'s, lock and safe exits `guarded`'s, the fast way over
-plain moves is `beaten_path`'s; what may be sent and what an answer means is `protocol.Link`'s.
+plain moves is `fast_path`'s; what may be sent and what an answer means is `protocol.Link`'s.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from operator import sub
 from pathlib import Path
 
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
-from gcode.hosts.beaten_path import Exchange, waiting
+from gcode.hosts.fast_path import Exchange, waiting
 from gcode.hosts.guarded import GuardedConversation
 from gcode.hosts.jobbook import TEMPERATURE_EVERY_S
 from gcode.hosts.journal import Journal

@@ -34,7 +34,7 @@ LOOK_EVERY = 5
 
 @runtime_checkable
 class News(Protocol):
-    """What is known of a server, told by its messages."""
+    """The state of a server, as its messages tell it."""
 
     def take(self, message: Any) -> None:
         """Take one message."""

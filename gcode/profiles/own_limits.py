@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterator
 
+from gcode.dialects import dialect_of
 from gcode.profiles.schema import PrinterProfile
 
 _WORD = re.compile(r"([A-Z])([-+]?(?:\d+\.?\d*|\.\d+))")
@@ -57,7 +58,7 @@ class _Start:
         self._absolute, self._absolute_e = True, True
 
     def wrong_with(self, line: str) -> Iterator[str]:
-        """What in the next line breaks a limit."""
+        """The limits that the next line breaks, as phrases."""
         command = line.partition(";")[0].strip().upper()
         name, _, rest = command.partition(" ")
         words = {letter: float(value) for letter, value in _WORD.findall(rest)}
@@ -71,7 +72,7 @@ class _Start:
                 yield f"the {what} at {value_c:g} °C, 'max_{what}_c' is {limit_c:g}"
         elif name in {"G90", "G91"}:
             self._absolute = name == "G90"
-            if self._printer.dialect == "marlin":  # it sets the extruder's mode too
+            if dialect_of(self._printer.dialect).g90_sets_e:
                 self._absolute_e = self._absolute
         elif name in {"M82", "M83"}:
             self._absolute_e = name == "M82"

@@ -11,6 +11,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from gcode.dialects import dialect_of
 from gcode.profiles.importers import ImportedFile, import_job, write_profiles
 from gcode.profiles.importers.jobs import generator
 from gcode.profiles.machines import machine_named
@@ -21,14 +22,6 @@ from gcode.profiles.setup import PrintSetup, load_setup
 SAME_BED_RATIO = 0.05  # slicers and makers give one bed a few millimetres more or less
 SAME_NOZZLE_MM = 0.01
 _POINT = re.compile(r"(-?\d+(?:\.\d+)?)x(-?\d+(?:\.\d+)?)")
-# Firmware that understands another's words for what a job holds: Prusa's is a Marlin, and slicers
-# that know no Klipper write Marlin's words for it.
-_READS = {
-    "marlin": {"marlin", "prusa"},
-    "prusa": {"prusa", "marlin"},
-    "klipper": {"klipper", "marlin"},
-    "reprap": {"reprap"},
-}
 # What one would ask first, and what no slicer tells.
 _WORDS = {
     "bed_size_mm": "bed",
@@ -117,7 +110,8 @@ class OwnSettings:
         if nozzle_mm is not None and abs(nozzle_mm - printer.nozzle_diameter_mm) > SAME_NOZZLE_MM:
             why.append(f"a nozzle of {nozzle_mm:g} mm, not {printer.nozzle_diameter_mm:g} mm")
         dialect = values.get("dialect")
-        if dialect is not None and dialect not in _READS[printer.dialect]:
+        understood = {printer.dialect} | dialect_of(printer.dialect).reads
+        if dialect is not None and dialect not in understood:
             why.append(f"{dialect}, not {printer.dialect}")
         given = machine_named(printer.name)
         known = self.machine is not None and given is not None

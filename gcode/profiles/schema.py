@@ -8,11 +8,19 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from gcode.dialects import DIALECTS
 from gcode.errors import ProfileError
 
-DialectName = Literal["marlin", "prusa", "klipper", "reprap"]
+
+def _known_dialect(name: str) -> str:
+    if name not in DIALECTS:
+        raise ValueError(f"it is one of {', '.join(map(repr, DIALECTS))}")
+    return name
+
+
+DialectName = Annotated[str, AfterValidator(_known_dialect)]
 Positive = Annotated[float, Field(gt=0)]
 Ratio = Annotated[float, Field(ge=0, le=1)]
 Xy = tuple[float, float]

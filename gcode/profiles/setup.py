@@ -29,7 +29,7 @@ class PrintSetup:
         return min(self.printer.max_volumetric_mm3_s, self.material.max_volumetric_mm3_s)
 
     def melting_all(self) -> PrintSetup:
-        """The same with a filament that melts as fast as the hotend can: what it is nobody said."""
+        """The same for a filament of unknown kind, taken to melt as fast as the hotend can."""
         as_hotend = {"max_volumetric_mm3_s": self.printer.max_volumetric_mm3_s}
         return replace(self, material=self.material.model_copy(update=as_hotend))
 

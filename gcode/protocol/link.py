@@ -125,7 +125,7 @@ class Link(Recovery):
     def moves(self, lines: WireLines, index: int) -> list[bytes]:
         """Return what may be written of the plain moves that follow, one after another.
 
-        The beaten path, which costs nothing between two lines: as long as the answers are `oks`
+        The fast path, which costs nothing between two lines: as long as the answers are `oks`
         and nothing else, as many may be under way as the window allows. Whatever happens,
         `moves_sent` has to be told before anything else is asked of the link. Empty where `send`
         must have its turn: lines under way, something in doubt, a command that is no plain move.

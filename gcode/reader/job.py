@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
+from gcode.dialects import dialect_of
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile
@@ -18,10 +19,6 @@ from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
 from gcode.units import filament_area_mm2
 
-# G90 and G91 set the extruder's mode too in Marlin alone (printers.md of each firmware's docs).
-_BOTH_MODES = frozenset({"marlin"})
-# In Klipper G91 makes E relative while it lasts, whatever M82 says (gcode_move.py).
-_G91_MOVES_E = frozenset({"klipper"})
 _LAYER_MARKS = ("LAYER_CHANGE", "CHANGE_LAYER", "BEFORE_LAYER_CHANGE")
 _CURA_LAYER = re.compile(r"LAYER:\s*(-?\d+)")
 _NUMBER = r"([-+]?\d*\.?\d+)"
@@ -190,7 +187,8 @@ def read_job(
     states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
     states[0, kernels.S_ACC] = np.nan
     pushed = np.zeros(len(lines))
-    both, g91 = program.dialect in _BOTH_MODES, program.dialect in _G91_MOVES_E
+    words_of = dialect_of(program.dialect)
+    both, g91 = words_of.g90_sets_e, words_of.g91_moves_e
     kernels.run(kinds, codes, words, both, g91, states, pushed)
     progress("read", 2.0, READ_STEPS)
     none3, none1, none0 = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)

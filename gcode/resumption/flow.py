@@ -70,7 +70,7 @@ class GapField:
             column = np.repeat(np.arange(ny * nx), np.diff(offset))
             thick = np.bincount(column, weights=up * z, minlength=ny * nx)
             level = np.bincount(column, weights=up, minlength=ny * nx)
-            # a column that meets an edge may miss a crossing: it says nothing
+            # A column that meets an edge may miss a crossing, so it is left out.
             gap += sign * np.where(level == 0, np.maximum(thick, 0.0), 0.0)
         return cls(low, cell_mm, gap.reshape(ny, nx))
 

@@ -86,11 +86,11 @@ class Head:
         return self._printer.prime_length_mm * self._area_mm2 / self._section_mm2
 
     def comment(self, *texts: str) -> None:
-        """Comments."""
+        """Write comment lines."""
         self.lines += [f"; {text}" for text in texts]
 
     def lift_and_home(self, settings: Settings) -> None:
-        """Above everything, then X and Y; never Z."""
+        """Lift above everything, then home X and Y; never Z."""
         self.lines += ["G21", "G90", "M83", "G92 E0"]
         self.lines += [f"G1 Z{number(self._clear_mm, 3)}{self._z_feed}", "G28 X Y"]
         if settings.levelled and self._printer.dialect == "marlin":
@@ -109,7 +109,7 @@ class Head:
             self.lines.append(f"T{self._state.tool}")
 
     def prime_on_bed(self, x: float, y: float, dx: float, dy: float) -> None:
-        """A line on the bed, then up again."""
+        """Draw a line on the bed, then lift."""
         length_mm, e_mm = self.prime_length_mm, self._printer.prime_length_mm
         self.lines += [
             f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}",
@@ -120,7 +120,7 @@ class Head:
         self._leave()
 
     def prime_in_air(self, x: float, y: float) -> None:
-        """What is pushed out falls on the bare bed."""
+        """Push out filament that falls on the bare bed."""
         e_mm = self._printer.prime_length_mm
         speed_mm_s = self._flow_mm3_s / self._area_mm2
         self.lines += [

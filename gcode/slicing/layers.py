@@ -74,7 +74,7 @@ class LayerGrid:
             )
         start = explicit if len(explicit) else np.array([last_mm])
         tops = np.concatenate([start, last_mm + self.layer_height_mm * np.arange(1, count + 1)])
-        # decimal heights, so that 0.2 × 3 reads 0.6
+        # Heights are rounded to decimals, so that 0.2 × 3 reads 0.6.
         return np.round(tops[: int(np.searchsorted(tops, z_mm - _SAME_MM)) + 1], 9)
 
 
@@ -175,7 +175,7 @@ def _snapped(cuts: list[float], faces: list[float], h_mm: float) -> list[float]:
             k = out.index(face)
             fixed = {j + (j >= k) for j in fixed} | {k}
     out = sorted(set(out))
-    # a moved cut may leave a crumb beside a face: drop the movable neighbour
+    # A moved cut may leave a crumb beside a face; then the movable neighbour is dropped.
     kept = [out[0]]
     face_set = {*faces}
     for z in out[1:]:

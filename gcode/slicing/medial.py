@@ -73,7 +73,7 @@ def _stroke(region: Any, area_mm2: float, *, least_mm: float, most_mm: float) ->
     """One straight stroke through a region that is about as long as wide: a dot."""
     points = np.asarray(max(region.to_polygons(), key=len), np.float64)
     centre = points.mean(axis=0)
-    # direction of the longest chord through the corners
+    # This is the direction of the longest chord through the corners.
     _, _, axes = np.linalg.svd(points - centre, full_matrices=False)
     along = (points - centre) @ axes[0]
     across = (points - centre) @ axes[1]

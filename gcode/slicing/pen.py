@@ -59,7 +59,7 @@ class Pen:
         flat = float(np.hypot(step[0], step[1]))
         speed = printer.travel_speed_mm_s
         if step[2] > LEAST_STEP_MM:
-            # the Z axis sets the pace of a slanted move
+            # The Z axis limits the speed of a slanted move.
             share = step[2] / float(np.hypot(flat, step[2]))
             speed = min(speed, printer.z_speed_mm_s / share)
         self.add(Travel(target[None, :].copy(), speed))

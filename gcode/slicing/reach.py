@@ -88,7 +88,7 @@ class Reach:
     ) -> None:
         window = field.window(window_mm or field.box_mm)
         self._top_mm = field.top_mm
-        # a slice that stays above everything when the tip is lowest cannot touch
+        # A slice that stays above everything when the tip is lowest cannot touch anything.
         high_mm = field.top_mm - lowest_tip_mm
         self.obstacles = tuple(
             Obstacle(part, least_tip(part, field, window, finer))

@@ -27,7 +27,7 @@ def over_bed(field: HeightField, printer: PrinterProfile) -> HeightField:
     z_mm = np.zeros(shape)
     cells = np.ix_(iy[rows], ix[columns])
     np.maximum.at(z_mm, cells, np.asarray(coarse.z_mm, np.float64)[np.ix_(rows, columns)])
-    # a cell reaches into those beside its middle's
+    # A cell reaches into the cells beside the one that holds its middle.
     z_mm = ndimage.maximum_filter(z_mm, 2 * int(np.ceil(0.5 * coarse.cell_mm / CELL_MM)) + 1)
     return HeightField(np.array([x0, y0]), CELL_MM, z_mm, np.ones(shape, dtype=bool))
 

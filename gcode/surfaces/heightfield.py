@@ -47,7 +47,7 @@ class HeightField:
         Edge of a square cell.
     z_mm
         (ny, nx) height of the top surface; 0 is the bed. Unseen cells carry the height that
-        is safe for collisions (idea 7 of the design: unseen is solid), and are False in `seen`.
+        is safe for collisions, since unseen may be solid, and are False in `seen`.
     seen
         (ny, nx) whether a sensor measured the cell.
 
@@ -402,7 +402,7 @@ def footprint_rows(
     first = math.floor(outline[:, 1].min() - aside + 0.5)
     last = math.ceil(outline[:, 1].max() + aside - 0.5)
     dy = np.arange(first, last + 1)
-    # the polygon's reach in x over the whole band of each row, [dy − reach, dy + reach]
+    # This is the polygon's extent in x over each row's whole band, [dy − reach, dy + reach].
     (px, py), (qx, qy) = closed[:-1].T, closed[1:].T
     y = np.stack(
         [
@@ -436,7 +436,7 @@ def _greatest_of_next(
         inside, source = [slice(None)] * 2, [slice(None)] * 2
         inside[axis], source[axis] = slice(low - first, high - first), slice(low, high)
         padded[tuple(inside)] = z_mm[tuple(source)]
-    # scipy centres its window: shifted so that it begins at each cell
+    # scipy centres its window; it is shifted so that it begins at each cell.
     greatest = ndimage.maximum_filter1d(
         padded, size, axis=axis, mode="constant", cval=-np.inf, origin=-(size // 2)
     )

@@ -6,8 +6,7 @@ import manifold3d as m3
 import numpy as np
 import pytest
 
-from amrepair.simulate.defects import parse_defect
-from amrepair.simulate.placement import place
+from amrepair.simulate.defects import parse_defect, place
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
 

@@ -117,7 +117,7 @@ def fuzz_host(fuzzer: Fuzzer, count: int) -> None:
                     given.update(link.send(f"G1 X{done} ; {done}", now_s).split(b"\n"))
                 except LocalProtocolError:
                     assert len(f"{done}") > 90
-            if rng.random() < 0.3:  # the beaten path: the answers are looked at unparsed
+            if rng.random() < 0.3:  # the fast path: the answers are looked at unparsed
                 moves = link.moves(link.prepare([f"G1 X{done}", f"G0 Y{done}"]), 0)
                 answered = min(link.oks(fuzzer.bytes(REPLIES), 0), len(moves))
                 moves = moves[: answered + link.window]

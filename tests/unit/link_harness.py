@@ -28,7 +28,7 @@ class Conversation:
     window: int = 1
     seed: int = 0
     advanced_ok: bool = False
-    by_moves: bool = False  # plain moves go the beaten path
+    by_moves: bool = False  # plain moves go the fast path
     executed: list[bytes] = field(default_factory=list)
     given: list[str] = field(default_factory=list)  # to the link, in order
     events: list[ev.Event] = field(default_factory=list)

@@ -19,10 +19,10 @@ from rich.console import Console
 
 import gcode
 from amrepair.align.standing import refuse_impossible
-from amrepair.cli.asking import confirmed
-from amrepair.cli.mend import pose_of_job
+from amrepair.cli.approval import confirmed
 from amrepair.cli.options import part_pose
-from amrepair.cli.warmth import ThermalLog
+from amrepair.cli.repairing import pose_of_job
+from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import AlignmentError, AmrepairError, InputError
 from amrepair.template import MeshSdf
 from gcode.cli import console

@@ -7,17 +7,29 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
 import typer
 
+from amrepair.bench.dataset import LAYOUTS
 from amrepair.cli.app import app as amrepair_app
+from amrepair.cli.scanners import Bed, open_scanner
+from amrepair.frames import Transform
+from amrepair.scans import ScanRequest
+from amrepair.simulate.defects import KINDS as DEFECTS
+from gcode.check.words import COMMANDS, LINE_LIMIT
 from gcode.cli.app import app as gcode_app
+from gcode.dialects import DIALECTS
 from gcode.firmware.faults import KINDS
+from gcode.firmware.variants import VARIANTS
+from gcode.profiles import load_setup
+from gcode.protocol.dialects import LINK_DIALECTS
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -53,7 +65,20 @@ def test_what_is_typed_is_understood(page: Path, line: str) -> None:
 WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
 
 
-@pytest.mark.usefixtures("small_fits")
+@pytest.fixture
+def own_tables() -> Iterator[None]:
+    """What a page adds to our tables is gone after it."""
+    tables: list[dict[str, Any]] = [
+        DIALECTS, LINK_DIALECTS, COMMANDS, LINE_LIMIT, VARIANTS, DEFECTS, LAYOUTS,
+    ]  # fmt: skip
+    before = [dict(table) for table in tables]
+    yield
+    for table, rows in zip(tables, before, strict=True):
+        table.clear()
+        table.update(rows)
+
+
+@pytest.mark.usefixtures("small_fits", "own_tables")
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.stem)
 def test_python_on_a_page_runs(
     page: Path, example_files: Path, monkeypatch: pytest.MonkeyPatch
@@ -64,6 +89,25 @@ def test_python_on_a_page_runs(
         exec(compile(block, str(page), "exec"), names)
     if page.stem == "tutorial":
         assert (example_files / "repair.gcode").is_file()
+
+
+NEW = sorted((DOCS / "how-to").glob("a-new-*.md"))
+
+
+@pytest.mark.parametrize("page", NEW, ids=lambda page: page.stem)
+def test_a_page_on_something_new_is_a_whole_example_of_sixty_lines(page: Path) -> None:
+    assert len(NEW) == 4
+    lines = [block.count("\n") for block in blocks(page, "python")]
+    assert 0 < sum(lines) <= 60
+
+
+def test_the_new_scanner_s_file_is_taken_by_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / "camera.py").write_text(blocks(DOCS / "how-to" / "a-new-scanner.md", "python")[0])
+    pose = Transform.identity("build", "scanner")
+    scanner = open_scanner(f"python:{tmp_path / 'camera.py'}", Bed(pose, 5.0, load_setup()))
+    scan = scanner.scan(ScanRequest("final", None, 1.0))
+    assert len(scan) == 120 * 157
+    assert scan.source == "depth camera, final"
 
 
 def test_every_fault_of_the_emulated_printer_is_on_its_page() -> None:

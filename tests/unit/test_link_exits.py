@@ -21,7 +21,7 @@ import gcode.hosts.serial as serial_host
 from gcode.errors import LinkError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import LinkLostError, supervisor
-from gcode.hosts.beaten_path import waiting
+from gcode.hosts.fast_path import waiting
 from gcode.hosts.serial import SerialPrinter
 from gcode.protocol import Link
 from gcode.protocol import events as ev

@@ -68,7 +68,7 @@ EDGE_MM = 5.0
 
 @dataclass(frozen=True, slots=True)
 class ImportedFile:
-    """What one file came to.
+    """What was imported from one file.
 
     Attributes
     ----------
@@ -197,7 +197,7 @@ def _parent(kind: Kind, source: Source, rules: dict[str, Rule]) -> str:
     if known is not None:
         return known
     flavour = source.values.get("gcode_flavor", source.values.get("FLAVOR", "marlin")).lower()
-    # their "reprap" is what nobody chose, and no RepRapFirmware
+    # Slicers' "reprap" is the default that nobody changed; it does not mean RepRapFirmware.
     dialect = {"reprapfirmware": "reprap", "reprap": "marlin"}.get(flavour, flavour)
     return _GENERIC.get(dialect, _GENERIC["marlin"])
 
@@ -211,7 +211,7 @@ def _settle(made: Imported) -> list[str]:
     if made.kind != "printers":
         return []
     if made.inherits not in _GENERIC_IDS and made.values.get("dialect") == "marlin":
-        # slicers call Prusa's firmware Marlin, and older ones and Cura Klipper, too
+        # Slicers call Prusa's firmware Marlin; older ones, and Cura, call Klipper so, too.
         made.values["dialect"] = above["dialect"]
     merged = {**above, **made.values}
     notes = []

@@ -42,7 +42,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """A key that found its place."""
+    """A key of another program, and the key of ours that it became."""
 
     source_key: str
     source_value: str
@@ -52,7 +52,7 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """A key that did not, and why."""
+    """A key of another program that has no counterpart here, and the reason."""
 
     source_key: str
     source_value: str

@@ -333,7 +333,7 @@ def _typed(placed: Transform) -> str:
 
 
 def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:
-    """What a person reads of the turns that were tried."""
+    """The text that says which turns were tried and what each would reach."""
     if not ranked:
         return []
     best = ranked[0]

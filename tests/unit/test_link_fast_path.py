@@ -15,8 +15,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from link_helpers import profile
 
 from gcode.firmware import EmulatedPrinterProcess
-from gcode.hosts import beaten_path
-from gcode.hosts.beaten_path import MOST_S, Exchange, waiting
+from gcode.hosts import fast_path
+from gcode.hosts.fast_path import MOST_S, Exchange, waiting
 from gcode.hosts.serial import SerialPrinter
 
 MOVES = [b"N%d G1 X1*1\n" % number for number in range(10, 20)]
@@ -68,7 +68,7 @@ class Port:
 @pytest.fixture
 def at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Port], Port]:
     def plug_in(port: Port) -> Port:
-        monkeypatch.setattr(beaten_path, "os", SimpleNamespace(write=port.write, read=port.read))
+        monkeypatch.setattr(fast_path, "os", SimpleNamespace(write=port.write, read=port.read))
         return port
 
     return plug_in
