@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from amrepair.field.faces import STRIP_COSINE, Faces, find_faces, nearest_planes
 from amrepair.field.fused import Surfels
 from amrepair.field.near import has_near
+from amrepair.field.occupancy import OccupancyOptions
 from amrepair.frames import unit_vectors
 from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
@@ -167,6 +168,7 @@ def gather(
     images: tuple[RangeImage, ...],
     *,
     threshold_mm: float,
+    occupancy: OccupancyOptions,
 ) -> Evidence:
     """Collect the evidence of a scan whose off-template surfels and range images are known."""
     off = off | _strips(template, surfels, off)
@@ -181,7 +183,9 @@ def gather(
         surfels = surfels.halves_joined(which, normal[which])
     elif len(which):
         surface = template.surface_points(max(PATCH_MM, surfels.spacing_mm))
-        faces = find_faces(scan, template, surfels, off, surface, threshold_mm=threshold_mm)
+        faces = find_faces(
+            scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=occupancy
+        )
         nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
         normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
     return Evidence(surfels, off, normal, images, faces)

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from amrepair.field import faces_kernels as kernels
 from amrepair.field.fused import Surfels
 from amrepair.field.near import has_near
-from amrepair.field.occupancy import Broken, Occupancy, find_occupancy
+from amrepair.field.occupancy import Broken, Occupancy, OccupancyOptions, find_occupancy
 from amrepair.frames import unit_vectors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -154,6 +154,7 @@ def find_faces(
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
     *,
     threshold_mm: float,
+    options: OccupancyOptions,
 ) -> Faces:
     """Look at the scan around the surfels in `off`, and at which space there is solid.
 
@@ -184,7 +185,9 @@ def find_faces(
     broken = Broken(place[which], plane[which], deviation[which])
     spacing_mm = float(np.sqrt(np.median(area_mm2))) or surfels.spacing_mm  # 0: all in one place
     on_mm = np.concatenate([place[~is_broken], scan.points_mm[kept & ~chosen]])
-    occupancy = find_occupancy(template, broken, on_mm, surface, spacing_mm=spacing_mm)
+    occupancy = find_occupancy(
+        template, broken, on_mm, surface, spacing_mm=spacing_mm, options=options
+    )
     given = None
     if scan.normals is not None:
         given = _given(scan.normals[chosen], gradient, ~is_broken)

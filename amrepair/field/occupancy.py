@@ -181,7 +181,7 @@ def find_occupancy(
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
     *,
     spacing_mm: float,
-    options: OccupancyOptions | None = None,
+    options: OccupancyOptions,
 ) -> Occupancy:
     """Label the space around broken surface.
 
@@ -194,7 +194,6 @@ def find_occupancy(
     spacing_mm
         Of the scan.
     """
-    options = options or OccupancyOptions()
     if len(broken.f_mm) == 0:
         none = np.zeros((0, 0, 0), bool)
         return Occupancy(np.zeros(3), spacing_mm, none, none)

@@ -114,6 +114,7 @@ def detect(
         missing | excess,
         seen.images,
         threshold_mm=min(_stray_limit_mm(levels[0], options, calibration), limit_mm),
+        occupancy=options.occupancy,
     )
     gone = np.zeros(len(surface_mm), bool)
     gone[seen.crossed] = labels[0, len(surfels) :]

@@ -79,7 +79,9 @@ def test_space_in_a_pit_is_empty_and_around_it_solid_whichever_way_its_planes_lo
     off = f_mm < -0.2
     broken = Broken(points[off], -normals[off] if turned else normals[off], f_mm[off])
     surface = block.surface_points(0.4)
-    found = find_occupancy(block, broken, points[~off], surface, spacing_mm=0.25)
+    found = find_occupancy(
+        block, broken, points[~off], surface, spacing_mm=0.25, options=OccupancyOptions()
+    )
     ask = np.random.default_rng(0).uniform((5.0, 3.0, 4.0), (19.0, 17.0, 10.0), (4000, 3))
     from_centre_mm = np.linalg.norm(ask - (12, 10, 10), axis=1)
     clear = np.abs(from_centre_mm - 5.0) > found.voxel_mm
