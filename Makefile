@@ -38,9 +38,9 @@ suite: $(EXTRAS)
 slow: $(EXTRAS) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
 
-chromium: $(EXTRAS) ## report and live view as a person sees and drives them
+chromium: $(EXTRAS) ## report, live view and the fleet's page as a person sees and drives them
 	$(BIN)/python -c "import sys; from tests.integration.browser import why_not; sys.exit(why_not())"
-	$(BIN)/python -m pytest -m slow tests/integration/test_report_in_browser.py tests/integration/test_live_view_in_browser.py tests/integration/test_loop_view_in_browser.py
+	$(BIN)/python -m pytest -m slow tests/integration/test_report_in_browser.py tests/integration/test_live_view_in_browser.py tests/integration/test_loop_view_in_browser.py tests/integration/test_fleet_printers.py
 
 peers: $(EXTRAS) ## print through and beside OctoPrint, Moonraker and Printrun, each in its own environment
 	$(BIN)/python tests/peers/environments.py
