@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from amrepair.errors import InputError
+from gcode.whole import put_in_place
 
 STATUS, ANSWER = "status.json", "answer.json"
 # Where scans may be sent to be judged, and how long to wait: the supervisor's word.
@@ -105,9 +106,8 @@ def answer(folder: Path, number: int, *, yes: bool) -> None:
 
 def write_note(path: Path, said: dict[str, Any]) -> None:
     """Whole or not at all."""
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    temporary.write_text(json.dumps(said), encoding="utf-8")
-    temporary.replace(path)
+    with put_in_place(path) as draft:
+        draft.write_text(json.dumps(said), encoding="utf-8")
 
 
 def read_note(path: Path) -> dict[str, Any] | None:

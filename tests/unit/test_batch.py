@@ -46,6 +46,7 @@ from amrepair.batch.pool import Pool
 from amrepair.batch.table import as_parquet, row_of
 from amrepair.errors import AmrepairError, InputError, MissingDependencyError
 from amrepair.template import open_template
+from gcode import whole
 
 DETECT = BatchOptions(Kind.DETECT)
 
@@ -386,7 +387,7 @@ def test_a_full_disk_is_one_sentence_and_what_is_done_stays(
 
     common = {"options": DETECT, "template": ready / "lug.safetensors", "executor": "serial"}
     with monkeypatch.context() as patch:
-        patch.setattr(batch_places.os, "fsync", full)
+        patch.setattr(whole.os, "fsync", full)
         with pytest.raises(InputError, match=r"No space left.*results of 9 scans are kept"):
             run_batch(str(ready / "scans"), out=str(out), **common)
     done = results(out)
