@@ -38,6 +38,8 @@ class Judges:
         When whoever asks stops waiting; what takes longer ends its process.
     restarts, restarts_within_s
         So many times in so many seconds one that died is replaced.
+    nice
+        How far they stand back for what prints.
 
     Raises
     ------
@@ -46,9 +48,16 @@ class Judges:
     """
 
     def __init__(
-        self, count: int, *, asking: int, within_s: float, restarts: int, restarts_within_s: float
+        self,
+        count: int,
+        *,
+        asking: int,
+        within_s: float,
+        restarts: int,
+        restarts_within_s: float,
+        nice: int = NICE,
     ) -> None:
-        self._count, self._within_s = count, within_s
+        self._within_s, self._nice = within_s, nice
         self._restarts, self._restarts_within_s = restarts, restarts_within_s
         self._deaths: deque[float] = deque()
         self._workers: list[BaseProcess] = []
@@ -110,16 +119,16 @@ class Judges:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _hire(self) -> None:
-        self._workers.append(spawned(serve, self._listener, self._within_s))
+        self._workers.append(spawned(serve, self._listener, self._within_s, self._nice))
 
 
-def serve(listener: socket.socket, within_s: float) -> None:
+def serve(listener: socket.socket, within_s: float, nice: int) -> None:
     """A worker's life: detect for one after another."""
     from gcode.process import end_with_parent
 
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's is for the supervisor
-    os.nice(NICE)
+    os.nice(nice)
     from amrepair.fleet.shared import mark
 
     own = mark()

@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 
-def idle(listener: socket.socket, within_s: float) -> None:
+def idle(listener: socket.socket, within_s: float, nice: int) -> None:
     """A worker that never takes anybody."""
     time.sleep(600.0)
 
