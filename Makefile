@@ -7,7 +7,7 @@ EXTRAS := $(VENV)/.extras
 # Tests wait for wires and for killed processes: one worker more than there are cores.
 WORKERS := $(shell $(PYTHON) -c "import os; print(1 + (os.cpu_count() or 1))")
 
-.PHONY: demo test lint suite slow chromium examples docs pictures peers clean help
+.PHONY: demo test lint suite slow chromium batches examples docs pictures peers clean help
 
 help: ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -38,9 +38,15 @@ suite: $(EXTRAS)
 slow: $(EXTRAS) ## the tests that take longer than a minute
 	$(BIN)/python -m pytest -m slow
 
-chromium: $(EXTRAS) ## report and live view as a person sees and drives them
+chromium: $(EXTRAS) ## report, live view and the fleet's page as a person sees and drives them
 	$(BIN)/python -c "import sys; from tests.integration.browser import why_not; sys.exit(why_not())"
-	$(BIN)/python -m pytest -m slow tests/integration/test_report_in_browser.py tests/integration/test_live_view_in_browser.py tests/integration/test_loop_view_in_browser.py
+	$(BIN)/python -m pytest -m slow tests/integration/test_report_in_browser.py tests/integration/test_live_view_in_browser.py tests/integration/test_loop_view_in_browser.py tests/integration/test_fleet_printers.py
+
+batches: $(EXTRAS) ## batches with every extra: Parquet, Ray, an S3 server; a thousand scans killed three times
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[batch,ray,store]'
+	$(BIN)/python tests/peers/environments.py moto
+	$(BIN)/python -m pytest tests/unit/test_batch.py
+	$(BIN)/python -m pytest -m "slow or peers" tests/integration/test_batch_kills.py tests/peers/test_s3_store.py
 
 peers: $(EXTRAS) ## print through and beside OctoPrint, Moonraker and Printrun, each in its own environment
 	$(BIN)/python tests/peers/environments.py

@@ -27,6 +27,7 @@ from amrepair.observe.rays import range_images
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.calibration import Calibration
 from amrepair.regions.options import RegionOptions
+from amrepair.regions.sites import RoundedUp
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.scans import Scan
 from amrepair.template.laid import LaidBeads
@@ -62,6 +63,8 @@ OFF_THE_PART_MM, OVER_BESIDE_MM, ON_BED_MM = 0.3, 0.3, 0.2
 LEVEL = 1e-7
 # Two poses whose repairs share less than this are two different repairs.
 SAME_REPAIR_RATIO = 0.8
+# `detect`, or what asks another process for the same
+Detector = Callable[..., AnomalyMap]
 
 
 class Stopwatch:
@@ -149,6 +152,7 @@ class Site:
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
     beside: HeightField | None = None
     laid: LaidBeads | None = None
+    detector: Detector = detect
 
     @classmethod
     def of_part(
@@ -156,38 +160,6 @@ class Site:
     ) -> Site:
         """A finished part on the layers of the process profile."""
         return cls(template, setup, LayerGrid.from_setup(setup), build_from_template)
-
-    def expected_offset_mm(
-        self,
-        place_mm: Float[np.ndarray, "s 3"],
-        normal: Float[np.ndarray, "s 3"],
-        deviation_mm: Float[np.ndarray, " s"],
-        *,
-        placed: Transform,
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
-        """How far off the drawing the job's own path puts places, and give or take how much.
-
-        Parameters
-        ----------
-        place_mm, normal
-            (s, 3) each, template frame: what was seen, and the outward unit normals of what is
-            expected there.
-        deviation_mm
-            (s,) how far out of what is expected each place lies.
-        placed
-            Where the part stands, build from template.
-
-        Returns
-        -------
-        offset_mm, tolerance_mm
-            (s,) each: a deviation within `offset ± tolerance` is the job's own; 0 where there is
-            no job.
-        """
-        if self.laid is None:
-            return np.zeros(len(place_mm)), np.zeros(len(place_mm))
-        return self.laid.expected_offset_mm(
-            placed.apply(place_mm), placed.rotate(normal), deviation_mm
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +301,7 @@ def plan_repair(
         whole = scan.moved(registration.template_from_scan)
         expected = site.planned or site.template
         moved = _in_view(_of_the_part(whole, site), site)
-        anomaly = detect(
+        anomaly = site.detector(
             moved,
             expected,
             options=RegionOptions(
@@ -341,7 +313,7 @@ def plan_repair(
             if seen is None
             else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
-            rounded_up=None if site.laid is None else partial(_laid_beyond, site, placed),
+            rounded_up=_told_to_go_beyond(site, expected, placed),
             progress=progress,
         )
     with watch("deficit"):
@@ -453,20 +425,28 @@ def _of_the_part(scan: Scan, site: Site) -> Scan:
     return scan.subset(keep)
 
 
+def _told_to_go_beyond(site: Site, expected: Template, placed: Transform) -> RoundedUp | None:
+    """How far out the job itself goes, as `detect` asks it; with no more than it needs."""
+    if site.laid is None:
+        return None
+    return partial(_laid_beyond, site.laid, expected, 0.5 * site.allowance_mm, placed)
+
+
 def _laid_beyond(
-    site: Site,
+    laid: LaidBeads,
+    expected: Template,
+    least_mm: float,
     placed: Transform,
     place_mm: Float[np.ndarray, "s 3"],
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
     """(s,) how far out of what is expected the job's own path may put each place."""
     beyond_mm = np.zeros(len(place_mm))
-    some = np.flatnonzero(deviation_mm > 0.5 * site.allowance_mm)
+    some = np.flatnonzero(deviation_mm > least_mm)
     if len(some):
-        expected = site.planned or site.template
         normal = unit_vectors(expected.distance_and_gradient(place_mm[some])[1])
-        offset_mm, tolerance_mm = site.expected_offset_mm(
-            place_mm[some], normal, deviation_mm[some], placed=placed
+        offset_mm, tolerance_mm = laid.expected_offset_mm(
+            placed.apply(place_mm[some]), placed.rotate(normal), deviation_mm[some]
         )
         beyond_mm[some] = offset_mm + tolerance_mm
     return np.maximum(beyond_mm, 0.0)

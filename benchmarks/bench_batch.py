@@ -1,10 +1,14 @@
 """What a batch costs beside the same work by hand, on 1 and 2 workers and on Ray.
 
-    python benchmarks/bench_batch.py [--scans 160] [--out out/bench-batch]
+    python benchmarks/bench_batch.py [--scans 160] [--points 3000] [--out out/bench-batch]
 
-Every way is run twice, with a quarter of the scans and with all: the difference is what scans cost,
-without what it takes to start. Processor time is of the command and all its children; Ray's workers
-are children of nobody, there the batch's own account is given.
+The overhead is measured in one process, where a batch and a loop written by hand take turns over
+the same scans, by turns the one first and the other: what else the machine does meets both alike.
+Its figure is all processor time of the batch beyond the hand's, table and overview included.
+
+Then every way is run as a command, twice, with a quarter of the scans and with all: the difference
+is what scans cost, without what it takes to start. Processor time is of the command and all its
+children; Ray's workers are children of nobody, there the batch's own account is given.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from gcode.process import one_thread, prepare
@@ -32,8 +37,8 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "unit"))
 
 
-def by_hand(folder: Path, template: Path) -> None:
-    """A loop as anybody would write it."""
+def by_hand(template: Path) -> Callable[[Path], None]:
+    """What anybody would write in a loop."""
     from amrepair.align import align
     from amrepair.deficit import compute_deficit, measured_regions
     from amrepair.frames import Transform
@@ -42,13 +47,58 @@ def by_hand(folder: Path, template: Path) -> None:
     from amrepair.template import open_template
 
     field, here = open_template(template), Transform.identity("build", "template")
-    for path in sorted(folder.glob("*.ply")):
+
+    def one(path: Path) -> None:
         scan = read_scan(path, frame="scanner")
         found = align(scan, field, rng=np.random.default_rng(0))
         placed = scan.moved(found.template_from_scan)
         anomaly = detect(placed, field)
         deficit = compute_deficit(placed, field, anomaly, build_from_template=here)
         measured_regions(anomaly, deficit)
+
+    return one
+
+
+def overhead(folder: Path, template: Path, out: Path) -> dict[str, float]:
+    """Processor time of a batch beside the same by hand, scan by scan in one process."""
+    from amrepair.batch import BatchOptions, Kind, run_batch
+
+    paths, hand = sorted(folder.glob("*.ply")), by_hand(template)
+    spent_s: dict[str, list[float]] = {"hand": [], "batch": []}
+    began_s = 0.0
+
+    def alone(path: Path) -> None:
+        before_s = time.process_time()
+        hand(path)
+        spent_s["hand"].append(time.process_time() - before_s)
+
+    def turn(stage: str, done: float, total: float) -> None:
+        nonlocal began_s
+        k = int(done) - 1
+        if stage == "scans" and k == len(spent_s["batch"]):
+            spent_s["batch"].append(time.process_time() - began_s)
+            for path in paths[k : k + 2] if k % 2 == 0 else ():
+                alone(path)
+        if stage == "scans":
+            began_s = time.process_time()
+
+    alone(paths[0])  # kernels are loaded
+    spent_s["hand"].clear()
+    shutil.rmtree(out, ignore_errors=True)
+    run_batch(
+        str(folder), options=BatchOptions(Kind.DETECT), template=template, out=str(out),
+        executor="serial", progress=turn,
+    )  # fmt: skip
+    end_s = time.process_time() - began_s
+    by_hand_s, batch_s = sum(spent_s["hand"]), sum(spent_s["batch"])
+    pairs = np.array(spent_s["batch"]) / np.array(spent_s["hand"])
+    return {
+        "by_hand_ms_a_scan": 1e3 * by_hand_s / len(paths),
+        "batch_ms_a_scan": 1e3 * batch_s / len(paths),
+        "end_ms": 1e3 * end_s,
+        "overhead": (batch_s + end_s) / by_hand_s - 1.0,
+        "overhead_median_pair": float(np.median(pairs)) - 1.0,
+    }
 
 
 def cost_of(command: list[str]) -> tuple[float, float]:
@@ -67,10 +117,14 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=160)
     parser.add_argument("--points", type=int, default=3_000)
     parser.add_argument("--out", type=Path, default=Path("out/bench-batch"))
+    parser.add_argument("--overhead", action="store_true", help="measure that, and no more")
     parser.add_argument("--hand", nargs=2, type=Path, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.hand:
-        by_hand(*asked.hand)
+        folder, field = asked.hand
+        one = by_hand(field)
+        for path in sorted(folder.glob("*.ply")):
+            one(path)
         return
     from batch_bench import write_scans, write_template
 
@@ -78,6 +132,10 @@ def main() -> None:
     template = write_template(asked.out / "lug.safetensors")
     counts = (asked.scans // 4, asked.scans)
     folders = [write_scans(asked.out / f"scans-{n}", n, points=asked.points) for n in counts]
+    beside = overhead(folders[1], template, asked.out / "results")
+    print({name: round(value, 4) for name, value in beside.items()}, flush=True)
+    if asked.overhead:
+        return
     ways = {"by hand": None, "serial": ("serial", 1), "process, 1 worker": ("process", 1),
             "process, 2 workers": ("process", 2)}  # fmt: skip
     if importlib.util.find_spec("ray"):
@@ -118,6 +176,7 @@ def main() -> None:
         "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
         "scans": counts,
         "points": asked.points,
+        "overhead": beside,
         "kept_bytes_a_scan": kept / counts[1],
         "rows": rows,
     }

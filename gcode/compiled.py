@@ -65,15 +65,20 @@ def keep_safely(kept: Any) -> None:
     kept._source_stamp = (*kept._source_stamp, kernels_stamp())
 
 
-@functools.cache
 def kernels_stamp() -> tuple[tuple[str, int, int], ...]:
     """Name, time of change and size of every file with kernels."""
+    return sources_stamp("_kernels.py")
+
+
+@functools.cache
+def sources_stamp(ending: str) -> tuple[tuple[str, int, int], ...]:
+    """Name, time of change and size of every file of both packages that ends so."""
     root = Path(__file__).parents[1]
     found = []
     for package in _PACKAGES:
         for folder, _, names in os.walk(root / package):
             for name in names:
-                if name.endswith("_kernels.py"):
+                if name.endswith(ending):
                     stat = Path(folder, name).stat()
                     found.append((name, stat.st_mtime_ns, stat.st_size))
     return tuple(sorted(found))

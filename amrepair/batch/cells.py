@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.errors import InputError
+from amrepair.field.near import nearest_within
 from amrepair.regions import AnomalyMap, Label, Region
 from amrepair.template.port import Template
 
@@ -57,6 +58,10 @@ class Cells:
 
     def __len__(self) -> int:
         return len(self.place_mm)
+
+    def nearest(self, points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+        """(n,) the cell that each point belongs to, −1 where it lies too far off."""
+        return nearest_within(points_mm, self.place_mm, REACH_CELLS * self.spacing_mm)
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -130,12 +135,10 @@ def sums_of(
         Regions with their volumes, and (r, 3) where they are, template frame.
     """
     count = len(cells)
-    tree = cells.tree
-    reach_mm = REACH_CELLS * cells.spacing_mm
-    near = np.asarray(tree.query(anomaly.points_mm, distance_upper_bound=reach_mm)[1])
+    near = cells.nearest(anomaly.points_mm)
     marked = anomaly.label != int(Label.OK)
     # points of the bed, strays and clutter are OK by label, however far they lie
-    part = (near < count) & (marked | (np.abs(anomaly.deviation_mm) < anomaly.threshold_mm))
+    part = (near >= 0) & (marked | (np.abs(anomaly.deviation_mm) < anomaly.threshold_mm))
     units = np.rint(anomaly.deviation_mm[part] / UNIT_MM).astype(np.int64)
     units = np.clip(units, -MOST_UNITS, MOST_UNITS)
     at, label = near[part], anomaly.label[part]
@@ -145,13 +148,13 @@ def sums_of(
     mean = np.where(points > 0, _rounded(total, np.maximum(points, 1)), 0)
     sums = CellSums.zero(count)
     table = sums.table
-    gone = _cells_of(tree, anomaly, Label.MISSING, count, reach_mm)
+    gone = _cells_of(cells, anomaly, Label.MISSING)
     for name, which in (("missing", Label.MISSING), ("excess", Label.EXCESS)):
         found = np.bincount(at[label == int(which)], minlength=count) > 0
         table[:, COLUMNS.index(name)] = found | gone if which is Label.MISSING else found
     table[:, 0] = (points > 0) | gone
     table[:, 3], table[:, 4] = mean, mean * mean
-    _add_volumes(sums, regions, centres_mm, cells, tree)
+    _add_volumes(sums, regions, centres_mm, cells)
     return sums
 
 
@@ -160,15 +163,10 @@ def _rounded(total: Int[np.ndarray, " k"], count: Int[np.ndarray, " k"]) -> Int[
     return (2 * total + count) // (2 * count)
 
 
-def _cells_of(
-    tree: cKDTree, anomaly: AnomalyMap, label: Label, count: int, reach_mm: float
-) -> np.ndarray:
+def _cells_of(cells: Cells, anomaly: AnomalyMap, label: Label) -> np.ndarray:
     """(k,) cells at which the template's own surface has a label: what is gone has no points."""
-    place_mm = anomaly.template_points_mm[anomaly.template_label == int(label)]
-    if not len(place_mm):
-        return np.zeros(count, bool)
-    near = np.asarray(tree.query(place_mm, distance_upper_bound=reach_mm)[1])
-    return np.bincount(near[near < count], minlength=count) > 0
+    near = cells.nearest(anomaly.template_points_mm[anomaly.template_label == int(label)])
+    return np.bincount(near[near >= 0], minlength=len(cells)) > 0
 
 
 def _add_volumes(
@@ -176,9 +174,9 @@ def _add_volumes(
     regions: Sequence[Region],
     centres_mm: Float[np.ndarray, "r 3"],
     cells: Cells,
-    tree: cKDTree,
 ) -> None:
     """Share each region's volume among the cells that were found to have it."""
+    tree = cells.tree
     for region, centre_mm in zip(regions, centres_mm, strict=True):
         name = "missing" if region.label is Label.MISSING else "excess"
         half_mm = 0.5 * float(np.linalg.norm(np.ptp(region.box_mm, axis=0)))

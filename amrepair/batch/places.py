@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, runtime_checkable
 
 from amrepair.errors import InputError, MissingDependencyError
+from gcode.whole import write_bytes
 
 _CHUNK_BYTES = 1 << 20
 
@@ -73,22 +74,7 @@ class Folder:
 
     def write(self, name: str, data: bytes) -> None:
         """Write under another name, onto the disk, then put in place."""
-        target = self.path / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(f".{os.getpid()}-{target.name}")
-        try:
-            with temporary.open("wb") as stream:
-                stream.write(data)
-                stream.flush()
-                os.fsync(stream.fileno())
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
-        folder = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # the name, too
-        finally:
-            os.close(folder)
+        write_bytes(self.path / name, data, durable=True)
 
     def read(self, name: str) -> bytes:
         """All of a file."""

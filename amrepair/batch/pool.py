@@ -10,11 +10,12 @@ import contextlib
 import multiprocessing
 import os
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from typing import Any
 
 from amrepair.batch.options import MOST_ATTEMPTS, Outcome, Task, Work, given_up
 from amrepair.errors import AmrepairError
@@ -47,7 +48,6 @@ class Pool:
     def __init__(self, work: Work, *, workers: int) -> None:
         self._work = work
         self._count = workers
-        self._context = multiprocessing.get_context("spawn")  # open3d's threads survive no fork
         self._workers: list[_Worker] = []
         self._stillborn = 0
 
@@ -93,10 +93,8 @@ class Pool:
     def _hire(self, waiting: int) -> None:
         busy = sum(one.task is not None for one in self._workers)
         while len(self._workers) < min(self._count, busy + waiting):
-            here, there = self._context.Pipe()
-            process = self._context.Process(target=_serve, args=(there, self._work), daemon=True)
-            with _with_one_thread():
-                process.start()
+            here, there = multiprocessing.Pipe()
+            process = spawned(_serve, there, self._work)
             there.close()
             self._workers.append(_Worker(process, here))
 
@@ -143,6 +141,15 @@ class Pool:
             yield given_up(one.task, MOST_ATTEMPTS)
         else:
             queue.appendleft(one.task)
+
+
+def spawned(life: Callable[..., object], *about: Any) -> BaseProcess:
+    """A started process with one thread a library, which ends with this one at the latest."""
+    context = multiprocessing.get_context("spawn")  # open3d's threads survive no fork
+    process = context.Process(target=life, args=about, daemon=True)
+    with _with_one_thread():
+        process.start()
+    return process
 
 
 @contextmanager

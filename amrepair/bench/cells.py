@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import time
 import zipfile
@@ -26,6 +25,7 @@ from amrepair.bench.registry import make_method
 from amrepair.bench.samples import BenchClass, Sample
 from amrepair.template.paper import PaperOptions
 from gcode.progress import Progress, silent
+from gcode.whole import put_in_place, write_bytes
 
 # Median residual of the normal points after alignment, over the noise: flat parts of a well
 # aligned cloud give 0.7, over another cloud's planes 1, a template's own error some more. Published
@@ -92,17 +92,6 @@ class Cell:
         return self.out / "cells" / self.method / self.one.name / f"{self.seed}.json"
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """All of the file or nothing of it, also after a kill or a power cut."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    with draft.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    draft.replace(path)
-
-
 def finished(cell: Cell) -> Row | None:
     """The row of a cell that an earlier run finished."""
     if not cell.result_path.is_file():
@@ -137,7 +126,7 @@ def run_cell(
             progress(f"{cell.method} {cell.one.name}", float(i), float(len(left)))
             _score(cell, sample, model, data.mm_per_unit, clock)
     row = _judge(cell, json.loads(fit_path.read_text()))
-    write_whole(cell.result_path, json.dumps(asdict(row)).encode())
+    write_bytes(cell.result_path, json.dumps(asdict(row)).encode(), durable=True)
     shutil.rmtree(cell.folder)
     return row
 
@@ -166,7 +155,7 @@ def _write_fit(path: Path, model: Model, seconds: float, sigma_mm: float) -> Non
         "from_surface": None if distance is None else distance.from_surface,
     }
     if not path.is_file():  # a resumed run keeps the first fit's time
-        write_whole(path, json.dumps(said).encode())
+        write_bytes(path, json.dumps(said).encode(), durable=True)
 
 
 def _score(
@@ -188,8 +177,7 @@ def _score(
         residual = float(np.median(np.abs(scores.residual_mm[normal])))
     path = _path(cell, sample)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    with draft.open("wb") as stream:
+    with put_in_place(path, durable=True) as draft, draft.open("wb") as stream:
         np.savez(
             stream,
             score=scores.point.astype(np.float32),
@@ -199,9 +187,6 @@ def _score(
             residual_mm=np.float64(residual),
             aligned=np.bool_(scores.aligned),
         )
-        stream.flush()
-        os.fsync(stream.fileno())
-    draft.replace(path)
 
 
 def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:

@@ -21,7 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from amrepair.bench.cells import Cell, Row, run_cell, write_whole
+from amrepair.bench.cells import Cell, Row, run_cell
 from amrepair.bench.dataset import open_dataset
 from amrepair.bench.paper import BENCH_PAPER
 from amrepair.bench.registry import METHODS, PAPER_METHOD, make_method
@@ -33,6 +33,7 @@ from amrepair.template.paper import PaperOptions
 from gcode.compiled import get_num_threads, set_num_threads
 from gcode.process import end_with_parent
 from gcode.progress import Progress, silent
+from gcode.whole import left_behind, write_bytes
 
 DEFAULT_SEEDS = (0, 1, 2)
 # Raised when scores of the same name would come out differently: old cells are then refused.
@@ -122,7 +123,7 @@ def run_bench(
         report = _write(out, chosen, rows, len(cells), paper)
         progress("bench", float(len(rows)), float(len(cells)))
     shutil.rmtree(out / "partial", ignore_errors=True)
-    for draft in out.rglob(".*.part"):  # what a killed run was writing
+    for draft in list(left_behind(out)):  # what a killed run was writing
         draft.unlink(missing_ok=True)
     return report
 
@@ -166,7 +167,7 @@ def _claim(out: Path, data: BenchData, paper: PaperOptions | None) -> None:
         said["paper"] = recipe
     if paper is not None:
         said["paper"] = asdict(paper)
-    write_whole(path, json.dumps(said).encode())
+    write_bytes(path, json.dumps(said).encode(), durable=True)
 
 
 def _work(cells: Sequence[Cell], jobs: int, progress: Progress) -> Iterator[Row]:
@@ -210,8 +211,8 @@ def _write(
     )
     complete = len(rows) == cells
     said = as_json(ordered, data.format, synthetic=synthetic, complete=complete, paper=paper)
-    write_whole(report.json_path, said.encode())
-    write_whole(report.csv_path, as_csv(ordered).encode())
+    write_bytes(report.json_path, said.encode(), durable=True)
+    write_bytes(report.csv_path, as_csv(ordered).encode(), durable=True)
     table = as_markdown(ordered, data.format, synthetic=synthetic, complete=complete, paper=paper)
-    write_whole(report.markdown_path, table.encode())
+    write_bytes(report.markdown_path, table.encode(), durable=True)
     return report

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
 from amrepair.errors import InputError
 from amrepair.fleet.desk import Desk
-from amrepair.loop import Decision
-from amrepair.repair import RepairPlan
+from amrepair.fleet.shared import SharedDetection
+from amrepair.loop import Decision, Stop
+from amrepair.repair import RepairPlan, Site
 from amrepair.report.text import plan_lines
 from gcode.cli import console
 
@@ -21,6 +26,10 @@ class Terminal:
 
     def __init__(self, bars: console.Bars) -> None:
         self._bars = bars
+
+    def judging(self, site_at: Callable[[Stop], Site]) -> Callable[[Stop], Site]:
+        """The same sites: scans are judged by this process."""
+        return site_at
 
     def to_print(self, plan: RepairPlan) -> bool:
         """Show what would be printed, and wait for a word."""
@@ -49,13 +58,18 @@ class AtDesk(console.Bars):
 
     Parameters
     ----------
-    desk
-        Of a supervisor's.
+    folder
+        The supervisor's desk.
     """
 
-    def __init__(self, desk: Desk) -> None:
+    def __init__(self, folder: Path) -> None:
         super().__init__()
-        self._desk = desk
+        self._desk = Desk(folder)
+        self._detector = SharedDetection(folder, self._desk.judged)
+
+    def judging(self, site_at: Callable[[Stop], Site]) -> Callable[[Stop], Site]:
+        """The same sites, their scans judged by the supervisor's shared processes where it can."""
+        return lambda stop: replace(site_at(stop), detector=self._detector)
 
     def __call__(self, stage: str, done: float, total: float) -> None:
         """Report that `done` of `total` of `stage` is finished."""

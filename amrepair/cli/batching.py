@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Callable
+from functools import wraps
+from inspect import Signature, signature
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -27,7 +29,7 @@ from gcode.process import one_thread
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
-    from amrepair.batch import BatchOptions, BatchReport
+    from amrepair.batch import BatchReport
 
 batch_app = typer.Typer(
     help="Align, judge or repair many scans; a batch that was killed goes on.",
@@ -54,6 +56,19 @@ WorkersOption = Annotated[
 AddressOption = Annotated[
     str | None, typer.Option(help="Ray cluster to use, such as auto or ray://head:10001.")
 ]
+PoseOption = Annotated[
+    str | None,
+    typer.Option(
+        help="X,Y,Z,RZ of each part's own origin on the bed, mm and degrees; left out: the scans "
+        "are in the bed's frame.",
+    ),
+]
+FixtureOption = Annotated[
+    bool, typer.Option("--on-fixture", help="The parts stand on something above the bed.")
+]
+
+# `BatchOptions` (loaded when a command runs), and the name of the calibration that judges.
+Judging = tuple[Any, str | None]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -61,141 +76,24 @@ def add_to(app: typer.Typer) -> None:
     app.add_typer(batch_app, name="batch")
 
 
-@batch_app.command(
-    "align",
-    epilog=console.examples(
-        "amrepair batch align scans --template part.stl --out out/batch",
-    ),
-)
-def align(
-    source: SourceArgument,
-    template: TemplateOption,
-    out: OutOption,
-    part_is_known: KnownOption = False,
-    sensor_at: SensorOption = None,
-    executor: ExecutorOption = "process",
-    workers: WorkersOption = None,
-    address: AddressOption = None,
-    seed: SeedOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Find where each scan lies in its template."""
-    os.environ.update(one_thread())
-    with console.starting():
-        from amrepair.batch import BatchOptions, Kind
-
-    options = BatchOptions(
-        Kind.ALIGN, seed=seed, part_is_known=part_is_known, sensors_mm=_places(sensor_at)
-    )
-    _run(source, options, template, out, (executor, workers, address), None, as_json=as_json)
-
-
-@batch_app.command(
-    "detect",
-    epilog=console.examples(
-        "amrepair batch detect scans --template part.stl --out out/batch",
-        "amrepair batch detect monday.csv --template templates --out out/batch --workers 2 --json",
-        "amrepair batch detect s3://lab/scans --template part.stl --out s3://lab/batch "
-        "--executor ray --address auto",
-    ),
-)
-def detect(
-    source: SourceArgument,
-    template: TemplateOption,
-    out: OutOption,
-    part_is_known: KnownOption = False,
-    sensor_at: SensorOption = None,
-    calibration: CalibrationOption = None,
-    executor: ExecutorOption = "process",
-    workers: WorkersOption = None,
-    address: AddressOption = None,
-    seed: SeedOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Say of each scan what is missing and what is too much."""
-    os.environ.update(one_thread())
-    with console.starting():
-        from amrepair.batch import BatchOptions, Kind
-
-    options = BatchOptions(
-        Kind.DETECT, seed=seed, part_is_known=part_is_known, sensors_mm=_places(sensor_at)
-    )
-    crew = (executor, workers, address)
-    _run(source, options, template, out, crew, calibration, as_json=as_json)
-
-
-@batch_app.command(
-    "repair",
-    epilog=console.examples(
-        "amrepair batch repair scans --template part.stl --out out/batch",
-        "amrepair batch repair scans --template part.stl --out out/batch --printer ender_3 "
-        "--part-pose 100,80,0,90",
-    ),
-)
-def repair(
-    source: SourceArgument,
-    template: TemplateOption,
-    out: OutOption,
-    printer: PrinterOption = DEFAULT_PRINTER,
-    material: MaterialOption = DEFAULT_MATERIAL,
-    process: ProcessOption = DEFAULT_PROCESS,
-    pose: Annotated[
-        str | None,
-        typer.Option(
-            "--part-pose",
-            help="X,Y,Z,RZ of each part's own origin on the bed, mm and degrees; left out: the "
-            "scans are in the bed's frame.",
-        ),
-    ] = None,
-    on_fixture: Annotated[
-        bool, typer.Option("--on-fixture", help="The parts stand on something above the bed.")
-    ] = False,
-    sensor_at: SensorOption = None,
-    calibration: CalibrationOption = None,
-    executor: ExecutorOption = "process",
-    workers: WorkersOption = None,
-    address: AddressOption = None,
-    seed: SeedOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Make for each scan the G-code that prints only what is missing."""
-    os.environ.update(one_thread())
-    with console.starting():
-        from amrepair.batch import BatchOptions, Kind
-
-    placed = None
-    if pose is not None:
-        x, y, z, turn_deg = (float(value) for value in numbers(pose, 4, "--part-pose"))
-        placed = (x, y, z, turn_deg)
-    options = BatchOptions(
-        Kind.REPAIR, seed=seed, sensors_mm=_places(sensor_at), part_pose=placed,
-        on_fixture=on_fixture, printer=printer, material=material, process=process,
-    )  # fmt: skip
-    crew = (executor, workers, address)
-    _run(source, options, template, out, crew, calibration, as_json=as_json)
-
-
-def _places(sensor_at: list[str] | None) -> tuple[tuple[float, float, float], ...]:
-    places = sensors(sensor_at)
-    if placed := () if places is None else tuple(places.tolist()):
-        return tuple((x, y, z) for x, y, z in placed)
-    return ()
-
-
 def _run(
-    source: str,
-    options: BatchOptions,
-    template: Path,
-    out: str,
-    crew: tuple[str, int | None, str | None],
-    calibration: str | None,
+    judging: Callable[..., Judging],
     *,
-    as_json: bool,
+    source: SourceArgument,
+    template: TemplateOption,
+    out: OutOption,
+    sensor_at: SensorOption = None,
+    executor: ExecutorOption = "process",
+    workers: WorkersOption = None,
+    address: AddressOption = None,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
 ) -> None:
     """Run it, tell of it; an exit code of 2 where not one scan has figures."""
-    from amrepair.batch import run_batch
+    with console.starting():
+        from amrepair.batch import run_batch
 
-    executor, workers, address = crew
+    options, calibration = judging(seed=seed, sensors_mm=_places(sensor_at))
     bars = console.Bars()
     with console.signals_end_it(), bars.shown():
         report = run_batch(
@@ -222,6 +120,97 @@ def _run(
         console.out.print(f"Overview: {out.rstrip('/')}/overview.html", markup=False)
     if report.refused == len(report.rows):
         raise typer.Exit(InputError.exit_code)
+
+
+def _command(name: str, *examples: str) -> Callable[[Callable[..., Judging]], Callable[..., None]]:
+    """A command with the options that every batch has, and with those of its own.
+
+    What is decorated has its own options by keyword, takes `seed` and `sensors_mm` as they are, and
+    says what is to be done.
+    """
+
+    def add(own: Callable[..., Judging]) -> Callable[..., None]:
+        said = signature(_run).parameters, signature(own).parameters
+        shared, mine = ([p for p in each.values() if p.kind is p.KEYWORD_ONLY] for each in said)
+        types = get_type_hints(_run, include_extras=True)
+        types |= get_type_hints(own, include_extras=True)
+
+        @wraps(own)
+        def command(**given: Any) -> None:
+            os.environ.update(one_thread())  # before anything that reads it is loaded
+            words = {p.name: given.pop(p.name) for p in mine}
+            _run(lambda **common: own(**words, **common), **given)
+
+        required = [p for p in shared if p.default is p.empty]
+        named = [*required, *mine, *(p for p in shared if p.default is not p.empty)]
+        command.__signature__ = Signature(  # type: ignore[attr-defined]
+            [p.replace(annotation=types[p.name]) for p in named]
+        )
+        batch_app.command(name, epilog=console.examples(*examples))(command)
+        return command
+
+    return add
+
+
+@_command("align", "amrepair batch align scans --template part.stl --out out/batch")
+def align(*, part_is_known: KnownOption = False, **common: Any) -> Judging:
+    """Find where each scan lies in its template."""
+    from amrepair.batch import BatchOptions, Kind
+
+    return BatchOptions(Kind.ALIGN, part_is_known=part_is_known, **common), None
+
+
+@_command(
+    "detect",
+    "amrepair batch detect scans --template part.stl --out out/batch",
+    "amrepair batch detect monday.csv --template templates --out out/batch --workers 2 --json",
+    "amrepair batch detect s3://lab/scans --template part.stl --out s3://lab/batch "
+    "--executor ray --address auto",
+)
+def detect(
+    *, part_is_known: KnownOption = False, calibration: CalibrationOption = None, **common: Any
+) -> Judging:
+    """Say of each scan what is missing and what is too much."""
+    from amrepair.batch import BatchOptions, Kind
+
+    return BatchOptions(Kind.DETECT, part_is_known=part_is_known, **common), calibration
+
+
+@_command(
+    "repair",
+    "amrepair batch repair scans --template part.stl --out out/batch",
+    "amrepair batch repair scans --template part.stl --out out/batch --printer ender_3 "
+    "--part-pose 100,80,0,90",
+)
+def repair(
+    *,
+    printer: PrinterOption = DEFAULT_PRINTER,
+    material: MaterialOption = DEFAULT_MATERIAL,
+    process: ProcessOption = DEFAULT_PROCESS,
+    part_pose: PoseOption = None,
+    on_fixture: FixtureOption = False,
+    calibration: CalibrationOption = None,
+    **common: Any,
+) -> Judging:
+    """Make for each scan the G-code that prints only what is missing."""
+    from amrepair.batch import BatchOptions, Kind
+
+    placed = None
+    if part_pose is not None:
+        x, y, z, turn_deg = (float(value) for value in numbers(part_pose, 4, "--part-pose"))
+        placed = (x, y, z, turn_deg)
+    options = BatchOptions(
+        Kind.REPAIR, part_pose=placed, on_fixture=on_fixture, printer=printer, material=material,
+        process=process, **common,
+    )  # fmt: skip
+    return options, calibration
+
+
+def _places(sensor_at: list[str] | None) -> tuple[tuple[float, float, float], ...]:
+    places = sensors(sensor_at)
+    if placed := () if places is None else tuple(places.tolist()):
+        return tuple((x, y, z) for x, y, z in placed)
+    return ()
 
 
 def _result(report: BatchReport, out: str) -> dict[str, Any]:

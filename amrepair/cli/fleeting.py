@@ -88,6 +88,8 @@ def _watch(crew: Fleet, history: History, *, until_done: bool) -> None:
                     f"{row['name']}: {row['state']}. {row['sentence']}".rstrip(". ") + ".",
                     markup=False,
                 )
+        while crew.notes:
+            console.errors.print(crew.notes.pop(0), markup=False)
         _remember(crew, history, kept)
         if until_done and crew.over:
             return

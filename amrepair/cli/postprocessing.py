@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +12,7 @@ import typer
 from amrepair.cli.options import JsonOption
 from amrepair.errors import InputError
 from gcode.cli import console
+from gcode.whole import put_in_place
 
 if TYPE_CHECKING:
     from amrepair.postprocess import Marked
@@ -130,18 +130,9 @@ def _in_words(file: Path, marked: Marked, reader: str) -> str:
 def _replace(file: Path, data: bytes) -> None:
     """Put new bytes in a file's place, whole or not at all, with the same rights."""
     try:
-        with tempfile.NamedTemporaryFile(
-            dir=file.parent, prefix=f".{file.name}-", delete=False
-        ) as new:
-            try:
-                new.write(data)
-                new.flush()
-                os.fsync(new.fileno())
-                shutil.copymode(file, new.name)
-                Path(new.name).replace(file)
-            except BaseException:
-                Path(new.name).unlink(missing_ok=True)
-                raise
+        with put_in_place(file, durable=True) as draft:
+            draft.write_bytes(data)
+            shutil.copymode(file, draft)
     except OSError as error:
         raise InputError(
             f"{file} cannot be written ({error.strerror}); it is as it was before"

@@ -14,7 +14,6 @@ from amrepair.cli.live import NoView, ShownRun, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
 from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import InputError, LoopError
-from amrepair.fleet.desk import Desk
 from amrepair.frames import Transform
 from amrepair.loop import (
     MAX_ITERATIONS,
@@ -114,7 +113,7 @@ def run(
     `said` is the scan's time limit, the calibration of its errors and the seed.
     """
     watch = Stopwatch()
-    bars = console.Bars() if shown.desk is None else AtDesk(Desk(shown.desk))
+    bars = console.Bars() if shown.desk is None else AtDesk(shown.desk)
     if resume is not None:
         if job_file is not None:
             raise InputError("--resume takes the job from the run's folder; leave JOB out")
@@ -290,6 +289,7 @@ def _print(
         machine.connect()
     page.drives(machine.pause, machine.resume)
     word = bars if isinstance(bars, AtDesk) else Terminal(bars)
+    expected = sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads)
     warmth = ThermalLog(machine.temperatures)
     shown = page.recording(begun.folder.record)
 
@@ -304,7 +304,7 @@ def _print(
                 begun.checked,
                 machine,
                 eye,
-                sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads),
+                word.judging(expected),
                 stops=begun.stops,
                 max_iterations=setting.max_iterations,
                 approve=(page.approve if view else word.to_print) if ask else lambda plan: True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Mapping
@@ -55,12 +56,17 @@ class FleetOptions:
     answer_within_s
         A question that nobody answers for so long ends its run, heaters off: it can be gone on
         with.
+    judges, judged_within_s
+        So many processes detect for all printers; what they have not come to in so many seconds a
+        printer's own process does. With 0 judges all is done by the printers' own.
     """
 
     out: Path = Path("out/fleet")
     restarts: int = 3
     within_s: float = 3600.0
     answer_within_s: float = 1800.0
+    judges: int = 1
+    judged_within_s: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +96,12 @@ def read_config(path: Path) -> FleetConfig:
         raise InputError(f"{path} has no printer; write a [[printer]] table for each")
     base = path.parent
     options = _made(FleetOptions, said, f"{path}", base)
-    if options.restarts < 0 or options.within_s <= 0 or options.answer_within_s <= 0:
-        raise InputError(f"{path}: restarts must be ≥ 0, within_s and answer_within_s above 0")
+    for name in ("restarts", "judges"):
+        if (value := getattr(options, name)) < 0:
+            raise InputError(f"{path}: {name} is {value}; it must be 0 or more")
+    for name in ("within_s", "answer_within_s", "judged_within_s"):
+        if not 0 < (value := getattr(options, name)) < math.inf:
+            raise InputError(f"{path}: {name} is {value:g}; it must be more than 0 s, and finite")
     printers = tuple(
         _made(PrinterSpec, table, f"{path}, printer {number}", base)
         for number, table in enumerate(tables, start=1)
@@ -133,6 +143,8 @@ def _made(kind: Any, said: Mapping[str, Any], where: str, base: Path) -> Any:
         wanted = str(known[name].type)
         if wanted == "Path":
             values[name] = base / value
+        elif wanted == "float":
+            values[name] = float(value)
         elif name == "scanner" and value.startswith("watch:"):
             values[name] = f"watch:{base / value.removeprefix('watch:')}"
         else:

@@ -1,6 +1,7 @@
 """Where a printer's process and whoever supervises it leave each other notes: files in a folder.
 
-`status.json` says what the process does and asks, `answer.json` answers the question of its number.
+`status.json` says what the process does and asks, `answer.json` answers the question of its number,
+`judges.json` says which shared processes there are to detect.
 Files outlive either side, and neither side waits for the other but where it asks.
 """
 
@@ -14,8 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from amrepair.errors import InputError
+from gcode.whole import put_in_place
 
 STATUS, ANSWER = "status.json", "answer.json"
+# Where scans may be sent to be judged, and how long to wait: the supervisor's word.
+JUDGES = "judges.json"
 POLL_S = 0.2
 # So often at most is progress written: a page is looked at once a second.
 TELL_S = 0.5
@@ -83,6 +87,13 @@ class Desk:
             self._said["question"] = None
             self._tell()
 
+    def judged(self, why: str) -> None:
+        """Count a scan that was judged: by shared processes, or, with a reason, by this one."""
+        counts = dict(self._said.get("judged") or {"shared": 0, "itself": 0})
+        counts["itself" if why else "shared"] += 1
+        self._said["judged"] = counts | {"why": why}
+        self._tell()
+
     def _tell(self) -> None:
         self._told_s = self._clock()
         write_note(self._folder / STATUS, {**self._said, "time_s": self._told_s})
@@ -95,9 +106,8 @@ def answer(folder: Path, number: int, *, yes: bool) -> None:
 
 def write_note(path: Path, said: dict[str, Any]) -> None:
     """Whole or not at all."""
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    temporary.write_text(json.dumps(said), encoding="utf-8")
-    temporary.replace(path)
+    with put_in_place(path) as draft:
+        draft.write_text(json.dumps(said), encoding="utf-8")
 
 
 def read_note(path: Path) -> dict[str, Any] | None:

@@ -186,6 +186,14 @@ def metrics(printers: Sequence[Mapping[str, Any]], history: Sequence[Mapping[str
     for one in printers:
         name = _label(one["name"])
         lines.append(f'amrepair_restarts_total{{printer="{name}"}} {one["restarts"]}')
+    lines += [
+        "# HELP amrepair_judged_total Scans of the process that runs, by who detected.",
+        "# TYPE amrepair_judged_total counter",
+    ]
+    for one in printers:
+        for by in ("shared", "itself"):
+            labels = f'printer="{_label(one["name"])}",by="{by}"'
+            lines.append(f"amrepair_judged_total{{{labels}}} {one['judged'][by]}")
     for column, what in (
         ("runs", "Runs begun"), ("looks", "Scans that were judged"),
         ("repairs", "Repairs that were printed"),

@@ -25,8 +25,10 @@ from typing import Any
 
 from amrepair.errors import InputError
 from amrepair.fleet.config import FleetConfig, FleetOptions, PrinterSpec
-from amrepair.fleet.desk import STATUS, answer, read_note
+from amrepair.fleet.desk import JUDGES, STATUS, answer, read_note, write_note
+from amrepair.fleet.judges import Judges
 from amrepair.loop.tape import read_events
+from gcode.process import one_thread
 
 BACK_OFF_S = 2.0
 # How long a process may take to lift the nozzle, switch heaters off and end.
@@ -140,8 +142,9 @@ class Seat:
         ):
             # a session of its own: an interrupt at the terminal is the supervisor's to pass on
             self.process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=out, stderr=log, start_new_session=True
-            )
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=log, start_new_session=True,
+                env={**os.environ, **one_thread()},  # as the shared judges: many on a few cores
+            )  # fmt: skip
         self.state, self.sentence, self.status = State.RUNS, "", {}
 
     def _watch(self, now_s: float) -> None:
@@ -252,7 +255,9 @@ class Fleet:
         clock: Callable[[], float] = time.time,
     ) -> None:
         self.options = config.options
+        self.notes: list[str] = []  # for whoever started it
         self._clock = clock
+        self._judges: Judges | None = None
         self._mutex = threading.RLock()
         out = config.options.out.absolute()
         self.seats = {
@@ -264,7 +269,7 @@ class Fleet:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """One supervisor a folder."""
+        """One supervisor a folder; its printers may ask its judges as long as it is there."""
         self.options.out.mkdir(parents=True, exist_ok=True)
         with (self.options.out / ".lock").open("w") as stream:
             try:
@@ -273,7 +278,11 @@ class Fleet:
                 raise InputError(
                     f"another fleet works in {self.options.out}; end it or name another out"
                 ) from error
-            yield
+            self._judges = self._hired()
+            try:
+                yield
+            finally:
+                self._let_go()
 
     @property
     def over(self) -> bool:
@@ -285,6 +294,32 @@ class Fleet:
         with self._mutex:
             for seat in self.seats.values():
                 seat.step(self._clock())
+            if self._judges is not None and (why := self._judges.step(self._clock())):
+                self.notes.append(why)
+                self._let_go()
+
+    def _hired(self) -> Judges | None:
+        """The shared processes that detect, and a note on every desk that says where they are."""
+        if self.options.judges == 0:
+            return None
+        judges = Judges(
+            self.options.judges,
+            asking=len(self.seats),
+            within_s=self.options.judged_within_s,
+            restarts=self.options.restarts,
+            restarts_within_s=self.options.within_s,
+        )
+        for seat in self.seats.values():
+            (seat.folder / DESK).mkdir(parents=True, exist_ok=True)
+            write_note(seat.folder / DESK / JUDGES, judges.note)
+        return judges
+
+    def _let_go(self) -> None:
+        for seat in self.seats.values():
+            (seat.folder / DESK / JUDGES).unlink(missing_ok=True)
+        if self._judges is not None:
+            self._judges.close()
+            self._judges = None
 
     def told(self) -> list[dict[str, Any]]:
         """What the page shows."""
@@ -327,6 +362,7 @@ def _row(seat: Seat) -> dict[str, Any]:
         "share": float(status.get("done") or 0.0) / total if total > 0 else 0.0,
         "question": status.get("question") if seat.state is State.ASKS else None,
         "restarts": seat.restarted,
+        "judged": status.get("judged") or {"shared": 0, "itself": 0, "why": ""},
         "pid": seat.process.pid if seat.process is not None else seat.orphan,
         "folder": str(seat.folder),
     }

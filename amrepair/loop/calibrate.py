@@ -22,6 +22,7 @@ from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
+from gcode.whole import put_in_place
 
 RIGID = 1e-4
 """A rotation's rows are orthonormal to this."""
@@ -153,10 +154,9 @@ def write_calibration(
     InputError
         If it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.new")
     try:
-        temporary.write_text(json.dumps({**found.to_json(), **(about or {})}, indent=2) + "\n")
-        temporary.replace(path)
+        with put_in_place(path) as draft:
+            draft.write_text(json.dumps({**found.to_json(), **(about or {})}, indent=2) + "\n")
     except OSError as error:
         raise InputError(f"the calibration {path} cannot be written ({error.strerror})") from error
 

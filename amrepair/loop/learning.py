@@ -39,7 +39,7 @@ class Learning:
 
     def judged_by(self, site: Site) -> Site:
         """What is expected, with what is known of the scanner's errors."""
-        if self.calibration is None or site.calibration is not NORMAL:
+        if self.calibration is None or site.calibration != NORMAL:
             return site
         return replace(site, calibration=self.calibration)
 
@@ -69,7 +69,7 @@ def _as_normal(seen: list[tuple[Level, ...]]) -> bool:
 
 def told(calibration: Calibration) -> str:
     """What was learned, in a sentence."""
-    if calibration is NORMAL:
+    if calibration == NORMAL:
         return f"The first {FIRST_LOOKS} clean layers show normal noise and nothing else."
     if calibration.name != OWN:
         return calibration.told()

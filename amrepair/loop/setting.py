@@ -24,6 +24,7 @@ from amrepair.template.port import Template
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, job_for
 from gcode.slicing.layers import mesh_of
+from gcode.whole import put_in_place
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
 VERSION = 1
@@ -247,6 +248,5 @@ def _tuples(value: Any) -> Any:
 
 
 def _put(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.new")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    with put_in_place(path) as draft:
+        draft.write_text(text, encoding="utf-8")

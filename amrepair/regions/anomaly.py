@@ -141,5 +141,5 @@ class AnomalyMap:
         """What belongs to the whole part or to whole views, in sentences."""
         whole = () if self.nuisance is None else self.nuisance.told()
         by = self.calibration
-        judged = () if by is None or by is NORMAL else (by.told(),)
+        judged = () if by is None or by == NORMAL else (by.told(),)
         return (*judged, *(one.told() for one in self.contradicting), *whole)

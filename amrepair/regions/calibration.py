@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import InputError
+from gcode.whole import put_in_place
 
 VERSION = 2
 
@@ -107,9 +108,8 @@ class Calibration:
         path = file_of(self.name, folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            new = path.with_name(f".{path.name}.new")
-            new.write_text(json.dumps({"version": VERSION, **asdict(self)}, indent=1) + "\n")
-            new.replace(path)
+            with put_in_place(path) as draft:
+                draft.write_text(json.dumps({"version": VERSION, **asdict(self)}, indent=1) + "\n")
         except OSError as e:
             raise InputError(f"{path}: the calibration cannot be written ({e.strerror})") from e
         return path

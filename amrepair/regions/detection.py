@@ -92,7 +92,7 @@ def detect(
         return seen, sites_of(seen, scan, template, options, top_z_mm, rounded_up)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
-    whole_part = top_z_mm is None and calibration is not NORMAL
+    whole_part = top_z_mm is None and calibration != NORMAL
     seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
     progress("detect", 1.0, 4.0)
     surfels, surface_mm = seen.surfels, seen.surface_mm
@@ -201,7 +201,7 @@ def _strands(
     What errors leave in strips neither a scan nor a calibration tells: only where they are known to
     be normal is there any.
     """
-    if calibration is not NORMAL:
+    if calibration != NORMAL:
         return np.zeros(len(surfels), bool)
     first = levels[1]
     at = first.scale.of_base[: len(surfels)]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from importlib import resources
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from amrepair.report.data import ReportData
 from amrepair.report.page import body
 from amrepair.report.payload import payload
 from amrepair.report.tables import escape
+from gcode.whole import put_in_place
 
 # The browser itself refuses every request, whatever a library may try.
 POLICY = (
@@ -54,16 +53,8 @@ def write_report(data: ReportData, path: Path) -> None:
     text = render_report(data)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        temporary = Path(name)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-                file.write(text)
-            temporary.chmod(0o644)
-            temporary.replace(path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        with put_in_place(path) as draft:
+            draft.write_text(text, encoding="utf-8", newline="\n")
     except OSError as e:
         raise InputError(
             f"the report cannot be written to {path}: {e.strerror or e}; choose another folder"

@@ -15,6 +15,7 @@ from amrepair.loop import Look
 from amrepair.loop.tape import scan_name
 from amrepair.scans import Scan, write_ply
 from gcode.slicing.layers import mesh_of
+from gcode.whole import put_in_place
 
 
 class RunFolder:
@@ -89,11 +90,6 @@ class RunFolder:
     def _whole(self, name: str, write: Callable[[Path], object]) -> Path:
         self._make()
         target = self.path / name
-        # the ending stays last: writers choose their format by it
-        temporary = self.path / f".{os.getpid()}-{name}"
-        try:
-            write(temporary)
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with put_in_place(target) as draft:
+            write(draft)
         return target

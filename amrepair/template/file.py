@@ -6,7 +6,6 @@ It knows arrays and a head; what they mean is the business of the classes that a
 from __future__ import annotations
 
 import json
-import os
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amrepair.errors import TemplateError
+from gcode.whole import put_in_place
 
 if TYPE_CHECKING:
     import trimesh
@@ -43,14 +43,11 @@ def write_template(path: Path, arrays: dict[str, np.ndarray], head: dict[str, An
         **head,
     }
     data = save(arrays, metadata={HEAD: json.dumps(said)})
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        temporary.write_bytes(data)
-        temporary.replace(path)
+        with put_in_place(path) as draft:
+            draft.write_bytes(data)
     except OSError as error:
         raise TemplateError(f"the template {path} cannot be written ({error.strerror})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_template(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -29,6 +29,7 @@ from rich.text import Text
 
 from gcode.errors import InputError
 from gcode.profiles.names import Kind, list_profiles
+from gcode.whole import put_in_place
 
 NOT_WITHIN_TOLERANCE = 3
 INTERRUPTED = 130
@@ -201,14 +202,11 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         If it cannot be written.
     """
     writable(path)
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        write(temporary)
-        temporary.replace(path)
+        with put_in_place(path) as draft:
+            write(draft)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}).") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager

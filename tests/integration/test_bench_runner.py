@@ -24,6 +24,7 @@ from amrepair.bench.metrics import aupr, auroc
 from amrepair.bench.registry import make_method
 from amrepair.bench.tables import in_short
 from amrepair.errors import InputError
+from gcode.whole import left_behind
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = "real3d-ad"
@@ -150,11 +151,11 @@ def test_a_killed_run_goes_on_to_the_same_results(dataset: Path, tmp_path: Path)
         time.sleep(0.002)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    (tmp_path / "out" / f".results.csv.{process.pid}.part").write_text("half a li")
+    (tmp_path / "out" / f".{process.pid}-{process.pid}-results.csv").write_text("half a li")
     resumed = run_bench(
         dataset, format=LAYOUT, methods=["patchcore-fpfh"], out=tmp_path / "out", seeds=[0]
     )
-    assert not list((tmp_path / "out").rglob("*.part"))
+    assert not list(left_behind(tmp_path / "out"))
     fresh = run_bench(
         dataset, format=LAYOUT, methods=["patchcore-fpfh"], out=tmp_path / "fresh", seeds=[0]
     )

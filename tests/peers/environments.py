@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2] / ".peers"
 PEERS: dict[str, tuple[str, ...]] = {
     "octoprint": ("OctoPrint==1.11.8",),
     "moonraker": ("moonraker==0.11.0",),
+    "moto": ("moto[server]==5.2.5",),  # speaks S3
     # Its other dependencies are for the windowed program, and one of them does not build.
     "printrun": ("--no-deps", "printrun==2.2.0", "pyserial==3.5", "platformdirs"),
 }

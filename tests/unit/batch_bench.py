@@ -47,10 +47,18 @@ def write_scans(folder: Path, count: int, *, points: int = POINTS) -> Path:
     return folder
 
 
-def write_template(path: Path) -> Path:
-    """Fitted, with a tenth of the work: the part is flat."""
+def bracket() -> trimesh.Trimesh:
+    """Another part, of about the lug's size and without symmetry."""
+    foot = trimesh.creation.box(bounds=((0, 0, 0), (26, 18, 3)))
+    wall = trimesh.creation.box(bounds=((0, 0, 0), (4, 18, 16)))
+    rib = trimesh.creation.box(bounds=((0, 2, 0), (14, 5, 9)))
+    return trimesh.boolean.union([foot, wall, rib], engine="manifold")
+
+
+def write_template(path: Path, part: trimesh.Trimesh | None = None) -> Path:
+    """Fitted, with a tenth of the work: the parts are flat."""
     mesh = path.with_suffix(".stl")
-    lug().export(mesh)
+    (part or lug()).export(mesh)
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"GRID_CELLS": 64, "SAMPLES": 40_000, "STEPS": 30}.items():
             if hasattr(fit, name):  # sizes of the recipe as it is now

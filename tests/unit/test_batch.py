@@ -21,6 +21,8 @@ import batch_workers
 import numpy as np
 import pytest
 from batch_bench import (
+    bracket,
+    lug,
     results,
     sums_files,
     tables,
@@ -44,6 +46,7 @@ from amrepair.batch.pool import Pool
 from amrepair.batch.table import as_parquet, row_of
 from amrepair.errors import AmrepairError, InputError, MissingDependencyError
 from amrepair.template import open_template
+from gcode import whole
 
 DETECT = BatchOptions(Kind.DETECT)
 
@@ -53,6 +56,7 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Template, and nine scans with a twin, a bad one and a strange one."""
     here = tmp_path_factory.mktemp("batch")
     write_template(here / "lug.safetensors")
+    write_template(here / "bracket.safetensors", bracket())
     scans = write_scans(here / "scans", 7)
     shutil.copy(scans / "00003.ply", scans / "twin-of-3.ply")
     (scans / "bad.ply").write_text("nothing\n")
@@ -325,6 +329,50 @@ def test_another_part_is_a_row_with_its_sentence(ready: Path, tmp_path: Path) ->
     assert "ball.ply" in report.rows[1]["sentence"]
 
 
+def test_mixed_parts_are_told_apart_and_what_fits_none_is_a_row(
+    ready: Path, tmp_path: Path
+) -> None:
+    """With a folder of templates each scan is held against its own part."""
+    import trimesh
+
+    library, folder = tmp_path / "templates", tmp_path / "scans"
+    library.mkdir()
+    folder.mkdir()
+    for part in ("lug", "bracket"):
+        shutil.copy(ready / f"{part}.safetensors", library)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=14.0)
+    for name, part in (("ball", ball), ("bracket", bracket()), ("lug", lug(2.0))):
+        write_scan(folder / f"{name}.ply", part, 1)
+    report = run_batch(
+        str(folder), options=DETECT, template=library, out=str(tmp_path / "out"),
+        executor="serial",
+    )  # fmt: skip
+    strange, *known = report.rows
+    assert [row["template"] for row in known] == ["bracket", "lug"]
+    assert all(row["confidence"] > 0.5 for row in known)
+    assert [row["missing_mm3"] > 30.0 for row in known] == [False, True]  # the lug's pocket
+    assert strange["sentence"].startswith("the scan ball.ply fits none of the 2 parts")
+    assert report.refused == 1
+
+
+def test_a_template_that_fits_none_is_told_and_is_no_success(ready: Path, tmp_path: Path) -> None:
+    from amrepair.cli.app import app
+
+    (tmp_path / "scans").mkdir()
+    shutil.copy(ready / "scans" / "00001.ply", tmp_path / "scans")
+    words = ["batch", "align", str(tmp_path / "scans"), "--out", str(tmp_path / "out")]
+    words += ["--template", str(ready / "bracket.safetensors"), "--executor", "serial"]
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("OMP", "NUMBA", "MKL", "OPENBLAS"):
+            patch.setenv(f"{name}_NUM_THREADS", "1")
+        done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2
+    (row,) = rows_of(tmp_path / "out")
+    assert row["status"] == "refused"
+    assert "00001.ply" in row["sentence"]
+    assert "1 of 1 scans have a sentence instead of figures" in " ".join(done.output.split())
+
+
 def test_a_full_disk_is_one_sentence_and_what_is_done_stays(
     ready: Path, serial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -339,7 +387,7 @@ def test_a_full_disk_is_one_sentence_and_what_is_done_stays(
 
     common = {"options": DETECT, "template": ready / "lug.safetensors", "executor": "serial"}
     with monkeypatch.context() as patch:
-        patch.setattr(batch_places.os, "fsync", full)
+        patch.setattr(whole.os, "fsync", full)
         with pytest.raises(InputError, match=r"No space left.*results of 9 scans are kept"):
             run_batch(str(ready / "scans"), out=str(out), **common)
     done = results(out)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import sys
 import time
 import urllib.error
@@ -12,13 +14,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import fleet_judges
 import numpy as np
 import pytest
 
 from amrepair.errors import InputError
 from amrepair.fleet.chart import ChartOptions, alarm_ratio, chart, false_alarm_ratio, limit_of
 from amrepair.fleet.config import FleetConfig, FleetOptions, PrinterSpec, read_config
-from amrepair.fleet.desk import STATUS, Desk, answer, read_note
+from amrepair.fleet.desk import JUDGES, STATUS, Desk, answer, read_note
 from amrepair.fleet.history import BAND_MM, History
 from amrepair.fleet.page import Page, metrics
 from amrepair.fleet.supervisor import DESK, Command, Fleet, State, loop_command
@@ -50,11 +53,15 @@ def test_a_file_is_read_with_paths_beside_it(tmp_path: Path) -> None:
         ("speed = 3\n[[printer]]\n" + ENTRY, "'speed' is unknown"),
         ("[[printer]]\nname = 'a'", "printer 1: port is missing"),
         ("[[printer]]\nname = 3", "name is 3; it is to be str"),
-        ("restarts = -1\n[[printer]]\n" + ENTRY.format(name="a", port="b"), "restarts must be"),
+        ("restarts = -1\n[[printer]]\n" + ENTRY.format(name="a", port="b"), "restarts is -1"),
+        ("judges = -2\n[[printer]]\n" + ENTRY.format(name="a", port="b"), "judges is -2"),
+        ("judged_within_s = 0\n[[printer]]\n" + ENTRY.format(name="a", port="b"),
+         "judged_within_s is 0; it must be more"),
+        ("within_s = nan\n[[printer]]\n" + ENTRY.format(name="a", port="b"), "within_s is nan"),
         ("[[printer]]\n" + ENTRY.format(name="../a", port="b"), "becomes a folder"),
         ("[[printer]]\n" + ENTRY.format(name="a", port="b") + "\napprove='yes'", "ask or auto"),
     ],
-)
+)  # fmt: skip
 def test_files_that_cannot_be_used(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "fleet.toml").write_text(text)
     with pytest.raises(InputError, match=said):
@@ -261,6 +268,37 @@ def test_two_supervisors_do_not_share_a_folder(tmp_path: Path) -> None:
         pass
 
 
+def test_printers_may_ask_judges_as_long_as_the_supervisor_is_there(
+    tmp_path: Path, ended: list[Fleet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("amrepair.fleet.judges.serve", fleet_judges.idle)
+    body = "(folder / 'threads').write_text(os.environ['NUMBA_NUM_THREADS'])\ntime.sleep(60)"
+    fleet = fleet_of(tmp_path, "a b", fake(body), judges=2, judged_within_s=7.0, restarts=0)
+    ended.append(fleet)
+    notes = [tmp_path / "out" / name / DESK / JUDGES for name in "ab"]
+    with fleet.alone():
+        said = [read_note(note) for note in notes]
+        assert said[0] == said[1]
+        assert said[0] is not None
+        assert said[0]["within_s"] == 7.0
+        assert Path(said[0]["address"]).is_socket()
+        threads = tmp_path / "out" / "a" / "threads"
+        until(fleet, lambda: threads.exists() and threads.read_text())
+        assert threads.read_text() == "1"  # as the judges have: the same bits
+        assert fleet._judges is not None
+        os.kill(fleet._judges.processes[0], signal.SIGKILL)
+        until(fleet, lambda: fleet.notes)
+        assert "each printer's process judges its own scans" in fleet.notes[0]
+        assert not any(note.exists() for note in notes)
+        assert states(fleet) == [State.RUNS, State.RUNS]
+    again = fleet_of(tmp_path, "a b", fake(body), judges=1)
+    with again.alone():
+        assert all(note.exists() for note in notes)
+    assert not any(note.exists() for note in notes)
+    with fleet_of(tmp_path, "a b", fake(body), judges=0).alone():
+        assert not any(note.exists() for note in notes)
+
+
 def test_the_command_of_a_printer_is_understood(tmp_path: Path) -> None:
     import typer
 
@@ -340,7 +378,8 @@ def test_off_this_machine_a_token_is_needed(tmp_path: Path) -> None:
 
 
 def test_metrics_are_prometheus_text() -> None:
-    printers = [{"name": 'a"b\\', "state": State.ASKS, "question": {}, "restarts": 2}]
+    printers = [{"name": 'a"b\\', "state": State.ASKS, "question": {}, "restarts": 2,
+                 "judged": {"shared": 3, "itself": 1, "why": "it was late"}}]  # fmt: skip
     history = [
         {"printer": "a", "part": "p", "runs": 1, "looks": 2, "repairs": 1, "missing_mm3": 2.5,
          "excess_mm3": 0.0}
@@ -351,6 +390,8 @@ def test_metrics_are_prometheus_text() -> None:
         assert line.startswith(("# HELP ", "# TYPE ")) or sample.fullmatch(line), line
     assert 'amrepair_restarts_total{printer="a\\"b\\\\"} 2' in lines
     assert 'amrepair_missing_mm3_total{printer="a",part="p"} 2.5' in lines
+    assert 'amrepair_judged_total{printer="a\\"b\\\\",by="shared"} 3' in lines
+    assert 'amrepair_judged_total{printer="a\\"b\\\\",by="itself"} 1' in lines
     assert len([line for line in lines if line.endswith(" 1") and "state=" in line]) == 1
 
 

@@ -12,7 +12,7 @@ from amrepair.align import align
 from amrepair.frames import Transform
 from amrepair.loop import Stop
 from amrepair.loop.sites import sites
-from amrepair.repair import Site, _outside_open_infill
+from amrepair.repair import Site, _outside_open_infill, _told_to_go_beyond
 from amrepair.scans import Scan
 
 
@@ -69,12 +69,16 @@ def test_a_site_tells_in_its_templates_frame_what_its_job_leaves(small: Small) -
     x = np.linspace(4.0, 12.0, 9)
     wall = np.column_stack([x, np.zeros(9), np.full(9, 0.5)])
     normal = np.tile([0.0, -1.0, 0.0], (9, 1))
-    offset, tolerance = site.expected_offset_mm(wall, normal, np.zeros(9), placed=small.placed)
+    assert site.laid is not None
+    there, facing = small.placed.apply(wall), small.placed.rotate(normal)
+    offset, tolerance = site.laid.expected_offset_mm(there, facing, np.zeros(9))
     assert (tolerance >= 0).all()
     # our own slicer fills a solid layer to a per cent: 4 mm of it and 2.3 % of filament
     assert (offset + tolerance).max() < 0.25
     assert (offset - tolerance).min() > -0.1
-    none = replace(site, laid=None).expected_offset_mm(
-        wall, normal, np.zeros(9), placed=small.placed
-    )
-    assert not np.any(none)
+    beyond = _told_to_go_beyond(site, site.planned or site.template, small.placed)
+    assert beyond is not None
+    out_mm = beyond(wall, np.full(9, site.allowance_mm))
+    assert out_mm.max() > 0
+    assert (beyond(wall, np.zeros(9)) == 0).all()  # what is within the allowance is not asked
+    assert _told_to_go_beyond(replace(site, laid=None), site.template, small.placed) is None
