@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 
 from amrepair.errors import InputError
 from amrepair.field.fused import Surfels, make_surfels
-from amrepair.field.groups import CELLS_APART
 from amrepair.field.near import nearest_within
 from amrepair.frames import unit_vectors
 from amrepair.observe.background import (
@@ -54,7 +53,7 @@ class Sites:
         How many of them are cells, and the edge of one.
     place_mm, normal, value_mm, weight
         (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are drawn to
-        the template's surface as far as cells touch.
+        the template's surface by up to half a cell.
     tolerance_mm
         (2, b) δ for missing and for excess.
     facing
@@ -193,9 +192,10 @@ def sites_of(
     """Cells and crossed template points, each with what a sound part may depart there."""
     surfels = seen.surfels
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
-    # cells one above the other are one place: strays below surface that is there are outvoted
-    reach_mm = CELLS_APART * surfels.cell_mm
-    aside_mm = np.clip(surfels.deviation_mm, -reach_mm, reach_mm)
+    # cells that noise alone put one above the other are one place; no more: at a broken rim of a
+    # thin wall the sound surface beside would outvote the break
+    half_mm = 0.5 * surfels.cell_mm
+    aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
     feet_mm = surfels.place_mm - aside_mm[:, None] * outward
     crossed_mm = seen.surface_mm[seen.crossed]
     value_mm = np.concatenate([surfels.deviation_mm, -seen.depth_mm])
