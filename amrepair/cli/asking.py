@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
 from amrepair.errors import InputError
-from amrepair.fleet.desk import Desk
 from amrepair.loop import Decision
 from amrepair.repair import RepairPlan
 from amrepair.report.text import plan_lines
@@ -44,16 +46,27 @@ class Terminal:
             return confirmed("Go on all the same (no ends the run)?")
 
 
+@runtime_checkable
+class Asker(Protocol):
+    """Who is told and asked elsewhere than at the terminal."""
+
+    def progress(self, stage: str, done: float, total: float) -> None:
+        """Be told how far it is."""
+
+    def ask(self, question: str, lines: Sequence[str]) -> bool:
+        """Answer, whenever that is."""
+
+
 class AtDesk(console.Bars):
-    """Asks by notes in a folder, and tells its progress there: somebody else has the terminal.
+    """Asks and tells its progress elsewhere: somebody else has the terminal, or nobody.
 
     Parameters
     ----------
     desk
-        Of a supervisor's.
+        A supervisor's folder of notes, or the printer's own screens.
     """
 
-    def __init__(self, desk: Desk) -> None:
+    def __init__(self, desk: Asker) -> None:
         super().__init__()
         self._desk = desk
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import typer
 
@@ -17,6 +17,7 @@ from amrepair.fleet.desk import Desk
 from amrepair.frames import Transform
 from amrepair.loop import (
     MAX_ITERATIONS,
+    Decision,
     Look,
     LoopReport,
     Stop,
@@ -28,12 +29,13 @@ from amrepair.loop.calibrate import read_calibration
 from amrepair.loop.learning import told
 from amrepair.loop.limits import Limits
 from amrepair.loop.locate import is_upright, locate_parts, stood
+from amrepair.loop.marks import marked_stops
 from amrepair.loop.pace import Pace, layers_at
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
-from amrepair.repair import Stopwatch
+from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result
 from amrepair.report.folder import RunFolder
@@ -48,6 +50,7 @@ from gcode.cli.owning import job_setup, told_if_for_another
 from gcode.errors import JournalError
 from gcode.hosts import connect
 from gcode.hosts.journal import Journal, default_path
+from gcode.hosts.port import Printer
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job, job_for
@@ -58,7 +61,7 @@ SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
 
 
 @dataclass(frozen=True, slots=True)
-class _Begun:
+class Begun:
     """All that a run needs, new or gone on with."""
 
     folder: RunFolder
@@ -73,12 +76,16 @@ class _Begun:
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """When to look, besides at the end: every so many layers, or adaptively; and where besides."""
+    """When to look, besides at the end: every so many layers, or adaptively; and where besides.
 
-    every: int
-    adaptive: bool
-    at_layers: tuple[int, ...]
-    at_mm: tuple[float, ...]
+    `marked`: where the job is marked, from this line on, and nowhere else; None: not by marks.
+    """
+
+    every: int = 0
+    adaptive: bool = False
+    at_layers: tuple[int, ...] = ()
+    at_mm: tuple[float, ...] = ()
+    marked: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +125,9 @@ def run(
     if resume is not None:
         if job_file is not None:
             raise InputError("--resume takes the job from the run's folder; leave JOB out")
-        begun = _gone_on_with(resume, port, scanner, approve)
+        begun = gone_on_with(resume, port, scanner, approve)
     else:
-        begun = _new_run(
+        begun = new_run(
             _given(job_file, "JOB"),
             _given(template, "--template"),
             out,
@@ -148,16 +155,22 @@ def run(
             token=shown.token,
         ) as page,
     ):
-        report, warmth = _print(
-            begun,
-            page,
-            watch,
-            bars,
-            view=shown.view,
-            going_on=resume is not None,
-            pose=pose_confirmed,
-        )
-    _tell(begun, report, warmth, watch, bars, as_json=as_json)
+        machine = _machine(begun)
+        try:
+            report, warmth = print_run(
+                begun,
+                machine,
+                page,
+                watch,
+                bars,
+                word=page if shown.view else bars if isinstance(bars, AtDesk) else Terminal(bars),
+                going_on=resume is not None,
+                pose=pose_confirmed,
+            )
+        finally:
+            machine.close()
+    result = written(begun, report, warmth, watch, bars)
+    _tell(begun, report, result, as_json=as_json)
 
 
 def _given(value: Any, name: str) -> Any:
@@ -166,7 +179,7 @@ def _given(value: Any, name: str) -> Any:
     return value
 
 
-def _new_run(
+def new_run(
     job_file: Path,
     template: Path,
     out: Path,
@@ -176,7 +189,7 @@ def _new_run(
     watch: Stopwatch,
     bars: console.Bars,
     **said: Any,
-) -> _Begun:
+) -> Begun:
     """Read, check and write down what a run begins with."""
     text = program_text(job_file)
     setup, own = job_setup(text, job_file, *named)
@@ -194,7 +207,11 @@ def _new_run(
     fixed = range(looks.every - 1, len(job.layers) - 1, looks.every) if looks.every else []
     pace = (looks.every or ADAPTIVE_LAYERS) if looks.adaptive else 0
     layers = [*looks.at_layers, *layers_at(job, looks.at_mm), *([] if pace else fixed)]
-    stops = plan_stops(job, layers)
+    stops = (
+        plan_stops(job, layers)
+        if looks.marked is None
+        else marked_stops(job, job_file.name, start=looks.marked)
+    )
     with bars.shown():
         with told_if_for_another(text, job_file, setup.printer):
             checked = _judged(job, setup, leave_heaters=said["leave_heaters"], progress=bars)
@@ -216,12 +233,12 @@ def _new_run(
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
         copies=() if expected is field else placed, by_beads=True,
-        max_iterations=MAX_ITERATIONS, adaptive=pace, limited=said["approve"] == "auto",
-        title=job_file.name, **said,
+        max_iterations=MAX_ITERATIONS, adaptive=pace, marked=looks.marked,
+        limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
     keep(out, setting, job.program.text, field)
-    return _Begun(folder, setting, setup, job, checked, expected, stops, Tape(out))
+    return Begun(folder, setting, setup, job, checked, expected, stops, Tape(out))
 
 
 def _judged(
@@ -242,9 +259,7 @@ def _how_it_stands(placed: tuple[Transform, ...]) -> str:
     return f"The job prints {len(placed)} copies of the part{lying}; all of them are looked at."
 
 
-def _gone_on_with(
-    folder: Path, port: str | None, scanner: str | None, approve: str | None
-) -> _Begun:
+def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: str | None) -> Begun:
     """Open a run's folder; what is said now counts more than what was said then."""
     run = open_run(folder)
     changes: dict[str, Any] = {"port": port, "scanner": scanner, "approve": approve}
@@ -254,30 +269,46 @@ def _gone_on_with(
     tape = Tape(folder)
     tape.reopen()
     checked = _judged(run.job, run.setup, leave_heaters=setting.leave_heaters)
-    return _Begun(
+    return Begun(
         RunFolder(folder), setting, run.setup, run.job, checked, run.template, run.stops, tape
     )
 
 
-def _print(
-    begun: _Begun,
+@runtime_checkable
+class Asked(Protocol):
+    """Whoever gives a word on what is found."""
+
+    def to_print(self, plan: RepairPlan) -> bool:
+        """Whether a repair is printed."""
+
+    def to_go_on(self, decision: Decision) -> bool:
+        """Whether the job goes on all the same."""
+
+
+def _machine(begun: Begun) -> Printer:
+    """The run's printer, not connected."""
+    return connect(
+        begun.setting.port,
+        dialect=begun.setup.printer.dialect,
+        baud=begun.setup.printer.baud,
+        wire_log=begun.folder.file("wire.log"),
+        journal=default_path(begun.setting.port),
+    )
+
+
+def print_run(
+    begun: Begun,
+    machine: Printer,
     page: NoView | ShownRun,
     watch: Stopwatch,
     bars: console.Bars,
     *,
-    view: bool,
+    word: Asked,
     going_on: bool,
     pose: bool,
 ) -> tuple[LoopReport, tuple[TemperatureSeries, ...]]:
     """Connect and run the loop; what became of it, and how warm it was at its looks."""
     setting, setup, ask = begun.setting, begun.setup, begun.setting.approve == "ask"
-    machine = connect(
-        setting.port,
-        dialect=setup.printer.dialect,
-        baud=setup.printer.baud,
-        wire_log=begun.folder.file("wire.log"),
-        journal=default_path(setting.port),
-    )
     find = None
     if going_on:
         find = pick_up(machine, release_c=setup.material.bed_release_c, pose_confirmed=pose)
@@ -288,7 +319,6 @@ def _print(
     if not going_on:
         machine.connect()
     page.drives(machine.pause, machine.resume)
-    word = bars if isinstance(bars, AtDesk) else Terminal(bars)
     warmth = ThermalLog(machine.temperatures)
     shown = page.recording(begun.folder.record)
 
@@ -306,8 +336,8 @@ def _print(
                 sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads),
                 stops=begun.stops,
                 max_iterations=setting.max_iterations,
-                approve=(page.approve if view else word.to_print) if ask else lambda plan: True,
-                ask=(page.ask_to_go_on if view else word.to_go_on) if ask else None,
+                approve=word.to_print if ask else lambda plan: True,
+                ask=word.to_go_on if ask else None,
                 limits=Limits.of(setup.process) if setting.limited else None,
                 pace=Pace(setting.adaptive) if setting.adaptive else None,
                 record=recorded,
@@ -329,7 +359,6 @@ def _print(
         )
         raise
     finally:
-        machine.close()
         begun.tape.close()
 
 
@@ -345,16 +374,14 @@ def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:
         return ()
 
 
-def _tell(
-    begun: _Begun,
+def written(
+    begun: Begun,
     report: LoopReport,
     warmth: tuple[TemperatureSeries, ...],
     watch: Stopwatch,
     bars: console.Bars,
-    *,
-    as_json: bool,
-) -> None:
-    """Result, report, exit code."""
+) -> dict[str, Any]:
+    """Result and report, in the run's folder; the result."""
     folder, setting, setup = begun.folder, begun.setting, begun.setup
     seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
     printed = [look for look in report.looks if look.printed]
@@ -364,7 +391,6 @@ def _tell(
     )
     result |= warnings_json(begun.checked.report)
     folder.write_json("result.json", result)
-    within = report.within_tolerance
     with bars.shown(), bars.stage("report"):
         data = report_of_loop(
             report,
@@ -376,6 +402,12 @@ def _tell(
             temperatures=warmth,
         )
         write_report(data, folder.file("report.html"))
+    return result
+
+
+def _tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: bool) -> None:
+    """What became of it, and the exit code."""
+    folder, within = begun.folder, report.within_tolerance
     if as_json:
         console.show_json(result)
     else:
