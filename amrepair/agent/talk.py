@@ -15,6 +15,7 @@ from amrepair.errors import LoopError
 from gcode.errors import GcodeError, LinkError
 
 POLL_S = 0.5
+END_PROMPT = 'RESPOND TYPE=command MSG="action:prompt_end"'
 _QUIET = frozenset({"print", "printing"})  # the printer's own screens show how far that is
 # A line of G-code ends at a comment; a quote ends its text, a bar a prompt's.
 _UNSAID = re.compile(r"[\x00-\x1f;#\"|*\\]+")
@@ -74,7 +75,8 @@ class Talk:
         """Tell of a stage once it begins."""
         new, self._doing = stage != self._doing, stage
         if new and stage not in _QUIET:
-            self._send(f"M117 amrepair: {plain(stage)}")
+            taken = f"{END_PROMPT}\n" if stage.startswith("scan") else ""  # nobody waits any more
+            self._send(f"{taken}M117 amrepair: {plain(stage)}")
 
     def say(self, text: str, *, wrong: bool = False) -> None:
         """One sentence, in the printer's console and on its display."""
@@ -96,7 +98,7 @@ class Talk:
 
     def end_prompt(self) -> None:
         """Take the window away."""
-        self._send('RESPOND TYPE=command MSG="action:prompt_end"')
+        self._send(END_PROMPT)
 
     def _send(self, script: str) -> None:
         """Told as well as can be: what is not heard changes nothing of what is done."""

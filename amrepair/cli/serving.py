@@ -142,7 +142,8 @@ class _Service:
         self._machine.serve(begun.checked)
         if not events:
             self._machine.forget_steps()
-        looks = f"{len(begun.stops)} looks"
+        count = len(begun.stops)
+        looks = f"{count} look{'s' if count > 1 else ''}"
         self._talk.say(f"{job.name} is {'gone on with' if events else 'followed'}: {looks}.")
         return begun, bool(events), watch
 

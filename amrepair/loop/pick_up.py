@@ -44,8 +44,6 @@ def pick_up(
     from gcode.hosts.rejoin import rejoin
     from gcode.hosts.server import ServerPrinter
 
-    if not isinstance(printer, ServerPrinter):
-        raise InputError(f"a run on a {type(printer).__name__} cannot be gone on with")
     if isinstance(printer, KlipperJob):
         job = printer
 
@@ -57,6 +55,8 @@ def pick_up(
             )
 
         return find_job
+    if not isinstance(printer, ServerPrinter):
+        raise InputError(f"a run on a {type(printer).__name__} cannot be gone on with")
     server: ServerPrinter[Any] = printer
 
     def find(sent: Sequence[Sent]) -> PrintReport | None:

@@ -30,6 +30,9 @@ AGENT, METHOD = "amrepair", "amrepair_call"
 LOOK, STEP = b"AMREPAIR_SCAN", "_AMREPAIR_STEP"
 STEP_LINES = 40
 """Lines a script: some seconds of moves, which Klipper has queued long before they are made."""
+WRITTEN_S = 3.0
+"""By then a server has long written a new print down; one that it was restarted in it calls
+interrupted, and goes on with."""
 
 Answer = TypeVar("Answer")
 
@@ -84,6 +87,7 @@ class KlipperJob(MoonrakerPrinter):
     _job: JobText | None = None
     _name = _sha256 = ""
     _joining = False
+    _unsure_s: float | None = None
 
     def _new_session(self) -> MoonrakerSession:
         self._hold = threading.Event()
@@ -113,8 +117,14 @@ class KlipperJob(MoonrakerPrinter):
         found = session.call("server.history.list", {"limit": 1, "order": "desc"})
         jobs = found.get("jobs") if isinstance(found, dict) else None
         latest = jobs[0] if isinstance(jobs, list) and jobs else {}
-        if latest.get("status") != "in_progress" or latest.get("filename") != state.print_file:
+        if latest.get("filename") != state.print_file:
             return None  # the server has not written it down yet
+        if latest.get("status") == "in_progress":
+            self._unsure_s = None
+        elif self._unsure_s is None:
+            self._unsure_s = self._clock()
+        if self._unsure_s is not None and self._clock() - self._unsure_s < WRITTEN_S:
+            return None  # an earlier print of this file, or a server that was restarted in this one
         return UnderWay(state.print_file, str(latest.get("job_id")))
 
     def fetch(self, name: str) -> bytes:
