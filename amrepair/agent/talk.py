@@ -15,6 +15,7 @@ from amrepair.errors import LoopError
 from gcode.errors import GcodeError, LinkError
 
 POLL_S = 0.5
+IDLE = "waiting for a print"
 END_PROMPT = 'RESPOND TYPE=command MSG="action:prompt_end"'
 _QUIET = frozenset({"print", "printing"})  # the printer's own screens show how far that is
 # A line of G-code ends at a comment; a quote ends its text, a bar a prompt's.
@@ -51,7 +52,7 @@ class Talk:
 
     def __init__(self, host: Host, note: Callable[[str], None]) -> None:
         self._host, self._note = host, note
-        self._doing = "waiting for a print"
+        self._doing = IDLE
         self._number = 0
         self._answers = threading.Condition()
         self._open, self._answer = False, False
@@ -77,6 +78,10 @@ class Talk:
         if new and stage not in _QUIET:
             taken = f"{END_PROMPT}\n" if stage.startswith("scan") else ""  # nobody waits any more
             self._send(f"{taken}M117 amrepair: {plain(stage)}")
+
+    def rest(self) -> None:
+        """Nothing is being done."""
+        self._doing = IDLE
 
     def say(self, text: str, *, wrong: bool = False) -> None:
         """One sentence, in the printer's console and on its display."""

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import typer
-
 from amrepair.cli.asking import AtDesk, Terminal
 from amrepair.cli.live import NoView, ShownRun, live_view
+from amrepair.cli.telling import Begun, placed_solid, tell, written
 from amrepair.cli.warmth import ThermalLog
-from amrepair.errors import InputError, LoopError
+from amrepair.errors import InputError
 from amrepair.fleet.desk import Desk
 from amrepair.frames import Transform
 from amrepair.loop import (
@@ -20,13 +19,11 @@ from amrepair.loop import (
     Decision,
     Look,
     LoopReport,
-    Stop,
     Tape,
     plan_stops,
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
-from amrepair.loop.learning import told
 from amrepair.loop.limits import Limits
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
@@ -36,15 +33,13 @@ from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
 from amrepair.repair import RepairPlan, Stopwatch
-from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
-from amrepair.report.collect import loop_result
+from amrepair.report import TemperatureSeries
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scanner, WatchedFolderScanner
 from amrepair.template import open_template
-from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check, policy_of
 from gcode.cli import console
-from gcode.cli.judging import tell_warnings, warnings_json
+from gcode.cli.judging import tell_warnings
 from gcode.cli.options import program_text
 from gcode.cli.owning import job_setup, told_if_for_another
 from gcode.errors import JournalError
@@ -58,20 +53,6 @@ from gcode.reader import Job, job_for
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
 PROFILES = "profiles"  # in the run's folder: those of the job's own settings
 SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
-
-
-@dataclass(frozen=True, slots=True)
-class Begun:
-    """All that a run needs, new or gone on with."""
-
-    folder: RunFolder
-    setting: Setting
-    setup: PrintSetup
-    job: Job
-    checked: CheckedProgram
-    template: Template
-    stops: tuple[Stop, ...]
-    tape: Tape
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,10 +148,17 @@ def run(
                 going_on=resume is not None,
                 pose=pose_confirmed,
             )
+        except KeyboardInterrupt:
+            console.errors.print(
+                "The heaters were told to switch off. When somebody has looked, go on with: "
+                f"amrepair loop --resume {begun.folder.path}",
+                markup=False,
+            )
+            raise
         finally:
             machine.close()
     result = written(begun, report, warmth, watch, bars)
-    _tell(begun, report, result, as_json=as_json)
+    tell(begun, report, result, as_json=as_json)
 
 
 def _given(value: Any, name: str) -> Any:
@@ -315,7 +303,7 @@ def print_run(
     eye = _scanner(
         setting.scanner, setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed
     )
-    page.show_run(begun.job, _placed_solid(begun.template, setting.placed))
+    page.show_run(begun.job, placed_solid(begun.template, setting.placed))
     if not going_on:
         machine.connect()
     page.drives(machine.pause, machine.resume)
@@ -351,13 +339,6 @@ def print_run(
                 progress=page.watching(bars),
             )
         return report, warmth.series(_noted(setting.port))
-    except KeyboardInterrupt:
-        console.errors.print(
-            "The heaters were told to switch off. When somebody has looked, go on with: "
-            f"amrepair loop --resume {begun.folder.path}",
-            markup=False,
-        )
-        raise
     finally:
         begun.tape.close()
 
@@ -372,59 +353,6 @@ def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:
             return journal.temperatures()
     except JournalError:
         return ()
-
-
-def written(
-    begun: Begun,
-    report: LoopReport,
-    warmth: tuple[TemperatureSeries, ...],
-    watch: Stopwatch,
-    bars: console.Bars,
-) -> dict[str, Any]:
-    """Result and report, in the run's folder; the result."""
-    folder, setting, setup = begun.folder, begun.setting, begun.setup
-    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
-    printed = [look for look in report.looks if look.printed]
-    last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
-    result = loop_result(
-        report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
-    )
-    result |= warnings_json(begun.checked.report)
-    folder.write_json("result.json", result)
-    with bars.shown(), bars.stage("report"):
-        data = report_of_loop(
-            report,
-            result,
-            title=f"Run: {setting.title}",
-            setup=setup,
-            about={"job": setting.title},
-            expected=_placed_solid(begun.template, setting.placed),
-            temperatures=warmth,
-        )
-        write_report(data, folder.file("report.html"))
-    return result
-
-
-def _tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: bool) -> None:
-    """What became of it, and the exit code."""
-    folder, within = begun.folder, report.within_tolerance
-    if as_json:
-        console.show_json(result)
-    else:
-        for line in summary_of_result(result, within_tolerance=within):
-            console.out.print(line)
-        if report.calibration is not None:
-            console.out.print(told(report.calibration))
-        console.out.print(f"Report: {folder.file('report.html')}")
-    if report.stopped:
-        console.errors.print(
-            f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
-            f"amrepair loop --resume {folder.path} --approve ask",
-            markup=False,
-        )
-        raise typer.Exit(LoopError.exit_code)
-    if not within:
-        raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
 
 
 def _scanner(
@@ -450,9 +378,3 @@ def _scanner(
         f"--scanner is {spec!r}; give watch:DIR, or simulated:FILE with the motion of an emulated "
         "printer ('gcode emulate --motion FILE')"
     )
-
-
-def _placed_solid(template: Template, placed: Transform) -> Any:
-    """The part as it should be, where it stands."""
-    solid: Any = template.solid()
-    return solid.transform(placed.matrix[:3])

@@ -10,14 +10,13 @@ from amrepair.agent.talk import Talk
 from amrepair.cli.asking import AtDesk
 from amrepair.cli.live import live_view
 from amrepair.cli.running import (
-    Begun,
     Looks,
     Page,
     gone_on_with,
     new_run,
     print_run,
-    written,
 )
+from amrepair.cli.telling import Begun, written
 from amrepair.errors import AmrepairError, InputError
 from amrepair.loop.looks import LoopReport
 from amrepair.loop.tape import read_events
@@ -69,6 +68,13 @@ def serve(told: Served) -> None:
             talk.listen()
             talk.say("the agent is here.")
             _Service(told, address, machine, talk).run()
+    except KeyboardInterrupt:
+        console.errors.print(
+            "A print that rests at a look stays so, heaters off; one that goes on is Klipper's. "
+            f"Started again with --out {told.out}, the agent goes on with it.",
+            markup=False,
+        )
+        raise
     finally:
         talk.close()
         machine.close()
@@ -103,6 +109,7 @@ class _Service:
                 continue
             served = job
             passes = not self._print(job)
+            self._talk.rest()
 
     def _print(self, job: UnderWay) -> bool:
         """Serve one print; False where it is not looked at at all."""

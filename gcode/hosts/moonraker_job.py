@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 from urllib.parse import quote
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
+from gcode.hosts.job_text import JobText
 from gcode.hosts.modes import Modes, commands_of, modes_after
 from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.moonraker_session import MoonrakerSession
@@ -27,7 +27,7 @@ from gcode.hosts.rejoin import require_as_left
 from gcode.progress import Progress, silent
 
 AGENT, METHOD = "amrepair", "amrepair_call"
-LOOK, STEP = b"AMREPAIR_SCAN", "_AMREPAIR_STEP"
+STEP = "_AMREPAIR_STEP"
 STEP_LINES = 40
 """Lines a script: some seconds of moves, which Klipper has queued long before they are made."""
 WRITTEN_S = 3.0
@@ -49,33 +49,6 @@ class UnderWay:
 
     name: str
     id: str
-
-
-class JobText:
-    """A job's file as Klipper reads it: which byte begins which line."""
-
-    def __init__(self, data: bytes) -> None:
-        self._lines = data.split(b"\n")
-        self._starts = [0]
-        for line in self._lines:
-            self._starts.append(self._starts[-1] + len(line) + 1)
-
-    @property
-    def lines(self) -> int:
-        """How many lines end in the file."""
-        return len(self._lines) - 1
-
-    def start(self, line: int) -> int:
-        """The byte that a line begins with."""
-        return self._starts[line]
-
-    def line_at(self, byte: int) -> int:
-        """The first line that begins at this byte or later."""
-        return bisect_left(self._starts, byte)
-
-    def is_look(self, line: int) -> bool:
-        """Whether the line before this one asks for a look."""
-        return 0 < line < len(self._lines) and self._lines[line - 1].strip().startswith(LOOK)
 
 
 class KlipperJob(MoonrakerPrinter):
@@ -157,8 +130,7 @@ class KlipperJob(MoonrakerPrinter):
     def rests_at_look(self) -> bool:
         """Whether the job rests where it asks for a look."""
         rests, byte = self._rest()
-        paused = self._session.state.print_state == "paused"
-        return rests and paused and self._text.is_look(self._text.line_at(byte))
+        return rests and self._text.is_look(self._text.line_at(byte))
 
     def pass_by(self) -> None:
         """Go on without a look."""
@@ -209,10 +181,13 @@ class KlipperJob(MoonrakerPrinter):
         return self._job
 
     def _rest(self) -> tuple[bool, int]:
-        """Whether the job rests, and the byte that Klipper reads next."""
-        card = self._session.query({"virtual_sdcard": ["is_active", "file_position"]})
-        told = card.get("virtual_sdcard", {})
-        return not told.get("is_active", True), int(told.get("file_position") or 0)
+        """Whether the job rests, and the byte that Klipper reads next; asked, for news lag."""
+        told = self._session.query(
+            {"virtual_sdcard": ["is_active", "file_position"], "print_stats": ["state"]}
+        )
+        card = told.get("virtual_sdcard", {})
+        paused = told.get("print_stats", {}).get("state") == "paused"
+        return paused and not card.get("is_active", True), int(card.get("file_position") or 0)
 
     def _print_on(self, first: int, end: int, progress: Progress) -> bool:
         """Until Klipper rests behind the look that line `end` follows, or the job is over."""
@@ -330,7 +305,7 @@ class KlipperJob(MoonrakerPrinter):
 
     def _require_rest(self) -> None:
         rests, _ = self._asked(self._rest)
-        if not rests or self._session.state.print_state != "paused":
+        if not rests:
             raise PrinterError("the print goes on or has ended; nothing is printed at its look.")
         if not self.motors_held():
             raise PrinterError(

@@ -215,7 +215,7 @@ def test_asked_and_killed_and_the_server_killed_and_nothing_is_printed_twice(sta
     job, agent = begin(stack)
     log = stack.folder / "agent.log"
     question = "action:prompt_text Print this repair?"
-    wait_for("the question", lambda: question in stack.console(), log, 200.0)
+    wait_for("the question", lambda: question in stack.console(), log, 100.0)
     second = subprocess.run(
         [*AMREPAIR, "agent", "--moonraker", stack.url.replace("127.0.0.1", "localhost"),
          "--template", str(stack.folder / "block.stl"), "--scanner", "watch:none"],
@@ -227,7 +227,7 @@ def test_asked_and_killed_and_the_server_killed_and_nothing_is_printed_twice(sta
     end(stack.moonraker)
     stack.start_moonraker()
     agent = stack.agent()
-    wait_for("the question again", lambda: question in stack.console(), log, 200.0)
+    wait_for("the question again", lambda: question in stack.console(), log, 100.0)
     (yes,) = set(re.findall(r"Yes\|(.*?)\|primary", stack.console()))
     stack.web.http.post("/printer/gcode/script", json={"script": yes}, timeout=60.0)
     wait_for("the repair", lambda: any(e.get("kind") == "repair" for e in events(stack)), log)

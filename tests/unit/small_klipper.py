@@ -284,6 +284,6 @@ class SmallKlipper:
             finally:
                 self.from_card = False
                 self.mutex.release()
-        self.worker = None
         if self.print_state == "printing":
             self.print_state = state
+        self.worker = None

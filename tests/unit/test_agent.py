@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +17,21 @@ from small_klipper import CommandError, SmallKlipper
 from amrepair.agent import MACROS, shipped
 from amrepair.cli import running, serving
 from amrepair.cli.running import Page
+from amrepair.loop.marks import marked_stops
 from amrepair.loop.tape import read_events
+from amrepair.loop.travel import park
 from amrepair.postprocess import Asked, mark
 from amrepair.scans import Scan
 from amrepair.template import open_template
-from gcode.errors import PortBusyError
+from gcode.check import check
+from gcode.errors import PortBusyError, PrinterError
+from gcode.hosts import PrintReport
+from gcode.hosts.moonraker_job import KlipperJob
 from gcode.hosts.moonraker_session import MoonrakerSession
+from gcode.hosts.secret import ApiKey
+from gcode.hosts.web import Address
 from gcode.profiles import load_setup
+from gcode.reader import job_for
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 
@@ -351,3 +360,71 @@ def test_a_print_that_cannot_be_looked_at_is_printed(
         assert "no part in" in bench.told()
     assert bench.klipper.print_state == "complete"
     assert not [line for line in bench.klipper.said if "Traceback" in line]
+
+
+@pytest.fixture
+def followed(bench: Bench) -> Iterator[KlipperJob]:
+    """A port on a job that somebody has begun."""
+    printer = KlipperJob(Address.parse(f"moonraker+{bench.fake.url}"), ApiKey(""))
+    printer.connect()
+    bench.klipper.pause_s = 0.001
+    bench.fake.start("small_pla.gcode")
+    printer.follow("small_pla.gcode", bench.ready.text.encode())
+    setup = load_setup(*PRINTER)
+    printer.serve(check(job_for(bench.ready.text, setup.printer).program, setup))
+    yield printer
+    printer.close()
+
+
+def test_a_pause_of_the_users_own_is_no_look(bench: Bench, followed: KlipperJob) -> None:
+    setup = load_setup(*PRINTER)
+    job = job_for(bench.ready.text, setup.printer)
+    (look,) = marked_stops(job, "job")
+    bench.klipper.run_script("PAUSE")
+    done: list[PrintReport] = []
+    checked = check(job.program, setup)
+    printing = threading.Thread(
+        target=lambda: done.append(followed.print(checked, lines=range(look.line)))
+    )
+    printing.start()
+    printing.join(0.5)
+    assert printing.is_alive(), "it waits for whoever has paused it"
+    bench.klipper.run_script("RESUME")
+    printing.join(20.0)
+    (report,) = done
+    assert (report.ok, report.next_line) == (True, look.line)
+    assert followed.rests_at_look()
+
+
+def test_a_layer_that_was_printed_by_us_is_left_out(bench: Bench, followed: KlipperJob) -> None:
+    """Klipper goes on behind it, from where our own program has ended."""
+    setup = load_setup(*PRINTER)
+    job = job_for(bench.ready.text, setup.printer)
+    checked = check(job.program, setup)
+    (look,) = marked_stops(job, "job")
+    followed.print(checked, lines=range(look.line))
+    own, parked = park(setup, job.state_after(look.line))
+    followed.print(own)
+    before = len(bench.klipper.executed)
+    behind = job.layers[LOOK_LAYER + 1].end_line
+    followed.print(checked, lines=range(behind, bench.ready.text.count("\n")))
+    after = [line for line in bench.klipper.executed[before:] if line != "M400"]
+    x_mm, y_mm, z_mm = parked.position_mm
+    assert after[2:4] == [f"G1 X{x_mm:.3f} Y{y_mm:.3f} F6000", f"G1 Z{z_mm:.3f} F600"]
+    lines = bench.ready.text.split("\n")[behind:]
+    wanted = [line.partition(";")[0].strip() for line in lines if line and line[0] in "GMT"]
+    assert after[-len(wanted) :] == wanted
+    assert len(after) - len(wanted) < 10, "and nothing of the layer before"
+
+
+def test_nothing_is_printed_once_the_motors_were_let_go(bench: Bench, followed: KlipperJob) -> None:
+    setup = load_setup(*PRINTER)
+    job = job_for(bench.ready.text, setup.printer)
+    (look,) = marked_stops(job, "job")
+    followed.print(check(job.program, setup), lines=range(look.line))
+    bench.klipper.homed = ""  # Klipper's idle_timeout
+    own, _ = park(setup, job.state_after(look.line))
+    before = len(bench.klipper.executed)
+    with pytest.raises(PrinterError, match="the motors were let go while the print rested"):
+        followed.print(own)
+    assert len(bench.klipper.executed) == before
