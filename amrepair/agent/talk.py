@@ -86,10 +86,9 @@ class Talk:
     def say(self, text: str, *, wrong: bool = False) -> None:
         """One sentence, in the printer's console and on its display."""
         self._note(text)
-        kind = "TYPE=error " if wrong else ""
-        self._send(
-            f'RESPOND {kind}PREFIX="amrepair:" MSG="{plain(text)}"\nM117 amrepair: {plain(text)}'
-        )
+        said = plain(text)
+        line = f'TYPE=error MSG="amrepair: {said}"' if wrong else f'PREFIX="amrepair:" MSG="{said}"'
+        self._send(f"RESPOND {line}\nM117 amrepair: {said}")
 
     def prompt(self, lines: Sequence[str], buttons: Sequence[Button]) -> None:
         """A window on the printer's screens."""

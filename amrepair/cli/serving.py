@@ -86,16 +86,17 @@ class _Service:
     def __init__(self, told: Served, address: Address, machine: KlipperJob, talk: Talk) -> None:
         self._told, self._address = told, address
         self._machine, self._talk = machine, talk
+        self._held: int | None = None
 
     def run(self) -> None:
         """One print after another."""
         served: UnderWay | None = None
-        passes = away = False
+        away = False
         while True:
             try:
                 job = self._machine.under_way()
-                if passes and job == served and self._machine.rests_at_look():
-                    self._machine.pass_by()
+                if job is not None and job == served:
+                    self._pass_by()
             except LinkError as error:
                 if not away:
                     console.errors.print(f"{error} Waiting for it.", markup=False)
@@ -108,23 +109,33 @@ class _Service:
                 self._machine.wait(LOOK_S)
                 continue
             served = job
-            passes = not self._print(job)
+            self._print(job)
             self._talk.rest()
 
-    def _print(self, job: UnderWay) -> bool:
-        """Serve one print; False where it is not looked at at all."""
-        begun = None
+    def _pass_by(self) -> None:
+        """Let a print that is not looked at (any more) go on at its looks.
+
+        Where looks were ended it rests, heaters off, until somebody has decided.
+        """
+        rests_at = self._machine.rests_at()
+        if rests_at is not None and rests_at != self._held:
+            self._talk.end_prompt()
+            self._machine.pass_by()
+
+    def _print(self, job: UnderWay) -> None:
+        """Serve one print."""
+        begun, self._held = None, None
         try:
             begun = self._begin(job)
             if begun is None:
-                return True
+                self._held = self._machine.rests_at()
+                return
             self._run(*begun)
         except (AmrepairError, GcodeError) as error:
             if begun is None:
                 self._talk.say(f"{job.name} is printed without looks: {error}", wrong=True)
-                return False
-            self._ended(f"{error}")
-        return True
+            else:
+                self._ended(f"{error}")
 
     def _begin(self, job: UnderWay) -> tuple[Begun, bool, Stopwatch] | None:
         """A new run, or the one that was begun; None where that was ended."""
@@ -194,9 +205,10 @@ class _Service:
         """A run that is over before its print: told where somebody can decide."""
         self._talk.say(f"no more looks at this print: {why}", wrong=True)
         try:
-            if not self._machine.rests_at_look():
-                return
+            self._held = self._machine.rests_at()
         except LinkError:
+            return
+        if self._held is None:
             return
         self._talk.prompt(
             [f"No more looks at this print: {why}", "It rests; heaters are off."],

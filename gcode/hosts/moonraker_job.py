@@ -127,10 +127,15 @@ class KlipperJob(MoonrakerPrinter):
             raise LinkError(f"{self._name} on {self.address.name} is not the file that was read.")
         self._sha256 = checked.program.sha256
 
+    def rests_at(self) -> int | None:
+        """The line after the look that the job rests at; None where it does not rest at one."""
+        rests, byte = self._rest()
+        line = self._text.line_at(byte)
+        return line if rests and self._text.is_look(line) else None
+
     def rests_at_look(self) -> bool:
         """Whether the job rests where it asks for a look."""
-        rests, byte = self._rest()
-        return rests and self._text.is_look(self._text.line_at(byte))
+        return self.rests_at() is not None
 
     def pass_by(self) -> None:
         """Go on without a look."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +45,7 @@ PRINTER = ("generic_klipper", "pla", "repair_0.20")
 class Ready:
     """A marked job, its part, and what stands at its look."""
 
+    plain: str
     text: str
     template: Path
     whole: m3.Manifold
@@ -63,7 +65,7 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Ready:
     (here / "small.stl").unlink()
     whole = part.trim_by_plane((0.0, 0.0, -1.0), -TOP_MM).translate(PLACE_MM)
     pocket = m3.Manifold.cube((6.0, 6.0, 1.0)).translate((105.0, 93.0, TOP_MM - 0.8))
-    return Ready(marked.text, here / "small.safetensors", whole, whole - pocket)
+    return Ready(plain, marked.text, here / "small.safetensors", whole, whole - pocket)
 
 
 class Bench:
@@ -260,6 +262,11 @@ def test_no_is_no(bench: Bench, ready: Ready) -> None:
 
 
 def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
+    """Nothing goes on until somebody has decided; then its later looks hold nothing up."""
+    looks = Asked(at_z_mm=(TOP_MM, TOP_MM + LAYER_MM), final=False)
+    twice = mark(bench.ready.plain, "job.gcode", "klipper", looks)
+    assert [place.layer for place in twice.places] == [LOOK_LAYER, LOOK_LAYER + 1]
+    (bench.folder / "gcodes" / "small_pla.gcode").write_text(twice.text)
     moved = bench.ready.whole.translate((6.0, 0.0, 0.0))
     bench.scans = [scan_of(moved), scan_of(moved)]
     ended: list[str] = []
@@ -268,6 +275,8 @@ def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
         if "footer_button Cancel the print" in text:
             heat = bench.klipper.modes
             ended.append(f"{heat.hotend_c:g} {heat.bed_c:g} {bench.klipper.print_state}")
+            time.sleep(1.5)  # longer than the agent takes from look to look: it leaves it alone
+            assert bench.klipper.print_state == "paused"
             bench.klipper.run_script("AMREPAIR_RESUME")
 
     bench.answers = press
@@ -380,6 +389,10 @@ def test_a_pause_of_the_users_own_is_no_look(bench: Bench, followed: KlipperJob)
     setup = load_setup(*PRINTER)
     job = job_for(bench.ready.text, setup.printer)
     (look,) = marked_stops(job, "job")
+    until_s = time.monotonic() + 10.0
+    while bench.klipper.modes.position_mm.get("Z", 0.0) < LAYER_MM:  # it lays its first beads
+        assert time.monotonic() < until_s
+        time.sleep(0.001)
     bench.klipper.run_script("PAUSE")
     done: list[PrintReport] = []
     checked = check(job.program, setup)
