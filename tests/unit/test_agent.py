@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -78,6 +80,7 @@ class Bench:
         self.fake = AgentsMoonraker(folder / "gcodes")
         self.klipper = self.fake.klipper
         self.scans = [scan_of(ready.broken), scan_of(ready.whole)]
+        monkeypatch.setattr(serving, "LOOK_S", 0.05)
         monkeypatch.setattr(running, "_scanner", lambda *given: Scripted(self._scan))
         self.starts = True
         self.heard: list[str] = []
@@ -204,6 +207,30 @@ def test_an_agent_that_was_killed_goes_on_and_nothing_is_printed_twice(
 
 
 @pytest.mark.slow
+def test_an_agent_that_is_asked_to_end_leaves_klippers_print_alone(bench: Bench) -> None:
+    """As systemd does it, while Klipper prints; started again it goes on."""
+    bench.scans = [scan_of(bench.ready.whole)]
+    bench.klipper.pause_s = 0.001
+    ended: list[str] = []
+
+    def stop(text: str) -> None:
+        if "is followed" in text and not ended:
+            ended.append(text)
+            while bench.klipper.modes.position_mm.get("Z", 0.0) < LAYER_MM:
+                time.sleep(0.001)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    bench.answers = stop
+    with pytest.raises(KeyboardInterrupt):
+        bench.agent()
+    assert bench.klipper.print_state == "printing"
+    assert bench.klipper.modes.hotend_c > 200
+    bench.agent()
+    assert bench.klipper.print_state == "complete"
+    assert [e["printed"] for e in bench.events() if e["event"] == "look"] == [False]
+
+
+@pytest.mark.slow
 def test_moonraker_goes_away_in_a_repair(bench: Bench, undisturbed: list[str]) -> None:
     """The answers to two steps are lost with the socket: one was carried out, one not."""
     run_script, lost = bench.klipper.run_script, []
@@ -275,7 +302,7 @@ def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
         if "footer_button Cancel the print" in text:
             heat = bench.klipper.modes
             ended.append(f"{heat.hotend_c:g} {heat.bed_c:g} {bench.klipper.print_state}")
-            time.sleep(1.5)  # longer than the agent takes from look to look: it leaves it alone
+            time.sleep(0.3)  # six times as long as from look to look: it is left alone
             assert bench.klipper.print_state == "paused"
             bench.klipper.run_script("AMREPAIR_RESUME")
 
