@@ -222,7 +222,8 @@ def live_view(
 
     operator = Operator()
     page = LiveView(title=title, operator=operator, host=host, port=port, token=token)
-    console.errors.print(f"Open {page.url}: approve, skip and pause are there.", markup=False)
+    there = "approve, skip and pause are" if ask else "a button to pause it is"
+    console.errors.print(f"Open {page.url}: {there} there.", markup=False)
     try:
         yield ShownRun(page, operator, ask)
     finally:
