@@ -136,29 +136,43 @@ def run(
             token=shown.token,
         ) as page,
     ):
-        machine = _machine(begun)
-        try:
-            report, warmth = print_run(
-                begun,
-                machine,
-                page,
-                watch,
-                bars,
-                word=page if shown.view else bars if isinstance(bars, AtDesk) else Terminal(bars),
-                going_on=resume is not None,
-                pose=pose_confirmed,
-            )
-        except KeyboardInterrupt:
-            console.errors.print(
-                "The heaters were told to switch off. When somebody has looked, go on with: "
-                f"amrepair loop --resume {begun.folder.path}",
-                markup=False,
-            )
-            raise
-        finally:
-            machine.close()
+        report, warmth = _printed(
+            begun,
+            page,
+            watch,
+            bars,
+            view=shown.view,
+            going_on=resume is not None,
+            pose=pose_confirmed,
+        )
     result = written(begun, report, warmth, watch, bars)
     tell(begun, report, result, as_json=as_json)
+
+
+def _printed(
+    begun: Begun,
+    page: NoView | ShownRun,
+    watch: Stopwatch,
+    bars: console.Bars,
+    *,
+    view: bool,
+    going_on: bool,
+    pose: bool,
+) -> tuple[LoopReport, tuple[TemperatureSeries, ...]]:
+    """Run the loop over the printer that was named; whoever looks is asked there."""
+    word = page if view else bars if isinstance(bars, AtDesk) else Terminal(bars)
+    machine = _machine(begun)
+    try:
+        return print_run(begun, machine, page, watch, bars, word=word, going_on=going_on, pose=pose)
+    except KeyboardInterrupt:
+        console.errors.print(
+            "The heaters were told to switch off. When somebody has looked, go on with: "
+            f"amrepair loop --resume {begun.folder.path}",
+            markup=False,
+        )
+        raise
+    finally:
+        machine.close()
 
 
 def _given(value: Any, name: str) -> Any:
