@@ -8,6 +8,7 @@ import typer
 
 import amrepair
 from amrepair.cli import (
+    agenting,
     batching,
     benchmark,
     calibration,
@@ -63,6 +64,7 @@ benchmark.add_to(app)
 health.add_to(app)
 live.add_to(app)
 fleeting.add_to(app)
+agenting.add_to(app)
 
 
 def main() -> None:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 from amrepair.errors import InputError
-from amrepair.fleet.desk import Desk
-from amrepair.fleet.shared import SharedDetection
-from amrepair.loop import Decision, Stop
-from amrepair.repair import RepairPlan, Site
+from amrepair.loop import Decision
+from amrepair.repair import RepairPlan
 from amrepair.report.text import plan_lines
 from gcode.cli import console
 
@@ -26,10 +23,6 @@ class Terminal:
 
     def __init__(self, bars: console.Bars) -> None:
         self._bars = bars
-
-    def judging(self, site_at: Callable[[Stop], Site]) -> Callable[[Stop], Site]:
-        """The same sites: scans are judged by this process."""
-        return site_at
 
     def to_print(self, plan: RepairPlan) -> bool:
         """Show what would be printed, and wait for a word."""
@@ -53,23 +46,29 @@ class Terminal:
             return confirmed("Go on all the same (no ends the run)?")
 
 
+@runtime_checkable
+class Asker(Protocol):
+    """Who is told and asked elsewhere than at the terminal."""
+
+    def progress(self, stage: str, done: float, total: float) -> None:
+        """Be told how far it is."""
+
+    def ask(self, question: str, lines: Sequence[str]) -> bool:
+        """Answer, whenever that is."""
+
+
 class AtDesk(console.Bars):
-    """Asks by notes in a folder, and tells its progress there: somebody else has the terminal.
+    """Asks and tells its progress elsewhere: somebody else has the terminal, or nobody.
 
     Parameters
     ----------
-    folder
-        The supervisor's desk.
+    desk
+        A supervisor's folder of notes, or the printer's own screens.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, desk: Asker) -> None:
         super().__init__()
-        self._desk = Desk(folder)
-        self._detector = SharedDetection(folder, self._desk.judged)
-
-    def judging(self, site_at: Callable[[Stop], Site]) -> Callable[[Stop], Site]:
-        """The same sites, their scans judged by the supervisor's shared processes where it can."""
-        return lambda stop: replace(site_at(stop), detector=self._detector)
+        self._desk = desk
 
     def __call__(self, stage: str, done: float, total: float) -> None:
         """Report that `done` of `total` of `stage` is finished."""

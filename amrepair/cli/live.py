@@ -146,11 +146,11 @@ class NoView:
     def drives(self, pause: Callable[[], None], resume: Callable[[], None]) -> None:
         """Nothing is driven."""
 
-    def approve(self, plan: RepairPlan) -> bool:
+    def to_print(self, plan: RepairPlan) -> bool:
         """Nobody is asked."""
         return True
 
-    def ask_to_go_on(self, decision: Decision) -> bool:
+    def to_go_on(self, decision: Decision) -> bool:
         """Nobody is asked."""
         return False
 
@@ -183,14 +183,14 @@ class ShownRun:
         self.operator.on_pause, self.operator.on_resume = pause, resume
         self.operator.wait_while_paused()  # pressed before there was a printer to pause
 
-    def approve(self, plan: RepairPlan) -> bool:
+    def to_print(self, plan: RepairPlan) -> bool:
         """Wait for a button, where the run asks at all; else for the end of a pause."""
         if self.ask:
             return self.page.approve(plan)
         self.operator.wait_while_paused()
         return True
 
-    def ask_to_go_on(self, decision: Decision) -> bool:
+    def to_go_on(self, decision: Decision) -> bool:
         """Wait for a button: whether the job goes on all the same."""
         return self.page.ask(decision)
 
@@ -222,7 +222,8 @@ def live_view(
 
     operator = Operator()
     page = LiveView(title=title, operator=operator, host=host, port=port, token=token)
-    console.errors.print(f"Open {page.url}: approve, skip and pause are there.", markup=False)
+    there = "approve, skip and pause are" if ask else "a button to pause it is"
+    console.errors.print(f"Open {page.url}: {there} there.", markup=False)
     try:
         yield ShownRun(page, operator, ask)
     finally:

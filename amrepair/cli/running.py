@@ -5,48 +5,49 @@ from __future__ import annotations
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import typer
+from typing import Any, Protocol, runtime_checkable
 
 from amrepair.cli.approval import AtDesk, Terminal
 from amrepair.cli.live import NoView, ShownRun, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
+from amrepair.cli.telling import Begun, placed_solid, tell, written
 from amrepair.cli.thermal_log import ThermalLog
-from amrepair.errors import InputError, LoopError
+from amrepair.errors import InputError
+from amrepair.fleet.desk import Desk
+from amrepair.fleet.shared import SharedDetection
 from amrepair.frames import Transform
 from amrepair.loop import (
     MAX_ITERATIONS,
+    Decision,
     Look,
     LoopReport,
-    Stop,
     Tape,
     plan_stops,
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
-from amrepair.loop.learning import told
 from amrepair.loop.limits import Limits
 from amrepair.loop.locate import is_upright, locate_parts, stood
+from amrepair.loop.marks import marked_stops
 from amrepair.loop.pace import Pace, layers_at
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
-from amrepair.repair import Stopwatch
-from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
-from amrepair.report.collect import loop_result
+from amrepair.regions import detect
+from amrepair.repair import Detector, RepairPlan, Stopwatch
+from amrepair.report import TemperatureSeries
 from amrepair.report.folder import RunFolder
 from amrepair.template import open_template
-from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check, policy_of
 from gcode.cli import console
-from gcode.cli.judging import tell_warnings, warnings_json
+from gcode.cli.judging import tell_warnings
 from gcode.cli.options import program_text
 from gcode.cli.owning import job_setup, told_if_for_another
 from gcode.errors import JournalError
 from gcode.hosts import connect
 from gcode.hosts.journal import Journal, default_path
+from gcode.hosts.port import Printer
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job, job_for
@@ -57,27 +58,17 @@ SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
 
 
 @dataclass(frozen=True, slots=True)
-class _Begun:
-    """All that a run needs, new or gone on with."""
-
-    folder: RunFolder
-    setting: Setting
-    setup: PrintSetup
-    job: Job
-    checked: CheckedProgram
-    template: Template
-    stops: tuple[Stop, ...]
-    tape: Tape
-
-
-@dataclass(frozen=True, slots=True)
 class Looks:
-    """When to look, besides at the end: every so many layers, or adaptively; and where besides."""
+    """When to look, besides at the end: every so many layers, or adaptively; and where besides.
 
-    every: int
-    adaptive: bool
-    at_layers: tuple[int, ...]
-    at_mm: tuple[float, ...]
+    `marked`: where the job is marked, from this line on, and nowhere else; None: not by marks.
+    """
+
+    every: int = 0
+    adaptive: bool = False
+    at_layers: tuple[int, ...] = ()
+    at_mm: tuple[float, ...] = ()
+    marked: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,13 +104,14 @@ def run(
     `said` is the scan's time limit, the calibration of its errors and the seed.
     """
     watch = Stopwatch()
-    bars = console.Bars() if shown.desk is None else AtDesk(shown.desk)
+    desk = None if shown.desk is None else Desk(shown.desk)
+    bars = console.Bars() if desk is None else AtDesk(desk)
     if resume is not None:
         if job_file is not None:
             raise InputError("--resume takes the job from the run's folder; leave JOB out")
-        begun = _gone_on_with(resume, port, scanner, approve)
+        begun = gone_on_with(resume, port, scanner, approve)
     else:
-        begun = _new_run(
+        begun = new_run(
             _given(job_file, "JOB"),
             _given(template, "--template"),
             out,
@@ -147,7 +139,7 @@ def run(
             token=shown.token,
         ) as page,
     ):
-        report, warmth = _print(
+        report, warmth = _printed(
             begun,
             page,
             watch,
@@ -155,8 +147,47 @@ def run(
             view=shown.view,
             going_on=resume is not None,
             pose=pose_confirmed,
+            desk=desk,
         )
-    _tell(begun, report, warmth, watch, bars, as_json=as_json)
+    result = written(begun, report, warmth, watch, bars)
+    tell(begun, report, result, as_json=as_json)
+
+
+def _printed(
+    begun: Begun,
+    page: NoView | ShownRun,
+    watch: Stopwatch,
+    bars: console.Bars,
+    *,
+    view: bool,
+    going_on: bool,
+    pose: bool,
+    desk: Desk | None,
+) -> tuple[LoopReport, tuple[TemperatureSeries, ...]]:
+    """Run the loop over the printer that was named; whoever looks is asked there."""
+    word = page if view else bars if isinstance(bars, AtDesk) else Terminal(bars)
+    machine = _machine(begun)
+    try:
+        return print_run(
+            begun,
+            machine,
+            page,
+            watch,
+            bars,
+            word=word,
+            going_on=going_on,
+            pose=pose,
+            detector=detect if desk is None else SharedDetection(desk.folder, desk.judged),
+        )
+    except KeyboardInterrupt:
+        console.errors.print(
+            "The heaters were told to switch off. When somebody has looked, go on with: "
+            f"amrepair loop --resume {begun.folder.path}",
+            markup=False,
+        )
+        raise
+    finally:
+        machine.close()
 
 
 def _given(value: Any, name: str) -> Any:
@@ -165,7 +196,7 @@ def _given(value: Any, name: str) -> Any:
     return value
 
 
-def _new_run(
+def new_run(
     job_file: Path,
     template: Path,
     out: Path,
@@ -175,7 +206,7 @@ def _new_run(
     watch: Stopwatch,
     bars: console.Bars,
     **said: Any,
-) -> _Begun:
+) -> Begun:
     """Read, check and write down what a run begins with."""
     text = program_text(job_file)
     setup, own = job_setup(text, job_file, *named)
@@ -193,7 +224,11 @@ def _new_run(
     fixed = range(looks.every - 1, len(job.layers) - 1, looks.every) if looks.every else []
     pace = (looks.every or ADAPTIVE_LAYERS) if looks.adaptive else 0
     layers = [*looks.at_layers, *layers_at(job, looks.at_mm), *([] if pace else fixed)]
-    stops = plan_stops(job, layers)
+    stops = (
+        plan_stops(job, layers)
+        if looks.marked is None
+        else marked_stops(job, job_file.name, start=looks.marked)
+    )
     with bars.shown():
         with told_if_for_another(text, job_file, setup.printer):
             checked = _judged(job, setup, leave_heaters=said["leave_heaters"], progress=bars)
@@ -215,12 +250,12 @@ def _new_run(
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
         copies=() if expected is field else placed, by_beads=True,
-        max_iterations=MAX_ITERATIONS, adaptive=pace, limited=said["approve"] == "auto",
-        title=job_file.name, **said,
+        max_iterations=MAX_ITERATIONS, adaptive=pace, marked=looks.marked,
+        limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
     keep(out, setting, job.program.text, field)
-    return _Begun(folder, setting, setup, job, checked, expected, stops, Tape(out))
+    return Begun(folder, setting, setup, job, checked, expected, stops, Tape(out))
 
 
 def _judged(
@@ -241,9 +276,7 @@ def _how_it_stands(placed: tuple[Transform, ...]) -> str:
     return f"The job prints {len(placed)} copies of the part{lying}; all of them are looked at."
 
 
-def _gone_on_with(
-    folder: Path, port: str | None, scanner: str | None, approve: str | None
-) -> _Begun:
+def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: str | None) -> Begun:
     """Open a run's folder; what is said now counts more than what was said then."""
     run = open_run(folder)
     changes: dict[str, Any] = {"port": port, "scanner": scanner, "approve": approve}
@@ -253,30 +286,47 @@ def _gone_on_with(
     tape = Tape(folder)
     tape.reopen()
     checked = _judged(run.job, run.setup, leave_heaters=setting.leave_heaters)
-    return _Begun(
+    return Begun(
         RunFolder(folder), setting, run.setup, run.job, checked, run.template, run.stops, tape
     )
 
 
-def _print(
-    begun: _Begun,
+@runtime_checkable
+class Asked(Protocol):
+    """Whoever gives a word on what is found."""
+
+    def to_print(self, plan: RepairPlan) -> bool:
+        """Whether a repair is printed."""
+
+    def to_go_on(self, decision: Decision) -> bool:
+        """Whether the job goes on all the same."""
+
+
+def _machine(begun: Begun) -> Printer:
+    """The run's printer, not connected."""
+    return connect(
+        begun.setting.port,
+        dialect=begun.setup.printer.dialect,
+        baud=begun.setup.printer.baud,
+        wire_log=begun.folder.file("wire.log"),
+        journal=default_path(begun.setting.port),
+    )
+
+
+def print_run(
+    begun: Begun,
+    machine: Printer,
     page: NoView | ShownRun,
     watch: Stopwatch,
     bars: console.Bars,
     *,
-    view: bool,
+    word: Asked,
     going_on: bool,
     pose: bool,
+    detector: Detector = detect,
 ) -> tuple[LoopReport, tuple[TemperatureSeries, ...]]:
     """Connect and run the loop; what became of it, and how warm it was at its looks."""
     setting, setup, ask = begun.setting, begun.setup, begun.setting.approve == "ask"
-    machine = connect(
-        setting.port,
-        dialect=setup.printer.dialect,
-        baud=setup.printer.baud,
-        wire_log=begun.folder.file("wire.log"),
-        journal=default_path(setting.port),
-    )
     find = None
     if going_on:
         find = pick_up(machine, release_c=setup.material.bed_release_c, pose_confirmed=pose)
@@ -284,11 +334,10 @@ def _print(
         setting.scanner,
         Bed(setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed),
     )
-    page.show_run(begun.job, _placed_solid(begun.template, setting.placed))
+    page.show_run(begun.job, placed_solid(begun.template, setting.placed))
     if not going_on:
         machine.connect()
     page.drives(machine.pause, machine.resume)
-    word = bars if isinstance(bars, AtDesk) else Terminal(bars)
     expected = sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads)
     warmth = ThermalLog(machine.temperatures)
     shown = page.recording(begun.folder.record)
@@ -304,11 +353,11 @@ def _print(
                 begun.checked,
                 machine,
                 eye,
-                word.judging(expected),
+                lambda stop: replace(expected(stop), detector=detector),
                 stops=begun.stops,
                 max_iterations=setting.max_iterations,
-                approve=(page.approve if view else word.to_print) if ask else lambda plan: True,
-                ask=(page.ask_to_go_on if view else word.to_go_on) if ask else None,
+                approve=word.to_print if ask else lambda plan: True,
+                ask=word.to_go_on if ask else None,
                 limits=Limits.of(setup.process) if setting.limited else None,
                 pace=Pace(setting.adaptive) if setting.adaptive else None,
                 record=recorded,
@@ -322,15 +371,7 @@ def _print(
                 progress=page.watching(bars),
             )
         return report, warmth.series(_noted(setting.port))
-    except KeyboardInterrupt:
-        console.errors.print(
-            "The heaters were told to switch off. When somebody has looked, go on with: "
-            f"amrepair loop --resume {begun.folder.path}",
-            markup=False,
-        )
-        raise
     finally:
-        machine.close()
         begun.tape.close()
 
 
@@ -344,59 +385,3 @@ def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:
             return journal.temperatures()
     except JournalError:
         return ()
-
-
-def _tell(
-    begun: _Begun,
-    report: LoopReport,
-    warmth: tuple[TemperatureSeries, ...],
-    watch: Stopwatch,
-    bars: console.Bars,
-    *,
-    as_json: bool,
-) -> None:
-    """Result, report, exit code."""
-    folder, setting, setup = begun.folder, begun.setting, begun.setup
-    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
-    printed = [look for look in report.looks if look.printed]
-    last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
-    result = loop_result(
-        report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
-    )
-    result |= warnings_json(begun.checked.report)
-    folder.write_json("result.json", result)
-    within = report.within_tolerance
-    with bars.shown(), bars.stage("report"):
-        data = report_of_loop(
-            report,
-            result,
-            title=f"Run: {setting.title}",
-            setup=setup,
-            about={"job": setting.title},
-            expected=_placed_solid(begun.template, setting.placed),
-            temperatures=warmth,
-        )
-        write_report(data, folder.file("report.html"))
-    if as_json:
-        console.show_json(result)
-    else:
-        for line in summary_of_result(result, within_tolerance=within):
-            console.out.print(line)
-        if report.calibration is not None:
-            console.out.print(told(report.calibration))
-        console.out.print(f"Report: {folder.file('report.html')}")
-    if report.stopped:
-        console.errors.print(
-            f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
-            f"amrepair loop --resume {folder.path} --approve ask",
-            markup=False,
-        )
-        raise typer.Exit(LoopError.exit_code)
-    if not within:
-        raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
-
-
-def _placed_solid(template: Template, placed: Transform) -> Any:
-    """The part as it should be, where it stands."""
-    solid: Any = template.solid()
-    return solid.transform(placed.matrix[:3])

@@ -141,7 +141,7 @@ def simulate(
                 world=told,
                 scanner=scanner,
                 max_iterations=max_iterations,
-                approve=page.approve,
+                approve=page.to_print,
                 record=page.recording(folder.record),
                 begun=lambda pose: _recorded(prepared, folder, pose, ids, max_iterations),
                 connected=lambda printer: page.drives(printer.pause, printer.resume),

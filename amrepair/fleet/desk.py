@@ -45,7 +45,7 @@ class Desk:
         parent: Callable[[], int] = os.getppid,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._clock, self._sleep, self._parent = folder, clock, sleep, parent
+        self.folder, self._clock, self._sleep, self._parent = folder, clock, sleep, parent
         self._asker = parent()
         self._said: dict[str, Any] = {"pid": os.getpid(), "stage": "starting", "question": None}
         self._number = int(1000 * clock())  # never one of an earlier process
@@ -74,7 +74,7 @@ class Desk:
         self._tell()
         try:
             while True:
-                answer = read_note(self._folder / ANSWER)
+                answer = read_note(self.folder / ANSWER)
                 if answer is not None and answer.get("number") == self._number:
                     return bool(answer.get("yes"))
                 if self._parent() != self._asker:
@@ -96,7 +96,7 @@ class Desk:
 
     def _tell(self) -> None:
         self._told_s = self._clock()
-        write_note(self._folder / STATUS, {**self._said, "time_s": self._told_s})
+        write_note(self.folder / STATUS, {**self._said, "time_s": self._told_s})
 
 
 def answer(folder: Path, number: int, *, yes: bool) -> None:

@@ -40,9 +40,21 @@ def pick_up(
     if isinstance(printer, (SerialPrinter, FilePrinter)):
         return pick_up_serial(printer, release_c=release_c, pose_confirmed=pose_confirmed)
     # loaded here: a printer on a cable needs none of the web's libraries
+    from gcode.hosts.moonraker_job import KlipperJob
     from gcode.hosts.rejoin import rejoin
     from gcode.hosts.server import ServerPrinter
 
+    if isinstance(printer, KlipperJob):
+        job = printer
+
+        def find_job(sent: Sequence[Sent]) -> None:
+            job.pick_up(
+                [(s.checked, s.first, s.end, s.done) for s in sent],
+                release_c=release_c,
+                pose_confirmed=pose_confirmed,
+            )
+
+        return find_job
     if not isinstance(printer, ServerPrinter):
         raise InputError(f"a run on a {type(printer).__name__} cannot be gone on with")
     server: ServerPrinter[Any] = printer

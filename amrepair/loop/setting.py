@@ -18,6 +18,7 @@ import trimesh
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
+from amrepair.loop.marks import marked_stops
 from amrepair.regions.calibration import Calibration
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
@@ -51,6 +52,9 @@ class Setting:
         Layers that adaptive looks begin with (`pace`); 0 where there are none.
     leave_heaters
         The job may leave heaters on; else lines that switch them off are put at its end.
+    marked
+        The run looks where the job is marked, from this line on; `layers` and `final` say nothing
+        then. None: it does not go by marks.
     sound
         What sound parts look like to the scanner, where somebody named it: name, scans, widths,
         wander and tails, as `Calibration` has them. Empty: the run learns from its first layers.
@@ -76,6 +80,7 @@ class Setting:
     title: str = "job"
     copies: tuple[tuple[tuple[float, ...], ...], ...] = ()
     leave_heaters: bool = False
+    marked: int | None = None
     sound: tuple[Any, ...] = ()
 
     @classmethod
@@ -202,7 +207,11 @@ def open_run(folder: Path) -> Recorded:
         raise InputError(f"{folder / SETTING} cannot be read ({error})") from error
     setup = setting.setup()
     job = job_for(text, setup.printer)
-    stops = plan_stops(job, setting.layers, final=setting.final)
+    stops = (
+        marked_stops(job, setting.title, start=setting.marked)
+        if setting.marked is not None
+        else plan_stops(job, setting.layers, final=setting.final)
+    )
     template = setting.as_it_stands(_kept_template(folder))
     return Recorded(setting, setup, job, template, stops)
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from amrepair.errors import InputError
+from amrepair.loop.marks import MARK
 from amrepair.loop.pace import layers_at
 from amrepair.postprocess.covering import covered_mm2
 from amrepair.postprocess.places import Place, Places
-from amrepair.postprocess.words import MARK, Target, lines_of
+from amrepair.postprocess.words import Target, lines_of
 from gcode.errors import ReadError
 from gcode.reader import Job, read_job
 

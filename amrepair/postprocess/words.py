@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Literal, get_args
 
 from amrepair.errors import InputError
+from amrepair.loop.marks import MARK
 from gcode.profiles.own_settings import own_settings
 
 Target = Literal["klipper", "prusa", "marlin", "reprap", "octoprint"]
@@ -20,7 +21,6 @@ COMMANDS: Mapping[Target, tuple[str, ...]] = {
     "reprap": ("M226",),
     "octoprint": ("@amrepair scan layer={layer} z={z}",),
 }
-MARK = ";AMREPAIR_LOOK"
 _FIELDS = ("layer", "z")
 _FLAVOURS: Mapping[str, Target] = {
     "klipper": "klipper",

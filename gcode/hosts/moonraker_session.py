@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gcode
-from gcode.errors import LinkError, PrinterError
+from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.moonraker_state import SUBSCRIPTION, KlippyState
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.server import ServerSession
@@ -19,7 +19,15 @@ _MESSAGE = re.compile(r"""['"]message['"]:\s*(['"])(.*?)\1\s*[,}]""", re.DOTALL)
 
 
 class MoonrakerSession(ServerSession[KlippyState]):
-    """One websocket, its calls and its news."""
+    """One websocket, its calls and its news.
+
+    Parameters
+    ----------
+    agent
+        Name of the agent as which this session serves the printer's macros; empty: it is none.
+    methods
+        What a macro may call by `action_call_remote_method`; an agent's only.
+    """
 
     def __init__(
         self,
@@ -28,18 +36,35 @@ class MoonrakerSession(ServerSession[KlippyState]):
         timing: WebTiming,
         clock: Callable[[], float],
         log: WebLog | None,
+        *,
+        agent: str = "",
+        methods: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(address, key, timing, clock, log, KlippyState())
+        super().__init__(address, key, timing, clock, log, KlippyState(methods=methods))
         self._numbers = itertools.count(1)
+        self._agent, self._methods = agent, methods
 
     def listen(self) -> None:
         """Open the websocket and say who we are."""
         self._client.get("/server/info")  # tells an unreachable server from a refused key
         self._open_socket("/websocket", dict(self._key.headers))
         who = {"client_name": "gcode", "version": gcode.__version__, "type": "other", "url": "-"}
+        if self._agent:
+            who |= {"client_name": self._agent, "type": "agent"}
         if self._key.value:
             who["api_key"] = self._key.value
-        self.call("server.connection.identify", who)
+        try:
+            self.call("server.connection.identify", who)
+            for method in self._methods:
+                self.call("connection.register_remote_method", {"method_name": method})
+        except PrinterError as error:
+            if "already registered" not in str(error):
+                raise
+            self._hang_up()
+            raise PortBusyError(
+                f"another agent named {self._agent!r} serves the printer behind "
+                f"{self.address.name}; end that one first."
+            ) from error
 
     def _logged(self, message: dict[str, Any]) -> str:
         return json.dumps({k: v for k, v in message.items() if k != "jsonrpc"})[:500]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,6 +34,8 @@ class KlippyState:
         How the followed print ended: one of `ENDS`.
     file_position
         Bytes of the followed file that Klipper has taken into its queue.
+    methods, called
+        What macros of the printer may call, and what they have called, oldest first.
     """
 
     klippy: str = ""
@@ -46,6 +49,8 @@ class KlippyState:
     stale: bool = False
     outcome: str = ""
     answers: dict[int, dict[str, Any]] = field(default_factory=dict)
+    methods: tuple[str, ...] = ()
+    called: deque[tuple[str, dict[str, Any]]] = field(default_factory=deque)
 
     @property
     def stopped(self) -> bool:
@@ -73,6 +78,9 @@ class KlippyState:
         method = message.get("method")
         if isinstance(number := message.get("id"), int):
             self.answers[number] = message
+        elif isinstance(method, str) and method in self.methods:
+            params = message.get("params")
+            self.called.append((method, params if isinstance(params, dict) else {}))
         elif isinstance(method, str) and method in _KLIPPY_NEWS:
             self.klippy = _KLIPPY_NEWS[method]
             self.stale = True

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 from gcode.hosts.modes import Modes, modes_after
 from gcode.hosts.port import PrintableProgram, PrintReport, ResumeRefusedError
@@ -61,8 +61,8 @@ def rejoin(
     """
     report, ended_s = printer.rejoin(checked, lines, progress=progress)
 
-    def refuse(why: str) -> NoReturn:
-        raise ResumeRefusedError(
+    def refused(why: str) -> ResumeRefusedError:
+        return ResumeRefusedError(
             f"The job on {printer.address.name} cannot be gone on with: {why}. 'gcode resume-at' "
             "makes a job from a layer on.",
             lines.start - 1,
@@ -70,32 +70,59 @@ def rejoin(
         )
 
     if report is not None and not report.ok:
-        refuse("its last part failed, or was cancelled there")
+        raise refused("its last part failed, or was cancelled there")
     modes = Modes()
     over = [(checked, lines.start, lines.stop)] if done or report is not None else []
     for program, first, end in (*before, *over):
         dialect = program.program.dialect
         modes = modes_after(program, end, dialect, first=first, modes=modes)
+    idle_s = 0.0 if ended_s is None else wall_clock() - ended_s
+    require_as_left(
+        printer, modes, refused, release_c=release_c, pose_confirmed=pose_confirmed, idle_s=idle_s
+    )
+    return None if done else report
+
+
+def require_as_left(
+    printer: ServerPrinter[Any],
+    modes: Modes,
+    refused: Callable[[str], ResumeRefusedError],
+    *,
+    release_c: float,
+    pose_confirmed: bool,
+    idle_s: float = 0.0,
+) -> None:
+    """Refuse a machine that is not as it was left; heat again what was switched off since.
+
+    Parameters
+    ----------
+    modes
+        As it was left; places that are not known there are not compared.
+    refused
+        Makes the error of a reason.
+    idle_s
+        How long it has rested.
+    """
     place = dict(zip("XYZ", printer.position_mm(), strict=True))
     known = {axis: modes.position_mm[axis] for axis in "XYZ" if axis in modes.position_mm}
     if any(abs(place[axis] - known[axis]) > SAME_PLACE_MM for axis in known):
         where = [" ".join(f"{a}{v:g}" for a, v in spot.items()) for spot in (place, known)]
-        refuse(f"the nozzle is at {where[0]}, and was left at {where[1]}")
-    idle_s = 0.0 if ended_s is None else wall_clock() - ended_s
+        raise refused(f"the nozzle is at {where[0]}, and was left at {where[1]}")
     if not printer.motors_held():
-        refuse("its motors were let go, and nothing tells where the nozzle is")
+        raise refused("its motors were let go, and nothing tells where the nozzle is")
     if not pose_confirmed:
         hint = "confirm by a rescan where the part stands, and say --pose-confirmed"
         if idle_s > MOTORS_HELD_S:
-            refuse(f"it has rested for {idle_s:.0f} s and may have let go of its motors; {hint}")
+            raise refused(
+                f"it has rested for {idle_s:.0f} s and may have let go of its motors; {hint}"
+            )
         bed_c = printer.temperatures().bed_c
         if modes.bed_c > release_c and bed_c is not None and bed_c < release_c:
-            refuse(
+            raise refused(
                 f"the bed is at {bed_c:.1f} °C, below the {release_c:g} °C at which this material "
                 f"lets go; {hint}"
             )
     _heat(printer, modes)
-    return None if done else report
 
 
 def _heat(printer: ServerPrinter[Any], modes: Modes) -> None:

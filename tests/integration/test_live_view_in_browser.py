@@ -66,7 +66,7 @@ class Run:
         try:
             run = simulate_run(
                 prepared,
-                approve=self.shown.approve,
+                approve=self.shown.to_print,
                 record=self.shown.recording(lambda look: None),
                 progress=self.shown.watching(lambda stage, done, total: None),
             )

@@ -53,6 +53,8 @@ class CommandError(Exception):
 
 
 class StandIn:
+    has_macros = False
+
     def __init__(self, gcodes: Path, record: Path, lines_per_s: float) -> None:
         self.gcodes = gcodes
         self.record = record.open("a", buffering=1)
@@ -113,6 +115,9 @@ class StandIn:
         return self.target[heater] or 21.0
 
     # ------------------------------------------------------------------ commands
+
+    async def registered(self, client: Client, method: str, params: dict[str, Any]) -> None:
+        """What a client wants to hear of; nothing here says any of it."""
 
     async def script(self, text: str) -> None:
         for line in text.split("\n"):
@@ -274,6 +279,10 @@ class Client:
 
     async def call(self, method: str, params: dict[str, Any]) -> dict[str, Any]:
         klipper = self.klipper
+        macros = {"pause": "PAUSE", "resume": "RESUME", "cancel": "CANCEL_PRINT"}
+        if method.startswith("pause_resume/") and klipper.has_macros:
+            await klipper.script(macros[method.partition("/")[2]])
+            return {}
         simple: dict[str, Callable[[], None]] = {
             "emergency_stop": klipper.shut_down,
             "pause_resume/pause": klipper.pause,
@@ -314,7 +323,10 @@ class Client:
         if method == "gcode/script":
             await klipper.script(params["script"])
             return {}
-        if method in {"gcode/help", "gcode/subscribe_output", "register_remote_method"}:
+        if method in {"gcode/subscribe_output", "register_remote_method"}:
+            await klipper.registered(self, method, params)
+            return {}
+        if method == "gcode/help":
             return {}
         raise CommandError(f"webhooks: No registered callback for path '{method}'")
 

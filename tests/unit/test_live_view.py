@@ -309,7 +309,7 @@ def test_a_pause_before_there_is_a_printer_holds_the_run_at_once(view: LiveView)
     def go() -> bool:
         shown.drives(lambda: said.append("pause"), lambda: said.append("resume"))
         said.append("print")
-        return shown.approve(None)  # type: ignore[arg-type]  # nobody is asked
+        return shown.to_print(None)  # type: ignore[arg-type]  # nobody is asked
 
     thread, found = answer_of(go)
     watcher.until(lambda: operator.paused)

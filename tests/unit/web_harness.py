@@ -99,7 +99,8 @@ class FakeServer:
             asked = Asked(method, path.partition("?")[0], headers, body)
             self.asked.append(asked)
             status, answer = self.handle(asked)
-            payload = b"" if answer is None else json.dumps(answer).encode()
+            raw = isinstance(answer, bytes)  # a file
+            payload = answer if raw else b"" if answer is None else json.dumps(answer).encode()
             connection.sendall(
                 b"HTTP/1.1 %d X\r\nContent-Type: application/json\r\nContent-Length: %d\r\n"
                 b"Connection: close\r\n\r\n%b" % (status, len(payload), payload)

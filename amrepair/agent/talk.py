@@ -1,0 +1,176 @@
+"""Tells and asks at the printer: its display, its console, and prompts that its screens show.
+
+Prompts are Klipper's `action:prompt_…`, which Mainsail, Fluidd and KlipperScreen draw themselves.
+Answers come by the macro AMREPAIR_APPROVE.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+from amrepair.errors import LoopError
+from gcode.errors import GcodeError, LinkError
+
+POLL_S = 0.5
+IDLE = "waiting for a print"
+END_PROMPT = 'RESPOND TYPE=command MSG="action:prompt_end"'
+_QUIET = frozenset({"print", "printing"})  # the printer's own screens show how far that is
+# A line of G-code ends at a comment; a quote ends its text, a bar a prompt's.
+_UNSAID = re.compile(r"[\x00-\x1f;#\"|*\\]+")
+
+Button = tuple[str, str, str]
+"""What is on it, the command, its colour."""
+
+
+@runtime_checkable
+class Host(Protocol):
+    """The printer, as far as it is spoken to."""
+
+    def rests_at_look(self) -> bool:
+        """Whether its job rests where it asks for a look."""
+
+    def command(self, text: str) -> None:
+        """Have a script carried out."""
+
+    def calls(self, wait_s: float) -> list[dict[str, Any]]:
+        """What macros have asked for; waits for some."""
+
+
+class Talk:
+    """Progress, messages and questions at the printer.
+
+    Parameters
+    ----------
+    host
+        Connected.
+    note
+        Called with every message besides, for whoever reads the agent's own output.
+    """
+
+    def __init__(self, host: Host, note: Callable[[str], None]) -> None:
+        self._host, self._note = host, note
+        self._doing = IDLE
+        self._number = 0
+        self._answers = threading.Condition()
+        self._open, self._answer = False, False
+        self._answered = False
+        self._ended = threading.Event()
+        self._hears = threading.Thread(target=self._hear, daemon=True, name="macro-calls")
+
+    def listen(self) -> None:
+        """Answer the macros from now on, in a thread."""
+        self._hears.start()
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._ended.set()
+        if self._hears.is_alive():
+            self._hears.join(timeout=5.0)
+
+    # ------------------------------------------------------------------ telling
+
+    def progress(self, stage: str, done: float, total: float) -> None:
+        """Tell of a stage once it begins."""
+        new, self._doing = stage != self._doing, stage
+        if new and stage not in _QUIET:
+            taken = f"{END_PROMPT}\n" if stage.startswith("scan") else ""  # nobody waits any more
+            self._send(f"{taken}M117 amrepair: {plain(stage)}")
+
+    def rest(self) -> None:
+        """Nothing is being done."""
+        self._doing = IDLE
+
+    def say(self, text: str, *, wrong: bool = False) -> None:
+        """One sentence, in the printer's console and on its display."""
+        self._note(text)
+        said = plain(text)
+        line = f'TYPE=error MSG="amrepair: {said}"' if wrong else f'PREFIX="amrepair:" MSG="{said}"'
+        self._send(f"RESPOND {line}\nM117 amrepair: {said}")
+
+    def prompt(self, lines: Sequence[str], buttons: Sequence[Button]) -> None:
+        """A window on the printer's screens."""
+        rows = ["prompt_end", "prompt_begin amrepair"]
+        rows += [f"prompt_text {plain(line)}" for line in lines]
+        rows += [
+            f"prompt_footer_button {label}|{gcode}|{colour}" for label, gcode, colour in buttons
+        ]
+        self._send("\n".join(f'RESPOND TYPE=command MSG="action:{row}"' for row in
+                             [*rows, "prompt_show"]))  # fmt: skip
+
+    def end_prompt(self) -> None:
+        """Take the window away."""
+        self._send(END_PROMPT)
+
+    def _send(self, script: str) -> None:
+        """Told as well as can be: what is not heard changes nothing of what is done."""
+        try:
+            self._host.command(script)
+        except GcodeError as error:
+            self._note(f"(not told at the printer: {error})")
+
+    # ------------------------------------------------------------------ asking
+
+    def ask(self, question: str, lines: Sequence[str]) -> bool:
+        """Ask at the printer, and wait for AMREPAIR_APPROVE.
+
+        Raises
+        ------
+        LoopError
+            If the print goes on or ends meanwhile: then nothing is left to be asked.
+        """
+        with self._answers:
+            self._number += 1
+            self._open, self._answered = True, False
+        yes = f"AMREPAIR_APPROVE ANSWER=yes QUESTION={self._number}"
+        no = f"AMREPAIR_APPROVE ANSWER=no QUESTION={self._number}"
+        self.say(question)
+        self.prompt([question, *lines], [("Yes", yes, "primary"), ("No", no, "warning")])
+        try:
+            while True:
+                with self._answers:
+                    if self._answers.wait_for(lambda: self._answered, POLL_S):
+                        return self._answer
+                if not self._still_rests():
+                    raise LoopError(
+                        "the print was resumed or ended while amrepair waited for an answer; it is "
+                        "left alone from here on"
+                    )
+        finally:
+            with self._answers:
+                self._open = False
+            self.end_prompt()
+
+    def _still_rests(self) -> bool:
+        try:
+            return self._host.rests_at_look()
+        except LinkError:
+            return True  # a server that is away for a moment; the printer waits as we do
+
+    # ------------------------------------------------------------------ macros
+
+    def _hear(self) -> None:
+        while not self._ended.is_set():
+            for call in self._host.calls(POLL_S):
+                what = call.get("what")
+                if what == "approve":
+                    self._take(call)
+                elif what == "status":
+                    self.say(f"{self._doing}{': a question waits' if self._open else ''}.")
+
+    def _take(self, call: dict[str, Any]) -> None:
+        """An answer; one to an earlier question decides nothing."""
+        number = call.get("question") or self._number
+        with self._answers:
+            if self._open and not self._answered and number == self._number:
+                self._answer, self._answered = call.get("answer") == "yes", True
+                self._answers.notify_all()
+                return
+        self.say("no question waits for this answer.", wrong=True)
+
+
+def plain(text: str) -> str:
+    """A text that may stand in a line of G-code."""
+    return " ".join(_UNSAID.sub(" ", text.replace(";", ",")).split())

@@ -1,0 +1,148 @@
+"""`amrepair agent`: beside a printer's own server, look at what it prints and repair it."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amrepair.cli.live import VIEW_PORT, HostOption, PortOption, TokenOption, ViewOption
+from amrepair.cli.options import ProcessOption, SeedOption, calibration_named
+from amrepair.cli.printing import APPROVALS
+from amrepair.errors import InputError
+from amrepair.report.guarded import LOOPBACK
+from gcode.cli import console
+from gcode.cli.owning import JobMaterialOption, JobPrinterOption
+from gcode.profiles import DEFAULT_PROCESS
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(
+        "agent",
+        epilog=console.examples(
+            "amrepair agent --macros amrepair.cfg",
+            "amrepair agent --moonraker http://127.0.0.1:7125 --template part.stl "
+            "--scanner watch:scans",
+            "amrepair agent --moonraker http://voron.local:7125 --template parts "
+            "--scanner watch:scans --approve auto",
+            "amrepair agent --unit amrepair-agent.service",
+        ),
+    )(agent)
+
+
+def agent(
+    moonraker: Annotated[
+        str | None, typer.Option(metavar="URL", help="The printer's Moonraker: http://HOST:PORT.")
+    ] = None,
+    template: Annotated[
+        Path | None,
+        typer.Option(
+            help="The part: a fitted template or a mesh; or a folder of them, where each job finds "
+            "the one whose name its own begins with."
+        ),
+    ] = None,
+    scanner: Annotated[
+        str | None,
+        typer.Option(help="watch:DIR or simulated:FILE, as 'amrepair loop' has it."),
+    ] = None,
+    printer: JobPrinterOption = None,
+    material: JobMaterialOption = None,
+    process: ProcessOption = DEFAULT_PROCESS,
+    approve: Annotated[
+        str,
+        typer.Option(
+            help="ask on the printer's screens before every repair, or auto: within the limits "
+            "that the process profile sets."
+        ),
+    ] = "ask",
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="File that 'amrepair calibrate' wrote; identity where left out."),
+    ] = None,
+    sound: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="What 'amrepair calibrate --sound' learned and kept by this name; left out: "
+            "learned from the job's own first clean layers.",
+        ),
+    ] = None,
+    scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the runs, one a print; a run begun there is gone on "
+                           "with.")
+    ] = Path("out/agent"),
+    pose_confirmed: Annotated[
+        bool,
+        typer.Option(
+            "--pose-confirmed",
+            help="The run that is gone on with: a scan has shown that the part stands where it "
+            "stood.",
+        ),
+    ] = False,
+    once: Annotated[bool, typer.Option("--once", help="End after one print.")] = False,
+    macros: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the printer's macros, to be included in "
+                     "printer.cfg, and end; - prints them."),
+    ] = None,
+    unit: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a systemd unit for the agent, and end; - prints "
+                     "it."),
+    ] = None,
+    view: ViewOption = False,
+    view_host: HostOption = LOOPBACK,
+    view_port: PortOption = VIEW_PORT,
+    token: TokenOption = None,
+    seed: SeedOption = 0,
+) -> None:  # fmt: skip
+    """Look at a printer's prints where their jobs are marked, repair them, and let them go on.
+
+    The jobs are begun as ever, from Mainsail, Fluidd or the printer's screen.
+    """
+    if macros is not None or unit is not None:
+        _hand_out(macros, unit)
+        return
+    if approve not in APPROVALS:
+        raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
+    missing = {"--moonraker": moonraker, "--template": template, "--scanner": scanner}
+    for name, value in missing.items():
+        if value is None:
+            raise InputError(f"{name} is missing; see 'amrepair agent --help'")
+    with console.starting():
+        from amrepair.cli import serving
+        from amrepair.cli.running import Page
+
+    errors = calibration_named(sound)
+    serving.serve(
+        serving.Served(
+            str(moonraker), Path(str(template)), out, (printer, material, process), calibration,
+            Page(view, view_host, view_port, token), once=once, pose_confirmed=pose_confirmed,
+            said={
+                "scanner": scanner, "approve": approve, "scan_timeout_s": scan_timeout_s,
+                "sound": () if errors is None else astuple(errors), "seed": seed,
+            },
+        )
+    )  # fmt: skip
+
+
+def _hand_out(macros: Path | None, unit: Path | None) -> None:
+    """Write or print files that come with the agent."""
+    from amrepair.agent.shipped import MACROS, UNIT, shipped
+
+    for path, name in ((macros, MACROS), (unit, UNIT)):
+        if path is None:
+            continue
+        if str(path) == "-":
+            console.out.print(shipped(name), end="", markup=False, highlight=False, soft_wrap=True)
+            continue
+        try:
+            path.write_text(shipped(name), encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{path} cannot be written ({error.strerror})") from error
+        console.errors.print(f"{path} is written; it says at its head where it belongs.",
+                             markup=False)  # fmt: skip

@@ -1,0 +1,219 @@
+"""What `amrepair agent` does: one print after another, each a run of the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from amrepair.agent.talk import Talk
+from amrepair.cli.approval import AtDesk
+from amrepair.cli.live import live_view
+from amrepair.cli.running import (
+    Looks,
+    Page,
+    gone_on_with,
+    new_run,
+    print_run,
+)
+from amrepair.cli.telling import Begun, written
+from amrepair.errors import AmrepairError, InputError
+from amrepair.loop.looks import LoopReport
+from amrepair.loop.tape import read_events
+from amrepair.repair import Stopwatch
+from amrepair.report.text import summary_of_result
+from gcode.cli import console
+from gcode.errors import GcodeError, LinkError
+from gcode.hosts.moonraker_job import KlipperJob, UnderWay
+from gcode.hosts.secret import find_key
+from gcode.hosts.web import Address
+from gcode.solids import SUFFIXES
+
+LOOK_S = 1.0  # between looks at whether something is printed
+PARTS = frozenset({".safetensors", *SUFFIXES})
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """What an agent is begun with; `said` is what a run's setting takes as it is."""
+
+    url: str
+    template: Path
+    out: Path
+    named: tuple[str | None, str | None, str]
+    calibration: Path | None
+    page: Page
+    once: bool
+    pose_confirmed: bool
+    said: dict[str, Any]
+
+
+def serve(told: Served) -> None:
+    """Serve a printer's prints until interrupted.
+
+    Raises
+    ------
+    LinkError, PortBusyError
+        If the server cannot be reached at the beginning, or has an agent already.
+    """
+    address = Address.parse(f"moonraker+{told.url}")
+    if not told.template.exists():
+        raise InputError(f"--template {told.template}: there is no such file or folder")
+    machine = KlipperJob(address, find_key(address.kind, address.spec))
+    machine.connect()
+    talk = Talk(machine, lambda text: console.errors.print(text, markup=False))
+    try:
+        with console.signals_end_it():
+            machine.require_macros()
+            talk.listen()
+            talk.say("the agent is here.")
+            _Service(told, address, machine, talk).run()
+    except KeyboardInterrupt:
+        console.errors.print(
+            "A print that rests at a look stays so, heaters off; one that goes on is Klipper's. "
+            f"Started again with --out {told.out}, the agent goes on with it.",
+            markup=False,
+        )
+        raise
+    finally:
+        talk.close()
+        machine.close()
+
+
+class _Service:
+    """The prints of one printer."""
+
+    def __init__(self, told: Served, address: Address, machine: KlipperJob, talk: Talk) -> None:
+        self._told, self._address = told, address
+        self._machine, self._talk = machine, talk
+        self._held: int | None = None
+
+    def run(self) -> None:
+        """One print after another."""
+        served: UnderWay | None = None
+        away = False
+        while True:
+            try:
+                job = self._machine.under_way()
+                if job is not None and job == served:
+                    self._pass_by()
+            except LinkError as error:
+                if not away:
+                    console.errors.print(f"{error} Waiting for it.", markup=False)
+                away, job = True, None
+            else:
+                away = False
+            if job is None or job == served:
+                if served is not None and job is None and self._told.once and not away:
+                    return
+                self._machine.wait(LOOK_S)
+                continue
+            served = job
+            self._print(job)
+            self._talk.rest()
+
+    def _pass_by(self) -> None:
+        """Let a print that is not looked at (any more) go on at its looks.
+
+        Where looks were ended it rests, heaters off, until somebody has decided.
+        """
+        rests_at = self._machine.rests_at()
+        if rests_at is not None and rests_at != self._held:
+            self._talk.end_prompt()
+            self._machine.pass_by()
+
+    def _print(self, job: UnderWay) -> None:
+        """Serve one print."""
+        begun, self._held = None, None
+        try:
+            begun = self._begin(job)
+            if begun is None:
+                self._held = self._machine.rests_at()
+                return
+            self._run(*begun)
+        except (AmrepairError, GcodeError) as error:
+            if begun is None:
+                self._talk.say(f"{job.name} is printed without looks: {error}", wrong=True)
+            else:
+                self._ended(f"{error}")
+
+    def _begin(self, job: UnderWay) -> tuple[Begun, bool, Stopwatch] | None:
+        """A new run, or the one that was begun; None where that was ended."""
+        told, watch = self._told, Stopwatch()
+        folder = told.out / f"{Path(job.name).stem}-{job.id}"
+        data = self._machine.fetch(job.name)
+        come_to = self._machine.follow(job.name, data)
+        events = read_events(folder)
+        if events and events[-1].get("event") == "end":
+            return None
+        if events:
+            begun = gone_on_with(folder, None, told.said["scanner"], told.said["approve"])
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            kept = folder / Path(job.name).name
+            kept.write_bytes(data)
+            begun = new_run(
+                kept, self._part_of(job.name), folder, told.named, Looks(marked=come_to),
+                told.calibration, watch, AtDesk(self._talk), port=self._address.spec,
+                leave_heaters=True, **told.said,
+            )  # fmt: skip
+        self._machine.serve(begun.checked)
+        if not events:
+            self._machine.forget_steps()
+        count = len(begun.stops)
+        looks = f"{count} look{'s' if count > 1 else ''}"
+        self._talk.say(f"{job.name} is {'gone on with' if events else 'followed'}: {looks}.")
+        return begun, bool(events), watch
+
+    def _part_of(self, name: str) -> Path:
+        """The template of a job: the one that was named, or the one whose name it begins with."""
+        where = self._told.template
+        if where.is_file():
+            return where
+        stem = Path(name).stem
+        parts = [
+            p for p in where.iterdir() if p.suffix.lower() in PARTS and stem.startswith(p.stem)
+        ]
+        if not parts:
+            raise InputError(f"no part in {where} has a name that {stem!r} begins with")
+        return max(parts, key=lambda path: len(path.stem))
+
+    def _run(self, begun: Begun, going_on: bool, watch: Stopwatch) -> None:
+        """The loop over one print, and what came of it."""
+        page, bars = self._told.page, AtDesk(self._talk)
+        with live_view(
+            page.view, ask=False, title=begun.setting.title, host=page.host, port=page.port,
+            token=page.token,
+        ) as shown:  # fmt: skip
+            report, warmth = print_run(
+                begun, self._machine, shown, watch, bars, word=bars, going_on=going_on,
+                pose=self._told.pose_confirmed,
+            )  # fmt: skip
+        result = written(begun, report, warmth, watch, bars)
+        self._talk.end_prompt()
+        if report.stopped:
+            self._ended(report.stopped)
+        else:
+            self._say_how(report, result)
+
+    def _say_how(self, report: LoopReport, result: dict[str, Any]) -> None:
+        within = report.within_tolerance
+        lines = summary_of_result(result, within_tolerance=within)
+        self._talk.say(" ".join(lines), wrong=not within)
+
+    def _ended(self, why: str) -> None:
+        """A run that is over before its print: told where somebody can decide."""
+        self._talk.say(f"no more looks at this print: {why}", wrong=True)
+        try:
+            self._held = self._machine.rests_at()
+        except LinkError:
+            return
+        if self._held is None:
+            return
+        self._talk.prompt(
+            [f"No more looks at this print: {why}", "It rests; heaters are off."],
+            [
+                ("Heat and go on", "AMREPAIR_RESUME", "warning"),
+                ("Cancel the print", "CANCEL_PRINT", "error"),
+            ],
+        )

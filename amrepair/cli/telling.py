@@ -1,0 +1,97 @@
+"""What became of a run: its result and report, what is said of it, and its exit code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+
+from amrepair.errors import LoopError
+from amrepair.frames import Transform
+from amrepair.loop import LoopReport, Stop, Tape
+from amrepair.loop.learning import told
+from amrepair.loop.setting import Setting
+from amrepair.repair import Stopwatch
+from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
+from amrepair.report.collect import loop_result
+from amrepair.report.folder import RunFolder
+from amrepair.template.port import Template
+from gcode.check import CheckedProgram
+from gcode.cli import console
+from gcode.cli.judging import warnings_json
+from gcode.profiles import PrintSetup
+from gcode.reader import Job
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """All that a run needs, new or gone on with."""
+
+    folder: RunFolder
+    setting: Setting
+    setup: PrintSetup
+    job: Job
+    checked: CheckedProgram
+    template: Template
+    stops: tuple[Stop, ...]
+    tape: Tape
+
+
+def written(
+    begun: Begun,
+    report: LoopReport,
+    warmth: tuple[TemperatureSeries, ...],
+    watch: Stopwatch,
+    bars: console.Bars,
+) -> dict[str, Any]:
+    """Result and report, in the run's folder; the result."""
+    folder, setting, setup = begun.folder, begun.setting, begun.setup
+    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
+    printed = [look for look in report.looks if look.printed]
+    last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
+    result = loop_result(
+        report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
+    )
+    result |= warnings_json(begun.checked.report)
+    folder.write_json("result.json", result)
+    with bars.shown(), bars.stage("report"):
+        data = report_of_loop(
+            report,
+            result,
+            title=f"Run: {setting.title}",
+            setup=setup,
+            about={"job": setting.title},
+            expected=placed_solid(begun.template, setting.placed),
+            temperatures=warmth,
+        )
+        write_report(data, folder.file("report.html"))
+    return result
+
+
+def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: bool) -> None:
+    """What became of it, and the exit code."""
+    folder, within = begun.folder, report.within_tolerance
+    if as_json:
+        console.show_json(result)
+    else:
+        for line in summary_of_result(result, within_tolerance=within):
+            console.out.print(line)
+        if report.calibration is not None:
+            console.out.print(told(report.calibration))
+        console.out.print(f"Report: {folder.file('report.html')}")
+    if report.stopped:
+        console.errors.print(
+            f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
+            f"amrepair loop --resume {folder.path} --approve ask",
+            markup=False,
+        )
+        raise typer.Exit(LoopError.exit_code)
+    if not within:
+        raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def placed_solid(template: Template, placed: Transform) -> Any:
+    """The part as it should be, where it stands."""
+    solid: Any = template.solid()
+    return solid.transform(placed.matrix[:3])

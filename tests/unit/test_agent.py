@@ -1,0 +1,470 @@
+"""The agent beside a small Moonraker: what it prints, asks, refuses, and does after a kill."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import manifold3d as m3
+import pytest
+from loop_bench import PLACE_MM, SIZE_MM, Scripted, scan_of, solid_mesh
+from moonraker_fake import AgentsMoonraker
+from small_klipper import CommandError, SmallKlipper
+
+from amrepair.agent import MACROS, shipped
+from amrepair.cli import running, serving
+from amrepair.cli.running import Page
+from amrepair.loop.marks import marked_stops
+from amrepair.loop.tape import read_events
+from amrepair.loop.travel import park
+from amrepair.postprocess import Asked, mark
+from amrepair.scans import Scan
+from amrepair.template import open_template
+from gcode.check import check
+from gcode.errors import PortBusyError, PrinterError
+from gcode.hosts import PrintReport
+from gcode.hosts.moonraker_job import KlipperJob
+from gcode.hosts.moonraker_session import MoonrakerSession
+from gcode.hosts.secret import ApiKey
+from gcode.hosts.web import Address
+from gcode.profiles import load_setup
+from gcode.reader import job_for
+from gcode.slicing.job import plan_part
+from gcode.writer import write
+
+LAYER_MM, LOOK_LAYER = 0.2, 4
+TOP_MM = LAYER_MM * (LOOK_LAYER + 1)
+PRINTER = ("generic_klipper", "pla", "repair_0.20")
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A marked job, its part, and what stands at its look."""
+
+    plain: str
+    text: str
+    template: Path
+    whole: m3.Manifold
+    broken: m3.Manifold
+
+
+@pytest.fixture(scope="module")
+def ready(tmp_path_factory: pytest.TempPathFactory) -> Ready:
+    here = tmp_path_factory.mktemp("agent")
+    setup = load_setup(*PRINTER)
+    part = m3.Manifold.cube(SIZE_MM)
+    plain = write(plan_part(part.translate(PLACE_MM), setup).toolpath, setup, title="small").text
+    marked = mark(plain, "job.gcode", "klipper", Asked(every=LOOK_LAYER + 1, final=False))
+    assert [place.layer for place in marked.places] == [LOOK_LAYER]
+    solid_mesh(part).export(here / "small.stl")
+    open_template(here / "small.stl").save(here / "small.safetensors")  # type: ignore[attr-defined]
+    (here / "small.stl").unlink()
+    whole = part.trim_by_plane((0.0, 0.0, -1.0), -TOP_MM).translate(PLACE_MM)
+    pocket = m3.Manifold.cube((6.0, 6.0, 1.0)).translate((105.0, 93.0, TOP_MM - 0.8))
+    return Ready(plain, marked.text, here / "small.safetensors", whole, whole - pocket)
+
+
+class Bench:
+    """A printer, and one agent after another."""
+
+    def __init__(self, ready: Ready, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.ready, self.folder = ready, folder
+        (folder / "gcodes").mkdir()
+        (folder / "gcodes" / "small_pla.gcode").write_text(ready.text)
+        self.fake = AgentsMoonraker(folder / "gcodes")
+        self.klipper = self.fake.klipper
+        self.scans = [scan_of(ready.broken), scan_of(ready.whole)]
+        monkeypatch.setattr(serving, "LOOK_S", 0.05)
+        monkeypatch.setattr(running, "_scanner", lambda *given: Scripted(self._scan))
+        self.starts = True
+        self.heard: list[str] = []
+        self.answers: Callable[[str], None] = lambda text: None
+        self.fake.on_said = self._hear
+
+    def _scan(self, number: int) -> Scan:
+        return self.scans.pop(0)
+
+    def _hear(self, text: str) -> None:
+        self.heard.append(text)
+        if self.starts and "the agent is here" in text:
+            self.starts = False
+            self.fake.start("small_pla.gcode")
+        self.answers(text)
+
+    def agent(self, approve: str = "auto", **changed: Any) -> None:
+        said = {"scanner": "watch:none", "approve": approve, "scan_timeout_s": 1.0, "sound": (),
+                "seed": 0}  # fmt: skip
+        told = {"template": self.ready.template, "out": self.folder / "runs", "named": PRINTER,
+                "calibration": None, "page": Page(False, "", 0, None), "once": True,
+                "pose_confirmed": False, "said": said}  # fmt: skip
+        serving.serve(serving.Served(self.fake.url, **{**told, **changed}))
+
+    def told(self) -> str:
+        return "\n".join(self.klipper.said)
+
+    def executed(self) -> list[str]:
+        """What moved or heated, in order; M400 only waits."""
+        return [line for line in self.klipper.executed if line != "M400"]
+
+    def events(self) -> list[dict[str, Any]]:
+        (run,) = (self.folder / "runs").iterdir()
+        return read_events(run)
+
+
+@pytest.fixture
+def bench(ready: Ready, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    made = Bench(ready, tmp_path, monkeypatch)
+    with made.fake:
+        yield made
+
+
+class Killed(BaseException):
+    """What ends an agent without its knowing."""
+
+
+class Killer:
+    """Kills the agent at its n-th step of a repair, before or after it has reached the printer."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, step: int, *, reaches: bool) -> None:
+        self.steps, self.dead = 0, False
+        original = MoonrakerSession.call
+
+        def call(session: MoonrakerSession, method: str, *given: Any, **named: Any) -> Any:
+            """What a dead agent says goes nowhere."""
+            if self.dead:
+                raise Killed
+            if given and "_AMREPAIR_STEP PROGRAM" in str(given[0]):
+                self.steps += 1
+                if self.steps == step:
+                    self.dead = True
+                    if reaches:
+                        original(session, method, *given, **named)
+                    raise Killed
+            return original(session, method, *given, **named)
+
+        monkeypatch.setattr(MoonrakerSession, "call", call)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(ready: Ready, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """What is executed where nobody is killed: found, repaired, gone on with."""
+    with pytest.MonkeyPatch.context() as patch:
+        made = Bench(ready, tmp_path_factory.mktemp("whole"), patch)
+        with made.fake:
+            made.agent()
+            steps = [s for s in made.fake.scripts if s.startswith("_AMREPAIR_STEP")]
+            assert len(steps) == STEPS, len(steps)
+    assert made.klipper.print_state == "complete"
+    assert "27.5 mm³ missing (a void)" in made.told()
+    looks = [event for event in made.events() if event["event"] == "look"]
+    assert [look["printed"] for look in looks] == [True, False]
+    return made.executed()
+
+
+STEPS = 36  # park, 33 of the repair, the way back, the modes
+
+
+def test_a_void_is_found_repaired_and_the_print_goes_on(
+    ready: Ready, undisturbed: list[str]
+) -> None:
+    job = [line for line in ready.text.split("\n") if line and line[0] in "GMT"]
+    rest = iter(undisturbed)
+    assert all(line in rest for line in job), "every line of the job, in its order"
+    more = len(undisturbed) - len(job)
+    assert 500 < more < 2000, "and the repair between them"
+
+
+@pytest.mark.parametrize(
+    ("step", "reaches"),
+    [
+        (17, True),
+        *(
+            pytest.param(step, reaches, marks=pytest.mark.slow)
+            for step in (1, 17, STEPS - 1)
+            for reaches in (False, True)
+            if (step, reaches) != (17, True)
+        ),
+    ],
+)
+def test_an_agent_that_was_killed_goes_on_and_nothing_is_printed_twice(
+    bench: Bench, undisturbed: list[str], monkeypatch: pytest.MonkeyPatch, step: int, reaches: bool
+) -> None:
+    killer = Killer(monkeypatch, step, reaches=reaches)
+    with pytest.raises(Killed):
+        bench.agent()
+    assert bench.klipper.print_state == "paused"
+    killer.dead = False
+    bench.agent()
+    assert bench.klipper.print_state == "complete"
+    assert bench.executed() == undisturbed
+    assert "gone on with" in bench.told()
+
+
+@pytest.mark.slow
+def test_an_agent_that_is_asked_to_end_leaves_klippers_print_alone(bench: Bench) -> None:
+    """As systemd does it, while Klipper prints; started again it goes on."""
+    bench.scans = [scan_of(bench.ready.whole)]
+    bench.klipper.pause_s = 0.001
+    ended: list[str] = []
+
+    def stop(text: str) -> None:
+        if "is followed" in text and not ended:
+            ended.append(text)
+            while bench.klipper.modes.position_mm.get("Z", 0.0) < LAYER_MM:
+                time.sleep(0.001)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    bench.answers = stop
+    with pytest.raises(KeyboardInterrupt):
+        bench.agent()
+    assert bench.klipper.print_state == "printing"
+    assert bench.klipper.modes.hotend_c > 200
+    bench.agent()
+    assert bench.klipper.print_state == "complete"
+    assert [e["printed"] for e in bench.events() if e["event"] == "look"] == [False]
+
+
+@pytest.mark.slow
+def test_moonraker_goes_away_in_a_repair(bench: Bench, undisturbed: list[str]) -> None:
+    """The answers to two steps are lost with the socket: one was carried out, one not."""
+    run_script, lost = bench.klipper.run_script, []
+
+    def cut(script: str) -> None:
+        if script.startswith("_AMREPAIR_STEP") and len(lost) < 2:
+            lost.append(script)
+            if len(lost) == 1:
+                run_script(script)
+            bench.fake.server.drop_sockets()
+            if len(lost) == 2:
+                return
+        else:
+            run_script(script)
+
+    bench.klipper.run_script = cut  # type: ignore[method-assign]
+    bench.agent()
+    assert len(lost) == 2
+    assert bench.executed() == undisturbed
+
+
+@pytest.mark.slow
+def test_it_asks_on_the_printers_screens(bench: Bench, undisturbed: list[str]) -> None:
+    buttons: list[str] = []
+
+    def press(text: str) -> None:
+        if "footer_button Yes" in text:
+            buttons.append(text.split("|")[1])
+        elif text == "// action:prompt_show" and buttons:
+            bench.klipper.run_script("AMREPAIR_STATUS")
+            bench.klipper.run_script("AMREPAIR_APPROVE ANSWER=no QUESTION=99")
+            bench.klipper.run_script("AMREPAIR_APPROVE ANSWER=perhaps")
+            bench.klipper.run_script(buttons.pop())
+
+    bench.answers = press
+    bench.agent("ask")
+    assert bench.executed() == undisturbed
+    told = bench.told()
+    assert "action:prompt_text Print this repair?" in told
+    assert "action:prompt_text missing: 27.5 mm³ in 1 region" in told
+    assert "a question waits." in told
+    assert "no question waits for this answer." in told
+    assert "ANSWER is yes or no." in told
+
+
+@pytest.mark.slow
+def test_no_is_no(bench: Bench, ready: Ready) -> None:
+    def press(text: str) -> None:
+        if text == "// action:prompt_show" and "Print this repair?" in bench.told():
+            bench.klipper.run_script("AMREPAIR_APPROVE ANSWER=no")
+
+    bench.answers = press
+    bench.agent("ask")
+    assert bench.klipper.print_state == "complete"
+    assert not [event for event in bench.events() if event.get("kind") == "repair"]
+
+
+def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
+    """Nothing goes on until somebody has decided; then its later looks hold nothing up."""
+    looks = Asked(at_z_mm=(TOP_MM, TOP_MM + LAYER_MM), final=False)
+    twice = mark(bench.ready.plain, "job.gcode", "klipper", looks)
+    assert [place.layer for place in twice.places] == [LOOK_LAYER, LOOK_LAYER + 1]
+    (bench.folder / "gcodes" / "small_pla.gcode").write_text(twice.text)
+    moved = bench.ready.whole.translate((6.0, 0.0, 0.0))
+    bench.scans = [scan_of(moved), scan_of(moved)]
+    ended: list[str] = []
+
+    def press(text: str) -> None:
+        if "footer_button Cancel the print" in text:
+            heat = bench.klipper.modes
+            ended.append(f"{heat.hotend_c:g} {heat.bed_c:g} {bench.klipper.print_state}")
+            time.sleep(0.3)  # six times as long as from look to look: it is left alone
+            assert bench.klipper.print_state == "paused"
+            bench.klipper.run_script("AMREPAIR_RESUME")
+
+    bench.answers = press
+    bench.agent()
+    assert ended == ["0 0 paused"], "heaters are off and the print rests"
+    assert "no more looks at this print" in bench.told()
+    assert bench.klipper.print_state == "complete", "somebody let it go on"
+    back = bench.executed()[bench.executed().index("M140 S0") :]
+    assert back[1:4] == ["M107", "M190 S60", "M109 S210"]
+
+
+@pytest.mark.slow
+def test_somebody_resumes_in_the_midst_of_a_repair(bench: Bench) -> None:
+    """Nothing of the repair comes between the job's own lines."""
+    carried, seen = bench.klipper.run_script, []
+
+    def resumed(script: str) -> None:
+        carried(script)
+        if script.startswith("_AMREPAIR_STEP"):
+            seen.append(len(bench.klipper.executed))
+            if len(seen) == 3:
+                bench.klipper.pause_s = 0.002
+                carried("RESUME")
+
+    bench.klipper.run_script = resumed  # type: ignore[method-assign]
+    bench.agent()
+    assert len(seen) == 3
+    assert "the print goes on" in bench.told()
+    assert "M104 S0" not in bench.executed()[seen[2] : seen[2] + 5], "its heaters are left alone"
+    assert bench.klipper.print_state == "complete"
+
+
+@pytest.mark.slow
+def test_klipper_restarts_while_the_print_rests(bench: Bench) -> None:
+    carried, steps = bench.klipper.run_script, []
+
+    def restarted(script: str) -> None:
+        if script.startswith("_AMREPAIR_STEP"):
+            steps.append(script)
+            if len(steps) == 3:
+                bench.klipper.reset()
+                bench.fake.server.drop_sockets()
+                return
+        carried(script)
+
+    bench.klipper.run_script = restarted  # type: ignore[method-assign]
+    bench.agent()
+    done = len(bench.klipper.executed)
+    assert "no more looks at this print" in bench.told()
+    assert bench.klipper.executed[done:] == []
+    assert len(steps) == 3, "nothing more of the repair is sent to a printer that forgot its place"
+
+
+def test_what_is_asked_at_the_wrong_time_is_one_sentence(ready: Ready, tmp_path: Path) -> None:
+    klipper = SmallKlipper(tmp_path, shipped(MACROS))
+    (tmp_path / "job.gcode").write_text("G28\nAMREPAIR_SCAN\n" + "G1 X1\n" * 5)
+    klipper.run_script("AMREPAIR_SCAN LAYER=3")
+    assert klipper.said == [
+        "!! AMREPAIR_SCAN: nothing is being printed, so there is nothing to look at."
+    ]
+    klipper.run_script("SDCARD_PRINT_FILE FILENAME=job.gcode")
+    worker = klipper.worker
+    if worker is not None:
+        worker.join()
+    assert "in the middle of a layer nothing can be judged" in klipper.said[-1]
+    assert klipper.print_state == "complete", "the print was not stopped for it"
+    with pytest.raises(CommandError, match="line 1 was to follow, and line 1"):
+        klipper.run_script("_AMREPAIR_STEP PROGRAM=5 FROM=0 TO=9")
+
+
+def test_a_second_agent_is_refused(bench: Bench) -> None:
+    bench.fake.agent_there = True
+    with pytest.raises(PortBusyError, match="another agent named 'amrepair' serves the printer"):
+        bench.agent()
+
+
+@pytest.mark.parametrize("trouble", ["no look", "no part"])
+def test_a_print_that_cannot_be_looked_at_is_printed(
+    bench: Bench, trouble: str, tmp_path: Path
+) -> None:
+    """One sentence; and a look that nobody can take holds nothing up."""
+    path = bench.folder / "gcodes" / "small_pla.gcode"
+    if trouble == "no look":
+        path.write_text(bench.ready.text.replace(";AMREPAIR_LOOK", ";look"))
+        bench.agent()
+        assert "has no looks in it, name 'amrepair postprocess'" in bench.told()
+    else:
+        (tmp_path / "parts").mkdir()
+        bench.agent(template=tmp_path / "parts")
+        assert "no part in" in bench.told()
+    assert bench.klipper.print_state == "complete"
+    assert not [line for line in bench.klipper.said if "Traceback" in line]
+
+
+@pytest.fixture
+def followed(bench: Bench) -> Iterator[KlipperJob]:
+    """A port on a job that somebody has begun."""
+    printer = KlipperJob(Address.parse(f"moonraker+{bench.fake.url}"), ApiKey(""))
+    printer.connect()
+    bench.klipper.pause_s = 0.001
+    bench.fake.start("small_pla.gcode")
+    printer.follow("small_pla.gcode", bench.ready.text.encode())
+    setup = load_setup(*PRINTER)
+    printer.serve(check(job_for(bench.ready.text, setup.printer).program, setup))
+    yield printer
+    printer.close()
+
+
+def test_a_pause_of_the_users_own_is_no_look(bench: Bench, followed: KlipperJob) -> None:
+    setup = load_setup(*PRINTER)
+    job = job_for(bench.ready.text, setup.printer)
+    (look,) = marked_stops(job, "job")
+    until_s = time.monotonic() + 10.0
+    while bench.klipper.modes.position_mm.get("Z", 0.0) < LAYER_MM:  # it lays its first beads
+        assert time.monotonic() < until_s
+        time.sleep(0.001)
+    bench.klipper.run_script("PAUSE")
+    done: list[PrintReport] = []
+    checked = check(job.program, setup)
+    printing = threading.Thread(
+        target=lambda: done.append(followed.print(checked, lines=range(look.line)))
+    )
+    printing.start()
+    printing.join(0.5)
+    assert printing.is_alive(), "it waits for whoever has paused it"
+    bench.klipper.run_script("RESUME")
+    printing.join(20.0)
+    (report,) = done
+    assert (report.ok, report.next_line) == (True, look.line)
+    assert followed.rests_at_look()
+
+
+def test_a_layer_that_was_printed_by_us_is_left_out(bench: Bench, followed: KlipperJob) -> None:
+    """Klipper goes on behind it, from where our own program has ended."""
+    setup = load_setup(*PRINTER)
+    job = job_for(bench.ready.text, setup.printer)
+    checked = check(job.program, setup)
+    (look,) = marked_stops(job, "job")
+    followed.print(checked, lines=range(look.line))
+    own, parked = park(setup, job.state_after(look.line))
+    followed.print(own)
+    before = len(bench.klipper.executed)
+    behind = job.layers[LOOK_LAYER + 1].end_line
+    followed.print(checked, lines=range(behind, bench.ready.text.count("\n")))
+    after = [line for line in bench.klipper.executed[before:] if line != "M400"]
+    x_mm, y_mm, z_mm = parked.position_mm
+    assert after[2:4] == [f"G1 X{x_mm:.3f} Y{y_mm:.3f} F6000", f"G1 Z{z_mm:.3f} F600"]
+    lines = bench.ready.text.split("\n")[behind:]
+    wanted = [line.partition(";")[0].strip() for line in lines if line and line[0] in "GMT"]
+    assert after[-len(wanted) :] == wanted
+    assert len(after) - len(wanted) < 10, "and nothing of the layer before"
+
+
+def test_nothing_is_printed_once_the_motors_were_let_go(bench: Bench, followed: KlipperJob) -> None:
+    setup = load_setup(*PRINTER)
+    job = job_for(bench.ready.text, setup.printer)
+    (look,) = marked_stops(job, "job")
+    followed.print(check(job.program, setup), lines=range(look.line))
+    bench.klipper.homed = ""  # Klipper's idle_timeout
+    own, _ = park(setup, job.state_after(look.line))
+    before = len(bench.klipper.executed)
+    with pytest.raises(PrinterError, match="the motors were let go while the print rested"):
+        followed.print(own)
+    assert len(bench.klipper.executed) == before
