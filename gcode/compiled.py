@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 import os
 import secrets
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,26 @@ _TOKEN = secrets.token_hex(4)
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
+
+
+def _load_without_scipy() -> None:
+    """Load what numba loads with its first kernel, without SciPy's linear algebra.
+
+    It looks whether there is a BLAS for inner products of vectors that its own helpers make, which
+    no kernel here has; to look takes as long as to load all kernels of a slice, and 25 MB. A kernel
+    that solves equations makes it look again when it is compiled or called.
+    """
+    if "scipy.linalg" in sys.modules:
+        return
+    # "there is none", to `import`
+    sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
+    try:
+        pass
+    finally:
+        del sys.modules["scipy.linalg"]
+
+
+_load_without_scipy()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
@@ -182,14 +182,16 @@ def read_job(
     if isinstance(program, str):
         program = Program(program, dialect)
     progress("read", 0.0, READ_STEPS)
-    lines = program.text.split("\n")
-    kinds, codes, words = _tokens(program.text, len(lines))
+    data, starts = _lines(program.text)
+    kinds, codes, words = _tokens(data, starts)
+    comments = _comments(data, starts, kinds)
+    del data
     progress("read", 1.0, READ_STEPS)
-    states = np.zeros((len(lines) + 1, kernels.STATES))
+    states = np.zeros((len(starts), kernels.STATES))
     states[0, :3] = np.nan
     states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
     states[0, kernels.S_ACC] = np.nan
-    pushed = np.zeros(len(lines))
+    pushed = np.zeros(len(kinds))
     both, g91 = program.dialect in _BOTH_MODES, program.dialect in _G91_MOVES_E
     kernels.run(kinds, codes, words, both, g91, states, pushed)
     progress("read", 2.0, READ_STEPS)
@@ -200,11 +202,12 @@ def read_job(
     start, end = np.zeros((count, 3)), np.zeros((count, 3))
     filament, owner = np.zeros(count), np.zeros(count, np.int64)
     kernels.beads(kinds, codes, words, states, pushed, start, end, filament, owner, False)
+    del words  # as much as all the rest
     known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
-    start, end, filament, owner = start[known], end[known], filament[known], owner[known]
+    if not known.all():
+        start, end, filament, owner = start[known], end[known], filament[known], owner[known]
     progress("read", 3.0, READ_STEPS)
-    comments = [(int(i), lines[i]) for i in np.flatnonzero(kinds == ord(";"))]
-    layers = _layers(comments, end, owner, filament, len(lines))
+    layers = _layers(comments, end, owner, filament, len(kinds))
     beads = _beads(comments, layers, start, end, filament, owner, filament_diameter_mm)
     progress("read", READ_STEPS, READ_STEPS)
     return Job(
@@ -242,12 +245,29 @@ def job_for(program: Program | str, printer: PrinterProfile) -> Job:
     )
 
 
-def _tokens(
-    text: str, count: int
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
+def _lines(text: str) -> tuple[UInt8[np.ndarray, " bytes"], Int[np.ndarray, " n1"]]:
+    """A text's bytes, and where each line begins, with the end."""
     data = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
-    breaks = np.flatnonzero(data == ord("\n")) + 1
-    starts = np.concatenate([[0], breaks, [len(data)]]).astype(np.int64)[: count + 1]
+    return data, np.concatenate([[0], np.flatnonzero(data == ord("\n")) + 1, [len(data)]])
+
+
+def _comments(
+    data: UInt8[np.ndarray, " bytes"],
+    starts: Int[np.ndarray, " n1"],
+    kinds: Int[np.ndarray, " n"],
+) -> list[tuple[int, str]]:
+    """Lines that are comments, with their numbers, from 0."""
+    which = np.flatnonzero(kinds == ord(";")).tolist()
+    return [
+        (i, str(data[starts[i] : starts[i + 1]].tobytes(), "utf-8").removesuffix("\n"))
+        for i in which
+    ]
+
+
+def _tokens(
+    data: UInt8[np.ndarray, " bytes"], starts: Int[np.ndarray, " n1"]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
+    count = len(starts) - 1
     kinds, codes = np.zeros(count, np.int64), np.zeros(count, np.int64)
     words = np.zeros((count, len(kernels.LETTERS)))
     letters = np.frombuffer(kernels.LETTERS, np.uint8)

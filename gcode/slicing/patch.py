@@ -18,8 +18,8 @@ from gcode.errors import SliceError
 from gcode.moves import Toolpath
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
-from gcode.slicing.job import Unprintable
 from gcode.slicing.job_lines import JobLines
+from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch_laying import after_first, begin, emit, end
 from gcode.slicing.patch_left import (

@@ -16,8 +16,8 @@ from gcode.moves import Role
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import ROUND_LOSS, Bead, spacing_of
 from gcode.slicing.infill import ring_beads, solid_fill
-from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES
 from gcode.slicing.job_lines import JobPieces, gathered
+from gcode.slicing.layer_plan import LEAST_NOZZLES, MOST_NOZZLES
 from gcode.slicing.medial import fill_thin
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach

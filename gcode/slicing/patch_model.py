@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
 from gcode.slicing.job_lines import JobColumns, JobLines
-from gcode.slicing.layers import mesh_of
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 from gcode.surfaces import raster_kernels as kernels

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 
 from gcode.profiles import PrintSetup
 from gcode.slicing.infill import SOLID_ANGLES_RAD
-from gcode.slicing.job import Unprintable
 from gcode.slicing.job_lines import runs_of
+from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_beads import (
     BOND_RATIO,
     LEAST_THICK_MM,
