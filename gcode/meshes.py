@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from manifold3d import CrossSection, FillRule
 
-from gcode import meshes_kernels as kernels
+from gcode.meshes_kernels import bodies_of, contours_at, crossing, paired
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class ClosedMesh:
 
     def volume(self) -> float:
         """Enclosed, mm³."""
-        return float(kernels.bodies_of(self.vertices_mm, self.faces, self.across)[0].sum())
+        return float(bodies_of(self.vertices_mm, self.faces, self.across)[0].sum())
 
     def bounding_box(self) -> tuple[float, ...]:
         """(x_min, y_min, z_min, x_max, y_max, z_max)."""
@@ -65,14 +65,14 @@ class Cuts:
     @classmethod
     def of(cls, mesh: ClosedMesh, heights_mm: Float[np.ndarray, " k"]) -> Cuts:
         """Ready to be asked: which faces cross which height is known."""
-        first, which = kernels.crossing(mesh.vertices_mm, mesh.faces, heights_mm)
+        first, which = crossing(mesh.vertices_mm, mesh.faces, heights_mm)
         return cls(mesh, heights_mm, first, which, np.full(len(mesh.faces), -1, np.int32))
 
     def at(self, index: int) -> Any:
         """What is inside at a height, as a `CrossSection`: once round or more, holes left out."""
         mesh, which = self.mesh, self._which[self._first[index] : self._first[index + 1]]
         self._done[which] = -1
-        points, starts = kernels.contours_at(
+        points, starts = contours_at(
             mesh.vertices_mm, mesh.faces, mesh.across, which,
             float(self.heights_mm[index]), self._done, index,
         )  # fmt: skip
@@ -95,7 +95,7 @@ def closed_mesh(solid: Any) -> ClosedMesh:
         return solid
     vertices_mm, faces = mesh_of(solid)
     faces = faces.astype(np.int32)
-    across, shared = kernels.paired(faces)
+    across, shared = paired(faces)
     if shared < 0:
         raise ValueError("a Manifold's faces close no surface")
     return ClosedMesh(vertices_mm, faces, across)
@@ -110,11 +110,11 @@ def bodies_apart(
     faces. What else may be a solid takes more than a look at its edges.
     """
     faces = np.ascontiguousarray(faces, np.int32)
-    across, shared = kernels.paired(faces)
+    across, shared = paired(faces)
     if shared != 0:
         return None
     mesh = ClosedMesh(np.ascontiguousarray(vertices_mm, np.float64), faces, across)
-    volumes, boxes = kernels.bodies_of(mesh.vertices_mm, faces, across)
+    volumes, boxes = bodies_of(mesh.vertices_mm, faces, across)
     wholes = int((volumes > 0).sum())
     if wholes < 2 or wholes < len(volumes):  # which cavity belongs to which body is not told
         return mesh

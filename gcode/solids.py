@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from gcode import meshes_kernels
 from gcode.errors import InputError
 from gcode.meshes import ClosedMesh, bodies_apart, closed_mesh
+from gcode.meshes_kernels import index_of_corners, put_in_table
 from gcode.solids_kernels import first_of_each
 from gcode.threemf import read_3mf
 
@@ -149,10 +149,10 @@ def _shared_corners(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarra
             most = n + len(corners)
             if 2 * most > len(table):
                 table = np.full(1 << (2 * most - 1).bit_length(), -1, np.int32)
-                meshes_kernels.put_in_table(vertices, n, table, 10.0**EQUAL_DIGITS)
+                put_in_table(vertices, n, table, 10.0**EQUAL_DIGITS)
             if most > len(vertices):
                 vertices = np.concatenate([vertices[:n], np.empty((most, 3))])
-            n = meshes_kernels.index_of_corners(
+            n = index_of_corners(
                 corners, vertices, n, table, 10.0**EQUAL_DIGITS, faces[start:].reshape(-1)
             )
     return vertices[:n].copy(), faces

@@ -92,6 +92,7 @@ def slice_solid(
         "beads_mm3": round(made.beads_mm3, 4),
         "filament_mm": round(cost.filament_mm, 2),
         "print_time_s": round(cost.print_time_s, 1),
+        "first_pass": made.first_pass,
         "left_out": [
             {"volume_mm3": round(u.volume_mm3, 4), "box_mm": list(u.box_mm), "reason": u.reason}
             for u in made.left
@@ -108,7 +109,7 @@ class _Made:
     """A program, and of what it was made from no more than is told of it.
 
     `moved_mm` is where it was moved to, `where` says so; `field` is what stands there, `left` what
-    is left out of it.
+    is left out of it, `first_pass` how it begins on what is cold.
     """
 
     program: Program
@@ -118,6 +119,7 @@ class _Made:
     where: str | None
     field: HeightField | None = None
     left: tuple[Any, ...] = ()
+    first_pass: str | None = None
 
 
 @gives_back
@@ -156,7 +158,7 @@ def _patch(
     left = (*plan.unreachable, *plan.unprintable)
     program = _written(plan.toolpath, setup, solid, left, bars)
     volumes = plan.toolpath.volume_mm3, float(shape.volume())
-    return _Made(program, *volumes, moved_mm, None, field, left)
+    return _Made(program, *volumes, moved_mm, None, field, left, plan.first_pass)
 
 
 def _written(
@@ -188,6 +190,8 @@ def _tell(result: dict[str, Any], where: str | None) -> None:
     )
     if where is not None:
         console.out.print(where, markup=False)
+    if result["first_pass"] is not None:
+        console.out.print(result["first_pass"].replace(" C", " °C"), markup=False)
     for thing in result["left_out"]:
         console.out.print(f"left out: {thing['volume_mm3']:.3f} mm³: {thing['reason']}")
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gcode import meshes_kernels
 from gcode.errors import SliceError
 from gcode.meshes import mesh_of
+from gcode.meshes_kernels import level_faces
 from gcode.profiles import PrintSetup
 from gcode.slicing import volume_kernels as kernels
 
@@ -137,7 +137,7 @@ def plan_slabs(solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float) -> tup
 
 def _horizontal_faces(solid: Any) -> list[float]:
     """Heights of level faces that are large enough to matter."""
-    z, areas = meshes_kernels.level_faces(*mesh_of(solid), _SAME_MM)
+    z, areas = level_faces(*mesh_of(solid), _SAME_MM)
     if not len(z):
         return []
     heights, group = np.unique(np.round(z, 3), return_inverse=True)
