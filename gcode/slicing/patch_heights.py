@@ -23,6 +23,9 @@ DEEP_RATIO = 1.6
 # Of columns over a hollow, as many as open to the head at one height are worth a pass there.
 OPENING_MM2 = 1.0
 OPENS_BELOW_MM = 0.1  # half a layer: over less of a hollow the last pass goes anyway
+# Of a layer: what hangs spreads to both sides of its line, held there or not, and a strand that is
+# drawn just above it finds no room.
+APART_LAYERS = 0.5
 # A flat top: as much area, as wide, within so little height.
 FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
 ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
@@ -102,8 +105,9 @@ class Heights:
             ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
         others = np.sort(np.concatenate([tops, flats]))
         alone = np.zeros(model.shape, dtype=bool)
-        opened = _openings(model, others, most_mm, grid.layer_height_mm)
-        if openings is Openings.ALONE and len(opened):
+        keep = openings is Openings.ALONE
+        opened = _openings(model, others, most_mm, grid.layer_height_mm, alone=keep)
+        if keep and len(opened):
             alone = _hollow(model, others, most_mm)
         return cls(tops, flats, opened, alone, ends, most_mm, grid.layer_height_mm)
 
@@ -121,9 +125,12 @@ class Heights:
         here = self.ends_mm > z_mm + ROUNDING_MM if on_grid else self.ends_mm == z_mm
         deep_mm = DEEP_RATIO * self.most_mm
         opens = bool((np.abs(self.openings_mm - z_mm) < ROUNDING_MM).any())
-        if self.alone.any() and z_mm < self.openings_mm[-1] + ROUNDING_MM:
-            more = self.openings_mm[self.openings_mm > z_mm + ROUNDING_MM]
-            here &= self.alone == opens
+        if self.alone.any() and z_mm < self.openings_mm[-1] + APART_LAYERS * self.layer_mm:
+            apart_mm = self.openings_mm[-1] + APART_LAYERS * self.layer_mm
+            more = np.concatenate([self.openings_mm, self.tops_mm[self.tops_mm >= apart_mm]])
+            more = more[more > z_mm + ROUNDING_MM]
+            ends = state.planar_top_mm <= z_mm + ROUNDING_MM
+            here &= (self.alone == opens) | (self.alone & ends)
             if len(more):
                 following = np.where(self.alone, np.minimum(self.ends_mm, more[0]), following)
         elif opens:
@@ -160,25 +167,34 @@ def _flats(model: PatchModel, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndar
 
 
 def _openings(
-    model: PatchModel, tops_mm: Float[np.ndarray, " n"], most_mm: float, layer_mm: float
+    model: PatchModel,
+    tops_mm: Float[np.ndarray, " n"],
+    most_mm: float,
+    layer_mm: float,
+    *,
+    alone: bool,
 ) -> Float[np.ndarray, " m"]:
     """Heights from the lowest at which the head gets into hollows, at least a layer apart.
 
     There beads grow out from what holds them by one more line before the next layer of the job:
     what lies under them is lost, and up to a layer less of it. A layer hangs under each, so that
-    nothing between two of them is lost. A pass of the job's a little higher takes the place of one;
-    a little lower, the head is not in yet.
+    nothing between two of them is lost. Unless hollows keep to them `alone`, a pass of the job's a
+    little higher takes the place of one, and so does one a little lower where the head is in: its
+    beads lie there already.
     """
     at_mm, area_mm2 = _opening(model, tops_mm, most_mm)
+    if not len(at_mm):
+        return np.zeros(0)
+    others = np.zeros(0) if alone else tops_mm[tops_mm >= at_mm[0] - ROUNDING_MM]
     found: list[float] = []
     last_mm, open_mm2 = -np.inf, 0.0
     for z_mm, more_mm2 in zip(at_mm.tolist(), area_mm2.tolist(), strict=True):
         open_mm2 += more_mm2
         if open_mm2 < OPENING_MM2 or z_mm < last_mm + layer_mm - ROUNDING_MM:
             continue
-        later = tops_mm[tops_mm >= z_mm - ROUNDING_MM]
-        if len(later) and later[0] - z_mm < LEAST_THICK_MM:
-            last_mm = float(later[0])
+        near = others[np.abs(others - z_mm) < LEAST_THICK_MM]
+        if len(near):
+            last_mm = float(near[-1])
         else:
             last_mm = z_mm
             found.append(z_mm)
