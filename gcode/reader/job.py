@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile
 from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
+from gcode.reader.lines import comments_of, lines_of, tokens_of
 from gcode.units import filament_area_mm2
 
 # G90 and G91 set the extruder's mode too in Marlin alone (printers.md of each firmware's docs).
@@ -182,9 +183,9 @@ def read_job(
     if isinstance(program, str):
         program = Program(program, dialect)
     progress("read", 0.0, READ_STEPS)
-    data, starts = _lines(program.text)
-    kinds, codes, words = _tokens(data, starts)
-    comments = _comments(data, starts, kinds)
+    data, starts = lines_of(program.text)
+    kinds, codes, words = tokens_of(data, starts)
+    comments = comments_of(data, starts, kinds)
     del data
     progress("read", 1.0, READ_STEPS)
     states = np.zeros((len(starts), kernels.STATES))
@@ -243,36 +244,6 @@ def job_for(program: Program | str, printer: PrinterProfile) -> Job:
         filament_diameter_mm=printer.filament_diameter_mm,
         dialect=program.dialect,
     )
-
-
-def _lines(text: str) -> tuple[UInt8[np.ndarray, " bytes"], Int[np.ndarray, " n1"]]:
-    """A text's bytes, and where each line begins, with the end."""
-    data = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
-    return data, np.concatenate([[0], np.flatnonzero(data == ord("\n")) + 1, [len(data)]])
-
-
-def _comments(
-    data: UInt8[np.ndarray, " bytes"],
-    starts: Int[np.ndarray, " n1"],
-    kinds: Int[np.ndarray, " n"],
-) -> list[tuple[int, str]]:
-    """Lines that are comments, with their numbers, from 0."""
-    which = np.flatnonzero(kinds == ord(";")).tolist()
-    return [
-        (i, str(data[starts[i] : starts[i + 1]].tobytes(), "utf-8").removesuffix("\n"))
-        for i in which
-    ]
-
-
-def _tokens(
-    data: UInt8[np.ndarray, " bytes"], starts: Int[np.ndarray, " n1"]
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
-    count = len(starts) - 1
-    kinds, codes = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    words = np.zeros((count, len(kernels.LETTERS)))
-    letters = np.frombuffer(kernels.LETTERS, np.uint8)
-    kernels.parse(data, starts, letters, codes, kinds, words)
-    return kinds, codes, words
 
 
 def _layers(
