@@ -39,6 +39,10 @@ class SliceError(GcodeError):
     """A solid that cannot be turned into beads."""
 
 
+class WorkerError(GcodeError):
+    """A process that shared a command's work ended before it was done."""
+
+
 class CheckRefusedError(GcodeError):
     """A program that the checker refuses.
 

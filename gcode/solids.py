@@ -7,6 +7,7 @@ in one sentence. Nothing is scaled, turned or filled.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gcode.errors import InputError
+from gcode.meshes import ClosedMesh, bodies_apart, closed_mesh
+from gcode.meshes_kernels import index_of_corners, put_in_table
 from gcode.solids_kernels import first_of_each
 from gcode.threemf import read_3mf
 
@@ -24,6 +27,7 @@ SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
 WELD_RATIO = 1e-6  # of the extent: STL holds single precision
 EQUAL_DIGITS = 8  # of mm
 STL_HEAD = 84
+STL_PIECE = 1 << 15  # triangles that are read at a time
 STL_TEXT_BYTES = 256  # spaces before a text file's first word
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("of_colour", "<u2")])
 # trimesh's readers raise whatever their parsing hits; these are the kinds seen in malformed files
@@ -86,6 +90,81 @@ def read_solid(path: Path) -> Any:
             "out?"
         )
     return solid
+
+
+def read_closed(path: Path) -> ClosedMesh:
+    """The same solid as `read_solid`'s as a mesh alone, which is what slicing needs.
+
+    A file of one closed body, or of several that lie apart, is read without a `Manifold`: for
+    700,000 triangles in a quarter of the time and a tenth of the memory.
+
+    Raises
+    ------
+    InputError
+        As `read_solid`.
+    """
+    mesh = None
+    if path.is_file():
+        with contextlib.suppress(*READ_ERRORS):  # told by `read_solid`, in one sentence
+            mesh = _as_it_is(path)
+    return closed_mesh(read_solid(path)) if mesh is None else mesh
+
+
+def _as_it_is(path: Path) -> ClosedMesh | None:
+    """A file's mesh where it is closed as it is, and no more need be asked."""
+    if path.suffix.lower() == ".stl":
+        shared = _shared_corners(path)
+    else:
+        shared = read_triangles(path) if path.suffix.lower() in SUFFIXES else None
+    if shared is None or len(shared[1]) == 0 or not np.isfinite(shared[0]).all():
+        return None
+    if float(np.abs(shared[0]).max()) > LARGEST_MM:
+        return None
+    mesh = bodies_apart(*shared)
+    if mesh is None:
+        return None
+    extent = float(np.ptp(mesh.vertices_mm, axis=0).max())
+    return mesh if mesh.volume() > 1e-9 * extent**3 else None
+
+
+def _shared_corners(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]] | None:
+    """Vertices, equal ones once, and faces of a binary STL file; None where it is none.
+
+    Read in pieces: corners by themselves take six times what the shared ones do.
+    """
+    count = _triangles_promised(path)
+    if count is None:
+        return None
+    faces = np.empty((count, 3), np.int32)
+    vertices = np.empty((min(STL_PIECE, count) * 3, 3))
+    table = np.full(1 << 16, -1, np.int32)
+    n = 0
+    with path.open("rb") as file:
+        file.seek(STL_HEAD)
+        for start in range(0, count, STL_PIECE):
+            piece = np.fromfile(file, STL_TRIANGLE, min(STL_PIECE, count - start))
+            corners = np.ascontiguousarray(piece["corners"]).reshape(-1, 3)
+            if not (np.abs(corners) <= LARGEST_MM).all():
+                return None
+            most = n + len(corners)
+            if 2 * most > len(table):
+                table = np.full(1 << (2 * most - 1).bit_length(), -1, np.int32)
+                put_in_table(vertices, n, table, 10.0**EQUAL_DIGITS)
+            if most > len(vertices):
+                vertices = np.concatenate([vertices[:n], np.empty((most, 3))])
+            n = index_of_corners(
+                corners, vertices, n, table, 10.0**EQUAL_DIGITS, faces[start:].reshape(-1)
+            )
+    return vertices[:n].copy(), faces
+
+
+def _triangles_promised(path: Path) -> int | None:
+    """How many triangles a binary STL file has; None where its size says otherwise."""
+    with path.open("rb") as file:
+        head = file.read(STL_HEAD)
+    count = int.from_bytes(head[80:84], "little")
+    whole = STL_HEAD + STL_TRIANGLE.itemsize * count == path.stat().st_size
+    return count if whole else None
 
 
 def read_triangles(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, box_of
 from amrepair.template.port import Template
+from gcode.meshes import mesh_of
 from gcode.profiles import PrinterProfile
-from gcode.slicing.layers import mesh_of
 
 # More than any calibration, raft or warp puts a part off; less than any layer it would be moved by.
 SLACK_MM = 1.0

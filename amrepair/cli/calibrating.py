@@ -19,9 +19,9 @@ from gcode.cli import console
 from gcode.cli.options import job_of
 from gcode.hosts import connect
 from gcode.hosts.journal import default_path
+from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup, load_setup
 from gcode.slicing.job import plan_part
-from gcode.slicing.layers import mesh_of
 from gcode.writer import write
 
 

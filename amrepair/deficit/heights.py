@@ -22,7 +22,7 @@ from amrepair.frames import Transform, box_corners
 from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
-from gcode.slicing.layers import mesh_of
+from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
 UNSEEN_MARGIN_MM = 1.0

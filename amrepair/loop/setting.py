@@ -22,9 +22,9 @@ from amrepair.loop.marks import marked_stops
 from amrepair.regions.calibration import Calibration
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
+from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, job_for
-from gcode.slicing.layers import mesh_of
 from gcode.whole import put_in_place
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"

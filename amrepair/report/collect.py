@@ -33,8 +33,8 @@ from amrepair.report.data import (
     SolidMesh,
 )
 from amrepair.report.text import NEGLIGIBLE_MM3, kind_name, plan_lines, quantity
+from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
-from gcode.slicing.layers import mesh_of
 
 DIGITS = 6  # of every figure in a result: beyond what any scan can tell
 STRAY_LIMITS = 3.0  # so many limits outside, and no excess: it hangs in the air

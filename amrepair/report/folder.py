@@ -14,7 +14,7 @@ from amrepair.errors import InputError
 from amrepair.loop import Look
 from amrepair.loop.tape import scan_name
 from amrepair.scans import Scan, write_ply
-from gcode.slicing.layers import mesh_of
+from gcode.meshes import mesh_of
 from gcode.whole import put_in_place
 
 

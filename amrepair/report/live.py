@@ -18,10 +18,10 @@ from amrepair.report.collect import decision_of, look_label, of_the_part
 from amrepair.report.operator import Operator, Verdict
 from amrepair.report.text import plan_lines
 from gcode.errors import GcodeError
+from gcode.meshes import mesh_of
 from gcode.moves import Extrude, Toolpath
 from gcode.progress import Progress
 from gcode.reader import Job
-from gcode.slicing.layers import mesh_of
 
 # Blue is missing, grey agrees, orange is too much: as in the report, safe for the colour-blind.
 STOPS = np.array(

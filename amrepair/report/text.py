@@ -270,6 +270,8 @@ def plan_lines(plan: RepairPlan) -> list[str]:
             f"the repair takes {duration(cost.print_time_s)} and {length(cost.filament_mm)} of "
             "filament"
         )
+        if plan.patch is not None:
+            lines.append(plan.patch.first_pass.replace(" C", " °C"))
     elif regions:
         lines.append("no repair can be printed here")
     lines += [f"left out: {line}" for line in left_out_lines(plan)]

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from amrepair.frames import Transform, box_of
 from amrepair.template.cut import CutTemplate
 from amrepair.template.port import Template
-from gcode.slicing.layers import mesh_of
+from gcode.meshes import mesh_of
 
 
 @dataclass(frozen=True, slots=True)

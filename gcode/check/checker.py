@@ -141,26 +141,25 @@ def judge(
         )
     if as_built is not None:
         _ = setup.printer.head  # nobody judges what a head of unknown shape would hit
-    lines = program.text.split("\n")
     top_mm = as_built.top_mm if as_built is not None else None
     one = Judge(program, setup, top_mm, initial, policy, touches)
     text = Text.of(program.text)
     number, said = 1, 0
-    while number <= len(lines):
-        number = one.follow(text, number, min(len(lines), said + SAY_EVERY_LINES) + 1)
+    while number <= len(text):
+        number = one.follow(text, number, min(len(text), said + SAY_EVERY_LINES) + 1)
         if number - said > SAY_EVERY_LINES:
-            progress("check", float(number - 1), float(len(lines)))
+            progress("check", float(number - 1), float(len(text)))
             said = number - 1
-        elif number <= len(lines):
-            one.read(number, lines[number - 1])
+        elif number <= len(text):
+            one.read(number, text.line(number))
             number += 1
-    one.end(lines, leave_heaters=leave_heaters)
-    progress("check", float(len(lines)), float(len(lines)))
+    one.end(text, leave_heaters=leave_heaters)
+    progress("check", float(len(text)), float(len(text)))
     refusals, clearance_mm = list(one.refusals), math.inf
     contact = None
     if as_built is not None:
         progress("sweep", 0.0, 1.0)
-        hits, clearance_mm = sweep(one.moves, lines, setup.printer, as_built)
+        hits, clearance_mm = sweep(one.moves, text, setup.printer, as_built)
         progress("sweep", 1.0, 1.0)
         refusals += hits
         if hits:

@@ -124,6 +124,15 @@ class Text:
         data = np.frombuffer(text.encode(errors="replace") + b"\n", dtype=np.uint8)
         return cls(data, np.concatenate([[0], np.flatnonzero(data == ord("\n")) + 1]))
 
+    def __len__(self) -> int:
+        """How many lines."""
+        return len(self.starts) - 1
+
+    def line(self, number: int) -> str:
+        """A line, counted from 1; all of them as strings take three times what the text does."""
+        begin, end = self.starts[number - 1], self.starts[number] - 1
+        return str(self.data[begin:end].tobytes(), "utf-8")
+
 
 class Moves:
     """Moves with known ends; rows of line, start, end and plastic, below 0 where pulled back."""

@@ -155,7 +155,7 @@ class Motion:
     def _hot_on_part(self) -> bool:
         return self._hotend_c >= self._setup.printer.min_extrude_c and self._occupied
 
-    def _backwards(self, lines: list[str]) -> None:
+    def _backwards(self, text: Text) -> None:
         """Relative values of E that are read as absolute go back and forth."""
         pulled, way_mm = self.moves.pulled, self.moves.sideways_mm
         if (pulled & (way_mm > 0)).sum() < BACKWARDS_MOVES:
@@ -163,7 +163,7 @@ class Motion:
         ratio = way_mm[pulled].sum() / way_mm[pulled | (self.moves.pushed_mm3 > 0)].sum()
         if ratio > BACKWARDS_RATIO:
             self._line = int(self.moves.line[np.flatnonzero(pulled & (way_mm > 0))[0]])
-            self._text = lines[self._line - 1]
+            self._text = text.line(self._line)
             self._refuse(
                 "pulls filament back as it goes (relative values of E, read as absolute?)",
                 f"{ratio:.0%} of the way that E goes along",

@@ -73,7 +73,7 @@ class CheckedProgram:
         self._program = program
         self._printer_id = printer_id
         self._report = report
-        self._lines = tuple(program.text.split("\n"))
+        self._lines: tuple[str, ...] | None = None
 
     @property
     def program(self) -> Program:
@@ -92,6 +92,8 @@ class CheckedProgram:
 
     def lines(self, first: int, end: int) -> Sequence[str]:
         """Lines of the half-open range [first, end)."""
+        if self._lines is None:  # for who sends it; to know that it is good takes none of them
+            self._lines = tuple(self._program.text.split("\n"))
         return self._lines[first:end]
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:

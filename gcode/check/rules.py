@@ -6,7 +6,7 @@ import math
 import re
 
 from gcode.check import limits, touches, waits
-from gcode.check.findings import Policy, Touch
+from gcode.check.findings import Policy, Text, Touch
 from gcode.check.motion import INCH_MM, PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
     COMMANDS,
@@ -120,14 +120,14 @@ class Judge(Motion):
         """The link puts its own around each line, and firmwares read both."""
         self._refuse(what, told.split(maxsplit=1)[0], "none: the link adds it")
 
-    def end(self, lines: list[str], *, leave_heaters: bool = False) -> None:
+    def end(self, text: Text, *, leave_heaters: bool = False) -> None:
         """Judge what the program is as a whole, and what it leaves behind after its last line.
 
         Heaters that a user's job leaves on are switched off by lines that are `added`, unless
         somebody asked to leave them.
         """
-        self._backwards(lines)
-        self._line, self._text = len(lines), lines[-1]
+        self._backwards(text)
+        self._line, self._text = len(text), text.line(len(text))
         if not self._alone:
             return
         heaters = (

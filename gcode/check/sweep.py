@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gcode.check import sweep_kernels as kernels
-from gcode.check.findings import Moves, Refusal
+from gcode.check.findings import Moves, Refusal, Text
 from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
 from gcode.surfaces.heightfield import footprint_rows
@@ -33,7 +33,7 @@ MOST_SAID = 20
 
 
 def sweep(
-    moves: Moves, lines: list[str], printer: PrinterProfile, as_built: HeightField
+    moves: Moves, text: Text, printer: PrinterProfile, as_built: HeightField
 ) -> tuple[list[Refusal], float]:
     """Refusals for every move that touches, and the least clearance of the body."""
     if not moves.count or not as_built.z_mm.size:
@@ -72,7 +72,7 @@ def sweep(
         refusals.append(
             Refusal(
                 int(line[k]),
-                lines[int(line[k]) - 1],
+                text.line(int(line[k])),
                 f"the {part.part} ({part.z_from_mm:g} mm above the tip) hits what stands there",
                 f"{worst[k] + slack:.2f} mm deep",
                 f"{slack:g} mm",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,7 +19,13 @@ from gcode.cli.options import (
     standing_on_bed,
 )
 from gcode.errors import InputError
+from gcode.process import gives_back
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+
+if TYPE_CHECKING:
+    from gcode.moves import Program, Toolpath
+    from gcode.profiles import PrintSetup
+    from gcode.surfaces import HeightField
 
 CENTRE, KEEP = "centre", "keep"
 
@@ -53,68 +60,124 @@ def slice_solid(
             "coordinates are the bed's (where left out with --as-built)."
         ),
     ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes that plan a job's layers; left out: one a core."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Slice a solid: a whole job, or with --as-built a patch on top of what stands there."""
     from gcode.check import check as check_program
     from gcode.estimate import estimate as estimate_program
     from gcode.profiles import load_setup
-    from gcode.slicing.job import slice_part
-    from gcode.slicing.placing import in_the_middle
-    from gcode.solids import read_solid
-    from gcode.writer import write
 
     place = _place(place, patch=as_built is not None)
     console.writable(output)
     setup = load_setup(printer, material, process)
     bars = console.Bars()
-    lost: tuple[Any, ...] = ()
     with bars.shown():
-        with bars.stage("read solid"):
-            shape = read_solid(solid)
-            moved_mm = (0.0, 0.0, 0.0)
-            if place == CENTRE:
-                shape, moved_mm = in_the_middle(shape, setup.printer)
         if as_built is None:
-            field = None
-            toolpath = slice_part(shape, setup, progress=bars)
+            made = _whole(solid, setup, place, workers, bars)
         else:
-            from gcode.slicing.patch import slice_patch
-
-            field = standing_on_bed(as_built)
-            plan = slice_patch(
-                shape,
-                setup,
-                as_built=field,
-                grid=grid_of(job, setup),
-                standalone=True,
-                progress=bars,
-            )
-            toolpath, lost = plan.toolpath, (*plan.unreachable, *plan.unprintable)
-        if not toolpath.extrusions:
-            raise InputError(f"{solid}: nothing of it can be printed: {_reasons(lost)}.")
-        with bars.stage("write"):
-            program = write(toolpath, setup, title=f"{solid.name}")
-        check_program(program, setup, as_built=field, progress=bars)
+            made = _patch(solid, setup, place, (as_built, job), bars)
+        program = made.program
+        gives_back(check_program)(program, setup, as_built=made.field, progress=bars)
         cost = estimate_program(program, setup.printer, progress=bars)
     console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
     result = {
         "gcode": str(output),
         "placed": place,
-        "moved_mm": [round(v, 4) for v in moved_mm],
-        "solid_mm3": round(float(shape.volume()), 4),
-        "beads_mm3": round(toolpath.volume_mm3, 4),
+        "moved_mm": [round(v, 4) for v in made.moved_mm],
+        "solid_mm3": round(made.solid_mm3, 4),
+        "beads_mm3": round(made.beads_mm3, 4),
         "filament_mm": round(cost.filament_mm, 2),
         "print_time_s": round(cost.print_time_s, 1),
+        "first_pass": made.first_pass,
         "left_out": [
             {"volume_mm3": round(u.volume_mm3, 4), "box_mm": list(u.box_mm), "reason": u.reason}
-            for u in lost
+            for u in made.left
         ],
     }
     if as_json:
         console.show_json(result)
     else:
-        _tell(result, _where(shape, moved_mm) if place == CENTRE else None)
+        _tell(result, made.where)
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A program, and of what it was made from no more than is told of it.
+
+    `moved_mm` is where it was moved to, `where` says so; `field` is what stands there, `left` what
+    is left out of it, `first_pass` how it begins on what is cold.
+    """
+
+    program: Program
+    beads_mm3: float
+    solid_mm3: float
+    moved_mm: tuple[float, float, float]
+    where: str | None
+    field: HeightField | None = None
+    left: tuple[Any, ...] = ()
+    first_pass: str | None = None
+
+
+@gives_back
+def _whole(
+    solid: Path, setup: PrintSetup, place: str, workers: int | None, bars: console.Bars
+) -> _Made:
+    """A whole job."""
+    from gcode.crew import cores
+    from gcode.slicing.job import slice_part
+    from gcode.solids import read_closed
+
+    with bars.stage("read solid"):
+        shape, moved_mm = _placed(read_closed(solid), setup, place)
+    toolpath = slice_part(shape, setup, workers=workers or cores(), progress=bars)
+    where = _where(shape, moved_mm) if place == CENTRE else None
+    program = _written(toolpath, setup, solid, (), bars)
+    return _Made(program, toolpath.volume_mm3, float(shape.volume()), moved_mm, where)
+
+
+def _patch(
+    solid: Path,
+    setup: PrintSetup,
+    place: str,
+    around: tuple[Path, Path | None],
+    bars: console.Bars,
+) -> _Made:
+    """What is to be laid on what stands there: its file, and the job's."""
+    from gcode.slicing.patch import slice_patch
+    from gcode.solids import read_solid
+
+    with bars.stage("read solid"):
+        shape, moved_mm = _placed(read_solid(solid), setup, place)
+    field = standing_on_bed(around[0])
+    grid = grid_of(around[1], setup)
+    plan = slice_patch(shape, setup, as_built=field, grid=grid, standalone=True, progress=bars)
+    left = (*plan.unreachable, *plan.unprintable)
+    program = _written(plan.toolpath, setup, solid, left, bars)
+    volumes = plan.toolpath.volume_mm3, float(shape.volume())
+    return _Made(program, *volumes, moved_mm, None, field, left, plan.first_pass)
+
+
+def _written(
+    toolpath: Toolpath, setup: PrintSetup, solid: Path, left: tuple[Any, ...], bars: console.Bars
+) -> Program:
+    from gcode.writer import write
+
+    if not toolpath.extrusions:
+        raise InputError(f"{solid}: nothing of it can be printed: {_reasons(left)}.")
+    with bars.stage("write"):
+        return write(toolpath, setup, title=f"{solid.name}")
+
+
+def _placed(shape: Any, setup: PrintSetup, place: str) -> tuple[Any, tuple[float, float, float]]:
+    from gcode.slicing.placing import in_the_middle
+
+    if place == CENTRE:
+        return in_the_middle(shape, setup.printer)
+    return shape, (0.0, 0.0, 0.0)
 
 
 def _tell(result: dict[str, Any], where: str | None) -> None:
@@ -127,6 +190,8 @@ def _tell(result: dict[str, Any], where: str | None) -> None:
     )
     if where is not None:
         console.out.print(where, markup=False)
+    if result["first_pass"] is not None:
+        console.out.print(result["first_pass"].replace(" C", " °C"), markup=False)
     for thing in result["left_out"]:
         console.out.print(f"left out: {thing['volume_mm3']:.3f} mm³: {thing['reason']}")
 

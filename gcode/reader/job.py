@@ -17,6 +17,7 @@ from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile
 from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
+from gcode.reader.lines import comments_of, lines_of, tokens_of
 from gcode.units import filament_area_mm2
 
 _LAYER_MARKS = ("LAYER_CHANGE", "CHANGE_LAYER", "BEFORE_LAYER_CHANGE")
@@ -179,14 +180,16 @@ def read_job(
     if isinstance(program, str):
         program = Program(program, dialect)
     progress("read", 0.0, READ_STEPS)
-    lines = program.text.split("\n")
-    kinds, codes, words = _tokens(program.text, len(lines))
+    data, starts = lines_of(program.text)
+    kinds, codes, words = tokens_of(data, starts)
+    comments = comments_of(data, starts, kinds)
+    del data
     progress("read", 1.0, READ_STEPS)
-    states = np.zeros((len(lines) + 1, kernels.STATES))
+    states = np.zeros((len(starts), kernels.STATES))
     states[0, :3] = np.nan
     states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
     states[0, kernels.S_ACC] = np.nan
-    pushed = np.zeros(len(lines))
+    pushed = np.zeros(len(kinds))
     words_of = dialect_of(program.dialect)
     both, g91 = words_of.g90_sets_e, words_of.g91_moves_e
     kernels.run(kinds, codes, words, both, g91, states, pushed)
@@ -198,11 +201,12 @@ def read_job(
     start, end = np.zeros((count, 3)), np.zeros((count, 3))
     filament, owner = np.zeros(count), np.zeros(count, np.int64)
     kernels.beads(kinds, codes, words, states, pushed, start, end, filament, owner, False)
+    del words  # as much as all the rest
     known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
-    start, end, filament, owner = start[known], end[known], filament[known], owner[known]
+    if not known.all():
+        start, end, filament, owner = start[known], end[known], filament[known], owner[known]
     progress("read", 3.0, READ_STEPS)
-    comments = [(int(i), lines[i]) for i in np.flatnonzero(kinds == ord(";"))]
-    layers = _layers(comments, end, owner, filament, len(lines))
+    layers = _layers(comments, end, owner, filament, len(kinds))
     beads = _beads(comments, layers, start, end, filament, owner, filament_diameter_mm)
     progress("read", READ_STEPS, READ_STEPS)
     return Job(
@@ -238,19 +242,6 @@ def job_for(program: Program | str, printer: PrinterProfile) -> Job:
         filament_diameter_mm=printer.filament_diameter_mm,
         dialect=program.dialect,
     )
-
-
-def _tokens(
-    text: str, count: int
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
-    data = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
-    breaks = np.flatnonzero(data == ord("\n")) + 1
-    starts = np.concatenate([[0], breaks, [len(data)]]).astype(np.int64)[: count + 1]
-    kinds, codes = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    words = np.zeros((count, len(kernels.LETTERS)))
-    letters = np.frombuffer(kernels.LETTERS, np.uint8)
-    kernels.parse(data, starts, letters, codes, kinds, words)
-    return kinds, codes, words
 
 
 def _layers(

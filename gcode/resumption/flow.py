@@ -20,10 +20,10 @@ from jaxtyping import Float
 from gcode.check import CheckedProgram, check, policy_of
 from gcode.dialects import number
 from gcode.errors import InputError
+from gcode.meshes import mesh_of
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
-from gcode.slicing.layers import mesh_of
 from gcode.surfaces import raster_kernels
 from gcode.units import filament_area_mm2
 

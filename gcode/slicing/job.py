@@ -8,44 +8,27 @@ thin for a bead is listed with its volume. Supports are not made.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from manifold3d import CrossSection
 
+from gcode.crew import in_order
 from gcode.errors import SliceError
+from gcode.meshes import Cuts, closed_mesh
 from gcode.moves import Comment, LayerChange, Role, Script, SetFan, SetHotend, Toolpath
 from gcode.profiles import PrintSetup, expand_script
 from gcode.progress import Progress, silent
 from gcode.slicing import infill_kernels as kernels
 from gcode.slicing.beads import Bead, loop_bead, spacing_of
-from gcode.slicing.infill import SOLID_ANGLES_RAD, ring_beads, solid_fill, sparse_fill
+from gcode.slicing.layer_plan import LayerPlan, PartLayers, Unprintable
 from gcode.slicing.layers import LayerGrid, Slab, plan_slabs
-from gcode.slicing.medial import fill_thin
 from gcode.slicing.order import nearest_first, seam_index
 from gcode.slicing.pen import MERGE_MM, Pen
-from gcode.slicing.regions import SIMPLIFY_MM, flattened, offset, peel, pieces, union
+from gcode.slicing.regions import flattened, union
 
-LEAST_NOZZLES = 0.5
-MOST_NOZZLES = 2.0
-INFILL_OVERLAP = 0.25  # of a spacing: PrusaSlicer's default overlap of infill and perimeters
-FLOW_CORRECTION = (0.85, 1.6)  # slab volume over section × height, outside of which flow is wrong
 SHORT_TRAVEL_MM = 1.5  # below this oozing costs less than a retraction
-NOT_LISTED_MM3 = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class Unprintable:
-    """Something that no bead can make, by name: its volume, its box and why.
-
-    `box_mm` is (x_min, y_min, z_min, x_max, y_max, z_max), build frame.
-    """
-
-    volume_mm3: float
-    box_mm: tuple[float, float, float, float, float, float]
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +40,10 @@ class PartPlan:
     grid: LayerGrid
 
 
-@dataclass
-class _Layer:
-    """Beads of a layer by island, in printing order of kinds."""
-
-    islands: list[tuple[Any, list[list[Bead]]]] = field(default_factory=list)
-    lost: list[Any] = field(default_factory=list)
-    lost_mm2: float = 0.0
-
-
-def slice_part(solid: Any, setup: PrintSetup, *, progress: Progress = silent) -> Toolpath:
-    """Slice a solid (`manifold3d.Manifold`, build frame) into a whole job.
+def slice_part(
+    solid: Any, setup: PrintSetup, *, workers: int = 1, progress: Progress = silent
+) -> Toolpath:
+    """Slice a solid (`Manifold` or `ClosedMesh`, build frame) into a whole job; see `plan_part`.
 
     Examples
     --------
@@ -78,7 +54,7 @@ def slice_part(solid: Any, setup: PrintSetup, *, progress: Progress = silent) ->
     >>> 0.97 < toolpath.volume_mm3 / solid.volume() < 1.03
     True
     """
-    return plan_part(solid, setup, progress=progress).toolpath
+    return plan_part(solid, setup, workers=workers, progress=progress).toolpath
 
 
 def plan_part(
@@ -86,6 +62,7 @@ def plan_part(
     setup: PrintSetup,
     *,
     grid: LayerGrid | None = None,
+    workers: int = 1,
     progress: Progress = silent,
 ) -> PartPlan:
     """Slice a solid into a whole job, and say what could not be made.
@@ -93,9 +70,12 @@ def plan_part(
     Parameters
     ----------
     solid
-        A `manifold3d.Manifold`, build frame, mm.
+        A `manifold3d.Manifold` or a `gcode.meshes.ClosedMesh`, build frame, mm.
     grid
         Heights to lie on; the process profile's by default.
+    workers
+        Processes that plan layers at once, forked from this one: 1 where it has other threads. What
+        they plan does not depend on how many they are.
 
     Raises
     ------
@@ -103,20 +83,21 @@ def plan_part(
         Where the solid is empty, below the bed or beyond the printer.
     """
     _refuse(solid, setup)
+    solid = closed_mesh(solid)
     nozzle_mm = setup.printer.nozzle_diameter_mm
     slabs = plan_slabs(solid, grid or LayerGrid.from_setup(setup), nozzle_diameter_mm=nozzle_mm)
-    sections = [solid.slice(s.middle_mm).simplify(SIMPLIFY_MM) for s in slabs]
-    solid_masks = _solid_masks(sections, setup)
-    park = np.array(setup.printer.park_mm, float)
-    pen = Pen(setup, park)
+    layers = PartLayers(Cuts.of(solid, np.array([s.middle_mm for s in slabs])), slabs, setup)
+    pen = Pen(setup, np.array(setup.printer.park_mm, float))
     lost: list[Unprintable] = []
     _begin(pen, setup, float(solid.bounding_box()[5]))
     seam_mm = np.array([-1e3, 1e3])
-    for slab, section, mask in zip(slabs, sections, solid_masks, strict=True):
-        layer = _plan_layer(section, mask, slab, setup)
-        lost += _listed(layer, slab)
-        _weigh(layer, slab, section)
-        seam_mm = _emit(pen, layer, section, slab, seam_mm, setup)
+    plans = in_order(layers.plan, len(slabs), workers=workers)
+    for slab, plan in zip(slabs, plans, strict=True):
+        lost += plan.lost
+        _change_layer(pen, slab, setup)
+        if slab.index == 0:
+            _skirt(pen, layers.section(0), slab, setup)
+        seam_mm = _emit(pen, plan, slab, seam_mm, setup)
         progress("slice", float(slab.index + 1), float(len(slabs)))
     pen.retract()
     pen.move_to(np.array([*pen.position_mm[:2], slabs[-1].top_mm + setup.printer.z_hop_mm + 1.0]))
@@ -152,104 +133,6 @@ def _box_text(box: tuple[float, ...]) -> str:
     return "({:.2f}, {:.2f}, {:.2f}) to ({:.2f}, {:.2f}, {:.2f})".format(*box)
 
 
-def _solid_masks(sections: list[Any], setup: PrintSetup) -> list[Any | None]:
-    """By layer, what lies within the shells' reach of air above or below; None = everything."""
-    process = setup.process
-    if process.infill_ratio >= 0.999:
-        return [None] * len(sections)
-    n = len(sections)
-    empty = CrossSection()
-    out: list[Any | None] = []
-    for i in range(n):
-        buried = sections[i]
-        for j in range(i - process.bottom_layers, i + process.top_layers + 1):
-            if j != i:
-                buried = buried ^ (sections[j] if 0 <= j < n else empty)
-            if buried.is_empty():
-                break
-        # solid areas reach a little under their neighbours, so that they hold on
-        out.append(offset(sections[i] - buried, process.line_width_mm))
-    return out
-
-
-def _plan_layer(section: Any, mask: Any | None, slab: Slab, setup: PrintSetup) -> _Layer:
-    """Rings, thin beads and fills of one section."""
-    process, nozzle_mm = setup.process, setup.printer.nozzle_diameter_mm
-    share_mm = spacing_of(max(process.line_width_mm, 1.05 * slab.height_mm), slab.height_mm)
-    least_mm, most_mm = LEAST_NOZZLES * nozzle_mm, MOST_NOZZLES * nozzle_mm
-    layer = _Layer()
-    for island in pieces(section):
-        peeled = peel(island, share_mm, process.perimeters)
-        groups: list[list[Bead]] = []
-        for i, ring in enumerate(peeled.rings):
-            role = Role.PERIMETER if i else Role.EXTERNAL_PERIMETER
-            groups.append(ring_beads(ring.centre, ring.area_mm2, share_mm, role))
-        groups.reverse()  # the outer wall last of the rings, against its support
-        thin_beads: list[Bead] = []
-        for part in peeled.thin:
-            thin = fill_thin(part, least_mm=least_mm, most_mm=most_mm)
-            thin_beads += thin.beads
-            layer.lost_mm2 += thin.lost_mm2
-            if not thin.beads:
-                layer.lost.append(part)
-        top = slab.index % 2
-        hard = peeled.core if mask is None else peeled.core ^ mask
-        fills, left = solid_fill(
-            hard,
-            spacing_mm=share_mm,
-            angle_rad=SOLID_ANGLES_RAD[top],
-            role=Role.SOLID_INFILL,
-            least_mm=least_mm,
-            most_mm=most_mm,
-            pattern="concentric" if process.infill_pattern == "concentric" else "rectilinear",
-            overlap_ratio=INFILL_OVERLAP,
-        )
-        layer.lost_mm2 += left
-        if mask is not None:
-            fills += sparse_fill(
-                peeled.core - mask,
-                spacing_mm=share_mm,
-                ratio=process.infill_ratio,
-                layer=slab.index,
-                pattern=process.infill_pattern,
-            )
-        layer.islands.append((island, [*groups, thin_beads, fills]))
-    return layer
-
-
-def _weigh(layer: _Layer, slab: Slab, section: Any) -> None:
-    """Scale flow so that full areas carry the slab's exact volume.
-
-    Lost slivers are not put elsewhere: where they are more than rounding, they are listed.
-    """
-    area_mm2 = section.area()
-    if area_mm2 <= 0:
-        return
-    beads = [b for _, groups in layer.islands for g in groups for b in g]
-    dense = not any(b.role is Role.SPARSE_INFILL for b in beads)
-    listed_mm2 = sum(part.area() for part in layer.lost)
-    factor = slab.volume_mm3 / (area_mm2 * slab.height_mm)
-    if dense:
-        laid_mm2 = sum(b.area_mm2 for b in beads)
-        if laid_mm2 > 0:
-            factor *= max(area_mm2 - listed_mm2, 0.0) / laid_mm2
-    factor = min(max(factor, FLOW_CORRECTION[0]), FLOW_CORRECTION[1])
-    for _, groups in layer.islands:
-        for group in groups:
-            group[:] = [bead.scaled(factor) for bead in group]
-
-
-def _listed(layer: _Layer, slab: Slab) -> list[Unprintable]:
-    out = []
-    for part in layer.lost:
-        volume = part.area() * slab.height_mm
-        x0, y0, x1, y1 = part.bounds()
-        box = (x0, y0, slab.bottom_mm, x1, y1, slab.top_mm)
-        if volume > NOT_LISTED_MM3:
-            out.append(Unprintable(volume, box, "thinner than half a nozzle"))
-    return out
-
-
 def _merged(lost: list[Unprintable]) -> tuple[Unprintable, ...]:
     """The same place in consecutive layers is one thing."""
     out: list[Unprintable] = []
@@ -274,36 +157,31 @@ def _begin(pen: Pen, setup: PrintSetup, top_mm: float) -> None:
     pen.position_mm = np.array([*setup.printer.prime_mm[:2], max(1.0, setup.printer.z_hop_mm)])
 
 
-def _emit(
-    pen: Pen,
-    layer: _Layer,
-    section: Any,
-    slab: Slab,
-    seam_mm: Float[np.ndarray, " 2"],
-    setup: PrintSetup,
-) -> Float[np.ndarray, " 2"]:
-    """Moves of one layer; returns where its first seam was."""
+def _change_layer(pen: Pen, slab: Slab, setup: PrintSetup) -> None:
     pen.add(LayerChange(slab.index, slab.top_mm, slab.height_mm))
+    if slab.index == 0:
+        pen.add(SetFan(0.0))
     if slab.index == 1:
         pen.add(SetFan(setup.material.fan_ratio))
         if setup.material.hotend_c != setup.material.first_layer_hotend_c:
             pen.add(SetHotend(setup.material.hotend_c))
-    if slab.index == 0:
-        pen.add(SetFan(0.0))
-        _skirt(pen, section, slab, setup)
-    left = list(layer.islands)
+
+
+def _emit(
+    pen: Pen, plan: LayerPlan, slab: Slab, seam_mm: Float[np.ndarray, " 2"], setup: PrintSetup
+) -> Float[np.ndarray, " 2"]:
+    """Moves of one layer, nearest island next; returns where its last seam was."""
+    left = list(plan.islands)
     seam = seam_mm
     while left:
         here = pen.position_mm[:2]
-        k = int(np.argmin([_box_distance(island.bounds(), here) for island, _ in left]))
-        island, groups = left.pop(k)
-        outline = flattened(island)
-        for group in groups:
+        island = left.pop(int(np.argmin([_box_distance(one.box_mm, here) for one in left])))
+        for group in island.groups:
             beads = [_seamed(bead, seam) for bead in group]
             if beads and beads[0].role is Role.EXTERNAL_PERIMETER:
                 seam = beads[0].xy_mm[0]
             for bead in nearest_first(beads, pen.position_mm[:2]):
-                _lay(pen, bead, slab, outline, setup)
+                _lay(pen, bead, slab, (island.outline_mm, island.starts), setup)
     return seam
 
 

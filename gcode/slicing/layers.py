@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.errors import SliceError
+from gcode.meshes import mesh_of
+from gcode.meshes_kernels import level_faces
 from gcode.profiles import PrintSetup
 from gcode.slicing import volume_kernels as kernels
 
@@ -98,13 +100,6 @@ class Slab:
         return 0.5 * (self.bottom_mm + self.top_mm)
 
 
-def mesh_of(solid: Any) -> tuple[Float[np.ndarray, "n 3"], Any]:
-    """(n, 3) vertices and (m, 3) faces of a manifold, in double precision."""
-    mesh = solid.to_mesh64() if hasattr(solid, "to_mesh64") else solid.to_mesh()
-    vertices = np.ascontiguousarray(np.asarray(mesh.vert_properties, np.float64)[:, :3])
-    return vertices, np.ascontiguousarray(np.asarray(mesh.tri_verts, np.int64))
-
-
 def slab_volumes(solid: Any, cuts_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
     """Exact volumes of a manifold between consecutive heights (m = n − 1).
 
@@ -142,15 +137,10 @@ def plan_slabs(solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float) -> tup
 
 def _horizontal_faces(solid: Any) -> list[float]:
     """Heights of level faces that are large enough to matter."""
-    vertices, faces = mesh_of(solid)
-    corners = vertices[faces]
-    z = corners[:, :, 2]
-    level = np.ptp(z, axis=1) < _SAME_MM
-    if not level.any():
+    z, areas = level_faces(*mesh_of(solid), _SAME_MM)
+    if not len(z):
         return []
-    u, v = corners[level, 1] - corners[level, 0], corners[level, 2] - corners[level, 0]
-    areas = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
-    heights, group = np.unique(np.round(z[level, 0], 3), return_inverse=True)
+    heights, group = np.unique(np.round(z, 3), return_inverse=True)
     total = np.bincount(group, areas)
     box = solid.bounding_box()
     extent_mm = float(box[5] - box[2])

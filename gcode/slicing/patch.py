@@ -18,10 +18,10 @@ from gcode.errors import SliceError
 from gcode.moves import Toolpath
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
-from gcode.slicing.job import Unprintable
 from gcode.slicing.job_lines import JobLines
+from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.patch_laying import after_first, begin, emit, end
+from gcode.slicing.patch_laying import after_first, begin, emit, end, first_pass_words
 from gcode.slicing.patch_left import (
     NOT_CLOSED,
     PatchRegion,
@@ -49,6 +49,8 @@ class PatchPlan:
         Volume of the deficit that the nozzle gets to.
     predicted
         The surface after the patch.
+    first_pass
+        How the first pass is laid onto what has long been cold, in words.
     """
 
     toolpath: Toolpath
@@ -58,6 +60,7 @@ class PatchPlan:
     unprintable: tuple[Unprintable, ...]
     regions: tuple[PatchRegion, ...]
     predicted: HeightField
+    first_pass: str
 
 
 def slice_patch(
@@ -146,6 +149,7 @@ def slice_patch(
         unprintable=left.unprintable,
         regions=left.regions,
         predicted=best.state.surface(model),
+        first_pass=first_pass_words(setup, hotend_c),
     )
 
 

@@ -16,8 +16,8 @@ from gcode.moves import Role
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import ROUND_LOSS, Bead, spacing_of
 from gcode.slicing.infill import ring_beads, solid_fill
-from gcode.slicing.job import LEAST_NOZZLES, MOST_NOZZLES
 from gcode.slicing.job_lines import JobPieces, gathered
+from gcode.slicing.layer_plan import LEAST_NOZZLES, MOST_NOZZLES
 from gcode.slicing.medial import fill_thin
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
@@ -117,6 +117,56 @@ def begun_inside(run: Bead, model: PatchModel) -> Bead:
     return run.started_at(int(np.argmax(model.beside_mm[cells[:, 1], cells[:, 0]])))
 
 
+@dataclass(frozen=True, slots=True)
+class _Shares:
+    """Which columns go to which piece of some runs.
+
+    Attributes
+    ----------
+    middle_mm, length_mm
+        (m, 2) and (m,) of the pieces; `tree` finds the nearest.
+    columns, piece, thick_mm
+        (c,) the columns that beads get to, the piece that each goes to, what each wants.
+    """
+
+    middle_mm: Float[np.ndarray, "m 2"]
+    length_mm: Float[np.ndarray, " m"]
+    tree: cKDTree
+    columns: Int[np.ndarray, " c"]
+    piece: Int[np.ndarray, " c"]
+    thick_mm: Float[np.ndarray, " c"]
+
+    @classmethod
+    def of(
+        cls,
+        runs: list[Bead],
+        thick: Float[np.ndarray, "ny nx"],
+        strips: Bool[np.ndarray, "ny nx"],
+        model: PatchModel,
+    ) -> _Shares:
+        """To the nearest piece, as far as a bead spreads, and in `strips` on to the wall."""
+        middle = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
+        length = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
+        filled = np.flatnonzero(thick.ravel() > 0)
+        tree = cKDTree(middle)
+        distance, nearest = tree.query(
+            model.points_mm[filled], distance_upper_bound=model.spread_mm + TO_WALL_MM
+        )
+        near = np.isfinite(distance) & ((distance < model.spread_mm) | strips.ravel()[filled])
+        columns = filled[near]
+        return cls(middle, length, tree, columns, nearest[near], thick.ravel()[columns])
+
+    def sums(self, of_column: Float[np.ndarray, " c"]) -> Float[np.ndarray, " m"]:
+        """By piece; of nothing `bincount` makes integers."""
+        return np.bincount(self.piece, of_column, minlength=self.tree.n).astype(np.float64)
+
+    @property
+    def deep_mm(self) -> Float[np.ndarray, " m"]:
+        """What the columns of each piece want on average."""
+        number = np.bincount(self.piece, minlength=self.tree.n)
+        return self.sums(self.thick_mm) / np.maximum(number, 1)
+
+
 def weighed(
     runs: list[Bead],
     tips_mm: list[Float[np.ndarray, " _n"]],
@@ -134,63 +184,48 @@ def weighed(
     the chains, and the thickness that columns get: none beyond where a bead can spread (farther in
     `strips` along walls), less where a bead would be too wide.
     """
-    nozzle_mm = setup.printer.nozzle_diameter_mm
-    middles = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
-    lengths = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
-    filled = np.flatnonzero(thick.ravel() > 0)
-    pieces_of = cKDTree(middles)
-    distance, nearest = pieces_of.query(
-        model.points_mm[filled], distance_upper_bound=model.spread_mm + TO_WALL_MM
-    )
-    near = np.isfinite(distance) & ((distance < model.spread_mm) | strips.ravel()[filled])
-    cell_mm3 = model.cell_mm**2 * model.weight
-    volume = np.bincount(
-        nearest[near], thick.ravel()[filled[near]] * cell_mm3, minlength=len(middles)
-    ).astype(np.float64)  # of nothing it makes integers
+    shares = _Shares.of(runs, thick, strips, model)
+    volume = shares.sums(shares.thick_mm * model.cell_mm**2 * model.weight)
+    depth = shares.deep_mm
+    own, met = np.zeros(len(volume)), np.ones(len(volume))
     if job is not None:
-        volume = _by_lines(
-            volume, runs, pieces_of, job, filled, near, nearest, thick, lengths, model
-        )
-    reach = np.bincount(nearest[near], thick.ravel()[filled[near]], minlength=len(middles))
-    number = np.bincount(nearest[near], minlength=len(middles))
-    depth = reach / np.maximum(number, 1)
-    told_mm3, met_mm3, own = volume, volume, np.zeros(len(middles))
-    if job is not None:
-        own = job.section_mm2
+        told_mm3 = _by_lines(volume, runs, shares, job, thick, model)
         volume, met_mm3 = gathered(
-            volume, depth, job, lengths, middles, setup.process.line_width_mm
+            told_mm3, depth, job, shares.length_mm, shares.middle_mm, setup.process.line_width_mm
         )
+        own, met = job.section_mm2, met_mm3 / np.maximum(told_mm3, 1e-9)
     chains: list[Chain] = []
-    given = np.zeros(len(middles))  # share of what its columns want that a piece lays
+    given = np.zeros(len(volume))  # share of what its columns want that a piece lays
     at = 0
     for run, tip_mm in zip(runs, tips_mm, strict=True):
-        n = len(run.xy_mm) - 1
-        mine = slice(at, at + n)
-        at += n
-        section = BOND_RATIO * _smooth(volume[mine], lengths[mine], closed=run.closed)
+        mine = slice(at, at + len(run.xy_mm) - 1)
+        at = mine.stop
+        section = BOND_RATIO * _smooth(volume[mine], shares.length_mm[mine], closed=run.closed)
         deep = np.maximum(depth[mine], LEAST_THICK_MM)
-        most = deep * (MOST_NOZZLES * nozzle_mm - deep * ROUND_LOSS)
-        most = np.maximum(most, BOND_RATIO * own[mine])
-        most = np.minimum(most, setup.printer.max_bead_section_mm2)
-        given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9))
-        given[mine] *= met_mm3[mine] / np.maximum(told_mm3[mine], 1e-9)
+        most = _most_section(deep, BOND_RATIO * own[mine], setup)
+        given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9)) * met[mine]
         section = np.minimum(section, most)
         chains += _split(Chain(run.xy_mm, tip_mm, section, deep, run.role))
     laid = np.zeros(thick.size)
-    laid[filled[near]] = thick.ravel()[filled[near]] * given[nearest[near]]
+    laid[shares.columns] = shares.thick_mm * given[shares.piece]
     return chains, laid.reshape(thick.shape)
+
+
+def _most_section(
+    deep_mm: Float[np.ndarray, " n"], own_mm2: Float[np.ndarray, " n"], setup: PrintSetup
+) -> Float[np.ndarray, " n"]:
+    """Greatest cross-sections: as wide as a bead may get, or the job's own, as the printer may."""
+    wide_mm = MOST_NOZZLES * setup.printer.nozzle_diameter_mm
+    most = np.maximum(deep_mm * (wide_mm - deep_mm * ROUND_LOSS), own_mm2)
+    return np.asarray(np.minimum(most, setup.printer.max_bead_section_mm2))
 
 
 def _by_lines(
     volume_mm3: Float[np.ndarray, " n"],
     runs: list[Bead],
-    pieces_of: cKDTree,
+    shares: _Shares,
     job: JobPieces,
-    filled: Int[np.ndarray, " c"],
-    near: Bool[np.ndarray, " c"],
-    nearest: Int[np.ndarray, " c"],
     thick: Float[np.ndarray, "ny nx"],
-    length_mm: Float[np.ndarray, " n"],
     model: PatchModel,
 ) -> Float[np.ndarray, " n"]:
     """Volumes by how deep the floor lies under each piece on average, times its own width.
@@ -199,15 +234,12 @@ def _by_lines(
     The total stays what it is. What lies beside the lines is added to the nearest as it is.
     """
     under = np.flatnonzero(job.over & beside_runs(runs, job.half_mm + ON_LINE_MM, model))
-    of_piece = pieces_of.query(model.points_mm[under])[1]
-    number = np.bincount(of_piece, minlength=pieces_of.n)
-    deep = np.bincount(of_piece, thick.ravel()[under], minlength=pieces_of.n)
-    own = job.section_mm2 * length_mm * deep / np.maximum(number, 1) / job.height_mm
-    cell_mm3 = model.cell_mm**2 * model.weight
-    beside = near & ~np.isin(filled, under)
-    extra = np.bincount(
-        nearest[beside], thick.ravel()[filled[beside]] * cell_mm3, minlength=pieces_of.n
-    )
+    of_piece = shares.tree.query(model.points_mm[under])[1]
+    number = np.bincount(of_piece, minlength=shares.tree.n)
+    deep = np.bincount(of_piece, thick.ravel()[under], minlength=shares.tree.n)
+    own = job.section_mm2 * shares.length_mm * deep / np.maximum(number, 1) / job.height_mm
+    beside = ~np.isin(shares.columns, under)
+    extra = shares.sums(np.where(beside, shares.thick_mm, 0.0)) * model.cell_mm**2 * model.weight
     whole_mm3 = float((own + extra).sum())
     return (own + extra) * (float(volume_mm3.sum()) / whole_mm3 if whole_mm3 > 0 else 1.0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +23,21 @@ DEEP_RATIO = 1.6
 # Of columns over a hollow, as many as open to the head at one height are worth a pass there.
 OPENING_MM2 = 1.0
 OPENS_BELOW_MM = 0.1  # half a layer: over less of a hollow the last pass goes anyway
+# Of a layer: what hangs spreads to both sides of its line, held there or not, and a strand that is
+# drawn just above it finds no room.
+APART_LAYERS = 0.5
 # A flat top: as much area, as wide, within so little height.
 FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
 ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
+
+
+class Openings(enum.Enum):
+    """Which heights between the job's layers get a pass, where the head first gets into hollows."""
+
+    EACH = enum.auto()
+    """From the lowest up, a layer after the other, as long as it gets in over more."""
+    ALONE = enum.auto()
+    """The same, and no pass of the job's in hollows until the last of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,20 +72,24 @@ class Height:
 
 @dataclass(frozen=True, slots=True)
 class Heights:
-    """All heights of a patch, from the floor up; `ends` is where flat tops end their columns."""
+    """All heights of a patch, from the floor up; `ends` is where flat tops end their columns.
+
+    Columns `alone` have openings of their own and, up to the last of these, nothing else.
+    """
 
     tops_mm: Float[np.ndarray, " n"]
     flats_mm: Float[np.ndarray, " m"]
     openings_mm: Float[np.ndarray, " k"]
+    alone: Bool[np.ndarray, "ny nx"]
     ends_mm: Float[np.ndarray, "ny nx"]
     most_mm: float
     layer_mm: float
 
     @classmethod
     def of(
-        cls, model: PatchModel, grid: LayerGrid, setup: PrintSetup, *, openings: bool
+        cls, model: PatchModel, grid: LayerGrid, setup: PrintSetup, *, openings: Openings
     ) -> Heights:
-        """Of a patch; without `openings`, none but those of the job's layers and of flat tops."""
+        """Of a patch: the job's layers, flat tops, and such openings."""
         low_mm, high_mm = float(model.box[2]), float(model.box[5])
         tops = grid.tops_to(high_mm)
         tops = tops[tops > low_mm + 1e-6]
@@ -87,8 +104,12 @@ class Heights:
         for flat_mm in flats:
             ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
         others = np.sort(np.concatenate([tops, flats]))
-        opened = _openings(model, others, most_mm) if openings else np.zeros(0)
-        return cls(tops, flats, opened, ends, most_mm, grid.layer_height_mm)
+        alone = np.zeros(model.shape, dtype=bool)
+        keep = openings is Openings.ALONE
+        opened = _openings(model, others, most_mm, grid.layer_height_mm, alone=keep)
+        if keep and len(opened):
+            alone = _hollow(model, others, most_mm)
+        return cls(tops, flats, opened, alone, ends, most_mm, grid.layer_height_mm)
 
     @property
     def all_mm(self) -> Float[np.ndarray, " n"]:
@@ -103,7 +124,16 @@ class Heights:
         following = np.minimum(self.ends_mm, float(later[0]) if len(later) else np.inf)
         here = self.ends_mm > z_mm + ROUNDING_MM if on_grid else self.ends_mm == z_mm
         deep_mm = DEEP_RATIO * self.most_mm
-        if (np.abs(self.openings_mm - z_mm) < ROUNDING_MM).any():
+        opens = bool((np.abs(self.openings_mm - z_mm) < ROUNDING_MM).any())
+        if self.alone.any() and z_mm < self.openings_mm[-1] + APART_LAYERS * self.layer_mm:
+            apart_mm = self.openings_mm[-1] + APART_LAYERS * self.layer_mm
+            more = np.concatenate([self.openings_mm, self.tops_mm[self.tops_mm >= apart_mm]])
+            more = more[more > z_mm + ROUNDING_MM]
+            ends = state.planar_top_mm <= z_mm + ROUNDING_MM
+            here &= (self.alone == opens) | (self.alone & ends)
+            if len(more):
+                following = np.where(self.alone, np.minimum(self.ends_mm, more[0]), following)
+        elif opens:
             here &= following - state.surface_mm > deep_mm
         reach = model.reach.at(z_mm)
         return Height(z_mm, index, here, following, self.most_mm, deep_mm, self.layer_mm, reach)
@@ -137,25 +167,59 @@ def _flats(model: PatchModel, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndar
 
 
 def _openings(
-    model: PatchModel, tops_mm: Float[np.ndarray, " n"], most_mm: float
+    model: PatchModel,
+    tops_mm: Float[np.ndarray, " n"],
+    most_mm: float,
+    layer_mm: float,
+    *,
+    alone: bool,
 ) -> Float[np.ndarray, " m"]:
-    """Heights between other passes at which the head first gets in over much that is hollow.
+    """Heights from the lowest at which the head gets into hollows, at least a layer apart.
 
     There beads grow out from what holds them by one more line before the next layer of the job:
-    what lies under them is lost, and up to a layer less of it.
+    what lies under them is lost, and up to a layer less of it. A layer hangs under each, so that
+    nothing between two of them is lost. Unless hollows keep to them `alone`, a pass of the job's a
+    little higher takes the place of one, and so does one a little lower where the head is in: its
+    beads lie there already.
     """
+    at_mm, area_mm2 = _opening(model, tops_mm, most_mm)
+    if not len(at_mm):
+        return np.zeros(0)
+    others = np.zeros(0) if alone else tops_mm[tops_mm >= at_mm[0] - ROUNDING_MM]
+    found: list[float] = []
+    last_mm, open_mm2 = -np.inf, 0.0
+    for z_mm, more_mm2 in zip(at_mm.tolist(), area_mm2.tolist(), strict=True):
+        open_mm2 += more_mm2
+        if open_mm2 < OPENING_MM2 or z_mm < last_mm + layer_mm - ROUNDING_MM:
+            continue
+        near = others[np.abs(others - z_mm) < LEAST_THICK_MM]
+        if len(near):
+            last_mm = float(near[-1])
+        else:
+            last_mm = z_mm
+            found.append(z_mm)
+        open_mm2 = 0.0
+    return np.array(found)
+
+
+def _hollow(
+    model: PatchModel, tops_mm: Float[np.ndarray, " n"], most_mm: float
+) -> Bool[np.ndarray, "ny nx"]:
+    """Columns too deep for a bead where passes at some heights first get in."""
+    later = np.searchsorted(tops_mm, model.need_mm - ROUNDING_MM)
+    first_mm = np.append(tops_mm, np.inf)[later]
+    deep = first_mm - model.floor_mm > DEEP_RATIO * most_mm
+    return np.asarray(deep & np.isfinite(model.top_mm))
+
+
+def _opening(
+    model: PatchModel, tops_mm: Float[np.ndarray, " n"], most_mm: float
+) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+    """Ascending heights, and over how much that is hollow the head first gets in at each."""
     need_mm = model.need_mm
-    later = np.searchsorted(tops_mm, need_mm - ROUNDING_MM)
-    first_mm = np.append(tops_mm, np.inf)[later]  # of the other passes, where the head is in
-    hollow = first_mm - model.floor_mm > DEEP_RATIO * most_mm
-    hollow &= np.isfinite(model.top_mm) & (need_mm < model.top_mm - OPENS_BELOW_MM)
+    hollow = _hollow(model, tops_mm, most_mm) & (need_mm < model.top_mm - OPENS_BELOW_MM)
     steps = np.ceil(need_mm[hollow] / FLAT_MM).astype(np.int64)
     if not len(steps):
-        return np.zeros(0)
+        return np.zeros(0), np.zeros(0)
     area_mm2 = np.bincount(steps - steps.min()) * model.cell_mm**2
-    found: list[float] = []
-    for step in np.flatnonzero(area_mm2 >= OPENING_MM2)[::-1] + steps.min():
-        z_mm = float(step * FLAT_MM)
-        if np.abs(np.array([*tops_mm, *found]) - z_mm).min() >= LEAST_THICK_MM:
-            found.append(z_mm)
-    return np.array(found)
+    return (np.arange(len(area_mm2)) + steps.min()) * FLAT_MM, area_mm2

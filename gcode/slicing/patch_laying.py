@@ -45,8 +45,10 @@ def begin(
 ) -> Pen:
     """From park (mid-job), or from a machine that stands still (standalone); hot at the end."""
     first_c = _first_bead_c(setup, hotend_c)
+    words = Comment(first_pass_words(setup, hotend_c))
     if start_mm is not None:
         pen = Pen(setup, np.array(start_mm))
+        pen.add(words)
         pen.retracted = setup.printer.retraction_mm > 0
         pen.add(SetFan(setup.material.fan_ratio))
         if first_c > hotend_c:
@@ -56,6 +58,7 @@ def begin(
     safe_mm = min(field.top_mm + STANDALONE_LIFT_MM, printer.max_z_mm)
     pen = Pen(setup, np.array([0.0, 0.0, safe_mm]))
     pen.add(Comment("The part stands on the bed and Z is true: X and Y are homed, Z is not."))
+    pen.add(words)
     pen.add(SetBed(material.bed_c))
     pen.add(SetHotend(hotend_c))
     lift = f"{safe_mm:.3f}".rstrip("0").rstrip(".")
@@ -123,6 +126,20 @@ def after_first(pen: Pen, setup: PrintSetup, hotend_c: float) -> None:
         pen.add(SetHotend(hotend_c))
 
 
+def first_pass_words(setup: PrintSetup, hotend_c: float) -> str:
+    """How the first pass is laid onto what has long been cold, in words."""
+    first_c = _first_bead_c(setup, hotend_c)
+    more = f" ({first_c - hotend_c:g} C more than the rest)" if first_c > hotend_c else ""
+    return (
+        f"first pass, onto cold material: {first_c:g} C{more}, at most {_first_mm_s(setup):g} mm/s"
+    )
+
+
+def _first_mm_s(setup: PrintSetup) -> float:
+    """No faster than a first layer: it must have time to hold on."""
+    return min(setup.process.repair_speed_mm_s, setup.process.first_layer_speed_mm_s)
+
+
 def _first_bead_c(setup: PrintSetup, hotend_c: float) -> float:
     """It must melt into what has long been cold; a job may be as hot as the hotend gets."""
     hotter_c = hotend_c + setup.material.repair_first_bead_delta_c
@@ -134,9 +151,7 @@ def emit(
 ) -> float:
     """Lay one pass, the first one no faster than a first layer; returns its plastic."""
     pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
-    speed_mm_s = setup.process.repair_speed_mm_s
-    if first:
-        speed_mm_s = min(speed_mm_s, setup.process.first_layer_speed_mm_s)
+    speed_mm_s = _first_mm_s(setup) if first else setup.process.repair_speed_mm_s
     laid_mm3 = 0.0
     planar = isinstance(one.tip_mm, float)
     # along a surface they are in order: the lowest first

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from gcode.slicing.job import Unprintable
+from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_beads import LEAST_THICK_MM
 from gcode.slicing.patch_due import AGREE_MM
 from gcode.slicing.patch_model import PatchModel

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
 from gcode.slicing.job_lines import JobColumns, JobLines
-from gcode.slicing.layers import mesh_of
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 from gcode.surfaces import raster_kernels as kernels
@@ -70,6 +70,9 @@ class PatchModel:
         self.points_mm = self._centres()
         floor_mm = as_built.sample(self.points_mm).reshape(self.shape)
         self.floor_mm = floor_mm
+        # where a tip may lay what is missing: over it, or in the air beside a rim
+        away_mm = ndimage.distance_transform_edt(~np.isfinite(self.top_mm)) * self.cell_mm
+        self.near = np.asarray(away_mm <= NEAR_MM)
         self.beside_mm = ndimage.uniform_filter(floor_mm, round(2 * SEAM_MM / self.cell_mm) + 1)
         self.job: JobColumns | None = None
         # along the surface itself it is not as the job had it
@@ -120,6 +123,19 @@ class PatchModel:
         index, inside = self._tip_cells
         need = np.where(inside, self.reach.need_mm[index[:, 0], index[:, 1]], -np.inf)
         return need.reshape(self.shape)
+
+    def open_mm3(self, layer_mm: float) -> float:
+        """How much is missing where the head lets a layer be laid, whatever holds it.
+
+        Plastic goes as far aside as the flat presses it, and no farther below a tip than a layer.
+        """
+        reach = round(self.spread_mm / self.cell_mm)
+        y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * self.cell_mm
+        disc = np.hypot(x, y) <= self.spread_mm
+        from_mm = ndimage.minimum_filter(self.need_mm, footprint=disc, mode="nearest") - layer_mm
+        thick_mm = np.minimum(self.top_mm - from_mm, self.wanted_below(np.inf))
+        thick_mm = np.where(np.isfinite(self.top_mm), np.clip(thick_mm, 0.0, None), 0.0)
+        return float(thick_mm.sum()) * self.cell_mm**2 * self.weight
 
     def cell_at(self, point_mm: Float[np.ndarray, " 2"]) -> tuple[int, int]:
         """Row and column of the column that a point lies over."""

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import divided
-from gcode.slicing.job import MOST_NOZZLES
+from gcode.slicing.layer_plan import MOST_NOZZLES
 from gcode.slicing.patch_beads import Chain
 from gcode.slicing.patch_free import surely_free
 from gcode.slicing.patch_model import NEAR_MM, PatchModel

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 
 from gcode.profiles import PrintSetup
 from gcode.slicing.infill import SOLID_ANGLES_RAD
-from gcode.slicing.job import Unprintable
 from gcode.slicing.job_lines import runs_of
+from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_beads import (
     BOND_RATIO,
     LEAST_THICK_MM,
@@ -63,6 +63,8 @@ def plan_pass(
     Along the job's own lines where there are any and they serve; else along lines of our own.
     """
     planned = model.job.at(at.z_mm) if model.job is not None else None
+    if not (model.free_at(at.reach) & model.near).any():
+        return None, state
     if planned is None:
         due = due_at(model, state, at)
         if hems and model.job is None:

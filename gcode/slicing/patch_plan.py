@@ -9,7 +9,7 @@ import numpy as np
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.patch_heights import Heights
+from gcode.slicing.patch_heights import Heights, Openings
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_passes import Pass, plan_pass, plan_skin, skin_served
 from gcode.slicing.patch_skin import skin_of
@@ -17,22 +17,8 @@ from gcode.slicing.patch_state import PatchState
 
 # Of the plastic, what may be laid in the air beside rims; about twice as much lies outside then.
 MOST_HEM = 0.025
-
-
-@dataclass(frozen=True, slots=True)
-class PlanOptions:
-    """A way to lay a patch.
-
-    Attributes
-    ----------
-    hems
-        Begun from the air beside a rim too, where that is the only way.
-    openings
-        With passes between the job's layers where the head first gets in.
-    """
-
-    hems: bool = True
-    openings: bool = True
+# Of what the head allows: a way that fills as much leaves little for others to find.
+ENOUGH = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +37,11 @@ class PatchPasses:
         """What was laid in the air beside rims."""
         return float(self.state.laid_mm[self.state.hem].sum()) * model.cell_mm**2
 
+    def filled_mm3(self, model: PatchModel) -> float:
+        """What is laid where something is missing."""
+        filled_mm = np.minimum(self.state.laid_mm, model.wanted_below(np.inf))
+        return float(filled_mm.sum()) * model.cell_mm**2 * model.weight
+
     def worth_mm3(self, model: PatchModel, setup: PrintSetup) -> float:
         """What is filled, less what is too much, and less the time that it takes.
 
@@ -58,7 +49,7 @@ class PatchPasses:
         """
         wanted = model.wanted_below(np.inf)
         cell_mm3 = model.cell_mm**2 * model.weight
-        filled = float(np.minimum(self.state.laid_mm, wanted).sum()) * cell_mm3
+        filled = self.filled_mm3(model)
         spilt = float(np.maximum(self.state.laid_mm - wanted, 0.0).sum()) * cell_mm3
         length_mm = sum(
             float(np.hypot(*np.diff(chain.xy_mm, axis=0).T).sum())
@@ -73,30 +64,29 @@ class PatchPasses:
 def best_plan(
     model: PatchModel, grid: LayerGrid, setup: PrintSetup, progress: Progress
 ) -> PatchPasses:
-    """The best of the ways to lay a patch, of those that lay little enough in the air."""
-    first = PlanOptions()
-    tried = {first: plan(model, grid, setup, progress, options=first)}
-    if len(Heights.of(model, grid, setup, openings=True).openings_mm):
-        other = PlanOptions(openings=False)
-        tried[other] = plan(model, grid, setup, progress, options=other)
-    for options, found in list(tried.items()):
+    """The best of the ways to lay a patch, of those that lay little enough in the air.
+
+    Another way is tried where one leaves open what the head allows.
+    """
+    open_mm3 = model.open_mm3(grid.layer_height_mm)
+    tried: list[PatchPasses] = []
+    for openings in Openings:
+        heights = Heights.of(model, grid, setup, openings=openings)
+        if tried and not heights.alone.any():
+            continue  # the same again
+        found = plan(model, heights, setup, progress, hems=True)
         if found.hem_mm3(model) > MOST_HEM * found.beads_mm3:
-            del tried[options]
-            without = replace(options, hems=False)
-            tried[without] = plan(model, grid, setup, progress, options=without)
-    return max(tried.values(), key=lambda found: found.worth_mm3(model, setup))
+            found = plan(model, heights, setup, progress, hems=False)
+        tried.append(found)
+        if found.filled_mm3(model) >= ENOUGH * open_mm3:
+            break
+    return max(tried, key=lambda found: found.worth_mm3(model, setup))
 
 
 def plan(
-    model: PatchModel,
-    grid: LayerGrid,
-    setup: PrintSetup,
-    progress: Progress,
-    *,
-    options: PlanOptions,
+    model: PatchModel, heights: Heights, setup: PrintSetup, progress: Progress, *, hems: bool
 ) -> PatchPasses:
-    """Passes from the floor up, in one way."""
-    heights = Heights.of(model, grid, setup, openings=options.openings)
+    """Passes from the floor up, in one way; with `hems`, begun from the air beside a rim too."""
     state = PatchState.begun(model)
     skin = None
     if setup.process.nonplanar_top:
@@ -106,7 +96,7 @@ def plan(
     passes: list[Pass] = []
     count = len(heights.all_mm)
     for k in range(count):
-        one, state = plan_pass(model, state, heights.at(k, state, model), setup, hems=options.hems)
+        one, state = plan_pass(model, state, heights.at(k, state, model), setup, hems=hems)
         passes += [one] if one is not None else []
         progress("slice patch", float(k + 1), float(count))
     if skin is not None:

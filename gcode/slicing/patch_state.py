@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gcode.slicing.job import Unprintable
+from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_model import PatchModel
 from gcode.surfaces import HeightField
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import manifold3d as m3
 import numpy as np
 import pytest
 
+from gcode.meshes import closed_mesh
 from gcode.moves import Extrude, Role
 from gcode.profiles.schema import MaterialProfile, ProcessProfile
 from gcode.profiles.setup import PrintSetup
 from gcode.slicing.infill import solid_fill
-from gcode.slicing.job import INFILL_OVERLAP, slice_part
+from gcode.slicing.job import slice_part
+from gcode.slicing.layer_plan import INFILL_OVERLAP
+from gcode.writer import write
 from tests.unit.link_helpers import profile
 
 
@@ -100,3 +105,15 @@ def test_lines_of_a_solid_fill_carry_their_own_strip_and_no_more() -> None:
     flow = np.concatenate([bead.share_mm for bead in lines]) / 0.407
     assert np.abs(flow - 1.0).max() < 0.01
     assert sum(bead.area_mm2 for bead in beads) == pytest.approx(ring.area(), rel=0.005)
+
+
+@pytest.mark.parametrize("infill_ratio", [1.0, 0.2])
+def test_layers_are_the_same_whoever_plans_them(setup: PrintSetup, infill_ratio: float) -> None:
+    """A solid or its mesh, in this process or in others: one text."""
+    setup = replace(setup, process=setup.process.model_copy(update={"infill_ratio": infill_ratio}))
+    solid = m3.Manifold.sphere(2.5, 40).translate((100.0, 100.0, 2.5))
+    texts = {
+        write(slice_part(part, setup, workers=workers), setup, title="ball").text
+        for part, workers in ((solid, 1), (closed_mesh(solid), 1), (solid, 2))
+    }
+    assert len(texts) == 1

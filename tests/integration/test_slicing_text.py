@@ -222,6 +222,11 @@ def test_the_first_pass_is_slower_and_hotter_and_the_rest_is_not(standalone: boo
     assert {step.hot_c for step in rest} == {own_c}
     assert {step.feed_mm_s for step in first} == {setup.process.first_layer_speed_mm_s}
     assert {step.feed_mm_s for step in rest} == {35.0}
+    told = [line for line in program.text.splitlines() if "onto cold material" in line]
+    assert told == [
+        f"; first pass, onto cold material: {hotter_c:g} C ({hotter_c - own_c:g} C more than the "
+        f"rest), at most {setup.process.first_layer_speed_mm_s:g} mm/s"
+    ]
     if not standalone:  # what the job goes on with
         heats = [line for line in program.text.splitlines() if line.startswith(("M104", "M109"))]
         assert heats == [f"M109 S{hotter_c:g}", f"M104 S{own_c:g}"]

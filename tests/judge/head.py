@@ -117,37 +117,48 @@ def least_tip(
     return np.asarray(np.max(least, axis=0))
 
 
+@dataclass(frozen=True)
+class Reaching:
+    """How a tip fills: where it may be, and how far its beads go.
+
+    `least_mm` is what `least_tip` says, on cells of `cell_mm`; voxels are `size_z_mm` high from
+    `low_z_mm` up. A tip may be `allowed_mm` lower than what it would touch.
+    """
+
+    least_mm: np.ndarray
+    cell_mm: float
+    low_z_mm: float
+    size_z_mm: float
+    bead_mm: float
+    layer_mm: float
+    allowed_mm: float
+
+
 def reachable(
     missing: np.ndarray,
     stands: np.ndarray,
-    low_z_mm: float,
-    size_z_mm: float,
-    least_mm: np.ndarray,
-    cell_mm: float,
+    by: Reaching,
     *,
-    bead_mm: float,
-    layer_mm: float,
-    allowed_mm: float,
     tip_layers: float = 0.5,
     held: bool = True,
 ) -> np.ndarray:
     """Missing voxels that a bead gets to: half its width from a free tip, and not over air.
 
-    `least_mm` is what `least_tip` says. A layer down, what stands or is filled must lie within a
-    bead's width; without `held` that is not asked, and what the head alone reaches is told. The tip
-    is looked for `tip_layers` layers over what it covers: half of one on average, a whole one at
-    most.
+    A layer down, what stands or is filled must lie within a bead's width; without `held` that is
+    not asked, and what the head alone reaches is told. The tip is looked for `tip_layers` layers
+    over what it covers: half of one on average, a whole one at most.
     """
     reach = np.zeros(missing.shape, bool)
-    below = max(1, round(layer_mm / size_z_mm))
+    below = max(1, round(by.layer_mm / by.size_z_mm))
     for k in range(missing.shape[2]):
         if not missing[:, :, k].any():
             continue
-        tip_mm = low_z_mm + (k + 1) * size_z_mm + tip_layers * layer_mm  # a bead lies below its tip
-        free = tip_mm >= least_mm - allowed_mm
-        near = ndimage.distance_transform_edt(~free) * cell_mm <= 0.5 * bead_mm
-        if held and low_z_mm + (k - below) * size_z_mm > 0 and k >= below:
+        # a bead lies below its tip
+        tip_mm = by.low_z_mm + (k + 1) * by.size_z_mm + tip_layers * by.layer_mm
+        free = tip_mm >= by.least_mm - by.allowed_mm
+        near = ndimage.distance_transform_edt(~free) * by.cell_mm <= 0.5 * by.bead_mm
+        if held and by.low_z_mm + (k - below) * by.size_z_mm > 0 and k >= below:
             floor = stands[:, :, k - below] | reach[:, :, k - below]
-            near &= ndimage.distance_transform_edt(~floor) * cell_mm <= bead_mm
+            near &= ndimage.distance_transform_edt(~floor) * by.cell_mm <= by.bead_mm
         reach[:, :, k] = missing[:, :, k] & near
     return reach

@@ -10,7 +10,7 @@ import trimesh
 from numba import njit
 from scipy import ndimage
 
-from tests.judge.head import MK3S_HEAD, HeadSlice, least_tip, reachable, under_cone
+from tests.judge.head import MK3S_HEAD, HeadSlice, Reaching, least_tip, reachable, under_cone
 from tests.judge.text import Steps, read_steps
 from tests.judge.voxels import Voxels, column_tops, occupancy
 
@@ -91,45 +91,25 @@ def judge(
     `piece_box_mm` (2, 3) is the box of what is missing; meshes and text share the build frame.
     """
     steps = read_steps(text)
-    low = np.array([*(piece_box_mm[0, :2] - MARGIN_MM), piece_box_mm[0, 2] - 1.0])
-    high = np.array([*(piece_box_mm[1, :2] + MARGIN_MM), piece_box_mm[1, 2] + 2.0])
-    low[2] = max(low[2], 0.0)
-    # the coarse field's cells are the fine ones', so that windows are slices
-    cell = FINE_MM[0]
-    field_low = np.floor((stands.bounds[0, :2] - BESIDE_MM) / cell) * cell
-    low[:2] = field_low + np.round((low[:2] - field_low) / cell) * cell
-    low[:2] = np.maximum(low[:2], field_low)
-    box = Voxels.around(low, high, FINE_MM)
-    tops = _tops(stands, field_low, stands.bounds[1, :2] + BESIDE_MM, cell)
-    corner = np.round((low[:2] - field_low) / cell).astype(int)
-    high_at = np.minimum(corner + np.array(box.shape[:2]), tops.shape)
-    box.shape = (int(high_at[0] - corner[0]), int(high_at[1] - corner[1]), box.shape[2])
-    window = (slice(corner[0], high_at[0]), slice(corner[1], high_at[1]))
-    before, aim = occupancy(stands, box), occupancy(wanted, box)
-    missing = aim & ~before
-    least = least_tip(tops, window, cell, head)
-    reach, high_reach, open_reach = (
-        reachable(
-            missing, before, low[2], FINE_MM[2], least, cell, bead_mm=bead_mm,
-            layer_mm=HANGING_MM, allowed_mm=0.1, tip_layers=layers, held=held,
-        )
-        for layers, held in ((0.5, True), (1.0, True), (1.0, False))
+    scene = _Scene.of(stands, wanted, piece_box_mm)
+    box, before, missing = scene.box, scene.before, scene.aim & ~scene.before
+    reaching = Reaching(
+        least_mm=least_tip(scene.tops_mm, scene.window, FINE_MM[0], head),
+        cell_mm=FINE_MM[0], low_z_mm=float(box.low_mm[2]), size_z_mm=FINE_MM[2],
+        bead_mm=bead_mm, layer_mm=HANGING_MM, allowed_mm=0.1,
     )  # fmt: skip
-    contact, line = _contact(steps, tops, field_low, cell, head)
+    reach, high_reach, open_reach = (
+        reachable(missing, before, reaching, tip_layers=layers, held=held)
+        for layers, held in ((0.5, True), (1.0, True), (1.0, False))
+    )
+    contact, line = _contact(steps, scene.tops_mm, scene.field_low_mm, FINE_MM[0], head)
     state = before.astype(np.uint8)
     lost, widest = _lay(
         steps.start_mm, steps.end_mm, steps.pushed_mm3, state, box.low_mm, box.size_mm,
-        *_disc(nozzle_mm, cell), MOST_GAP_MM, HANGING_MM,
+        *_disc(nozzle_mm, FINE_MM[0]), MOST_GAP_MM, HANGING_MM,
     )  # fmt: skip
     welled = lost.sum()
     laid = state >= 2
-    hanging = state == 3
-    # by what stands there, or by a bead that lies on something
-    held = (
-        ndimage.binary_dilation(before | (state == 2), iterations=round(bead_mm / cell))
-        if hanging.any()
-        else hanging
-    )
     v = box.volume_mm3
     return Verdict(
         missing_mm3=missing.sum() * v,
@@ -137,8 +117,8 @@ def judge(
         filled_mm3=(laid & missing).sum() * v,
         filled_reachable_mm3=(laid & reach).sum() * v,
         laid_mm3=laid.sum() * v + welled,
-        outside_mm3=(laid & ~aim).sum() * v + welled,
-        in_air_mm3=(hanging & ~held).sum() * v,
+        outside_mm3=(laid & ~scene.aim).sum() * v + welled,
+        in_air_mm3=_in_air(state, before, bead_mm).sum() * v,
         widest_mm=widest,
         deepest_contact_mm=contact,
         contact_line=line,
@@ -147,6 +127,48 @@ def judge(
         reachable_open_mm3=open_reach.sum() * v,
         filled_open_mm3=(laid & open_reach).sum() * v,
     )
+
+
+@dataclass
+class _Scene:
+    """What stands there and what is wanted: voxels round the piece, tops of columns farther out."""
+
+    box: Voxels
+    before: np.ndarray
+    aim: np.ndarray
+    tops_mm: np.ndarray
+    field_low_mm: np.ndarray
+    window: tuple[slice, slice]
+
+    @classmethod
+    def of(
+        cls, stands: trimesh.Trimesh, wanted: trimesh.Trimesh, piece_box_mm: np.ndarray
+    ) -> _Scene:
+        """From meshes."""
+        low = np.array([*(piece_box_mm[0, :2] - MARGIN_MM), piece_box_mm[0, 2] - 1.0])
+        high = np.array([*(piece_box_mm[1, :2] + MARGIN_MM), piece_box_mm[1, 2] + 2.0])
+        low[2] = max(low[2], 0.0)
+        # the coarse field's cells are the fine ones', so that windows are slices
+        cell = FINE_MM[0]
+        field_low = np.floor((stands.bounds[0, :2] - BESIDE_MM) / cell) * cell
+        low[:2] = field_low + np.round((low[:2] - field_low) / cell) * cell
+        low[:2] = np.maximum(low[:2], field_low)
+        box = Voxels.around(low, high, FINE_MM)
+        tops = _tops(stands, field_low, stands.bounds[1, :2] + BESIDE_MM, cell)
+        corner = np.round((low[:2] - field_low) / cell).astype(int)
+        high_at = np.minimum(corner + np.array(box.shape[:2]), tops.shape)
+        box.shape = (int(high_at[0] - corner[0]), int(high_at[1] - corner[1]), box.shape[2])
+        window = (slice(corner[0], high_at[0]), slice(corner[1], high_at[1]))
+        return cls(box, occupancy(stands, box), occupancy(wanted, box), tops, field_low, window)
+
+
+def _in_air(state: np.ndarray, before: np.ndarray, bead_mm: float) -> np.ndarray:
+    """Voxels that hang, held neither by what stands there nor by a bead that lies on something."""
+    hanging = state == 3
+    if not hanging.any():
+        return hanging
+    lies = before | (state == 2)
+    return hanging & ~ndimage.binary_dilation(lies, iterations=round(bead_mm / FINE_MM[0]))
 
 
 def _tops(mesh: trimesh.Trimesh, low, high, cell: float) -> np.ndarray:

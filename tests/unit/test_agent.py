@@ -81,7 +81,7 @@ class Bench:
         self.klipper = self.fake.klipper
         self.scans = [scan_of(ready.broken), scan_of(ready.whole)]
         monkeypatch.setattr(serving, "LOOK_S", 0.05)
-        monkeypatch.setattr(running, "_scanner", lambda *given: Scripted(self._scan))
+        monkeypatch.setattr(running, "open_scanner", lambda *given: Scripted(self._scan))
         self.starts = True
         self.heard: list[str] = []
         self.answers: Callable[[str], None] = lambda text: None

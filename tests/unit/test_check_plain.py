@@ -50,7 +50,7 @@ def judged(text: str, initial: ModalState | None, *, plain: bool) -> Judge:
         if number <= len(lines):
             judge.read(number, lines[number - 1])
             number += 1
-    judge.end(lines)
+    judge.end(laid_out)
     return judge
 
 

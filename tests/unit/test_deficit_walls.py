@@ -18,7 +18,7 @@ from amrepair.deficit.walls import (
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
-from gcode.slicing.layers import mesh_of
+from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField
 
 Solid = manifold3d.Manifold

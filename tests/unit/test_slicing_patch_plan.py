@@ -11,10 +11,10 @@ import pytest
 from gcode.profiles import PrintSetup, load_setup
 from gcode.progress import silent
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.patch_heights import Heights
+from gcode.slicing.patch_heights import Heights, Openings
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_passes import plan_pass
-from gcode.slicing.patch_plan import PlanOptions, best_plan, plan
+from gcode.slicing.patch_plan import ENOUGH, best_plan, plan
 from gcode.slicing.patch_state import PatchState
 from gcode.surfaces import HeightField
 
@@ -31,7 +31,7 @@ def model() -> PatchModel:
 
 
 def test_a_pass_leaves_the_state_before_it_as_it_was(model: PatchModel) -> None:
-    heights = Heights.of(model, GRID, SETUP, openings=True)
+    heights = Heights.of(model, GRID, SETUP, openings=Openings.EACH)
     before = PatchState.begun(model)
     told = [np.array(before.surface_mm), np.array(before.laid_mm), np.array(before.sunk_mm)]
     state, laid_mm3 = before, 0.0
@@ -52,12 +52,23 @@ def _with(setup: PrintSetup, **weights: float) -> PrintSetup:
     return replace(setup, process=setup.process.model_copy(update=weights))
 
 
-def test_the_best_way_is_laid_by_the_process_s_weights(model: PatchModel) -> None:
+@pytest.fixture(scope="module")
+def slot() -> PatchModel:
+    """Hardly wider than the nozzle's flat, which gets in just above one of the job's layers."""
+    block = m3.Manifold.cube((20.0, 20.0, 6.0)).translate((60.0, 60.0, 0.0))
+    tool = m3.Manifold.cube((1.6, 16.0, 20.0)).translate((65.0, 62.0, 5.0))
+    tool = tool ^ block
+    field = HeightField.from_manifold(block - tool, 0.1, margin_mm=8.0)
+    return PatchModel(tool, SETUP, field)
+
+
+def test_the_best_way_is_laid_by_the_process_s_weights(slot: PatchModel) -> None:
+    model = slot
     ways = [
-        plan(model, GRID, SETUP, silent, options=PlanOptions(openings=openings))
-        for openings in (True, False)
+        plan(model, Heights.of(model, GRID, SETUP, openings=each), SETUP, silent, hems=True)
+        for each in Openings
     ]
-    assert len({len(way.passes) for way in ways}) == 2
+    assert ways[0].worth_mm3(model, SETUP) != ways[1].worth_mm3(model, SETUP)
     chosen = best_plan(model, GRID, SETUP, silent)
     assert chosen.worth_mm3(model, SETUP) == max(way.worth_mm3(model, SETUP) for way in ways)
     # each second costs what the profile says
@@ -70,3 +81,23 @@ def test_the_best_way_is_laid_by_the_process_s_weights(model: PatchModel) -> Non
         )
         cost_mm3 = way.worth_mm3(model, free) - way.worth_mm3(model, dear)
         assert cost_mm3 == pytest.approx(length_mm / SETUP.process.repair_speed_mm_s)
+
+
+def test_what_the_head_allows_of_a_slot_is_laid(slot: PatchModel) -> None:
+    """Passes of the job's layers alone left a third of it; where the head gets in, one begins."""
+    open_mm3 = slot.open_mm3(GRID.layer_height_mm)
+    assert 0.3 * slot.deficit.volume() < open_mm3 < 0.7 * slot.deficit.volume()
+    found = best_plan(slot, GRID, SETUP, silent)
+    assert found.filled_mm3(slot) >= 0.85 * open_mm3
+    lowest_mm = float(slot.need_mm[np.isfinite(slot.top_mm)].min())
+    assert lowest_mm - 1e-6 <= found.passes[0].z_mm < lowest_mm + 0.5 * GRID.layer_height_mm
+
+
+def test_a_way_that_fills_what_the_head_allows_is_enough(model: PatchModel) -> None:
+    """Others are not even tried: they take as long again."""
+    heights = Heights.of(model, GRID, SETUP, openings=Openings.EACH)
+    first = plan(model, heights, SETUP, silent, hems=True)
+    assert first.filled_mm3(model) >= ENOUGH * model.open_mm3(GRID.layer_height_mm)
+    asked: list[float] = []
+    best_plan(model, GRID, SETUP, lambda _, done, total: asked.append(done))
+    assert len(asked) == len(heights.all_mm)
