@@ -98,7 +98,7 @@ class Bench:
         self.answers(text)
 
     def agent(self, approve: str = "auto", **changed: Any) -> None:
-        said = {"scanner": "watch:none", "approve": approve, "scan_timeout_s": 1.0, "sound": (),
+        said = {"scanner": f"watch:{self.folder}", "approve": approve, "scan_timeout_s": 1.0, "sound": (),
                 "seed": 0}  # fmt: skip
         told = {"template": self.ready.template, "out": self.folder / "runs", "named": PRINTER,
                 "calibration": None, "page": Page(False, "", 0, None), "once": True,
@@ -167,7 +167,7 @@ def undisturbed(ready: Ready, tmp_path_factory: pytest.TempPathFactory) -> list[
     return made.executed()
 
 
-STEPS = 36  # park, 33 of the repair, the way back, the modes
+STEPS = 38  # park, 35 of the repair, the way back, the modes
 
 
 def test_a_void_is_found_repaired_and_the_print_goes_on(
