@@ -65,7 +65,7 @@ def verdict_of(program: Program, block: m3.Manifold) -> Verdict:
     return judge(program.text, mesh_of(block - missing), mesh_of(block), box)
 
 
-@pytest.mark.parametrize("slope_deg", [4.0, 8.0])
+@pytest.mark.parametrize("slope_deg", [pytest.param(4.0, marks=pytest.mark.slow), 8.0])
 def test_a_gentle_slope_is_followed_and_less_lies_outside(slope_deg: float) -> None:
     block = sloped(slope_deg)
     _, program, field = patched(block, "repair_0.20_nonplanar")

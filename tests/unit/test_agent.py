@@ -98,8 +98,8 @@ class Bench:
         self.answers(text)
 
     def agent(self, approve: str = "auto", **changed: Any) -> None:
-        said = {"scanner": f"watch:{self.folder}", "approve": approve, "scan_timeout_s": 1.0, "sound": (),
-                "seed": 0}  # fmt: skip
+        said = {"scanner": f"watch:{self.folder}", "approve": approve, "scan_timeout_s": 1.0,
+                "sound": (), "seed": 0}  # fmt: skip
         told = {"template": self.ready.template, "out": self.folder / "runs", "named": PRINTER,
                 "calibration": None, "page": Page(False, "", 0, None), "once": True,
                 "pose_confirmed": False, "said": said}  # fmt: skip

@@ -83,7 +83,7 @@ def test_a_cut_in_a_whole_part_cloud(name: str, with_normals: bool) -> None:
 
 
 @pytest.mark.parametrize("sensors", [ABOVE, BOTH_SIDES], ids=["above", "both sides"])
-@pytest.mark.parametrize("name", ["corner", "pit", "void"])
+@pytest.mark.parametrize("name", [pytest.param("corner", marks=pytest.mark.slow), "pit", "void"])
 def test_a_cut_seen_by_known_sensors(name: str, sensors: np.ndarray) -> None:
     cut = CUTS.get(name, cube((20, 10, 0.6), (10, 10, 9.4)))
     built = BLOCK.body - cut

@@ -61,7 +61,7 @@ def test_a_merged_scan_with_holes_is_a_template_that_knows_them(tmp_path: Path) 
     assert len(detect(Scan(dented, 0.03, "template"), template).regions) == 1
 
 
-@pytest.mark.parametrize("crowded", [False, True])
+@pytest.mark.parametrize("crowded", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_scanned_mesh_with_holes_is_closed_and_said(tmp_path: Path, crowded: bool) -> None:
     ball = trimesh.creation.icosphere(5, 20.0)
     centres = ball.triangles_center

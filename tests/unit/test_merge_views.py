@@ -277,6 +277,7 @@ def test_views_of_untold_sensors_are_right_or_left_out(bracket: Shape) -> None:
     assert set(found.left_out) | set(found.poses) == set(range(5))
 
 
+@pytest.mark.slow
 def test_views_that_fit_in_more_than_one_way_are_refused_with_advice() -> None:
     """A ring of equal sides: every view fits on every other as well as beside it."""
     shape = shape_of(Manifold.cylinder(12.0, 10.0, 10.0, 6))
