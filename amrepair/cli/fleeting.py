@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 FLEET_PORT = 8643
 STEP_S = 0.25
+LAST_LOOK_S = 1.5  # an open page asks every second, and is to show how it ended
 
 
 def add_to(app: typer.Typer) -> None:
@@ -92,6 +93,7 @@ def _watch(crew: Fleet, history: History, *, until_done: bool) -> None:
             console.errors.print(crew.notes.pop(0), markup=False)
         _remember(crew, history, kept)
         if until_done and crew.over:
+            time.sleep(LAST_LOOK_S)
             return
         time.sleep(STEP_S)
 
