@@ -237,6 +237,7 @@ def test_align_and_detect_write_what_the_contract_says(
     assert told["regions"][0]["volume_mm3"] == pytest.approx(8 * 8 * 1.2, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_bent_part_is_taken_when_it_is_known(chipped: dict[str, Path], tmp_path: Path) -> None:
     points = np.loadtxt(chipped["scan.xyz"])
     points[:, 2] += 0.006 * np.square(points[:, 0] - 120.0)  # both ends 2.4 mm up

@@ -300,6 +300,7 @@ def test_views_in_one_frame_stay_as_they_came() -> None:
     assert farthest_off_mm(found, [pose for _, pose in made], shape) < 0.1
 
 
+@pytest.mark.slow
 def test_a_round_part_that_turned_before_a_fixed_sensor_is_not_taken_as_it_came() -> None:
     """All views lie on each other and contradict nothing; the sensor never moved."""
     shape = shape_of(Manifold.cylinder(12.0, 10.0, 10.0, 6))

@@ -163,6 +163,7 @@ def stage_of(
     )
 
 
+@pytest.mark.slow
 def test_truth_says_how_even_a_repair_is_and_what_it_added() -> None:
     world = World((60.0, 60.0))
     block = m3.Manifold.cube((16, 16, 2)).translate((20, 20, 0))
