@@ -289,22 +289,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         judged = [row for row in mine if "error" not in row]
         if not judged:
             continue
-        if "filled" not in judged[0]:
-            ratio = [row["deficit_mm3"] / row["truth_mm3"] for row in judged]
-            span, missed = (
-                f"{min(ratio):.3f} to {max(ratio):.3f}",
-                sum(map(bool, map(failings, mine))),
-            )
-            lines.append(f"| {kind} | {len(mine)} | | | | | {span} | {missed} |")
-            continue
-        filled = [row["filled"] for row in judged if row["reached_mm3"] >= FULL_MM3] or [0.0]
-        good = sum(v >= 0.95 for v in filled)
         ratio = [row["deficit_mm3"] / row["truth_mm3"] for row in judged]
         lines.append(
-            f"| {kind} | {len(mine)} | {min(filled):.3f}, {statistics.median(filled):.3f},"
-            f" {good} of {len(filled)} | {max(row['outside'] for row in judged):.1%} |"
-            f" {max(row['contact_mm'] or 0.0 for row in judged):.2f} |"
-            f" {max(declared_off(row) for row in judged):.3f} |"
+            f"| {kind} | {len(mine)} | {_laid([row for row in judged if 'filled' in row])} |"
             f" {min(ratio):.3f} to {max(ratio):.3f} |"
             f" {sum(bool(failings(row)) for row in mine)} |"
         )
@@ -312,6 +299,20 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         if missed := failings(row):
             lines.append(f"{row['part']} {row['kind']} {row['seed']}: {said(row)} {missed}")
     return "\n".join(lines)
+
+
+def _laid(rows: Sequence[dict[str, Any]]) -> str:
+    """Cells of what was laid; empty ones of cuts whose deficit alone was made."""
+    if not rows:
+        return " | | | "
+    filled = [row["filled"] for row in rows if row["reached_mm3"] >= FULL_MM3] or [0.0]
+    good = sum(v >= 0.95 for v in filled)
+    return (
+        f"{min(filled):.3f}, {statistics.median(filled):.3f}, {good} of {len(filled)} |"
+        f" {max(row['outside'] for row in rows):.1%} |"
+        f" {max(row['contact_mm'] or 0.0 for row in rows):.2f} |"
+        f" {max(declared_off(row) for row in rows):.3f}"
+    )
 
 
 PAGE_HEADER = (

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import astuple
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from amrepair.cli.live import VIEW_PORT, HostOption, PortOption, TokenOption, ViewOption
-from amrepair.cli.options import ProcessOption, SeedOption, calibration_named
-from amrepair.cli.printing import APPROVALS
+from amrepair.cli.options import (
+    SCAN_TIMEOUT_S,
+    ProcessOption,
+    ScannerOption,
+    ScannerPoseOption,
+    ScanTimeoutOption,
+    SeedOption,
+    SoundOption,
+    calibration_named,
+    require_approval,
+)
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
@@ -44,10 +54,7 @@ def agent(
             "the one whose name its own begins with."
         ),
     ] = None,
-    scanner: Annotated[
-        str | None,
-        typer.Option(help="watch:DIR or simulated:FILE, as 'amrepair loop' has it."),
-    ] = None,
+    scanner: ScannerOption = None,
     printer: JobPrinterOption = None,
     material: JobMaterialOption = None,
     process: ProcessOption = DEFAULT_PROCESS,
@@ -58,19 +65,9 @@ def agent(
             "that the process profile sets."
         ),
     ] = "ask",
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="File that 'amrepair calibrate' wrote; identity where left out."),
-    ] = None,
-    sound: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="What 'amrepair calibrate --sound' learned and kept by this name; left out: "
-            "learned from the job's own first clean layers.",
-        ),
-    ] = None,
-    scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
+    calibration: ScannerPoseOption = None,
+    sound: SoundOption = None,
+    scan_timeout_s: ScanTimeoutOption = SCAN_TIMEOUT_S,
     out: Annotated[
         Path, typer.Option(help="Folder for the runs, one a print; a run begun there is gone on "
                            "with.")
@@ -107,8 +104,7 @@ def agent(
     if macros is not None or unit is not None:
         _hand_out(macros, unit)
         return
-    if approve not in APPROVALS:
-        raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
+    require_approval(approve)
     missing = {"--moonraker": moonraker, "--template": template, "--scanner": scanner}
     for name, value in missing.items():
         if value is None:
@@ -140,9 +136,7 @@ def _hand_out(macros: Path | None, unit: Path | None) -> None:
         if str(path) == "-":
             console.out.print(shipped(name), end="", markup=False, highlight=False, soft_wrap=True)
             continue
-        try:
-            path.write_text(shipped(name), encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{path} cannot be written ({error.strerror})") from error
+        write = partial(Path.write_text, data=shipped(name), encoding="utf-8")
+        console.write_whole(path, write)
         console.errors.print(f"{path} is written; it says at its head where it belongs.",
                              markup=False)  # fmt: skip

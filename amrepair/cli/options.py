@@ -20,16 +20,22 @@ if TYPE_CHECKING:
     from gcode.profiles import PrintSetup
 
 __all__ = [
+    "SCAN_TIMEOUT_S",
     "CalibrationOption",
     "JsonOption",
     "MaterialOption",
     "PrinterOption",
     "ProcessOption",
+    "ScanTimeoutOption",
+    "ScannerOption",
+    "ScannerPoseOption",
     "SeedOption",
     "SensorOption",
+    "SoundOption",
     "calibration_named",
     "numbers",
     "part_pose",
+    "require_approval",
     "scaled_mesh",
     "sensors",
     "with_settings",
@@ -102,6 +108,43 @@ def part_pose(text: str) -> Transform:
         rotation=np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]),
         translation_mm=np.array([x, y, z]),
     )
+
+
+APPROVALS = ("ask", "auto")
+SCAN_TIMEOUT_S = 120.0
+
+ScannerOption = Annotated[
+    str | None,
+    typer.Option(
+        help="watch:DIR, a folder that scans are dropped in; python:FILE, a scanner of your "
+        "own; or simulated:FILE, of what 'gcode emulate --motion FILE' has printed."
+    ),
+]
+ScannerPoseOption = Annotated[
+    Path | None,
+    typer.Option(help="File that 'amrepair calibrate' wrote; identity where left out."),
+]
+SoundOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="What 'amrepair calibrate --sound' learned and kept by this name; left out: "
+        "learned from the job's own first clean layers.",
+    ),
+]
+ScanTimeoutOption = Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")]
+
+
+def require_approval(approve: str) -> None:
+    """Refuse a word of `--approve` that says neither who nor what decides.
+
+    Raises
+    ------
+    InputError
+        If it is none of `APPROVALS`.
+    """
+    if approve not in APPROVALS:
+        raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
 
 
 SensorOption = Annotated[

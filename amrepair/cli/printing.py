@@ -16,10 +16,16 @@ from amrepair.cli.live import (
     ViewOption,
 )
 from amrepair.cli.options import (
+    SCAN_TIMEOUT_S,
     JsonOption,
     ProcessOption,
+    ScannerOption,
+    ScannerPoseOption,
+    ScanTimeoutOption,
     SeedOption,
+    SoundOption,
     calibration_named,
+    require_approval,
 )
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
@@ -27,8 +33,6 @@ from gcode.cli import console
 from gcode.cli.judging import LeaveHeatersOption
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption
 from gcode.profiles import DEFAULT_PROCESS
-
-APPROVALS = ("ask", "auto")
 
 
 def add_to(app: typer.Typer) -> None:
@@ -61,13 +65,7 @@ def loop(
         str | None,
         typer.Option(help="Device path, octoprint+http://HOST:PORT or moonraker+http://HOST:PORT."),
     ] = None,
-    scanner: Annotated[
-        str | None,
-        typer.Option(
-            help="watch:DIR, a folder that scans are dropped in; python:FILE, a scanner of your "
-            "own; or simulated:FILE, of what 'gcode emulate --motion FILE' has printed."
-        ),
-    ] = None,
+    scanner: ScannerOption = None,
     printer: JobPrinterOption = None,
     material: JobMaterialOption = None,
     process: ProcessOption = DEFAULT_PROCESS,
@@ -96,19 +94,9 @@ def loop(
     at_layer: Annotated[
         list[int] | None, typer.Option("--at-layer", help="Scan after this layer, too.")
     ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="File that 'amrepair calibrate' wrote; identity where left out."),
-    ] = None,
-    sound: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="What 'amrepair calibrate --sound' learned and kept by this name; left out: "
-            "learned from the job's own first clean layers.",
-        ),
-    ] = None,
-    scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
+    calibration: ScannerPoseOption = None,
+    sound: SoundOption = None,
+    scan_timeout_s: ScanTimeoutOption = SCAN_TIMEOUT_S,
     out: Annotated[Path, typer.Option(help="Folder for result, scans, report.")] = Path("out/loop"),
     resume: Annotated[
         Path | None,
@@ -142,8 +130,8 @@ def loop(
     as_json: JsonOption = False,
 ) -> None:
     """Print a job; at chosen layers and at the end scan, repair what is missing, go on."""
-    if approve not in (None, *APPROVALS):
-        raise InputError(f"--approve is {approve!r}; it is one of {', '.join(APPROVALS)}")
+    if approve is not None:
+        require_approval(approve)
     if desk is not None and view:
         raise InputError("--desk and --view are two places to ask at; leave one out")
     with console.starting():

@@ -28,6 +28,7 @@ from gcode.hosts.moonraker_job import KlipperJob, UnderWay
 from gcode.hosts.secret import find_key
 from gcode.hosts.web import Address
 from gcode.solids import SUFFIXES
+from gcode.whole import write_bytes
 
 LOOK_S = 1.0  # between looks at whether something is printed
 PARTS = frozenset({".safetensors", *SUFFIXES})
@@ -149,9 +150,8 @@ class _Service:
         if events:
             begun = gone_on_with(folder, None, told.said["scanner"], told.said["approve"])
         else:
-            folder.mkdir(parents=True, exist_ok=True)
             kept = folder / Path(job.name).name
-            kept.write_bytes(data)
+            write_bytes(kept, data)
             begun = new_run(
                 kept, self._part_of(job.name), folder, told.named, Looks(marked=come_to),
                 told.calibration, watch, AtDesk(self._talk), port=self._address.spec,

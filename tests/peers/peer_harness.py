@@ -20,6 +20,18 @@ from environments import PEERS, python_of
 HERE = Path(__file__).parent
 
 START_S = 90.0
+# Of Moonraker; dev_mode: nothing is looked up outside.
+MOONRAKER = """\
+[server]
+host: 127.0.0.1
+port: {port}
+klippy_uds_address: {klippy}
+[machine]
+provider: none
+validate_service: False
+[announcements]
+dev_mode: True
+"""
 
 
 def peer(name: str) -> str:

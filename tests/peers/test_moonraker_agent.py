@@ -16,22 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from peer_harness import HERE, Web, end, free_port, peer, process, wait_for
+from peer_harness import HERE, MOONRAKER, Web, end, free_port, peer, process, wait_for
 
 from gcode.firmware.motion import MotionFile
 
 pytestmark = pytest.mark.peers
 
-CONFIG = """\
-[server]
-host: 127.0.0.1
-port: {port}
-klippy_uds_address: {klippy}
-[machine]
-provider: none
-validate_service: False
-[announcements]
-dev_mode: True
+AUTHORIZATION = """\
 [authorization]
 trusted_clients:
   127.0.0.1
@@ -69,7 +60,7 @@ class Stack:
         self.klippy, self.own = folder / "klippy.sock", folder / "moonraker.sock"
         for name in ("config", "gcodes", "logs", "database"):
             (folder / name).mkdir()
-        text = CONFIG.format(port=self.port, klippy=self.klippy)
+        text = MOONRAKER.format(port=self.port, klippy=self.klippy) + AUTHORIZATION
         (folder / "config" / "moonraker.conf").write_text(text)
         self.url = f"http://127.0.0.1:{self.port}"
         self.web = Web(self.url, "")

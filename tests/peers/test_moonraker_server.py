@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from link_helpers import program
-from peer_harness import HERE, Printing, Web, end, free_port, peer, process, wait_for
+from peer_harness import HERE, MOONRAKER, Printing, Web, end, free_port, peer, process, wait_for
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts import LinkLostError
@@ -20,17 +20,8 @@ from gcode.hosts.web import Address, WebTiming
 
 pytestmark = pytest.mark.peers
 
-# dev_mode: nothing is looked up outside. Nobody is trusted: every client needs the key.
-CONFIG = """\
-[server]
-host: 127.0.0.1
-port: {port}
-klippy_uds_address: {klippy}
-[machine]
-provider: none
-validate_service: False
-[announcements]
-dev_mode: True
+# Nobody is trusted: every client needs the key.
+AUTHORIZATION = """\
 [authorization]
 enable_api_key: True
 """
@@ -50,7 +41,7 @@ class Stack:
         self.port = free_port()
         for name in ("config", "gcodes", "logs", "database"):
             (folder / name).mkdir()
-        text = CONFIG.format(port=self.port, klippy=self.klippy)
+        text = MOONRAKER.format(port=self.port, klippy=self.klippy) + AUTHORIZATION
         (folder / "config" / "moonraker.conf").write_text(text)
         self.start_klipper()
         self.start_moonraker()
