@@ -138,7 +138,15 @@ def _until_interrupted() -> None:
 
 
 class NoView:
-    """What a run tells where nobody looks."""
+    """What a run tells where nobody looks.
+
+    Attributes
+    ----------
+    address
+        host:port of the page; empty where there is none.
+    """
+
+    address = ""
 
     def show_run(self, job: Job, part: Any) -> None:
         """Nothing is shown."""
@@ -170,6 +178,11 @@ class ShownRun:
     page: LiveView
     operator: Operator
     ask: bool
+
+    @property
+    def address(self) -> str:
+        """host:port of the page."""
+        return self.page.address
 
     def show_run(self, job: Job, part: Any) -> None:
         """The part as it should be, and the beads that will appear."""
