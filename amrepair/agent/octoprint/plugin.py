@@ -69,7 +69,7 @@ class AmrepairPlugin(
 
     def send(self, line: str, tag: str) -> None:
         """Have a line sent in its turn."""
-        self._printer.commands([line], tags={f"{TAG}{tag}"} if tag else None)
+        self._printer.commands([line], tags={f"{TAG}{tag}"} if tag else set())
 
     def heat(self) -> tuple[float, float]:
         """What hotend and bed are set to, °C."""
