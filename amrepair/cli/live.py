@@ -154,6 +154,9 @@ class NoView:
     def drives(self, pause: Callable[[], None], resume: Callable[[], None]) -> None:
         """Nothing is driven."""
 
+    def shows(self, plan: RepairPlan) -> None:
+        """Nothing is shown."""
+
     def to_print(self, plan: RepairPlan) -> bool:
         """Nobody is asked."""
         return True
@@ -195,6 +198,10 @@ class ShownRun:
         """What the pause button calls; rests first where it was pressed already."""
         self.operator.on_pause, self.operator.on_resume = pause, resume
         self.operator.wait_while_paused()  # pressed before there was a printer to pause
+
+    def shows(self, plan: RepairPlan) -> None:
+        """What is asked about elsewhere."""
+        self.page.show_plan(plan, "Print this repair?")
 
     def to_print(self, plan: RepairPlan) -> bool:
         """Wait for a button, where the run asks at all; else for the end of a pause."""

@@ -9,7 +9,7 @@ from typing import Any
 from amrepair.agent.screens import Button, KlipperScreens, OctoPrintTab, Screens
 from amrepair.agent.talk import Talk
 from amrepair.cli.approval import AtDesk
-from amrepair.cli.live import live_view
+from amrepair.cli.live import NoView, ShownRun, live_view
 from amrepair.cli.running import (
     Looks,
     Page,
@@ -19,10 +19,11 @@ from amrepair.cli.running import (
 )
 from amrepair.cli.telling import Begun, written
 from amrepair.errors import AmrepairError, InputError
+from amrepair.loop.decide import Decision
 from amrepair.loop.looks import LoopReport
 from amrepair.loop.tape import read_events
 from amrepair.loop.travel import park, way_back
-from amrepair.repair import Stopwatch
+from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.report.text import summary_of_result
 from gcode.cli import console
 from gcode.errors import GcodeError, LinkError
@@ -92,6 +93,21 @@ def _machine(address: Address, key: ApiKey) -> tuple[ServedJob[Any], Screens]:
         return klipper, KlipperScreens(klipper.command)
     octoprint = OctoPrintJob(address, key)
     return octoprint, OctoPrintTab(octoprint.show)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """Questions go to the printer's screens; the live page shows what they are about."""
+
+    page: NoView | ShownRun
+    desk: AtDesk
+
+    def to_print(self, plan: RepairPlan) -> bool:
+        self.page.shows(plan)
+        return self.desk.to_print(plan)
+
+    def to_go_on(self, decision: Decision) -> bool:
+        return self.desk.to_go_on(decision)
 
 
 class _Service:
@@ -198,8 +214,8 @@ class _Service:
             token=page.token,
         ) as shown, self._machine.showing(shown.address, page.token):  # fmt: skip
             report, warmth = print_run(
-                begun, self._machine, shown, watch, bars, word=bars, going_on=going_on,
-                pose=self._told.pose_confirmed,
+                begun, self._machine, shown, watch, bars, word=_Asked(shown, bars),
+                going_on=going_on, pose=self._told.pose_confirmed,
             )  # fmt: skip
         result = written(begun, report, warmth, watch, bars)
         self._talk.end_prompt()

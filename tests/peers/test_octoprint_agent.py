@@ -30,6 +30,7 @@ pytestmark = [
     pytest.mark.timeout(900),
     pytest.mark.skipif(PRUSA_SLICER is None, reason="PrusaSlicer is not installed here"),
 ]
+PATIENCE_MS = 60_000.0
 QUESTION = "Print this repair?"
 
 
@@ -136,6 +137,9 @@ class Tab:
     def __init__(self, browser: Any, url: str) -> None:
         self.watched = Watched(browser, url, viewport={"width": 1280, "height": 1000})
         self.page = self.watched.page
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.page.locator("#navbar_login").get_by_text("me").first.wait_for()
+        self.page.locator("#tabs .dropdown-toggle").click()  # there are more tabs than have room
         self.page.locator("#tab_plugin_amrepair_link a").click()
         self.prompt = self.page.locator("#amrepair_prompt")
 
@@ -155,7 +159,7 @@ def test_approved_in_the_tab_and_killed_and_nothing_is_printed_twice(stack: Stac
         # the live page, under OctoPrint's own address
         live = tab.page.frame_locator("#amrepair_page")
         live.get_by_role("button", name="Pause").wait_for()
-        live.get_by_text("void").first.wait_for()
+        live.get_by_text(QUESTION).first.wait_for()
         if os.environ.get("AMREPAIR_PICTURES"):
             tab.page.screenshot(path=Path(os.environ["AMREPAIR_PICTURES"]) / "octoprint-tab.png")
         second = subprocess.run(

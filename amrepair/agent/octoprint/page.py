@@ -40,11 +40,11 @@ class LivePage(tornado.websocket.WebSocketHandler):
         if self.request.headers.get("Upgrade", "").lower() == "websocket":
             wanted = self.request.headers.get("Sec-WebSocket-Protocol", "")
             self._behind = await tornado.websocket.websocket_connect(
-                tornado.httpclient.HTTPRequest(f"ws://{host}/", headers=cookie),
-                connect_timeout=PATIENCE_S,
+                tornado.httpclient.HTTPRequest(
+                    f"ws://{host}/", headers=cookie, connect_timeout=PATIENCE_S
+                ),
                 subprotocols=[word.strip() for word in wanted.split(",") if word.strip()],
                 max_message_size=MAX_MESSAGE_BYTES,
-                on_message_callback=self._from_behind,
             )
             await super().get(*args, **kwargs)
             return
@@ -70,15 +70,14 @@ class LivePage(tornado.websocket.WebSocketHandler):
         """To the page."""
         await self._behind.write_message(message, binary=isinstance(message, bytes))
 
-    def _from_behind(self, message: str | bytes | None) -> None:
-        """From the page; None: it has ended."""
-        if message is None:
-            self.close()
-            return
-        try:
-            self.write_message(message, binary=isinstance(message, bytes))
-        except tornado.websocket.WebSocketClosedError:
-            self._behind.close()
+    async def open(self, *args: Any, **kwargs: Any) -> None:
+        """The browser is there: hand on what comes from the page, until it ends."""
+        while (message := await self._behind.read_message()) is not None:
+            try:
+                await self.write_message(message, binary=isinstance(message, bytes))
+            except tornado.websocket.WebSocketClosedError:
+                return
+        self.close()
 
     def on_close(self) -> None:
         """The browser is gone."""

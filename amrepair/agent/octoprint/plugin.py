@@ -227,13 +227,13 @@ class AmrepairPlugin(
             {"type": "settings", "name": "amrepair", "custom_bindings": False},
         ]
 
+    def is_template_autoescaped(self) -> bool:
+        """Nothing that we show is HTML."""
+        return True
+
     def get_assets(self) -> dict[str, list[str]]:
         """The tab's script."""
         return {"js": ["amrepair.js"], "css": ["amrepair.css"]}
-
-    def is_wizard_required(self) -> bool:
-        """Nothing has to be asked at first."""
-        return False
 
 
 def _byte(tags: Any) -> int | None:
