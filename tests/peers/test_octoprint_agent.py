@@ -183,3 +183,26 @@ def test_approved_in_the_tab_and_killed_and_nothing_is_printed_twice(stack: Stac
         assert not [said for said in tab.watched.complaints if "amrepair" in said]
     judge(stack.motion, job, "@amrepair")
     assert stack.state()["print"]["ended"] == "done"
+
+
+def test_octoprint_is_killed_at_a_look(stack: Stack) -> None:
+    """Its print is over: nothing more is sent, the heaters are switched off, and both sides say."""
+    job = sliced(stack.folder, flavour="marlin2", reads="octoprint")
+    agent = stack.agent()
+    stack.upload(job)
+    wait_for("the question", lambda: QUESTION in stack.said(), stack.log)
+    assert stack.web.get("/api/printer")["temperature"]["tool0"]["target"] == 210.0
+    printed = stack.motion.stat().st_size
+    end(stack.server)
+    stack.start_octoprint()
+    told = "OctoPrint was restarted while a print rested at its look"
+    wait_for("a sentence", lambda: told in stack.tab(), stack.folder / "octoprint.log")
+    wait_for("the agent's word", lambda: "no more looks at this print" in stack.said(), stack.log)
+
+    def off() -> bool:
+        heat = stack.web.get("/api/printer").get("temperature", {})
+        return all(heat.get(name, {}).get("target") == 0.0 for name in ("tool0", "bed"))
+
+    wait_for("heaters are off", off, stack.folder / "octoprint.log")
+    assert stack.motion.stat().st_size == printed
+    end(agent)
