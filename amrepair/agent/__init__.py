@@ -1,7 +1,8 @@
 """What an agent beside a print server says and is asked: macros, messages, questions, its unit.
 
 It serves a print that the server's own printer has begun; the run itself is `loop`'s, and the
-printer is a port of `gcode.hosts`. What is put into a job for it is `postprocess`'s. `octoprint` is what sits in OctoPrint itself.
+printer is a port of `gcode.hosts`. What is put into a job for it is `postprocess`'s; what sits in
+OctoPrint itself is `octoprint`.
 """
 
 from amrepair.agent.screens import Button, KlipperScreens, OctoPrintTab, Screens
