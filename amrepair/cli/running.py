@@ -338,7 +338,14 @@ def print_run(
     if not going_on:
         machine.connect()
     page.drives(machine.pause, machine.resume)
-    expected = sites(begun.job, begun.template, setting.placed, setup, by_beads=setting.by_beads)
+    expected = sites(
+        begun.job,
+        begun.template,
+        setting.placed,
+        setup,
+        by_beads=setting.by_beads,
+        detector=detector,
+    )
     warmth = ThermalLog(machine.temperatures)
     shown = page.recording(begun.folder.record)
 
@@ -353,7 +360,7 @@ def print_run(
                 begun.checked,
                 machine,
                 eye,
-                lambda stop: replace(expected(stop), detector=detector),
+                expected,
                 stops=begun.stops,
                 max_iterations=setting.max_iterations,
                 approve=word.to_print if ask else lambda plan: True,

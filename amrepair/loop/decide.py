@@ -21,6 +21,7 @@ class Action(StrEnum):
 
     STOP = "stop"
     PAUSE = "pause and ask"
+    GIVE_UP = "give the object up"
     LOOK_AGAIN = "look again"
     FILL_NOW = "fill now"
     FILL_WITH_NEXT = "fill with the next layer"
@@ -58,6 +59,12 @@ class Finding:
         Lowest and highest corner, build frame.
     skipped
         A line of the job that is not there lies in it: its room is a bead's.
+    object
+        Which of several objects of the job, not given up yet, it lies in; empty: in none.
+    lost_ratio
+        Share of what the job has laid of that object that is missing, all its regions together.
+    given_up
+        It lies in an object that has been given up.
     layer_off
         The layer's top lies off its plane there by more than tolerance and its own scatter
         explain (`layer_level`): what the next layer's flow is changed for.
@@ -77,6 +84,9 @@ class Finding:
     seen_twice: bool = False
     skipped: bool = False
     layer_off: bool = True
+    object: str = ""
+    lost_ratio: float = 0.0
+    given_up: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +159,9 @@ _NAMES = {
     "cover": "covered next by",
     "hit_mm": "in the head's way by",
     "seen_twice": "looked at twice",
+    "object": "in one of several objects",
+    "lost_ratio": "share of the object that is gone",
+    "given_up": "in an object that was given up",
     "skipped": "where a line was skipped",
     "layer_off": "the layer lies off by more than its own scatter",
     "last_pass": "it was the last pass allowed",
@@ -191,6 +204,8 @@ ONE_LAYER = 1.75
 """What is lower than this, noise and all, lies within one layer."""
 LEAST_LAYERS = 0.2
 """Less than this is within what a layer's beads differ by themselves."""
+LOST_RATIO = 0.5
+"""An object of which more is gone has nothing left that a repair could stand on."""
 LEAST_HIT_MM3 = 0.1
 """A drop 0.6 mm across: less bends away, or melts under the nozzle."""
 ENDS = (DefectType.DETACHED, DefectType.LAYER_SHIFT)
@@ -216,15 +231,28 @@ _THIN = (
     _is("cover", Cover.SOLID),
 )  # fmt: skip
 _MISSING, _EXCESS = _is("kind", "missing"), _is("kind", "excess")
+_OWN = Condition("object", "stated", None)
 
 FINDINGS: tuple[Row, ...] = (
+    Row("F0a", Action.GO_ON, (_is("given_up", True),),
+        "nothing more is printed of that object"),
+    Row("F0b", Action.LOOK_AGAIN, (_MISSING, _OWN, _from("lost_ratio", LOST_RATIO),
+                                   _is("seen_twice", False)),
+        "a false alarm would cost the object"),
+    Row("F0c", Action.GIVE_UP, (_MISSING, _OWN, _from("lost_ratio", LOST_RATIO)),
+        "too little is left of the object to repair it; the others can go on"),
     Row("F1", Action.STOP, (_is("type", ENDS), _from("confidence", SURE)),
         "what is printed from here on would land beside the part"),
     Row("F2", Action.LOOK_AGAIN, (_is("type", BEYOND_MENDING), _below("confidence", SURE),
                                   _is("seen_twice", False)),
         "a false alarm would cost the print"),
+    Row("F3a", Action.GIVE_UP, (_is("type", (DefectType.WARP,)), _OWN),
+        "adding material cannot mend it; the other objects can go on"),
     Row("F3", Action.PAUSE, (_is("type", BEYOND_MENDING),),
         "adding material cannot mend it; somebody has to look"),
+    Row("F4a", Action.GIVE_UP, (_EXCESS, _OWN, _from("volume_mm3", LEAST_HIT_MM3),
+                                _from("hit_mm", 1e-6)),
+        "the head would hit it on its next moves; the other objects can go on"),
     Row("F4", Action.PAUSE, (_EXCESS, _from("volume_mm3", LEAST_HIT_MM3), _from("hit_mm", 1e-6)),
         "the head would hit it on its next moves; cut it off, or end the print"),
     Row("F5", Action.GO_ON, (_EXCESS, _is("type", (DefectType.STRING,))),
@@ -268,6 +296,9 @@ STOPS: tuple[Row, ...] = (
         "a finding ends the run: parked, heaters off"),
     Row("S2", Action.PAUSE, (_is("gravest", Action.PAUSE),),
         "a finding needs somebody's word; where nobody can be asked, the run ends parked"),
+    Row("S2a", Action.GIVE_UP, (_is("gravest", Action.GIVE_UP),),
+        "nothing more is printed of the object, which is asked about where somebody is; then "
+        "another look at the rest"),
     Row("S3", Action.LOOK_AGAIN, (_is("gravest", Action.LOOK_AGAIN), _is("seen_twice", False)),
         "another scan, nothing moved between"),
     Row("S4", Action.GO_ON, (_FILL, _is("little_left", True)),

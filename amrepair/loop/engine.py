@@ -25,6 +25,8 @@ from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
 from amrepair.loop.memory import settled
 from amrepair.loop.next_layer import rewritten_layer
+from amrepair.loop.objects import Course, Objects
+from amrepair.loop.sites import Expected
 from amrepair.loop.situation import decide_look
 from amrepair.loop.tape import Sent, Tape, TapeEndsError, report_from_json, report_to_json
 from amrepair.regions.calibration import Calibration
@@ -32,13 +34,19 @@ from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
 from amrepair.scans import Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
-from gcode.hosts.port import Printer, PrintReport
+from gcode.hosts.port import LeavesOut, Printer, PrintReport
 from gcode.moves import ModalState
 from gcode.progress import Progress, silent
 from gcode.reader import Job
+from gcode.resumption.head import pulled_back_mm
+from gcode.resumption.rest import rest_without
+from gcode.resumption.standing import with_solid
 
 PickUp = Callable[[Sequence[Sent]], PrintReport | None]
 """Finds out where the printer is, and has it finish what it was sent last."""
+
+
+ENDED_BY_NO = (Action.PAUSE, Action.GIVE_UP)
 
 
 class Run:
@@ -52,6 +60,7 @@ class Run:
         scanner: Scanner,
         site_at: Callable[[Stop], Site],
         *,
+        stops: Sequence[Stop],
         max_iterations: int,
         approve: Callable[[RepairPlan], bool],
         ask: Callable[[Decision], bool] | None,
@@ -67,6 +76,8 @@ class Run:
         progress: Progress,
     ) -> None:
         self._job, self._checked, self._printer, self._scanner = job, checked, printer, scanner
+        self._base = 0  # of the job's lines, the one that the program under way begins with
+        self._objects, self._course, self._stops = Objects.of(job), Course(job), tuple(stops)
         self._site_at, self._max_iterations = site_at, max_iterations
         self._approve, self._ask, self._limits = approve, ask, limits
         self._record, self._keep_scan = record, keep_scan
@@ -93,16 +104,18 @@ class Run:
             self._stopped,
             tuple(self._passed),
             self._learning.calibration,
+            self._objects.given_up,
         )
 
     # ------------------------------------------------------------------ the job
 
     def print_job(self, end: int, coming: Stop | None = None) -> None:
-        """Print the job's lines up to `end`, and wait until the nozzle rests.
+        """Print the job's lines up to `end`, as the run was begun, and wait until the nozzle rests.
 
         What is to be expected at the `coming` stop is made meanwhile.
         """
-        first, lines = self._next_line, self._checked.program.text.count("\n")
+        first, lines = self._next_line, self._base + self._checked.program.text.count("\n")
+        end = self._course.line(end)
         if first >= end:
             return
 
@@ -111,17 +124,19 @@ class Run:
             self._progress("print", float(first) + done, float(lines))
 
         with self._watch("print"), ThreadPoolExecutor(1) as beside:
-            if coming is not None and not self._tape.only_read:
-                self._coming = coming, beside.submit(self._site_at, coming)
+            now = None if coming is None else self._course.stop(coming)
+            if coming is not None and now is not None and not self._tape.only_read:
+                self._coming = coming, beside.submit(self._site_at, now)
             settling = beside.submit(self.settle)
-            report = self._send("job", self._checked, first, end, whole_job)
+            kind, base = ("rest" if self._base else "job"), self._base
+            report = self._send(kind, self._checked, first - base, end - base, whole_job)
         settling.result()
         if report is not None:
             self._job_prints.append(report)
             if not report.ok:
                 raise LoopError(
-                    f"the job was stopped at line {report.next_line + 1} of {lines}; heaters are "
-                    "off"
+                    f"the job was stopped at line {base + report.next_line + 1} of {lines}; "
+                    "heaters are off"
                 )
         self._next_line = end
 
@@ -140,8 +155,11 @@ class Run:
         """Look, decide, repair, until there is nothing more to do; whether the job goes on."""
         if self._tape.only_read:
             return self._again(stop)
-        state = self._job.state_after(stop.line)
-        site = self._expected(stop)
+        now = self._course.stop(stop)
+        if now is None:
+            return True  # nothing is printed there any more
+        state, began = self._job.state_after(now.line), self._checked
+        site = self._expected(stop, now)
         with self._watch("print"):
             program, parked = travel.park(site.setup, state)
             self._send("park", program)
@@ -157,11 +175,17 @@ class Run:
                     report = self._send("repair", look.plan.checked)
                     if report is not None:
                         self._repair_prints.append(report)
-            elif action is Action.STOP or (action is Action.PAUSE and look.declined):
+            elif action is Action.STOP or (look.declined and action in ENDED_BY_NO):
                 self._stopped = _why(look.decision)
                 return False
+            elif action is Action.GIVE_UP:
+                if not self._give_up(now, site, look, parked):
+                    return False
+                site = self._site_at(self._course.stop(stop) or now)
             elif action is not Action.LOOK_AGAIN:
                 break
+        if self._checked is not began:
+            return True  # what is left of the job begins where the nozzle rests
         with self._watch("print"):
             for program in travel.way_back(site.setup, state, parked):
                 self._send("back", program)
@@ -169,12 +193,58 @@ class Run:
                 self._change_next(stop, site, look)
         return True
 
-    def _expected(self, stop: Stop) -> Site:
+    def _give_up(self, now: Stop, site: Site, look: Look, parked: ModalState) -> bool:
+        """Print nothing more of the objects that a decision names; whether that can be done."""
+        names = [v.finding.object for v in look.decision.verdicts if v.action is Action.GIVE_UP]
+        names = sorted(set(names))
+        objects = self._objects.giving_up(names)
+        if not objects.left:
+            self._stopped = f"stop: no object is left: {', '.join(names)} cannot be repaired"
+            return False
+        try:
+            if isinstance(self._printer, LeavesOut):
+                if self._tape.next("given_up") is None:
+                    self._go_live()
+                    for name in names:
+                        self._printer.leave_out(name)
+                    self._tape.write("given_up", objects=names)
+                self._job = objects.expected(now.line, names)
+            else:
+                self._write_anew(now, site, look, parked, names)
+        except GcodeError as error:
+            self._stopped = f"stop: {', '.join(names)} cannot be left out: {error}"
+            return False
+        self._objects = replace(Objects.of(self._job), given_up=objects.given_up)
+        if isinstance(self._site_at, Expected):
+            self._site_at = self._site_at.of(self._job)
+        self._progress(f"given up: {', '.join(names)}", 1.0, 1.0)
+        return True
+
+    def _write_anew(
+        self, now: Stop, site: Site, look: Look, parked: ModalState, names: Sequence[str]
+    ) -> None:
+        """The job from here on without some objects, from where the nozzle rests."""
+        machine = site.setup.printer
+        ends = [layer.end_line for layer in self._job.layers]
+        coming = [s.line for s in map(self._course.stop, self._stops) if s is not None]
+        rest = rest_without(
+            self._job, names, site.setup, first=now.line, parked=parked,
+            pulled_mm=pulled_back_mm(self._job, now.line) + machine.retraction_mm,
+            standing=with_solid(
+                self._job.beads, now.line, machine, look.plan.deficit.excess
+            ),
+            stops=sorted({*ends, *coming}),
+        )  # fmt: skip
+        self._course = self._course.anew(rest)
+        self._job, self._checked = rest.job, rest.checked
+        self._base = self._next_line = rest.first_line
+
+    def _expected(self, stop: Stop, now: Stop) -> Site:
         """What is expected at a stop, made beforehand or now."""
         coming, self._coming = self._coming, None
         if coming is not None and coming[0] == stop:
             return coming[1].result()
-        return self._site_at(stop)
+        return self._site_at(now)
 
     def _again(self, stop: Stop) -> bool:
         """Look at the recorded scans of a stop, however it is decided now."""
@@ -188,10 +258,11 @@ class Run:
 
     def _change_next(self, stop: Stop, site: Site, look: Look) -> None:
         """Print the next layer with its flow changed, where that was decided."""
-        if not look.decision.changes_next or stop.layer_index is None:
+        now = self._course.stop(stop)
+        if not look.decision.changes_next or now is None or now.layer_index is None:
             return
         changed = rewritten_layer(
-            self._job, site.setup, stop.layer_index + 1, look.plan, look.decision.changes_next
+            self._job, site.setup, now.layer_index + 1, look.plan, look.decision.changes_next
         )
         if changed is None:
             return
@@ -244,7 +315,8 @@ class Run:
             self._progress(f"scan {stop.label}", 1.0, 1.0)
         with ThreadPoolExecutor(1) as beside:  # the disk need not wait for the plan, nor it for it
             kept = beside.submit(self._keep_scan, number, scan) if taped is None else None
-            plan, decision = self._plan(number, stop, site, parked, scan, here)
+            now = self._course.stop(stop) or stop
+            plan, decision = self._plan(number, now, site, parked, scan, here)
         if kept is not None:
             kept.result()
         look = self._outcome(Look(number, stop, scan, plan, decision, printed=False), taped)
@@ -294,7 +366,8 @@ class Run:
             interruption=parked,
             strict=False,
             wanted=lambda region: (
-                early_action(region, self._job, site.setup, stop.layer_index)
+                self._objects.owner(np.asarray(region.box_mm)) not in self._objects.given_up
+                and early_action(region, self._job, site.setup, stop.layer_index)
                 is not Action.FILL_WITH_NEXT
             ),
             rng=np.random.default_rng([self._seed, number]),
@@ -319,6 +392,7 @@ class Run:
                 seen_twice=again,
                 max_iterations=self._max_iterations,
                 limits=self._limits,
+                objects=self._objects,
             )
         return plan, decision
 
@@ -330,6 +404,8 @@ class Run:
         if action is Action.FILL_NOW:
             granted = self._approve(look.plan)
             return replace(look, printed=granted, declined=not granted)
+        if action is Action.GIVE_UP and self._ask is not None:
+            return replace(look, declined=not self._ask(look.decision))
         if action is Action.PAUSE:
             if self._ask is None or not self._ask(look.decision):
                 return replace(look, declined=True)

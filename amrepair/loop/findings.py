@@ -15,6 +15,7 @@ from jaxtyping import Float
 from amrepair.deficit.worth import defect_volumes
 from amrepair.loop.decide import Action, Cover, Finding, judge
 from amrepair.loop.layer_level import FLOW_TEST, FlowTest, LayerLevel, lie_off
+from amrepair.loop.objects import Objects
 from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals
@@ -113,6 +114,7 @@ def findings(
     line: int,
     seen_twice: bool = False,
     flow_test: FlowTest = FLOW_TEST,
+    objects: Objects | None = None,
 ) -> tuple[Finding, ...]:
     """The facts about every region of a plan.
 
@@ -124,6 +126,8 @@ def findings(
         Whether this stop was looked at before, nothing printed between.
     flow_test
         What it takes to change the next layer's flow.
+    objects
+        The job's, where it is printed on without those that cannot be repaired.
     """
     after = next_layer(job, layer_index)
     end_line = job.layers[after].end_line if after is not None else line
@@ -131,8 +135,11 @@ def findings(
     found = []
     regions = plan.deficit.regions
     z_mm = None if layer_index is None else job.layers[layer_index].z_mm
+    owners = _owners(objects, regions, line)
     off = lie_off(LayerLevel.of(plan, z_mm, flow_test) if regions else None, regions)
-    for region, whole_mm3, is_off in zip(regions, _whole_defects(regions), off, strict=True):
+    for region, whole_mm3, is_off, owner in zip(
+        regions, _whole_defects(regions), off, owners, strict=True
+    ):
         reach, hit = 1.0, 0.0
         if region.label is Label.MISSING:
             reach = reach_of(plan, region.box_mm)
@@ -156,9 +163,31 @@ def findings(
                 seen_twice=seen_twice,
                 skipped=region.skipped,
                 layer_off=is_off,
+                object=owner[0],
+                lost_ratio=owner[1],
+                given_up=owner[2],
             )
         )
     return tuple(found)
+
+
+def _owners(
+    objects: Objects | None, regions: Sequence[Region], line: int
+) -> list[tuple[str, float, bool]]:
+    """Of each region: the object it lies in, the share of that one that is gone, given up."""
+    if objects is None:
+        return [("", 0.0, False)] * len(regions)
+    names = [objects.owner(np.asarray(region.box_mm)) for region in regions]
+    gone_mm3 = dict.fromkeys(names, 0.0)
+    for name, region in zip(names, regions, strict=True):
+        gone_mm3[name] += float(region.volume_mm3) * (region.label is Label.MISSING)
+    share = {n: gone_mm3[n] / max(objects.laid_mm3(n, line), 1e-9) for n in gone_mm3 if n}
+    found = []
+    for name in names:
+        given_up = name in objects.given_up
+        own = name if not given_up and len(objects.left) > 1 else ""
+        found.append((own, share.get(name, 0.0) if own else 0.0, given_up))
+    return found
 
 
 def _whole_defects(regions: Sequence[Region]) -> Float[np.ndarray, " n"]:

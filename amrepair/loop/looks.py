@@ -87,6 +87,8 @@ class LoopReport:
     calibration
         What the run learned of its scanner from its first clean layers, or was told of it; None
         where it came to neither.
+    given_up
+        Objects of the job that could not be repaired: nothing more was printed of them.
     """
 
     looks: tuple[Look, ...]
@@ -95,6 +97,7 @@ class LoopReport:
     stopped: str = ""
     passed: tuple[Stop, ...] = ()
     calibration: Calibration | None = None
+    given_up: tuple[str, ...] = ()
 
     def at_stop(self, stop: Stop) -> tuple[Look, ...]:
         """The looks of one stop."""
@@ -126,7 +129,7 @@ class LoopReport:
     @property
     def within_tolerance(self) -> bool:
         """Whether every stop was left within tolerance (`left_well`), and each was looked at."""
-        found_mm3, well = 0.0, not self.stopped and not self.passed
+        found_mm3, well = 0.0, not self.stopped and not self.passed and not self.given_up
         for looks in self.by_stop.values():
             found_mm3 += looks[0].plan.deficit.missing_mm3
             well = well and left_well(looks, found_mm3)

@@ -124,7 +124,7 @@ def run_loop(
     ['fill now', 'go on']
     """
     run = Run(
-        job, checked, printer, scanner, site_at,
+        job, checked, printer, scanner, site_at, stops=stops,
         max_iterations=max_iterations, approve=approve, ask=ask, limits=limits, record=record,
         keep_scan=keep_scan, tape=tape or Tape(), pick_up=pick_up, silent_stops=silent_stops,
         calibration=calibration,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool
@@ -10,10 +11,11 @@ from jaxtyping import Bool
 from amrepair.frames import Transform, box_of
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
+from amrepair.regions import detect
 from amrepair.regions.calibration import NORMAL
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
-from amrepair.repair import Site
+from amrepair.repair import Detector, Site
 from amrepair.template import LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
@@ -27,6 +29,29 @@ BESIDE_MM, BESIDE_CELL_MM = 0.4, 0.25
 RIMS = ("perimeter", "wall")  # what slicers call it
 
 
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What is expected at a stop of a job (`sites`), and how it is judged."""
+
+    template: Template
+    build_from_template: Transform
+    setup: PrintSetup
+    by_beads: bool
+    detector: Detector
+    _at: Callable[[Stop], Site]
+
+    def __call__(self, stop: Stop) -> Site:
+        """At one stop."""
+        return replace(self._at(stop), detector=self.detector)
+
+    def of(self, job: Job) -> Expected:
+        """The same of another job: what is left of it, say."""
+        return sites(
+            job, self.template, self.build_from_template, self.setup, by_beads=self.by_beads,
+            detector=self.detector,
+        )  # fmt: skip
+
+
 def sites(
     job: Job,
     template: Template,
@@ -34,7 +59,8 @@ def sites(
     setup: PrintSetup,
     *,
     by_beads: bool = True,
-) -> Callable[[Stop], Site]:
+    detector: Detector = detect,
+) -> Expected:
     """What is expected at a stop, for `run_loop`.
 
     A finished part is judged by its template. A layer is, too, where `by_beads` is false (all of
@@ -84,7 +110,7 @@ def sites(
             laid=_laid(job, done),
         )
 
-    return at
+    return Expected(template, build_from_template, setup, by_beads, detector, at)
 
 
 def _laid(job: Job, which: Bool[np.ndarray, " n"]) -> LaidBeads | None:

@@ -8,6 +8,7 @@ from amrepair.loop.decide import Decision, Situation, decide, gravest, judge
 from amrepair.loop.findings import findings
 from amrepair.loop.limits import Limits, beyond
 from amrepair.loop.looks import Look, Stop
+from amrepair.loop.objects import Objects
 from amrepair.repair import RepairPlan, Site
 from gcode.reader import Job
 
@@ -27,6 +28,7 @@ def decide_look(
     seen_twice: bool,
     max_iterations: int,
     limits: Limits | None,
+    objects: Objects | None = None,
 ) -> Decision:
     """What the table says of a plan.
 
@@ -36,6 +38,8 @@ def decide_look(
         The earlier looks of this stop.
     limits
         What may be printed unasked; None where somebody is asked, or all is allowed.
+    objects
+        The job's.
     """
     verdicts = tuple(
         judge(finding)
@@ -46,6 +50,7 @@ def decide_look(
             layer_index=stop.layer_index,
             line=stop.line,
             seen_twice=seen_twice,
+            objects=objects,
         )
     )
     situation = Situation(

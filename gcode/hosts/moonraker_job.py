@@ -79,6 +79,17 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
         self.command("\n".join(f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE={v} VALUE=0" for v in
                                ("program", "begun", "done", "hotend", "bed")))  # fmt: skip
 
+    def leave_out(self, name: str) -> None:
+        """By Klipper's own [exclude_object]; told twice, it is left out once."""
+        found = self._session.query({"exclude_object": ["objects"]}).get("exclude_object", {})
+        known = [str(row.get("name")) for row in found.get("objects", ())]
+        if name.upper() not in known:
+            raise LinkError(
+                f"the printer behind {self.address.name} knows no object {name!r}; write "
+                "[exclude_object] into printer.cfg, and label objects in the slicer."
+            )
+        self.command(f"EXCLUDE_OBJECT NAME={name}")
+
     # ------------------------------------------------------------------ printing
 
     def _refresh(self) -> None:

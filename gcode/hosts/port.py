@@ -80,6 +80,14 @@ class PrintReport:
     warnings: tuple[str, ...] = ()
 
 
+@runtime_checkable
+class LeavesOut(Protocol):
+    """A printer whose server prints the job, and can leave an object of it out by itself."""
+
+    def leave_out(self, name: str) -> None:
+        """Print nothing more of an object, whose name is the job's."""
+
+
 class LinkLostError(LinkError):
     """The link was lost in mid-job; what is uncertain is named.
 

@@ -185,6 +185,16 @@ class ServedJob(ServerPrinter[Session]):
             raise LinkError("no job is followed; call follow() first.")
         return self._job_text
 
+    def leave_out(self, name: str) -> None:
+        """Have the server print nothing more of an object.
+
+        Raises
+        ------
+        LinkError
+            If it cannot.
+        """
+        raise LinkError(f"{self.address.name} cannot leave the object {name!r} out of its print.")
+
     # ------------------------------------------------------------------ printing
 
     def print(

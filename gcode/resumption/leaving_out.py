@@ -19,7 +19,7 @@ from gcode.profiles import PrinterProfile
 from gcode.reader import Job, JobObjects, objects_of
 from gcode.resumption.head import feed
 
-_MOVE = re.compile(r"^\s*[Gg]0*[0123](?!\d)")
+MOVE = re.compile(r"^\s*[Gg]0*[0123](?!\d)")
 LEAST_MM = 5e-4
 
 
@@ -59,7 +59,7 @@ def lines_without(job: Job, first: int, name: str, printer: PrinterProfile) -> t
     at = first
     for start, stop in _gaps(job, objects, index, first):
         out += lines[at:start]
-        out += [line for line in lines[start:stop] if not _MOVE.match(line)]
+        out += [line for line in lines[start:stop] if not MOVE.match(line)]
         out += _across(job, start, stop, printer)
         at = stop
     return (*out, *lines[at:])
@@ -85,7 +85,7 @@ def _across(job: Job, start: int, stop: int, printer: PrinterProfile) -> list[st
     over = [f"G1 X{number(x, 5)} Y{number(y, 5)}{travel}"]
     lift = [f"G1 Z{number(z, 5)} F{feed(printer.z_speed_mm_s)}"]
     moves = [*lift, *over] if z > before.position_mm[2] else [*over, *lift]
-    return ["G90", "M83", *_filament(job, start, stop, printer), *moves, *_modes(after)]
+    return ["G90", "M83", *_filament(job, start, stop, printer), *moves, *modes_as(after)]
 
 
 def _filament(job: Job, start: int, stop: int, printer: PrinterProfile) -> list[str]:
@@ -103,7 +103,8 @@ def _pulled_back(pushed_mm: np.ndarray) -> float:
     return float(np.maximum.accumulate(whole)[-1] - whole[-1])
 
 
-def _modes(after: ModalState) -> list[str]:
+def modes_as(after: ModalState) -> list[str]:
+    """What brings a machine in G90 and M83 into a state's modes; it is at its place already."""
     said = [f"G92 E{number(after.e_mm, 5)}"]
     if after.feed_mm_s > 0:
         said.append(f"G1 F{feed(after.feed_mm_s)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import manifold3d
 import numpy as np
 
 from gcode.profiles import PrinterProfile
@@ -40,6 +41,17 @@ def standing_field(beads: Beads, line: int, printer: PrinterProfile) -> HeightFi
     return HeightField(
         np.array([x0, y0]), CELL_MM, z_mm.reshape(ny, nx), np.ones((ny, nx), dtype=bool)
     )
+
+
+def with_solid(
+    beads: Beads, line: int, printer: PrinterProfile, excess: manifold3d.Manifold
+) -> HeightField:
+    """What is laid by lines [0, line), and what stands out beside or above it."""
+    laid = standing_field(beads, line, printer)
+    if excess.is_empty():
+        return laid
+    there = over_reach(HeightField.from_manifold(excess, CELL_MM), printer)
+    return HeightField(laid.origin_mm, CELL_MM, np.maximum(laid.z_mm, there.z_mm), laid.seen)
 
 
 def over_reach(field: HeightField, printer: PrinterProfile) -> HeightField:
