@@ -17,19 +17,19 @@ from amrepair.fleet.desk import Desk
 from amrepair.fleet.shared import SharedDetection
 from amrepair.frames import Transform
 from amrepair.loop import (
-    MAX_ITERATIONS,
+    Approval,
     Decision,
     Look,
     LoopReport,
+    Records,
     Tape,
     plan_stops,
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
-from amrepair.loop.limits import Limits
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
-from amrepair.loop.pace import Pace, layers_at
+from amrepair.loop.pace import layers_at
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
@@ -250,7 +250,7 @@ def new_run(
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
         copies=() if expected is field else placed, by_beads=True,
-        max_iterations=MAX_ITERATIONS, adaptive=pace, marked=looks.marked,
+        adaptive=pace, marked=looks.marked,
         limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
@@ -355,19 +355,9 @@ def print_run(
                 eye,
                 lambda stop: replace(expected(stop), detector=detector),
                 stops=begun.stops,
-                max_iterations=setting.max_iterations,
-                approve=word.to_print if ask else lambda plan: True,
-                ask=word.to_go_on if ask else None,
-                limits=Limits.of(setup.process) if setting.limited else None,
-                pace=Pace(setting.adaptive) if setting.adaptive else None,
-                record=recorded,
-                keep_scan=begun.folder.keep_scan,
-                tape=begun.tape,
-                pick_up=find,
-                silent_stops=SILENT_STOPS,
-                calibration=setting.scanners_errors,
-                seed=setting.seed,
-                watch=watch,
+                options=replace(setting.options(setup.process), silent_stops=SILENT_STOPS),
+                approval=Approval(word.to_print, word.to_go_on) if ask else Approval(),
+                records=Records(recorded, begun.folder.keep_scan, begun.tape, find, watch),
                 progress=page.watching(bars),
             )
         return report, warmth.series(_noted(setting.port))

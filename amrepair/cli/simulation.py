@@ -31,9 +31,11 @@ from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 if TYPE_CHECKING:
     from amrepair.frames import Transform
     from amrepair.loop import Tape
+    from amrepair.policy import PolicyOptions
     from amrepair.report import ReportData
     from amrepair.report.folder import RunFolder
     from amrepair.simulate.run import PreparedRun, SimulatedRun
+    from gcode.hosts.port import Printer
 
 DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
 
@@ -102,6 +104,8 @@ def simulate(
     with console.starting():
         import numpy as np
 
+        from amrepair.loop import Approval
+        from amrepair.policy import PolicyOptions
         from amrepair.repair import Stopwatch
         from amrepair.report import write_report
         from amrepair.report.folder import RunFolder
@@ -112,6 +116,7 @@ def simulate(
         from gcode.profiles import load_setup
 
     watch, bars = Stopwatch(), console.Bars()
+    policy = PolicyOptions(most_passes=max_iterations)
     defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
     defects = [d for d in defects if d.kind != "none"]
     setup = load_setup(printer, material, process)
@@ -135,16 +140,20 @@ def simulate(
             view, ask=True, title=path.name, host=view_host, port=view_port, token=token
         ) as page:
             page.show_run(prepared.job, prepared.part)
+
+            def begun(pose: Transform, printer: Printer) -> Tape:
+                page.drives(printer.pause, printer.resume)
+                return _recorded(prepared, folder, pose, ids, policy)
+
             run = simulate_run(
                 prepared,
                 wire_log=folder.file("wire.log"),
                 world=told,
                 scanner=scanner,
-                max_iterations=max_iterations,
-                approve=page.to_print,
+                policy=policy,
+                approval=Approval(page.to_print),
                 record=page.recording(folder.record),
-                begun=lambda pose: _recorded(prepared, folder, pose, ids, max_iterations),
-                connected=lambda printer: page.drives(printer.pause, printer.resume),
+                begun=begun,
                 watch=watch,
                 progress=page.watching(bars),
             )
@@ -172,7 +181,7 @@ def _recorded(
     folder: RunFolder,
     pose: Transform,
     ids: tuple[str, str, str],
-    max_iterations: int,
+    policy: PolicyOptions,
 ) -> Tape:
     """Write down what the run begins with; the tape that it is recorded on."""
     from amrepair.loop import Tape
@@ -187,7 +196,7 @@ def _recorded(
         build_from_scanner=pose,
         by_beads=run.by_beads,
         seed=run.seed,
-        max_iterations=max_iterations,
+        policy=policy,
     )
     keep(folder.path, setting, run.checked.program.text, run.template)
     return Tape(folder.path)

@@ -12,9 +12,9 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.deficit.worth import defect_volumes
-from amrepair.loop.decide import Action, Cover, Finding, judge
 from amrepair.loop.layer_level import FLOW_TEST, FlowTest, LayerLevel, lie_off
+from amrepair.policy.table import Action, Cover, Finding, judge
+from amrepair.policy.worth import defect_volumes
 from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals

@@ -6,7 +6,6 @@ protocol, the emulated firmware. Only plastic and light are simulated (`world`, 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +17,21 @@ from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
-from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, Tape, plan_stops, run_loop
+from amrepair.loop import (
+    Approval,
+    Look,
+    LoopOptions,
+    LoopReport,
+    Records,
+    Stop,
+    Tape,
+    plan_stops,
+    run_loop,
+)
+from amrepair.loop.options import UNASKED
 from amrepair.loop.sites import sites
-from amrepair.repair import RepairPlan, Stopwatch
+from amrepair.policy import POLICY, PolicyOptions
+from amrepair.repair import Stopwatch
 from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
@@ -258,14 +269,12 @@ def simulate_run(
     run: PreparedRun,
     *,
     wire_log: Path | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    approve: Callable[[RepairPlan], bool] = lambda plan: True,
+    policy: PolicyOptions = POLICY,
+    approval: Approval = UNASKED,
     record: Callable[[Look], None] = lambda look: None,
-    begun: Callable[[Transform], Tape] | None = None,
-    connected: Callable[[Printer], None] = lambda printer: None,
+    begun: Callable[[Transform, Printer], Tape] = lambda pose, printer: Tape(),
     world: WorldParameters | None = None,
     scanner: str = DEFAULT_SCANNER,
-    clock: Callable[[], float] = time.monotonic,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
 ) -> SimulatedRun:
@@ -274,10 +283,8 @@ def simulate_run(
     Parameters
     ----------
     begun
-        Called with the scanner's calibrated pose; returns the tape that the run is recorded on,
-        which is closed at its end.
-    connected
-        Called with the printer before anything is printed: a view's pause button needs it.
+        Called with the scanner's calibrated pose and the printer before anything is printed;
+        returns the tape that the run is recorded on, which is closed at its end.
     world, scanner
         The world's parameters (None: the shipped ones), and which of its scanners looks.
 
@@ -286,7 +293,7 @@ def simulate_run(
     AmrepairError, GcodeError
         Whatever stops the loop.
     """
-    watch = watch or Stopwatch(clock)
+    watch = watch or Stopwatch()
     printer_profile = run.setup.printer
     temperatures: list[tuple[float, float, float]] = []
     with EmulatedPrinterProcess(printer_profile.dialect, printer=printer_profile) as machine:
@@ -298,8 +305,7 @@ def simulate_run(
             wire_log=wire_log,
         )
         printer.connect()
-        connected(printer)
-        tape = begun(stage.build_from_scanner) if begun is not None else None
+        tape = begun(stage.build_from_scanner, printer)
 
         def recorded(look: Look) -> None:
             now = printer.temperatures()
@@ -316,18 +322,14 @@ def simulate_run(
                     run.job, run.template, run.build_from_template, run.setup, by_beads=run.by_beads
                 ),
                 stops=run.stops,
-                max_iterations=max_iterations,
-                approve=approve,
-                record=recorded,
-                tape=tape,
-                seed=run.seed,
-                watch=watch,
+                options=LoopOptions(policy=policy, seed=run.seed),
+                approval=approval,
+                records=Records(recorded, tape=tape, watch=watch),
                 progress=progress,
             )
         finally:
             printer.close()
-            if tape is not None:
-                tape.close()
+            tape.close()
         stage.finish()
         printer_clock_s = machine.clock_s()
     return SimulatedRun(

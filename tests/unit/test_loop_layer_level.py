@@ -8,9 +8,9 @@ import manifold3d as m3
 import numpy as np
 import pytest
 
-from amrepair.loop.decide import Action, Cover, Finding, judge
 from amrepair.loop.layer_level import FlowTest, LayerLevel
 from amrepair.loop.next_layer import gap_solids
+from amrepair.policy.table import Action, Cover, Finding, judge
 from amrepair.regions.anomaly import DefectType
 
 LAYER_MM, Z_MM = 0.2, 2.0
