@@ -12,7 +12,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.loop.layer_level import FLOW_TEST, FlowTest, LayerLevel, lie_off
+from amrepair.loop.layer_level import FLOW_TEST, FlowOptions, LayerLevel, lie_off
 from amrepair.policy.table import Action, Cover, Finding, judge
 from amrepair.policy.worth import defect_volumes
 from amrepair.regions import Label, Region
@@ -112,7 +112,7 @@ def findings(
     layer_index: int | None,
     line: int,
     seen_twice: bool = False,
-    flow_test: FlowTest = FLOW_TEST,
+    flow_test: FlowOptions = FLOW_TEST,
 ) -> tuple[Finding, ...]:
     """The facts about every region of a plan.
 
