@@ -91,9 +91,9 @@ def _solid_in_box(
     away_mm = sign * f  # from the template, of which so much is no defect
     away_mm[near] -= _allowed(anomaly, label, samples[near], away_mm[near] - thin_mm[near])
     core = (away_mm > limit_mm) & (beyond > limit_mm / 2)
-    if label is Label.MISSING and evidence.has_rays:
-        # a planned bead is thinner than 2 τ: nothing of it would be left of an eroded template,
-        # but rays that went through it count as well
+    if label is Label.MISSING:
+        # a planned bead or a thin wall is thinner than 2 τ: nothing of it would be left of an
+        # eroded template, but what is known to be empty that far around counts as well
         core |= (away_mm > limit_mm / 4) & (beyond > limit_mm)
     ask = np.flatnonzero(can_be & ~core & (away_mm > thin_mm) & (clip < 0))
     nearest = s.tree.query(samples[ask], workers=2)[1]
