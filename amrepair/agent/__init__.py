@@ -1,10 +1,13 @@
 """What an agent beside a print server says and is asked: macros, messages, questions, its unit.
 
 It serves a print that the server's own printer has begun; the run itself is `loop`'s, and the
-printer is a port of `gcode.hosts`. What is put into a job for it is `postprocess`'s.
+printer is a port of `gcode.hosts`. What is put into a job for it is `postprocess`'s; what sits in
+OctoPrint itself is `octoprint`.
 """
 
+from amrepair.agent.screens import Button, KlipperScreens, OctoPrintTab, Screens
 from amrepair.agent.shipped import MACROS, UNIT, shipped
 from amrepair.agent.talk import Talk
 
-__all__ = ["MACROS", "UNIT", "Talk", "shipped"]
+__all__ = ["MACROS", "UNIT", "Button", "KlipperScreens", "OctoPrintTab", "Screens", "Talk",
+           "shipped"]  # fmt: skip

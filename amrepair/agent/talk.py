@@ -1,28 +1,18 @@
-"""Tells and asks at the printer: its display, its console, and prompts that its screens show.
-
-Prompts are Klipper's `action:prompt_…`, which Mainsail, Fluidd and KlipperScreen draw themselves.
-Answers come by the macro AMREPAIR_APPROVE.
-"""
+"""Tells and asks at the printer, on whatever screens it has (`screens`)."""
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
+from amrepair.agent.screens import Button, Screens
 from amrepair.errors import LoopError
 from gcode.errors import GcodeError, LinkError
 
 POLL_S = 0.5
 IDLE = "waiting for a print"
-END_PROMPT = 'RESPOND TYPE=command MSG="action:prompt_end"'
 _QUIET = frozenset({"print", "printing"})  # the printer's own screens show how far that is
-# A line of G-code ends at a comment; a quote ends its text, a bar a prompt's.
-_UNSAID = re.compile(r"[\x00-\x1f;#\"|*\\]+")
-
-Button = tuple[str, str, str]
-"""What is on it, the command, its colour."""
 
 
 @runtime_checkable
@@ -32,11 +22,8 @@ class Host(Protocol):
     def rests_at_look(self) -> bool:
         """Whether its job rests where it asks for a look."""
 
-    def command(self, text: str) -> None:
-        """Have a script carried out."""
-
     def calls(self, wait_s: float) -> list[dict[str, Any]]:
-        """What macros have asked for; waits for some."""
+        """What people have asked for there; waits for some."""
 
 
 class Talk:
@@ -46,22 +33,24 @@ class Talk:
     ----------
     host
         Connected.
+    screens
+        Its own.
     note
         Called with every message besides, for whoever reads the agent's own output.
     """
 
-    def __init__(self, host: Host, note: Callable[[str], None]) -> None:
-        self._host, self._note = host, note
+    def __init__(self, host: Host, screens: Screens, note: Callable[[str], None]) -> None:
+        self._host, self._screens, self._note = host, screens, note
         self._doing = IDLE
         self._number = 0
         self._answers = threading.Condition()
         self._open, self._answer = False, False
         self._answered = False
         self._ended = threading.Event()
-        self._hears = threading.Thread(target=self._hear, daemon=True, name="macro-calls")
+        self._hears = threading.Thread(target=self._hear, daemon=True, name="calls")
 
     def listen(self) -> None:
-        """Answer the macros from now on, in a thread."""
+        """Answer what people ask for from now on, in a thread."""
         self._hears.start()
 
     def close(self) -> None:
@@ -76,8 +65,9 @@ class Talk:
         """Tell of a stage once it begins."""
         new, self._doing = stage != self._doing, stage
         if new and stage not in _QUIET:
-            taken = f"{END_PROMPT}\n" if stage.startswith("scan") else ""  # nobody waits any more
-            self._send(f"{taken}M117 amrepair: {plain(stage)}")
+            if stage.startswith("scan"):
+                self.end_prompt()  # nobody waits any more
+            self._told(lambda: self._screens.stage(stage))
 
     def rest(self) -> None:
         """Nothing is being done."""
@@ -86,35 +76,27 @@ class Talk:
     def say(self, text: str, *, wrong: bool = False) -> None:
         """One sentence, in the printer's console and on its display."""
         self._note(text)
-        said = plain(text)
-        line = f'TYPE=error MSG="amrepair: {said}"' if wrong else f'PREFIX="amrepair:" MSG="{said}"'
-        self._send(f"RESPOND {line}\nM117 amrepair: {said}")
+        self._told(lambda: self._screens.say(text, wrong=wrong))
 
     def prompt(self, lines: Sequence[str], buttons: Sequence[Button]) -> None:
         """A window on the printer's screens."""
-        rows = ["prompt_end", "prompt_begin amrepair"]
-        rows += [f"prompt_text {plain(line)}" for line in lines]
-        rows += [
-            f"prompt_footer_button {label}|{gcode}|{colour}" for label, gcode, colour in buttons
-        ]
-        self._send("\n".join(f'RESPOND TYPE=command MSG="action:{row}"' for row in
-                             [*rows, "prompt_show"]))  # fmt: skip
+        self._told(lambda: self._screens.prompt(lines, buttons))
 
     def end_prompt(self) -> None:
         """Take the window away."""
-        self._send(END_PROMPT)
+        self._told(self._screens.end_prompt)
 
-    def _send(self, script: str) -> None:
+    def _told(self, tell: Callable[[], None]) -> None:
         """Told as well as can be: what is not heard changes nothing of what is done."""
         try:
-            self._host.command(script)
+            tell()
         except GcodeError as error:
             self._note(f"(not told at the printer: {error})")
 
     # ------------------------------------------------------------------ asking
 
     def ask(self, question: str, lines: Sequence[str]) -> bool:
-        """Ask at the printer, and wait for AMREPAIR_APPROVE.
+        """Ask at the printer, and wait for an answer.
 
         Raises
         ------
@@ -124,10 +106,13 @@ class Talk:
         with self._answers:
             self._number += 1
             self._open, self._answered = True, False
-        yes = f"AMREPAIR_APPROVE ANSWER=yes QUESTION={self._number}"
-        no = f"AMREPAIR_APPROVE ANSWER=no QUESTION={self._number}"
+        answer = {"what": "approve", "question": self._number}
+        buttons = [
+            Button("Yes", {**answer, "answer": "yes"}, "primary"),
+            Button("No", {**answer, "answer": "no"}, "warning"),
+        ]
         self.say(question)
-        self.prompt([question, *lines], [("Yes", yes, "primary"), ("No", no, "warning")])
+        self.prompt([question, *lines], buttons)
         try:
             while True:
                 with self._answers:
@@ -149,7 +134,7 @@ class Talk:
         except LinkError:
             return True  # a server that is away for a moment; the printer waits as we do
 
-    # ------------------------------------------------------------------ macros
+    # ------------------------------------------------------------------ being asked
 
     def _hear(self) -> None:
         while not self._ended.is_set():
@@ -169,8 +154,3 @@ class Talk:
                 self._answers.notify_all()
                 return
         self.say("no question waits for this answer.", wrong=True)
-
-
-def plain(text: str) -> str:
-    """A text that may stand in a line of G-code."""
-    return " ".join(_UNSAID.sub(" ", text.replace(";", ",")).split())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import astuple
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -27,6 +27,10 @@ from gcode.cli import console
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption
 from gcode.profiles import DEFAULT_PROCESS
 
+if TYPE_CHECKING:
+    from gcode.hosts.secret import ApiKey
+    from gcode.hosts.web import Address
+
 
 def add_to(app: typer.Typer) -> None:
     """Add the command."""
@@ -36,8 +40,8 @@ def add_to(app: typer.Typer) -> None:
             "amrepair agent --macros amrepair.cfg",
             "amrepair agent --moonraker http://127.0.0.1:7125 --template part.stl "
             "--scanner watch:scans",
-            "amrepair agent --moonraker http://voron.local:7125 --template parts "
-            "--scanner watch:scans --approve auto",
+            "amrepair agent --octoprint http://octopi.local --api-key-file octoprint.key "
+            "--template parts --scanner watch:scans",
             "amrepair agent --unit amrepair-agent.service",
         ),
     )(agent)
@@ -46,6 +50,18 @@ def add_to(app: typer.Typer) -> None:
 def agent(
     moonraker: Annotated[
         str | None, typer.Option(metavar="URL", help="The printer's Moonraker: http://HOST:PORT.")
+    ] = None,
+    octoprint: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="The printer's OctoPrint, with our plugin in it."),
+    ] = None,
+    api_key_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The server's API key, in a file that only its owner can read; else from "
+            "OCTOPRINT_API_KEY or MOONRAKER_API_KEY.",
+        ),
     ] = None,
     template: Annotated[
         Path | None,
@@ -99,31 +115,49 @@ def agent(
 ) -> None:  # fmt: skip
     """Look at a printer's prints where their jobs are marked, repair them, and let them go on.
 
-    The jobs are begun as ever, from Mainsail, Fluidd or the printer's screen.
+    The jobs are begun as ever, from Mainsail, Fluidd, OctoPrint or the printer's screen.
     """
     if macros is not None or unit is not None:
         _hand_out(macros, unit)
         return
     require_approval(approve)
-    missing = {"--moonraker": moonraker, "--template": template, "--scanner": scanner}
-    for name, value in missing.items():
+    for name, value in {"--template": template, "--scanner": scanner}.items():
         if value is None:
             raise InputError(f"{name} is missing; see 'amrepair agent --help'")
     with console.starting():
         from amrepair.cli import serving
         from amrepair.cli.running import Page
 
+    address, key = _server(moonraker, octoprint, api_key_file)
     errors = calibration_named(sound)
     serving.serve(
         serving.Served(
-            str(moonraker), Path(str(template)), out, (printer, material, process), calibration,
-            Page(view, view_host, view_port, token), once=once, pose_confirmed=pose_confirmed,
+            address, key, Path(str(template)), out, (printer, material, process), calibration,
+            Page(view or octoprint is not None, view_host, view_port, token), once=once,
+            pose_confirmed=pose_confirmed,
             said={
                 "scanner": scanner, "approve": approve, "scan_timeout_s": scan_timeout_s,
                 "sound": () if errors is None else astuple(errors), "seed": seed,
             },
         )
     )  # fmt: skip
+
+
+def _server(
+    moonraker: str | None, octoprint: str | None, key_file: Path | None
+) -> tuple[Address, ApiKey]:
+    """The one server that was named, and its key."""
+    from gcode.hosts.secret import find_key, key_in
+    from gcode.hosts.web import Address
+
+    named = {"moonraker": moonraker, "octoprint": octoprint}
+    given = [f"{kind}+{url}" for kind, url in named.items() if url is not None]
+    if len(given) != 1:
+        raise InputError("name one server, by --moonraker or --octoprint")
+    address = Address.parse(given[0])
+    if key_file is not None:
+        return address, key_in(key_file)
+    return address, find_key(address.kind, address.spec)
 
 
 def _hand_out(macros: Path | None, unit: Path | None) -> None:

@@ -138,13 +138,24 @@ def _until_interrupted() -> None:
 
 
 class NoView:
-    """What a run tells where nobody looks."""
+    """What a run tells where nobody looks.
+
+    Attributes
+    ----------
+    address
+        host:port of the page; empty where there is none.
+    """
+
+    address = ""
 
     def show_run(self, job: Job, part: Any) -> None:
         """Nothing is shown."""
 
     def drives(self, pause: Callable[[], None], resume: Callable[[], None]) -> None:
         """Nothing is driven."""
+
+    def shows(self, plan: RepairPlan) -> None:
+        """Nothing is shown."""
 
     def to_print(self, plan: RepairPlan) -> bool:
         """Nobody is asked."""
@@ -171,6 +182,11 @@ class ShownRun:
     operator: Operator
     ask: bool
 
+    @property
+    def address(self) -> str:
+        """host:port of the page."""
+        return self.page.address
+
     def show_run(self, job: Job, part: Any) -> None:
         """The part as it should be, and the beads that will appear."""
         from amrepair.report.live import PART
@@ -182,6 +198,10 @@ class ShownRun:
         """What the pause button calls; rests first where it was pressed already."""
         self.operator.on_pause, self.operator.on_resume = pause, resume
         self.operator.wait_while_paused()  # pressed before there was a printer to pause
+
+    def shows(self, plan: RepairPlan) -> None:
+        """What is asked about elsewhere."""
+        self.page.show_plan(plan, "Print this repair?")
 
     def to_print(self, plan: RepairPlan) -> bool:
         """Wait for a button, where the run asks at all; else for the end of a pause."""

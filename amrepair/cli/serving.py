@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from amrepair.agent.screens import Button, KlipperScreens, OctoPrintTab, Screens
 from amrepair.agent.talk import Talk
 from amrepair.cli.approval import AtDesk
-from amrepair.cli.live import live_view
+from amrepair.cli.live import NoView, ShownRun, live_view
 from amrepair.cli.running import (
     Looks,
     Page,
@@ -18,14 +19,18 @@ from amrepair.cli.running import (
 )
 from amrepair.cli.telling import Begun, written
 from amrepair.errors import AmrepairError, InputError
+from amrepair.loop.decide import Decision
 from amrepair.loop.looks import LoopReport
 from amrepair.loop.tape import read_events
-from amrepair.repair import Stopwatch
+from amrepair.loop.travel import park, way_back
+from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.report.text import summary_of_result
 from gcode.cli import console
 from gcode.errors import GcodeError, LinkError
-from gcode.hosts.moonraker_job import KlipperJob, UnderWay
-from gcode.hosts.secret import find_key
+from gcode.hosts.moonraker_job import KlipperJob
+from gcode.hosts.octoprint_job import OctoPrintJob
+from gcode.hosts.secret import ApiKey
+from gcode.hosts.served_job import ServedJob, UnderWay
 from gcode.hosts.web import Address
 from gcode.solids import SUFFIXES
 from gcode.whole import write_bytes
@@ -38,7 +43,8 @@ PARTS = frozenset({".safetensors", *SUFFIXES})
 class Served:
     """What an agent is begun with; `said` is what a run's setting takes as it is."""
 
-    url: str
+    address: Address
+    key: ApiKey
     template: Path
     out: Path
     named: tuple[str | None, str | None, str]
@@ -57,21 +63,20 @@ def serve(told: Served) -> None:
     LinkError, PortBusyError
         If the server cannot be reached at the beginning, or has an agent already.
     """
-    address = Address.parse(f"moonraker+{told.url}")
     if not told.template.exists():
         raise InputError(f"--template {told.template}: there is no such file or folder")
-    machine = KlipperJob(address, find_key(address.kind, address.spec))
+    machine, screens = _machine(told.address, told.key)
     machine.connect()
-    talk = Talk(machine, lambda text: console.errors.print(text, markup=False))
+    talk = Talk(machine, screens, lambda text: console.errors.print(text, markup=False))
     try:
         with console.signals_end_it():
-            machine.require_macros()
+            machine.require_partner()
             talk.listen()
             talk.say("the agent is here.")
-            _Service(told, address, machine, talk).run()
+            _Service(told, machine, talk).run()
     except KeyboardInterrupt:
         console.errors.print(
-            "A print that rests at a look stays so, heaters off; one that goes on is Klipper's. "
+            "A print that rests at a look stays so, heaters off; one that goes on goes on. "
             f"Started again with --out {told.out}, the agent goes on with it.",
             markup=False,
         )
@@ -81,12 +86,35 @@ def serve(told: Served) -> None:
         machine.close()
 
 
+def _machine(address: Address, key: ApiKey) -> tuple[ServedJob[Any], Screens]:
+    """The printer of a server, not connected, and its screens."""
+    if address.kind == "moonraker":
+        klipper = KlipperJob(address, key)
+        return klipper, KlipperScreens(klipper.command)
+    octoprint = OctoPrintJob(address, key)
+    return octoprint, OctoPrintTab(octoprint.show)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """Questions go to the printer's screens; the live page shows what they are about."""
+
+    page: NoView | ShownRun
+    desk: AtDesk
+
+    def to_print(self, plan: RepairPlan) -> bool:
+        self.page.shows(plan)
+        return self.desk.to_print(plan)
+
+    def to_go_on(self, decision: Decision) -> bool:
+        return self.desk.to_go_on(decision)
+
+
 class _Service:
     """The prints of one printer."""
 
-    def __init__(self, told: Served, address: Address, machine: KlipperJob, talk: Talk) -> None:
-        self._told, self._address = told, address
-        self._machine, self._talk = machine, talk
+    def __init__(self, told: Served, machine: ServedJob[Any], talk: Talk) -> None:
+        self._told, self._machine, self._talk = told, machine, talk
         self._held: int | None = None
 
     def run(self) -> None:
@@ -125,18 +153,18 @@ class _Service:
 
     def _print(self, job: UnderWay) -> None:
         """Serve one print."""
-        begun, self._held = None, None
+        found, self._held = None, None
         try:
-            begun = self._begin(job)
-            if begun is None:
+            found = self._begin(job)
+            if found is None:
                 self._held = self._machine.rests_at()
                 return
-            self._run(*begun)
+            self._run(*found)
         except (AmrepairError, GcodeError) as error:
-            if begun is None:
+            if found is None:
                 self._talk.say(f"{job.name} is printed without looks: {error}", wrong=True)
             else:
-                self._ended(f"{error}")
+                self._ended(f"{error}", found[0])
 
     def _begin(self, job: UnderWay) -> tuple[Begun, bool, Stopwatch] | None:
         """A new run, or the one that was begun; None where that was ended."""
@@ -154,7 +182,7 @@ class _Service:
             write_bytes(kept, data)
             begun = new_run(
                 kept, self._part_of(job.name), folder, told.named, Looks(marked=come_to),
-                told.calibration, watch, AtDesk(self._talk), port=self._address.spec,
+                told.calibration, watch, AtDesk(self._talk), port=self._told.address.spec,
                 leave_heaters=True, **told.said,
             )  # fmt: skip
         self._machine.serve(begun.checked)
@@ -184,15 +212,15 @@ class _Service:
         with live_view(
             page.view, ask=False, title=begun.setting.title, host=page.host, port=page.port,
             token=page.token,
-        ) as shown:  # fmt: skip
+        ) as shown, self._machine.showing(shown.address, page.token):  # fmt: skip
             report, warmth = print_run(
-                begun, self._machine, shown, watch, bars, word=bars, going_on=going_on,
-                pose=self._told.pose_confirmed,
+                begun, self._machine, shown, watch, bars, word=_Asked(shown, bars),
+                going_on=going_on, pose=self._told.pose_confirmed,
             )  # fmt: skip
         result = written(begun, report, warmth, watch, bars)
         self._talk.end_prompt()
         if report.stopped:
-            self._ended(report.stopped)
+            self._ended(report.stopped, begun)
         else:
             self._say_how(report, result)
 
@@ -201,19 +229,22 @@ class _Service:
         lines = summary_of_result(result, within_tolerance=within)
         self._talk.say(" ".join(lines), wrong=not within)
 
-    def _ended(self, why: str) -> None:
+    def _ended(self, why: str, begun: Begun) -> None:
         """A run that is over before its print: told where somebody can decide."""
         self._talk.say(f"no more looks at this print: {why}", wrong=True)
         try:
             self._held = self._machine.rests_at()
+            if self._held is None:
+                return
+            state = begun.job.state_after(self._held)
+            _, parked = park(begun.setup, state)
+            self._machine.leave(way_back(begun.setup, state, parked))
         except LinkError:
-            return
-        if self._held is None:
             return
         self._talk.prompt(
             [f"No more looks at this print: {why}", "It rests; heaters are off."],
             [
-                ("Heat and go on", "AMREPAIR_RESUME", "warning"),
-                ("Cancel the print", "CANCEL_PRINT", "error"),
+                Button("Heat and go on", {"what": "go on"}, "warning"),
+                Button("Cancel the print", {"what": "cancel"}, "error"),
             ],
         )

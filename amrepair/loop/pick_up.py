@@ -40,12 +40,12 @@ def pick_up(
     if isinstance(printer, (SerialPrinter, FilePrinter)):
         return pick_up_serial(printer, release_c=release_c, pose_confirmed=pose_confirmed)
     # loaded here: a printer on a cable needs none of the web's libraries
-    from gcode.hosts.moonraker_job import KlipperJob
     from gcode.hosts.rejoin import rejoin
+    from gcode.hosts.served_job import ServedJob
     from gcode.hosts.server import ServerPrinter
 
-    if isinstance(printer, KlipperJob):
-        job = printer
+    if isinstance(printer, ServedJob):
+        job: ServedJob[Any] = printer
 
         def find_job(sent: Sequence[Sent]) -> None:
             job.pick_up(

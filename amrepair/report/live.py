@@ -123,6 +123,11 @@ class LiveView:
         tail = f"?token={self._token}" if self._token else ""
         return f"http://{host}:{self.server.get_port()}/{tail}"
 
+    @property
+    def address(self) -> str:
+        """host:port that it is served at."""
+        return f"{self._host}:{self.server.get_port()}"
+
     def close(self) -> None:
         """Stop serving; a question that waits is answered with skip."""
         self._open = False

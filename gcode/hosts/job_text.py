@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from bisect import bisect_left
 
-LOOK = b"AMREPAIR_SCAN"
+LOOKS = (b"AMREPAIR_SCAN", b"@amrepair scan")
 
 
 class JobText:
-    """A job's file as Klipper reads it: which byte begins which line."""
+    """A job's file as a server reads it: which byte begins which line."""
 
     def __init__(self, data: bytes) -> None:
         self._lines = data.split(b"\n")
@@ -31,4 +31,4 @@ class JobText:
 
     def is_look(self, line: int) -> bool:
         """Whether the line before this one asks for a look."""
-        return 0 < line < len(self._lines) and self._lines[line - 1].strip().startswith(LOOK)
+        return 0 < line < len(self._lines) and self._lines[line - 1].strip().startswith(LOOKS)

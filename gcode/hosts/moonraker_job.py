@@ -1,32 +1,24 @@
-"""A job that Klipper prints from its own file, as a `Printer` that rests at the job's looks.
+"""A job that Klipper prints from its own file, reached through Moonraker: see `served_job`.
 
-The job's lines are Klipper's to print: asked for them, this port lets Klipper go on and returns
-when it has paused behind the line of the look. What is printed at a look (parking, a repair) goes
-to the paused printer as short scripts. Before each stands a step of the printer's own macro, which
-counts it and refuses it where the job goes on or another step is due: so whoever was away, agent,
-server or link, learns from the printer what was carried out, and nothing is printed twice.
+What is printed at a look goes to the paused printer as short scripts. Before each stands a step of
+the printer's own macro, which counts it and refuses it where the job goes on or another step is
+due.
 """
 
 from __future__ import annotations
 
-import hashlib
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
-from urllib.parse import quote
+from typing import Any
 
-from gcode.errors import LinkError, PortBusyError, PrinterError
-from gcode.hosts.job_text import JobText
-from gcode.hosts.modes import Modes, commands_of, modes_after
+from gcode.errors import LinkError, PrinterError
+from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.moonraker_session import MoonrakerSession
-from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
-from gcode.hosts.proof import require_checked
-from gcode.hosts.rejoin import require_as_left
-from gcode.progress import Progress, silent
+from gcode.hosts.port import PrintableProgram
+from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
+from gcode.progress import Progress
 
-AGENT, METHOD = "amrepair", "amrepair_call"
+METHOD = "amrepair_call"
 STEP = "_AMREPAIR_STEP"
 STEP_LINES = 40
 """Lines a script: some seconds of moves, which Klipper has queued long before they are made."""
@@ -34,36 +26,14 @@ WRITTEN_S = 3.0
 """By then a server has long written a new print down; one that it was restarted in it calls
 interrupted, and goes on with."""
 
-Answer = TypeVar("Answer")
 
+class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
+    """A printer whose job Klipper prints by itself; parameters of `ServerPrinter`."""
 
-@dataclass(frozen=True, slots=True)
-class UnderWay:
-    """A print that Klipper has begun.
-
-    Attributes
-    ----------
-    id
-        The server's own number for it: another print of the same file has another.
-    """
-
-    name: str
-    id: str
-
-
-class KlipperJob(MoonrakerPrinter):
-    """A printer whose job Klipper prints by itself; parameters of `ServerPrinter`.
-
-    `follow` says which job it is; programs that are not that job go to the paused printer.
-    """
-
-    _job: JobText | None = None
-    _name = _sha256 = ""
-    _joining = False
     _unsure_s: float | None = None
 
     def _new_session(self) -> MoonrakerSession:
-        self._hold = threading.Event()
+        self._held_back = threading.Event()
         return MoonrakerSession(
             self.address, self._key, self._timing, self._clock, self._log,
             agent=AGENT, methods=(METHOD,),
@@ -100,51 +70,9 @@ class KlipperJob(MoonrakerPrinter):
             return None  # an earlier print of this file, or a server that was restarted in this one
         return UnderWay(state.print_file, str(latest.get("job_id")))
 
-    def fetch(self, name: str) -> bytes:
-        """A job's file as it lies on the server."""
-        answer = self._session.request("GET", f"{self.files}/{quote(name)}")
-        if answer.status_code != 200:
-            raise LinkError(f"{self.address.name} does not give the file {name!r} out.")
-        return answer.content
-
-    def follow(self, name: str, data: bytes) -> int:
-        """Serve this job from now on; returns the first line that a look can still stand before."""
-        self._name, self._job, self._sha256, self._joining = name, JobText(data), "", False
-        self._session.state.follow(name)
-        self._session.look()
-        rests, byte = self._rest()
-        return self._job.line_at(byte) + (not rests)
-
-    def serve(self, checked: PrintableProgram) -> None:
-        """Which program the job is: its lines are Klipper's to print.
-
-        Raises
-        ------
-        LinkError
-            If it is another.
-        """
-        if checked.program.text.count("\n") != self._text.lines:
-            raise LinkError(f"{self._name} on {self.address.name} is not the file that was read.")
-        self._sha256 = checked.program.sha256
-
-    def rests_at(self) -> int | None:
-        """The line after the look that the job rests at; None where it does not rest at one."""
-        rests, byte = self._rest()
-        line = self._text.line_at(byte)
-        return line if rests and self._text.is_look(line) else None
-
-    def rests_at_look(self) -> bool:
-        """Whether the job rests where it asks for a look."""
-        return self.rests_at() is not None
-
     def pass_by(self) -> None:
         """Go on without a look."""
         self._session.call("printer.print.resume", limit_s=None)
-
-    def wait(self, wait_s: float) -> None:
-        """Until there is news, or so long."""
-        with self._session.news:
-            self._session.news.wait(wait_s)
 
     def forget_steps(self) -> None:
         """What an earlier run had counted is none of this one's."""
@@ -153,79 +81,34 @@ class KlipperJob(MoonrakerPrinter):
 
     # ------------------------------------------------------------------ printing
 
-    def print(
-        self,
-        checked: PrintableProgram,
-        *,
-        lines: range | None = None,
-        progress: Progress = silent,
-    ) -> PrintReport:
-        """Have Klipper print on to a look of the job, or print a program of ours while it rests."""
-        require_checked(checked)
-        start_s = self._clock()
-        total = checked.program.text.count("\n")
-        lines = range(total) if lines is None else lines
-        if checked.program.sha256 == self._sha256:
-            ok = self._print_on(lines.start, lines.stop, progress)
-        else:
-            self._print_at_rest(checked, lines, progress)
-            ok = True
-        end = lines.stop if ok else self._text.line_at(self._session.state.file_position)
-        size = sum(len(text) + 1 for text in checked.lines(lines.start, end))
-        return PrintReport(
-            ok=ok, lines_acked=sum(1 for _ in commands_of(checked, lines.start, end)), resends=0,
-            stalls=0, spare_oks=0, bytes_sent=size, seconds=self._clock() - start_s,
-            next_line=end, round_trip_s=(0.0, 0.0, 0.0), first_line=lines.start,
-            warnings=() if ok else (f"{self.address.name} cancelled the print",),
-        )  # fmt: skip
-
-    @property
-    def _text(self) -> JobText:
-        if self._job is None:
-            raise LinkError("no job is followed; call follow() first.")
-        return self._job
+    def _refresh(self) -> None:
+        self._session.look()
 
     def _rest(self) -> tuple[bool, int]:
-        """Whether the job rests, and the byte that Klipper reads next; asked, for news lag."""
         told = self._session.query(
             {"virtual_sdcard": ["is_active", "file_position"], "print_stats": ["state"]}
         )
         card = told.get("virtual_sdcard", {})
         paused = told.get("print_stats", {}).get("state") == "paused"
-        return paused and not card.get("is_active", True), int(card.get("file_position") or 0)
+        line = self._text.line_at(int(card.get("file_position") or 0))
+        return paused and not card.get("is_active", True), line
 
-    def _print_on(self, first: int, end: int, progress: Progress) -> bool:
-        """Until Klipper rests behind the look that line `end` follows, or the job is over."""
-        state, text = self._session.state, self._text
-        while True:
-            self._asked(self._session.look)
-            if state.ended:
-                return self._ended(end)
-            if state.print_file != self._name or not state.busy:
-                raise self._gone(first, end, f"Klipper has let go of {self._name}")
-            rests, byte = self._asked(self._rest)
-            line = text.line_at(byte)
-            progress("printing", float(min(line, end) - first), float(end - first))
-            if rests and text.is_look(line):
-                if line == end:
-                    return True
-                if line < end:
-                    self._go_on(line, max(first, line))
-                    continue
-            if line > end:
-                raise self._gone(first, end, "the print was resumed at the look by somebody else")
-            with self._session.news:
-                if not state.called:
-                    self._session.news.wait(self._timing.poll_s)
+    def _has_it(self) -> bool:
+        state = self._session.state
+        return state.print_file == self._name and state.busy
+
+    def _pending(self) -> bool:
+        return bool(self._session.state.called)
 
     def _go_on(self, line: int, first: int) -> None:
-        """Have Klipper print on from line `first`, resting behind the look before `line`."""
         if first != line:  # what lies between was printed by us, and ended elsewhere
             self.command(f"SAVE_GCODE_STATE NAME=PAUSE_STATE\nM26 S{self._text.start(first)}")
         self._session.call("printer.print.resume", limit_s=None)
 
-    def _ended(self, end: int) -> bool:
+    def _how_it_ended(self, end: int) -> bool | None:
         state = self._session.state
+        if not state.ended:
+            return None
         if state.outcome == "cancelled":
             return False
         if state.outcome == "complete" and end >= self._text.lines:
@@ -241,17 +124,15 @@ class KlipperJob(MoonrakerPrinter):
     # ------------------------------------------------------------------ at rest
 
     def _print_at_rest(self, checked: PrintableProgram, lines: range, progress: Progress) -> None:
-        """Send a program to the paused printer, a step at a time, each once."""
-        program = _number(checked)
-        first = self._reached(checked, lines) if self._joining else lines.start
-        self._joining = False
+        """Send a program to the paused printer, a step at a time."""
+        program, first = number_of(checked), lines.start
         self._require_rest()
         while first < lines.stop:
-            while self._hold.is_set():
+            while self._held_back.is_set():
                 with self._session.news:
                     self._session.news.wait(self._timing.poll_s)
             after = min(first + STEP_LINES, lines.stop)
-            start = " START=1" if first == lines.start else ""
+            start = " START=1" if first == 0 else ""
             script = [f"{STEP} PROGRAM={program} FROM={first} TO={after}{start}"]
             script += [command for _, command in commands_of(checked, first, after)]
             script.append(f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE=done VALUE={after}")
@@ -278,19 +159,21 @@ class KlipperJob(MoonrakerPrinter):
             return
 
     def _settled(self) -> None:
-        """Return when nothing that was sent is under way."""
         self._session.look()
         self.command("M400")
 
-    def _reached(self, checked: PrintableProgram, lines: range) -> int:  # type: ignore[override]
-        """The line of a program that was under way when we went, where it is to be gone on with."""
+    def _reached_at_rest(self, checked: PrintableProgram, lines: range) -> int:
         self._asked(self._settled)
         told = self._steps()
-        if told["program"] != _number(checked):
+        if told["program"] != number_of(checked):
             return lines.start
         if told["begun"] != told["done"]:
             raise self._in_doubt(told["done"], told["begun"])
         return max(lines.start, min(told["done"], lines.stop))
+
+    def _heat_of_before(self) -> tuple[float, float]:
+        told = self._steps()
+        return float(told["hotend"]), float(told["bed"])
 
     def _steps(self) -> dict[str, int]:
         """What the printer's macro has counted."""
@@ -304,7 +187,7 @@ class KlipperJob(MoonrakerPrinter):
         return {name: int(told.get(name) or 0) for name in ("program", "begun", "done", "hotend",
                                                             "bed")}  # fmt: skip
 
-    def require_macros(self) -> None:
+    def require_partner(self) -> None:
         """Refuse a printer without our macros."""
         self._steps()
 
@@ -318,88 +201,19 @@ class KlipperJob(MoonrakerPrinter):
                 "the nozzle is, is not known, and the print cannot be gone on with."
             )
 
-    # ------------------------------------------------------------------ a run gone on with
-
-    def pick_up(
-        self,
-        sent: Sequence[tuple[PrintableProgram, int, int, bool]],
-        *,
-        release_c: float,
-        pose_confirmed: bool = False,
-    ) -> None:
-        """Find a job again that an agent was serving, as (program, first, end, done) were sent.
-
-        Raises
-        ------
-        ResumeRefusedError
-            If the machine is not as it was left.
-        """
-        self._joining = True
-        if not sent or (sent[-1][0].program.sha256 == self._sha256 and not sent[-1][3]):
-            return  # Klipper has it in hand
-        checked, first, end, done = sent[-1]
-        self._asked(self._settled)
-        end = end if done else self._reached(checked, range(first, end))
-        modes = Modes()
-        for program, start, stop in (*(row[:3] for row in sent[:-1]), (checked, first, end)):
-            modes = modes_after(program, stop, program.program.dialect, first=start, modes=modes)
-        if checked.program.sha256 == self._sha256 or end == first:
-            modes.position_mm.clear()  # a PAUSE macro has parked it somewhere
-        told = self._steps()
-        now = self.temperatures()
-        if told["bed"] and not now.bed_target_c:
-            self.command(f"M140 S{told['bed']}")
-        if told["hotend"] and not now.hotend_target_c:
-            self.command(f"M109 S{told['hotend']}")
-
-        def refuse(why: str) -> ResumeRefusedError:
-            return ResumeRefusedError(
-                f"The job on {self.address.name} cannot be gone on with: {why}.", first - 1, end - 1
-            )
-
-        require_as_left(self, modes, refuse, release_c=release_c, pose_confirmed=pose_confirmed)
-
-    def _asked(self, ask: Callable[[], Answer]) -> Answer:
-        """Ask; a server that went away gets time to come back."""
-        until_s = self._clock() + self._timing.lost_s
-        while True:
-            try:
-                return ask()
-            except (PrinterError, PortBusyError) as error:
-                if isinstance(error, PrinterError) or self._clock() > until_s:
-                    raise
-            except LinkError as error:
-                if self._clock() > until_s:
-                    raise self._gone(0, 0, f"{error} It may be printing on by itself") from error
-            with self._session.news:
-                self._session.news.wait(self._timing.poll_s)
-
-    def _gone(self, first: int, end: int, why: str) -> LinkLostError:
-        return LinkLostError(
-            f"The print of {self._name} on {self.address.name} is not followed any more: {why}.",
-            first - 1, end - 1,
-        )  # fmt: skip
-
-    def _in_doubt(self, first: int, after: int) -> ResumeRefusedError:
-        return ResumeRefusedError(
-            f"the printer was cut short in lines {first + 1} to {after} of what was printed at the "
-            "look: which of them it has carried out is not known, and none is printed twice.",
-            first - 1, after - 1,
-        )  # fmt: skip
-
     # ------------------------------------------------------------------ pause, safety
 
     def pause(self) -> None:
         """Hold what is printed at a look; have Klipper pause where the job goes on."""
-        self._hold.set()
+        self._held_back.set()
         if not self._rest()[0]:
             super().pause()
 
     def resume(self) -> None:
         """Go on."""
-        self._hold.clear()
-        rests, byte = self._rest()
-        if rests and not self._text.is_look(self._text.line_at(byte)):
+        self._held_back.clear()
+        rests, line = self._rest()
+        if rests and not self._text.is_look(line):
             super().resume()
 
     def heaters_off(self) -> None:
@@ -431,8 +245,3 @@ class KlipperJob(MoonrakerPrinter):
             found = [params for _, params in session.state.called]
             session.state.called.clear()
         return found
-
-
-def _number(checked: PrintableProgram) -> int:
-    """What the printer's macro calls a program."""
-    return int(hashlib.sha256(checked.program.sha256.encode()).hexdigest()[:12], 16)

@@ -23,11 +23,17 @@ from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
 _SENT = re.compile(r"Send: (?:N\d+ )?(.*?)(?:\*\d+)?")
-SUBSCRIPTION = {"state": {"logs": True, "messages": False}, "plugins": False, "events": True}
+SUBSCRIPTION = {"state": {"logs": True, "messages": False}, "events": True}
 
 
 class OctoPrintSession(ServerSession[ServerState]):
-    """One login to a server and the socket that its news come over."""
+    """One login to a server and the socket that its news come over.
+
+    Parameters
+    ----------
+    plugin
+        Whose messages are listened to, besides; empty: nobody's.
+    """
 
     def __init__(
         self,
@@ -36,8 +42,10 @@ class OctoPrintSession(ServerSession[ServerState]):
         timing: WebTiming,
         clock: Callable[[], float],
         log: WebLog | None,
+        *,
+        plugin: str = "",
     ) -> None:
-        super().__init__(address, key, timing, clock, log, ServerState())
+        super().__init__(address, key, timing, clock, log, ServerState(plugin=plugin))
         self._asking = threading.Lock()
 
     def get(self, path: str) -> dict[str, Any]:
@@ -57,7 +65,8 @@ class OctoPrintSession(ServerSession[ServerState]):
         self.state.connected = False
         socket = self._open_socket("/sockjs/websocket", {})
         socket.send({"auth": f"{user.get('name')}:{user['session']}"})
-        socket.send({"subscribe": SUBSCRIPTION})
+        plugins = [self.state.plugin] if self.state.plugin else False
+        socket.send({"subscribe": {**SUBSCRIPTION, "plugins": plugins}})
         with self.news:
             if not self.news.wait_for(lambda: self.state.connected, self._timing.request_s):
                 raise LinkError(

@@ -24,6 +24,8 @@ class ServerState:
         It has changed since the follower last looked.
     terminal
         Lines of the server's terminal while somebody waits for an answer, else None.
+    plugin, told
+        Whose messages are taken, and the last one.
     """
 
     connected: bool = False
@@ -36,6 +38,8 @@ class ServerState:
     resends: int = 0
     outcome: str = ""
     terminal: deque[str] | None = None
+    plugin: str = ""
+    told: dict[str, Any] = field(default_factory=dict)
 
     @property
     def failed(self) -> bool:
@@ -69,6 +73,9 @@ class ServerState:
             if isinstance(news := message.get(kind), dict):
                 self._take_current(news, with_log=kind == "current")
                 self.connected = True
+        said = part_of(message, "plugin")
+        if self.plugin and said.get("plugin") == self.plugin:
+            self.told = part_of(said, "data")
         event = message.get("event")
         if isinstance(event, dict):
             self._take_event(str(event.get("type")), event.get("payload"))

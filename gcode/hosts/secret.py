@@ -62,11 +62,7 @@ def find_key(kind: str, spec: str, environment: Mapping[str, str] = os.environ) 
     path = keys_file(environment)
     if not path.is_file():
         return ApiKey("")
-    mode = stat.S_IMODE(path.stat().st_mode)
-    if mode & 0o077:
-        raise InputError(
-            f"{path} holds API keys and others may read it (mode {mode:03o}); run: chmod 600 {path}"
-        )
+    _refuse_open(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):  # the cause quotes the text, and with it perhaps a key
@@ -77,6 +73,33 @@ def find_key(kind: str, spec: str, environment: Mapping[str, str] = os.environ) 
     if not isinstance(found, str):
         raise InputError(f'{path}: the key of {spec} is not a text; write "{spec}" = "KEY".')
     return ApiKey(_plain(found.strip(), str(path)))
+
+
+def key_in(path: Path) -> ApiKey:
+    """The key that a file of its own holds.
+
+    Raises
+    ------
+    InputError
+        If there is none, or others can read it.
+    """
+    try:
+        _refuse_open(path)
+        text = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or "it is no text"
+        raise InputError(f"{path} cannot be read for the API key ({why}).") from None
+    if not text:
+        raise InputError(f"{path} is empty; write the API key into it.")
+    return ApiKey(_plain(text, str(path)))
+
+
+def _refuse_open(path: Path) -> None:
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o077:
+        raise InputError(
+            f"{path} holds API keys and others may read it (mode {mode:03o}); run: chmod 600 {path}"
+        )
 
 
 def _plain(value: str, where: str) -> str:

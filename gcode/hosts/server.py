@@ -21,7 +21,13 @@ import httpx
 
 from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.lock import PortLock
-from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, Temperatures
+from gcode.hosts.port import (
+    Capabilities,
+    LinkLostError,
+    PrintableProgram,
+    PrintReport,
+    Temperatures,
+)
 from gcode.hosts.proof import require_checked
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.upload import JobFile, part_prefix
@@ -284,6 +290,34 @@ class ServerPrinter(ABC, Generic[Session]):
     @abstractmethod
     def command(self, text: str) -> None:
         """Have one command of the host's own carried out."""
+
+    @abstractmethod
+    def __enter__(self) -> ServerPrinter[Session]:
+        """Connected."""
+
+    @abstractmethod
+    def capabilities(self) -> Capabilities:
+        """What firmware and server say of themselves."""
+
+    @abstractmethod
+    def finish_moves(self) -> None:
+        """Return when every buffered move has been made."""
+
+    @abstractmethod
+    def pause(self) -> None:
+        """Have the server pause."""
+
+    @abstractmethod
+    def resume(self) -> None:
+        """Have the server go on."""
+
+    @abstractmethod
+    def emergency_stop(self) -> None:
+        """Stop everything now."""
+
+    @abstractmethod
+    def heaters_off(self) -> None:
+        """Switch every heater and the fan off."""
 
     @abstractmethod
     def _refuse_unless_ready(self) -> None:

@@ -20,6 +20,9 @@ PEERS: dict[str, tuple[str, ...]] = {
     "printrun": ("--no-deps", "printrun==2.2.0", "pyserial==3.5", "platformdirs"),
 }
 
+# Where our own package is put, too, without what it needs to look and plan: OctoPrint's plugin.
+WITH_US = {"octoprint": ("--no-deps", "--editable", str(ROOT.parent))}
+
 
 def python_of(name: str) -> Path:
     """Return the interpreter of a peer's environment."""
@@ -28,11 +31,12 @@ def python_of(name: str) -> Path:
 
 def make(name: str) -> None:
     """Make an environment unless it is there as wanted."""
-    stamp, wanted = ROOT / name / "installed", " ".join(PEERS[name])
+    stamp, wanted = ROOT / name / "installed", " ".join((*PEERS[name], *WITH_US.get(name, ())))
     if stamp.is_file() and stamp.read_text() == wanted:
         return
     venv.create(ROOT / name, with_pip=True, clear=True)
-    subprocess.run([python_of(name), "-m", "pip", "install", "--quiet", *PEERS[name]], check=True)
+    for packages in filter(None, (PEERS[name], WITH_US.get(name))):
+        subprocess.run([python_of(name), "-m", "pip", "install", "--quiet", *packages], check=True)
     stamp.write_text(wanted)
 
 

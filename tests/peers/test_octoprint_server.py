@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from link_helpers import profile, program
-from peer_harness import Printing, Web, end, free_port, peer, process, wait_for
+from octoprint_server import KEY, QUICK, Server, octoprint
+from peer_harness import Printing, Web, end, wait_for
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.firmware import EmulatedPrinterProcess
@@ -22,24 +19,6 @@ from gcode.hosts.web import Address, WebTiming
 
 pytestmark = pytest.mark.peers
 
-KEY = "0123456789ABCDEF0123456789ABCDEF"
-# Nothing is looked up outside, nothing reports home.
-CONFIG = """\
-api: {{key: {key}}}
-server:
-  firstRun: false
-  onlineCheck: {{enabled: false}}
-  pluginBlacklist: {{enabled: false}}
-plugins:
-  _disabled: [tracking, softwareupdate, announcements, discovery, errortracking, pi_support, backup]
-  virtual_printer: {{enabled: true, waitInterval: 0.2}}
-serial:
-  autoconnect: true
-  port: {port}
-  baudrate: 115200
-  additionalPorts: [{port}]
-"""
-QUICK = WebTiming(answer_s=20.0, lost_s=30.0, poll_s=0.2)
 # The virtual printer takes the time that its moves would take, from 200 mm/min on.
 SHORT = ["G90", "G1 F60000", *(f"G1 X{50 + i / 100:.2f} Y50" for i in range(150))]
 LONG = [
@@ -47,40 +26,6 @@ LONG = [
     "G1 F60000",
     *(line for i in range(200) for line in (f"G1 X{i / 100:.2f}", "G4 P40")),
 ]
-
-
-@dataclass
-class Server:
-    base: str
-    log: Path
-    running: subprocess.Popen[bytes]
-
-    def printer(self) -> OctoPrintPrinter:
-        return OctoPrintPrinter(Address.parse(f"octoprint+{self.base}"), ApiKey(KEY), timing=QUICK)
-
-
-@contextmanager
-def octoprint(folder: Path, port: str) -> Iterator[Server]:
-    base = folder / "octoprint"
-    base.mkdir()
-    (base / "config.yaml").write_text(CONFIG.format(key=KEY, port=port))
-    log, number = folder / "octoprint.log", free_port()
-    python = peer("octoprint")
-    command = [python, "-m", "octoprint", "--basedir", str(base)]
-    subprocess.run(
-        [*command, "user", "add", "me", "--password", "none", "--admin"],
-        check=True,
-        capture_output=True,
-    )
-    serve = [*command, "serve", "--host", "127.0.0.1", "--port", str(number), "--no-color"]
-    if os.geteuid() == 0:
-        serve.append("--iknowwhatimdoing")
-    with process(*serve, log=log) as running:
-        web = Web(f"http://127.0.0.1:{number}", KEY)
-        ready = lambda: web.get("/api/connection").get("current", {}).get("state") == "Operational"  # noqa: E731
-        wait_for("OctoPrint is operational", ready, log)
-        yield Server(web.base, log, running)
-        web.http.close()
 
 
 @pytest.fixture(scope="module")

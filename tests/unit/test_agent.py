@@ -103,7 +103,11 @@ class Bench:
         told = {"template": self.ready.template, "out": self.folder / "runs", "named": PRINTER,
                 "calibration": None, "page": Page(False, "", 0, None), "once": True,
                 "pose_confirmed": False, "said": said}  # fmt: skip
-        serving.serve(serving.Served(self.fake.url, **{**told, **changed}))
+        serving.serve(
+            serving.Served(
+                Address.parse(f"moonraker+{self.fake.url}"), ApiKey(""), **{**told, **changed}
+            )
+        )
 
     def told(self) -> str:
         return "\n".join(self.klipper.said)
