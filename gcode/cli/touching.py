@@ -9,6 +9,7 @@ import typer
 
 from gcode.cli import console
 from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
+from gcode.errors import InputError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
 
 
@@ -19,8 +20,25 @@ def add_to(app: typer.Typer) -> None:
         epilog=console.examples(
             "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin "
             "--port /dev/ttyACM0",
+            "gcode touch --klipper-macro klipper_touch.cfg",
         ),
     )(touch_command)
+
+
+def _hand_out(path: Path | None) -> None:
+    """Write the macro that touches need on Klipper."""
+    if path is None:
+        return
+    from gcode.resumption.klipper import MACRO
+    from gcode.whole import put_in_place
+
+    try:
+        with put_in_place(path) as draft:
+            draft.write_text(MACRO, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: the macro cannot be written ({error.strerror}).") from error
+    console.errors.print(f"Written: {path}; include it in printer.cfg.")
+    raise typer.Exit
 
 
 def touch_command(
@@ -41,12 +59,23 @@ def touch_command(
     ] = None,
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
+    klipper_macro: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            is_eager=True,
+            callback=_hand_out,
+            help="Write the macro AMREPAIR_TOUCH, which Klipper needs for touches, and end.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find Z anew on a standing part after a power loss: the cold nozzle feels for a flat.
 
-    The nozzle itself must feel contact (a load cell, a strain gauge, a contact in the nozzle), and
-    the firmware must have G38.2. Z is never homed onto the part; 'gcode resume-at' goes on.
+    The nozzle itself must feel contact (a load cell, a strain gauge, a contact in the nozzle), as
+    the printer's profile says under 'probe', and the firmware must have G38.2 (Marlin,
+    RepRapFirmware) or, on Klipper, the macro of --klipper-macro. Z is never homed onto the part;
+    'gcode resume-at' goes on.
     """
     with console.starting():
         from gcode.hosts.serial import SerialPrinter

@@ -16,6 +16,7 @@ from gcode.firmware.planner import Planner
 from gcode.firmware.thermal import BED, HOTEND, Heater
 from gcode.firmware.variants import Variant
 from gcode.profiles import AxisLimits, PrinterProfile
+from gcode.surfaces import HeightField
 from gcode.units import mm_s_from_mm_min
 
 ARC_SEGMENT_MM = 0.5
@@ -67,6 +68,13 @@ class Mechanics:
         self.power_up()
         self.contact: Contact | None = None  # where the nozzle feels what it touches
         self.let_go = 0  # how often moves came after the motors had been let go
+
+    def stand(self, surface: HeightField, *, seed: int = 0, dead: bool = False) -> None:
+        """Have this stand on the bed from now on, for what feels contact."""
+        if self.contact is None:
+            self.contact = Contact.of(self.profile.probe, surface, seed=seed)
+            self.contact.dead = dead
+        self.contact.surface = surface
 
     def power_up(self) -> None:
         """Forget everything, as after a reset; the clock and what was executed stay."""

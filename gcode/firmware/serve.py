@@ -26,6 +26,7 @@ from gcode.errors import InputError
 from gcode.firmware.core import FirmwareCore
 from gcode.firmware.faults import FaultScript
 from gcode.profiles import PrinterProfile
+from gcode.surfaces import HeightField
 
 FRAME = struct.Struct("<cI")
 MOTION_FRAME_NUMBERS = 9 * 2000
@@ -194,6 +195,8 @@ class PtyServer:
             self._send_motion()
         elif what == "reset":
             core.power_up()
+        elif what == "stand":
+            core.machine.stand(HeightField.read(Path(str(request["path"]))))
         elif what == "stop":
             self._stopping = True
         machine = core.machine

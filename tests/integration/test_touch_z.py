@@ -45,6 +45,7 @@ def plan_for(printer: str, folder: Path, *, slope: float = 0.0) -> tuple[Touchin
         ("generic_marlin", 3.1, 1),  # by eye it is within a millimetre
         ("generic_marlin", 4.9, 2),
         ("generic_reprap", 4.7, 3),
+        ("generic_klipper", 3.3, 4),
     ],
 )
 def test_z_is_found_and_the_job_goes_on_at_its_true_height(
@@ -100,6 +101,23 @@ def test_a_probe_that_never_triggers_stops_at_the_planned_depth(tmp_path: Path) 
         allowed_mm = plan.options.doubt_mm + plan.options.over_mm
         assert state["deepest_mm"] == pytest.approx(allowed_mm, abs=1e-6)
         assert state["position_mm"][2] + 4.0 > 0  # type: ignore[index]  # lifted off the part
+        assert (state["hotend_target_c"], state["bed_target_c"]) == (0.0, 0.0)
+
+
+def test_a_firmware_without_the_touch_is_not_believed(tmp_path: Path) -> None:
+    """Prusa's Buddy firmware is built without G38.2: it says so, and nothing moves."""
+    setup = load_setup("generic_marlin", "pla")
+    plan, standing = plan_for("generic_marlin", tmp_path)
+    with (
+        EmulatedPrinterProcess(
+            "prusa", printer=setup.printer, standing=standing, lost_mm=TOP_MM + 4.0
+        ) as emulator,
+        SerialPrinter(emulator.port, dialect="marlin") as host,
+    ):
+        with pytest.raises(PrinterError, match=r"does not know G38\.2, so nothing was touched"):
+            touch_z(host, plan, 4.0)
+        state = emulator.state()
+        assert state["deepest_mm"] == 0.0
         assert (state["hotend_target_c"], state["bed_target_c"]) == (0.0, 0.0)
 
 
