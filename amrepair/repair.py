@@ -25,11 +25,11 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, unit_vectors
 from amrepair.observe.rays import range_images
 from amrepair.regions import AnomalyMap, Label, Region, detect
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.calibration import Calibration, of_touches
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import RoundedUp
 from amrepair.regions.skipped import PlannedBeads
-from amrepair.scans import Scan
+from amrepair.scans import PROBE, Scan
 from amrepair.template.laid import LaidBeads
 from amrepair.template.port import Template, is_off_bed
 from gcode.check import CheckedProgram, check
@@ -253,7 +253,7 @@ def plan_repair(
     Parameters
     ----------
     scan
-        In whatever frame its sensor has.
+        In whatever frame its sensor has; in that of the printer's probe no pose is looked for.
     guess
         A pose (template from the scan's frame) known beforehand; None searches from any pose.
     interruption
@@ -284,12 +284,17 @@ def plan_repair(
     >>> "G28 X Y" in plan.checked.program.text  # Z is never homed onto a part
     True
     """
-    watch = watch or Stopwatch()
+    watch, known = watch or Stopwatch(), scan.frame == PROBE
+    if known:
+        site = replace(site, calibration=of_touches(scan.sigma_mm, site.process_sigma_mm))
     with watch("align"), ThreadPoolExecutor(1) as beside:
         # what rays saw needs no pose, nor it them; a part of the scan has images of its own
         seen = None if _is_cut(site) else beside.submit(range_images, scan)
-        outer = _outside_open_infill(scan, site, guess)
-        registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
+        if known and guess is not None:
+            registration = Registration.known(guess)
+        else:
+            outer = _outside_open_infill(scan, site, guess)
+            registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
     placed = _build_from_template(site, scan, registration)
     if site.printed_z_mm is None:
         said = site.build_from_template is not None or guess is not None
@@ -314,6 +319,7 @@ def plan_repair(
             else tuple(i.moved(registration.template_from_scan) for i in seen.result()),
             surface=site.surface,
             rounded_up=_told_to_go_beyond(site, expected, placed),
+            pose_is_known=known,
             progress=progress,
         )
     with watch("deficit"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -81,8 +82,8 @@ def simulate(
     scanner: Annotated[
         str,
         typer.Option(
-            help="structured-light, laser-line, another of the world's file, or recorded:FILE: "
-            "the noise of a real scanner."
+            help="structured-light, laser-line, another of the world's file, recorded:FILE (the "
+            "noise of a real scanner), or probe: the printer's own probe touches."
         ),
     ] = "structured-light",
     max_iterations: Annotated[
@@ -105,6 +106,7 @@ def simulate(
         from amrepair.repair import Stopwatch
         from amrepair.report import write_report
         from amrepair.report.folder import RunFolder
+        from amrepair.scans import PROBE
         from amrepair.simulate.defects import parse_defect
         from amrepair.simulate.parameters import load_world
         from amrepair.simulate.part_files import bracket_path
@@ -116,7 +118,7 @@ def simulate(
     defects = [d for d in defects if d.kind != "none"]
     setup = load_setup(printer, material, process)
     told = load_world(world)
-    told.scanner(scanner)  # refused before any work
+    _ = setup.printer.feeler if scanner == PROBE else told.scanner(scanner)  # before any work
     path = part or bracket_path()
     mesh = scaled_mesh(path, scale, setup)
     ids = (printer, material, process)
@@ -233,6 +235,7 @@ def _result(
             "unprintable_mm3": rounded(sum(u.volume_mm3 for u in run.prepared.plan.unprintable)),
         },
         "speed_up": round(speed, 1),
+        **({"touches": rounded([asdict(felt) for felt in run.felt])} if run.felt else {}),
     }
 
 
@@ -272,6 +275,8 @@ def _say(run: SimulatedRun, result: dict[str, Any], folder: RunFolder, within: b
         table.add_row(t.kind, t.label, *volumes)
     if run.truth:
         console.out.print(table)
+    for felt in run.felt:
+        console.out.print(f"{felt.stop}: {felt.told()}.")
     console.out.print(f"Simulated {result['speed_up']:g} times as fast as the printer prints.\n")
     for line in summary_of_result(result, within_tolerance=within):
         console.out.print(line)

@@ -165,9 +165,9 @@ def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchO
         )
     if printer.feeler.kind != "nozzle":
         raise InputError(
-            f"{printer.name} feels with a {printer.feeler.kind} beside its nozzle, whose own height "
-            f"is not certain to a few hundredths of a millimetre; set Z by hand, with paper below "
-            f"the nozzle."
+            f"{printer.name} feels with a {printer.feeler.kind} beside its nozzle, whose own "
+            f"height that does not tell to a few hundredths of a millimetre; set Z by hand, with "
+            f"paper below the nozzle."
         )
     if not 2 * options.doubt_mm <= above_mm <= LIFT_MM:
         raise InputError(
