@@ -145,7 +145,9 @@ def simulate(
                 max_iterations=max_iterations,
                 approve=page.to_print,
                 record=page.recording(folder.record),
-                begun=lambda pose: _recorded(prepared, folder, pose, ids, max_iterations),
+                begun=lambda pose: _recorded(
+                    prepared, folder, pose, ids, max_iterations, scanner=scanner
+                ),
                 connected=lambda printer: page.drives(printer.pause, printer.resume),
                 watch=watch,
                 progress=page.watching(bars),
@@ -175,6 +177,8 @@ def _recorded(
     pose: Transform,
     ids: tuple[str, str, str],
     max_iterations: int,
+    *,
+    scanner: str,
 ) -> Tape:
     """Write down what the run begins with; the tape that it is recorded on."""
     from amrepair.loop import Tape
@@ -190,6 +194,7 @@ def _recorded(
         by_beads=run.by_beads,
         seed=run.seed,
         max_iterations=max_iterations,
+        scanner=scanner,
     )
     keep(folder.path, setting, run.checked.program.text, run.template)
     return Tape(folder.path)

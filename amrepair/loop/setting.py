@@ -20,6 +20,7 @@ from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
 from amrepair.loop.marks import marked_stops
 from amrepair.regions.calibration import Calibration
+from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
 from gcode.meshes import mesh_of
@@ -128,8 +129,9 @@ class Setting:
 
     @property
     def scanner_pose(self) -> Transform:
-        """Build from scanner."""
-        return Transform("build", "scanner", np.array(self.build_from_scanner))
+        """Build from scanner; from the printer's own axes where its probe touches."""
+        frame = PROBE if self.scanner == PROBE else "scanner"
+        return Transform("build", frame, np.array(self.build_from_scanner))
 
     def setup(self) -> PrintSetup:
         """The profiles, which must not have changed.

@@ -1,9 +1,10 @@
 """From touches to a scan: what each touch says of the surface around it, and how surely.
 
-A tip with a flat rests on the highest place below it. So a touch that is low says that all below
-the flat is at least as low, one that is not that something below it is as high; the rim between
-the two lies that much nearer to the second. Each speaks as far as a bead beside its flat; farther
-off nothing is known, which is not to say that it is missing.
+A tip with a flat of radius r rests on the highest place below it. So a touch that is low says that
+all within r is at least as low, one that is not that something within r is as high: the rim between
+a low one at p and another at q lies anywhere from p + r to q + r, in the mean at their middle + r.
+Each speaks as far as a bead beside its flat; farther off nothing is known, which is not to say that
+it is missing.
 """
 
 from __future__ import annotations
@@ -77,19 +78,20 @@ def scan_of(
     xy_mm, is_low = touches.place_mm[:, :2], touches.is_off(RegionOptions()) & (touches.off_mm < 0)
     rows, columns = np.nonzero(np.isfinite(flats.top_mm))
     cells_mm, tops_mm = flats.xy_mm(rows, columns), flats.top_mm[rows, columns]
-    best = np.full(len(cells_mm), np.inf)
+    best, nearest_mm = np.full(len(cells_mm), np.inf), np.full(len(cells_mm), np.inf)
     owner = np.full(len(cells_mm), -1)
     for k, place in enumerate(xy_mm):
         own = np.abs(tops_mm - touches.planned_mm[k]) < FLAT_MM  # of another flat it says nothing
         away = np.linalg.norm(cells_mm - place, axis=1)
         lead = away - (tip_radius_mm if is_low[k] else -tip_radius_mm)
-        nearer = own & (away <= reach_mm) & (lead < best)
+        nearer = own & (away <= reach_mm + tip_radius_mm) & (lead < best)
         best[nearer], owner[nearer] = lead[nearer], k
-    said = owner >= 0
+        nearest_mm[own] = np.minimum(nearest_mm[own], away[own])
+    said = nearest_mm <= reach_mm
     points = np.column_stack([cells_mm[said], touches.place_mm[owner[said], 2]])
     # a touch itself, wherever it lies in its cell
     points = np.concatenate([points, touches.place_mm])
-    middle = points.mean(axis=0) + [0.0, 0.0, SIGHT_MM]
+    middle = points.mean(axis=0) + np.array([0.0, 0.0, SIGHT_MM])
     return Scan(
         points,
         touches.sigma_mm,

@@ -189,6 +189,7 @@ class Machine(Mechanics):
         """Go straight down until something is felt, or to a native Z; then say whether it was."""
         drained_s = self.planner.drained_s(self.clock_s)
         here = (self.x, self.y, self.z)
+        self.lay_executed()
         met_mm = None if self.contact is None else self.contact.met_at_mm(self.x, self.y)
         touched = met_mm is not None and target_mm <= met_mm <= self.z
         end_mm = met_mm if touched and met_mm is not None else min(target_mm, self.z)

@@ -147,7 +147,7 @@ class PtyServer:
         if self._motion is not None and machine.planner.executed:
             self._motion.write(machine.planner.executed.tobytes())
             self._motion.flush()
-            del machine.planner.executed[:]
+            machine.forget_executed()
         data = core.take_output()
         if data:
             self._write(data)
@@ -155,7 +155,7 @@ class PtyServer:
             if self._control is not None:
                 self._send_motion()
             else:
-                del machine.planner.executed[:]  # nobody asks for it
+                machine.forget_executed()  # nobody asks for it
 
     def _write(self, data: bytes) -> None:
         """Write as much as the host reads; what a full, unread port cannot take is lost."""
@@ -226,7 +226,7 @@ class PtyServer:
         executed = self.core.machine.planner.executed
         if executed:
             self._frame(b"m", executed.tobytes())
-            del executed[:]
+            self.core.machine.forget_executed()
 
     def _frame(self, kind: bytes, payload: bytes) -> None:
         assert self._control is not None
@@ -263,6 +263,8 @@ def serve_forever(
         If that file cannot be opened.
     """
     core = FirmwareCore(profile, firmware, faults=faults, accelerated=accelerated)
+    if profile.probe is not None:
+        core.machine.feel_what_is_laid()
     with contextlib.ExitStack() as stack:
         file: BinaryIO | None = None
         if motion is not None:
