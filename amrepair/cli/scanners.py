@@ -125,14 +125,15 @@ def _own(where: str, bed: Bed) -> Scanner:
 
 
 def _probe(where: str, bed: Bed) -> Scanner:
-    from amrepair.loop.probing import ProbeScanner
+    from amrepair.loop.probing import PortFeeler, ProbeScanner
 
     if bed.printer is None or bed.job is None:
         raise InputError(
             "--scanner probe touches what a job has laid: it is for 'amrepair loop' and "
             "'simulate', and needs no calibration"
         )
-    return ProbeScanner(bed.printer, bed.job, bed.setup, progress=bed.progress)
+    feeler = PortFeeler(bed.printer, bed.setup)
+    return ProbeScanner(feeler, bed.job, bed.setup, progress=bed.progress)
 
 
 @dataclass(frozen=True, slots=True)

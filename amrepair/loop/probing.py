@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -22,9 +23,11 @@ from amrepair.loop.touch_design import Flats, TouchOptions, first_places, flats_
 from amrepair.loop.touched import Touches, measured_sigma_mm, scan_of
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import PROBE, Scan, ScanRequest
+from gcode.check import CheckedProgram
 from gcode.hosts.port import Printer
 from gcode.hosts.serial import SerialPrinter
 from gcode.hosts.touching import felt
+from gcode.moves import ModalState
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job
@@ -59,13 +62,78 @@ class Felt:
         )
 
 
+@runtime_checkable
+class Feeler(Protocol):
+    """Whoever touches, for a job that rests."""
+
+    def get_ready(self, rest: ModalState) -> None:
+        """Be cold, where what feels must be."""
+
+    def feel(
+        self,
+        places_mm: Float[np.ndarray, "k 3"],
+        rest: ModalState,
+        standing: HeightField,
+        told: Callable[[], None],
+    ) -> Float[np.ndarray, " k"]:
+        """(k,) heights met where surfaces are to be felt, build frame; `told` at each."""
+
+    def get_back(self, rest: ModalState) -> None:
+        """Be as hot as the job was."""
+
+
+class PortFeeler:
+    """The probe of a printer on a port, by programs that the checker has passed.
+
+    Raises
+    ------
+    InputError
+        If the printer is not on a port of its own.
+    gcode.errors.ProfileError
+        If it has no probe that feels plastic.
+    """
+
+    def __init__(self, printer: Printer, setup: PrintSetup) -> None:
+        if not isinstance(printer, SerialPrinter):
+            raise InputError(
+                "--scanner probe needs the printer's own port (--port /dev/ttyACM0, or Klipper's "
+                "/tmp/printer): a server or a file does not answer where a touch ended"
+            )
+        self._printer, self._setup, self._probe = printer, setup, setup.printer.feeler
+
+    def get_ready(self, rest: ModalState) -> None:
+        """Wait until the nozzle is cold, where it feels itself."""
+        self._send(cooled(self._setup, rest))
+
+    def feel(
+        self,
+        places_mm: Float[np.ndarray, "k 3"],
+        rest: ModalState,
+        standing: HeightField,
+        told: Callable[[], None],
+    ) -> Float[np.ndarray, " k"]:
+        """Touch, and go back to where the job rests."""
+        program = tour(places_mm, self._setup, rest, standing)
+        met_mm = felt(self._printer, program, at_contact=told)
+        return np.array(met_mm) + self._probe.offset_mm[2]
+
+    def get_back(self, rest: ModalState) -> None:
+        """Heat the nozzle again."""
+        self._send(heated(self._setup, rest))
+
+    def _send(self, program: CheckedProgram | None) -> None:
+        if program is not None:
+            self._printer.print(program)
+            self._printer.finish_moves()
+
+
 class ProbeScanner:
     """A scanner (`Scanner`) that touches.
 
     Parameters
     ----------
-    printer
-        Connected, at rest where `travel.park` left it.
+    feeler
+        Touches; the nozzle is at rest where `travel.park` left it.
     job
         What is being printed.
     clock
@@ -75,18 +143,11 @@ class ProbeScanner:
     ----------
     felt
         What each look cost.
-
-    Raises
-    ------
-    InputError
-        If the printer is not on a serial port.
-    gcode.errors.ProfileError
-        If it has no probe that feels plastic.
     """
 
     def __init__(
         self,
-        printer: Printer,
+        feeler: Feeler,
         job: Job,
         setup: PrintSetup,
         *,
@@ -94,7 +155,7 @@ class ProbeScanner:
         clock: Callable[[], float] = time.monotonic,
         progress: Progress = silent,
     ) -> None:
-        self._printer = on_serial_port(printer)
+        self._feeler = feeler
         self._probe = setup.printer.feeler
         self._job, self._setup, self._options = job, setup, options or TouchOptions()
         self._clock, self._progress = clock, progress
@@ -146,11 +207,10 @@ class ProbeScanner:
 
     def _touched(self, stop: Stop, flats: Flats, standing: HeightField) -> tuple[Touches, int]:
         """All touches of a look, and how many they were."""
-        setup, most = self._setup, self._options.most
-        _, rest = travel.park(setup, self._job.state_after(stop.line))
-        if (cold := cooled(setup, rest)) is not None:
-            self._progress(f"touch {stop.label}: the nozzle cools", 0.0, float(most))
-            self._send(cold)
+        most = self._options.most
+        _, rest = travel.park(self._setup, self._job.state_after(stop.line))
+        self._progress(f"touch {stop.label}: the nozzle gets ready", 0.0, float(most))
+        self._feeler.get_ready(rest)
         felt_mm = np.zeros((0, 3))
         places = self._first(stop, flats)
         repeated = np.repeat(places[:1], self._options.repeats, axis=0)
@@ -169,9 +229,8 @@ class ProbeScanner:
                 flats, felt_mm[:, :2], touches.off_mm, touches.is_off(RegionOptions()),
                 reach_mm=self._reach_mm, most=most - count,
             )  # fmt: skip
-        if (hot := heated(setup, rest)) is not None:
-            self._progress(f"touch {stop.label}: the nozzle is heated", float(count), float(most))
-            self._send(hot)
+        self._progress(f"touch {stop.label}: the nozzle gets hot again", float(most), float(most))
+        self._feeler.get_back(rest)
         return touches, count
 
     def _first(self, stop: Stop, flats: Flats) -> Float[np.ndarray, "k 2"]:
@@ -210,38 +269,17 @@ class ProbeScanner:
         xy_mm: Float[np.ndarray, "k 2"],
         flats: Flats,
         standing: HeightField,
-        rest: travel.ModalState,
+        rest: ModalState,
         stage: str,
         done: int,
     ) -> Float[np.ndarray, " k"]:
         """(k,) heights felt at places, build frame."""
-        planned_mm = flats.top_mm[flats.at(xy_mm)]
-        program = tour(np.column_stack([xy_mm, planned_mm]), self._setup, rest, standing)
-        heights: list[float] = []
+        places_mm = np.column_stack([xy_mm, flats.top_mm[flats.at(xy_mm)]])
+        count = done
 
         def one_more() -> None:
-            heights.append(0.0)
-            self._progress(stage, float(done + len(heights)), float(self._options.most))
+            nonlocal count
+            count += 1
+            self._progress(stage, float(count), float(self._options.most))
 
-        met_mm = felt(self._printer, program, at_contact=one_more)
-        return np.array(met_mm) + self._probe.offset_mm[2]
-
-    def _send(self, program: travel.CheckedProgram) -> None:
-        self._printer.print(program)
-        self._printer.finish_moves()
-
-
-def on_serial_port(printer: Printer) -> SerialPrinter:
-    """The printer, which must be on a serial port: a server does not hand on what a touch says.
-
-    Raises
-    ------
-    InputError
-        If it is on none.
-    """
-    if not isinstance(printer, SerialPrinter):
-        raise InputError(
-            "--scanner probe needs the printer's own port (--port /dev/ttyACM0, or Klipper's "
-            "/tmp/printer): a server or a file does not answer where a touch ended"
-        )
-    return printer
+        return self._feeler.feel(places_mm, rest, standing, one_more)

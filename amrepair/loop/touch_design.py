@@ -5,12 +5,13 @@ plastic as it takes away. What no touch meets lies in a disc without a touch, so
 leaves the least plastic in the largest such disc: that is a minimax distance design (Johnson, Moore
 and Ylvisaker 1990) with distances weighted by the root of the plastic laid on an area. Farthest
 points are within a factor of two of it (Gonzalez 1985), and come near to it once each is moved,
-again and again, to the middle of what is nearest to it (Lloyd 1982). Places felt at earlier looks count as well, the less the more layers lie between: what lasts
-over layers is met sooner or later wherever it is.
+again and again, to the middle of what is nearest to it (Lloyd 1982). Places felt at earlier looks
+count as well, the less the more layers lie between: what lasts over layers is met sooner or later
+wherever it is.
 
 Then, around a touch that is off: defects hang together, so the places least certain are those next
 to touches that are off and to none that is not: a hexagonal lattice grown from them, whose touches
-just cover the area between them, the nearest to the farthest off first.
+just cover the area between them, beginning at the farthest off.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ LEAST_COVER = 0.4
 CANDIDATE_MM = 0.75
 AROUND_MM = 2.0
 """Plastic is weighed over so far around: some beads."""
-CENTRED = 30
-"""Steps towards the middle of a cell: to a thirtieth of its radius."""
-EVENED = 20
+CENTRED = 12
+"""Steps towards the middle of a cell: to a twelfth of its radius."""
+EVENED = 12
 """Times that places are moved to the middle of what is theirs; more move them by no cell."""
 HEXAGON = np.array([[np.cos(a), np.sin(a)] for a in np.arange(6) * np.pi / 3])
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, Tape, plan_stops, run_loop
-from amrepair.loop.probing import Felt, ProbeScanner
+from amrepair.loop.probing import Felt, PortFeeler, ProbeScanner
 from amrepair.loop.sites import sites
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.scans import PROBE, Scanner
@@ -360,5 +360,6 @@ def _looked_at(
     """What looks at a stage, and what its looks cost where the printer's own probe touches."""
     if scanner != PROBE:
         return stage, []
-    probe = ProbeScanner(printer, run.job, run.setup, clock=machine.clock_s, progress=progress)
+    feeler = PortFeeler(printer, run.setup)
+    probe = ProbeScanner(feeler, run.job, run.setup, clock=machine.clock_s, progress=progress)
     return FeltStage(stage, probe, machine.stand), probe.felt

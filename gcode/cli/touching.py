@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -25,32 +25,32 @@ def add_to(app: typer.Typer) -> None:
     )(touch_command)
 
 
-def _hand_out(path: Path | None) -> None:
+def _hand_out(path: Path) -> None:
     """Write the macro that touches need on Klipper."""
-    if path is None:
-        return
     from gcode.resumption.klipper import MACRO
-    from gcode.whole import put_in_place
 
-    try:
-        with put_in_place(path) as draft:
-            draft.write_text(MACRO, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: the macro cannot be written ({error.strerror}).") from error
+    console.write_whole(path, lambda draft: draft.write_text(MACRO, encoding="utf-8"))
     console.errors.print(f"Written: {path}; include it in printer.cfg.")
-    raise typer.Exit
+
+
+def _given(value: Any, name: str) -> Any:
+    if value is None:
+        raise InputError(f"{name} is missing; give it, or --klipper-macro FILE for the macro.")
+    return value
 
 
 def touch_command(
-    job: Annotated[Path, typer.Argument(help="The whole job's G-code, of any slicer.")],
-    port: Annotated[str, typer.Option(help="Device path of the printer.")],
+    job: Annotated[
+        Path | None, typer.Argument(help="The whole job's G-code, of any slicer.")
+    ] = None,
+    port: Annotated[str | None, typer.Option(help="Device path of the printer.")] = None,
     above_mm: Annotated[
-        float,
+        float | None,
         typer.Option(
             help="How high the nozzle stands above the part's top now, mm, by eye, within 1 mm: "
             "2 to 10. Turn Z by hand until it does."
         ),
-    ],
+    ] = None,
     z_mm: Annotated[
         float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
     ] = None,
@@ -63,8 +63,6 @@ def touch_command(
         Path | None,
         typer.Option(
             metavar="FILE",
-            is_eager=True,
-            callback=_hand_out,
             help="Write the macro AMREPAIR_TOUCH, which Klipper needs for touches, and end.",
         ),
     ] = None,
@@ -77,6 +75,12 @@ def touch_command(
     RepRapFirmware) or, on Klipper, the macro of --klipper-macro. Z is never homed onto the part;
     'gcode resume-at' goes on.
     """
+    if klipper_macro is not None:
+        _hand_out(klipper_macro)
+        return
+    job, port, above_mm = (
+        _given(job, "JOB"), _given(port, "--port"), _given(above_mm, "--above-mm"),
+    )  # fmt: skip
     with console.starting():
         from gcode.hosts.serial import SerialPrinter
         from gcode.hosts.touching import touch_z

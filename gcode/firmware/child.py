@@ -41,9 +41,10 @@ def main() -> None:
     )
     if options["advanced_ok"]:
         core.enable_advanced_ok()
+    core.machine.dead_probe = options["dead_probe"]
     if options["standing"]:
         surface = HeightField.read(Path(options["standing"]))
-        core.machine.stand(surface, seed=options["seed"], dead=options["dead_probe"])
+        core.machine.stand(surface, seed=options["seed"])
         assert core.machine.contact is not None
         core.machine.contact.lost_mm = options["lost_mm"]
     server = PtyServer(core, Path(options["link"]), control=control)

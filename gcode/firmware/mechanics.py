@@ -69,16 +69,17 @@ class Mechanics:
         self.planner = self._new_planner()
         self.power_up()
         self.contact: Contact | None = None  # where the nozzle feels what it touches
+        self.dead_probe = False  # it never triggers
         self.laid: Laid | None = None
         self._laid_bytes = 0  # of what was executed and is not forgotten, so much is laid
         self.clogged_moves = 0  # nothing comes out on so many more that extrude
         self.let_go = 0  # how often moves came after the motors had been let go
 
-    def stand(self, surface: HeightField, *, seed: int = 0, dead: bool = False) -> None:
+    def stand(self, surface: HeightField, *, seed: int = 0) -> None:
         """Have this stand on the bed from now on, for what feels contact."""
         if self.contact is None:
             self.contact = Contact.of(self.profile.probe, surface, seed=seed)
-            self.contact.dead = dead
+            self.contact.dead = self.dead_probe
         self.contact.surface = surface
 
     def feel_what_is_laid(self) -> None:

@@ -140,8 +140,8 @@ def felt(
         except PrinterError as error:
             raise PrinterError(
                 f"Nothing was felt down to {line.split()[1].replace('DEPTH=', '')} mm, where the "
-                f"touch was to end ({error}); the nozzle was lifted, the heaters are off, and Z is "
-                f"not known: look how high the nozzle stands, and whether its probe triggers."
+                f"touch was to end ({error}); the nozzle was lifted and the heaters are off: the "
+                f"probe does not trigger, or what it was to feel is farther below."
             ) from error
         felt_mm.append(_met_mm(printer, report.warnings, command))
         at_contact()

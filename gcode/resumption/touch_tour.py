@@ -14,7 +14,7 @@ from jaxtyping import Float
 from gcode.check import CheckedProgram, Touch, check
 from gcode.dialects import number
 from gcode.moves import ModalState, Program
-from gcode.profiles import PrinterProfile, PrintSetup
+from gcode.profiles import PrintSetup
 from gcode.resumption.touch import touch_line
 from gcode.surfaces import HeightField
 from gcode.units import mm_min_from_mm_s
@@ -49,7 +49,7 @@ def tour(
     """
     printer, probe = setup.printer, setup.printer.feeler
     tip_mm = np.asarray(places_mm) - probe.offset_mm  # the nozzle's, where the probe's meets
-    touches = tuple(Touch(*map(float, p), float(p[2]) - probe.depth_mm) for p in tip_mm)
+    touches = tuple(Touch(x, y, z, z - probe.depth_mm) for x, y, z in tip_mm.tolist())
     high_mm = standing.top_mm + CLEAR_MM - probe.offset_mm[2]
     travel, down = _feed(printer.travel_speed_mm_s), _feed(printer.z_speed_mm_s)
     x, y, z = (number(float(v), 3) for v in rest.position_mm)
@@ -85,13 +85,9 @@ def heated(setup: PrintSetup, rest: ModalState) -> CheckedProgram | None:
     """Heat the hotend again as it was; None where it never cooled."""
     if setup.printer.feeler.kind != "nozzle" or rest.hotend_c <= 0:
         return None
-    program = Program(f"; as hot as before\nM109 S{number(rest.hotend_c, 0)}\n", _dialect(setup))
+    text = f"; as hot as before\nM109 S{number(rest.hotend_c, 0)}\n"
+    program = Program(text, setup.printer.dialect)
     return check(program, setup, initial=replace(rest, hotend_c=0.0))
-
-
-def _dialect(setup: PrintSetup) -> str:
-    printer: PrinterProfile = setup.printer
-    return printer.dialect
 
 
 def _fan(rest: ModalState) -> list[str]:
