@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amrepair.cli.files import refuse_traps
 from amrepair.cli.live import (
     VIEW_PORT,
     HostOption,
@@ -100,6 +101,7 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Print a part on an emulated printer, break it, find what is missing and print only that."""
+    refuse_traps([] if part is None else [part])
     with console.starting():
         import numpy as np
 
