@@ -178,6 +178,9 @@ class Machine(Mechanics):
         """Take an axis for where it is told to be, and for homed (klippy/extras/force_move.py)."""
         for word in rest.upper().split():
             letter, _, value = word.partition(b"=")
+            if letter == b"CLEAR_HOMED":
+                self.unhomed |= set(value.decode()) & set("XYZ")
+                continue
             axis = b"XYZ".find(letter)
             if axis >= 0:
                 self.offset[axis] = float(value) - (self.x, self.y, self.z)[axis]

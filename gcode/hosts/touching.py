@@ -6,6 +6,7 @@ was felt has the height that the job gave it.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from gcode.check import CheckedProgram
 from gcode.check.touches import COMMANDS
 from gcode.dialects import number
-from gcode.errors import PrinterError
+from gcode.errors import LinkError, LocalProtocolError, PrinterError
 from gcode.hosts.serial import SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.resumption.touch import Touching
@@ -138,6 +139,7 @@ def felt(
         try:
             report = printer.print(checked, lines=range(first, index + 1), progress=progress)
         except PrinterError as error:
+            _forget_z(printer, command)
             raise PrinterError(
                 f"Nothing was felt down to {line.split()[1].replace('DEPTH=', '')} mm, where the "
                 f"touch was to end ({error}); the nozzle was lifted and the heaters are off: the "
@@ -149,6 +151,13 @@ def felt(
     printer.print(checked, lines=range(first, len(lines)), progress=progress)
     printer.finish_moves()
     return felt_mm
+
+
+def _forget_z(printer: SerialPrinter, command: str) -> None:
+    """Klipper's Z is still the one that the macro lowered: it must be homed before it moves."""
+    if command == COMMANDS["klipper"]:
+        with contextlib.suppress(LinkError, LocalProtocolError):
+            printer.command("SET_KINEMATIC_POSITION CLEAR_HOMED=Z")
 
 
 def _met_mm(printer: SerialPrinter, warnings: tuple[str, ...], command: str) -> float:
