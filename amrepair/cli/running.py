@@ -31,6 +31,7 @@ from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
 from amrepair.loop.pace import layers_at
 from amrepair.loop.pick_up import pick_up
+from amrepair.loop.probing import ProbeScanner
 from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
@@ -38,6 +39,7 @@ from amrepair.regions import detect
 from amrepair.repair import Detector, RepairPlan, Stopwatch
 from amrepair.report import TemperatureSeries
 from amrepair.report.folder import RunFolder
+from amrepair.scans import PROBE
 from amrepair.template import open_template
 from gcode.check import CheckedProgram, check, policy_of
 from gcode.cli import console
@@ -213,6 +215,8 @@ def new_run(
     _ = setup.printer.head  # refused before any work
     pose = read_calibration(calibration)
     known_scanner(said["scanner"])  # refused before any work
+    if said["scanner"] == PROBE:
+        _ = setup.printer.feeler
     folder = RunFolder(out)
     before = read_events(out)
     if before and before[-1].get("event") != "end":
@@ -332,8 +336,11 @@ def print_run(
         find = pick_up(machine, release_c=setup.material.bed_release_c, pose_confirmed=pose)
     eye = open_scanner(
         setting.scanner,
-        Bed(setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed),
-    )
+        Bed(
+            setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed,
+            printer=machine, job=begun.job, progress=page.watching(bars),
+        ),
+    )  # fmt: skip
     page.show_run(begun.job, placed_solid(begun.template, setting.placed))
     if not going_on:
         machine.connect()
@@ -363,6 +370,8 @@ def print_run(
         return report, warmth.series(_noted(setting.port))
     finally:
         begun.tape.close()
+        if isinstance(eye, ProbeScanner):
+            begun.felt.extend(eye.felt)
 
 
 def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amrepair.cli.files import refuse_traps
 from amrepair.cli.live import (
     VIEW_PORT,
     HostOption,
@@ -83,8 +85,8 @@ def simulate(
     scanner: Annotated[
         str,
         typer.Option(
-            help="structured-light, laser-line, another of the world's file, or recorded:FILE: "
-            "the noise of a real scanner."
+            help="structured-light, laser-line, another of the world's file, recorded:FILE (the "
+            "noise of a real scanner), or probe: the printer's own probe touches."
         ),
     ] = "structured-light",
     max_iterations: Annotated[
@@ -101,6 +103,7 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Print a part on an emulated printer, break it, find what is missing and print only that."""
+    refuse_traps([] if part is None else [part])
     with console.starting():
         import numpy as np
 
@@ -109,6 +112,7 @@ def simulate(
         from amrepair.repair import Stopwatch
         from amrepair.report import write_report
         from amrepair.report.folder import RunFolder
+        from amrepair.scans import PROBE
         from amrepair.simulate.defects import parse_defect
         from amrepair.simulate.parameters import load_world
         from amrepair.simulate.part_files import bracket_path
@@ -121,7 +125,7 @@ def simulate(
     defects = [d for d in defects if d.kind != "none"]
     setup = load_setup(printer, material, process)
     told = load_world(world)
-    told.scanner(scanner)  # refused before any work
+    _ = setup.printer.feeler if scanner == PROBE else told.scanner(scanner)  # before any work
     path = part or bracket_path()
     mesh = scaled_mesh(path, scale, setup)
     ids = (printer, material, process)
@@ -143,7 +147,7 @@ def simulate(
 
             def begun(pose: Transform, printer: Printer) -> Tape:
                 page.drives(printer.pause, printer.resume)
-                return _recorded(prepared, folder, pose, ids, policy)
+                return _recorded(prepared, folder, pose, ids, policy, scanner=scanner)
 
             run = simulate_run(
                 prepared,
@@ -182,6 +186,8 @@ def _recorded(
     pose: Transform,
     ids: tuple[str, str, str],
     policy: PolicyOptions,
+    *,
+    scanner: str,
 ) -> Tape:
     """Write down what the run begins with; the tape that it is recorded on."""
     from amrepair.loop import Tape
@@ -197,6 +203,7 @@ def _recorded(
         by_beads=run.by_beads,
         seed=run.seed,
         policy=policy,
+        scanner=scanner,
     )
     keep(folder.path, setting, run.checked.program.text, run.template)
     return Tape(folder.path)
@@ -242,6 +249,7 @@ def _result(
             "unprintable_mm3": rounded(sum(u.volume_mm3 for u in run.prepared.plan.unprintable)),
         },
         "speed_up": round(speed, 1),
+        **({"touches": rounded([asdict(felt) for felt in run.felt])} if run.felt else {}),
     }
 
 
@@ -281,6 +289,8 @@ def _say(run: SimulatedRun, result: dict[str, Any], folder: RunFolder, within: b
         table.add_row(t.kind, t.label, *volumes)
     if run.truth:
         console.out.print(table)
+    for felt in run.felt:
+        console.out.print(f"{felt.stop}: {felt.told()}.")
     console.out.print(f"Simulated {result['speed_up']:g} times as fast as the printer prints.\n")
     for line in summary_of_result(result, within_tolerance=within):
         console.out.print(line)

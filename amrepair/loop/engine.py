@@ -28,7 +28,7 @@ from amrepair.loop.situation import decide_look
 from amrepair.loop.tape import Sent, TapeEndsError, report_from_json, report_to_json
 from amrepair.policy import Action, Decision
 from amrepair.repair import RepairPlan, Site, plan_repair
-from amrepair.scans import Scan, Scanner, ScanRequest
+from amrepair.scans import PROBE, Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import Printer, PrintReport
@@ -245,6 +245,8 @@ class Run:
 
     def _learn(self, look: Look) -> None:
         """What the first clean layers tell of the scanner; said and on the tape, once."""
+        if look.scan.frame == PROBE:  # it measures its noise itself
+            return
         learned = self._learning.note(look.stop, look.plan, look.decision)
         if learned is None or self._tape.only_read:
             return

@@ -24,6 +24,7 @@ from amrepair.loop.pace import Pace
 from amrepair.policy import POLICY, PolicyOptions
 from amrepair.policy.unasked import Limits
 from amrepair.regions.calibration import Calibration
+from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
 from gcode.meshes import mesh_of
@@ -144,8 +145,9 @@ class Setting:
 
     @property
     def scanner_pose(self) -> Transform:
-        """Build from scanner."""
-        return Transform("build", "scanner", np.array(self.build_from_scanner))
+        """Build from scanner; from the printer's own axes where its probe touches."""
+        frame = PROBE if self.scanner == PROBE else "scanner"
+        return Transform("build", frame, np.array(self.build_from_scanner))
 
     def setup(self) -> PrintSetup:
         """The profiles, which must not have changed.

@@ -47,6 +47,7 @@ def detect(
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
     rounded_up: RoundedUp | None = None,
+    pose_is_known: bool = False,
     progress: Progress = silent,
 ) -> AnomalyMap:
     """Score and label a scan against its template.
@@ -69,6 +70,8 @@ def detect(
     rounded_up
         Of places and their deviations: how far out of the template the process itself was told to
         go there. So much is not excess.
+    pose_is_known
+        Nothing of what is seen is taken for a pose that is off.
 
     Raises
     ------
@@ -94,7 +97,7 @@ def detect(
         return seen, sites_of(seen, scan, template, options, top_z_mm, rounded_up)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
-    whole_part = top_z_mm is None and calibration != NORMAL
+    whole_part = top_z_mm is None and calibration != NORMAL and not pose_is_known
     seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
     progress("detect", 1.0, 4.0)
     test = _test(seen, sites, scan, template, options, calibration)

@@ -17,13 +17,14 @@ from amrepair.deficit import Deficit, as_built_heights, compute_deficit
 from amrepair.frames import Transform
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
+from amrepair.regions.calibration import of_touches
 from amrepair.regions.options import RegionOptions
 from amrepair.repair import in_view
 from amrepair.repair.filling import fillable, lines_of, refuse_ambiguity
 from amrepair.repair.plan import RepairPlan
 from amrepair.repair.site import Site
 from amrepair.repair.stopwatch import Stopwatch
-from amrepair.scans import Scan
+from amrepair.scans import PROBE, Scan
 from gcode.check import check
 from gcode.errors import CheckRefusedError
 from gcode.estimate import estimate
@@ -52,6 +53,8 @@ def plan_repair(
 
     Parameters
     ----------
+    scan
+        In whatever frame its sensor has; in that of the printer's probe no pose is looked for.
     guess
         A pose (template from the scan's frame) known beforehand; None searches from any pose.
     interruption
@@ -83,6 +86,8 @@ def plan_repair(
     True
     """
     watch = watch or Stopwatch()
+    if scan.frame == PROBE:  # it measures its noise itself
+        site = replace(site, calibration=of_touches(scan.sigma_mm, site.process_sigma_mm))
     with watch("align"):
         laid = _align(scan, site, guess, rng, progress)
     with watch("detect"):
@@ -118,6 +123,8 @@ class _Laid:
         The scan in the template's frame: all of it, and what is held against the template.
     images
         What rays saw, in the template's frame; None where what is expected ends in mid-air.
+    known
+        The pose was told and not looked for, as that of the printer's own probe.
     """
 
     registration: Registration
@@ -125,6 +132,7 @@ class _Laid:
     whole: Scan
     judged: Scan
     images: tuple[RangeImage, ...] | None
+    known: bool
 
     def plan(self, anomaly: AnomalyMap, deficit: Deficit, site: Site) -> RepairPlan:
         """The verdict, as yet without a program."""
@@ -150,8 +158,12 @@ def _align(
     with ThreadPoolExecutor(1) as beside:
         # what rays saw needs no pose, nor it them; a part of the scan has images of its own
         seen = None if in_view.is_cut(site) else beside.submit(range_images, scan)
-        outer = in_view.outside_open_infill(scan, site, guess)
-        registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
+        known = scan.frame == PROBE and guess is not None
+        if known and guess is not None:
+            registration = Registration.known(guess)
+        else:
+            outer = in_view.outside_open_infill(scan, site, guess)
+            registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
     placed = site.stands_at(scan, registration)
     if site.printed_z_mm is None:
         said = site.build_from_template is not None or guess is not None
@@ -165,6 +177,7 @@ def _align(
         whole,
         in_view.of_layer(in_view.of_the_part(whole, site), site),
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
+        known,
     )
 
 
@@ -180,6 +193,7 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
         top_z_mm=in_view.top_of_layer(site),
         images=laid.images,
         surface=site.surface,
+        pose_is_known=laid.known,
         rounded_up=in_view.told_to_go_beyond(site, laid.placed),
         progress=progress,
     )

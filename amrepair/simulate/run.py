@@ -29,14 +29,16 @@ from amrepair.loop import (
     run_loop,
 )
 from amrepair.loop.options import UNASKED
+from amrepair.loop.probing import Felt, PortFeeler, ProbeScanner
 from amrepair.loop.sites import sites
 from amrepair.policy import POLICY, PolicyOptions
 from amrepair.repair import Stopwatch
+from amrepair.scans import PROBE, Scanner
 from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
 from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
-from amrepair.simulate.stage import DefectTruth, Stage
+from amrepair.simulate.stage import DefectTruth, FeltStage, Stage
 from amrepair.simulate.world import World
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
@@ -100,6 +102,8 @@ class SimulatedRun:
         Time that the wall's clock spent on the same.
     temperatures
         (n, 3) printer clock s, hotend °C, bed °C as they were at every stop.
+    felt
+        What each look cost, where the printer's own probe touched.
     """
 
     prepared: PreparedRun
@@ -108,6 +112,7 @@ class SimulatedRun:
     printer_clock_s: float
     print_wall_s: float
     temperatures: Float[np.ndarray, "n 3"]
+    felt: tuple[Felt, ...] = ()
 
     @property
     def repaired_ratio(self) -> float | None:
@@ -219,6 +224,7 @@ def set_stage(
     box = run.part.bounding_box()
     centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
     told = world or load_world()
+    scanner = DEFAULT_SCANNER if scanner == PROBE else scanner  # it only touches
     model = told.scanner(scanner)
     standing = World(
         printer.bed_size_mm,
@@ -286,7 +292,8 @@ def simulate_run(
         Called with the scanner's calibrated pose and the printer before anything is printed;
         returns the tape that the run is recorded on, which is closed at its end.
     world, scanner
-        The world's parameters (None: the shipped ones), and which of its scanners looks.
+        The world's parameters (None: the shipped ones), and which of its scanners looks; `probe`:
+        the printer's own probe touches.
 
     Raises
     ------
@@ -305,7 +312,8 @@ def simulate_run(
             wire_log=wire_log,
         )
         printer.connect()
-        tape = begun(stage.build_from_scanner, printer)
+        eye, costs = _looked_at(run, stage, scanner, machine, printer, progress)
+        tape = begun(eye.build_from_scanner, printer)
 
         def recorded(look: Look) -> None:
             now = printer.temperatures()
@@ -317,7 +325,7 @@ def simulate_run(
                 run.job,
                 run.checked,
                 printer,
-                stage,
+                eye,
                 sites(
                     run.job, run.template, run.build_from_template, run.setup, by_beads=run.by_beads
                 ),
@@ -339,4 +347,21 @@ def simulate_run(
         printer_clock_s=printer_clock_s,
         print_wall_s=watch.seconds.get("print", 0.0) + watch.seconds.get("repair", 0.0),
         temperatures=np.array(temperatures, dtype=np.float64).reshape(-1, 3),
+        felt=tuple(costs),
     )
+
+
+def _looked_at(
+    run: PreparedRun,
+    stage: Stage,
+    scanner: str,
+    machine: EmulatedPrinterProcess,
+    printer: Printer,
+    progress: Progress,
+) -> tuple[Scanner, list[Felt]]:
+    """What looks at a stage, and what its looks cost where the printer's own probe touches."""
+    if scanner != PROBE:
+        return stage, []
+    feeler = PortFeeler(printer, run.setup)
+    probe = ProbeScanner(feeler, run.job, run.setup, clock=machine.clock_s, progress=progress)
+    return FeltStage(stage, probe, machine.stand), probe.felt

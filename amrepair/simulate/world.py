@@ -11,6 +11,7 @@ nozzle that comes back to it (`onto_cold`) meets them there.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import manifold3d
@@ -245,6 +246,19 @@ class World:
             z_mm=z_mm,
             seen=np.ones(z_mm.shape, dtype=bool),
         )
+
+    def felt(self) -> HeightField:
+        """Heights that a probe meets: the top as it has cooled, its columns where they were laid.
+
+        What shrinks sideways, some hundredths of a millimetre, a probe's flat does not tell.
+        """
+        top = self.top()
+        x_mm, y_mm = top.centres_mm()
+        laid = np.column_stack([
+            np.tile(x_mm, len(y_mm)), np.repeat(y_mm, len(x_mm)), top.z_mm.ravel()
+        ]).astype(np.float64)  # fmt: skip
+        cooled_mm = self.as_cooled(laid)[:, 2].reshape(top.shape)
+        return replace(top, z_mm=np.where(top.z_mm > 0, cooled_mm, 0.0))
 
     def copy(self) -> World:
         """An independent copy; what is laid in one does not show in the other."""
