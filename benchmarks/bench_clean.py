@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 
 from amrepair.frames import Transform
-from amrepair.loop.decide import Action, judge
 from amrepair.loop.findings import findings
 from amrepair.loop.kinds import typed
+from amrepair.policy.table import Action, judge
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Site, plan_repair
 from amrepair.scans import ScanRequest

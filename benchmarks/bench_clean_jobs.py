@@ -37,11 +37,11 @@ from bench_clean import HALTS, MOST_CURL_MM, motion_of
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.loop import Stop, locate_part, plan_stops
-from amrepair.loop.decide import Action
 from amrepair.loop.kinds import typed
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.sites import sites
 from amrepair.loop.situation import decide_look
+from amrepair.policy.table import Action
 from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.flow import noisy_flow
@@ -264,9 +264,7 @@ def judged(
         interruption=job.state_after(stop.line), rng=rng,
     )  # fmt: skip
     plan = typed(plan, job, site, stop.line, pose)
-    decision = decide_look(
-        plan, job, site, stop, (), seen_twice=False, max_iterations=3, limits=None
-    )
+    decision = decide_look(plan, job, site, stop, (), seen_twice=False, limits=None)
     changed = None
     if decision.changes_next and stop.layer_index is not None:
         after = stop.layer_index + 1

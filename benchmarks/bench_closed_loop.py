@@ -36,8 +36,9 @@ prepare()  # as the command lines do
 
 import measured_page
 
-from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
+from amrepair.loop import LoopOptions, LoopReport, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites
+from amrepair.policy import PolicyOptions
 from amrepair.simulate.defects import parse_defect
 from amrepair.simulate.parameters import DEFAULT_SCANNER, load_world
 from amrepair.simulate.run import PreparedRun, prepare_run, set_stage, simulate_run
@@ -61,7 +62,7 @@ PARTS: dict[str, tuple[str, float]] = {
 }
 DEFECTS = ("void", "missing_beads", "under_extrusion", "chip")
 SEEDS = (0, 1, 2)
-MAX_ITERATIONS = 2
+POLICY = PolicyOptions(most_passes=2)
 Case = tuple[str, str, int]
 
 
@@ -160,8 +161,7 @@ def run_without_wire(
             by_beads=prepared.by_beads,
         ),
         stops=stops,
-        max_iterations=MAX_ITERATIONS,
-        seed=prepared.seed,
+        options=LoopOptions(policy=POLICY, seed=prepared.seed),
     )
     return report, stage.truth[0]
 
@@ -177,7 +177,7 @@ def run_case(
     setup = load_setup(process=process)
     prepared = prepare_run(load_or_fit(mesh), setup, [parse_defect(kind)], title=part, seed=seed)
     if wire:
-        run = simulate_run(prepared, max_iterations=MAX_ITERATIONS, scanner=scanner)
+        run = simulate_run(prepared, policy=POLICY, scanner=scanner)
         report, truth = run.report, run.truth[0]
     else:
         report, truth = run_without_wire(prepared, each=each, scanner=scanner)

@@ -70,7 +70,10 @@ def one_print(template: MeshSdf, seed: int, folder: Path) -> dict[str, Any]:
     prepared = prepare_run(template, setup, [parse_defect(DEFECT)], title="day", seed=seed)
     kept = RunFolder(folder)
     run = simulate_run(
-        prepared, wire_log=folder / "wire.log", record=kept.record, begun=lambda pose: Tape(folder)
+        prepared,
+        wire_log=folder / "wire.log",
+        record=kept.record,
+        begun=lambda pose, printer: Tape(folder),
     )
     ratio = run.repaired_ratio
     result = loop_result(

@@ -32,8 +32,9 @@ import manifold3d as m3
 import numpy as np
 
 from amrepair.frames import Transform
-from amrepair.loop import Look, Stop, Tape, plan_stops, run_loop
+from amrepair.loop import Look, LoopOptions, Records, Stop, Tape, plan_stops, run_loop
 from amrepair.loop.sites import sites
+from amrepair.policy import PolicyOptions
 from amrepair.repair import Stopwatch
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan, ScanRequest
@@ -195,8 +196,8 @@ def measure(
     report = run_loop(
         run.job, run.checked, printer, eye,
         sites(run.job, run.template, run.build_from_template, run.setup, by_beads=run.by_beads),
-        stops=stops, max_iterations=1, record=record,
-        keep_scan=kept.keep_scan, tape=Tape(folder), watch=watch,
+        stops=stops, options=LoopOptions(policy=PolicyOptions(most_passes=1)),
+        records=Records(record, kept.keep_scan, Tape(folder), watch=watch),
     )  # fmt: skip
     printer.close()
     spent = []

@@ -4,6 +4,7 @@ numba numbers the files it keeps by how many there are: two processes that compi
 two kinds of arrays at the same moment take the same number, and either then loads what the other
 compiled, with wrong results and no error. Here every process names its files itself. And a kernel
 is compiled again when any of the kernels has changed: it may have another one's code in its own.
+Of processes that start together on a new machine one compiles a kernel, and the others wait.
 
 A kernel that may add up in any order (`fastmath`) and is called by another is inlined there
 (`inline="always"`). Else the process that compiles both uses the code that stands alone, and a
@@ -17,9 +18,11 @@ was done did not end for minutes.
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import os
 import secrets
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,6 +36,9 @@ __all__ = ["get_num_threads", "njit", "prange", "set_num_threads"]
 
 _PACKAGES = ("gcode", "amrepair")
 _TOKEN = secrets.token_hex(4)
+# The slowest kernel takes six seconds alone, with all that it calls eleven.
+LONGEST_COMPILE_S = 60.0
+POLL_S = 0.02
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
@@ -46,6 +52,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         kept = getattr(dispatcher._cache, "_cache_file", None)
         if kept is not None:
             keep_safely(kept)
+            compile_in_turn(dispatcher._cache, Path(f"{kept._index_path}.lock"))
         return dispatcher
 
     return compiled
@@ -63,6 +70,72 @@ def keep_safely(kept: Any) -> None:
     # A forked process has its parent's token, but a process number of its own.
     kept._data_name = lambda number: f"{base}.{os.getpid():x}-{_TOKEN}.{number}.nbc"
     kept._source_stamp = (*kept._source_stamp, kernels_stamp())
+
+
+def compile_in_turn(cache: Any, lock: Path) -> None:
+    """Have one process compile a kernel while others that need it wait, and load what it kept.
+
+    Parameters
+    ----------
+    cache
+        A `numba.core.caching.FunctionCache`: it is asked before a kernel is compiled, and told
+        afterwards.
+    lock
+        File whose lock is the turn. It dies with its process.
+    """
+    load, save, turn = cache.load_overload, cache.save_overload, _Turn(lock)
+
+    def load_in_turn(signature: Any, context: Any) -> Any:
+        found = load(signature, context)
+        if found is None and turn.take():
+            found = load(signature, context)  # somebody else may have compiled it meanwhile
+            if found is not None:
+                turn.give()
+        return found
+
+    def save_in_turn(signature: Any, compiled: Any) -> None:
+        try:
+            save(signature, compiled)
+        finally:
+            turn.give()
+
+    cache.load_overload, cache.save_overload = load_in_turn, save_in_turn
+
+
+class _Turn:
+    """The right to compile a kernel; who waits too long compiles it all the same."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._fd = path, -1
+
+    def take(self, *, wait_s: float = LONGEST_COMPILE_S) -> bool:
+        """Wait for the turn; false where it is held already, or cannot be had."""
+        if self._fd >= 0:
+            return False
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError:
+            return False  # nothing can be kept there, either
+        until_s = time.monotonic() + wait_s
+        while True:
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                if time.monotonic() > until_s:
+                    os.close(fd)
+                    return False
+                time.sleep(POLL_S)
+            else:
+                self._fd = fd
+                return True
+
+    def give(self) -> None:
+        """Give the turn to the next."""
+        if self._fd >= 0:
+            fd, self._fd = self._fd, -1
+            fcntl.flock(fd, fcntl.LOCK_UN)
+            os.close(fd)
 
 
 def kernels_stamp() -> tuple[tuple[str, int, int], ...]:

@@ -14,6 +14,7 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
@@ -26,9 +27,10 @@ MODEL_RELATION = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
 # goes no further than a thousandth. What is small in any case may pack as it likes.
 MOST_PACKED, SMALL_BYTES = 100, 16 * 2**20
 MOST_DIRECTORY_BYTES = 4 * 2**20  # some 50,000 files in one
-CHUNK_BYTES = 2**20
+CHUNK_BYTES, PROLOGUE_BYTES = 2**20, 2**16
 MOST_LAID_OUT = 5_000_000  # triangles by using parts again and again
 MOST_NESTED = 32  # components in components
+_GROWS = "{name} has a document type or entities, which no 3MF has"
 _END_OF_DIRECTORY = b"PK\x05\x06"
 _END_BYTES, _COMMENT_BYTES = 22, 65_535
 _IDENTITY = np.hstack([np.eye(3), np.zeros((3, 1))])
@@ -60,6 +62,28 @@ def read_3mf(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3
         with zipfile.ZipFile(path) as archive:
             model = _Model(archive, length)
             return model.triangles()
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+        raise ValueError(f"the zip file in it is damaged: {error}") from error
+    except expat.ExpatError as error:
+        raise ValueError(f"its XML is damaged: {error}") from error
+
+
+def refuse_trap(path: Path) -> None:
+    """Refuse at once what reading would refuse as no 3MF, or as one that grows beyond measure.
+
+    The first lines of its model are looked at and nothing is laid out, so that whoever has much to
+    load before it reads need not.
+
+    Raises
+    ------
+    ValueError
+        As `read_3mf`.
+    """
+    length = path.stat().st_size
+    _refuse_directory(path, length)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _Model(archive, length).refuse_trap()
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
         raise ValueError(f"the zip file in it is damaged: {error}") from error
     except expat.ExpatError as error:
@@ -145,8 +169,25 @@ class _Model:
             raise ValueError(f"an object is in {name!r}, which is not in the file")
         self._parse(name, _Reader(self, name).start)
 
+    def refuse_trap(self) -> None:
+        """Raise for what the root model's size or its first lines already tell."""
+        name = self._root()
+        with self._parser_of(name)[1] as stream:
+            head = stream.read(PROLOGUE_BYTES)
+        if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
+            raise ValueError(_GROWS.format(name=name))
+
     def _parse(self, name: str, start: object) -> None:
         """XML without a document type or entities, no larger than its file makes likely."""
+        parser, packed = self._parser_of(name)
+        parser.StartElementHandler = start  # type: ignore[assignment]
+        with packed as stream:
+            while chunk := stream.read(CHUNK_BYTES):
+                parser.Parse(chunk, False)
+        parser.Parse(b"", True)
+
+    def _parser_of(self, name: str) -> tuple[expat.XMLParserType, Any]:
+        """A parser for one file, and the file, once its size is known to be likely."""
         size = self._archive.getinfo(name).file_size
         self._unpacked += size
         limit = max(MOST_PACKED * self._length, SMALL_BYTES)
@@ -159,15 +200,11 @@ class _Model:
         parser.buffer_text = True
 
         def no_entities(*_: object) -> None:
-            raise ValueError(f"{name} has a document type or entities, which no 3MF has")
+            raise ValueError(_GROWS.format(name=name))
 
         parser.StartDoctypeDeclHandler = no_entities
         parser.EntityDeclHandler = no_entities
-        parser.StartElementHandler = start  # type: ignore[assignment]
-        with self._archive.open(name) as stream:
-            while chunk := stream.read(CHUNK_BYTES):
-                parser.Parse(chunk, False)
-        parser.Parse(b"", True)
+        return parser, self._archive.open(name)
 
     def _unused(self) -> list[Key]:
         used = {key for one in self._objects.values() for key, _ in one.uses}

@@ -226,29 +226,45 @@ def pose_from_anywhere(
         progress("align", 0.6, 1.0)
         _ask_features(hunt)
     if hunt.left_out_ratio > 0.0:
-        starts = [pose.matrix for _, pose in hunt.found[:FEW_TRIED]]
-        whole = sorted(refined(starts, clouds, template) + of_all, key=by_score)
-        share = explained(whole[0][1], inlier_mm)
-        without = hunt.best.matrix
-        off_mm = template.distance(clouds.dense_mm @ without[:3, :3].T + without[:3, 3])
-        clearer = float((np.abs(off_mm) <= inlier_mm).mean()) + CLEARER_BY
-        if share > CLEARED or share > max(least_ratio, clearer):
-            # What was left out fits the part as well, so it was no clutter.
-            hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = (
-                clouds, whole, 0.0, points_mm
-            )  # fmt: skip
+        _ask_the_whole(hunt, clouds, of_all, points_mm, least_ratio)
     progress("align", 0.8, 1.0)
     if hunt.share > EXPLAINED:
         hunt.take(hunt.twins())
         hunt.take(_turns(hunt.found, hunt.clouds, field, template, rng))
         hunt.take(hunt.twins())
     progress("align", 0.9, 1.0)
+    return _answer(hunt, rng)
+
+
+def _ask_the_whole(
+    hunt: _Hunt,
+    clouds: Clouds,
+    of_all: list[Scored],
+    points_mm: Float[np.ndarray, "n 3"],
+    least_ratio: float,
+) -> None:
+    """Take all points back in where what was left out fits the part as well: it was no clutter."""
+    starts = [pose.matrix for _, pose in hunt.found[:FEW_TRIED]]
+    whole = sorted(refined(starts, clouds, hunt.template) + of_all, key=by_score)
+    share = explained(whole[0][1], hunt.inlier_mm)
+    without = hunt.best.matrix
+    off_mm = hunt.template.distance(clouds.dense_mm @ without[:3, :3].T + without[:3, 3])
+    clearer = float((np.abs(off_mm) <= hunt.inlier_mm).mean()) + CLEARER_BY
+    if share > CLEARED or share > max(least_ratio, clearer):
+        hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = clouds, whole, 0.0, points_mm
+
+
+def _answer(hunt: _Hunt, rng: np.random.Generator) -> Found:
+    """What was found, with the share of the points that it explains."""
     best, others = _best_and_others(hunt)
     # The thinned cloud will not do: few scattered points fill as many voxels as many on a surface.
     sample = hunt.part_mm[rng.permutation(len(hunt.part_mm))[:DENSE_POINTS]]
-    residual = template.distance(sample @ best.matrix[:3, :3].T + best.matrix[:3, 3])
-    ratio = float((np.abs(residual) <= inlier_mm).mean())
-    return Found(best, others, ratio, hunt.part_mm, hunt.left_out_ratio, sigma_mm, inlier_mm, field)
+    residual = hunt.template.distance(sample @ best.matrix[:3, :3].T + best.matrix[:3, 3])
+    ratio = float((np.abs(residual) <= hunt.inlier_mm).mean())
+    return Found(
+        best, others, ratio, hunt.part_mm, hunt.left_out_ratio, hunt.sigma_mm, hunt.inlier_mm,
+        hunt.field,
+    )  # fmt: skip
 
 
 def _leave_clutter(

@@ -45,6 +45,8 @@ class BatchOptions:
     part_pose
         X, Y, Z in mm and the turn about Z in degrees at which each part stands on the bed; None
         where the scans are in the build frame. Only `repair` asks.
+    on_fixture
+        Finished parts stand on a fixture, not with their foot on the bed.
     printer, material, process
         Profiles; only `repair` asks.
     """

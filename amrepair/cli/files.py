@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from amrepair.errors import InputError
+from gcode.cli import console
 from gcode.cli.console import write_whole
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from amrepair.scans import Scan
 
 
 def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
@@ -19,6 +25,41 @@ def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
         is_mesh = path.suffix.lower() in SUFFIXES and not is_cloud(path)
         (meshes if is_mesh else scans).append(path)
     return meshes, scans
+
+
+def read_early(scan: Path, frame: str, sensors_mm: np.ndarray | None, bars: console.Bars) -> Scan:
+    """A scan, read before whatever judges it is loaded: a broken file is refused at once.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    with console.starting():
+        from amrepair.scans import read_scan
+
+    with bars.shown(), bars.stage("read scan"):
+        return read_scan(scan, frame=frame, sensor_at=sensors_mm)
+
+
+def refuse_traps(paths: list[Path]) -> None:
+    """Refuse 3MF files that are none, or that grow beyond measure, before anything is loaded.
+
+    Raises
+    ------
+    InputError
+        As reading them would.
+    """
+    from gcode.threemf import refuse_trap
+
+    for path in paths:
+        if path.suffix.lower() == ".3mf" and path.is_file():
+            try:
+                refuse_trap(path)
+            except (ValueError, OSError) as error:
+                raise InputError(
+                    f"the mesh {path} cannot be read as 3MF ({error}); export it again"
+                ) from error
 
 
 def is_cloud(path: Path) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import platform
 import sys
-from typing import Any
+from dataclasses import asdict
+from typing import Annotated, Any
 
 import typer
 
@@ -21,15 +22,28 @@ def add_to(app: typer.Typer) -> None:
     """Add the command."""
     app.command(
         "doctor",
-        epilog=console.examples("amrepair doctor", "amrepair doctor --json > doctor.json"),
+        epilog=console.examples(
+            "amrepair doctor", "amrepair doctor --json > doctor.json", "amrepair doctor --options"
+        ),
     )(doctor)
 
 
-def doctor(as_json: JsonOption = False) -> None:
+def doctor(
+    options: Annotated[
+        bool,
+        typer.Option(
+            "--options", help="Tell every number that can be set, with its unit and its reason."
+        ),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
     """Check Python, libraries, torch, open3d, profiles, ports, disk and cache; say how to fix.
 
     Exit 0 where every command can work, 2 where one cannot.
     """
+    if options:
+        _tell_options(as_json=as_json)
+        return
     with console.errors.status("doctor") as status:
         findings = examine(lambda name: status.update(f"doctor: {name}"))
     healthy = all(finding.state is not State.BAD for finding in findings)
@@ -40,6 +54,23 @@ def doctor(as_json: JsonOption = False) -> None:
             _say(finding)
     if not healthy:
         raise typer.Exit(BAD_EXIT)
+
+
+def _tell_options(*, as_json: bool) -> None:
+    from amrepair.doctor.options import tunables
+
+    with console.errors.status("doctor: options"):
+        found = tunables()
+    if as_json:
+        console.show_json({"options": [asdict(one) for one in found]})
+        return
+    said = ""
+    for one in found:
+        if one.options != said:
+            said = one.options
+            console.out.print(f"\n{said}", style="bold", markup=False)
+        value = f"{one.value}{' ' + one.unit if one.unit not in ('', 'ratio') else ''}"
+        console.out.print(f"  {one.name:<24}{value:<16}{one.reason}", markup=False)
 
 
 def _say(finding: Finding) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amrepair.cli.files import read_early
 from amrepair.cli.options import (
     CalibrationOption,
     JsonOption,
@@ -85,25 +86,25 @@ def align(
     as_json: JsonOption = False,
 ) -> None:
     """Find where a scan lies in its template."""
-    with console.starting():
-        import numpy as np
-
-    from amrepair.align import align as align_scan
-    from amrepair.align.pam import VARIANTS
-    from amrepair.repair import Stopwatch
-    from amrepair.scans import read_scan, write_ply
-    from amrepair.template import open_template
-
     if output is not None and output.suffix.lower() != ".ply":
         raise InputError(f"{output}: an aligned scan is written as .ply; rename it")
     if pam and method != "paper":
         raise InputError(f"--pam belongs to --method paper, the method is {method}")
     _refuse_known_of_many(part_is_known, template)
+    bars = console.Bars()
+    cloud = read_early(scan, "scanner", sensors(sensor_at), bars)
+    with console.starting():
+        import numpy as np
+
+        from amrepair.align import align as align_scan
+        from amrepair.align.pam import VARIANTS
+        from amrepair.repair import Stopwatch
+        from amrepair.scans import write_ply
+        from amrepair.template import open_template
+
     settings = with_settings(VARIANTS, pam, "--pam")
-    watch, bars = Stopwatch(), console.Bars()
+    watch = Stopwatch()
     with bars.shown():
-        with bars.stage("read scan"):
-            cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
         if template.is_dir():
             known = from_library(cloud, template, method, seed, watch, bars)
             found, chosen = known.registration, chosen_part(known)
@@ -200,25 +201,24 @@ def detect(
     as_json: JsonOption = False,
 ) -> None:
     """Align a scan and say what is missing and what is too much."""
+    _refuse_known_of_many(part_is_known, template)
+    bars = console.Bars()
+    cloud = read_early(scan, "scanner", sensors(sensor_at), bars)
+    known_errors = calibration_named(calibration)
     with console.starting():
         import numpy as np
 
-    from amrepair.align import align as align_scan
-    from amrepair.deficit import compute_deficit, measured_regions
-    from amrepair.frames import Transform
-    from amrepair.regions import detect as detect_defects
-    from amrepair.repair import Stopwatch
-    from amrepair.report.collect import rounded
-    from amrepair.report.folder import RunFolder
-    from amrepair.scans import read_scan
-    from amrepair.template import open_template
+        from amrepair.align import align as align_scan
+        from amrepair.deficit import compute_deficit, measured_regions
+        from amrepair.frames import Transform
+        from amrepair.regions import detect as detect_defects
+        from amrepair.repair import Stopwatch
+        from amrepair.report.collect import rounded
+        from amrepair.report.folder import RunFolder
+        from amrepair.template import open_template
 
-    _refuse_known_of_many(part_is_known, template)
-    known_errors = calibration_named(calibration)
-    watch, bars = Stopwatch(), console.Bars()
+    watch = Stopwatch()
     with bars.shown():
-        with bars.stage("read scan"):
-            cloud = read_scan(scan, frame="scanner", sensor_at=sensors(sensor_at))
         folder = RunFolder(out)
         chosen: dict[str, Any] = {}
         if template.is_dir():

@@ -67,15 +67,16 @@ def view(
     token: TokenOption = None,
 ) -> None:
     """Show files together in a browser, each with a box to hide it; Ctrl+C ends it."""
+    for path in files:
+        _refuse(path)
+    shown = [_shown(path) for path in files]
     with console.starting():
         from amrepair.report.live import LiveView
 
-    for path in files:
-        _refuse(path)
     page = LiveView(title="amrepair view", host=host, port=port, token=token)
     try:
-        for path in files:
-            show_file(page, path)
+        for show in shown:
+            show(page)
         page.say("Files", [path.name for path in files])
         console.out.print(f"Open {page.url} (Ctrl+C ends it)", markup=False)
         _until_interrupted()
@@ -91,27 +92,43 @@ def show_file(page: LiveView, path: Path) -> None:
     InputError
         If it is none that can be shown.
     """
+    _refuse(path)
+    _shown(path)(page)
+
+
+def _shown(path: Path) -> Callable[[LiveView], None]:
+    """Read a file, before any page is loaded; what puts it there."""
     import numpy as np
 
-    from amrepair.report.live import PART
-    from amrepair.scans import read_scan
-    from amrepair.template import load_template
-    from amrepair.template.mesh_file import load_mesh
-    from gcode.reader import read_job
     from gcode.solids import SUFFIXES as MESH_SUFFIXES
 
-    _refuse(path)
-    suffix = path.suffix.lower()
+    suffix, name = path.suffix.lower(), path.name
     if suffix in JOB_SUFFIXES:
-        text = path.read_text(encoding="utf-8", errors="replace")
-        page.show_job(read_job(text), name=path.name, grown=True)
-    elif suffix == ".safetensors":
-        page.show_solid(path.name, load_template(path).solid(), PART)
-    elif suffix in MESH_SUFFIXES and not is_cloud(path):
+        from gcode.reader import read_job
+
+        job = read_job(path.read_text(encoding="utf-8", errors="replace"))
+        return lambda page: page.show_job(job, name=name, grown=True)
+    if suffix == ".safetensors":
+        from amrepair.template import load_template
+
+        solid = load_template(path).solid()
+        return lambda page: page.show_solid(name, solid, _colour())
+    if suffix in MESH_SUFFIXES and not is_cloud(path):
+        from amrepair.template.mesh_file import load_mesh
+
         mesh = load_mesh(path)
-        page.show_mesh(path.name, np.asarray(mesh.vertices), np.asarray(mesh.faces), PART)
-    else:
-        page.show_cloud(path.name, np.array(read_scan(path, frame="file").points_mm))
+        corners, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        return lambda page: page.show_mesh(name, corners, faces, _colour())
+    from amrepair.scans import read_scan
+
+    points_mm = np.array(read_scan(path, frame="file").points_mm)
+    return lambda page: page.show_cloud(name, points_mm)
+
+
+def _colour() -> tuple[int, int, int]:
+    from amrepair.report.live import PART
+
+    return PART
 
 
 def _refuse(path: Path) -> None:

@@ -117,7 +117,8 @@ ScannerOption = Annotated[
     str | None,
     typer.Option(
         help="watch:DIR, a folder that scans are dropped in; python:FILE, a scanner of your "
-        "own; or simulated:FILE, of what 'gcode emulate --motion FILE' has printed."
+        "own; probe, the printer's own probe, which touches; or simulated:FILE, of what 'gcode "
+        "emulate --motion FILE' has printed."
     ),
 ]
 ScannerPoseOption = Annotated[

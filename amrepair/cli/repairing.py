@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amrepair.cli.files import read_early
 from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.options import (
     CalibrationOption,
@@ -114,18 +115,6 @@ def repair(
     as_json: JsonOption = False,
 ) -> None:
     """Make the G-code that prints only what is missing on a finished part."""
-    with console.starting():
-        import numpy as np
-
-    from amrepair.repair import Site, Stopwatch, plan_repair
-    from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
-    from amrepair.report.collect import plan_result
-    from amrepair.report.text import left_out_lines
-    from amrepair.scans import read_scan
-    from amrepair.template import open_template
-    from amrepair.turning import turns_named, turns_of
-    from gcode.cli.words import what_it_does
-
     if scan_frame not in FRAMES:
         raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
     if pose == OF_JOB and job is None:
@@ -139,6 +128,20 @@ def repair(
             "--scan-frame unknown needs --part-pose X,Y,Z,RZ: an aligned shape does not say where "
             f"the part stands on the bed; {hint}"
         )
+    bars = console.Bars()
+    frame = "build" if scan_frame == "build" else "scanner"
+    cloud = read_early(scan, frame, sensors(sensor_at), bars)
+    with console.starting():
+        import numpy as np
+
+        from amrepair.repair import Site, Stopwatch, plan_repair
+        from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
+        from amrepair.report.collect import plan_result
+        from amrepair.report.text import left_out_lines
+        from amrepair.template import open_template
+        from amrepair.turning import turns_named, turns_of
+        from gcode.cli.words import what_it_does
+
     turns = turns_named(turn or [])
     if standing is not None and standing.suffix != ".npz":
         raise InputError(f"{standing}: what stands there is written as .npz; rename it")
@@ -146,11 +149,9 @@ def repair(
         console.writable(path)
     placed = part_pose(pose) if pose is not None and pose != OF_JOB else None
     known_errors = calibration_named(calibration)
-    watch, bars = Stopwatch(), console.Bars()
-    frame = "build" if scan_frame == "build" else "scanner"
+    watch = Stopwatch()
     with bars.shown():
         with bars.stage("read"):
-            cloud = read_scan(scan, frame=frame, sensor_at=sensors(sensor_at))
             grid = grid_of(job, setup)
         with watch("template"):
             field = open_template(template, progress=bars)

@@ -20,21 +20,32 @@ def add_to(app: typer.Typer) -> None:
     """Add the command."""
     app.command(
         "replay",
-        epilog=console.examples("amrepair replay out/demo", "amrepair replay out/loop --json"),
+        epilog=console.examples(
+            "amrepair replay out/demo",
+            "amrepair replay out/loop --json",
+            "amrepair replay out/loop --rule least_mm3=2.5 --rule sure=0.95",
+        ),
     )(replay_command)
 
 
 def replay_command(
     run: Annotated[Path, typer.Argument(help="Folder of a run of 'loop' or 'simulate'.")],
+    rule: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME=VALUE of a number of the policy (see 'amrepair doctor --options'): the "
+            "recorded facts are judged by it, and no scan is read; may be repeated."
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Decide again from the recorded scans: exit 0 if all is the same, 1 if something differs."""
     with console.starting():
-        from amrepair.loop.replay import replay
+        from amrepair.loop.replay import decide_again, replay
 
     bars = console.Bars()
     with bars.shown():
-        looks = replay(run, progress=bars)
+        looks = decide_again(run, rule) if rule else replay(run, progress=bars)
     same = not any(look.differences for look in looks)
     if as_json:
         console.show_json(

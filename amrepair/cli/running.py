@@ -17,20 +17,21 @@ from amrepair.fleet.desk import Desk
 from amrepair.fleet.shared import SharedDetection
 from amrepair.frames import Transform
 from amrepair.loop import (
-    MAX_ITERATIONS,
+    Approval,
     Decision,
     Look,
     LoopReport,
+    Records,
     Tape,
     plan_stops,
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
-from amrepair.loop.limits import Limits
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
-from amrepair.loop.pace import Pace, layers_at
+from amrepair.loop.pace import layers_at
 from amrepair.loop.pick_up import pick_up
+from amrepair.loop.probing import ProbeScanner
 from amrepair.loop.setting import Setting, forget, keep, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
@@ -38,6 +39,7 @@ from amrepair.regions import detect
 from amrepair.repair import Detector, RepairPlan, Stopwatch
 from amrepair.report import TemperatureSeries
 from amrepair.report.folder import RunFolder
+from amrepair.scans import PROBE
 from amrepair.template import open_template
 from gcode.check import CheckedProgram, check, policy_of
 from gcode.cli import console
@@ -213,6 +215,8 @@ def new_run(
     _ = setup.printer.head  # refused before any work
     pose = read_calibration(calibration)
     known_scanner(said["scanner"])  # refused before any work
+    if said["scanner"] == PROBE:
+        _ = setup.printer.feeler
     folder = RunFolder(out)
     before = read_events(out)
     if before and before[-1].get("event") != "end":
@@ -250,7 +254,7 @@ def new_run(
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
         copies=() if expected is field else placed, by_beads=True,
-        max_iterations=MAX_ITERATIONS, adaptive=pace, marked=looks.marked,
+        adaptive=pace, marked=looks.marked,
         limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
@@ -332,8 +336,11 @@ def print_run(
         find = pick_up(machine, release_c=setup.material.bed_release_c, pose_confirmed=pose)
     eye = open_scanner(
         setting.scanner,
-        Bed(setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed),
-    )
+        Bed(
+            setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed,
+            printer=machine, job=begun.job, progress=page.watching(bars),
+        ),
+    )  # fmt: skip
     page.show_run(begun.job, placed_solid(begun.template, setting.placed))
     if not going_on:
         machine.connect()
@@ -362,24 +369,16 @@ def print_run(
                 eye,
                 expected,
                 stops=begun.stops,
-                max_iterations=setting.max_iterations,
-                approve=word.to_print if ask else lambda plan: True,
-                ask=word.to_go_on if ask else None,
-                limits=Limits.of(setup.process) if setting.limited else None,
-                pace=Pace(setting.adaptive) if setting.adaptive else None,
-                record=recorded,
-                keep_scan=begun.folder.keep_scan,
-                tape=begun.tape,
-                pick_up=find,
-                silent_stops=SILENT_STOPS,
-                calibration=setting.scanners_errors,
-                seed=setting.seed,
-                watch=watch,
+                options=replace(setting.options(setup.process), silent_stops=SILENT_STOPS),
+                approval=Approval(word.to_print, word.to_go_on) if ask else Approval(),
+                records=Records(recorded, begun.folder.keep_scan, begun.tape, find, watch),
                 progress=page.watching(bars),
             )
         return report, warmth.series(_noted(setting.port))
     finally:
         begun.tape.close()
+        if isinstance(eye, ProbeScanner):
+            begun.felt.extend(eye.felt)
 
 
 def _noted(port: str) -> tuple[tuple[float, float, float | None], ...]:

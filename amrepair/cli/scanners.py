@@ -12,8 +12,11 @@ from pathlib import Path
 
 from amrepair.errors import AmrepairError, InputError, ScannerError
 from amrepair.frames import Transform
-from amrepair.scans import Scan, Scanner, ScanRequest, WatchedFolderScanner
+from amrepair.scans import PROBE, Scan, Scanner, ScanRequest, WatchedFolderScanner
+from gcode.hosts.port import Printer
 from gcode.profiles import PrintSetup
+from gcode.progress import Progress, silent
+from gcode.reader import Job
 
 MAKER = "open_scanner"  # the function that a scanner's file defines
 
@@ -32,12 +35,19 @@ class Bed:
         The printer below it.
     seed
         Of what is simulated.
+    printer, job
+        The printer itself, connected, and what it prints: for its own probe, which touches.
+    progress
+        Told of touches.
     """
 
     build_from_scanner: Transform
     timeout_s: float
     setup: PrintSetup
     seed: int = 0
+    printer: Printer | None = None
+    job: Job | None = None
+    progress: Progress = silent
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +124,18 @@ def _own(where: str, bed: Bed) -> Scanner:
     return OwnScanner(path, scanner)
 
 
+def _probe(where: str, bed: Bed) -> Scanner:
+    from amrepair.loop.probing import PortFeeler, ProbeScanner
+
+    if bed.printer is None or bed.job is None:
+        raise InputError(
+            "--scanner probe touches what a job has laid: it is for 'amrepair loop' and "
+            "'simulate', and needs no calibration"
+        )
+    feeler = PortFeeler(bed.printer, bed.setup)
+    return ProbeScanner(feeler, bed.job, bed.setup, progress=bed.progress)
+
+
 @dataclass(frozen=True, slots=True)
 class Kind:
     """A kind of scanner.
@@ -124,16 +146,20 @@ class Kind:
         Opens what is named after the colon.
     there
         Whether that is there already; asked before any work, and opens nothing.
+    alone
+        Nothing is named: there is no colon.
     """
 
     open: Callable[[str, Bed], Scanner]
     there: Callable[[Path], bool]
+    alone: bool = False
 
 
 SCANNERS: dict[str, Kind] = {
     "watch": Kind(_watched, Path.is_dir),
     "simulated": Kind(_simulated, lambda _: True),  # the file comes with the first move
     "python": Kind(_own, Path.is_file),
+    PROBE: Kind(_probe, lambda _: True, alone=True),
 }
 
 
@@ -145,15 +171,17 @@ def known_scanner(typed: str) -> Kind:
     InputError
         If there is no such kind, or its folder or file is not there.
     """
-    kind, _, where = typed.partition(":")
-    if kind not in SCANNERS or not where:
+    kind, colon, where = typed.partition(":")
+    known = SCANNERS.get(kind)
+    if known is None or (bool(colon) if known.alone else not where):
         raise InputError(
-            f"--scanner is {typed!r}; give watch:DIR, python:FILE with a scanner of your own, or "
-            "simulated:FILE with the motion of an emulated printer ('gcode emulate --motion FILE')"
+            f"--scanner is {typed!r}; give watch:DIR, python:FILE with a scanner of your own, "
+            "probe for the printer's own, or simulated:FILE with the motion of an emulated printer "
+            "('gcode emulate --motion FILE')"
         )
-    if not SCANNERS[kind].there(Path(where)):
+    if not known.there(Path(where)):
         raise InputError(f"--scanner {typed}: {where} is not there; create it first")
-    return SCANNERS[kind]
+    return known
 
 
 def open_scanner(typed: str, bed: Bed) -> Scanner:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amrepair.cli.files import refuse_traps
 from amrepair.cli.live import (
     VIEW_PORT,
     HostOption,
@@ -31,9 +33,11 @@ from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 if TYPE_CHECKING:
     from amrepair.frames import Transform
     from amrepair.loop import Tape
+    from amrepair.policy import PolicyOptions
     from amrepair.report import ReportData
     from amrepair.report.folder import RunFolder
     from amrepair.simulate.run import PreparedRun, SimulatedRun
+    from gcode.hosts.port import Printer
 
 DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
 
@@ -81,8 +85,8 @@ def simulate(
     scanner: Annotated[
         str,
         typer.Option(
-            help="structured-light, laser-line, another of the world's file, or recorded:FILE: "
-            "the noise of a real scanner."
+            help="structured-light, laser-line, another of the world's file, recorded:FILE (the "
+            "noise of a real scanner), or probe: the printer's own probe touches."
         ),
     ] = "structured-light",
     max_iterations: Annotated[
@@ -99,12 +103,16 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Print a part on an emulated printer, break it, find what is missing and print only that."""
+    refuse_traps([] if part is None else [part])
     with console.starting():
         import numpy as np
 
+        from amrepair.loop import Approval
+        from amrepair.policy import PolicyOptions
         from amrepair.repair import Stopwatch
         from amrepair.report import write_report
         from amrepair.report.folder import RunFolder
+        from amrepair.scans import PROBE
         from amrepair.simulate.defects import parse_defect
         from amrepair.simulate.parameters import load_world
         from amrepair.simulate.part_files import bracket_path
@@ -112,11 +120,12 @@ def simulate(
         from gcode.profiles import load_setup
 
     watch, bars = Stopwatch(), console.Bars()
+    policy = PolicyOptions(most_passes=max_iterations)
     defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
     defects = [d for d in defects if d.kind != "none"]
     setup = load_setup(printer, material, process)
     told = load_world(world)
-    told.scanner(scanner)  # refused before any work
+    _ = setup.printer.feeler if scanner == PROBE else told.scanner(scanner)  # before any work
     path = part or bracket_path()
     mesh = scaled_mesh(path, scale, setup)
     ids = (printer, material, process)
@@ -135,16 +144,20 @@ def simulate(
             view, ask=True, title=path.name, host=view_host, port=view_port, token=token
         ) as page:
             page.show_run(prepared.job, prepared.part)
+
+            def begun(pose: Transform, printer: Printer) -> Tape:
+                page.drives(printer.pause, printer.resume)
+                return _recorded(prepared, folder, pose, ids, policy, scanner=scanner)
+
             run = simulate_run(
                 prepared,
                 wire_log=folder.file("wire.log"),
                 world=told,
                 scanner=scanner,
-                max_iterations=max_iterations,
-                approve=page.to_print,
+                policy=policy,
+                approval=Approval(page.to_print),
                 record=page.recording(folder.record),
-                begun=lambda pose: _recorded(prepared, folder, pose, ids, max_iterations),
-                connected=lambda printer: page.drives(printer.pause, printer.resume),
+                begun=begun,
                 watch=watch,
                 progress=page.watching(bars),
             )
@@ -172,7 +185,9 @@ def _recorded(
     folder: RunFolder,
     pose: Transform,
     ids: tuple[str, str, str],
-    max_iterations: int,
+    policy: PolicyOptions,
+    *,
+    scanner: str,
 ) -> Tape:
     """Write down what the run begins with; the tape that it is recorded on."""
     from amrepair.loop import Tape
@@ -187,7 +202,8 @@ def _recorded(
         build_from_scanner=pose,
         by_beads=run.by_beads,
         seed=run.seed,
-        max_iterations=max_iterations,
+        policy=policy,
+        scanner=scanner,
     )
     keep(folder.path, setting, run.checked.program.text, run.template)
     return Tape(folder.path)
@@ -233,6 +249,7 @@ def _result(
             "unprintable_mm3": rounded(sum(u.volume_mm3 for u in run.prepared.plan.unprintable)),
         },
         "speed_up": round(speed, 1),
+        **({"touches": rounded([asdict(felt) for felt in run.felt])} if run.felt else {}),
     }
 
 
@@ -272,6 +289,8 @@ def _say(run: SimulatedRun, result: dict[str, Any], folder: RunFolder, within: b
         table.add_row(t.kind, t.label, *volumes)
     if run.truth:
         console.out.print(table)
+    for felt in run.felt:
+        console.out.print(f"{felt.stop}: {felt.told()}.")
     console.out.print(f"Simulated {result['speed_up']:g} times as fast as the printer prints.\n")
     for line in summary_of_result(result, within_tolerance=within):
         console.out.print(line)

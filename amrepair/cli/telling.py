@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import typer
@@ -11,10 +11,11 @@ from amrepair.errors import LoopError
 from amrepair.frames import Transform
 from amrepair.loop import LoopReport, Stop, Tape
 from amrepair.loop.learning import told
+from amrepair.loop.probing import Felt
 from amrepair.loop.setting import Setting
 from amrepair.repair import Stopwatch
 from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
-from amrepair.report.collect import loop_result
+from amrepair.report.collect import loop_result, rounded
 from amrepair.report.folder import RunFolder
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram
@@ -36,6 +37,7 @@ class Begun:
     template: Template
     stops: tuple[Stop, ...]
     tape: Tape
+    felt: list[Felt] = field(default_factory=list)  # what each look by touches cost
 
 
 def written(
@@ -54,6 +56,8 @@ def written(
         report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
     )
     result |= warnings_json(begun.checked.report)
+    if begun.felt:
+        result["touches"] = [rounded(asdict(felt)) for felt in begun.felt]
     folder.write_json("result.json", result)
     with bars.shown(), bars.stage("report"):
         data = report_of_loop(
@@ -77,6 +81,8 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
     else:
         for line in summary_of_result(result, within_tolerance=within):
             console.out.print(line)
+        for felt in begun.felt:
+            console.out.print(f"{felt.stop}: {felt.told()}.")
         if report.calibration is not None:
             console.out.print(told(report.calibration))
         console.out.print(f"Report: {folder.file('report.html')}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amrepair.cli.files import sort_inputs, write_mesh
+from amrepair.cli.files import refuse_traps, sort_inputs, write_mesh
 from amrepair.cli.options import JsonOption, SeedOption, sensors, with_settings
 from amrepair.errors import InputError
 from gcode.cli import console
@@ -82,6 +82,7 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Fit the signed distance field that scans are held against."""
+    refuse_traps(inputs)
     with console.starting():
         from amrepair.merge import fit_mesh
         from amrepair.template import fit_template

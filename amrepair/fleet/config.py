@@ -51,6 +51,8 @@ class FleetOptions:
 
     Attributes
     ----------
+    out
+        Folder of the runs, the history and the report.
     restarts, within_s
         So many times in so many seconds a printer's process that died is started again.
     answer_within_s

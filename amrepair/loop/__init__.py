@@ -6,19 +6,21 @@ run looked at again. It knows ports only, and draws nothing.
 
 from __future__ import annotations
 
-from amrepair.loop.decide import Action, Decision
 from amrepair.loop.locate import locate_part
-from amrepair.loop.looks import LEFT_RATIO, Look, LoopReport, Stop, left_well, plan_stops
-from amrepair.loop.run import MAX_ITERATIONS, run_loop
+from amrepair.loop.looks import Look, LoopReport, Stop, left_well, plan_stops
+from amrepair.loop.options import Approval, LoopOptions, Records
+from amrepair.loop.run import run_loop
 from amrepair.loop.tape import Tape
+from amrepair.policy import Action, Decision
 
 __all__ = [
-    "LEFT_RATIO",
-    "MAX_ITERATIONS",
     "Action",
+    "Approval",
     "Decision",
     "Look",
+    "LoopOptions",
     "LoopReport",
+    "Records",
     "Stop",
     "Tape",
     "left_well",

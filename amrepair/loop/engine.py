@@ -17,21 +17,20 @@ import numpy as np
 from amrepair.errors import AlignmentError, LoopError, ScannerError
 from amrepair.frames import Transform
 from amrepair.loop import travel
-from amrepair.loop.decide import Action, Decision
 from amrepair.loop.findings import early_action
 from amrepair.loop.kinds import typed
 from amrepair.loop.learning import Learning, to_json, told
-from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
 from amrepair.loop.memory import settled
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.objects import Course, Objects
+from amrepair.loop.options import Approval, LoopOptions, Records
 from amrepair.loop.sites import Expected
 from amrepair.loop.situation import decide_look
-from amrepair.loop.tape import Sent, Tape, TapeEndsError, report_from_json, report_to_json
-from amrepair.regions.calibration import Calibration
-from amrepair.repair import RepairPlan, Site, Stopwatch, plan_repair
-from amrepair.scans import Scan, Scanner, ScanRequest
+from amrepair.loop.tape import Sent, TapeEndsError, report_from_json, report_to_json
+from amrepair.policy import Action, Decision
+from amrepair.repair import RepairPlan, Site, plan_repair
+from amrepair.scans import PROBE, Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import LeavesOut, Printer, PrintReport
@@ -41,10 +40,6 @@ from gcode.reader import Job
 from gcode.resumption.head import pulled_back_mm
 from gcode.resumption.rest import rest_without
 from gcode.resumption.standing import with_solid
-
-PickUp = Callable[[Sequence[Sent]], PrintReport | None]
-"""Finds out where the printer is, and has it finish what it was sent last."""
-
 
 ENDED_BY_NO = (Action.PAUSE, Action.GIVE_UP)
 
@@ -61,29 +56,19 @@ class Run:
         site_at: Callable[[Stop], Site],
         *,
         stops: Sequence[Stop],
-        max_iterations: int,
-        approve: Callable[[RepairPlan], bool],
-        ask: Callable[[Decision], bool] | None,
-        limits: Limits | None,
-        record: Callable[[Look], None],
-        keep_scan: Callable[[int, Scan], None],
-        tape: Tape,
-        pick_up: PickUp | None,
-        silent_stops: int,
-        calibration: Calibration | None,
-        seed: int,
-        watch: Stopwatch,
+        options: LoopOptions,
+        approval: Approval,
+        records: Records,
         progress: Progress,
     ) -> None:
         self._job, self._checked, self._printer, self._scanner = job, checked, printer, scanner
         self._base = 0  # of the job's lines, the one that the program under way begins with
         self._objects, self._course, self._stops = Objects.of(job), Course(job), tuple(stops)
-        self._site_at, self._max_iterations = site_at, max_iterations
-        self._approve, self._ask, self._limits = approve, ask, limits
-        self._record, self._keep_scan = record, keep_scan
-        self._tape, self._pick_up, self._seed = tape, pick_up, seed
-        self._watch, self._progress = watch, progress
-        self._learning = Learning(calibration)
+        self._site_at, self._options, self._approval = site_at, options, approval
+        self._keep_scan, self._record = records.scan, records.look
+        self._tape, self._pick_up, self._watch = records.tape, records.pick_up, records.watch
+        self._progress = progress
+        self._learning = Learning(options.calibration)
         self._sent: list[Sent] = []
         self._next_line = 0
         self._looks: list[Look] = []
@@ -91,7 +76,7 @@ class Run:
         self._job_prints: list[PrintReport] = []
         self._repair_prints: list[PrintReport] = []
         self._stopped = ""
-        self._silent_stops, self._silent = silent_stops, 0
+        self._silent = 0
         self._coming: tuple[Stop, Future[Site]] | None = None
         self._passed: list[Stop] = []
 
@@ -281,7 +266,7 @@ class Run:
                 try:
                     look = self._look(stop, site, parked)
                 except ScannerError as error:
-                    if self._silent >= self._silent_stops:
+                    if self._silent >= self._options.silent_stops:
                         raise
                     outcome, why = "pass by", str(error)
                 except AlignmentError as error:
@@ -300,7 +285,7 @@ class Run:
     def _look(self, stop: Stop, site: Site, parked: ModalState) -> Look:
         """Scan, plan, decide; what is to be printed is on the tape when this returns."""
         number, here = len(self._looks) + 1, [k for k in self._looks if k.stop == stop]
-        site = self._learning.judged_by(site)
+        site = replace(self._learning.judged_by(site), policy=self._options.policy)
         taped = self._tape.next("look")
         if taped is None:
             self._go_live()
@@ -331,6 +316,8 @@ class Run:
 
     def _learn(self, look: Look) -> None:
         """What the first clean layers tell of the scanner; said and on the tape, once."""
+        if look.scan.frame == PROBE:  # it measures its noise itself
+            return
         learned = self._learning.note(look.stop, look.plan, look.decision)
         if learned is None or self._tape.only_read:
             return
@@ -370,7 +357,7 @@ class Run:
                 and early_action(region, self._job, site.setup, stop.layer_index)
                 is not Action.FILL_WITH_NEXT
             ),
-            rng=np.random.default_rng([self._seed, number]),
+            rng=np.random.default_rng([self._options.seed, number]),
             watch=self._watch,
             progress=self._progress,
         )
@@ -390,8 +377,8 @@ class Run:
                 stop,
                 here,
                 seen_twice=again,
-                max_iterations=self._max_iterations,
-                limits=self._limits,
+                limits=self._options.limits,
+                policy=self._options.policy,
                 objects=self._objects,
             )
         return plan, decision
@@ -402,17 +389,17 @@ class Run:
             return replace(look, printed=bool(taped["printed"]), declined=bool(taped["declined"]))
         action = look.decision.action
         if action is Action.FILL_NOW:
-            granted = self._approve(look.plan)
+            granted = self._approval.approve(look.plan)
             return replace(look, printed=granted, declined=not granted)
-        if action is Action.GIVE_UP and self._ask is not None:
-            return replace(look, declined=not self._ask(look.decision))
+        if action is Action.GIVE_UP and self._approval.ask is not None:
+            return replace(look, declined=not self._approval.ask(look.decision))
         if action is Action.PAUSE:
-            if self._ask is None or not self._ask(look.decision):
+            if self._approval.ask is None or not self._approval.ask(look.decision):
                 return replace(look, declined=True)
             fills = [v for v in look.decision.verdicts if v.action is Action.FILL_NOW]
             situation = look.decision.situation
             if fills and not (situation.refused or situation.last_pass or situation.stuck):
-                return replace(look, printed=self._approve(look.plan))
+                return replace(look, printed=self._approval.approve(look.plan))
         return look
 
     # ------------------------------------------------------------------ the wire

@@ -12,10 +12,10 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.deficit.worth import defect_volumes
-from amrepair.loop.decide import Action, Cover, Finding, judge
-from amrepair.loop.layer_level import FLOW_TEST, FlowTest, LayerLevel, lie_off
+from amrepair.loop.layer_level import FLOW_TEST, FlowOptions, LayerLevel, lie_off
 from amrepair.loop.objects import Objects
+from amrepair.policy.table import Action, Cover, Finding, judge
+from amrepair.policy.worth import defect_volumes
 from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals
@@ -113,7 +113,7 @@ def findings(
     layer_index: int | None,
     line: int,
     seen_twice: bool = False,
-    flow_test: FlowTest = FLOW_TEST,
+    flow_test: FlowOptions = FLOW_TEST,
     objects: Objects | None = None,
 ) -> tuple[Finding, ...]:
     """The facts about every region of a plan.

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from amrepair.loop.decide import LEAST_LAYERS
+from amrepair.policy import POLICY
 from amrepair.regions import Region
 from amrepair.repair import RepairPlan
 
@@ -23,7 +23,7 @@ MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
 @dataclass(frozen=True, slots=True)
-class FlowTest:
+class FlowOptions:
     """What it takes to change a layer's flow.
 
     Attributes
@@ -44,13 +44,13 @@ class FlowTest:
 
     false_alarm: float = 1e-3
     patch_mm: float = 2.0
-    tolerance_layers: float = LEAST_LAYERS
+    tolerance_layers: float = POLICY.least_layers
     band_layers: float = 2.0
     least_points: int = 5
     least_patches: int = 6
 
 
-FLOW_TEST = FlowTest()
+FLOW_TEST = FlowOptions()
 """What the loop goes by."""
 
 
@@ -72,11 +72,11 @@ class LayerLevel:
     mean_mm: Float[np.ndarray, " p"]
     spread_mm: float
     layer_mm: float
-    options: FlowTest
+    options: FlowOptions
 
     @classmethod
     def of(
-        cls, plan: RepairPlan, z_mm: float | None, options: FlowTest = FLOW_TEST
+        cls, plan: RepairPlan, z_mm: float | None, options: FlowOptions = FLOW_TEST
     ) -> LayerLevel | None:
         """Of the layer whose top is at z, build frame; None where too little of it was seen.
 
@@ -103,7 +103,7 @@ class LayerLevel:
         deviation_mm: Float[np.ndarray, " n"],
         z_mm: float,
         layer_mm: float,
-        options: FlowTest = FLOW_TEST,
+        options: FlowOptions = FLOW_TEST,
     ) -> LayerLevel | None:
         """Of a scan's points, build frame, and how far out of what is expected they lie."""
         over = place_mm[:, 2] - z_mm

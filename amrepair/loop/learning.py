@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from amrepair.loop.decide import Action, Decision
 from amrepair.loop.looks import Stop
+from amrepair.policy.table import Action, Decision
 from amrepair.regions.calibrating import calibrated
 from amrepair.regions.calibration import NORMAL, Calibration
 from amrepair.regions.detection import judged_levels

@@ -11,15 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amrepair.errors import LoopError
-from amrepair.loop.decide import Decision
+from amrepair.policy import Decision
+from amrepair.policy.passes import may_be_left
+from amrepair.policy.worth import volume_mm3
 from amrepair.regions.calibration import Calibration
-from amrepair.repair import MIN_REPAIR_MM3, RepairPlan
+from amrepair.repair import RepairPlan
 from amrepair.scans import Scan
 from gcode.hosts.port import PrintReport
 from gcode.reader import Job
-
-# Of what was missing at a stop, this share may be left, and as much may stand out.
-LEFT_RATIO = 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,10 +136,7 @@ class LoopReport:
 
 
 def left_well(looks: Sequence[Look], found_mm3: float) -> bool:
-    """Whether a stop was left within tolerance.
-
-    Nothing that is worth a repair is left, beyond a share of what was found; and no more than
-    that share stands out: a repair's own rims are not a new defect.
+    """Whether a stop was left within tolerance, by the policy (`may_be_left`).
 
     Parameters
     ----------
@@ -150,17 +146,12 @@ def left_well(looks: Sequence[Look], found_mm3: float) -> bool:
         Volume found missing in the job so far: a later look sees earlier repairs, too.
     """
     last = looks[-1].plan
-    if last.within_tolerance:
-        return True
-    allowed_mm3 = LEFT_RATIO * found_mm3
-    missing_mm3 = sum(region.volume_mm3 for region in last.to_fill)
-    excess_mm3 = sum(region.volume_mm3 for region in last.too_much)
-    before_mm3 = sum(region.volume_mm3 for region in looks[0].plan.too_much)
-    unmended_mm3 = min(before_mm3, excess_mm3)  # excess that was there before the repair
-    return (
-        missing_mm3 <= allowed_mm3
-        and excess_mm3 - unmended_mm3 <= allowed_mm3
-        and unmended_mm3 <= max(allowed_mm3, MIN_REPAIR_MM3)
+    return last.within_tolerance or may_be_left(
+        found_mm3,
+        missing_mm3=volume_mm3(last.to_fill),
+        excess_mm3=volume_mm3(last.too_much),
+        excess_before_mm3=volume_mm3(looks[0].plan.too_much),
+        options=last.policy,
     )
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Int
 from amrepair.deficit import Standing, as_built_heights
 from amrepair.frames import in_box
 from amrepair.loop.looks import Look
-from amrepair.repair import AS_BUILT_CELL_MM, RepairPlan, Site
+from amrepair.repair import RepairPlan, Site
 from amrepair.scans import Scan
 from gcode.surfaces import HeightField
 
@@ -80,7 +80,7 @@ def _heights_later(
         spacing_mm,
         build_from_template=placed,
         printed_z_mm=printed_z_mm,
-        cell_mm=AS_BUILT_CELL_MM,
+        cell_mm=site.options.as_built_cell_mm,
     )
 
 

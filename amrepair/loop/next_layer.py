@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import manifold3d
 import numpy as np
 
-from amrepair.loop.decide import Action, Verdict
 from amrepair.loop.findings import matching
+from amrepair.policy.table import Action, Verdict
 from amrepair.repair import RepairPlan
 from gcode.errors import GcodeError
 from gcode.profiles import PrintSetup

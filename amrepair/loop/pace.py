@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from amrepair.errors import LoopError
-from amrepair.loop.decide import Action
 from amrepair.loop.looks import Look, Stop, plan_stops
+from amrepair.policy.table import Action
 from gcode.reader import Job
 
 AFTER_TROUBLE = 4

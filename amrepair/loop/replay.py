@@ -5,19 +5,20 @@ Nothing is sent and nobody is asked: what was answered then is taken from the re
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from amrepair.errors import InputError, LoopError
 from amrepair.frames import Transform
-from amrepair.loop.limits import Limits
 from amrepair.loop.looks import Look, Stop, plan_stops
+from amrepair.loop.options import Records
 from amrepair.loop.run import run_loop
 from amrepair.loop.setting import Recorded, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import Tape, read_events
+from amrepair.policy.again import changed, decided_again
 from amrepair.repair import Stopwatch
 from amrepair.scans import Scan, ScanRequest
 from gcode.check import CheckedProgram, check, policy_of
@@ -70,11 +71,38 @@ def replay(
         If the folder holds no recorded run, or a profile has changed.
     """
     run = open_run(folder)
-    then = [event for event in read_events(folder) if event.get("event") == "look"]
-    if not then:
-        raise InputError(f"{folder} has no recorded look; the run was ended before its first scan")
+    then = _recorded_looks(folder)
     now = looks_of(run, Tape(folder, only_read=True), watch=watch, progress=progress)
     return tuple(compare(event, look) for event, look in zip(then, now, strict=True))
+
+
+def decide_again(folder: Path, rules: Sequence[str] = ()) -> tuple[Replayed, ...]:
+    """Every recorded look decided again from its own facts, with some rules changed.
+
+    Parameters
+    ----------
+    rules
+        `name=value` of numbers of `PolicyOptions`; the others are those that the run went by.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no recorded run, or there is no such rule.
+    """
+    policy = changed(open_run(folder).setting.policy, rules)
+    again = []
+    for event in _recorded_looks(folder):
+        now = decided_again(event["decision"], policy).to_json()
+        said = _differences(event["decision"], now)
+        again.append(Replayed(event["look"], event["stop"], event["decision"], now, said))
+    return tuple(again)
+
+
+def _recorded_looks(folder: Path) -> list[dict[str, Any]]:
+    found = [event for event in read_events(folder) if event.get("event") == "look"]
+    if not found:
+        raise InputError(f"{folder} has no recorded look; the run was ended before its first scan")
+    return found
 
 
 def looks_of(
@@ -99,12 +127,8 @@ def looks_of(
         _TapeScanner(setting.scanner_pose),
         sites(run.job, run.template, setting.placed, run.setup, by_beads=setting.by_beads),
         stops=_looked_at(run, tape),
-        max_iterations=setting.max_iterations,
-        limits=Limits.of(run.setup.process) if setting.limited else None,
-        tape=tape,
-        calibration=setting.scanners_errors,
-        seed=setting.seed,
-        watch=watch,
+        options=replace(setting.options(run.setup.process), pace=None),
+        records=Records(tape=tape, watch=watch or Stopwatch()),
         progress=progress,
     )
     return report.looks
@@ -122,7 +146,19 @@ def _looked_at(run: Recorded, tape: Tape) -> tuple[Stop, ...]:
 def compare(then: dict[str, Any], look: Look) -> Replayed:
     """One look as it was recorded, and as it is decided now."""
     was, now = then["decision"], look.decision.to_json()
-    said: list[str] = []
+    said = list(_differences(was, now))
+    for key, value in (
+        ("missing", (then["missing_mm3"], look.plan.deficit.missing_mm3)),
+        ("excess", (then["excess_mm3"], look.plan.deficit.excess_mm3)),
+    ):
+        if abs(value[0] - value[1]) > max(SAME_MM3, SAME_RATIO * abs(value[0])):
+            said.append(f"{value[0]:.2f} mm³ {key} then, {value[1]:.2f} mm³ now")
+    return Replayed(look.number, look.stop.label, was, now, tuple(said))
+
+
+def _differences(was: dict[str, Any], now: dict[str, Any]) -> tuple[str, ...]:
+    """What is decided differently, in whole sentences."""
+    said = []
     if (was["action"], was["row"]) != (now["action"], now["row"]):
         said.append(
             f"decided '{was['action']}' by {was['row']} then, '{now['action']}' by {now['row']} now"
@@ -131,13 +167,7 @@ def compare(then: dict[str, Any], look: Look) -> Replayed:
             for d in (was, now)]  # fmt: skip
     if rows[0] != rows[1]:
         said.append(f"findings were {_words(rows[0])}, and are {_words(rows[1])}")
-    for key, value in (
-        ("missing", (then["missing_mm3"], look.plan.deficit.missing_mm3)),
-        ("excess", (then["excess_mm3"], look.plan.deficit.excess_mm3)),
-    ):
-        if abs(value[0] - value[1]) > max(SAME_MM3, SAME_RATIO * abs(value[0])):
-            said.append(f"{value[0]:.2f} mm³ {key} then, {value[1]:.2f} mm³ now")
-    return Replayed(look.number, look.stop.label, was, now, tuple(said))
+    return tuple(said)
 
 
 def _words(rows: list[tuple[str, str, str, str]]) -> str:

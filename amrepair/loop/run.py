@@ -11,23 +11,19 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 
-from amrepair.loop.decide import Decision
-from amrepair.loop.engine import PickUp, Run
-from amrepair.loop.limits import Limits
-from amrepair.loop.looks import Look, LoopReport, Stop
-from amrepair.loop.pace import Pace, Stops, had_trouble
-from amrepair.loop.tape import Tape, TapeEndsError
-from amrepair.regions.calibration import Calibration
-from amrepair.repair import RepairPlan, Site, Stopwatch
-from amrepair.scans import Scan, Scanner
+from amrepair.loop.engine import Run
+from amrepair.loop.looks import LoopReport, Stop
+from amrepair.loop.options import LOOP, UNASKED, Approval, LoopOptions, Records
+from amrepair.loop.pace import Stops, had_trouble
+from amrepair.loop.tape import TapeEndsError
+from amrepair.repair import Site
+from amrepair.scans import Scanner
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import Printer
 from gcode.process import gives_back
 from gcode.progress import Progress, silent
 from gcode.reader import Job
-
-MAX_ITERATIONS = 3
 
 
 @gives_back
@@ -39,19 +35,9 @@ def run_loop(
     site_at: Callable[[Stop], Site],
     *,
     stops: Sequence[Stop],
-    pace: Pace | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    approve: Callable[[RepairPlan], bool] = lambda plan: True,
-    ask: Callable[[Decision], bool] | None = None,
-    limits: Limits | None = None,
-    record: Callable[[Look], None] = lambda look: None,
-    keep_scan: Callable[[int, Scan], None] = lambda number, scan: None,
-    tape: Tape | None = None,
-    pick_up: PickUp | None = None,
-    silent_stops: int = 0,
-    calibration: Calibration | None = None,
-    seed: int = 0,
-    watch: Stopwatch | None = None,
+    options: LoopOptions = LOOP,
+    approval: Approval = UNASKED,
+    records: Records | None = None,
     progress: Progress = silent,
 ) -> LoopReport:
     """Print a job, repairing it at its stops.
@@ -65,30 +51,8 @@ def run_loop(
         off before this returns.
     site_at
         What is expected at a stop, and where it stands (`build_from_template` is required).
-    pace
-        Looks besides `stops`: more often after trouble, fewer while all is clean.
-    approve
-        Asked before every repair is sent.
-    ask
-        Asked where a decision is `pause and ask`: whether to go on all the same. Where nobody can
-        be asked (None) the run ends there, parked, heaters off.
-    limits
-        What may be printed without asking; beyond them the decision is `pause and ask`.
-    record
-        Called with every look as soon as its outcome is known, before anything follows from it.
-    keep_scan
-        Called with a look's number and scan while the look is planned; done before `record`.
-    tape
-        What was sent, seen and decided, written ahead; what it already holds is not done again.
-    pick_up
-        How a killed run's printer is found again, before the first thing that the tape lacks.
-    silent_stops
-        So many stops in a row may be passed by where the scanner does not answer; the next such
-        stop ends the run with its `ScannerError`. A scan that does not fit the part is taken once
-        more, and then ends the run, parked.
-
-    calibration
-        What sound parts look like to this scanner; None: learned from the first clean layers.
+    records
+        What is kept; None keeps nothing.
 
     Raises
     ------
@@ -125,13 +89,10 @@ def run_loop(
     """
     run = Run(
         job, checked, printer, scanner, site_at, stops=stops,
-        max_iterations=max_iterations, approve=approve, ask=ask, limits=limits, record=record,
-        keep_scan=keep_scan, tape=tape or Tape(), pick_up=pick_up, silent_stops=silent_stops,
-        calibration=calibration,
-        seed=seed, watch=watch or Stopwatch(), progress=progress,
+        options=options, approval=approval, records=records or Records(), progress=progress,
     )  # fmt: skip
     try:
-        ahead = Stops(job, stops, pace)
+        ahead = Stops(job, stops, options.pace)
         while (stop := ahead.next()) is not None:
             run.print_job(stop.line, coming=stop)
             if not run.at(stop):

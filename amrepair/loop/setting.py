@@ -19,16 +19,21 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
 from amrepair.loop.marks import marked_stops
+from amrepair.loop.options import LoopOptions
+from amrepair.loop.pace import Pace
+from amrepair.policy import POLICY, PolicyOptions
+from amrepair.policy.unasked import Limits
 from amrepair.regions.calibration import Calibration
+from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
 from gcode.meshes import mesh_of
-from gcode.profiles import PrintSetup, load_setup
+from gcode.profiles import PrintSetup, ProcessProfile, load_setup
 from gcode.reader import Job, job_for
 from gcode.whole import put_in_place
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +51,8 @@ class Setting:
     copies
         Where each copy stands, 4×4, where the template that the run looks with is of them
         (`locate.stood`); else empty.
+    policy
+        What is worth a repair, and how many passes a stop may have.
     limited
         Whether it prints without asking, within the profile's limits.
     adaptive
@@ -70,7 +77,7 @@ class Setting:
     build_from_template: tuple[tuple[float, ...], ...]
     build_from_scanner: tuple[tuple[float, ...], ...]
     seed: int
-    max_iterations: int
+    policy: PolicyOptions = POLICY
     limited: bool = False
     adaptive: int = 0
     port: str = ""
@@ -109,6 +116,16 @@ class Setting:
             **others,
         )
 
+    def options(self, process: ProcessProfile) -> LoopOptions:
+        """How the run goes."""
+        return LoopOptions(
+            policy=self.policy,
+            pace=Pace(self.adaptive) if self.adaptive else None,
+            limits=Limits.of(process) if self.limited else None,
+            calibration=self.scanners_errors,
+            seed=self.seed,
+        )
+
     @property
     def scanners_errors(self) -> Calibration | None:
         """The calibration that somebody named."""
@@ -128,8 +145,9 @@ class Setting:
 
     @property
     def scanner_pose(self) -> Transform:
-        """Build from scanner."""
-        return Transform("build", "scanner", np.array(self.build_from_scanner))
+        """Build from scanner; from the printer's own axes where its probe touches."""
+        frame = PROBE if self.scanner == PROBE else "scanner"
+        return Transform("build", frame, np.array(self.build_from_scanner))
 
     def setup(self) -> PrintSetup:
         """The profiles, which must not have changed.
@@ -202,8 +220,9 @@ def open_run(folder: Path) -> Recorded:
     if not isinstance(said, dict) or said.pop("version", None) != VERSION:
         raise InputError(f"{folder / SETTING} is of another version than {VERSION}")
     try:
-        setting = Setting(**{key: _tuples(value) for key, value in said.items()})
-    except TypeError as error:
+        policy = PolicyOptions(**said.pop("policy"))
+        setting = Setting(policy=policy, **{key: _tuples(value) for key, value in said.items()})
+    except (KeyError, TypeError) as error:
         raise InputError(f"{folder / SETTING} cannot be read ({error})") from error
     setup = setting.setup()
     job = job_for(text, setup.printer)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from amrepair.loop.decide import Decision, Situation, decide, gravest, judge
 from amrepair.loop.findings import findings
-from amrepair.loop.limits import Limits, beyond
 from amrepair.loop.looks import Look, Stop
 from amrepair.loop.objects import Objects
+from amrepair.policy import POLICY, Decision, PolicyOptions, decide, gravest, judge
+from amrepair.policy.passes import is_little, is_stuck
+from amrepair.policy.table import Situation
+from amrepair.policy.unasked import Limits
+from amrepair.policy.worth import volume_mm3
 from amrepair.repair import RepairPlan, Site
 from gcode.reader import Job
-
-# A repair that leaves more than this share of what it found has met something else than noise.
-STUCK_RATIO = 0.8
-# Less than this share of what was found at a stop is not worth another pass.
-LITTLE_RATIO = 0.03
 
 
 def decide_look(
@@ -26,8 +24,8 @@ def decide_look(
     here: Sequence[Look],
     *,
     seen_twice: bool,
-    max_iterations: int,
     limits: Limits | None,
+    policy: PolicyOptions = POLICY,
     objects: Objects | None = None,
 ) -> Decision:
     """What the table says of a plan.
@@ -42,7 +40,7 @@ def decide_look(
         The job's.
     """
     verdicts = tuple(
-        judge(finding)
+        judge(finding, policy)
         for finding in findings(
             plan,
             job,
@@ -57,24 +55,35 @@ def decide_look(
         gravest=gravest(verdicts),
         seen_twice=seen_twice,
         refused=plan.checked is None,
-        last_pass=sum(look.printed for look in here) >= max_iterations,
-        stuck=_stuck(here, plan),
-        little_left=_done(here, plan),
-        beyond="" if limits is None else beyond(plan, limits),
+        last_pass=sum(look.printed for look in here) >= policy.most_passes,
+        stuck=_stuck(here, plan, policy),
+        little_left=_done(here, plan, policy),
+        beyond="" if limits is None else _beyond(plan, limits),
     )
     return decide(verdicts, situation)
 
 
-def _stuck(here: Sequence[Look], plan: RepairPlan) -> bool:
+def _stuck(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:
     """Whether the last repair at this stop changed next to nothing."""
     if not here or not here[-1].printed:
         return False
-    return plan.deficit.missing_mm3 > STUCK_RATIO * here[-1].plan.deficit.missing_mm3
+    return is_stuck(here[-1].plan.deficit.missing_mm3, plan.deficit.missing_mm3, policy)
 
 
-def _done(looks: Sequence[Look], plan: RepairPlan) -> bool:
-    """Whether what is left is a small share of what was found: more passes would only add rims."""
+def _done(looks: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:
+    """Whether what is left at this stop is too little for another pass."""
     if not looks:
         return False
-    left_mm3 = sum(region.volume_mm3 for region in plan.to_fill)
-    return left_mm3 <= LITTLE_RATIO * looks[0].plan.deficit.missing_mm3
+    left_mm3 = volume_mm3(plan.to_fill)
+    return is_little(looks[0].plan.deficit.missing_mm3, left_mm3, policy)
+
+
+def _beyond(plan: RepairPlan, limits: Limits) -> str:
+    """The first limit that a plan's program exceeds; empty if none."""
+    if plan.checked is None or plan.patch is None or plan.estimate is None:
+        return ""
+    return limits.exceeded(
+        missing_mm3=volume_mm3(plan.to_fill),
+        print_time_s=plan.estimate.print_time_s,
+        unreachable_mm3=plan.unreachable_mm3,
+    )

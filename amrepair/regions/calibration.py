@@ -140,6 +140,20 @@ class Calibration:
             raise InputError(f"{path}: the calibration cannot be read ({e}); make it again") from e
 
 
+def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:
+    """The errors of scans by touches: all that is said of one touch errs as that touch does.
+
+    Parameters
+    ----------
+    sigma_mm
+        Standard deviation of one touch.
+    process_sigma_mm
+        By how much sound parts depart as a whole, which the test takes out of the wander.
+    """
+    wander_mm = float(np.hypot(sigma_mm, process_sigma_mm))
+    return Calibration("repeated touches", 1, (1.0,), ((wander_mm,),))
+
+
 # Independent normal errors and nothing else: what the simulated scanner leaves by default.
 NORMAL = Calibration("normal noise", 0)
 

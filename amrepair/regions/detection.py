@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
@@ -45,6 +47,7 @@ def detect(
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
     rounded_up: RoundedUp | None = None,
+    pose_is_known: bool = False,
     progress: Progress = silent,
 ) -> AnomalyMap:
     """Score and label a scan against its template.
@@ -67,6 +70,8 @@ def detect(
     rounded_up
         Of places and their deviations: how far out of the template the process itself was told to
         go there. So much is not excess.
+    pose_is_known
+        Nothing of what is seen is taken for a pose that is off.
 
     Raises
     ------
@@ -92,69 +97,122 @@ def detect(
         return seen, sites_of(seen, scan, template, options, top_z_mm, rounded_up)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
-    whole_part = top_z_mm is None and calibration != NORMAL
+    whole_part = top_z_mm is None and calibration != NORMAL and not pose_is_known
     seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
     progress("detect", 1.0, 4.0)
-    surfels, surface_mm = seen.surfels, seen.surface_mm
+    test = _test(seen, sites, scan, template, options, calibration)
+    progress("detect", 2.0, 4.0)
+    evidence, surface_label = _bounded(seen, test, scan, template, options, calibration)
+    progress("detect", 3.0, 4.0)
+    regions = find_regions(
+        evidence, test.missing, test.excess, seen.surface_mm, surface_label, template,
+        p_value=np.exp(test.log_p), gone_p_value=test.gone_p_value,
+    )  # fmt: skip
+    score = np.abs(seen.f_mm)
+    k = min(options.top_k, int(seen.keep.sum()))
+    surfel_label = np.where(test.missing, int(Label.MISSING), test.excess * int(Label.EXCESS))
+    allowed_mm = sites.tolerance_mm[1] - sites.tolerance_mm[0]
+    progress("detect", 4.0, 4.0)
+    return AnomalyMap(
+        points_mm=scan.points_mm,
+        deviation_mm=seen.f_mm,
+        score=score,
+        label=np.append(surfel_label, 0)[seen.surfels.of_point],
+        template_points_mm=seen.surface_mm,
+        template_label=surface_label,
+        threshold_mm=test.limit_mm,
+        threshold_source=_source(options, template, test.noise),
+        object_score=float(np.partition(score[seen.keep], -k)[-k:].mean()),
+        regions=regions,
+        top_z_mm=top_z_mm if options.tolerance_mm is None else None,
+        top_threshold_mm=test.top_mm,
+        evidence=evidence,
+        surfel_label=surfel_label,
+        surfel_higher_mm=np.maximum(allowed_mm[: len(seen.surfels)], 0.0),
+        sites=sites,
+        noise=test.noise,
+        nuisance=nuisance,
+        contradicting=contradicting,
+        calibration=calibration,
+        options=options,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Tested:
+    """What the test says of a scan.
+
+    Attributes
+    ----------
+    missing, excess
+        (s,) cells of scanned surface that belong to a region.
+    gone, gone_p_value
+        (m,) template surface that rays went through and that belongs to one, and how sure it is.
+    limit_mm, top_mm
+        The depth that half of the places would show over a few cells; under a layer's top.
+    """
+
+    levels: tuple[Level, ...]
+    noise: Noise
+    missing: Bool[np.ndarray, " s"]
+    excess: Bool[np.ndarray, " s"]
+    gone: Bool[np.ndarray, " m"]
+    gone_p_value: Float[np.ndarray, " m"]
+    log_p: Float[np.ndarray, "2 all"]
+    limit_mm: float
+    top_mm: float
+
+
+def _test(
+    seen: Observed,
+    sites: Sites,
+    scan: Scan,
+    template: Template,
+    options: RegionOptions,
+    calibration: Calibration | None,
+) -> _Tested:
+    """Test every scale, and grow regions from where it is significant."""
+    surfels = seen.surfels
     levels = _tested(sites, options, calibration)
-    noise = noise_of(levels, surfels, scan, options)
     strands = _strands(surfels, template, levels, options, calibration)
     tolerances_mm = tolerances(options, template)
     labels, log_p = grown(
         levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
     )
     missing, excess = labels[:, : len(surfels)]
+    gone = np.zeros(len(seen.surface_mm), bool)
+    gone[seen.crossed] = labels[0, len(surfels) :]
+    gone_p_value = np.ones(len(seen.surface_mm))
+    gone_p_value[seen.crossed] = np.exp(log_p[0, len(surfels) :])
     noise_mm = float(np.median(levels[1].quantile * levels[1].error_mm))
     limit_mm, top_mm = (t + noise_mm for t in tolerances_mm)
-    progress("detect", 2.0, 4.0)
+    noise = noise_of(levels, surfels, scan, options)
+    return _Tested(
+        levels, noise, missing, excess, gone, gone_p_value, log_p, limit_mm, top_mm
+    )  # fmt: skip
+
+
+def _bounded(
+    seen: Observed,
+    test: _Tested,
+    scan: Scan,
+    template: Template,
+    options: RegionOptions,
+    calibration: Calibration | None,
+) -> tuple[Evidence, Int[np.ndarray, " m"]]:
+    """What is known of the space around regions, and of each place of the template's surface."""
+    labelled = test.missing | test.excess
     evidence = gather(
         scan,
         template,
-        surfels,
-        missing | excess,
+        seen.surfels,
+        labelled,
         seen.images,
-        threshold_mm=min(_stray_limit_mm(levels[0], options, calibration), limit_mm),
+        threshold_mm=min(_stray_limit_mm(test.levels[0], options, calibration), test.limit_mm),
         occupancy=options.occupancy,
     )
-    gone = np.zeros(len(surface_mm), bool)
-    gone[seen.crossed] = labels[0, len(surfels) :]
-    surface_label = _label_surface(seen, template, evidence, missing, gone, limit_mm)
-    evidence = with_stubs(evidence, scan, surface_mm[gone], missing | excess)
-    progress("detect", 3.0, 4.0)
-    score = np.abs(seen.f_mm)
-    k = min(options.top_k, int(seen.keep.sum()))
-    gone_p_value = np.ones(len(surface_mm))
-    gone_p_value[seen.crossed] = np.exp(log_p[0, len(surfels) :])
-    regions = find_regions(
-        evidence, missing, excess, surface_mm, surface_label, template,
-        p_value=np.exp(log_p), gone_p_value=gone_p_value,
-    )  # fmt: skip
-    progress("detect", 4.0, 4.0)
-    surfel_label = np.where(missing, int(Label.MISSING), np.where(excess, int(Label.EXCESS), 0))
-    allowed_mm = sites.tolerance_mm[1] - sites.tolerance_mm[0]
-    return AnomalyMap(
-        points_mm=scan.points_mm,
-        deviation_mm=seen.f_mm,
-        score=score,
-        label=np.append(surfel_label, 0)[surfels.of_point],
-        template_points_mm=surface_mm,
-        template_label=surface_label,
-        threshold_mm=limit_mm,
-        threshold_source=_source(options, template, noise),
-        object_score=float(np.partition(score[seen.keep], -k)[-k:].mean()),
-        regions=regions,
-        top_z_mm=top_z_mm if options.tolerance_mm is None else None,
-        top_threshold_mm=top_mm,
-        evidence=evidence,
-        surfel_label=surfel_label,
-        surfel_higher_mm=np.maximum(allowed_mm[: len(surfels)], 0.0),
-        sites=sites,
-        noise=noise,
-        nuisance=nuisance,
-        contradicting=contradicting,
-        calibration=calibration,
-        options=options,
-    )
+    surface_label = _label_surface(seen, template, evidence, test)
+    return with_stubs(evidence, scan, seen.surface_mm[test.gone], labelled), surface_label
 
 
 def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
@@ -251,17 +309,16 @@ def _label_surface(
     seen: Observed,
     template: Template,
     evidence: Evidence,
-    missing: Bool[np.ndarray, " s"],
-    gone: Bool[np.ndarray, " m"],
-    limit_mm: float,
+    test: _Tested,
 ) -> Int[np.ndarray, " m"]:
     """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
     surfels, surface_mm = evidence.surfels, seen.surface_mm
+    missing, limit_mm = test.missing, test.limit_mm
     nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     present = (nearest >= 0) & ~missing[nearest]
     label = np.where(present, int(Label.OK), int(Label.UNSEEN))
     if evidence.has_rays:
-        label[gone] = int(Label.MISSING)
+        label[test.gone] = int(Label.MISSING)
     elif missing.any():
         open_ = np.flatnonzero(~present)
         # just inside the surface, as deep as the limit: empty there is more than noise

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 
 from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
-from amrepair.loop.decide import FINDINGS, STOPS
 from amrepair.loop.findings import reach_of
 from amrepair.loop.learning import to_json
 from amrepair.observe.background import BED_BAND_MM
+from amrepair.policy.table import FINDINGS, STOPS
 from amrepair.regions import Label
 from amrepair.repair import RepairPlan
 from amrepair.report.data import (

@@ -8,11 +8,12 @@ from amrepair.scans.ply import write_ply
 from amrepair.scans.range_grid import EDGE, FLYING, EdgeOptions, RangeGrid, edge_flags
 from amrepair.scans.readers import read_height_map, read_scan
 from amrepair.scans.scan import Scan
-from amrepair.scans.scanner import Scanner, ScanRequest
+from amrepair.scans.scanner import PROBE, Scanner, ScanRequest
 
 __all__ = [
     "EDGE",
     "FLYING",
+    "PROBE",
     "EdgeOptions",
     "FileScanner",
     "RangeGrid",

@@ -6,7 +6,6 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from amrepair.errors import InputError
 from amrepair.scans.scan import Scan
@@ -28,6 +27,8 @@ def read_mesh(path: Path, frame: str, sigma_mm: float, *, unit_mm: float = 1.0) 
     """
     if path.suffix.lower() == ".3mf":
         _refuse_3mf(path)
+    import trimesh  # half a second, which a file that is refused need not wait
+
     try:
         mesh = trimesh.load(path, force="mesh")
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:

@@ -8,6 +8,9 @@ from typing import Protocol, runtime_checkable
 from amrepair.frames import Transform
 from amrepair.scans.scan import Scan
 
+PROBE = "probe"
+"""The frame of scans by the printer's own probe: the printer's axes themselves, no pose between."""
+
 
 @dataclass(frozen=True, slots=True)
 class ScanRequest:

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import binomtest
 
 from amrepair.scans import range_grid_kernels as kernels
 from amrepair.scans.range_grid import EdgeOptions, Kind, RangeGrid, depths_of
@@ -262,6 +261,8 @@ def _far_away(
     most = max(falls, rises)
     if not told or most < options.rim_share * told:
         return None
+    from scipy.stats import binomtest  # half a second: asked for by scans without sensors alone
+
     if binomtest(most, told).pvalue > options.rim_probability:
         return None
     side = 1.0 if falls > rises else -1.0

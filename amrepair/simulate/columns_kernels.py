@@ -9,6 +9,8 @@ the head of the list of freed ones. Nothing here knows beads, scanners or units 
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from gcode.compiled import njit
@@ -39,6 +41,17 @@ def release(pool_next, meta, node):
     pool_next[node] = meta[FREE]
     meta[FREE] = node
     return following
+
+
+class Stacks(NamedTuple):
+    """The columns: topmost interval, the chain of those below in a pool of nodes, its counters."""
+
+    hi: Any
+    lo: Any
+    nxt: Any
+    pool: Any
+    pool_next: Any
+    meta: Any
 
 
 @njit(cache=True, nogil=True)

@@ -20,14 +20,17 @@ coordinates), so that a wall's mean position does not depend on where it falls i
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from amrepair.simulate.columns_kernels import FRESH, grown, insert, surface_below
+from amrepair.simulate.columns_kernels import FRESH, Stacks, grown, insert, surface_below
 from amrepair.simulate.strand_kernels import (
     AT_BOTH,
     AT_END,
     AT_START,
     NO_ANCHOR,
+    Standing,
     drop_of,
     groove_columns,
     highest_below,
@@ -64,7 +67,29 @@ PRESSED_SHARE = 0.25  # of what rides along before it rises: from here on it is 
 OPEN_LAYERS = 1.5  # a void is under the strand if its roof is no more than this below the nozzle
 
 
-# The common cases are told twice, inline: a call with arrays costs more than the work itself.
+class Bead(NamedTuple):
+    """What a step lays: number of its layer, thickness / mm, how deep below it fills / mm."""
+
+    layer: Any
+    thickness: Any
+    gap_limit: Any
+
+
+class Room(NamedTuple):
+    """Working room of a step: floors, what an edge is sunk by, columns; the strand's axis; window.
+
+    `axis` is as `share_of` says; `window` (4,) holds the rows and columns touched so far.
+    """
+
+    floors: Any
+    sunk: Any
+    chosen: Any
+    axis: Any
+    window: Any
+
+
+# The common cases are told twice, inline: a call with arrays costs more than the work itself, and
+# so does a record with arrays: kernels of a column take the arrays, those of a step take records.
 @njit(cache=True, nogil=True, inline="always")
 def surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z):
     """As `surface_below`, the topmost interval first."""
@@ -90,21 +115,20 @@ def stack(hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bott
 
 @njit(cache=True, nogil=True, inline="always")
 def floor_under(
-    hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit, bridges,
-    cell,
+    hi, lo, nxt, pool, pool_next, before, stamp, bead, iy, ix, z, bridges, cell
 ):  # fmt: skip
     """Where plastic coming from height z begins to stack: on what lies below, or hanging."""
     surface = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
-    underside = z - thickness
-    if z - surface > gap_limit + LEAST_MM:
+    underside = z - bead.thickness
+    if z - surface > bead.gap_limit + LEAST_MM:
         surface = underside
     elif underside - surface > LEAST_VOID_MM:
         across = groove_columns(
-            hi, before, stamp, layer, iy, ix, underside - LEAST_VOID_MM, bridges
+            hi, before, stamp, bead.layer, iy, ix, underside - LEAST_VOID_MM, bridges
         )
         if across > 0:
             # a column that is low by a share of the layer is open over that share of its width
-            open_share = min(1.0, (underside - surface) / thickness)
+            open_share = min(1.0, (underside - surface) / bead.thickness)
             spanned = underside - MENISCUS * across * cell * open_share**2
             if spanned > surface + LEAST_VOID_MM:
                 surface = spanned
@@ -122,9 +146,7 @@ def share_of(axis, iy, ix):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def edge_span(
-    hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness, gap_limit
-):
+def edge_span(hi, lo, nxt, pool, pool_next, before, stamp, bead, axis, iy, ix, z):
     """From where to where a strand's edge fills a column; (0, inf): it has no edge there.
 
     Plastic is as wide as its section says where nothing lies beside it: the column that its edge
@@ -137,14 +159,14 @@ def edge_span(
     y = int(np.floor(iy + 0.5 + away * axis[3]))
     beside = hi[y, x] if 0 <= x < hi.shape[1] and 0 <= y < hi.shape[0] else 0.0
     bottom, top = 0.0, np.inf
-    if beside < z - 0.5 * thickness:
+    if beside < z - 0.5 * bead.thickness:
         floor = before[iy, ix]
-        if stamp[iy, ix] != layer or floor > z:
+        if stamp[iy, ix] != bead.layer or floor > z:
             floor = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
-        underside = z - thickness - LEAST_VOID_MM
+        underside = z - bead.thickness - LEAST_VOID_MM
         if floor >= underside or beside < underside:
-            deep = max(share_of(axis, iy, ix), 0.0) * thickness
-            bottom = floor if z - floor <= gap_limit else z - deep
+            deep = max(share_of(axis, iy, ix), 0.0) * bead.thickness
+            bottom = floor if z - floor <= bead.gap_limit else z - deep
             top = min(z, bottom + deep)
     return bottom, top
 
@@ -210,28 +232,26 @@ def level_of(floors, count, amount, z):
 
 
 @njit(cache=True, nogil=True)
-def lay(
-    hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases, grid, state,
-    floors, sunk, chosen, axis, x, y, z, amount, thickness, gap_limit, bridges, planes, carry_limit,
-    flush,
-):  # fmt: skip
+def lay(world, head, bead, room, state, x, y, z, amount, flush):
     """One step: place `amount` (mm of column) from the nozzle at (x, y, z)."""
+    (hi, lo, nxt, pool, pool_next, meta), before, stamp = world
+    near, counts, phases, cell = head.near, head.counts, head.phases, head.grid[2]
+    floors, sunk, chosen, axis, window = room
+    bridges, carry_limit = head.bridges, head.carry_limit
     ny, nx = hi.shape
-    cell = grid[2]
-    gx = (x - grid[0]) / cell
-    gy = (y - grid[1]) / cell
+    gx = (x - head.grid[0]) / cell
+    gy = (y - head.grid[1]) / cell
     cx, cy = int(np.floor(gx)), int(np.floor(gy))
     amount += state[CARRY]
     if cx < 0 or cy < 0 or cx >= nx or cy >= ny:
         state[LOST] += amount
         state[CARRY] = 0.0
         return
-    layer = int(state[LAYER])
     phase = int((gy - cy) * phases) * phases + int((gx - cx) * phases)
     bore, reach = counts[phase, 0], counts[phase, 1]
     flat, spread = counts[phase, 2], counts[phase, 3]
-    if planes > 0.0:
-        amount += planed(hi, lo, near, phase, flat, cx, cy, z, planes * thickness)
+    if head.planes > 0.0:
+        amount += planed(hi, lo, near, phase, flat, cx, cy, z, head.planes * bead.thickness)
     found = 0
     capacity = 0.0
     # the corners of its edges on this step, give or take the dither
@@ -248,9 +268,8 @@ def lay(
                 continue
         if share < 1.0:
             bottom, top = edge_span(
-                hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness,
-                gap_limit,
-            )  # fmt: skip
+                hi, lo, nxt, pool, pool_next, before, stamp, bead, axis, iy, ix, z
+            )
         if top < np.inf:
             along = (iy + 0.5 - axis[1]) * axis[2] - (ix + 0.5 - axis[0]) * axis[3]
             if abs(along) > axis[5]:
@@ -261,9 +280,8 @@ def lay(
         else:
             top = z
             bottom = floor_under(
-                hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness,
-                gap_limit, bridges, cell,
-            )  # fmt: skip
+                hi, lo, nxt, pool, pool_next, before, stamp, bead, iy, ix, z, bridges, cell
+            )
         if bottom >= top:
             continue
         bottom += z - top  # an edge is thin: the last to be filled
@@ -285,7 +303,7 @@ def lay(
         for k in range(found):
             if floors[k] < level:
                 stack(
-                    hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, chosen[k, 0],
+                    hi, lo, nxt, pool, pool_next, meta, before, stamp, bead.layer, chosen[k, 0],
                     chosen[k, 1], floors[k] - sunk[k], level - sunk[k],
                 )  # fmt: skip
         amount = amount - capacity if capacity <= amount else 0.0
@@ -296,27 +314,37 @@ def lay(
             wide = True  # the strand is as wide as it is meant to be: more takes pressure
             if flush or amount > PRESSED_SHARE * carry_limit:
                 amount = pressed(
-                    hi, lo, nxt, pool, pool_next, meta, near, phase, reach, cx, cy, z, amount,
-                    thickness,
-                )  # fmt: skip
+                    hi,
+                    lo,
+                    nxt,
+                    pool,
+                    pool_next,
+                    meta,
+                    near,
+                    phase,
+                    reach,
+                    cx,
+                    cy,
+                    z,
+                    amount,
+                    bead.thickness,
+                )
         if amount <= LEAST_MM or (k == reach and not flush and amount <= carry_limit):
             break
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
         if not wide and share_of(axis, iy, ix) < 1.0:
-            _, top = edge_span(
-                hi, lo, nxt, pool, pool_next, before, stamp, layer, axis, iy, ix, z, thickness,
-                gap_limit,
-            )  # fmt: skip
+            _, top = edge_span(hi, lo, nxt, pool, pool_next, before, stamp, bead, axis, iy, ix, z)
             if top < np.inf:
                 continue  # it has its share
         bottom = floor_under(
-            hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z, thickness, gap_limit,
-            bridges, cell,
-        )  # fmt: skip
+            hi, lo, nxt, pool, pool_next, before, stamp, bead, iy, ix, z, bridges, cell
+        )
         if bottom < z:
             level = min(z, bottom + amount)
-            stack(hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level)
+            stack(
+                hi, lo, nxt, pool, pool_next, meta, before, stamp, bead.layer, iy, ix, bottom, level
+            )
             amount -= level - bottom
     ridge = 0
     while amount > LEAST_MM and (flush or amount > carry_limit) and ridge < MOST_RIDGE_STEPS:
@@ -328,10 +356,22 @@ def lay(
                 continue
             bottom = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, top)
             if bottom < top:
-                bottom = max(bottom, z - thickness)
+                bottom = max(bottom, z - bead.thickness)
                 level = min(top, bottom + amount)
                 stack(
-                    hi, lo, nxt, pool, pool_next, meta, before, stamp, layer, iy, ix, bottom, level
+                    hi,
+                    lo,
+                    nxt,
+                    pool,
+                    pool_next,
+                    meta,
+                    before,
+                    stamp,
+                    bead.layer,
+                    iy,
+                    ix,
+                    bottom,
+                    level,
                 )
                 amount -= level - bottom
                 if amount <= LEAST_MM:
@@ -360,35 +400,26 @@ def flow_factor(regions, x, y, z):
 
 
 @njit(cache=True, nogil=True)
-def height_of_strand(
-    hi, lo, nxt, pool, pool_next, before, stamp, near, counts, phases, grid, state, start, end,
-    volume, thickness, s, k, x, y, z, step_mm, strand, thermal,
-):  # fmt: skip
+def height_of_strand(world, head, path, state, s, k, x, y, z):
     """Height at which step k of segment s is laid, and how deep below that it fills columns.
 
-    The height is the nozzle's, or lower where nothing holds the strand. `strand` is (die swell,
-    sag / mm, droop / mm, how far beside it a neighbour lies / mm, layers that plastic pools over).
+    The height is the nozzle's, or lower where nothing holds the strand.
     """
+    start, end, thickness = path.start, path.end, path.thickness[s]
     layer = int(state[LAYER])
     dx, dy = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1]
     flat = np.sqrt(dx * dx + dy * dy)
     length = np.sqrt(flat * flat + (end[s, 2] - start[s, 2]) ** 2)
-    reach = strand_reach(volume[s], length, thickness[s], strand[0])
-    pools = max(reach, strand[4] * thickness[s])
+    reach = strand_reach(path.volume[s], length, thickness, head.swell)
+    pools = max(reach, head.pools * thickness)
     flat = max(flat, 1e-9)
-    if is_held(
-        hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z,
-        dx / flat, dy / flat, strand[3], thickness[s],
-    ):  # fmt: skip
+    if is_held(world, head, layer, x, y, z, dx / flat, dy / flat, thickness):
         state[HELD] = 1.0
         state[RUN_LENGTH] = 0.0
         return z, pools
-    each = length / max(1, int(np.ceil(length / step_mm)))
+    each = length / max(1, int(np.ceil(length / head.step_mm)))
     if state[RUN_LENGTH] <= 0.0:
-        ahead, anchored = run_ahead(
-            hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, start,
-            end, volume, thickness, s, k, step_mm, strand[3], thermal,
-        )  # fmt: skip
+        ahead, anchored = run_ahead(world, head, layer, path, s, k)
         state[RUN_LENGTH] = max(ahead, each)
         state[RUN_DONE] = 0.0
         state[RUN_KIND] = (AT_START if state[HELD] > 0.0 else NO_ANCHOR) + (
@@ -397,31 +428,29 @@ def height_of_strand(
     state[HELD] = 0.0
     done = state[RUN_DONE] + 0.5 * each
     state[RUN_DONE] += each
-    drop = drop_of(int(state[RUN_KIND]), done, state[RUN_LENGTH], strand[1], strand[2])
-    lies_on = highest_below(
-        hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z
-    )
+    drop = drop_of(int(state[RUN_KIND]), done, state[RUN_LENGTH], head.sag, head.droop)
+    lies_on = highest_below(world, head, layer, x, y, z)
     if state[RUN_KIND] == AT_BOTH and z - drop > lies_on + reach:
         return z - drop, reach  # it hangs, as thick as it is
     return max(z - drop, min(z, lies_on + pools)), pools
 
 
 @njit(cache=True, nogil=True)
-def deposit(
-    hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases, grid, state,
-    start, end, volume, thickness, regions, step_mm, bridges, planes, strand, thermal, carry_limit,
-):  # fmt: skip
+def deposit(world, head, path, window, state):
     """Lay every segment in order; returns the pool and the volume pushed out, mm³."""
+    start, end, volume, thickness = path.start, path.end, path.volume, path.thickness
+    stacks, before, stamp = world
+    hi, lo, nxt, pool, pool_next, meta = stacks
+    grid = head.grid
     cell = grid[2]
     area = cell * cell
     pushed = 0.0
-    room = 4 * near.shape[1] + 64  # more pool nodes than one step can take
-    floors = np.empty(near.shape[1])
-    chosen = np.empty((near.shape[1], 2), dtype=np.int64)
-    sunk = np.empty(near.shape[1])
-    least_half = NARROWEST_BORES * strand[3]  # strand[3]: the bore
+    most = head.near.shape[1]
+    nodes = 4 * most + 64  # more of the pool than one step can take
     axis = np.zeros(6)
-    axis[5] = 0.5 * strand[3] / cell
+    axis[5] = 0.5 * head.beside / cell
+    room = Room(np.empty(most), np.empty(most), np.empty((most, 2), np.int64), axis, window)
+    least_half = NARROWEST_BORES * head.beside
     for s in range(len(volume)):
         chained = (
             volume[s] > 0.0
@@ -433,15 +462,15 @@ def deposit(
             state[HELD] = 0.0
             state[RUN_LENGTH] = 0.0
         if not chained and state[CARRY] > 0.0:
-            pool, pool_next = grown(pool, pool_next, meta, room)
+            pool, pool_next = grown(pool, pool_next, meta, nodes)
+            world = Standing(Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp)
             if s == 0:  # of the strand before nothing is known
                 axis[4] = np.inf
             axis[0] = (state[LAST_X] - grid[0]) / cell
             axis[1] = (state[LAST_Y] - grid[1]) / cell
+            bead = Bead(int(state[LAYER]), state[LAST_T], state[LAST_GAP])
             lay(
-                hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
-                grid, state, floors, sunk, chosen, axis, state[LAST_X], state[LAST_Y],
-                state[LAST_Z], 0.0, state[LAST_T], state[LAST_GAP], bridges, planes, carry_limit,
+                world, head, bead, room, state, state[LAST_X], state[LAST_Y], state[LAST_Z], 0.0,
                 True,
             )  # fmt: skip
         dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
@@ -453,7 +482,7 @@ def deposit(
             flat = max(np.sqrt(dx * dx + dy * dy), LEAST_MM)
             axis[2], axis[3] = -dy / flat, dx / flat
             axis[4] = half / cell if flat > LEAST_MM else np.inf
-            steps = max(1, int(np.ceil(length / step_mm)))
+            steps = max(1, int(np.ceil(length / head.step_mm)))
             share = volume[s] / steps
             seed = np.abs(np.sin(12.9898 * start[s, 0] + 78.233 * start[s, 1]) * 43758.5453)
             jx, jy = seed % 1.0, (seed * 7.0) % 1.0
@@ -462,8 +491,8 @@ def deposit(
                 x, y = start[s, 0] + t * dx, start[s, 1] + t * dy
                 z = start[s, 2] + t * dz
                 amount = share
-                if len(regions) > 0:
-                    amount *= flow_factor(regions, x, y, z)
+                if len(path.regions) > 0:
+                    amount *= flow_factor(path.regions, x, y, z)
                 jx = (jx + R2_X) % 1.0
                 jy = (jy + R2_Y) % 1.0
                 if amount <= 0.0 and state[CARRY] <= 0.0:
@@ -473,21 +502,17 @@ def deposit(
                 if abs(z - state[LAID_Z]) > NEW_LAYER_MM:
                     state[LAID_Z] = z
                     state[LAYER] += 1.0
-                z -= lifted(thermal, x, y, z)
-                if meta[FRESH] + room > len(pool_next):
-                    pool, pool_next = grown(pool, pool_next, meta, room)
-                laid_z, gap = height_of_strand(
-                    hi, lo, nxt, pool, pool_next, before, stamp, near, counts, phases, grid, state,
-                    start, end, volume, thickness, s, k, x, y, z, step_mm, strand, thermal,
-                )  # fmt: skip
+                z -= lifted(head.thermal, x, y, z)
+                if meta[FRESH] + nodes > len(pool_next):
+                    pool, pool_next = grown(pool, pool_next, meta, nodes)
+                    world = Standing(Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp)
+                laid_z, gap = height_of_strand(world, head, path, state, s, k, x, y, z)
+                bead = Bead(int(state[LAYER]), thickness[s], gap)
                 lay(
-                    hi, lo, nxt, pool, pool_next, meta, before, stamp, window, near, counts, phases,
-                    grid, state, floors, sunk, chosen, axis, x + (jx - 0.5) * cell,
-                    y + (jy - 0.5) * cell, laid_z, amount / area, thickness[s], gap, bridges,
-                    planes, carry_limit,
-                    amount <= 0.0,
+                    world, head, bead, room, state, x + (jx - 0.5) * cell, y + (jy - 0.5) * cell,
+                    laid_z, amount / area, amount <= 0.0,
                 )  # fmt: skip
         state[LAST_X], state[LAST_Y], state[LAST_Z] = end[s, 0], end[s, 1], end[s, 2]
         state[LAST_T] = thickness[s]
-        state[LAST_GAP] = strand[4] * thickness[s]
+        state[LAST_GAP] = head.pools * thickness[s]
     return pool, pool_next, pushed

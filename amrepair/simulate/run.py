@@ -6,7 +6,6 @@ protocol, the emulated firmware. Only plastic and light are simulated (`world`, 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +17,28 @@ from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
-from amrepair.loop import MAX_ITERATIONS, Look, LoopReport, Stop, Tape, plan_stops, run_loop
+from amrepair.loop import (
+    Approval,
+    Look,
+    LoopOptions,
+    LoopReport,
+    Records,
+    Stop,
+    Tape,
+    plan_stops,
+    run_loop,
+)
+from amrepair.loop.options import UNASKED
+from amrepair.loop.probing import Felt, PortFeeler, ProbeScanner
 from amrepair.loop.sites import sites
-from amrepair.repair import RepairPlan, Stopwatch
+from amrepair.policy import POLICY, PolicyOptions
+from amrepair.repair import Stopwatch
+from amrepair.scans import PROBE, Scanner
 from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
 from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
-from amrepair.simulate.stage import DefectTruth, Stage
+from amrepair.simulate.stage import DefectTruth, FeltStage, Stage
 from amrepair.simulate.world import World
 from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check
@@ -89,6 +102,8 @@ class SimulatedRun:
         Time that the wall's clock spent on the same.
     temperatures
         (n, 3) printer clock s, hotend °C, bed °C as they were at every stop.
+    felt
+        What each look cost, where the printer's own probe touched.
     """
 
     prepared: PreparedRun
@@ -97,6 +112,7 @@ class SimulatedRun:
     printer_clock_s: float
     print_wall_s: float
     temperatures: Float[np.ndarray, "n 3"]
+    felt: tuple[Felt, ...] = ()
 
     @property
     def repaired_ratio(self) -> float | None:
@@ -208,6 +224,7 @@ def set_stage(
     box = run.part.bounding_box()
     centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
     told = world or load_world()
+    scanner = DEFAULT_SCANNER if scanner == PROBE else scanner  # it only touches
     model = told.scanner(scanner)
     standing = World(
         printer.bed_size_mm,
@@ -258,14 +275,12 @@ def simulate_run(
     run: PreparedRun,
     *,
     wire_log: Path | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    approve: Callable[[RepairPlan], bool] = lambda plan: True,
+    policy: PolicyOptions = POLICY,
+    approval: Approval = UNASKED,
     record: Callable[[Look], None] = lambda look: None,
-    begun: Callable[[Transform], Tape] | None = None,
-    connected: Callable[[Printer], None] = lambda printer: None,
+    begun: Callable[[Transform, Printer], Tape] = lambda pose, printer: Tape(),
     world: WorldParameters | None = None,
     scanner: str = DEFAULT_SCANNER,
-    clock: Callable[[], float] = time.monotonic,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
 ) -> SimulatedRun:
@@ -274,19 +289,18 @@ def simulate_run(
     Parameters
     ----------
     begun
-        Called with the scanner's calibrated pose; returns the tape that the run is recorded on,
-        which is closed at its end.
-    connected
-        Called with the printer before anything is printed: a view's pause button needs it.
+        Called with the scanner's calibrated pose and the printer before anything is printed;
+        returns the tape that the run is recorded on, which is closed at its end.
     world, scanner
-        The world's parameters (None: the shipped ones), and which of its scanners looks.
+        The world's parameters (None: the shipped ones), and which of its scanners looks; `probe`:
+        the printer's own probe touches.
 
     Raises
     ------
     AmrepairError, GcodeError
         Whatever stops the loop.
     """
-    watch = watch or Stopwatch(clock)
+    watch = watch or Stopwatch()
     printer_profile = run.setup.printer
     temperatures: list[tuple[float, float, float]] = []
     with EmulatedPrinterProcess(printer_profile.dialect, printer=printer_profile) as machine:
@@ -298,8 +312,8 @@ def simulate_run(
             wire_log=wire_log,
         )
         printer.connect()
-        connected(printer)
-        tape = begun(stage.build_from_scanner) if begun is not None else None
+        eye, costs = _looked_at(run, stage, scanner, machine, printer, progress)
+        tape = begun(eye.build_from_scanner, printer)
 
         def recorded(look: Look) -> None:
             now = printer.temperatures()
@@ -311,23 +325,19 @@ def simulate_run(
                 run.job,
                 run.checked,
                 printer,
-                stage,
+                eye,
                 sites(
                     run.job, run.template, run.build_from_template, run.setup, by_beads=run.by_beads
                 ),
                 stops=run.stops,
-                max_iterations=max_iterations,
-                approve=approve,
-                record=recorded,
-                tape=tape,
-                seed=run.seed,
-                watch=watch,
+                options=LoopOptions(policy=policy, seed=run.seed),
+                approval=approval,
+                records=Records(recorded, tape=tape, watch=watch),
                 progress=progress,
             )
         finally:
             printer.close()
-            if tape is not None:
-                tape.close()
+            tape.close()
         stage.finish()
         printer_clock_s = machine.clock_s()
     return SimulatedRun(
@@ -337,4 +347,21 @@ def simulate_run(
         printer_clock_s=printer_clock_s,
         print_wall_s=watch.seconds.get("print", 0.0) + watch.seconds.get("repair", 0.0),
         temperatures=np.array(temperatures, dtype=np.float64).reshape(-1, 3),
+        felt=tuple(costs),
     )
+
+
+def _looked_at(
+    run: PreparedRun,
+    stage: Stage,
+    scanner: str,
+    machine: EmulatedPrinterProcess,
+    printer: Printer,
+    progress: Progress,
+) -> tuple[Scanner, list[Felt]]:
+    """What looks at a stage, and what its looks cost where the printer's own probe touches."""
+    if scanner != PROBE:
+        return stage, []
+    feeler = PortFeeler(printer, run.setup)
+    probe = ProbeScanner(feeler, run.job, run.setup, clock=machine.clock_s, progress=progress)
+    return FeltStage(stage, probe, machine.stand), probe.felt

@@ -16,12 +16,14 @@ from jaxtyping import Bool
 from scipy import ndimage
 
 from amrepair.frames import Transform
+from amrepair.loop.probing import ProbeScanner
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
+from gcode.surfaces import HeightField
 
 # Beads of a repair spread, and crumble over a rim, no farther than this from the defect.
 AROUND_MM = 3.0
@@ -74,6 +76,34 @@ class _Wound:
     filled_mm3: float = 0.0
     added_mm3: float = 0.0
     surface_ratio: float = 1.0
+
+
+class FeltStage:
+    """A stage that is not looked at, but touched by the emulated printer's own probe.
+
+    Parameters
+    ----------
+    probe
+        Touches.
+    stand
+        Has the emulated printer feel what stands there.
+    """
+
+    def __init__(
+        self, stage: Stage, probe: ProbeScanner, stand: Callable[[HeightField], None]
+    ) -> None:
+        self._stage, self._probe, self._stand = stage, probe, stand
+
+    @property
+    def build_from_scanner(self) -> Transform:
+        """The printer's own axes."""
+        return self._probe.build_from_scanner
+
+    def scan(self, request: ScanRequest) -> Scan:
+        """Lay what was printed since the last look, then touch it."""
+        self._stage.lay(request)
+        self._stand(self._stage.world.felt())
+        return self._probe.scan(request)
 
 
 class Stage:
@@ -153,6 +183,11 @@ class Stage:
 
     def scan(self, request: ScanRequest) -> Scan:
         """Lay what was printed since the last look, then look; points in the scanner frame."""
+        self.lay(request)
+        return self._scanner.scan(request)
+
+    def lay(self, request: ScanRequest) -> None:
+        """Lay what was printed since the last look, and let happen what is due."""
         motion = self._take_motion()
         if request.label in self._stops:  # a repair: it is laid in the broken world alone
             self.world.deposit(motion, onto_cold=True)
@@ -161,7 +196,6 @@ class Stage:
             self._print_job(motion)
             self._break(request)
         self._measure(request.label)
-        return self._scanner.scan(request)
 
     def finish(self) -> None:
         """Lay what was printed after the last look."""

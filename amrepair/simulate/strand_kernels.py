@@ -9,9 +9,11 @@ length), droops from the one that is (a cantilever), or falls onto what lies bel
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from amrepair.simulate.columns_kernels import surface_below
+from amrepair.simulate.columns_kernels import Stacks, surface_below
 from gcode.compiled import njit
 
 HELD_LAYERS = 1.5  # as deep below the nozzle as a layer's own underside, and half as much again
@@ -20,6 +22,51 @@ SIDE_SHARE = 0.75  # of a layer that solid beside a strand must reach up to hold
 ON_SPOT_LAYERS = 4.0  # what is pushed out on one spot hangs down as a drop
 LONGEST_MM = 150.0  # farther than this no end is looked for: nothing bridges so much
 NO_ANCHOR, AT_START, AT_END, AT_BOTH = 0, 1, 2, 3
+
+
+class Standing(NamedTuple):
+    """The columns, and what the layer that is being laid found in each it has touched.
+
+    `before` (ny, nx) is the column's top before the layer whose number is in `stamp` (ny, nx).
+    """
+
+    stacks: Stacks
+    before: Any
+    stamp: Any
+
+
+class Head(NamedTuple):
+    """The nozzle and how its strands behave.
+
+    `near` (phases², n, 2): columns around the nozzle by distance, for each place of its axis within
+    a column; `counts` (phases², 4): how many lie under the bore, in its reach, under the flat, and
+    where plastic spreads. `grid` is (origin x, y, cell), mm.
+    """
+
+    near: Any
+    counts: Any
+    phases: Any
+    grid: Any
+    step_mm: Any
+    bridges: Any  # columns that a strand spans without pressure
+    planes: Any  # layers that the flat planes off
+    carry_limit: Any  # mm of column that ride along
+    swell: Any  # of the die, as a ratio
+    sag: Any  # of a bridge, per mm
+    droop: Any  # of a cantilever, per mm
+    beside: Any  # mm to a neighbour: the bore
+    pools: Any  # layers that plastic pools over
+    thermal: Any  # see `lifted`
+
+
+class Path(NamedTuple):
+    """Segments in order: ends (n, 3), plastic / mm³, thickness / mm; regions that change flow."""
+
+    start: Any
+    end: Any
+    volume: Any
+    thickness: Any
+    regions: Any
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -68,11 +115,10 @@ def found_below(hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z):
 
 
 @njit(cache=True, nogil=True)
-def is_held(
-    hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z, ux, uy,
-    beside, thickness,
-):  # fmt: skip
+def is_held(world, head, layer, x, y, z, ux, uy, thickness):
     """Whether a strand at (x, y, z) that runs along (ux, uy) finds solid under or beside it."""
+    (hi, lo, nxt, pool, pool_next, _), before, stamp = world
+    near, counts, phases, grid = head.near, head.counts, head.phases, head.grid
     ny, nx = hi.shape
     gx, gy = (x - grid[0]) / grid[2], (y - grid[1]) / grid[2]
     cx, cy = int(np.floor(gx)), int(np.floor(gy))
@@ -91,8 +137,8 @@ def is_held(
             if need == 0:
                 return True
     for side in (-1.0, 1.0):
-        ix = int(np.floor(gx - side * uy * beside / grid[2]))
-        iy = int(np.floor(gy + side * ux * beside / grid[2]))
+        ix = int(np.floor(gx - side * uy * head.beside / grid[2]))
+        iy = int(np.floor(gy + side * ux * head.beside / grid[2]))
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
         below = surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z)
@@ -102,29 +148,24 @@ def is_held(
 
 
 @njit(cache=True, nogil=True)
-def run_ahead(
-    hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, start, end,
-    volume, thickness, s, k, step_mm, beside, thermal,
-):  # fmt: skip
+def run_ahead(world, head, layer, path, s, k):
     """From step k of segment s on: length to the next place that holds, and whether there is one.
 
     A stretch ends where the path is broken off, by a travel or with the motion itself.
     """
+    start, end, volume = path.start, path.end, path.volume
     length = 0.0
     while True:
         dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
         long = np.sqrt(dx * dx + dy * dy + dz * dz)
-        steps = max(1, int(np.ceil(long / step_mm)))
+        steps = max(1, int(np.ceil(long / head.step_mm)))
         flat = max(np.sqrt(dx * dx + dy * dy), 1e-9)
         for m in range(k, steps):
             t = (m + 0.5) / steps
             x, y = start[s, 0] + t * dx, start[s, 1] + t * dy
             z = start[s, 2] + t * dz
-            if is_held(
-                hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid,
-                x, y, z - lifted(thermal, x, y, z),
-                dx / flat, dy / flat, beside, thickness[s],
-            ):  # fmt: skip
+            lifted_z = z - lifted(head.thermal, x, y, z)
+            if is_held(world, head, layer, x, y, lifted_z, dx / flat, dy / flat, path.thickness[s]):
                 return length, True
             length += long / steps
             if length > LONGEST_MM:
@@ -176,10 +217,10 @@ def drop_of(kind, done, length, sag, droop):
 
 
 @njit(cache=True, nogil=True)
-def highest_below(
-    hi, lo, nxt, pool, pool_next, before, stamp, layer, near, counts, phases, grid, x, y, z
-):
+def highest_below(world, head, layer, x, y, z):
     """Highest solid under the bore that the layer has found, at or below z; 0 is the bed."""
+    (hi, lo, nxt, pool, pool_next, _), before, stamp = world
+    near, counts, phases, grid = head.near, head.counts, head.phases, head.grid
     ny, nx = hi.shape
     gx, gy = (x - grid[0]) / grid[2], (y - grid[1]) / grid[2]
     cx, cy = int(np.floor(gx)), int(np.floor(gy))

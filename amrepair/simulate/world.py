@@ -11,6 +11,7 @@ nozzle that comes back to it (`onto_cold`) meets them there.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import manifold3d
@@ -19,9 +20,11 @@ from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.simulate.columns import Columns, IntervalMap, Window
+from amrepair.simulate.columns_kernels import Stacks
 from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.deposit_kernels import LAYER, STATE_SIZE, deposit
 from amrepair.simulate.parameters import BeadModel, ThermalModel
+from amrepair.simulate.strand_kernels import Head, Path, Standing
 from amrepair.simulate.truth import Difference
 from gcode.firmware.motion import MotionBatch
 from gcode.surfaces import HeightField
@@ -137,47 +140,46 @@ class World:
             self._state[LAYER] += 1.0  # at the height of the layer before it, but not of it
         none = np.zeros((0, 9))
         regions = np.concatenate([none, *(defect.flow_regions for defect in defects)])
-        lay_all: Any = deposit
-        pool, pool_next, pushed = lay_all(
-            *self.columns.arrays,
-            self._before,
-            self._stamp,
-            self.columns.touched,
-            self._near,
-            self._counts,
-            _PHASES,
-            np.array([*self.columns.origin_mm, self.cell_mm]),
-            self._state,
+        path = Path(
             self._as_laid(motion.start_mm, onto_cold=onto_cold),
             self._as_laid(motion.end_mm, onto_cold=onto_cold),
             volume_mm3,
             thickness_mm,
             np.ascontiguousarray(regions),
-            self.bead.step_mm,
-            int(self.bead.bridges_mm / self.cell_mm + 1e-6),
-            self.bead.planes_layers,
-            np.array(
-                [
-                    self.bead.swell_ratio,
-                    self.bead.sag_per_mm,
-                    self.bead.droop_per_mm,
-                    self.nozzle_diameter_mm,
-                    self.bead.pools_layers,
-                ]
-            ),
-            np.array(
-                [
-                    *self._middle_mm,
-                    self.thermal.curl_per_mm,
-                    self.thermal.held_mm,
-                    self._risen if onto_cold else -1.0,
-                ]
-            ),
-            self.bead.carry_mm3 / self.cell_mm**2,
+        )
+        world = Standing(Stacks(*self.columns.arrays), self._before, self._stamp)
+        lay_all: Any = deposit
+        pool, pool_next, pushed = lay_all(
+            world, self._head(onto_cold=onto_cold), path, self.columns.touched, self._state
         )
         self.columns.pool, self.columns.pool_next = pool, pool_next
         self.pushed_mm3 += float(pushed)
         return float(pushed)
+
+    def _head(self, *, onto_cold: bool) -> Head:
+        """The nozzle and its strands, as the kernels take them."""
+        thermal = (
+            *self._middle_mm,
+            self.thermal.curl_per_mm,
+            self.thermal.held_mm,
+            self._risen if onto_cold else -1.0,
+        )
+        return Head(
+            near=self._near,
+            counts=self._counts,
+            phases=_PHASES,
+            grid=np.array([*self.columns.origin_mm, self.cell_mm]),
+            step_mm=self.bead.step_mm,
+            bridges=int(self.bead.bridges_mm / self.cell_mm + 1e-6),
+            planes=self.bead.planes_layers,
+            carry_limit=self.bead.carry_mm3 / self.cell_mm**2,
+            swell=self.bead.swell_ratio,
+            sag=self.bead.sag_per_mm,
+            droop=self.bead.droop_per_mm,
+            beside=self.nozzle_diameter_mm,
+            pools=self.bead.pools_layers,
+            thermal=np.array(thermal),
+        )
 
     def as_cooled(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """(n, 3) where points of the part as it was laid are now, build frame."""
@@ -244,6 +246,19 @@ class World:
             z_mm=z_mm,
             seen=np.ones(z_mm.shape, dtype=bool),
         )
+
+    def felt(self) -> HeightField:
+        """Heights that a probe meets: the top as it has cooled, its columns where they were laid.
+
+        What shrinks sideways, some hundredths of a millimetre, a probe's flat does not tell.
+        """
+        top = self.top()
+        x_mm, y_mm = top.centres_mm()
+        laid = np.column_stack([
+            np.tile(x_mm, len(y_mm)), np.repeat(y_mm, len(x_mm)), top.z_mm.ravel()
+        ]).astype(np.float64)  # fmt: skip
+        cooled_mm = self.as_cooled(laid)[:, 2].reshape(top.shape)
+        return replace(top, z_mm=np.where(top.z_mm > 0, cooled_mm, 0.0))
 
     def copy(self) -> World:
         """An independent copy; what is laid in one does not show in the other."""

@@ -43,7 +43,7 @@ class SoundOptions:
     reach_mm
         A point farther from the template is no part of the surface beside it, and none teaches
         anything; farther away the field stays as it was.
-    facing
+    facing_mm
         Of two places on a wall's two sides the normals differ; so many mm apart stand for a right
         angle between them.
     least_points

@@ -73,8 +73,9 @@ class Judge(Motion):
         self._heats_unsaid = False  # whether a macro ran that may have heated something
         self._waited_s, self._waited_at = 0.0, -1
         self._known = COMMANDS[program.dialect] | macros | {name.upper() for name in own}
-        if planned and program.dialect in touches.DIALECTS:
-            self._known |= {touches.COMMAND}
+        self._feels = touches.COMMANDS.get(program.dialect, "") if planned else ""
+        if self._feels:
+            self._known |= {self._feels}
         self._tool: str | None = None
 
     def read(self, number: int, raw: str) -> None:
@@ -153,6 +154,9 @@ class Judge(Motion):
         given = parameters(command)
         if name not in self._known:
             self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
+        elif name == self._feels:
+            told = {key: self._number(value) for key, value in given.items()}
+            self._touch(touches.words_of_macro(told, self._place[2]))
         elif name in PROBES and self._occupied:
             self._refuse("probing over a standing part", name, "nothing may stand there")
         elif self._begins is not None and name == self._begins.name.upper():
@@ -230,8 +234,8 @@ class Judge(Motion):
             self._dwell(words)
         elif name == "G28":
             self._home(words)
-        elif name == touches.COMMAND:
-            self._touch(words)
+        elif name == self._feels:
+            self._touch({letter: v and v * self._unit for letter, v in words.items()})
         elif name in PROBES and self._occupied:
             self._refuse("probing over a standing part", name, "nothing may stand there")
         elif name in {"G90", "G91"}:
@@ -388,16 +392,18 @@ class Judge(Motion):
             self._place[axis] = None  # the place of an end stop is the firmware's business
 
     def _touch(self, words: dict[str, float | None]) -> None:
-        """The head is swept down to what it is to feel."""
-        told = {letter: None if v is None else v * self._unit for letter, v in words.items()}
+        """The head is swept down to what it is to feel; words in mm and mm/min."""
         planned = touches.planned_at(self._touches, self._place)
-        wrong = touches.refusal_of(planned, told, self._place[2], self._text, self._hotend_c)
+        wrong = touches.refusal_of(
+            planned, words, self._place[2], self._text, self._hotend_c, self._setup.printer.probe
+        )
         if not self._absolute:
             self._refuse("touch that is not straight down", "G91", "G90")
         elif wrong is not None:
             self._refuse(*wrong)
         elif planned is not None:
-            self._move({"Z": planned.surface_mm / self._unit, "F": words["F"]})
+            feed = words["F"] or 0.0
+            self._move({"Z": planned.surface_mm / self._unit, "F": feed / self._unit})
 
     def _homes_above(self, z_mm: float | None) -> None:
         """X and Y are homed across the bed: above all that stands there."""

@@ -66,7 +66,8 @@ def sweep(
         which = np.where(deeper, np.array(own)[of_own], which)
     tip = np.array([part.is_tip for part in slices])
     refusals = []
-    for k in np.flatnonzero(worst > 0)[:MOST_SAID]:
+    hits = np.flatnonzero(worst > 0)
+    for k in hits[np.unique(line[hits], return_index=True)[1]][:MOST_SAID]:  # an arc is one line
         part = slices[int(which[k])]
         slack = _slack_mm(part)
         refusals.append(

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from gcode.check.findings import Touch
 from gcode.check.motion import PLACE_SLACK_MM
+from gcode.profiles import ProbeProfile
 
-COMMAND = "G38.2"
-"""A straight move until something is felt (Marlin's G38.cpp; RepRapFirmware has it too)."""
-DIALECTS = frozenset({"marlin", "reprap"})
+COMMANDS = {"marlin": "G38.2", "reprap": "G38.2", "klipper": "AMREPAIR_TOUCH"}
+"""By dialect: touches whose depth the program tells.
+
+G38.2 is a straight move until something is felt (Marlin's G38.cpp; RepRapFirmware has it too).
+AMREPAIR_TOUCH is a macro of ours around Klipper's PROBE, which alone goes down to the
+`position_min` of Z. Prusa's firmware has neither: G30 feels down to 2 or 5 mm below the bed, at up
+to forty places some millimetres around, and lowers the nozzle to 2 mm above the bed afterwards
+(Z_PROBE_LOW_POINT, offset_for_probe_try, Z_AFTER_PROBING), wherever the part's top is.
+"""
 FASTEST_MM_S = 4.0  # Z_PROBE_FEEDRATE_FAST of Marlin's Configuration.h
 
 
@@ -23,12 +30,24 @@ def planned_at(touches: Sequence[Touch], place: Sequence[float | None]) -> Touch
     return next(near, None)
 
 
+def words_of_macro(
+    given: Mapping[str, float | None], z_mm: float | None
+) -> dict[str, float | None]:
+    """Z and F, mm and mm/min, of what DEPTH and SPEED tell; other parameters stay as they are."""
+    words = {key: value for key, value in given.items() if key not in {"DEPTH", "SPEED"}}
+    depth_mm, speed_mm_s = given.get("DEPTH"), given.get("SPEED")
+    words["Z"] = None if depth_mm is None or z_mm is None else z_mm - depth_mm
+    words["F"] = None if speed_mm_s is None else 60.0 * speed_mm_s
+    return words
+
+
 def refusal_of(
     planned: Touch | None,
-    words: dict[str, float | None],
+    words: Mapping[str, float | None],
     z_mm: float | None,
     text: str,
     hotend_c: float,
+    probe: ProbeProfile | None,
 ) -> tuple[str, str, str] | None:
     """What is wrong with a touch, its value and the limit; None where nothing is.
 
@@ -38,6 +57,8 @@ def refusal_of(
         Of the command, mm and mm/min.
     z_mm
         Where the nozzle is.
+    probe
+        The printer's; None: the nozzle itself.
     """
     depth_mm, feed = words.get("Z"), words.get("F") or 0.0
     if planned is None:
@@ -48,7 +69,7 @@ def refusal_of(
         return "touch below its planned depth", f"Z {depth_mm:g} mm", f"{planned.lowest_mm:g} mm"
     if z_mm is None or z_mm < planned.surface_mm:
         return "touch from below what it is to feel", text, f"Z {planned.surface_mm:g} mm or more"
-    if hotend_c > 0:
+    if hotend_c > 0 and (probe is None or probe.kind == "nozzle"):
         return "touch with a hot nozzle", f"{hotend_c:g} °C", "heater off"
     if not 0 < feed <= 60.0 * FASTEST_MM_S:
         return "touch too fast", f"{feed / 60.0:g} mm/s", f"{FASTEST_MM_S:g} mm/s"

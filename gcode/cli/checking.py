@@ -74,7 +74,7 @@ def check(
     text = program_text(file)
     setup = setup_to_judge(text, file, printer, material)
     program = Program(text, setup.printer.dialect)
-    field = standing_on_bed(as_built) if as_built is not None else None
+    field = None if as_built is None else standing_on_bed(as_built, setup.printer)
     bars = console.Bars()
     with bars.shown():
         verdict = judge(

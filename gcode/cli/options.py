@@ -12,12 +12,13 @@ from gcode.cli import console
 from gcode.errors import InputError
 
 if TYPE_CHECKING:
-    from gcode.profiles import PrintSetup
+    from gcode.profiles import PrinterProfile, PrintSetup
     from gcode.reader import Job
     from gcode.slicing.layers import LayerGrid
     from gcode.surfaces import HeightField
 
 AS_BUILT_CELL_MM = 0.2
+PIXELS_IN_CELL = 1.5  # of a depth map, across: no cell is empty for want of pixels
 AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
 
 AsBuiltOption = Annotated[
@@ -127,8 +128,11 @@ def grid_of(job: Path | None, setup: PrintSetup) -> LayerGrid:
     )
 
 
-def standing_on_bed(path: Path) -> HeightField:
-    """A height field from a height map, a scan in the bed's frame, or a mesh with room around it.
+def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> HeightField:
+    """A height field of what stands on the bed.
+
+    From a height map, a scan in the bed's frame, a photographed depth map with its camera (of
+    which what lies around the printer's bed is left out), or a mesh with room around it.
 
     Raises
     ------
@@ -136,9 +140,14 @@ def standing_on_bed(path: Path) -> HeightField:
         If it cannot be read.
     """
     from gcode.solids import SUFFIXES, NotClosedError, read_solid, read_triangles
-    from gcode.surfaces import HeightField, clouds, scanned
+    from gcode.surfaces import HeightField, clouds, depth_maps, scanned
 
     suffix = path.suffix.lower()
+    if path.is_file() and depth_maps.is_depth_map(path):
+        seen = depth_maps.read_on_bed(path, None if printer is None else printer.reach_box_mm)
+        console.errors.print(seen.told, markup=False)
+        cell_mm = max(AS_BUILT_CELL_MM, PIXELS_IN_CELL * seen.spacing_mm)
+        return scanned.from_points(seen.points_mm, cell_mm, what=str(path))
     if suffix in clouds.SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
         return scanned.from_points(clouds.read_points(path), AS_BUILT_CELL_MM, what=str(path))
     if suffix not in SUFFIXES:

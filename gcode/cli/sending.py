@@ -94,7 +94,7 @@ def send(
 
     text = program_text(file)
     setup = setup_to_judge(text, file, printer, material)
-    field = standing_on_bed(as_built) if as_built is not None else None
+    field = None if as_built is None else standing_on_bed(as_built, setup.printer)
     program = Program(text, setup.printer.dialect)
     bars = console.Bars()
     with ThreadPoolExecutor(1) as beside, bars.shown():  # nobody waits for the estimate alone

@@ -152,7 +152,7 @@ def _patch(
 
     with bars.stage("read solid"):
         shape, moved_mm = _placed(read_solid(solid), setup, place)
-    field = standing_on_bed(around[0])
+    field = standing_on_bed(around[0], setup.printer)
     grid = grid_of(around[1], setup)
     plan = slice_patch(shape, setup, as_built=field, grid=grid, standalone=True, progress=bars)
     left = (*plan.unreachable, *plan.unprintable)

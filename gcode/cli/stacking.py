@@ -52,7 +52,7 @@ def print_onto_command(
     console.writable(output)
     text = program_text(job)
     setup, _ = job_setup(text, job, printer, material)
-    field = standing_on_bed(part)
+    field = standing_on_bed(part, setup.printer)
     bars = console.Bars()
     with bars.shown(), told_if_for_another(text, job, setup.printer):
         made = print_onto(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from gcode.cli import console
 from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
+from gcode.errors import InputError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
 
 
@@ -19,20 +20,37 @@ def add_to(app: typer.Typer) -> None:
         epilog=console.examples(
             "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin "
             "--port /dev/ttyACM0",
+            "gcode touch --klipper-macro klipper_touch.cfg",
         ),
     )(touch_command)
 
 
+def _hand_out(path: Path) -> None:
+    """Write the macro that touches need on Klipper."""
+    from gcode.resumption.klipper import MACRO
+
+    console.write_whole(path, lambda draft: draft.write_text(MACRO, encoding="utf-8"))
+    console.errors.print(f"Written: {path}; include it in printer.cfg.")
+
+
+def _given(value: Any, name: str) -> Any:
+    if value is None:
+        raise InputError(f"{name} is missing; give it, or --klipper-macro FILE for the macro.")
+    return value
+
+
 def touch_command(
-    job: Annotated[Path, typer.Argument(help="The whole job's G-code, of any slicer.")],
-    port: Annotated[str, typer.Option(help="Device path of the printer.")],
+    job: Annotated[
+        Path | None, typer.Argument(help="The whole job's G-code, of any slicer.")
+    ] = None,
+    port: Annotated[str | None, typer.Option(help="Device path of the printer.")] = None,
     above_mm: Annotated[
-        float,
+        float | None,
         typer.Option(
             help="How high the nozzle stands above the part's top now, mm, by eye, within 1 mm: "
             "2 to 10. Turn Z by hand until it does."
         ),
-    ],
+    ] = None,
     z_mm: Annotated[
         float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
     ] = None,
@@ -41,13 +59,28 @@ def touch_command(
     ] = None,
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
+    klipper_macro: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the macro AMREPAIR_TOUCH, which Klipper needs for touches, and end.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find Z anew on a standing part after a power loss: the cold nozzle feels for a flat.
 
-    The nozzle itself must feel contact (a load cell, a strain gauge, a contact in the nozzle), and
-    the firmware must have G38.2. Z is never homed onto the part; 'gcode resume-at' goes on.
+    The nozzle itself must feel contact (a load cell, a strain gauge, a contact in the nozzle), as
+    the printer's profile says under 'probe', and the firmware must have G38.2 (Marlin,
+    RepRapFirmware) or, on Klipper, the macro of --klipper-macro. Z is never homed onto the part;
+    'gcode resume-at' goes on.
     """
+    if klipper_macro is not None:
+        _hand_out(klipper_macro)
+        return
+    job, port, above_mm = (
+        _given(job, "JOB"), _given(port, "--port"), _given(above_mm, "--above-mm"),
+    )  # fmt: skip
     with console.starting():
         from gcode.hosts.serial import SerialPrinter
         from gcode.hosts.touching import touch_z

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from gcode.firmware.contact import Contact
 from gcode.firmware.core import FirmwareCore
 from gcode.firmware.faults import parse_faults
 from gcode.firmware.serve import FRAME, PtyServer
@@ -42,13 +41,12 @@ def main() -> None:
     )
     if options["advanced_ok"]:
         core.enable_advanced_ok()
+    core.machine.dead_probe = options["dead_probe"]
     if options["standing"]:
-        core.machine.contact = Contact(
-            HeightField.read(Path(options["standing"])),
-            lost_mm=options["lost_mm"],
-            dead=options["dead_probe"],
-            seed=options["seed"],
-        )
+        surface = HeightField.read(Path(options["standing"]))
+        core.machine.stand(surface, seed=options["seed"])
+        assert core.machine.contact is not None
+        core.machine.contact.lost_mm = options["lost_mm"]
     server = PtyServer(core, Path(options["link"]), control=control)
     control.sendall(FRAME.pack(b"a", 2) + b"{}")
     try:

@@ -337,6 +337,8 @@ class FirmwareCore:
                 then=lambda: machine.replies.append("//action:resumed"),
             )
             self._run_pause()
+        if "clog" in faults:
+            machine.clogged_moves = int(_value(faults["clog"], 100.0))
         if "resend_storm" in faults:
             for _ in range(int(_value(faults["resend_storm"], 8.0))):
                 self._ask_again(self.last_number + 1, faults)

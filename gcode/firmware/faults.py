@@ -36,6 +36,7 @@ KINDS: dict[str, str] = {
     "silent_reset": "the printer starts anew without a banner",
     "thermal_runaway": "the firmware halts on thermal runaway",
     "runout": "filament runs out: the firmware pauses for s seconds (default 20)",
+    "clog": "nothing comes out of the nozzle on the next n moves (default 100) that extrude",
     "disconnect": "the port vanishes for s seconds (default 0.2)",
     "slow_reader": "the printer reads one line each s seconds (default 0.001)",
     "damage": "each byte is damaged on its way, in both directions, with probability s (default "

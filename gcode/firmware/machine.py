@@ -54,6 +54,10 @@ class Machine(Mechanics):
                 table[name[1:].upper().encode()] = getattr(self, name)
         if self.variant.family not in ("marlin", "reprap"):
             table.pop(b"G38")  # neither Prusa's firmware nor Klipper has it
+        if self.variant.family == "klipper":
+            table[b"AMREPAIR_TOUCH"] = self._amrepair_touch
+            table[b"TEMPERATURE_WAIT"] = self._temperature_wait
+            table[b"SET_KINEMATIC_POSITION"] = self._set_kinematic_position
         for name in _IGNORED:
             table.setdefault(name.encode(), self._ignore)
         if not self.variant.emergency_parser and self.variant.family == "klipper":
@@ -149,8 +153,46 @@ class Machine(Mechanics):
         Marlin's G38.cpp; RepRapFirmware's own words differ, and begin with `Error:` as well.
         """
         (_, _, target_mm), _ = self.target_of(words_of(rest))
+
+        def stopped(touched: bool) -> None:
+            if not touched:
+                self.replies.append(f"{self.variant.error_prefix}Failed to reach target")
+
+        self._feel_down_to(target_mm, self.feed_mm_s, stopped)
+
+    def _amrepair_touch(self, rest: bytes) -> None:
+        """Do what our macro around Klipper's PROBE does (`gcode/resumption/klipper_touch.cfg`)."""
+        said = dict(word.partition(b"=")[::2] for word in rest.upper().split())
+        depth_mm, speed_mm_s = float(said[b"DEPTH"]), float(said[b"SPEED"])
+
+        def stopped(touched: bool) -> None:
+            if touched:
+                z_mm = self.z + self.offset[2]
+                self.replies.append(f"// amrepair: touched at z={z_mm:.4f}")
+            else:
+                self.replies.append("!! No trigger on probe after full movement")
+
+        self._feel_down_to(self.z - depth_mm, speed_mm_s, stopped)
+
+    def _set_kinematic_position(self, rest: bytes) -> None:
+        """Take an axis for where it is told to be, and for homed (klippy/extras/force_move.py)."""
+        for word in rest.upper().split():
+            letter, _, value = word.partition(b"=")
+            if letter == b"CLEAR_HOMED":
+                self.unhomed |= set(value.decode()) & set("XYZ")
+                continue
+            axis = b"XYZ".find(letter)
+            if axis >= 0:
+                self.offset[axis] = float(value) - (self.x, self.y, self.z)[axis]
+                self.unhomed.discard(letter.decode())
+
+    def _feel_down_to(
+        self, target_mm: float, speed_mm_s: float, then: Callable[[bool], None]
+    ) -> None:
+        """Go straight down until something is felt, or to a native Z; then say whether it was."""
         drained_s = self.planner.drained_s(self.clock_s)
         here = (self.x, self.y, self.z)
+        self.lay_executed()
         met_mm = None if self.contact is None else self.contact.met_at_mm(self.x, self.y)
         touched = met_mm is not None and target_mm <= met_mm <= self.z
         end_mm = met_mm if touched and met_mm is not None else min(target_mm, self.z)
@@ -160,10 +202,19 @@ class Machine(Mechanics):
             self.record_jump(here)
             if self.contact is not None:
                 self.contact.note(self.x, self.y, self.z)
-            if not touched:
-                self.replies.append(f"{self.variant.error_prefix}Failed to reach target")
+            then(touched)
 
-        self.wait_for(drained_s + (here[2] - end_mm) / self.feed_mm_s, then=stopped)
+        self.wait_for(drained_s + (here[2] - end_mm) / speed_mm_s, then=stopped)
+
+    def _temperature_wait(self, rest: bytes) -> None:
+        """Klipper's wait until a sensor is warm or cold enough (klippy/extras/heaters.py)."""
+        said = dict(word.partition(b"=")[::2] for word in rest.upper().split())
+        heater = self.bed if said.get(b"SENSOR") == b"HEATER_BED" else self.hotend
+        if b"MAXIMUM" in said:
+            end_s = heater.cooled_s(float(said[b"MAXIMUM"]), self.clock_s)
+        else:
+            end_s = heater.reached_s(cooling=False)
+        self.wait_for(max(end_s, self.planner.drained_s(self.clock_s)), heating=True)
 
     def _g90(self, rest: bytes) -> None:
         self.absolute = True

@@ -12,10 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gcode.firmware.contact import Contact
+from gcode.firmware.laid import Laid
+from gcode.firmware.motion import MotionBatch
 from gcode.firmware.planner import Planner
 from gcode.firmware.thermal import BED, HOTEND, Heater
 from gcode.firmware.variants import Variant
 from gcode.profiles import AxisLimits, PrinterProfile
+from gcode.surfaces import HeightField
 from gcode.units import mm_s_from_mm_min
 
 ARC_SEGMENT_MM = 0.5
@@ -66,7 +69,38 @@ class Mechanics:
         self.planner = self._new_planner()
         self.power_up()
         self.contact: Contact | None = None  # where the nozzle feels what it touches
+        self.dead_probe = False  # it never triggers
+        self.laid: Laid | None = None
+        self._laid_bytes = 0  # of what was executed and is not forgotten, so much is laid
+        self.clogged_moves = 0  # nothing comes out on so many more that extrude
         self.let_go = 0  # how often moves came after the motors had been let go
+
+    def stand(self, surface: HeightField, *, seed: int = 0) -> None:
+        """Have this stand on the bed from now on, for what feels contact."""
+        if self.contact is None:
+            self.contact = Contact.of(self.profile.probe, surface, seed=seed)
+            self.contact.dead = self.dead_probe
+        self.contact.surface = surface
+
+    def feel_what_is_laid(self) -> None:
+        """Have what this printer itself lays stand on the bed."""
+        self.laid = Laid(self.profile)
+        self.stand(self.laid.surface)
+
+    def forget_executed(self) -> None:
+        """Let go of what was executed; what it laid stays."""
+        executed = self.planner.executed
+        if self.laid is not None:
+            self.laid.add(MotionBatch.from_bytes(executed.tobytes()[self._laid_bytes :]))
+            self._laid_bytes = 0
+        del executed[:]
+
+    def lay_executed(self) -> None:
+        """What was executed so far stands there to be felt."""
+        if self.laid is not None:
+            told = self.planner.executed.tobytes()
+            self.laid.add(MotionBatch.from_bytes(told[self._laid_bytes :]))
+            self._laid_bytes = len(told)
 
     def power_up(self) -> None:
         """Forget everything, as after a reset; the clock and what was executed stay."""
@@ -142,6 +176,9 @@ class Mechanics:
                 self.min_extrude_c
             ):
                 self._cold()
+                de_mm = 0.0
+            elif self.clogged_moves > 0 and de_mm > 0:
+                self.clogged_moves -= 1
                 de_mm = 0.0
             elif de_mm > MAX_EXTRUDE_MM:
                 self.replies.append("echo: too long extrusion prevented")

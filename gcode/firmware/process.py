@@ -24,6 +24,7 @@ from gcode.firmware.faults import FaultScript, parse_faults
 from gcode.firmware.motion import MotionBatch
 from gcode.firmware.serve import FRAME
 from gcode.profiles import PrinterProfile
+from gcode.surfaces import HeightField
 
 ANSWER_S = 60.0
 
@@ -133,6 +134,12 @@ class EmulatedPrinterProcess:
         """Return what the machine really is at, for tests: temperatures, targets, position."""
         return self._ask("state")
 
+    def stand(self, surface: HeightField) -> None:
+        """Have this stand on the bed from now on; what feels contact feels it."""
+        path = Path(self._folder.name) / "standing.npz"
+        surface.write(path)
+        self._ask("stand", path=str(path))
+
     def reset(self) -> None:
         """Press the reset button."""
         self._ask("reset")
@@ -156,9 +163,9 @@ class EmulatedPrinterProcess:
         self._socket.close()
         self._folder.cleanup()
 
-    def _ask(self, what: str) -> dict[str, object]:
+    def _ask(self, what: str, **more: str) -> dict[str, object]:
         try:
-            self._socket.sendall(json.dumps({"do": what}).encode() + b"\n")
+            self._socket.sendall(json.dumps({"do": what, **more}).encode() + b"\n")
         except OSError as error:
             raise LinkError("The emulated printer's process is gone; start it anew.") from error
         return self._answer()

@@ -26,6 +26,7 @@ from gcode.errors import InputError
 from gcode.firmware.core import FirmwareCore
 from gcode.firmware.faults import FaultScript
 from gcode.profiles import PrinterProfile
+from gcode.surfaces import HeightField
 
 FRAME = struct.Struct("<cI")
 MOTION_FRAME_NUMBERS = 9 * 2000
@@ -146,7 +147,7 @@ class PtyServer:
         if self._motion is not None and machine.planner.executed:
             self._motion.write(machine.planner.executed.tobytes())
             self._motion.flush()
-            del machine.planner.executed[:]
+            machine.forget_executed()
         data = core.take_output()
         if data:
             self._write(data)
@@ -154,7 +155,7 @@ class PtyServer:
             if self._control is not None:
                 self._send_motion()
             else:
-                del machine.planner.executed[:]  # nobody asks for it
+                machine.forget_executed()  # nobody asks for it
 
     def _write(self, data: bytes) -> None:
         """Write as much as the host reads; what a full, unread port cannot take is lost."""
@@ -194,6 +195,8 @@ class PtyServer:
             self._send_motion()
         elif what == "reset":
             core.power_up()
+        elif what == "stand":
+            core.machine.stand(HeightField.read(Path(str(request["path"]))))
         elif what == "stop":
             self._stopping = True
         machine = core.machine
@@ -223,7 +226,7 @@ class PtyServer:
         executed = self.core.machine.planner.executed
         if executed:
             self._frame(b"m", executed.tobytes())
-            del executed[:]
+            self.core.machine.forget_executed()
 
     def _frame(self, kind: bytes, payload: bytes) -> None:
         assert self._control is not None
@@ -260,6 +263,8 @@ def serve_forever(
         If that file cannot be opened.
     """
     core = FirmwareCore(profile, firmware, faults=faults, accelerated=accelerated)
+    if profile.probe is not None:
+        core.machine.feel_what_is_laid()
     with contextlib.ExitStack() as stack:
         file: BinaryIO | None = None
         if motion is not None:

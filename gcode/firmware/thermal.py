@@ -79,3 +79,13 @@ class Heater:
         return self._from_s + self.model.cool_tau_s * math.log(
             (start_c - AMBIENT_C) / (floor_c - AMBIENT_C)
         )
+
+    def cooled_s(self, limit_c: float, now_s: float) -> float:
+        """When it is no warmer than a limit; never, where its target or the room is warmer."""
+        if self.temperature_c(now_s) <= limit_c:
+            return now_s
+        if max(self.target_c, AMBIENT_C) >= limit_c:
+            return math.inf
+        return self._from_s + self.model.cool_tau_s * math.log(
+            (self._from_c - AMBIENT_C) / (limit_c - AMBIENT_C)
+        )

@@ -90,6 +90,7 @@ class SerialPrinter(GuardedConversation):
         self._printing = False
         self._ask_s = -math.inf if journal is not None else math.inf  # temperatures, when next
         self.actions: deque[str] = deque(maxlen=100)
+        self.said: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> SerialPrinter:
         self.connect()
@@ -351,6 +352,8 @@ class SerialPrinter(GuardedConversation):
     def _on_other_event(self, event: ev.Event) -> None:
         if isinstance(event, ev.TemperatureReport):
             self._book.temperature(event)
+        elif isinstance(event, ev.Echo):
+            self.said.append(event.text)
         elif isinstance(event, ev.HostAction):
             self.actions.append(event.action)
             asked = {"pause": self.pause, "resume": self.resume, "cancel": self.abort}

@@ -6,19 +6,22 @@ was felt has the height that the job gave it.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from gcode.check import CheckedProgram
+from gcode.check.touches import COMMANDS
 from gcode.dialects import number
-from gcode.errors import PrinterError
+from gcode.errors import LinkError, LocalProtocolError, PrinterError
 from gcode.hosts.serial import SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.resumption.touch import Touching
 
-COLD_C = 60.0
-"""PLA, the softest of the materials, begins to give way there."""
+_TOUCHED = re.compile(r"(?://\s*)?amrepair: touched at z=(-?\d+\.\d+)")
+"""What the macro AMREPAIR_TOUCH says; Klipper's own answers differ by its version."""
 REPORTED_MM = 0.01
 """Marlin tells a position in two digits."""
 
@@ -60,22 +63,21 @@ def touch_z(
     PrinterError
         If the nozzle is warm, nothing is felt, or the touches do not agree.
     """
-    now = printer.temperatures()
-    if now.hotend_target_c > 0 or now.hotend_c > COLD_C:
+    now, cold_c = printer.temperatures(), plan.probe.cold_c
+    if now.hotend_target_c > 0 or now.hotend_c > cold_c:
         raise PrinterError(
             f"The nozzle is at {now.hotend_c:.0f} °C (target {now.hotend_target_c:.0f}) and would "
-            f"melt in or leave a drop; switch it off and touch below {COLD_C:.0f} °C."
+            f"melt in or leave a drop; switch it off and touch below {cold_c:.0f} °C."
         )
     top_mm, options = plan.layer.z_mm, plan.options
     printer.command("G21")
     printer.command("G90")
-    printer.command(f"G92 Z{number(top_mm + above_mm, 3)}")
+    tell_z(printer, top_mm + above_mm)
 
-    def take_for_top() -> None:
-        printer.command(f"G92 Z{number(top_mm, 3)}")
-
-    first_mm = _felt(printer, plan.coarse, take_for_top, progress)
-    felt_mm = _felt(printer, plan.fine, lambda: None, progress)
+    first_mm = felt(
+        printer, plan.coarse, at_contact=lambda: tell_z(printer, top_mm), progress=progress
+    )
+    felt_mm = felt(printer, plan.fine, progress=progress)
     mean_mm = sum(felt_mm) / len(felt_mm)
     apart_mm = max(felt_mm) - min(felt_mm)
     if apart_mm > options.agree_mm:
@@ -86,8 +88,8 @@ def touch_z(
         )
     shift_mm = top_mm - mean_mm
     here_mm = printer.position_mm()[2]
-    printer.command(f"G92 Z{number(here_mm + shift_mm, 3)}")
-    variance_mm2 = options.sigma_mm**2 + REPORTED_MM**2 / 12 + apart_mm**2 / 2
+    tell_z(printer, here_mm + shift_mm)
+    variance_mm2 = plan.probe.sigma_mm**2 + REPORTED_MM**2 / 12 + apart_mm**2 / 2
     return Touched(
         first_shift_mm=top_mm - first_mm[0],
         shift_mm=shift_mm,
@@ -96,30 +98,88 @@ def touch_z(
     )
 
 
-def _felt(
+def tell_z(printer: SerialPrinter, z_mm: float) -> None:
+    """Have the firmware take its Z for this, where the nozzle is now; nothing moves.
+
+    Klipper moves no axis that it does not take for homed, and G92 does not make it so.
+    """
+    z = number(z_mm, 3)
+    klipper = printer.dialect.name == "klipper"
+    printer.command(f"SET_KINEMATIC_POSITION Z={z}" if klipper else f"G92 Z{z}")
+
+
+def felt(
     printer: SerialPrinter,
     checked: CheckedProgram,
-    at_contact: Callable[[], None],
-    progress: Progress,
+    *,
+    at_contact: Callable[[], None] = lambda: None,
+    progress: Progress = silent,
 ) -> list[float]:
-    """Carry out the touches of a program; where each was stopped, in the firmware's Z."""
+    """Carry out the touches of a program; where the nozzle met something, in the firmware's Z.
+
+    Parameters
+    ----------
+    at_contact
+        Called while the nozzle rests on what it met.
+
+    Raises
+    ------
+    PrinterError
+        If nothing is felt down to where a touch was to end, or the firmware does not know touches;
+        heaters are off then, and the nozzle is lifted.
+    """
+    command = COMMANDS[checked.program.dialect]
     lines = checked.program.text.split("\n")
     felt_mm: list[float] = []
     first = 0
     for index, line in enumerate(lines):
-        if not line.startswith("G38.2 "):
+        if not line.startswith(command + " "):
             continue
+        printer.said.clear()
         try:
-            printer.print(checked, lines=range(first, index + 1), progress=progress)
+            report = printer.print(checked, lines=range(first, index + 1), progress=progress)
         except PrinterError as error:
+            _forget_z(printer, command)
             raise PrinterError(
-                f"Nothing was felt down to {line.split()[1]} mm, where the touch was to end, or "
-                f"the printer has none ({error}); the nozzle was lifted, the heaters are off, and "
-                f"Z is not known: look how high the nozzle stands, and whether its probe triggers."
+                f"Nothing was felt down to {line.split()[1].replace('DEPTH=', '')} mm, where the "
+                f"touch was to end ({error}); the nozzle was lifted and the heaters are off: the "
+                f"probe does not trigger, or what it was to feel is farther below."
             ) from error
-        felt_mm.append(printer.place().z_mm)
+        felt_mm.append(_met_mm(printer, report.warnings, command))
         at_contact()
         first = index + 1
     printer.print(checked, lines=range(first, len(lines)), progress=progress)
     printer.finish_moves()
     return felt_mm
+
+
+def _forget_z(printer: SerialPrinter, command: str) -> None:
+    """Klipper's Z is still the one that the macro lowered: it must be homed before it moves."""
+    if command == COMMANDS["klipper"]:
+        with contextlib.suppress(LinkError, LocalProtocolError):
+            printer.command("SET_KINEMATIC_POSITION CLEAR_HOMED=Z")
+
+
+def _met_mm(printer: SerialPrinter, warnings: tuple[str, ...], command: str) -> float:
+    """Where the touch that was just made ended."""
+    if any(command in text for text in warnings):
+        printer.make_safe()
+        how = (
+            "write its macro by 'gcode touch --klipper-macro FILE' and include it in printer.cfg"
+            if command == COMMANDS["klipper"]
+            else "build it with G38_PROBE_TARGET, or set Z by hand, with paper below the nozzle"
+        )
+        raise PrinterError(
+            f"The printer's firmware does not know {command}, so nothing was touched; the nozzle "
+            f"was lifted and the heaters are off: {how}."
+        )
+    if command != COMMANDS["klipper"]:
+        return printer.place().z_mm
+    said = [match for text in printer.said if (match := _TOUCHED.fullmatch(text.strip()))]
+    if not said:
+        printer.make_safe()
+        raise PrinterError(
+            "The printer does not say where the touch ended; is its macro AMREPAIR_TOUCH of this "
+            "version? The nozzle was lifted and the heaters are off."
+        )
+    return float(said[-1].group(1))

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         EnvelopeSlice,
         MaterialProfile,
         PrinterProfile,
+        ProbeProfile,
         ProcessProfile,
     )
     from gcode.profiles.setup import PrintSetup, expand_script, load_setup
@@ -40,6 +41,7 @@ __all__ = [
     "MaterialProfile",
     "PrintSetup",
     "PrinterProfile",
+    "ProbeProfile",
     "ProcessProfile",
     "expand_script",
     "kind_of",
@@ -58,6 +60,7 @@ _HOMES = {
     "MaterialProfile": ("gcode.profiles.schema", "MaterialProfile"),
     "PrintSetup": ("gcode.profiles.setup", "PrintSetup"),
     "PrinterProfile": ("gcode.profiles.schema", "PrinterProfile"),
+    "ProbeProfile": ("gcode.profiles.schema", "ProbeProfile"),
     "ProcessProfile": ("gcode.profiles.schema", "ProcessProfile"),
     "expand_script": ("gcode.profiles.setup", "expand_script"),
     "kind_of": ("gcode.profiles.store", "kind_of"),

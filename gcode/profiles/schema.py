@@ -156,6 +156,51 @@ class StartMacro(BaseModel):
     bed: str
 
 
+class ProbeProfile(BaseModel):
+    """A probe that feels plastic, for whoever touches what stands on the bed.
+
+    What senses metal or a sheet (inductive, optical) feels no part: a printer with such a one has
+    no probe here. It is not inherited: a child is another machine.
+
+    Attributes
+    ----------
+    kind
+        `nozzle`: the nozzle itself feels (load cell, strain gauge, contact); `pin`: one beside it.
+    command
+        Whose depth the host sets: `G38.2` (Marlin with G38_PROBE_TARGET, RepRapFirmware) or
+        `AMREPAIR_TOUCH` (a macro around Klipper's PROBE).
+    offset_mm
+        Of the tip that feels from the nozzle's: x, y, and z, 0 or below.
+    tip_radius_mm
+        Of the flat that meets the part: it feels the highest place below it.
+    sigma_mm
+        Standard deviation of one touch, until repeated touches tell.
+    speed_mm_s
+        Downwards, while it feels.
+    depth_mm
+        Deepest that a touch may go below what it is to feel.
+    cold_c
+        A nozzle that feels is no warmer: plastic gives way, and what oozes is felt for the part.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    kind: Literal["nozzle", "pin"]
+    command: Literal["G38.2", "AMREPAIR_TOUCH"]
+    offset_mm: tuple[float, float, Annotated[float, Field(ge=-10, le=0)]] = (0.0, 0.0, 0.0)
+    tip_radius_mm: Annotated[float, Field(gt=0, le=3)]
+    sigma_mm: Annotated[float, Field(gt=0, le=0.2)]
+    speed_mm_s: Annotated[float, Field(gt=0, le=4)]
+    depth_mm: Annotated[float, Field(gt=0, le=3)]
+    cold_c: Annotated[float, Field(ge=40, le=160)] = 60.0
+
+    @model_validator(mode="after")
+    def _nozzle_is_itself(self) -> ProbeProfile:
+        if self.kind == "nozzle" and any(self.offset_mm):
+            raise ValueError("a nozzle that feels has offset_mm 0, 0, 0")
+        return self
+
+
 class PrinterProfile(_Profile):
     """A machine: what it can reach, how fast, how hot, and in which words it is spoken to."""
 
@@ -184,6 +229,7 @@ class PrinterProfile(_Profile):
     prime_mm: Xyz
     prime_length_mm: Annotated[float, Field(ge=0)]
     envelope: tuple[EnvelopeSlice, ...]  # empty: nobody has measured it
+    probe: ProbeProfile | None = None  # that feels plastic
     baud: int = 115200
     start_gcode: tuple[str, ...]
     end_gcode: tuple[str, ...]
@@ -196,6 +242,24 @@ class PrinterProfile(_Profile):
     @classmethod
     def _lines(cls, value: Any) -> Any:
         return value.strip().splitlines() if isinstance(value, str) else value
+
+    @property
+    def feeler(self) -> ProbeProfile:
+        """The probe, for whoever touches what stands there.
+
+        Raises
+        ------
+        ProfileError
+            If it has none that feels plastic.
+        """
+        if self.probe is None:
+            raise ProfileError(
+                f"{self.name} has no probe that feels plastic in its profile: write '[probe]' into "
+                "a profile of your own that inherits this one, where it has a load cell, a strain "
+                "gauge or a pin, and its firmware a touch whose depth can be told (G38.2, or "
+                "Klipper with the macro AMREPAIR_TOUCH)."
+            )
+        return self.probe
 
     @property
     def head(self) -> tuple[EnvelopeSlice, ...]:

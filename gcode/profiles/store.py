@@ -139,7 +139,8 @@ def _resolve(kind: Kind, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
             raise ProfileError(f"{path}: key 'inherits' = {parent!r} must be one ID or path.")
         found = _find(kind, parent, beside=path.parent).resolve()
         base = _resolve(kind, found, (*chain, path))
-        base.pop("slicer_names", None)  # a child is another machine
+        for key in ("slicer_names", "probe"):  # a child is another machine
+            base.pop(key, None)
     for key, value in own.items():
         if isinstance(value, dict) and isinstance(base.get(key), dict):
             base[key] = {**base[key], **value}

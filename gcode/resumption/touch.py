@@ -1,8 +1,8 @@
 """Z found anew on a standing part by touching a flat of it that its job knows.
 
 Nobody knows Z after a power loss, and homing it would drive the nozzle into the part. The job tells
-where the last layer is solid, and how high; there the nozzle itself feels for it (G38.2), never
-deeper than planned. It makes the programs; `hosts.touching` carries them out.
+where the last layer is solid, and how high; there the nozzle itself feels for it, never deeper
+than planned. It makes the programs; `hosts.touching` carries them out.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from gcode.check import CheckedProgram, Touch, check
+from gcode.check.touches import COMMANDS
 from gcode.dialects import number
 from gcode.errors import InputError
 from gcode.moves import Program
-from gcode.profiles import PrinterProfile, PrintSetup
+from gcode.profiles import PrinterProfile, PrintSetup, ProbeProfile
 from gcode.progress import Progress, silent
 from gcode.reader import read_job
 from gcode.reader.job import Beads, JobLayer
@@ -32,10 +33,6 @@ from gcode.units import mm_min_from_mm_s
 CELL_MM = 0.2
 FLAT_SLACK_MM = 0.01
 """Beads of one layer lie at one height, within the digits of the text; a spiral's do not."""
-TOUCHING_DIALECTS = ("marlin", "reprap")
-"""Those with a touch that is told how deep it may go: Marlin's G38.2 (G38_PROBE_TARGET), and
-RepRapFirmware's. Klipper's PROBE goes down to the `position_min` of its own configuration, and
-Prusa's firmware has G30 alone, which ends at a depth of its own as well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +50,6 @@ class TouchOptions:
     flat_mm
         Least diameter of a flat: the end of a nozzle (1 mm) and a millimetre on each side, for
         where X and Y are homed to.
-    feed_mm_s
-        Half of Z_PROBE_FEEDRATE_FAST in Marlin's Configuration.h (4 mm/s).
-    sigma_mm
-        Standard deviation of one touch, as Marlin's M48 tells it for good probes.
     agree_mm
         Most by which two touches may differ: what they feel is no flat, or something gives way.
     coverage
@@ -67,8 +60,6 @@ class TouchOptions:
     over_mm: float = 0.5
     fine_mm: float = 0.3
     flat_mm: float = 3.0
-    feed_mm_s: float = 2.0
-    sigma_mm: float = 0.01
     agree_mm: float = 0.1
     coverage: float = 2.0
 
@@ -91,6 +82,8 @@ class Touching:
         Both touches, when it is known by the first.
     standing
         What stands there.
+    probe
+        What feels it.
     """
 
     layer: JobLayer
@@ -99,6 +92,7 @@ class Touching:
     coarse: CheckedProgram
     fine: CheckedProgram
     standing: HeightField
+    probe: ProbeProfile
     options: TouchOptions
 
 
@@ -144,7 +138,7 @@ def plan_touch(
         touches = tuple(
             Touch(float(x), float(y), last.z_mm, last.z_mm - below_mm) for x, y in where
         )
-        text = _text(touches, setup, high_mm, options, meshed=meshed)
+        text = _text(touches, setup, high_mm, meshed=meshed)
         whole = Program(text, program.dialect)
         return check(whole, setup, as_built=field, touches=touches, progress=progress)
 
@@ -155,17 +149,25 @@ def plan_touch(
         coarse=made(places_mm[:1], options.doubt_mm + options.over_mm),
         fine=made(places_mm, options.fine_mm),
         standing=field,
+        probe=printer.feeler,
         options=options,
     )
 
 
 def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchOptions) -> None:
-    """Raise where the firmware has no such touch, or the nozzle stands too low or too high."""
-    if printer.dialect not in TOUCHING_DIALECTS:
+    """Raise where no nozzle feels by such a touch, or it stands too low or too high."""
+    if printer.dialect not in COMMANDS:
         raise InputError(
             f"{printer.id} speaks {printer.dialect}, whose probing goes as deep as its own "
             f"configuration says: nothing could stop it above the part; set Z by hand, with paper "
-            f"between nozzle and part, or use a printer with G38.2 (Marlin, RepRapFirmware)."
+            f"between nozzle and part, or use a printer whose touches can be told how deep "
+            f"(Marlin, RepRapFirmware, Klipper)."
+        )
+    if printer.feeler.kind != "nozzle":
+        raise InputError(
+            f"{printer.name} feels with a {printer.feeler.kind} beside its nozzle, whose own "
+            f"height that does not tell to a few hundredths of a millimetre; set Z by hand, with "
+            f"paper below the nozzle."
         )
     if not 2 * options.doubt_mm <= above_mm <= LIFT_MM:
         raise InputError(
@@ -174,28 +176,29 @@ def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchO
         )
 
 
-def _text(
-    touches: tuple[Touch, ...],
-    setup: PrintSetup,
-    high_mm: float,
-    options: TouchOptions,
-    *,
-    meshed: bool,
-) -> str:
+def _text(touches: tuple[Touch, ...], setup: PrintSetup, high_mm: float, *, meshed: bool) -> str:
     """Above everything, X and Y homed; over each place, down to it, and up again."""
     z_feed = f" F{number(mm_min_from_mm_s(setup.printer.z_speed_mm_s), 0)}"
     travel = f" F{number(mm_min_from_mm_s(setup.printer.travel_speed_mm_s), 0)}"
-    feed = f" F{number(mm_min_from_mm_s(options.feed_mm_s), 0)}"
     up = f"G1 Z{number(high_mm, 3)}{z_feed}"
     lines = ["; Z found anew: heaters off, never deeper than planned", "G21", "G90", "M83", up]
     lines += ["G28 X Y", "M420 S1"] if meshed else ["G28 X Y"]
     for touch in touches:
         lines += [
             f"G1 X{number(touch.x_mm, 3)} Y{number(touch.y_mm, 3)}{travel}",
-            f"G38.2 Z{number(touch.lowest_mm, 3)}{feed}",
+            touch_line(setup.printer, from_mm=high_mm, lowest_mm=touch.lowest_mm),
             up,
         ]
     return "\n".join(lines) + "\n"
+
+
+def touch_line(printer: PrinterProfile, *, from_mm: float, lowest_mm: float) -> str:
+    """The line that feels straight down from one height, to another at the deepest."""
+    probe = printer.feeler
+    if COMMANDS[printer.dialect] == "AMREPAIR_TOUCH":
+        depth = number(from_mm - lowest_mm, 3)
+        return f"AMREPAIR_TOUCH DEPTH={depth} SPEED={number(probe.speed_mm_s, 3)}"
+    return f"G38.2 Z{number(lowest_mm, 3)} F{number(mm_min_from_mm_s(probe.speed_mm_s), 0)}"
 
 
 def _flat(

@@ -19,6 +19,7 @@ from PIL import Image
 
 import gcode
 from amrepair.cli.live import ShownRun
+from amrepair.loop import Approval
 from amrepair.report.live import LiveView
 from amrepair.report.operator import Operator
 from amrepair.simulate.defects import parse_defect
@@ -66,7 +67,7 @@ class Run:
         try:
             run = simulate_run(
                 prepared,
-                approve=self.shown.to_print,
+                approval=Approval(self.shown.to_print),
                 record=self.shown.recording(lambda look: None),
                 progress=self.shown.watching(lambda stage, done, total: None),
             )

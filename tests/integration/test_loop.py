@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from amrepair.errors import AlignmentError, AmrepairError, InputError, LoopError
-from amrepair.loop import Look, locate_part, plan_stops, travel
+from amrepair.loop import Approval, Look, locate_part, plan_stops, travel
 from amrepair.repair import RepairPlan
 from amrepair.report.collect import look_of, loop_result
 from amrepair.simulate.defects import parse_defect
@@ -159,7 +159,7 @@ def test_excess_is_reported_and_nothing_is_printed(plate: MeshSdf) -> None:
     run = simulate_run(prepared(plate, "blob:size=5,height=1.5"))
     assert not run.report.repair_prints
     assert not run.report.within_tolerance
-    assert result_of(run)["excess_mm3_before"] > 3.0  # type: ignore[operator]
+    assert result_of(run)["excess_mm3_before"] > 3.0  # type: ignore[approval]
 
 
 def test_a_declined_repair_is_not_printed(plate: MeshSdf) -> None:
@@ -169,7 +169,7 @@ def test_a_declined_repair_is_not_printed(plate: MeshSdf) -> None:
         asked.append(plan)
         return False
 
-    run = simulate_run(prepared(plate, "void:diameter=7,layers=3"), approve=decline)
+    run = simulate_run(prepared(plate, "void:diameter=7,layers=3"), approval=Approval(decline))
     assert asked
     assert not run.report.repair_prints
     assert any(look.declined for look in run.report.looks)

@@ -60,7 +60,7 @@ def make_ready(here: Path, layers: list[int]) -> Path:
     setting = Setting.of(
         setup, (PRINTER, "pla", "repair_0.20"), stops=plan_stops(job, layers),
         build_from_template=placed, build_from_scanner=Transform.identity("build", "scanner"),
-        by_beads=False, seed=0, max_iterations=3,
+        by_beads=False, seed=0,
     )  # fmt: skip
     keep(here / "run", setting, program.text, MeshSdf.from_mesh(solid_mesh(part)))
     tops = [(f"layer-{layer:03d}", job.layers[layer].z_mm) for layer in layers]

@@ -85,7 +85,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     (here / "job.gcode").write_text(run.checked.program.text)
     looks: list[Look] = []
     poses: list[Transform] = []
-    simulate_run(run, record=looks.append, begun=lambda pose: [poses.append(pose), Tape()][1])
+    simulate_run(
+        run, record=looks.append, begun=lambda pose, printer: [poses.append(pose), Tape()][1]
+    )
     for look in looks:  # the first of a stop is kept as broken, the last as whole
         seen = thinned(look.scan.moved(poses[0]))
         for which in ("broken", "whole"):

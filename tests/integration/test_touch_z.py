@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -45,6 +46,7 @@ def plan_for(printer: str, folder: Path, *, slope: float = 0.0) -> tuple[Touchin
         ("generic_marlin", 3.1, 1),  # by eye it is within a millimetre
         ("generic_marlin", 4.9, 2),
         ("generic_reprap", 4.7, 3),
+        ("generic_klipper", 3.3, 4),
     ],
 )
 def test_z_is_found_and_the_job_goes_on_at_its_true_height(
@@ -100,6 +102,46 @@ def test_a_probe_that_never_triggers_stops_at_the_planned_depth(tmp_path: Path) 
         allowed_mm = plan.options.doubt_mm + plan.options.over_mm
         assert state["deepest_mm"] == pytest.approx(allowed_mm, abs=1e-6)
         assert state["position_mm"][2] + 4.0 > 0  # type: ignore[index]  # lifted off the part
+        assert (state["hotend_target_c"], state["bed_target_c"]) == (0.0, 0.0)
+
+
+def test_klipper_must_home_z_after_a_touch_that_met_nothing(tmp_path: Path) -> None:
+    """The macro has lowered the height that Klipper believes in: nothing may go by it."""
+    setup = load_setup("generic_klipper", "pla")
+    plan, standing = plan_for("generic_klipper", tmp_path)
+    with (
+        EmulatedPrinterProcess(
+            "klipper",
+            printer=setup.printer,
+            standing=standing,
+            lost_mm=TOP_MM + 4.0,
+            dead_probe=True,
+        ) as emulator,
+        SerialPrinter(emulator.port, dialect="klipper") as host,
+    ):
+        with pytest.raises(PrinterError, match=r"Nothing was felt down to 1\d\.\d+ mm"):
+            touch_z(host, plan, 4.0)
+        lifted_mm = emulator.state()["position_mm"][2]  # type: ignore[index]
+        with contextlib.suppress(PrinterError):
+            host.command("G1 Z1 F600")
+        host.finish_moves()
+        assert emulator.state()["position_mm"][2] == lifted_mm  # type: ignore[index]
+
+
+def test_a_firmware_without_the_touch_is_not_believed(tmp_path: Path) -> None:
+    """Prusa's Buddy firmware is built without G38.2: it says so, and nothing moves."""
+    setup = load_setup("generic_marlin", "pla")
+    plan, standing = plan_for("generic_marlin", tmp_path)
+    with (
+        EmulatedPrinterProcess(
+            "prusa", printer=setup.printer, standing=standing, lost_mm=TOP_MM + 4.0
+        ) as emulator,
+        SerialPrinter(emulator.port, dialect="marlin") as host,
+    ):
+        with pytest.raises(PrinterError, match=r"does not know G38\.2, so nothing was touched"):
+            touch_z(host, plan, 4.0)
+        state = emulator.state()
+        assert state["deepest_mm"] == 0.0
         assert (state["hotend_target_c"], state["bed_target_c"]) == (0.0, 0.0)
 
 

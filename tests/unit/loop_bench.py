@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,14 @@ import numpy as np
 import trimesh
 
 from amrepair.frames import Transform
-from amrepair.loop import LoopReport, Stop, plan_stops, run_loop
+from amrepair.loop import Approval, LoopOptions, LoopReport, Records, Stop, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.scans import Scan, ScanRequest
 from amrepair.template import MeshSdf
 from gcode.check import CheckedProgram, check
 from gcode.hosts.file import FilePrinter
 from gcode.profiles import PrintSetup, load_setup
+from gcode.progress import Progress, silent
 from gcode.reader import Job, read_job
 from gcode.slicing.job import plan_part
 from gcode.writer import write
@@ -94,11 +95,13 @@ class Small:
         scans: Callable[[int], Scan] | Callable[[ScanRequest], Scan],
         *,
         stops: Sequence[Stop] | None = None,
-        **options: object,
+        progress: Progress = silent,
+        **named: Any,
     ) -> tuple[LoopReport, list[str]]:
         """Print with one stop, or those given; the report, and every line that was sent.
 
-        `scans` is asked for the n-th scan, or, with stops, for what is requested.
+        `scans` is asked for the n-th scan, or, with stops, for what is requested. What is `named`
+        are fields of the loop's options, of its approval and of its records.
         """
         folder.mkdir(exist_ok=True)
         printer = Thermal(folder / "sent.gcode")
@@ -112,12 +115,21 @@ class Small:
                 eye,
                 sites(self.job, self.template, self.placed, self.setup, by_beads=False),
                 stops=plan_stops(self.job, [LAYER], final=False) if stops is None else stops,
-                **options,  # type: ignore[arg-type]
+                options=LoopOptions(**_some(LoopOptions, named)),
+                approval=Approval(**_some(Approval, named)),
+                records=Records(**_some(Records, named)),
+                progress=progress,
             )
         finally:
             printer.close()
         lines = (folder / "sent.gcode").read_text().splitlines()
         return report, [*lines, *["heaters off"] * printer.switched_off]
+
+
+def _some(record: type, named: dict[str, Any]) -> dict[str, Any]:
+    """Those of the named values that are fields of a record."""
+    assert set(named) <= {f.name for kind in (LoopOptions, Approval, Records) for f in fields(kind)}
+    return {f.name: named[f.name] for f in fields(record) if f.name in named}
 
 
 class Thermal(FilePrinter):

@@ -14,7 +14,7 @@ from link_children import QUICK
 
 from amrepair.errors import ScannerError
 from amrepair.frames import Transform
-from amrepair.loop import Tape, run_loop
+from amrepair.loop import LoopOptions, Records, Tape, run_loop
 from amrepair.loop.pick_up import pick_up_serial
 from amrepair.loop.setting import open_run
 from amrepair.loop.sites import sites
@@ -124,11 +124,8 @@ def loop(
             StoredScanner(here, rough=rough),
             sites(run.job, run.template, run.setting.placed, run.setup, by_beads=False),
             stops=run.stops,
-            record=RunFolder(here / "run").record,
-            tape=tape,
-            pick_up=pick_up,
-            silent_stops=int(rough),
-            seed=run.setting.seed,
+            options=LoopOptions(silent_stops=int(rough), seed=run.setting.seed),
+            records=Records(RunFolder(here / "run").record, tape=tape, pick_up=pick_up),
         )
         told = (
             f"within: {report.within_tolerance}, looks: {len(report.looks)}, "

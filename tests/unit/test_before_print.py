@@ -129,6 +129,22 @@ def test_a_scan_of_another_frame_is_refused() -> None:
         scanned.from_points(POINTS - [0.0, 0.0, 300.0], 0.2, what="scan.ply")
 
 
+def test_a_scan_in_metres_is_refused() -> None:
+    """As a real one was, which would have stood there as a speck that nothing touches."""
+    with pytest.raises(InputError, match=r"spreads over 0\.0699 × 0\.0699 mm.*is it in metres"):
+        scanned.from_points(POINTS / 1000.0, 0.2, what="the scan")
+
+
+def test_an_arc_that_hits_is_told_once() -> None:
+    field = scanned.from_points(POINTS, 0.2, what="the scan")
+    lines = ["G21", "G90", "M83", "G1 Z20 F600", "G28 X Y", "G1 X90 Y105 F6000", "G1 Z1 F600"]
+    arc = "G2 X140 Y105 I25 J0 F1200"
+    program = Program("\n".join([*lines, arc]) + "\n", SETUP.printer.dialect)
+    hits = [r for r in find_refusals(program, SETUP, as_built=field) if r.text.startswith("G2")]
+    assert len(hits) == 1
+    assert "hits what stands there" in hits[0].what
+
+
 def test_a_scanners_open_mesh_stands_there(tmp_path: Path) -> None:
     vertices = np.array([[100, 90, 6], [130, 90, 6], [130, 120, 6], [100, 120, 6.0]])
     mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], process=False)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from gcode import compiled
 from gcode.slicing import infill_kernels
 
 STAMP = (1.0, 1)
+ROOT = Path(__file__).parents[2]
 
 
 def kept_in(folder: Path, *, safely: bool) -> Any:
@@ -119,3 +122,49 @@ def test_sums_in_any_order_have_one_machine_code() -> None:
             reordering.add(function.name)
     assert reordering, "the kernels of the search"
     assert not reordering & called
+
+
+KERNEL = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from gcode.compiled import njit
+
+@njit(cache=True)
+def kernel(points):
+    return np.sort(points.ravel()).mean() + np.linalg.norm(points)
+
+me, folder, others = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
+(folder / f"ready-{me}").touch()
+while len(list(folder.glob("ready-*"))) < others:
+    time.sleep(0.001)
+kernel(np.ones((4, 3)))
+print(sum(kernel.stats.cache_misses.values()), sum(kernel.stats.cache_hits.values()))
+"""
+
+
+def test_of_processes_that_start_together_one_compiles(tmp_path: Path) -> None:
+    """On a new machine every worker compiled every kernel, at the same time as the others."""
+    script = tmp_path / "kernel.py"
+    script.write_text(KERNEL)
+    running = [
+        subprocess.Popen(
+            [sys.executable, str(script), str(k), str(tmp_path), "3"],
+            stdout=subprocess.PIPE, text=True, cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        for k in range(3)
+    ]  # fmt: skip
+    told = [tuple(map(int, one.communicate(timeout=120)[0].split())) for one in running]
+    assert sorted(told) == [(0, 1), (0, 1), (1, 0)]
+
+
+def test_a_turn_that_nobody_gives_back_is_waited_for_no_longer(tmp_path: Path) -> None:
+    held, late = (compiled._Turn(tmp_path / "kernel.lock") for _ in range(2))
+    assert held.take()
+    assert not held.take()  # it has it
+    assert not late.take(wait_s=0.05)
+    held.give()
+    assert late.take(wait_s=0.05)
+    late.give()
+    assert not compiled._Turn(Path("/dev/null/kernel.lock")).take()

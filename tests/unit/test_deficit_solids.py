@@ -110,6 +110,16 @@ def test_a_gap_in_a_thin_wall_in_a_bare_cloud() -> None:
     assert found.missing_mm3 == pytest.approx(96.0, rel=0.05)
 
 
+def test_a_fin_of_one_bead_goes_with_what_it_hung_on_in_a_bare_cloud() -> None:
+    """Thinner than twice the erosion: its 8 % stood in mid-air where the pillar beside was gone."""
+    fin = analytic.box((5, 10, 0), (35, 10.45, 13))
+    floor = analytic.box((0, 0, 0), (40, 30, 3))
+    part = analytic.union(analytic.union(floor, fin), analytic.box((18, 0, 0), (22, 25, 13)))
+    built = part.body - cube((20, 30, 12), (10, 0, 3))
+    true_mm3 = part.body.volume() - built.volume()
+    assert deficit_of(cloud(built), part).missing_mm3 == pytest.approx(true_mm3, rel=0.02)
+
+
 def test_a_tenth_of_a_millimetre_over_a_wide_area() -> None:
     """Under-extrusion below every single point's threshold, with an exact template."""
     built = BLOCK.body - cube((20, 10, 0.15), (10, 10, 9.85))

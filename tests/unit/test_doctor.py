@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 from amrepair import doctor
 from amrepair.cli.app import app
 from amrepair.doctor import Finding, SerialPort, State
+from amrepair.doctor.options import tunables
 from amrepair.errors import MissingDependencyError
+from amrepair.policy import PolicyOptions
 from gcode.profiles import profile_dir
 
 ROOT = Path(__file__).parents[2]
@@ -156,3 +158,21 @@ def test_without_its_libraries_the_program_still_says_what_is_missing() -> None:
     assert "Traceback" not in done.stderr
     assert "libraries: " in done.stderr
     assert "pip install" in done.stderr
+
+
+def test_every_number_that_can_be_set_is_told_with_its_reason() -> None:
+    found = tunables()
+    assert {one.options.rpartition(".")[2] for one in found} >= {
+        "PolicyOptions", "RepairOptions", "RegionOptions", "OccupancyOptions", "TouchOptions",
+    }  # fmt: skip
+    assert [f"{one.options}.{one.name}" for one in found if not one.reason] == []
+    (least,) = (one for one in found if one.name == "least_mm3")
+    assert (least.value, least.unit) == (PolicyOptions().least_mm3, "mm³")
+    assert "a bead 11 mm long" in least.reason
+
+
+def test_the_command_tells_them_without_a_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amrepair.cli.health.examine", lambda tell: pytest.fail("it checked"))
+    done = CliRunner().invoke(app, ["doctor", "--options", "--json"])
+    assert done.exit_code == 0, done.output
+    assert {one["name"] for one in json.loads(done.stdout)["options"]} >= {"false_regions", "sure"}

@@ -23,7 +23,7 @@ from amrepair.cli.app import app
 from amrepair.cli.live import ShownRun, show_file
 from amrepair.errors import InputError, MissingDependencyError
 from amrepair.loop import Look, Stop
-from amrepair.loop.decide import Action, Cover, Finding, Situation, decide, judge
+from amrepair.policy.table import Action, Cover, Finding, Situation, decide, judge
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import RepairPlan
 from amrepair.report import guarded

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amrepair.loop.decide import (
+from amrepair.loop.findings import _whole_defects
+from amrepair.policy.table import (
     FINDINGS,
     STOPS,
     Action,
@@ -21,7 +22,6 @@ from amrepair.loop.decide import (
     judge,
     tables,
 )
-from amrepair.loop.findings import _whole_defects
 from amrepair.regions.anomaly import DefectType, Label, Region
 
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "decisions.md"

@@ -8,9 +8,9 @@ import manifold3d as m3
 import numpy as np
 import pytest
 
-from amrepair.loop.decide import Action, Cover, Finding, judge
-from amrepair.loop.layer_level import FlowTest, LayerLevel
+from amrepair.loop.layer_level import FlowOptions, LayerLevel
 from amrepair.loop.next_layer import gap_solids
+from amrepair.policy.table import Action, Cover, Finding, judge
 from amrepair.regions.anomaly import DefectType
 
 LAYER_MM, Z_MM = 0.2, 2.0
@@ -61,7 +61,7 @@ def test_clean_layers_change_nothing_wherever_one_looks() -> None:
 
 def test_the_rate_of_false_alarms_is_no_more_than_stated() -> None:
     """With no tolerance at all, and the worst of disjoint places, the promise still holds."""
-    options = FlowTest(false_alarm=0.1, tolerance_layers=0.0)
+    options = FlowOptions(false_alarm=0.1, tolerance_layers=0.0)
     alarms, looks = 0, 300
     for seed in range(looks):
         rng = np.random.default_rng([7, seed])

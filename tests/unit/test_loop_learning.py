@@ -66,7 +66,7 @@ def _run(
     stops = plan_stops(small.job, LAYERS, final=False)
     setting = Setting.of(
         small.setup, ("prusa_mk3s", "pla", "repair_0.20"), stops=stops,
-        build_from_template=small.placed, by_beads=False, seed=0, max_iterations=3,
+        build_from_template=small.placed, by_beads=False, seed=0,
         build_from_scanner=Transform.identity("build", "scanner"),
         sound=() if given is None else astuple(given),
     )  # fmt: skip
@@ -74,7 +74,7 @@ def _run(
     said: list[str] = []
     report, _ = small.run(
         folder, _scans(small, wave_mm), stops=stops, tape=Tape(folder), calibration=given,
-        record=RunFolder(folder).record, progress=lambda stage, done, total: said.append(stage),
+        look=RunFolder(folder).record, progress=lambda stage, done, total: said.append(stage),
     )  # fmt: skip
     return report, stops, said
 

@@ -88,12 +88,12 @@ def test_an_adaptive_run_looks_again_soon_and_is_replayed(small: Small, tmp_path
     setting = Setting.of(
         small.setup, ("prusa_mk3s", "pla", "repair_0.20"), stops=stops,
         build_from_template=small.placed, build_from_scanner=small.pose, by_beads=False, seed=0,
-        max_iterations=3, adaptive=6,
+        adaptive=6,
     )  # fmt: skip
     keep(folder, setting, small.job.program.text, small.template)
     report, _ = small.run(
         folder, eye.scan, stops=stops, pace=Pace(6), tape=Tape(folder),
-        record=RunFolder(folder).record,
+        look=RunFolder(folder).record,
     )  # fmt: skip
     assert [stop.label for stop in report.stops] == [
         "layer-005", "layer-006", "layer-008", "layer-012", "final",

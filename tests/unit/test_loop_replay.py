@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from loop_bench import LAYER, Small, scan_of
 
+from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import Tape, plan_stops
-from amrepair.loop.replay import replay
+from amrepair.loop.replay import decide_again, replay
 from amrepair.loop.setting import Setting, keep
 from amrepair.report.folder import RunFolder
 
@@ -24,7 +25,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         small.setup, ("prusa_mk3s", "pla", "repair_0.20"),
         stops=plan_stops(small.job, [LAYER], final=False), build_from_template=small.placed,
         build_from_scanner=Transform.identity("build", "scanner"), by_beads=False, seed=0,
-        max_iterations=3,
     )  # fmt: skip
     keep(folder, setting, small.job.program.text, small.template)
     pocket = small.block(-0.6, 0.5)
@@ -32,7 +32,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder,
         lambda n: scan_of(small.standing - pocket if n == 1 else small.standing),
         tape=Tape(folder),
-        record=RunFolder(folder).record,
+        look=RunFolder(folder).record,
     )
     return folder
 
@@ -57,3 +57,17 @@ def test_what_is_decided_differently_is_said(recorded: Path, tmp_path: Path) -> 
     assert second.stop == f"layer-{LAYER:03d}"
     said = json.loads((tmp_path / "run.json").read_text())
     assert said["layers"] == [LAYER]
+
+
+def test_facts_alone_lead_to_the_same_decisions_and_to_others_by_other_rules(
+    recorded: Path, tmp_path: Path
+) -> None:
+    for name in ("run.json", "run.jsonl", "job.gcode", "template.npz"):
+        (tmp_path / name).write_bytes((recorded / name).read_bytes())  # and no scan
+    assert [look.differences for look in decide_again(tmp_path)] == [(), ()]
+    first, second = decide_again(tmp_path, ["least_mm3=1000"])
+    assert "decided 'fill now' by S9 then, 'go on' by S12 now" in first.differences
+    assert not second.differences
+    for rule, said in (("least=2", "there is no rule 'least'"), ("sure=high", "has no number")):
+        with pytest.raises(InputError, match=said):
+            decide_again(tmp_path, [rule])

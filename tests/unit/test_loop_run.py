@@ -11,8 +11,8 @@ from loop_bench import LAYER, Small, scan_of
 from amrepair.errors import ScannerError
 from amrepair.frames import Transform
 from amrepair.loop import Action, Tape
-from amrepair.loop.limits import Limits
 from amrepair.loop.tape import read_events
+from amrepair.policy.unasked import Limits
 from amrepair.scans import Scan
 from gcode.moves import Program
 from gcode.reader import read_job

@@ -11,7 +11,7 @@ import pytest
 from loop_bench import LAYER, Scripted, Small, scan_of
 from test_hosts_octoprint import FakeOctoPrint, printer_at
 
-from amrepair.loop import LoopReport, Tape, plan_stops, run_loop
+from amrepair.loop import LoopReport, Records, Tape, plan_stops, run_loop
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.sites import sites
 from amrepair.report.folder import RunFolder
@@ -64,9 +64,11 @@ def run(
             Scripted(scans),
             sites(small.job, small.template, small.placed, small.setup, by_beads=False),
             stops=plan_stops(small.job, [LAYER], final=False),
-            record=RunFolder(folder).record,
-            tape=tape,
-            pick_up=pick_up(printer, release_c=40.0) if going_on else None,
+            records=Records(
+                RunFolder(folder).record,
+                tape=tape,
+                pick_up=pick_up(printer, release_c=40.0) if going_on else None,
+            ),
         )
     finally:
         printer.close()

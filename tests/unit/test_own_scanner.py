@@ -90,4 +90,12 @@ def test_a_scanner_is_known_without_being_opened(tmp_path: Path) -> None:
 
 def test_a_folder_is_watched(tmp_path: Path) -> None:
     assert isinstance(open_scanner(f"watch:{tmp_path}", bed()), WatchedFolderScanner)
-    assert set(SCANNERS) == {"watch", "simulated", "python"}
+    assert set(SCANNERS) == {"watch", "simulated", "python", "probe"}
+
+
+def test_the_printers_own_probe_needs_a_job() -> None:
+    known_scanner("probe")
+    with pytest.raises(InputError, match="needs no calibration"):
+        open_scanner("probe", bed())
+    with pytest.raises(InputError, match="probe for the printer's own"):
+        known_scanner("probe:somewhere")

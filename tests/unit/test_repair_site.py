@@ -12,7 +12,8 @@ from amrepair.align import align
 from amrepair.frames import Transform
 from amrepair.loop import Stop
 from amrepair.loop.sites import sites
-from amrepair.repair import Site, _outside_open_infill, _told_to_go_beyond
+from amrepair.repair import Site
+from amrepair.repair.in_view import outside_open_infill, told_to_go_beyond
 from amrepair.scans import Scan
 
 
@@ -44,7 +45,7 @@ def test_a_clean_look_into_shallow_open_infill_fits(small: Small, above_skin: in
     site, _ = look(small, layer)
     scan = scan_from_above(site, small.placed, 0.1)
     guess = Transform("template", "scanner", small.placed.inverse().matrix)
-    found = align(_outside_open_infill(scan, site, guess), site.template, guess=guess)
+    found = align(outside_open_infill(scan, site, guess), site.template, guess=guess)
     moved = found.template_from_scan.apply(scan.points_mm)
     off_mm = moved - small.placed.inverse().apply(scan.points_mm) - [0.0, 0.0, 0.1]
     assert np.abs(off_mm).max() < 0.06
@@ -59,7 +60,7 @@ def test_what_is_missing_below_a_layer_still_counts_against_the_fit(small: Small
     floor = (inside_mm < -0.3) & (inside_mm > -0.45)
     assert floor.sum() > 300
     deeper = replace(scan, points_mm=scan.points_mm - floor[:, None] * [0.0, 0.0, 0.3])
-    kept = [len(_outside_open_infill(one, site, guess)) for one in (scan, deeper)]
+    kept = [len(outside_open_infill(one, site, guess)) for one in (scan, deeper)]
     assert kept[0] < len(scan) - 0.9 * floor.sum()
     assert kept[1] > kept[0]
 
@@ -76,9 +77,9 @@ def test_a_site_tells_in_its_templates_frame_what_its_job_leaves(small: Small) -
     # our own slicer fills a solid layer to a per cent: 4 mm of it and 2.3 % of filament
     assert (offset + tolerance).max() < 0.25
     assert (offset - tolerance).min() > -0.1
-    beyond = _told_to_go_beyond(site, site.planned or site.template, small.placed)
+    beyond = told_to_go_beyond(site, small.placed)
     assert beyond is not None
     out_mm = beyond(wall, np.full(9, site.allowance_mm))
     assert out_mm.max() > 0
     assert (beyond(wall, np.zeros(9)) == 0).all()  # what is within the allowance is not asked
-    assert _told_to_go_beyond(replace(site, laid=None), site.template, small.placed) is None
+    assert told_to_go_beyond(replace(site, laid=None), small.placed) is None

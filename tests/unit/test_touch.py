@@ -13,7 +13,7 @@ from touch_job import HEIGHT_MM, SPARSE_LAYER, X_MM, Y_MM, touch_job
 
 from gcode.check import Touch, find_refusals
 from gcode.check.checker import judge
-from gcode.errors import InputError
+from gcode.errors import InputError, ProfileError
 from gcode.firmware import FirmwareCore
 from gcode.firmware.contact import Contact
 from gcode.moves import Program
@@ -113,8 +113,9 @@ def test_the_mesh_is_on_where_the_job_goes_on_with_it(setup: PrintSetup) -> None
 @pytest.mark.parametrize(
     ("printer", "above_mm", "layer", "why"),
     [
-        ("generic_klipper", 4.0, 2, "speaks klipper"),
         ("prusa_mk3s", 4.0, 2, "speaks prusa"),
+        ("prusa_mk4", 4.0, 2, "has no probe that feels plastic"),
+        ("ender_3", 4.0, 2, "has no probe that feels plastic"),
         ("generic_marlin", 1.0, 2, "2 to 10 mm"),
         ("generic_marlin", 11.0, 2, "2 to 10 mm"),
         ("generic_marlin", float("nan"), 2, "2 to 10 mm"),
@@ -128,7 +129,7 @@ def test_what_cannot_be_touched_is_refused(
 ) -> None:
     setup = load_setup(printer, "pla")
     job = touch_job(setup.printer.dialect)
-    with pytest.raises(InputError, match=why):
+    with pytest.raises((InputError, ProfileError), match=why):
         plan_touch(job, setup, above_mm=above_mm, layer=layer)
 
 
@@ -147,6 +148,46 @@ def test_the_emulated_nozzle_stops_at_what_it_feels(
     assert ("Failed to reach target" in said) is not met
     assert f"Z:{3.0 if met else 1.5:.3f}" in said
     assert core.machine.contact.deepest_mm == pytest.approx(0.0 if met else 1.5, abs=1e-9)
+
+
+def klipper_touch(touch: str, *, hot: bool = False) -> Program:
+    before = ["M104 S200"] if hot else []
+    lines = ["G90", "M83", "G1 Z13 F300", "G28 X Y", "G1 X100 Y100 F6000", touch, "G1 Z13 F300"]
+    return Program("\n".join([*before, *lines]) + "\n", "klipper")
+
+
+@pytest.mark.parametrize(
+    ("touch", "hot", "why"),
+    [
+        ("AMREPAIR_TOUCH DEPTH=10.3 SPEED=2", False, ""),
+        ("AMREPAIR_TOUCH DEPTH=10.5 SPEED=2", False, "below its planned depth"),
+        ("AMREPAIR_TOUCH SPEED=2", False, "not straight down"),
+        ("AMREPAIR_TOUCH DEPTH=10.3", False, "too fast"),
+        ("AMREPAIR_TOUCH DEPTH=10.3 SPEED=20", False, "too fast"),
+        ("AMREPAIR_TOUCH DEPTH=10.3 SPEED=2 SAMPLES=3", False, "not straight down"),
+        ("AMREPAIR_TOUCH DEPTH=10.3 SPEED=2", True, "hot nozzle"),
+        ("PROBE", False, "unknown or not allowed"),
+    ],
+)
+def test_klippers_touch_is_as_deep_as_planned(touch: str, hot: bool, why: str) -> None:
+    klipper = load_setup("generic_klipper", "pla")
+    told = refused(klipper_touch(touch, hot=hot), klipper)
+    assert told == "" if not why else why in told
+
+
+def test_a_flat_rests_on_the_highest_place_below_it() -> None:
+    """A pit narrower than the flat is not felt, however deep; a wider one is."""
+    z_mm = np.full((100, 100), 3.0)
+    y, x = np.mgrid[:100, :100]
+    away_mm = 0.1 * np.hypot(x - 49.5, y - 49.5)
+    for pit_mm, felt_mm in ((0.45, 3.0), (0.7, 2.0)):
+        field = HeightField(
+            np.zeros(2), 0.1, np.where(away_mm < pit_mm, 2.0, z_mm), np.ones_like(z_mm, bool)
+        )
+        contact = Contact(field, sigma_mm=0.0, tip_radius_mm=0.5)
+        assert contact.met_at_mm(5.0, 5.0) == felt_mm
+        beside = Contact(field, sigma_mm=0.0, tip_radius_mm=0.5, offset_mm=(2.0, 0.0, -1.5))
+        assert beside.met_at_mm(3.0, 5.0) == felt_mm + 1.5  # the nozzle stays above
 
 
 def test_prusas_firmware_and_klipper_know_no_such_touch(setup: PrintSetup) -> None:

@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
+from amrepair.policy.options import POLICY, PolicyOptions
 from amrepair.regions.anomaly import DefectType
-from amrepair.repair import EXCESS_LAYERS, MIN_EXCESS_MM3, MIN_REPAIR_MM3, MIN_SKIPPED_MM3
 
 
 class Action(StrEnum):
@@ -119,13 +119,19 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One fact compared with one value."""
+    """One fact compared with one value.
+
+    Attributes
+    ----------
+    value
+        What it is to be; of a measure (`≥`, `<`) a number, or the name of one in `PolicyOptions`.
+    """
 
     fact: str
     test: str
     value: Any
 
-    def fits(self, facts: Finding | Situation) -> bool:
+    def fits(self, facts: Finding | Situation, options: PolicyOptions = POLICY) -> bool:
         """Whether it holds."""
         found = getattr(facts, self.fact)
         if self.test == "is":
@@ -134,7 +140,12 @@ class Condition:
             return found in self.value
         if self.test == "stated":
             return bool(found)
-        return bool(found >= self.value) if self.test == "≥" else bool(found < self.value)
+        limit = self.limit(options)
+        return bool(found >= limit) if self.test == "≥" else bool(found < limit)
+
+    def limit(self, options: PolicyOptions) -> float:
+        """What a measure is compared with: a number of the options, by its name, or itself."""
+        return float(getattr(options, self.value) if isinstance(self.value, str) else self.value)
 
     def __str__(self) -> str:
         if self.test == "stated":
@@ -143,8 +154,9 @@ class Condition:
             return self._name() if self.value else f"not {self._name()}"
         if self.test == "in":
             return f"{self._name()} is {' or '.join(str(v) for v in self.value)}"
-        value = f"{self.value:g}" if isinstance(self.value, float) else str(self.value)
-        return f"{self._name()} {self.test} {value}{_UNITS.get(self.fact, '')}"
+        if self.test == "is":
+            return f"{self._name()} is {self.value}"
+        return f"{self._name()} {self.test} {self.limit(POLICY):g}{_UNITS.get(self.fact, '')}"
 
     def _name(self) -> str:
         return _NAMES.get(self.fact, self.fact)
@@ -189,25 +201,11 @@ class Row:
     when: tuple[Condition, ...]
     reason: str
 
-    def fits(self, facts: Finding | Situation) -> bool:
+    def fits(self, facts: Finding | Situation, options: PolicyOptions = POLICY) -> bool:
         """Whether all its conditions hold."""
-        return all(condition.fits(facts) for condition in self.when)
+        return all(condition.fits(facts, options) for condition in self.when)
 
 
-SURE = 0.9
-"""Confidence from which a run is ended without asking first."""
-DOUBTFUL = 0.25
-"""Confidence below which another look is taken."""
-THIN_LAYERS = 0.75
-"""A bead laid into less than this has no room under the nozzle."""
-ONE_LAYER = 1.75
-"""What is lower than this, noise and all, lies within one layer."""
-LEAST_LAYERS = 0.2
-"""Less than this is within what a layer's beads differ by themselves."""
-LOST_RATIO = 0.5
-"""An object of which more is gone has nothing left that a repair could stand on."""
-LEAST_HIT_MM3 = 0.1
-"""A drop 0.6 mm across: less bends away, or melts under the nozzle."""
 ENDS = (DefectType.DETACHED, DefectType.LAYER_SHIFT)
 BEYOND_MENDING = (*ENDS, DefectType.WARP, DefectType.CLOG)
 """What adding material cannot mend."""
@@ -217,17 +215,17 @@ def _is(fact: str, value: object) -> Condition:
     return Condition(fact, "in" if isinstance(value, tuple) else "is", value)
 
 
-def _from(fact: str, value: float) -> Condition:
+def _from(fact: str, value: float | str) -> Condition:
     return Condition(fact, "≥", value)
 
 
-def _below(fact: str, value: float) -> Condition:
+def _below(fact: str, value: float | str) -> Condition:
     return Condition(fact, "<", value)
 
 
 _THIN = (
-    _is("skipped", False), _below("thickness_layers", THIN_LAYERS),
-    _from("thickness_layers", LEAST_LAYERS), _below("height_layers", ONE_LAYER),
+    _is("skipped", False), _below("thickness_layers", "thin_layers"),
+    _from("thickness_layers", "least_layers"), _below("height_layers", "one_layer"),
     _is("cover", Cover.SOLID),
 )  # fmt: skip
 _MISSING, _EXCESS = _is("kind", "missing"), _is("kind", "excess")
@@ -236,54 +234,54 @@ _OWN = Condition("object", "stated", None)
 FINDINGS: tuple[Row, ...] = (
     Row("F0a", Action.GO_ON, (_is("given_up", True),),
         "nothing more is printed of that object"),
-    Row("F0b", Action.LOOK_AGAIN, (_MISSING, _OWN, _from("lost_ratio", LOST_RATIO),
+    Row("F0b", Action.LOOK_AGAIN, (_MISSING, _OWN, _from("lost_ratio", "lost_ratio"),
                                    _is("seen_twice", False)),
         "a false alarm would cost the object"),
-    Row("F0c", Action.GIVE_UP, (_MISSING, _OWN, _from("lost_ratio", LOST_RATIO)),
+    Row("F0c", Action.GIVE_UP, (_MISSING, _OWN, _from("lost_ratio", "lost_ratio")),
         "too little is left of the object to repair it; the others can go on"),
-    Row("F1", Action.STOP, (_is("type", ENDS), _from("confidence", SURE)),
+    Row("F1", Action.STOP, (_is("type", ENDS), _from("confidence", "sure")),
         "what is printed from here on would land beside the part"),
-    Row("F2", Action.LOOK_AGAIN, (_is("type", BEYOND_MENDING), _below("confidence", SURE),
+    Row("F2", Action.LOOK_AGAIN, (_is("type", BEYOND_MENDING), _below("confidence", "sure"),
                                   _is("seen_twice", False)),
         "a false alarm would cost the print"),
     Row("F3a", Action.GIVE_UP, (_is("type", (DefectType.WARP,)), _OWN),
         "adding material cannot mend it; the other objects can go on"),
     Row("F3", Action.PAUSE, (_is("type", BEYOND_MENDING),),
         "adding material cannot mend it; somebody has to look"),
-    Row("F4a", Action.GIVE_UP, (_EXCESS, _OWN, _from("volume_mm3", LEAST_HIT_MM3),
+    Row("F4a", Action.GIVE_UP, (_EXCESS, _OWN, _from("volume_mm3", "least_hit_mm3"),
                                 _from("hit_mm", 1e-6)),
         "the head would hit it on its next moves; the other objects can go on"),
-    Row("F4", Action.PAUSE, (_EXCESS, _from("volume_mm3", LEAST_HIT_MM3), _from("hit_mm", 1e-6)),
+    Row("F4", Action.PAUSE, (_EXCESS, _from("volume_mm3", "least_hit_mm3"), _from("hit_mm", 1e-6)),
         "the head would hit it on its next moves; cut it off, or end the print"),
     Row("F5", Action.GO_ON, (_EXCESS, _is("type", (DefectType.STRING,))),
         "strings come off by hand, and the nozzle melts through them"),
-    Row("F6", Action.LOWER_NEXT, (_EXCESS, _from("volume_mm3", MIN_EXCESS_MM3),
-                                  _from("thickness_layers", LEAST_LAYERS),
-                                  _below("thickness_layers", EXCESS_LAYERS),
+    Row("F6", Action.LOWER_NEXT, (_EXCESS, _from("volume_mm3", "least_excess_mm3"),
+                                  _from("thickness_layers", "least_layers"),
+                                  _below("thickness_layers", "excess_layers"),
                                   _is("cover", (Cover.SOLID, Cover.OPEN)),
                                   _is("layer_off", True)),
         "the next layer's beads have less room there"),
     Row("F7", Action.GO_ON, (_EXCESS,),
         "printing cannot take excess away"),
     Row("F8a", Action.GO_ON, (_MISSING, _is("skipped", False),
-                              _below("defect_mm3", MIN_REPAIR_MM3)),
+                              _below("defect_mm3", "least_mm3")),
         "smaller than is worth a repair"),
-    Row("F8b", Action.GO_ON, (_MISSING, _below("defect_mm3", MIN_SKIPPED_MM3)),
+    Row("F8b", Action.GO_ON, (_MISSING, _below("defect_mm3", "least_skipped_mm3")),
         "less of the job's lines is gone than is worth a repair"),
-    Row("F9", Action.LOOK_AGAIN, (_MISSING, _below("confidence", DOUBTFUL),
+    Row("F9", Action.LOOK_AGAIN, (_MISSING, _below("confidence", "doubtful"),
                                   _is("seen_twice", False)),
         "it hardly stands out from the noise"),
-    Row("F10", Action.GO_ON, (_MISSING, _below("confidence", DOUBTFUL)),
+    Row("F10", Action.GO_ON, (_MISSING, _below("confidence", "doubtful")),
         "two looks do not make it stand out from the noise"),
     Row("F11a", Action.GO_ON, (_MISSING, *_THIN, _is("layer_off", False)),
         "no more than the layer's own beads differ by"),
     Row("F11b", Action.FILL_WITH_NEXT, (_MISSING, *_THIN),
         "thinner than a bead of its own; the next layer's beads can carry it"),
-    Row("F12", Action.FILL_WITH_NEXT, (_MISSING, _below("reachable_ratio", 0.05),
-                                       _below("height_layers", ONE_LAYER),
+    Row("F12", Action.FILL_WITH_NEXT, (_MISSING, _below("reachable_ratio", "least_reach_ratio"),
+                                       _below("height_layers", "one_layer"),
                                        _is("cover", Cover.SOLID), _is("layer_off", True)),
         "the nozzle cannot get down to it, and the next layer's beads can carry it"),
-    Row("F13", Action.GO_ON, (_MISSING, _below("reachable_ratio", 0.05)),
+    Row("F13", Action.GO_ON, (_MISSING, _below("reachable_ratio", "least_reach_ratio")),
         "nothing of it can be reached"),
     Row("F14", Action.FILL_NOW, (_MISSING,),
         "a bead fits, and the nozzle reaches it"),
@@ -366,9 +364,9 @@ class Decision:
         }  # fmt: skip
 
 
-def judge(finding: Finding) -> Verdict:
+def judge(finding: Finding, options: PolicyOptions = POLICY) -> Verdict:
     """The first row that fits a finding."""
-    row = next(row for row in FINDINGS if row.fits(finding))
+    row = next(row for row in FINDINGS if row.fits(finding, options))
     return Verdict(finding, row.action, row.id, row.reason)
 
 

@@ -1,0 +1,102 @@
+"""From touches to a scan: what each touch says of the surface around it, and how surely.
+
+A tip with a flat of radius r rests on the highest place below it. So a touch that is low says that
+all within r is at least as low, one that is not that something within r is as high: the rim between
+a low one at p and another at q lies anywhere from p + r to q + r, in the mean at their middle + r.
+Each speaks as far as a bead beside its flat; farther off nothing is known, which is not to say that
+it is missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from amrepair.loop.touch_design import FLAT_MM, Flats
+from amrepair.regions.options import RegionOptions
+from amrepair.scans import PROBE, Scan
+
+PRIOR_TOUCHES = 4
+"""The profile's noise counts as so many touches beside those that measure it."""
+SURE_SIGMAS = 4.0
+SIGHT_MM = 3000.0
+"""Touches come from straight above: as rays, from so high that they slant by no hundredth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Touches:
+    """What was felt at one look, build frame.
+
+    Attributes
+    ----------
+    place_mm
+        (n, 3) XY, and the height that was felt.
+    planned_mm
+        (n,) the job's own height there.
+    sigma_mm
+        Standard deviation of one touch.
+    """
+
+    place_mm: Float[np.ndarray, "n 3"]
+    planned_mm: Float[np.ndarray, " n"]
+    sigma_mm: float
+
+    @property
+    def off_mm(self) -> Float[np.ndarray, " n"]:
+        """(n,) higher than planned; negative: lower."""
+        return np.asarray(self.place_mm[:, 2] - self.planned_mm)
+
+    def is_off(self, options: RegionOptions) -> Bool[np.ndarray, " n"]:
+        """(n,) whether a touch is beyond what a region goes on to, and beyond noise."""
+        allowed_mm = options.top_allowance_mm + options.registration_sigma_mm
+        least_mm = max(options.grow_share * allowed_mm, SURE_SIGMAS * self.sigma_mm)
+        return np.asarray(np.abs(self.off_mm) > least_mm)
+
+
+def measured_sigma_mm(repeated_mm: Float[np.ndarray, " r"], told_mm: float) -> float:
+    """Standard deviation of one touch, from touches of one place and what the profile says.
+
+    Its variance is the mean of its inverse-gamma posterior, the profile's value as prior.
+    """
+    spread_mm2 = float(((repeated_mm - repeated_mm.mean()) ** 2).sum()) if len(repeated_mm) else 0.0
+    freedom = max(len(repeated_mm) - 1, 0)
+    return float(np.sqrt((PRIOR_TOUCHES * told_mm**2 + spread_mm2) / (PRIOR_TOUCHES + freedom)))
+
+
+def scan_of(
+    touches: Touches, flats: Flats, *, tip_radius_mm: float, reach_mm: float, source: str
+) -> Scan:
+    """The touches as a scan: every cell of the grid that one of them speaks of.
+
+    Parameters
+    ----------
+    reach_mm
+        How far from its middle a touch speaks.
+    """
+    xy_mm, is_low = touches.place_mm[:, :2], touches.is_off(RegionOptions()) & (touches.off_mm < 0)
+    rows, columns = np.nonzero(np.isfinite(flats.top_mm))
+    cells_mm, tops_mm = flats.xy_mm(rows, columns), flats.top_mm[rows, columns]
+    best, nearest_mm = np.full(len(cells_mm), np.inf), np.full(len(cells_mm), np.inf)
+    owner = np.full(len(cells_mm), -1)
+    for k, place in enumerate(xy_mm):
+        own = np.abs(tops_mm - touches.planned_mm[k]) < FLAT_MM  # of another flat it says nothing
+        away = np.linalg.norm(cells_mm - place, axis=1)
+        lead = away - (tip_radius_mm if is_low[k] else -tip_radius_mm)
+        nearer = own & (away <= reach_mm + tip_radius_mm) & (lead < best)
+        best[nearer], owner[nearer] = lead[nearer], k
+        nearest_mm[own] = np.minimum(nearest_mm[own], away[own])
+    said = nearest_mm <= reach_mm
+    points = np.column_stack([cells_mm[said], touches.place_mm[owner[said], 2]])
+    # a touch itself, wherever it lies in its cell
+    points = np.concatenate([points, touches.place_mm])
+    middle = points.mean(axis=0) + np.array([0.0, 0.0, SIGHT_MM])
+    return Scan(
+        points,
+        touches.sigma_mm,
+        PROBE,
+        sensors_mm=middle[None],
+        sensor_index=np.zeros(len(points), np.int64),
+        source=source,
+    )

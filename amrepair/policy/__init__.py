@@ -1,0 +1,25 @@
+"""Policy: what is worth a repair, in which order, when to ask, and when to give up.
+
+Frozen rules with their reasons, and pure functions on results: nothing here measures, prints, asks
+or reads a file. A recorded run is judged again by this room alone (`policy.again`).
+"""
+
+from amrepair.policy.options import POLICY, PolicyOptions
+from amrepair.policy.table import (
+    FINDINGS,
+    STOPS,
+    Action,
+    Condition,
+    Decision,
+    Row,
+    Verdict,
+    decide,
+    gravest,
+    judge,
+    tables,
+)
+
+__all__ = [
+    "FINDINGS", "POLICY", "STOPS", "Action", "Condition", "Decision", "PolicyOptions", "Row",
+    "Verdict", "decide", "gravest", "judge", "tables",
+]  # fmt: skip

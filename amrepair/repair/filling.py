@@ -1,0 +1,76 @@
+"""Which pieces of a deficit are filled, and what a repair of them rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import manifold3d
+import numpy as np
+
+from amrepair.align.registration import Registration
+from amrepair.deficit import Deficit
+from amrepair.errors import AlignmentError
+from amrepair.frames import Transform
+from amrepair.policy import PolicyOptions, worth
+from amrepair.regions import Label, Region
+from amrepair.repair.site import Site
+from amrepair.scans import Scan
+from gcode.slicing.job_lines import JobLines
+
+
+def fillable(
+    deficit: Deficit, wanted: Callable[[Region], bool], policy: PolicyOptions
+) -> manifold3d.Manifold:
+    """The missing pieces that are worth a repair, and wanted in it."""
+    pieces = deficit.missing.decompose()
+    boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
+    regions = [region for region in deficit.regions if region.label is Label.MISSING]
+    of_piece = [_region_of(piece, regions) if regions else None for piece in pieces]
+    lines = [region is not None and region.skipped for region in of_piece]
+    keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces], lines, policy)
+    filled = [
+        piece
+        for piece, region, kept in zip(pieces, of_piece, keep, strict=True)
+        if kept and (region is None or wanted(region))
+    ]
+    if not filled:
+        return manifold3d.Manifold()
+    return manifold3d.Manifold.batch_boolean(filled, manifold3d.OpType.Add)
+
+
+def lines_of(site: Site, deficit: Deficit, placed: Transform) -> JobLines | None:
+    """The job's lines, and which stretches of them the deficit says are gone, build frame."""
+    if site.lines is None or deficit.gone is None:
+        return site.lines
+    ends = [placed.apply(ends_mm) for ends_mm in (deficit.gone.start_mm, deficit.gone.end_mm)]
+    return replace(site.lines, gone_mm=np.stack(ends, axis=1))
+
+
+def _region_of(piece: manifold3d.Manifold, regions: list[Region]) -> Region:
+    """The region that a piece is: the one whose box is nearest to its own."""
+    box = np.asarray(piece.bounding_box()).reshape(2, 3)
+    off_mm = [float(np.abs(np.asarray(region.box_mm) - box).max()) for region in regions]
+    return regions[int(np.argmin(off_mm))]
+
+
+def refuse_ambiguity(scan: Scan, site: Site, registration: Registration, deficit: Deficit) -> None:
+    """Refuse a pose that fits no better than another which would repair something else."""
+    if site.build_from_template is None or deficit.missing.is_empty():
+        return  # the scan is in the build frame: every pose that fits puts the repair there
+    for other in registration.symmetric_alternatives:
+        # the same scanned hole, seen in the template through the other pose
+        motion = (
+            site.build_from_template
+            @ other
+            @ registration.template_from_scan.inverse()
+            @ site.build_from_template.inverse()
+        )
+        turned = deficit.missing.transform(motion.matrix[:3])
+        shared_mm3 = (turned ^ deficit.missing).volume()
+        if shared_mm3 < site.options.same_repair_ratio * deficit.missing_mm3:
+            raise AlignmentError(
+                f"the scan {scan.source} fits its template in "
+                f"{1 + len(registration.symmetric_alternatives)} poses equally well, and they "
+                "would repair different places; scan in the build frame or give a better pose"
+            )

@@ -1,0 +1,104 @@
+"""What of a scan is held against what: without the infill's floor, skirts, and what lies below."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.frames import Transform, unit_vectors
+from amrepair.regions.sites import RoundedUp
+from amrepair.repair.site import Site
+from amrepair.scans import Scan
+from amrepair.template.laid import LaidBeads
+from amrepair.template.port import Template, is_off_bed
+
+
+def outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Scan:
+    """Without the points that look into sparse infill: deep inside the part, as CAD has it.
+
+    A layer or two above the bottom's skin they are not deep; then the beads tell them.
+    """
+    if site.planned is None or guess is None:
+        return scan
+    points_mm = guess.apply(scan.points_mm)
+    inside_mm = site.template.distance(points_mm)
+    keep = inside_mm > -site.options.open_infill_mm
+    shallow = np.flatnonzero(keep & (inside_mm < -site.grid.layer_height_mm))
+    as_planned_mm = np.abs(site.planned.distance(points_mm[shallow]))
+    keep[shallow] = as_planned_mm > 0.5 * np.abs(inside_mm[shallow])
+    return scan.subset(keep)
+
+
+def is_cut(site: Site) -> bool:
+    """Whether what is expected ends in mid-air, and not at the bed."""
+    return site.planned is not None and is_off_bed(site.planned)
+
+
+def of_the_part(scan: Scan, site: Site) -> Scan:
+    """Without what the job laid beside the part."""
+    if site.beside is None or site.build_from_template is None:
+        return scan
+    placed = site.build_from_template
+    height_mm = scan.points_mm @ placed.rotation[2] + placed.translation_mm[2]
+    # what lies nearly on the bed is taken for it anyhow
+    over_mm = site.options.over_beside_mm
+    over_bed = (height_mm > site.options.on_bed_mm) & (height_mm < site.beside.top_mm + over_mm)
+    low = np.flatnonzero(over_bed)
+    xy_mm = placed.apply(scan.points_mm[low])[:, :2]
+    high_mm = site.beside.sample(xy_mm, outside_mm=-np.inf) + over_mm
+    low = low[height_mm[low] < high_mm]
+    if not len(low):
+        return scan
+    keep = np.ones(len(scan), dtype=bool)
+    keep[low] = site.template.distance(scan.points_mm[low]) < site.options.off_the_part_mm
+    return scan.subset(keep)
+
+
+def told_to_go_beyond(site: Site, placed: Transform) -> RoundedUp | None:
+    """How far out the job itself goes, as `detect` asks it; with no more than it needs."""
+    if site.laid is None:
+        return None
+    return partial(_laid_beyond, site.laid, site.expected, 0.5 * site.allowance_mm, placed)
+
+
+def _laid_beyond(
+    laid: LaidBeads,
+    expected: Template,
+    least_mm: float,
+    placed: Transform,
+    place_mm: Float[np.ndarray, "s 3"],
+    deviation_mm: Float[np.ndarray, " s"],
+) -> Float[np.ndarray, " s"]:
+    """(s,) how far out of what is expected the job's own path may put each place."""
+    beyond_mm = np.zeros(len(place_mm))
+    some = np.flatnonzero(deviation_mm > least_mm)
+    if len(some):
+        normal = unit_vectors(expected.distance_and_gradient(place_mm[some])[1])
+        offset_mm, tolerance_mm = laid.expected_offset_mm(
+            placed.apply(place_mm[some]), placed.rotate(normal), deviation_mm[some]
+        )
+        beyond_mm[some] = offset_mm + tolerance_mm
+    return np.maximum(beyond_mm, 0.0)
+
+
+def of_layer(scan: Scan, site: Site) -> Scan:
+    """What a planned template can judge: its own last millimetres; all of it otherwise."""
+    if not is_cut(site):
+        return scan
+    assert site.planned is not None
+    low_mm = float(site.planned.bounds_mm[0, 2]) + site.options.planned_edge_mm
+    return scan.subset(scan.points_mm[:, 2] > low_mm)
+
+
+def top_of_layer(site: Site) -> float | None:
+    """Height of the layer just printed, template frame; None where none is, or it is tilted."""
+    placed = site.build_from_template
+    if (
+        placed is None
+        or site.printed_z_mm is None
+        or abs(placed.matrix[2, 2] - 1.0) > site.options.upright
+    ):
+        return None
+    return site.printed_z_mm - float(placed.translation_mm[2])

@@ -1,0 +1,45 @@
+"""The numbers of a repair that no profile and no measurement gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class RepairOptions:
+    """What of a scan is held against the template, and when two repairs are the same.
+
+    Attributes
+    ----------
+    planned_edge_mm
+        A planned template ends below; so near to its end its distances are not to be trusted.
+    open_infill_mm
+        Deeper inside than this, beyond a calibration's error, infill is open (or something is
+        missing: that tells nothing of the pose, either).
+    off_the_part_mm, over_beside_mm, on_bed_mm
+        What lies beside the part: so far off it, no higher than it was to be by this much, and
+        higher than what is taken for the bed.
+    as_built_cell_mm
+        Width of the columns of what stands there.
+    open_cell_margin_mm
+        What is added to what stands there where nobody saw it. No sensor sees to the bottom of a
+        deep cell of infill, and the nozzle has just been over it: nothing.
+    upright
+        A part stands upright where its Z is the bed's: 1 − cos of 0.05 mm over 100 mm.
+    same_repair_ratio
+        Two poses whose repairs share less than this are two different repairs.
+    """
+
+    planned_edge_mm: float = 1.0
+    open_infill_mm: float = 0.5
+    off_the_part_mm: float = 0.3
+    over_beside_mm: float = 0.3
+    on_bed_mm: float = 0.2
+    as_built_cell_mm: float = 0.25
+    open_cell_margin_mm: float = 0.0
+    upright: float = 1e-7
+    same_repair_ratio: float = 0.8
+
+
+REPAIR = RepairOptions()
+"""What the loop and the command line go by."""

@@ -1,0 +1,272 @@
+"""From a scan to a checked program, a call per stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import manifold3d
+import numpy as np
+
+from amrepair.align import align
+from amrepair.align.registration import Registration
+from amrepair.align.standing import refuse_impossible
+from amrepair.deficit import Deficit, as_built_heights, compute_deficit
+from amrepair.frames import Transform
+from amrepair.observe.rays import RangeImage, range_images
+from amrepair.regions import AnomalyMap, Region
+from amrepair.regions.calibration import of_touches
+from amrepair.regions.options import RegionOptions
+from amrepair.repair import in_view
+from amrepair.repair.filling import fillable, lines_of, refuse_ambiguity
+from amrepair.repair.plan import RepairPlan
+from amrepair.repair.site import Site
+from amrepair.repair.stopwatch import Stopwatch
+from amrepair.scans import PROBE, Scan
+from gcode.check import check
+from gcode.errors import CheckRefusedError
+from gcode.estimate import estimate
+from gcode.moves import ModalState
+from gcode.progress import Progress, silent
+from gcode.slicing.job_lines import JobLines
+from gcode.slicing.patch import PatchPlan, slice_patch
+from gcode.surfaces import HeightField
+from gcode.writer import write
+
+
+def plan_repair(
+    scan: Scan,
+    site: Site,
+    *,
+    title: str,
+    guess: Transform | None = None,
+    interruption: ModalState | None = None,
+    strict: bool = True,
+    wanted: Callable[[Region], bool] = lambda region: True,
+    rng: np.random.Generator | None = None,
+    watch: Stopwatch | None = None,
+    progress: Progress = silent,
+) -> RepairPlan:
+    """Align, detect, make the deficit, slice it, write and check it.
+
+    Parameters
+    ----------
+    scan
+        In whatever frame its sensor has; in that of the printer's probe no pose is looked for.
+    guess
+        A pose (template from the scan's frame) known beforehand; None searches from any pose.
+    interruption
+        The state of the machine in mid-job; None makes a whole program for a standing part.
+    strict
+        Raise where the checker refuses the program; else return a plan without one, that says so:
+        a job must not die of a patch that is never sent.
+    wanted
+        Which of the missing regions the program is to fill.
+
+    Raises
+    ------
+    AlignmentError
+        If the scan cannot be aligned, equally good poses lead to different repairs, or a finished
+        part would stand in the bed, in the air or beyond the printer.
+    DeficitError
+        If the deficit is no valid solid.
+    gcode.errors.GcodeError
+        If the deficit cannot be sliced or the checker refuses the program.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gcode
+    >>> from amrepair import Site, open_template, plan_repair, read_scan
+    >>> site = Site.of_part(open_template(Path("part.safetensors")), gcode.load_setup())
+    >>> plan = plan_repair(read_scan(Path("scan.ply"), frame="build"), site, title="repair")
+    >>> "G28 X Y" in plan.checked.program.text  # Z is never homed onto a part
+    True
+    """
+    watch = watch or Stopwatch()
+    if scan.frame == PROBE:  # it measures its noise itself
+        site = replace(site, calibration=of_touches(scan.sigma_mm, site.process_sigma_mm))
+    with watch("align"):
+        laid = _align(scan, site, guess, rng, progress)
+    with watch("detect"):
+        anomaly = _detect(laid, site, progress)
+    with watch("deficit"):
+        deficit = _deficit(laid, anomaly, site, progress)
+        refuse_ambiguity(scan, site, laid.registration, deficit)
+        missing = fillable(deficit, wanted, site.policy)
+    plan = laid.plan(anomaly, deficit, site)
+    if missing.is_empty():
+        return plan
+    with watch("deficit"):
+        as_built = deficit.as_built  # made where it is needed: a clean layer has no use for it
+    with watch("slice"):
+        lines = lines_of(site, deficit, laid.placed)
+        patch = _slice(missing, as_built, site, interruption, lines, progress)
+    plan = replace(plan, patch=patch)
+    if not patch.toolpath.extrusions:
+        return plan
+    with watch("check"):
+        return _checked(plan, site, title=title, interruption=interruption, strict=strict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Laid:
+    """A scan laid into its template.
+
+    Attributes
+    ----------
+    placed
+        Build from template.
+    whole, judged
+        The scan in the template's frame: all of it, and what is held against the template.
+    images
+        What rays saw, in the template's frame; None where what is expected ends in mid-air.
+    known
+        The pose was told and not looked for, as that of the printer's own probe.
+    """
+
+    registration: Registration
+    placed: Transform
+    whole: Scan
+    judged: Scan
+    images: tuple[RangeImage, ...] | None
+    known: bool
+
+    def plan(self, anomaly: AnomalyMap, deficit: Deficit, site: Site) -> RepairPlan:
+        """The verdict, as yet without a program."""
+        return RepairPlan(
+            self.registration,
+            anomaly,
+            deficit,
+            self.placed @ self.registration.template_from_scan,
+            site.setup.process.layer_height_mm,
+            self.judged,
+            site.policy,
+        )
+
+
+def _align(
+    scan: Scan,
+    site: Site,
+    guess: Transform | None,
+    rng: np.random.Generator | None,
+    progress: Progress,
+) -> _Laid:
+    """Lay the scan into the template; a pose in which a part cannot stand is refused."""
+    with ThreadPoolExecutor(1) as beside:
+        # what rays saw needs no pose, nor it them; a part of the scan has images of its own
+        seen = None if in_view.is_cut(site) else beside.submit(range_images, scan)
+        known = scan.frame == PROBE and guess is not None
+        if known and guess is not None:
+            registration = Registration.known(guess)
+        else:
+            outer = in_view.outside_open_infill(scan, site, guess)
+            registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
+    placed = site.stands_at(scan, registration)
+    if site.printed_z_mm is None:
+        said = site.build_from_template is not None or guess is not None
+        printer, raised = site.setup.printer, site.on_fixture
+        refuse_impossible(site.template, placed, printer, said=said, raised=raised)
+    moved = registration.template_from_scan
+    whole = scan.moved(moved)
+    return _Laid(
+        registration,
+        placed,
+        whole,
+        in_view.of_layer(in_view.of_the_part(whole, site), site),
+        None if seen is None else tuple(image.moved(moved) for image in seen.result()),
+        known,
+    )
+
+
+def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
+    """Hold the scan against what is expected."""
+    return site.detector(
+        laid.judged,
+        site.expected,
+        options=RegionOptions(
+            allowance_mm=site.allowance_mm, process_sigma_mm=site.process_sigma_mm
+        ),
+        calibration=site.calibration,
+        top_z_mm=in_view.top_of_layer(site),
+        images=laid.images,
+        surface=site.surface,
+        pose_is_known=laid.known,
+        rounded_up=in_view.told_to_go_beyond(site, laid.placed),
+        progress=progress,
+    )
+
+
+def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -> Deficit:
+    """Solids of what is missing and of what is too much, build frame."""
+    return compute_deficit(
+        laid.judged,
+        site.expected,
+        anomaly,
+        build_from_template=laid.placed,
+        printed_z_mm=site.printed_z_mm,
+        as_built=None if site.planned is None else partial(_stands, laid, anomaly, site),
+        beads=site.beads,
+        progress=progress,
+    )
+
+
+def _stands(laid: _Laid, anomaly: AnomalyMap, site: Site) -> HeightField:
+    """What stands there is all that was seen, the bottoms of open cells too."""
+    evidence = anomaly.evidence
+    assert evidence is not None
+    return as_built_heights(
+        laid.whole,
+        site.template,
+        evidence.spacing_mm,
+        build_from_template=laid.placed,
+        printed_z_mm=site.printed_z_mm,
+        cell_mm=site.options.as_built_cell_mm,
+        unseen_margin_mm=site.options.open_cell_margin_mm,
+        images=evidence.images,
+    )
+
+
+def _slice(
+    missing: manifold3d.Manifold,
+    as_built: HeightField,
+    site: Site,
+    interruption: ModalState | None,
+    lines: JobLines | None,
+    progress: Progress,
+) -> PatchPlan:
+    """Toolpaths that fill what is missing, onto what stands there."""
+    x_mm = y_mm = z_mm = 0.0
+    if interruption is not None:
+        x_mm, y_mm, z_mm = (float(axis) for axis in interruption.position_mm)
+    return slice_patch(
+        missing,
+        site.setup,
+        as_built=as_built,
+        grid=site.grid,
+        standalone=interruption is None,
+        start_mm=None if interruption is None else (x_mm, y_mm, z_mm),
+        hotend_c=None if interruption is None else interruption.hotend_c,
+        lines=lines,
+        progress=progress,
+    )
+
+
+def _checked(
+    plan: RepairPlan, site: Site, *, title: str, interruption: ModalState | None, strict: bool
+) -> RepairPlan:
+    """The plan with its program, written and checked, or with the reason why it has none."""
+    assert plan.patch is not None
+    as_built, printer = plan.deficit.as_built, site.setup.printer
+    program = write(
+        plan.patch.toolpath, site.setup, title=title, resume=interruption, restore=False
+    )
+    try:
+        checked = check(program, site.setup, as_built=as_built, initial=interruption)
+    except CheckRefusedError as error:
+        if strict:
+            raise
+        return replace(plan, refused=str(error))
+    return replace(plan, checked=checked, estimate=estimate(program, printer))

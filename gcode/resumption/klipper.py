@@ -1,0 +1,7 @@
+"""The macro by which Klipper feels no deeper than it is told (`klipper_touch.cfg`)."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+MACRO = files("gcode.resumption").joinpath("klipper_touch.cfg").read_text(encoding="utf-8")

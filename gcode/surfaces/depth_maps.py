@@ -1,0 +1,323 @@
+"""Depth maps of the bed, as a camera photographs them: PNG or TIFF, and JSON beside it.
+
+`bed.png` (16 bits, grey) or `bed.tif` with `bed.json`, which says either `fx fy cx cy width height`
+(RealSense's `ppx ppy` for the centre do as well) or, as Open3D writes it, `width`, `height` and an
+`intrinsic_matrix` of nine numbers, column after column. Further keys: `depth_scale_mm` (millimetres
+a count), or `depth_scale` (counts a metre as Open3D has it, where it is 1 or more; metres a count
+as RealSense has it, below), and `pose`, a 4×4 bed_from_camera in millimetres, row after row. Depth
+is along the camera's axis; the camera looks along +z, x to the right, y down. 0 or NaN is a gap.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from jaxtyping import Bool, Float, Num
+
+from gcode.errors import InputError
+from gcode.surfaces.heightfield import READ_ERRORS
+
+SUFFIXES = frozenset({".png", ".tif", ".tiff"})
+MOST_JSON_BYTES = 1_000_000
+MOST_PIXELS = 50_000_000
+MOST_PACKED = 100
+"""Real depths pack to a third; deflate itself goes no further than a thousandth."""
+COUNT_MM = 1.0  # of depth cameras (RealSense, Azure Kinect) where nothing is said
+RIGID = 1e-3  # digits of a rotation in a file
+BAND_MM, TILT_RAD = 10.0, math.radians(3.0)
+"""How far off a camera's pose may be for the bed to put it right."""
+NEAR_MM = 0.7
+"""Of one plane: what depth cameras of this class are off by at half a metre."""
+UNDER_MM, UNDER_RATIO = 2.0, 0.01
+LEAST_BED_RATIO = 0.05
+TRIES = 400  # of three points: where a tenth is bed, one in three such runs in a hundred misses it
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """What the JSON file says.
+
+    Attributes
+    ----------
+    focal, centre
+        fx, fy and cx, cy in pixels.
+    shape
+        Rows and columns.
+    count_mm
+        Millimetres a count; None where the file does not say.
+    pose
+        (4, 4) frame_from_camera, mm; None where the file does not say.
+    """
+
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    shape: tuple[int, int]
+    count_mm: float | None
+    pose: Float[np.ndarray, "4 4"] | None
+
+    def points_mm(
+        self, image: Num[np.ndarray, "rows columns"], count_mm: float
+    ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "rows columns"]]:
+        """(n, 3) the seen pixels in the camera's frame, row after row, and which they are."""
+        seen = np.isfinite(image) & (image != 0)
+        rows, columns = np.nonzero(seen)
+        z_mm = image[seen].astype(np.float64) * count_mm
+        across = (columns - self.centre[0]) / self.focal[0] * z_mm
+        down = (rows - self.centre[1]) / self.focal[1] * z_mm
+        return np.stack([across, down, z_mm], axis=1), seen
+
+
+def camera_of(said: dict[str, Any]) -> Camera:
+    """The camera that a JSON object tells of.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError, OverflowError
+        If something is missing, is no number, or cannot be.
+    """
+    if "intrinsic_matrix" in said:
+        k = np.array(said["intrinsic_matrix"], dtype=np.float64)
+        k = k.reshape(3, 3) if k.ndim == 2 else k.reshape(3, 3).T
+        focal, centre = (float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]), float(k[1, 2]))
+    else:
+        focal = float(said["fx"]), float(said["fy"])
+        x, y = ("cx", "cy") if "cx" in said else ("ppx", "ppy")
+        centre = float(said[x]), float(said[y])
+    shape = int(said["height"]), int(said["width"])
+    if not all(0 < f < np.inf for f in focal) or not np.isfinite(centre).all() or min(shape) < 1:
+        raise ValueError(f"focal length {focal}, centre {centre}, size {shape}")
+    bent = np.array(said.get("distortion", said.get("coeffs", [])), dtype=np.float64)
+    if np.abs(bent).max(initial=0.0) > 0:
+        raise ValueError("lens distortion is not undone here: export a rectified depth map")
+    pose = None
+    if said.get("pose") is not None:
+        pose = np.array(said["pose"], dtype=np.float64).reshape(4, 4)
+        turn = pose[:3, :3]
+        if not (np.abs(turn @ turn.T - np.eye(3)).max() < RIGID and np.linalg.det(turn) > 0):
+            raise ValueError("the pose is no rigid motion: its rotation stretches or mirrors")
+    return Camera(focal, centre, shape, _count_mm(said), pose)
+
+
+def _count_mm(said: dict[str, Any]) -> float | None:
+    """Millimetres a count, by whichever key says it."""
+    if said.get("depth_scale_mm") is not None:
+        count_mm = float(said["depth_scale_mm"])
+    elif said.get("depth_scale") is not None:
+        scale = float(said["depth_scale"])
+        count_mm = 1000.0 / scale if scale >= 1 else 1000.0 * scale
+    else:
+        return None
+    if not 0 < count_mm < np.inf:
+        raise ValueError(f"a depth scale of {count_mm} mm a count")
+    return count_mm
+
+
+def is_depth_map(path: Path) -> bool:
+    """Whether a camera's JSON lies beside an image; a TIFF without one is a height map."""
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        return True
+    beside = path.with_suffix(".json")
+    if suffix not in SUFFIXES or not beside.is_file():
+        return False
+    said = _said(beside)
+    return isinstance(said, dict) and bool({"fx", "intrinsic_matrix"} & said.keys())
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a depth map shows.
+
+    Attributes
+    ----------
+    points_mm
+        (n, 3) in the bed's frame.
+    spacing_mm
+        Between the pixels of one thing, the median.
+    told
+        By how much the camera's pose was put right, in a sentence.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    spacing_mm: float
+    told: str
+
+
+def read_on_bed(path: Path, box_mm: tuple[float, float, float, float] | None = None) -> Seen:
+    """What a depth map shows of the bed and what stands on it.
+
+    The camera's own pose is taken, then height and tilt from the bed that it sees.
+
+    Parameters
+    ----------
+    box_mm
+        (x_min, y_min, x_max, y_max) of the bed: what lies around it is left out.
+
+    Raises
+    ------
+    InputError
+        If something cannot be read, nobody says where the camera stands, or it sees no bed.
+    """
+    camera = _camera_beside(path)
+    image = _image(path, camera)
+    count_mm = camera.count_mm
+    if count_mm is None:
+        if image.dtype.kind == "f":
+            raise InputError(
+                f"{path}: the JSON file beside it does not say depth_scale_mm, and depths in "
+                "fractions may be metres or millimetres; add it."
+            )
+        count_mm = COUNT_MM
+    points_mm, _ = camera.points_mm(image, count_mm)
+    if not len(points_mm) or points_mm[:, 2].min() < 0:
+        raise InputError(f"{path}: the depth map has no seen pixel, or depths below 0.")
+    pose = camera.pose
+    if pose is None:
+        raise InputError(
+            f"{path}: the JSON file beside it does not say where the camera stands: add 'pose', a "
+            "4×4 bed_from_camera in millimetres, row after row, good to a centimetre and 3°."
+        )
+    placed_mm = points_mm @ pose[:3, :3].T + pose[:3, 3]
+    if box_mm is not None:
+        low, high = np.array(box_mm[:2]), np.array(box_mm[2:])
+        inside = ((placed_mm[:, :2] >= low) & (placed_mm[:, :2] <= high)).all(axis=1)
+        points_mm, placed_mm = points_mm[inside], placed_mm[inside]
+    moved_mm, told = levelled(placed_mm, what=str(path))
+    spacing_mm = float(np.median(points_mm[:, 2])) / min(camera.focal)
+    return Seen(moved_mm, spacing_mm, told)
+
+
+def levelled(
+    points_mm: Float[np.ndarray, "n 3"], *, what: str
+) -> tuple[Float[np.ndarray, "n 3"], str]:
+    """The same points, moved so that the bed among them lies at Z 0, and what that took.
+
+    The bed is the plane with the most points on it that has nothing below it.
+
+    Raises
+    ------
+    InputError
+        If there is none within 10 mm and 3° of where it should be.
+    """
+    near = np.flatnonzero(np.abs(points_mm[:, 2]) < 2 * BAND_MM)
+    some = points_mm[near[:: max(1, len(near) // 20_000)]]
+    every = points_mm[:: max(1, len(points_mm) // 20_000)]
+    rng, best, plane = np.random.default_rng(0), 0, None
+    for _ in range(TRIES if len(some) > 2 else 0):
+        fitted = _plane(some[rng.choice(len(some), 3, replace=False)])
+        if fitted is None:
+            continue
+        count = int((np.abs(_above(some, fitted)) < NEAR_MM).sum())
+        if count > best and (_above(every, fitted) < -UNDER_MM).mean() < UNDER_RATIO:
+            best, plane = count, fitted
+    if plane is None or best < LEAST_BED_RATIO * len(some):
+        raise InputError(
+            f"{what} shows no bed within {BAND_MM:g} mm and {math.degrees(TILT_RAD):g}° of Z 0: "
+            "photograph more of the bed, or calibrate the camera's pose."
+        )
+    for _ in range(3):
+        plane = _plane(some[np.abs(_above(some, plane)) < NEAR_MM]) or plane
+    a, b, c = plane
+    up = np.array([-a, -b, 1.0]) / math.sqrt(a * a + b * b + 1.0)
+    axis = np.array([up[1], -up[0], 0.0])  # up × Z
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn = np.eye(3) + cross + cross @ cross / (1.0 + up[2])
+    foot = np.array([0.0, 0.0, c])
+    moved = (points_mm - foot) @ turn.T
+    middle = points_mm.mean(axis=0)
+    off_mm = a * middle[0] + b * middle[1] + c
+    tilt = math.degrees(math.acos(min(1.0, up[2])))
+    return moved, f"{what}: put right by its bed, {-off_mm:+.2f} mm in height and {tilt:.2f}°."
+
+
+Plane = tuple[float, float, float]
+"""z = a x + b y + c."""
+
+
+def _plane(points_mm: Float[np.ndarray, "k 3"]) -> Plane | None:
+    """The plane through some points; None where it is steep, or is far from the bed's place."""
+    if len(points_mm) < 3:
+        return None
+    design = np.column_stack([points_mm[:, :2], np.ones(len(points_mm))])
+    (a, b, c), _, rank, _ = np.linalg.lstsq(design, points_mm[:, 2], rcond=None)
+    middle = design.mean(axis=0)
+    far = abs(float(middle @ [a, b, c])) > BAND_MM
+    if rank < 3 or far or math.hypot(a, b) > math.tan(TILT_RAD):
+        return None
+    return float(a), float(b), float(c)
+
+
+def _above(points_mm: Float[np.ndarray, "n 3"], plane: Plane) -> Float[np.ndarray, " n"]:
+    return np.asarray(points_mm[:, 2] - points_mm[:, :2] @ plane[:2] - plane[2])
+
+
+def _said(beside: Path) -> Any:
+    try:
+        if beside.stat().st_size > MOST_JSON_BYTES:
+            raise InputError(f"{beside}: over {MOST_JSON_BYTES} bytes are no camera's intrinsics.")
+        return json.loads(beside.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{beside}: the camera of the depth map cannot be read ({error}); it is a JSON file of "
+            "the image's name, with fx, fy, cx, cy, width, height and pose."
+        ) from error
+
+
+def _camera_beside(path: Path) -> Camera:
+    beside = path.with_suffix(".json")
+    said = _said(beside)
+    try:
+        return camera_of(said)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        what = " ".join(str(error).split())[:120]
+        raise InputError(
+            f"{beside}: the camera cannot be understood ({type(error).__name__}: {what}); it needs "
+            "fx, fy, cx, cy or intrinsic_matrix, and width and height."
+        ) from error
+
+
+def _image(path: Path, camera: Camera) -> Num[np.ndarray, "rows columns"]:
+    from PIL import Image
+
+    if math.prod(camera.shape) > MOST_PIXELS:
+        raise InputError(f"{path}: over {MOST_PIXELS:,} pixels are no depth map.")
+    try:
+        size = path.stat().st_size
+        if path.suffix.lower() == ".png":
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of bombs: the limit here is held below
+                with Image.open(path, formats=["PNG"]) as image:
+                    mode, shape = image.mode, (image.height, image.width)
+                    _refuse_shape(path, shape, size, camera)
+                    if mode not in {"I;16", "I;16B", "I"}:
+                        raise InputError(
+                            f"{path}: a depth map is grey of 16 bits a pixel, this is '{mode}'."
+                        )
+                    return np.asarray(image)
+        with tifffile.TiffFile(path) as tiff:
+            page = tiff.pages[0]
+            _refuse_shape(path, tuple(page.shape), size, camera)
+            return np.asarray(page.asarray())
+    except InputError:
+        raise
+    except (*READ_ERRORS, Image.DecompressionBombError) as error:
+        what = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: the depth map cannot be read ({what}).") from error
+
+
+def _refuse_shape(path: Path, shape: tuple[int, ...], size: int, camera: Camera) -> None:
+    if shape != camera.shape:
+        told = " × ".join(str(n) for n in reversed(shape))
+        raise InputError(
+            f"{path}: the depth map has {told} pixels, the JSON file beside it says "
+            f"{camera.shape[1]} × {camera.shape[0]}; they do not belong together."
+        )
+    if 2 * math.prod(shape) > max(MOST_PACKED * size, 16 * 2**20):
+        raise InputError(f"{path}: {size} bytes would unpack to {2 * math.prod(shape)}; a trap?")
