@@ -172,6 +172,7 @@ def loop_result(
         "stopped": report.stopped or None,
         "learned": None if report.calibration is None else to_json(report.calibration),
         "passed_by": [stop.label for stop in report.passed],
+        "given_up": list(report.given_up),
         "stops": [_stop_row(look) for look in report.looks],
     }
     return dict(rounded(result))

@@ -34,6 +34,11 @@ BLOB = replace(VOID, kind="excess", type=DefectType.BLOB)
 THIN = replace(VOID, thickness_layers=0.4, height_layers=0.8)
 
 CASES = {
+    "F0a": replace(VOID, given_up=True),
+    "F0b": replace(VOID, object="lid", lost_ratio=0.7),
+    "F0c": replace(VOID, object="lid", lost_ratio=0.7, seen_twice=True),
+    "F3a": replace(VOID, type=DefectType.WARP, object="lid"),
+    "F4a": replace(BLOB, hit_mm=0.4, object="lid"),
     "F1": replace(VOID, type=DefectType.DETACHED),
     "F2": replace(VOID, type=DefectType.LAYER_SHIFT, confidence=0.5),
     "F3": replace(VOID, type=DefectType.WARP),
@@ -54,6 +59,7 @@ CASES = {
 SITUATIONS = {
     "S1": Situation(Action.STOP),
     "S2": Situation(Action.PAUSE),
+    "S2a": Situation(Action.GIVE_UP),
     "S3": Situation(Action.LOOK_AGAIN),
     "S4": Situation(Action.FILL_NOW, little_left=True),
     "S5": Situation(Action.FILL_NOW, stuck=True),
