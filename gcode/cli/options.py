@@ -144,7 +144,7 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
 
     suffix = path.suffix.lower()
     if path.is_file() and depth_maps.is_depth_map(path):
-        seen = depth_maps.read_on_bed(path, printer and printer.reach_box_mm)
+        seen = depth_maps.read_on_bed(path, None if printer is None else printer.reach_box_mm)
         console.errors.print(seen.told, markup=False)
         cell_mm = max(AS_BUILT_CELL_MM, PIXELS_IN_CELL * seen.spacing_mm)
         return scanned.from_points(seen.points_mm, cell_mm, what=str(path))
