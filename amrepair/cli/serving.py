@@ -19,10 +19,10 @@ from amrepair.cli.running import (
 )
 from amrepair.cli.telling import Begun, written
 from amrepair.errors import AmrepairError, InputError
-from amrepair.policy import Decision
 from amrepair.loop.looks import LoopReport
 from amrepair.loop.tape import read_events
 from amrepair.loop.travel import park, way_back
+from amrepair.policy import Decision
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.report.text import summary_of_result
 from gcode.cli import console
