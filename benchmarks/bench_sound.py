@@ -25,7 +25,7 @@ import trimesh
 from amrepair.frames import unit_vectors
 from amrepair.template import MeshSdf
 from amrepair.template.fit import fit_fast
-from amrepair.template.learned import LearnedSdf
+from amrepair.template.grid import GridSdf
 from amrepair.template.sound import learn
 
 SIZE_MM = np.array([60.0, 40.0, 20.0])
@@ -55,7 +55,7 @@ def printed(seed: int, points: int) -> tuple[np.ndarray, np.ndarray]:
     return place + rng.normal(0, SIGMA_MM, place.shape), place
 
 
-def by_network(template: LearnedSdf, scans: list[np.ndarray], steps: int, seed: int) -> Offsets:
+def by_network(template: GridSdf, scans: list[np.ndarray], steps: int, seed: int) -> Offsets:
     """A coordinate network fitted to every point's deviation."""
     torch.manual_seed(seed)
     points = np.concatenate(scans)

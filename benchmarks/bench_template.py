@@ -26,7 +26,7 @@ from amrepair.scans import Scan
 from amrepair.simulate.part_files import part_path
 from amrepair.template import MeshSdf, extract_mesh, load_mesh
 from amrepair.template.fit import fit_fast
-from amrepair.template.learned import Grid, LearnedSdf
+from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.paper import PAPER, fit_paper
 from amrepair.template.port import Template
 
@@ -72,7 +72,7 @@ def fits(exact: MeshSdf, steps: int) -> dict[str, Template]:
     print("|---" * (3 + len(OFFSETS_MM)) + "|")
     made: dict[str, Template] = {}
     template, seconds = timed(lambda: fit_fast(exact))
-    assert isinstance(template, LearnedSdf)
+    assert isinstance(template, GridSdf)
     made["fast"] = template
     accuracy("fast", template, exact, seconds)
     grid = template.grid

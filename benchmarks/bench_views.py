@@ -1,20 +1,29 @@
 """Partial views of parts onto each other, without a mesh: how many are placed, and how far off.
 
     python benchmarks/bench_views.py PART… [--ring 6] [--below 2] [--untold] [--noise-mm 0.04]
+    python benchmarks/bench_views.py --real FOLDER/POSES.conf [--seeds 3]
 
 A ring of views as from a turntable, and some from below; each in a random pose of its own, with or
 without the sensor's place. Off is the root mean square of a view's points from where they belong.
 Held: for each view the standard deviation that is said of it across its surface, where that is
 largest, and by how much it truly is off across its surface, at most, from the view held best.
+Real views are a folder's, whose file of poses is the truth as far as its makers knew it: templates
+are fitted from the bare views and with the poses told, each in a process of its own.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from amrepair.bench.synth_views import (
     Rays,
@@ -26,8 +35,9 @@ from amrepair.bench.synth_views import (
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge.place import Placement, place
+from amrepair.merge.told import of_views, read_poses
 from amrepair.merge.views import View
-from amrepair.scans import Scan
+from amrepair.scans import Scan, read_scan
 from amrepair.template import load_mesh
 
 WRONG_MM = 0.3
@@ -38,7 +48,9 @@ Made = list[tuple[Scan, np.ndarray]]
 def main() -> None:
     """One line for each part."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="+", type=Path)
+    parser.add_argument("parts", nargs="*", type=Path)
+    parser.add_argument("--real", nargs="*", type=Path, default=[], help="files of poses")
+    parser.add_argument("--seeds", type=int, default=1, help="of real views")
     parser.add_argument("--ring", type=int, default=6)
     parser.add_argument("--below", type=int, default=2)
     parser.add_argument("--untold", action="store_true", help="without the sensors' places")
@@ -46,6 +58,8 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=60_000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    for poses in options.real:
+        real(poses, options.seeds)
     ratios: list[float] = []
     for part in options.parts:
         made = views(part, options)
@@ -69,6 +83,51 @@ def main() -> None:
     if ratios:
         share = float((np.array(ratios) <= SIGMAS).mean())
         print(f"{share:.1%} of {len(ratios)} views within {SIGMAS:g} sigma, most {max(ratios):.1f}")
+
+
+def real(poses: Path, seeds: int) -> None:
+    """Templates of a folder's views, without and with the poses that its makers found."""
+    told = read_poses(poses)
+    files = [path for name in told if (path := poses.parent / name).is_file()]
+    scans = [read_scan(path, frame="scanner") for path in files]
+    unit_mm = 1000.0 if max(np.ptp(scan.points_mm, axis=0).max() for scan in scans) < 1.0 else 1.0
+    scans = [Scan(unit_mm * s.points_mm, s.sigma_mm, "scanner", source=s.source) for s in scans]
+    truth = of_views(told, [View.of(scan, np.random.default_rng(0)) for scan in scans], unit_mm)
+    made = [(scan, np.linalg.inv(truth[k])) for k, scan in enumerate(scans)]
+    for words in ([], ["--poses", str(poses)]):
+        for seed in range(seeds):
+            found, wall_s, cpu_s = fitted(files, words, seed)
+            if isinstance(found, str):
+                said = f"refused: {found}"
+            else:
+                off = off_mm(made, Placement(found, 0.0))
+                said = (
+                    f"{len(off)} of {len(made)} placed, {np.median(off):.3f} mm off in the median, "
+                    f"{off.max():.3f} mm at most"
+                )
+            print(
+                f"{poses.parent.name}, {'poses told' if words else 'bare'}, seed {seed}: {said}; "
+                f"{wall_s:.0f} s, {cpu_s:.0f} s of processor time",
+                flush=True,
+            )
+
+
+def fitted(
+    files: list[Path], words: list[str], seed: int
+) -> tuple[dict[int, np.ndarray] | str, float, float]:
+    """Poses by number as `template fit` finds them, or why not; seconds, and of the processor."""
+    with tempfile.TemporaryDirectory() as scratch:
+        out = ["-o", f"{scratch}/t.safetensors", "--json", "--seed", str(seed)]
+        command = [sys.executable, "-m", "amrepair", "template", "fit", *map(str, files)]
+        wall, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run([*command, *words, *out], capture_output=True, text=True, check=False)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    wall = time.perf_counter() - wall
+    cpu_s = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    if done.returncode:
+        return done.stderr.strip().splitlines()[-1], wall, cpu_s
+    told = json.loads(done.stdout)["scans"]
+    return {k: np.array(s["pose"]) for k, s in enumerate(told) if s["pose"]}, wall, cpu_s
 
 
 def views(part: Path, options: argparse.Namespace) -> Made:
@@ -99,20 +158,20 @@ def views(part: Path, options: argparse.Namespace) -> Made:
 
 
 def off_mm(made: Made, found: Placement) -> np.ndarray:
-    """(k,) of each placed view; in the frame of the one that most others agree with."""
-    every = []
-    for home, base in found.poses.items():
-        common_from_part = base @ made[home][1]
-        row = []
-        for k, pose in found.poses.items():
-            scan, from_part = made[k]
-            points = scan.points_mm[::40]
-            truth = moved(points, common_from_part @ np.linalg.inv(from_part))
-            squares = ((moved(points, pose) - truth) ** 2).sum(axis=1)
-            row.append(float(np.sqrt(squares.mean())))
-        every.append(row)
-    table = np.array(every)
-    return np.asarray(table[int(np.argmin(np.median(table, axis=1)))])
+    """(k,) of each placed view, in the frame in which all together lie nearest to the truth."""
+    here, there, whose = [], [], []
+    for k, pose in found.poses.items():
+        scan, from_part = made[k]
+        points = scan.points_mm[::40]
+        here.append(moved(points, pose))
+        there.append(moved(points, np.linalg.inv(from_part)))
+        whose += [k] * len(points)
+    one, other = np.concatenate(here), np.concatenate(there)
+    turn = Rotation.align_vectors(one - one.mean(axis=0), other - other.mean(axis=0))[0]
+    truth = turn.apply(other - other.mean(axis=0)) + one.mean(axis=0)
+    squares = ((one - truth) ** 2).sum(axis=1)
+    number = np.array(whose)
+    return np.array([np.sqrt(squares[number == k].mean()) for k in found.poses])
 
 
 def held_mm(made: Made, views: list[View], found: Placement) -> list[tuple[float, float]]:

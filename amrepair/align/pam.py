@@ -38,8 +38,8 @@ class PamOptions:
     ----------
     voxel
         v, edge of the down-sampling voxel, in template radii.
-    threshold, threshold_step, step_from, iterations
-        τ, Δτ, the first iteration after which τ grows, and K.
+    threshold, threshold_step, iterations
+        τ, Δτ by which it grows after each iteration, and K.
     loss
         `chamfer`: mean squared nearest distance, both directions (eq. 7); `directed`: mean nearest
         distance from source to target × 100 (the released code).
@@ -60,7 +60,6 @@ class PamOptions:
     voxel: float = 0.03
     threshold: float = 0.016
     threshold_step: float = 0.001
-    step_from: int = 1
     iterations: int = 10
     loss: str = "chamfer"
     loss_points: int = 0
@@ -98,7 +97,6 @@ PAPER = PamOptions()
 CODE = PamOptions(
     threshold=1.6,
     threshold_step=0.1,
-    step_from=5,
     loss="directed",
     loss_points=5_000,
     loss_on_voxels=True,
@@ -188,7 +186,7 @@ def pam(
         loss = _loss(moving, target, options, rng)
         if loss < threshold:
             return PamResult(_in_mm(pose, start, middle, radius_mm), loss, threshold, k, radius_mm)
-        if k < rounds and k >= options.step_from:
+        if k < rounds:
             threshold += options.threshold_step
     raise PamError(
         f"PAM did not converge on {source}: its loss is {loss:.4g} after {rounds} iterations, the "

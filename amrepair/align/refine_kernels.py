@@ -2,7 +2,7 @@
 """Gauss–Newton on the field: normal equations, one step, and all steps of many poses; compiled.
 
 A pose is a rotation and the place of the points' centroid; the points are about their centroid.
-`step` is the same for any template; `refine_all` asks a grid's numbers (`learned.Grid`) itself.
+`step` is the same for any template; `refine_all` asks a grid's numbers (`grid.Grid`) itself.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from amrepair.align.pose_kernels import solve, turn
-from amrepair.template.learned_kernels import field_at
+from amrepair.template.trilinear_kernels import field_at
 from gcode.compiled import njit, prange
 
 SHRINK = 0.6  # of the loss's scale, from one iteration to the next

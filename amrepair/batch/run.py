@@ -40,7 +40,7 @@ from amrepair.batch.work import PROGRAM, SUMS
 from amrepair.errors import InputError
 from amrepair.library import template_files
 from amrepair.regions.calibration import Calibration
-from amrepair.template import LearnedSdf, NetworkSdf, open_template
+from amrepair.template import GridSdf, PaperSdf, open_template
 from gcode.profiles import load_setup
 from gcode.progress import Progress, silent
 
@@ -179,7 +179,7 @@ def _templates(
         fitted = file
         if file.suffix.lower() != ".safetensors":
             fitted = scratch / f"{k}.safetensors"
-            assert isinstance(template, (LearnedSdf, NetworkSdf))
+            assert isinstance(template, (GridSdf, PaperSdf))
             template.save(fitted)
         found.append(TemplateFile(file.stem, digest_of(str(file))[0], fitted.resolve()))
         parts[file.stem] = Part(Cells.of(open_template(fitted)))

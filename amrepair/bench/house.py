@@ -27,9 +27,9 @@ from amrepair.frames import moved
 from amrepair.merge import fit_from_scans
 from amrepair.scans.scan import Scan
 from amrepair.template import (
-    LearnedSdf,
+    GridSdf,
     MeshSdf,
-    NetworkSdf,
+    PaperSdf,
     extract_mesh,
     fit_template,
     load_template,
@@ -68,7 +68,7 @@ def class_template(
     *,
     recipe: str = "fast",
     paper: PaperOptions = PAPER,
-) -> LearnedSdf | NetworkSdf:
+) -> GridSdf | PaperSdf:
     """The class's template; fitted once for each seed, then read from the cache.
 
     A class without a normal mesh gets a template of its training clouds together.
@@ -77,7 +77,7 @@ def class_template(
     path = cache / f"{data.name}-{recipe}{words}-{seed}.safetensors"
     if path.is_file():
         return load_template(path)
-    template: LearnedSdf | NetworkSdf
+    template: GridSdf | PaperSdf
     if data.mesh is None:
         template = _from_clouds(data, seed)
         if recipe != "fast":
@@ -89,7 +89,7 @@ def class_template(
     return template
 
 
-def _from_clouds(data: ClassInput, seed: int) -> LearnedSdf:
+def _from_clouds(data: ClassInput, seed: int) -> GridSdf:
     scans = [
         Scan(cloud, data.sigma_mm, "scanner", source=f"{data.name}, training cloud {k}")
         for k, cloud in enumerate(data.clouds_mm)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from amrepair.merge import ScanFit, SoundFit
-    from amrepair.template import LearnedSdf, NetworkSdf
+    from amrepair.template import GridSdf, PaperSdf
 
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
 
@@ -101,7 +101,7 @@ def fit(
             raise InputError(f"--{option} belongs to scans, only meshes are given")
     if scans and recipe == "paper" and not meshes:
         raise InputError("the recipe paper needs a mesh; fit the scans with --recipe fast")
-    template: LearnedSdf | NetworkSdf
+    template: GridSdf | PaperSdf
     told: dict[str, Any] = {}
     with bars.shown():
         if scans and recipe == "fast":

@@ -20,9 +20,10 @@ from amrepair.merge.options import MergeOptions
 from amrepair.merge.place import Placement, place
 from amrepair.merge.views import LEAST_POINTS, View
 from amrepair.scans import Scan
-from amrepair.template import LearnedSdf, MeshSdf
+from amrepair.template import GridSdf, MeshSdf
 from amrepair.template.fit import fit_fast
-from amrepair.template.learned import Coverage, Tolerance
+from amrepair.template.grid import Coverage
+from amrepair.template.learned import LearnedSdf, Tolerance
 from gcode.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class ScanFit:
         Sentences for the user.
     """
 
-    template: LearnedSdf
+    template: GridSdf
     fused: Fused
     poses: tuple[Float[np.ndarray, "4 4"] | None, ...]
     sigma_mm: float
@@ -227,12 +228,12 @@ def _outvoted(cloud: Cloud, fused: Fused, which: Sequence[int]) -> dict[int, flo
 
 
 def _with_tolerance(
-    made: LearnedSdf,
+    made: GridSdf,
     cloud: Cloud,
     fused: Fused,
     placed: Placement,
     weak: Mapping[int, Slack],
-) -> LearnedSdf:
+) -> GridSdf:
     """The template with how far sound parts differ, and where nobody knows."""
     spread = fused.spread
     if spread is not None and weak:
@@ -243,14 +244,14 @@ def _with_tolerance(
                 slack_mm[own] = weak[k].across(cloud.points_mm[own], cloud.normals[own])
         spread = spread.widened(cloud, slack_mm)
     coverage: Coverage | None = None if fused.coverage.unseen_mm2 == 0.0 else fused.coverage
-    return replace(
+    fitted = replace(
         made,
         bias_mm=float(np.hypot(made.bias_mm, 2.0 * fused.standard_error_mm)),
-        tolerance=None
-        if spread is None
-        else Tolerance(spread.origin_mm, spread.cell_mm, spread.values_mm),
         coverage=coverage,
     )
+    if spread is None:
+        return fitted
+    return LearnedSdf.on(fitted, Tolerance(spread.origin_mm, spread.cell_mm, spread.values_mm))
 
 
 def _metadata(scans: Sequence[Scan], notes: Sequence[str], seed: int) -> dict[str, str]:

@@ -19,7 +19,7 @@ from amrepair.errors import TemplateError
 from amrepair.merge import fuse_kernels as kernels
 from amrepair.merge.cloud import Cells
 from amrepair.template.extract import zero_level
-from amrepair.template.learned import Coverage
+from amrepair.template.grid import Coverage
 from amrepair.template.mesh_file import manifold_arrays
 from amrepair.template.mesh_sdf import MeshSdf
 from gcode.solids import as_manifold, is_valid

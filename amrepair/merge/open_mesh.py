@@ -20,10 +20,10 @@ from scipy.spatial import cKDTree
 from amrepair.errors import TemplateError
 from amrepair.merge.fuse import solid_surface
 from amrepair.merge.winding import Shell
-from amrepair.template import LearnedSdf, MeshSdf, load_mesh
+from amrepair.template import GridSdf, MeshSdf, load_mesh
 from amrepair.template.fit import fit_fast
 from amrepair.template.fitting import made_from
-from amrepair.template.learned import Coverage
+from amrepair.template.grid import Coverage
 from amrepair.template.mesh_file import OpenMeshError, file_sha256, read_mesh
 from amrepair.template.nearest import TriangleTree
 from amrepair.template.surface import count_for_spacing, sample_surface, triangle_areas_normals
@@ -66,7 +66,7 @@ def fit_mesh(
     seed: int = 0,
     options: OpenMeshOptions | None = None,
     progress: Progress = silent,
-) -> LearnedSdf:
+) -> GridSdf:
     """The template of a mesh's file, closed or not.
 
     Raises
@@ -93,7 +93,7 @@ def fit_mesh(
     return replace(made, coverage=coverage)
 
 
-def _by_winding(path: Path, options: OpenMeshOptions, seed: int, progress: Progress) -> LearnedSdf:
+def _by_winding(path: Path, options: OpenMeshOptions, seed: int, progress: Progress) -> GridSdf:
     mesh = read_mesh(path)
     made = _closed(mesh, path.name, options, progress)
     metadata = {

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import trimesh
 
 FORMAT = "amrepair-template"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3  # templates with a spread are a kind of their own
 HEAD = "amrepair"
 
 

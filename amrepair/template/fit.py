@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
+from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.grid_kernels import NOBODY, carry, near_triangles
-from amrepair.template.learned import Grid, LearnedSdf
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.signs import signed_grid, signs_in_blocks
 from amrepair.template.surface import sample_surface
@@ -45,7 +45,7 @@ def fit_fast(
     least_residual_mm: float = 0.0,
     metadata: dict[str, str] | None = None,
     progress: Progress = silent,
-) -> LearnedSdf:
+) -> GridSdf:
     """Fit a template to an exact field.
 
     Parameters
@@ -74,7 +74,7 @@ def fit_fast(
     grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, progress))
     held = _on_surface(exact, HELD_OUT, rng)
     bias_mm = float(np.quantile(np.abs(grid.distance(held)), 0.99))
-    return LearnedSdf(grid=grid, mesh=exact.mesh, bias_mm=bias_mm, metadata=metadata or {})
+    return GridSdf(grid=grid, mesh=exact.mesh, bias_mm=bias_mm, metadata=metadata or {})
 
 
 def _cell_mm(size_mm: Float[np.ndarray, " 3"], margin_mm: float) -> float:

@@ -15,11 +15,13 @@ import amrepair
 from amrepair.errors import TemplateError
 from amrepair.template.file import FORMAT_VERSION, read_template
 from amrepair.template.fit import FIT_VERSION, fit_fast
+from amrepair.template.grid import GridSdf
+from amrepair.template.learned import KIND as LEARNED
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh, require_mesh
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.network import KIND as NETWORK
-from amrepair.template.network import NetworkSdf
+from amrepair.template.network import PaperSdf
 from amrepair.template.paper import PAPER, PaperOptions, fit_paper
 from gcode.progress import Progress, silent
 
@@ -37,7 +39,7 @@ def fit_template(
     device: str = "auto",
     seed: int = 0,
     progress: Progress = silent,
-) -> LearnedSdf | NetworkSdf:
+) -> GridSdf | PaperSdf:
     """Fit a template to a part.
 
     Parameters
@@ -95,7 +97,7 @@ def made_from(closed: trimesh.Trimesh, recipe: str, seed: int) -> dict[str, str]
     }
 
 
-def load_template(path: Path) -> LearnedSdf | NetworkSdf:
+def load_template(path: Path) -> GridSdf | PaperSdf:
     """Open a template's file, whatever its recipe.
 
     Raises
@@ -107,8 +109,10 @@ def load_template(path: Path) -> LearnedSdf | NetworkSdf:
     arrays, head = read_template(path)
     try:
         if head.get("kind") == NETWORK:
-            return NetworkSdf.unpacked(path, arrays, head)
-        return LearnedSdf.unpacked(path, arrays, head)
+            return PaperSdf.unpacked(path, arrays, head)
+        if head.get("kind") == LEARNED:
+            return LearnedSdf.unpacked(path, arrays, head)
+        return GridSdf.unpacked(path, arrays, head)
     except (KeyError, TypeError, ValueError) as error:
         raise TemplateError(f"the template {path} is damaged ({error}); fit it again") from error
 
@@ -119,7 +123,7 @@ def load_or_fit(
     cache_dir: Path | None = None,
     seed: int = 0,
     progress: Progress = silent,
-) -> LearnedSdf:
+) -> GridSdf:
     """The fast template of a part: from the cache, keyed by its hash, or fitted and kept there.
 
     Parameters
@@ -137,7 +141,7 @@ def load_or_fit(
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.safetensors"
     if path.is_file():
         try:
-            return LearnedSdf.load(path)
+            return GridSdf.load(path)
         except TemplateError:
             path.unlink(missing_ok=True)  # a crash while it was written, or another version
     template = fit_fast(

@@ -1,124 +1,24 @@
-"""`LearnedSdf`: a template as a file holds it: coarse grid, finer blocks, the part's own mesh.
+"""`LearnedSdf`: a prior field and what sound scans say on top of it.
 
-One safetensors file with JSON metadata (units, frame, recipe, hashes, versions); never pickle. It
-answers without torch. Fitting is `fit`'s business.
+The prior is a part's own field, or the surface that scans share. The scans' bias by place is in the
+grid's distances already (`sound.learn`, `merge.fuse`); their spread by place is the tolerance of
+the test. Learning is those modules' business.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy import ndimage
+from jaxtyping import Float
 
-from amrepair.errors import TemplateError
-from amrepair.template import learned_kernels as kernels
-from amrepair.template.cut import CutTemplate
-from amrepair.template.file import (
-    read_template,
-    require_kind,
-    stored_mesh,
-    stored_metadata,
-    write_template,
-)
-from amrepair.template.port import Template
-from amrepair.template.surface import mesh_points
-from gcode.solids import as_manifold
+from amrepair.template.grid import GridSdf, stored_grid
 
-if TYPE_CHECKING:
-    import trimesh
-
-KIND = "grid"
+KIND = "learned"
 # Sound parts lie within three standard deviations of what they differ by.
 TOLERATED_SPREADS = 3.0
-MOST_COVER_CELLS = 200  # of what is known, along the longest side: 8 MB
-_ARRAYS = ("base", "cells", "blocks", "vertices_mm", "faces")
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Numbers of a fast field: exact distances at the nodes of a grid, finer where it bends.
-
-    Attributes
-    ----------
-    origin_mm, cell_mm
-        Corner and edge of the coarse grid, template frame.
-    base
-        (x, y, z) distances at its nodes, float32.
-    block_of
-        (x-1, y-1, z-1) number of the block in each cell, −1 where the coarse grid is good enough.
-    blocks
-        (b, r+1, r+1, r+1) distances at the nodes that divide a cell into r³, float32.
-    """
-
-    origin_mm: Float[np.ndarray, " 3"]
-    cell_mm: float
-    base: Float[np.ndarray, "x y z"]
-    block_of: Int[np.ndarray, "_x _y _z"]
-    blocks: Float[np.ndarray, "b r r r"]
-
-    @classmethod
-    def bare(
-        cls, origin_mm: Float[np.ndarray, " 3"], cell_mm: float, base: Float[np.ndarray, "x y z"]
-    ) -> Grid:
-        """The coarse grid alone."""
-        return cls.refined(
-            origin_mm, cell_mm, base, np.zeros((0, 3), np.int64), np.zeros((0, 2, 2, 2))
-        )
-
-    @classmethod
-    def refined(
-        cls,
-        origin_mm: Float[np.ndarray, " 3"],
-        cell_mm: float,
-        base: Float[np.ndarray, "x y z"],
-        cells: Int[np.ndarray, "b 3"],
-        blocks: Float[np.ndarray, "b r r r"],
-    ) -> Grid:
-        """The coarse grid with blocks in the cells named."""
-        block_of = np.full(tuple(n - 1 for n in base.shape), -1, dtype=np.int32)
-        block_of[tuple(cells.T)] = np.arange(len(cells))
-        return cls(
-            np.array(origin_mm, dtype=np.float64),
-            float(cell_mm),
-            np.ascontiguousarray(base, dtype=np.float32),
-            block_of,
-            np.ascontiguousarray(blocks, dtype=np.float32),
-        )
-
-    @property
-    def cells(self) -> Int[np.ndarray, "b 3"]:
-        """(b, 3) cells that have blocks, in the blocks' order."""
-        which = np.argwhere(self.block_of >= 0)
-        found = np.empty_like(which)
-        found[self.block_of[tuple(which.T)]] = which
-        return found
-
-    def cell_of(self, points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 3"]:
-        """(n, 3) indices of the coarse cells that hold the points, or the nearest ones."""
-        index = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
-        return np.clip(index, 0, np.array(self.block_of.shape) - 1)
-
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """(n,) signed distance, mm."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        return np.asarray(kernels.evaluate(points, *self.numbers))
-
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-        """(n,) signed distance, mm, and (n, 3) its gradient within the cell."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        distance, gradient = kernels.evaluate_with_gradient(points, *self.numbers)
-        return np.asarray(distance), np.asarray(gradient)
-
-    @property
-    def numbers(self) -> tuple[Any, ...]:
-        """What compiled code asks the field with (`learned_kernels.field_at`)."""
-        return self.origin_mm, self.cell_mm, self.base, self.block_of, self.blocks
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,205 +45,44 @@ class Tolerance:
 
 
 @dataclass(frozen=True, slots=True)
-class Coverage:
-    """Where nobody knows what the part's surface is like: no scan of it looked there.
+class LearnedSdf(GridSdf):
+    """A field that sound scans have taught (`Template`).
 
     Attributes
     ----------
-    origin_mm, cell_mm
-        Corner and edge of the cells, template frame.
-    unseen
-        (x, y, z) cells that hold surface nobody saw, and those beside them.
-    unseen_mm2
-        Area of that surface.
-    """
-
-    origin_mm: Float[np.ndarray, " 3"]
-    cell_mm: float
-    unseen: Bool[np.ndarray, "x y z"]
-    unseen_mm2: float
-
-    @classmethod
-    def of(
-        cls,
-        places_mm: Float[np.ndarray, "n 3"],
-        area_mm2: Float[np.ndarray, " n"],
-        bounds_mm: Float[np.ndarray, "2 3"],
-        cell_mm: float,
-    ) -> Coverage:
-        """Of pieces of surface that nobody saw: where, and how large each is."""
-        cell_mm = max(cell_mm, float(np.ptp(bounds_mm, axis=0).max()) / MOST_COVER_CELLS)
-        origin = bounds_mm[0] - 2.0 * cell_mm
-        shape = np.ceil((bounds_mm[1] + 2.0 * cell_mm - origin) / cell_mm).astype(int)
-        unseen = np.zeros(tuple(shape), bool)
-        unseen[tuple(((places_mm - origin) / cell_mm).astype(int).T)] = True
-        unseen = ndimage.binary_dilation(unseen, np.ones((3, 3, 3)))
-        return cls(origin, cell_mm, unseen, float(area_mm2.sum()))
-
-    def unseen_at(self, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """(n,) whether the surface nearest to a place near it is unknown."""
-        index = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
-        inside = ((index >= 0) & (index < self.unseen.shape)).all(axis=1)
-        found = np.zeros(len(points_mm), bool)
-        found[inside] = self.unseen[tuple(index[inside].T)]
-        return found
-
-
-@dataclass(frozen=True, slots=True)
-class LearnedSdf:
-    """A fitted template (`Template`).
-
-    Attributes
-    ----------
-    mesh
-        The closed mesh that it was fitted to.
-    bias_mm
-        99th percentile of |f| on points of the surface that training never saw.
-    metadata
-        Recipe, hashes, seed, versions.
     tolerance
-        Of templates that were learned from several scans.
-    coverage
-        Of templates whose surface is not known everywhere.
+        How far sound parts differ, by place.
     """
 
-    grid: Grid
-    mesh: trimesh.Trimesh
-    bias_mm: float
-    metadata: dict[str, str] = field(default_factory=dict)
-    tolerance: Tolerance | None = None
-    coverage: Coverage | None = None
-
-    @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
-        """(2, 3) box of the part."""
-        return np.array(self.mesh.bounds, dtype=np.float64)
-
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """(n,) signed distance, mm, negative inside."""
-        return self.grid.distance(points_mm)
-
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-        """(n,) signed distance and (n, 3) its gradient."""
-        return self.grid.distance_and_gradient(points_mm)
-
-    def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """(n,) standard deviation between normal parts: the part's size where nobody knows."""
-        found = np.zeros(len(points_mm)) if self.tolerance is None else self.tolerance.at(points_mm)
-        if self.coverage is not None:
-            # A place off the surface is unseen, too, where the surface nearest to it was not seen.
-            f_mm, outward = self.distance_and_gradient(points_mm)
-            unseen = self.coverage.unseen_at(points_mm - f_mm[:, None] * outward)
-            size_mm = float(np.linalg.norm(np.ptp(self.bounds_mm, axis=0)))
-            found = np.where(unseen | self.coverage.unseen_at(points_mm), size_mm, found)
-        return found
-
-    @property
-    def grid_numbers(self) -> tuple[Any, ...]:
-        """The field as compiled code asks it (`OnGrid`)."""
-        return self.grid.numbers
-
-    def below_z(self, z_mm: float) -> Template:
-        """The part printed so far."""
-        return CutTemplate(self, z_mm)
-
-    def surface_points(
-        self, spacing_mm: float
-    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """(m, 3) points of the part's surface, each for spacing² of area, and their normals."""
-        return mesh_points(self.mesh, spacing_mm)
-
-    def solid(self) -> Any:
-        """The part as a `manifold3d.Manifold`."""
-        return as_manifold(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
-
-    def extracted(self, voxel_mm: float, *, level_mm: float = 0.0) -> trimesh.Trimesh:
-        """A level set as a closed mesh (`extract.extract_mesh`)."""
-        from amrepair.template.extract import extract_mesh
-
-        return extract_mesh(self, voxel_mm, level_mm=level_mm)
-
-    def save(self, path: Path) -> None:
-        """Write the template's file, whole or not at all."""
-        arrays = {
-            "base": self.grid.base,
-            "cells": self.grid.cells.astype(np.int32),
-            "blocks": self.grid.blocks,
-            "vertices_mm": np.asarray(self.mesh.vertices, dtype=np.float64),
-            "faces": np.asarray(self.mesh.faces, dtype=np.int32),
-        }
-        head = {
-            "kind": KIND,
-            "origin_mm": self.grid.origin_mm.tolist(),
-            "cell_mm": self.grid.cell_mm,
-            "bias_mm": self.bias_mm,
-            **self.metadata,
-        }
-        if self.tolerance is not None:
-            arrays["spread_mm"] = self.tolerance.spread_mm.astype(np.float32)
-            head["spread_origin_mm"] = self.tolerance.origin_mm.tolist()
-            head["spread_cell_mm"] = self.tolerance.cell_mm
-        if self.coverage is not None:
-            arrays["unseen"] = self.coverage.unseen.astype(np.uint8)
-            head["unseen_origin_mm"] = self.coverage.origin_mm.tolist()
-            head["unseen_cell_mm"] = self.coverage.cell_mm
-            head["unseen_mm2"] = self.coverage.unseen_mm2
-        write_template(path, arrays, head)
+    tolerance: Tolerance = field(kw_only=True)
 
     @classmethod
-    def load(cls, path: Path) -> LearnedSdf:
-        """Read a template's file.
+    def on(cls, taught: GridSdf, tolerance: Tolerance) -> LearnedSdf:
+        """A field whose distances are learned already, with its tolerance."""
+        known = {f.name: getattr(taught, f.name) for f in fields(GridSdf)}
+        return cls(**known, tolerance=tolerance)
 
-        Raises
-        ------
-        TemplateError
-            If it is missing, truncated, or no template of ours.
-        """
-        return cls.unpacked(Path(path), *read_template(Path(path)))
+    def _told_spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        return self.tolerance.at(points_mm)
+
+    def _packed(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        arrays, head = GridSdf._packed(self)
+        arrays["spread_mm"] = self.tolerance.spread_mm.astype(np.float32)
+        return arrays, {
+            **head,
+            "kind": KIND,
+            "spread_origin_mm": self.tolerance.origin_mm.tolist(),
+            "spread_cell_mm": self.tolerance.cell_mm,
+        }
 
     @classmethod
     def unpacked(
         cls, path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]
     ) -> LearnedSdf:
         """The template in a file's arrays and head."""
-        require_kind(path, head.get("kind", KIND), KIND)
-        if not set(_ARRAYS) <= set(arrays):
-            raise TemplateError(f"{path} lacks parts of a template; fit it again")
-        grid = Grid.refined(
-            np.array(head["origin_mm"], dtype=np.float64),
-            float(head["cell_mm"]),
-            arrays["base"],
-            arrays["cells"].astype(np.int64),
-            arrays["blocks"],
+        tolerance = Tolerance(
+            np.array(head["spread_origin_mm"], dtype=np.float64),
+            float(head["spread_cell_mm"]),
+            arrays["spread_mm"],
         )
-        return cls(
-            grid=grid,
-            mesh=stored_mesh(path, arrays),
-            bias_mm=float(head["bias_mm"]),
-            metadata=stored_metadata(head),
-            tolerance=_stored_tolerance(arrays, head),
-            coverage=_stored_coverage(arrays, head),
-        )
-
-
-def _stored_tolerance(arrays: dict[str, np.ndarray], head: dict[str, Any]) -> Tolerance | None:
-    if "spread_mm" not in arrays:
-        return None
-    return Tolerance(
-        np.array(head["spread_origin_mm"], dtype=np.float64),
-        float(head["spread_cell_mm"]),
-        arrays["spread_mm"],
-    )
-
-
-def _stored_coverage(arrays: dict[str, np.ndarray], head: dict[str, Any]) -> Coverage | None:
-    if "unseen" not in arrays:
-        return None
-    return Coverage(
-        np.array(head["unseen_origin_mm"], dtype=np.float64),
-        float(head["unseen_cell_mm"]),
-        arrays["unseen"].astype(bool),
-        float(head["unseen_mm2"]),
-    )
+        return cls(**stored_grid(path, arrays, head, KIND), tolerance=tolerance)

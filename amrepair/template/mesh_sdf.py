@@ -1,7 +1,7 @@
 """`MeshSdf`: the exact signed distance of a closed mesh.
 
 Distance is to the nearest triangle, sign by what rays cross (`nearest`). It holds no learned
-state; `LearnedSdf` is faster.
+state; `GridSdf` is faster.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""`NetworkSdf`: a template as PASDF has it, one coordinate network for the whole field.
+"""`PaperSdf`: a template as PASDF has it, one coordinate network for the whole field.
 
 It answers with torch, loaded on first use, in batches and with exact gradients. Fitting is
-`paper`'s business. It is 20 times slower than `LearnedSdf` and saturates at the training clamp.
+`paper`'s business. It is 20 times slower than `GridSdf` and saturates at the training clamp.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Architecture:
 
 
 @dataclass(frozen=True, slots=True)
-class NetworkSdf:
+class PaperSdf:
     """A fitted network (`Template`).
 
     Attributes
@@ -203,9 +203,7 @@ class NetworkSdf:
         write_template(path, arrays, head)
 
     @classmethod
-    def unpacked(
-        cls, path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]
-    ) -> NetworkSdf:
+    def unpacked(cls, path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]) -> PaperSdf:
         """The template in a file's arrays and head."""
         require_kind(path, head.get("kind"), KIND)
         known = {f.name for f in fields(Architecture)}

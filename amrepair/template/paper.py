@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from amrepair.device import torch_device
 from amrepair.errors import TemplateError
 from amrepair.template.mesh_sdf import MeshSdf
-from amrepair.template.network import Architecture, NetworkSdf
+from amrepair.template.network import Architecture, PaperSdf
 from amrepair.template.surface import sample_surface
 from gcode.progress import Progress, silent
 
@@ -123,7 +123,7 @@ def fit_paper(
     seed: int = 0,
     metadata: dict[str, str] | None = None,
     progress: Progress = silent,
-) -> NetworkSdf:
+) -> PaperSdf:
     """Fit a network to an exact field.
 
     Parameters
@@ -147,7 +147,7 @@ def fit_paper(
     target = np.clip(distance_mm / radius_mm, -options.clamp, options.clamp).astype(np.float32)
     weights, biases, steps = _train(local, target, options, device, seed, progress)
     said = {"settings": json.dumps(asdict(options)), **(metadata or {}), "steps": str(steps)}
-    made = NetworkSdf(
+    made = PaperSdf(
         architecture=options.architecture,
         weights=weights,
         biases=biases,

@@ -57,7 +57,7 @@ class OnGrid(Protocol):
 
     @property
     def grid_numbers(self) -> tuple[Any, ...]:
-        """What `learned_kernels.field_at` takes after a point."""
+        """What `trilinear_kernels.field_at` takes after a point."""
         ...
 
 

@@ -25,7 +25,8 @@ from scipy.stats import norm, t
 
 from amrepair.errors import InputError
 from amrepair.frames import unit_vectors
-from amrepair.template.learned import TOLERATED_SPREADS, Grid, LearnedSdf, Tolerance
+from amrepair.template.grid import Grid, GridSdf
+from amrepair.template.learned import TOLERATED_SPREADS, LearnedSdf, Tolerance
 
 BESIDE = [1, 2, 3, 4, 5]  # a site and its four neighbours, nearest first
 NORMAL_MAD = 0.6745  # median absolute deviation of a standard normal
@@ -78,7 +79,7 @@ class Sites:
     tree: cKDTree
 
     @classmethod
-    def on(cls, template: LearnedSdf, options: SoundOptions) -> Sites:
+    def on(cls, template: GridSdf, options: SoundOptions) -> Sites:
         """On a template's surface, `site_mm` apart."""
         place, normal = template.surface_points(options.site_mm)
         tree = cKDTree(np.column_stack([place, options.facing_mm * normal]))
@@ -141,7 +142,7 @@ class SoundParts:
 
 
 def learn(
-    template: LearnedSdf,
+    template: GridSdf,
     scans_mm: Sequence[Float[np.ndarray, "_ 3"]],
     options: SoundOptions | None = None,
 ) -> tuple[LearnedSdf, SoundParts]:
@@ -176,7 +177,7 @@ def learn(
 
 def _means(
     points_mm: Float[np.ndarray, "n 3"],
-    template: LearnedSdf,
+    template: GridSdf,
     sites: Sites,
     options: SoundOptions,
 ) -> Float[np.ndarray, " s"]:
@@ -281,7 +282,7 @@ def _inverse_trigamma(y: float) -> float:
     return x
 
 
-def _on_top(template: LearnedSdf, sound: SoundParts, options: SoundOptions) -> LearnedSdf:
+def _on_top(template: GridSdf, sound: SoundParts, options: SoundOptions) -> LearnedSdf:
     """The field with the offset taken from it, its mesh moved out by it, and the tolerance."""
     grid = template.grid
     axes = [grid.origin_mm[k] + grid.cell_mm * np.arange(n) for k, n in enumerate(grid.base.shape)]
@@ -300,19 +301,19 @@ def _on_top(template: LearnedSdf, sound: SoundParts, options: SoundOptions) -> L
     moved.vertices = (
         vertices + sound.at(sound.offset_mm, vertices, f_mm, outward)[:, None] * outward
     )
-    return replace(
+    taught = replace(
         template,
         grid=Grid(grid.origin_mm, grid.cell_mm, base, grid.block_of, blocks),
         mesh=moved,
-        tolerance=_tolerance(template, sound, options),
         metadata={**template.metadata, "learned_from": str(int(sound.scans.max(initial=0)))},
     )
+    return LearnedSdf.on(taught, _tolerance(template, sound, options))
 
 
 def _lowered(
     values: Float[np.ndarray, "*n"],
     nodes_mm: Float[np.ndarray, "*n 3"],
-    template: LearnedSdf,
+    template: GridSdf,
     sound: SoundParts,
     options: SoundOptions,
 ) -> Float[np.ndarray, "*n"]:
@@ -324,7 +325,7 @@ def _lowered(
     return np.ascontiguousarray(flat.reshape(values.shape), dtype=np.float32)
 
 
-def _tolerance(template: LearnedSdf, sound: SoundParts, options: SoundOptions) -> Tolerance:
+def _tolerance(template: GridSdf, sound: SoundParts, options: SoundOptions) -> Tolerance:
     """The spread in cells about the surface; the larger of it and what was tolerated before."""
     low, high = template.bounds_mm + np.array([[-1.0], [1.0]]) * options.reach_mm
     shape = np.ceil((high - low) / options.site_mm).astype(int)
@@ -335,6 +336,6 @@ def _tolerance(template: LearnedSdf, sound: SoundParts, options: SoundOptions) -
     spread = np.zeros(len(centres))
     f_near, gradient = template.distance_and_gradient(centres[near])
     spread[near] = sound.at(sound.spread_mm, centres[near], f_near, unit_vectors(gradient))
-    if template.tolerance is not None:
+    if isinstance(template, LearnedSdf):
         spread = np.maximum(spread, template.tolerance.at(centres))
     return Tolerance(low, options.site_mm, spread.reshape(tuple(shape)).astype(np.float32))

@@ -19,7 +19,7 @@ from typing import NoReturn, TypeVar
 
 import serial
 
-from gcode.errors import LinkError
+from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.port import Capabilities, LinkLostError, Temperatures
 from gcode.hosts.wirelog import WireLog
 from gcode.protocol import Link, LinkDialect, LinkTiming
@@ -243,6 +243,8 @@ class SerialConversation:
 
     def _ask(self, command: str) -> list[ev.Event]:
         """Send one command outside of any job and return what is said until its `ok`."""
+        if self._serial is None:  # nothing would ever answer
+            raise LocalProtocolError("The printer is not connected; call connect() first.")
         with self._mutex:
             heard: list[ev.Event] = []
             while not self._link.ready:

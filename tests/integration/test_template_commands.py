@@ -60,7 +60,6 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_template_from_scan_files_is_the_part(library: Path) -> None:
     template = load_template(library / "bracket.safetensors")
     assert isinstance(template, LearnedSdf)
-    assert template.tolerance is not None
     # the template's frame is the first scan's, which was not turned
     exact = MeshSdf.from_mesh(load_mesh(PARTS / "bracket.stl"))
     points = np.asarray(trimesh.sample.sample_surface(exact.mesh, 30_000, seed=9)[0])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import random
 import sys
+import time
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -163,3 +165,50 @@ def test_a_job_is_checked_against_the_photograph(
     assert ("First contact" in said.out + said.err) is hits
     if hits:
         assert ElementTree.parse(picture).getroot().tag.endswith("svg")
+
+
+def fuzzed(folder: Path, count: int, seed: int) -> int:
+    """How many of so many changed depth maps and cameras are refused; none may do anything else."""
+    rng, refused = random.Random(seed), 0
+    good = {}
+    for suffix in (".png", ".tif"):
+        path = written(folder, suffix=suffix)
+        camera = path.with_suffix(".json")
+        good[suffix] = {path: path.read_bytes(), camera: camera.read_bytes()}
+    printer = load_setup("generic_marlin").printer
+    for _ in range(count):
+        files = good[rng.choice([".png", ".tif"])]
+        changed = rng.choice(list(files))
+        for path, data in files.items():
+            out = bytearray(data)
+            for _ in range(rng.randint(1, 3) if path == changed else 0):
+                at = rng.randrange(len(out) + 1)
+                if rng.random() < 0.3:
+                    del out[at : at + rng.randint(1, 40)]
+                elif rng.random() < 0.5:
+                    out[at : at + 1] = bytes([rng.randrange(256)])
+                else:
+                    out[at:at] = rng.choice([b"9999999", b"-1", b"NaN", b"1e99", b"[]", b"null"])
+            path.write_bytes(bytes(out))
+        begun, said = time.process_time(), ""
+        try:
+            assert np.isfinite(standing_on_bed(next(iter(files)), printer).z_mm).all()
+        except InputError as error:
+            said = str(error)
+        refused += bool(said)
+        assert "\n" not in said
+        assert time.process_time() - begun < 2.0
+    return refused
+
+
+@pytest.mark.filterwarnings("ignore")  # of the libraries, about broken files
+def test_changed_depth_maps_are_read_or_refused(tmp_path: Path) -> None:
+    assert 10 < fuzzed(tmp_path, 60, seed=1) < 60
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("seed", range(2, 12))
+def test_many_changed_depth_maps_are_read_or_refused(tmp_path: Path, seed: int) -> None:
+    assert 1_000 < fuzzed(tmp_path, 10_000, seed=seed) < 10_000

@@ -18,7 +18,7 @@ from link_forks import until
 from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
-from gcode.errors import LinkError
+from gcode.errors import LinkError, LocalProtocolError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import LinkLostError, supervisor
 from gcode.hosts.fast_path import waiting
@@ -242,3 +242,11 @@ def test_a_garbled_answer_does_not_cost_the_job_its_proof(tmp_path: Path) -> Non
         for kind in ("M114", "M115"):
             printer._asked[kind] += 1  # as if one had been asked, and its answer not been heard
         assert printer.print(program(["G28", *MOVES[:50]])).ok
+
+
+def test_nothing_is_waited_for_on_a_port_that_was_never_opened() -> None:
+    """Regression: a run refused before it connected waited for ever for its heaters' `ok`."""
+    printer = SerialPrinter("/dev/ttyNOBODY", supervise=False)
+    for ask in (printer.heaters_off, printer.temperatures):
+        with pytest.raises(LocalProtocolError, match="not connected"):
+            ask()

@@ -13,7 +13,7 @@ from amrepair.merge import fit_from_scans, fit_mesh
 from amrepair.merge.open_mesh import OpenMeshOptions
 from amrepair.regions import detect
 from amrepair.scans import Scan
-from amrepair.template import LearnedSdf, load_template
+from amrepair.template import GridSdf, load_template
 from tests.analytic import box, cylinder, difference, sample_surface, union
 
 PART = difference(
@@ -42,7 +42,7 @@ def test_a_merged_scan_with_holes_is_a_template_that_knows_them(tmp_path: Path) 
     assert "seen by no scan" in made.template.metadata["notes"]
     made.template.save(tmp_path / "t.safetensors")
     template = load_template(tmp_path / "t.safetensors")
-    assert isinstance(template, LearnedSdf)
+    assert isinstance(template, GridSdf)
     assert template.coverage is not None
     truth, _ = sample_surface(PART.body, 0.5, seed=3)
     far = np.linalg.norm(truth[:, None] - HOLES_MM, axis=2).min(axis=1)

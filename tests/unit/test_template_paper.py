@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from amrepair.errors import TemplateError
-from amrepair.template import LearnedSdf, MeshSdf, NetworkSdf, extract_mesh, load_template
+from amrepair.template import GridSdf, MeshSdf, PaperSdf, extract_mesh, load_template
 from amrepair.template.fitting import fit_template
 from amrepair.template.network import Architecture
 from amrepair.template.paper import CODE, PAPER, VARIANTS, _from_cloud, _queries, fit_paper
@@ -26,7 +26,7 @@ def ball() -> MeshSdf:
 
 
 @pytest.fixture(scope="module")
-def fitted(ball: MeshSdf) -> NetworkSdf:
+def fitted(ball: MeshSdf) -> PaperSdf:
     return fit_paper(ball, options=QUICK, device="cpu", seed=1)
 
 
@@ -74,7 +74,7 @@ def test_distances_from_a_cloud_are_those_of_the_mesh(ball: MeshSdf) -> None:
     assert (np.sign(found) == np.sign(truth))[np.abs(truth) > 0.1].all()
 
 
-def test_a_ball_is_learned(fitted: NetworkSdf, ball: MeshSdf) -> None:
+def test_a_ball_is_learned(fitted: PaperSdf, ball: MeshSdf) -> None:
     points, _ = trimesh.sample.sample_surface(ball.mesh, 5_000, seed=3)
     error_mm = np.abs(fitted.distance(np.asarray(points)))
     assert error_mm.mean() < 0.05  # 0.5 % of the radius after 380 steps
@@ -84,13 +84,13 @@ def test_a_ball_is_learned(fitted: NetworkSdf, ball: MeshSdf) -> None:
     assert fitted.distance(0.95 * np.asarray(points)).mean() == pytest.approx(-0.5, abs=0.1)
 
 
-def test_far_points_are_outside_and_far(fitted: NetworkSdf) -> None:
+def test_far_points_are_outside_and_far(fitted: PaperSdf) -> None:
     far = np.array([[100.0, 0.0, 0.0], [0.0, -60.0, 60.0]])
     found = fitted.distance(far)
     assert (found > 30.0).all()  # the network itself saturates at the clamp
 
 
-def test_gradients_are_those_of_the_field(fitted: NetworkSdf) -> None:
+def test_gradients_are_those_of_the_field(fitted: PaperSdf) -> None:
     points = np.random.default_rng(0).uniform(-11, 11, (400, 3))
     value, gradient = fitted.distance_and_gradient(points)
     assert np.allclose(value, fitted.distance(points))
@@ -104,7 +104,7 @@ def test_gradients_are_those_of_the_field(fitted: NetworkSdf) -> None:
 
 
 def test_a_large_query_is_the_same_as_small_ones(
-    fitted: NetworkSdf, monkeypatch: pytest.MonkeyPatch
+    fitted: PaperSdf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points = np.random.default_rng(0).uniform(-11, 11, (1_000, 3))
     whole = fitted.distance(points)
@@ -112,23 +112,23 @@ def test_a_large_query_is_the_same_as_small_ones(
     assert np.allclose(fitted.distance(points), whole, atol=1e-5)
 
 
-def test_its_surface_is_a_closed_ball(fitted: NetworkSdf) -> None:
+def test_its_surface_is_a_closed_ball(fitted: PaperSdf) -> None:
     mesh = extract_mesh(fitted, 0.5)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS_MM**3, rel=0.03)
 
 
-def test_the_file_comes_back(fitted: NetworkSdf, tmp_path: Path) -> None:
+def test_the_file_comes_back(fitted: PaperSdf, tmp_path: Path) -> None:
     path = tmp_path / "ball.safetensors"
     fitted.save(path)
     again = load_template(path)
-    assert isinstance(again, NetworkSdf)
+    assert isinstance(again, PaperSdf)
     points = np.random.default_rng(0).uniform(-11, 11, (500, 3))
     assert np.array_equal(again.distance(points), fitted.distance(points))
     assert '"epochs": 10' in again.metadata["settings"]
     assert again.bias_mm == fitted.bias_mm
     with pytest.raises(TemplateError, match="kind 'network', not 'grid'"):
-        LearnedSdf.load(path)
+        GridSdf.load(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(TemplateError, match="truncated"):
         load_template(path)
@@ -153,7 +153,7 @@ def test_fit_template_takes_the_recipe_by_name() -> None:
     box = trimesh.creation.box((10.0, 8.0, 6.0))
     short = replace(QUICK, epochs=1, encoding=False, distances="cloud")
     template = fit_template(box, recipe="paper", paper=short, device="cpu")
-    assert isinstance(template, NetworkSdf)
+    assert isinstance(template, PaperSdf)
     assert template.metadata["recipe"] == "paper"
     assert template.weights[0].shape == (96, 3)
 

@@ -15,7 +15,7 @@ from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from amrepair.template.fit import fit_fast
-from amrepair.template.learned import LearnedSdf
+from amrepair.template.grid import GridSdf
 from amrepair.template.sound import SoundOptions, _common, learn
 
 SIZE_MM = np.array([40.0, 30.0, 16.0])
@@ -25,7 +25,7 @@ TOLERANCE_MM = 0.05  # below what the foot departs by: 0.25 mm less shrinkage
 
 
 @pytest.fixture(scope="module")
-def drawn() -> LearnedSdf:
+def drawn() -> GridSdf:
     box = trimesh.creation.box(extents=SIZE_MM)
     return fit_fast(MeshSdf.from_mesh(box), seed=0)
 
@@ -53,13 +53,13 @@ def printed(
     return place + rng.normal(0, SIGMA_MM, place.shape)
 
 
-def told(points: np.ndarray, template: LearnedSdf) -> list[tuple[Label, float, np.ndarray]]:
+def told(points: np.ndarray, template: GridSdf) -> list[tuple[Label, float, np.ndarray]]:
     options = RegionOptions(tolerance_mm=TOLERANCE_MM)
     found = detect(Scan(points, SIGMA_MM, "template", source="scan"), template, options=options)
     return [(r.label, r.depth_mm, r.box_mm.mean(axis=0)) for r in found.regions]
 
 
-def test_a_foot_and_shrinkage_are_learned_and_a_dent_is_not(drawn: LearnedSdf) -> None:
+def test_a_foot_and_shrinkage_are_learned_and_a_dent_is_not(drawn: GridSdf) -> None:
     learned, sound = learn(drawn, [printed(seed) for seed in range(5)])
     other = printed(10)
     wall = (other[:, 2] < -7.3) & (other[:, 2] > -7.8) & (other[:, 0] > 19.0)
@@ -77,7 +77,7 @@ def test_a_foot_and_shrinkage_are_learned_and_a_dent_is_not(drawn: LearnedSdf) -
     assert not sound.outvoted_mm2.any()
 
 
-def test_one_defective_scan_does_not_enter_and_is_named(drawn: LearnedSdf) -> None:
+def test_one_defective_scan_does_not_enter_and_is_named(drawn: GridSdf) -> None:
     scans = [printed(seed, dent_mm=1.0 if seed == 3 else 0.0) for seed in range(5)]
     learned, sound = learn(drawn, scans)
     assert np.flatnonzero(sound.outvoted_mm2 > 5.0).tolist() == [3]
@@ -87,7 +87,7 @@ def test_one_defective_scan_does_not_enter_and_is_named(drawn: LearnedSdf) -> No
     assert found[0][1] > 0.8
 
 
-def test_what_no_scan_saw_stays_as_it_was_drawn(drawn: LearnedSdf) -> None:
+def test_what_no_scan_saw_stays_as_it_was_drawn(drawn: GridSdf) -> None:
     half = [p[p[:, 0] < 0] for p in (printed(seed) for seed in range(3))]
     learned, sound = learn(drawn, half)
     right = np.array([[20.0, 0.0, 0.0], [20.0, 5.0, 3.0]])
@@ -151,7 +151,7 @@ def test_scans_in_poses_of_their_own_are_laid_first_and_a_foreign_one_is_left_ou
     assert "learned from 3 of 4 scans" in fit.notes[0]
 
 
-def test_scans_that_say_nothing_are_refused(drawn: LearnedSdf) -> None:
+def test_scans_that_say_nothing_are_refused(drawn: GridSdf) -> None:
     with pytest.raises(InputError, match="no scan"):
         learn(drawn, [])
     with pytest.raises(InputError, match="scan 2 has no surface"):

@@ -1,7 +1,7 @@
 # mypy: disable-error-code="no-untyped-def"
 """The fast field at points: a coarse grid, and finer blocks in the cells that need them; compiled.
 
-Layout of the arrays is `learned.Grid`'s.
+Layout of the arrays is `grid.Grid`'s.
 """
 
 from __future__ import annotations

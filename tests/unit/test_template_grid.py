@@ -9,22 +9,22 @@ import pytest
 import trimesh
 
 from amrepair.errors import TemplateError
-from amrepair.template import LearnedSdf, MeshSdf, PlannedSdf, fit_template, load_or_fit
+from amrepair.template import GridSdf, MeshSdf, PlannedSdf, fit_template, load_or_fit
 
 KNOB = Path(__file__).parents[2] / "examples" / "parts" / "knob.stl"
 
 
 @pytest.fixture(scope="module")
-def knob() -> LearnedSdf:
+def knob() -> GridSdf:
     return fit_template(KNOB, seed=1)
 
 
 @pytest.fixture(scope="module")
-def exact(knob: LearnedSdf) -> MeshSdf:
+def exact(knob: GridSdf) -> MeshSdf:
     return MeshSdf.from_mesh(knob.mesh)
 
 
-def test_the_surface_lies_where_it_should(knob: LearnedSdf) -> None:
+def test_the_surface_lies_where_it_should(knob: GridSdf) -> None:
     points, _ = trimesh.sample.sample_surface(knob.mesh, 40_000, seed=9)
     error_mm = np.abs(knob.distance(np.asarray(points)))
     assert error_mm.mean() < 0.002
@@ -32,7 +32,7 @@ def test_the_surface_lies_where_it_should(knob: LearnedSdf) -> None:
     assert np.quantile(error_mm, 0.99) < 1.5 * knob.bias_mm
 
 
-def test_the_grid_holds_the_exact_field_to_its_corners(knob: LearnedSdf, exact: MeshSdf) -> None:
+def test_the_grid_holds_the_exact_field_to_its_corners(knob: GridSdf, exact: MeshSdf) -> None:
     grid, rng = knob.grid, np.random.default_rng(0)
     nodes = np.stack([rng.integers(0, n, 20_000) for n in grid.base.shape], axis=1)
     truth = exact.distance(grid.origin_mm + grid.cell_mm * nodes)
@@ -46,7 +46,7 @@ def test_the_grid_holds_the_exact_field_to_its_corners(knob: LearnedSdf, exact: 
 
 @pytest.mark.parametrize("offset_mm", [0.05, 0.5, 2.0])
 def test_distances_and_signs_hold_away_from_it(
-    knob: LearnedSdf, exact: MeshSdf, offset_mm: float
+    knob: GridSdf, exact: MeshSdf, offset_mm: float
 ) -> None:
     points, _ = trimesh.sample.sample_surface(knob.mesh, 20_000, seed=4)
     rng = np.random.default_rng(0)
@@ -58,7 +58,7 @@ def test_distances_and_signs_hold_away_from_it(
     assert wrong.mean() < 1e-4
 
 
-def test_beyond_the_grid_distances_go_on(knob: LearnedSdf, exact: MeshSdf) -> None:
+def test_beyond_the_grid_distances_go_on(knob: GridSdf, exact: MeshSdf) -> None:
     # regression: 5 mm out, beyond the grid's margin, the field said 4.0
     points, _ = trimesh.sample.sample_surface(knob.mesh, 5_000, seed=6)
     middle = knob.bounds_mm.mean(axis=0)
@@ -70,12 +70,12 @@ def test_beyond_the_grid_distances_go_on(knob: LearnedSdf, exact: MeshSdf) -> No
         assert np.abs(knob.distance(away) - truth)[far].mean() < 0.02 * reach_mm
 
 
-def test_far_points_are_far(knob: LearnedSdf, exact: MeshSdf) -> None:
+def test_far_points_are_far(knob: GridSdf, exact: MeshSdf) -> None:
     far = np.array([[200.0, 0.0, 0.0], [0.0, -300.0, 50.0], [0.0, 0.0, 500.0]])
     assert knob.distance(far) == pytest.approx(exact.distance(far), rel=0.1)
 
 
-def test_gradients_point_outwards(knob: LearnedSdf) -> None:
+def test_gradients_point_outwards(knob: GridSdf) -> None:
     points, normals = knob.surface_points(1.5)
     _, gradient = knob.distance_and_gradient(points)
     agree = np.einsum("ij,ij->i", gradient, normals)
@@ -83,10 +83,10 @@ def test_gradients_point_outwards(knob: LearnedSdf) -> None:
     assert (agree > 0.7).mean() > 0.9
 
 
-def test_a_file_comes_back_bit_for_bit(knob: LearnedSdf, tmp_path: Path) -> None:
+def test_a_file_comes_back_bit_for_bit(knob: GridSdf, tmp_path: Path) -> None:
     path = tmp_path / "knob.safetensors"
     knob.save(path)
-    again = LearnedSdf.load(path)
+    again = GridSdf.load(path)
     points = np.random.default_rng(0).uniform(*knob.bounds_mm, (5_000, 3))
     assert np.array_equal(again.distance(points), knob.distance(points))
     assert again.metadata["recipe"] == "fast"
@@ -94,7 +94,7 @@ def test_a_file_comes_back_bit_for_bit(knob: LearnedSdf, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "zeroed", "foreign", "text"])
-def test_a_damaged_file_is_refused(knob: LearnedSdf, tmp_path: Path, damage: str) -> None:
+def test_a_damaged_file_is_refused(knob: GridSdf, tmp_path: Path, damage: str) -> None:
     path = tmp_path / "t.safetensors"
     if damage == "truncated":
         knob.save(path)
@@ -111,7 +111,7 @@ def test_a_damaged_file_is_refused(knob: LearnedSdf, tmp_path: Path, damage: str
     elif damage != "missing":
         path.write_bytes(b"" if damage == "empty" else b"not a template at all")
     with pytest.raises(TemplateError, match=r"t\.safetensors"):
-        LearnedSdf.load(path)
+        GridSdf.load(path)
 
 
 def test_the_cache_is_used_and_survives_damage(tmp_path: Path) -> None:
