@@ -11,7 +11,8 @@ from pathlib import Path
 
 HEAVY = ("scipy.stats", "trimesh", "torch", "open3d", "amrepair.align", "amrepair.repair")
 RUN = """
-import json, resource, sys
+import json, re, sys
+from pathlib import Path
 from amrepair.cli import main
 ends = []
 for words in json.loads(sys.argv[1]):
@@ -20,7 +21,9 @@ for words in json.loads(sys.argv[1]):
         main()
     except SystemExit as end:
         ends.append(end.code)
-kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+# not ru_maxrss: Linux counts what the parent held before this process began as its own
+status = Path("/proc/self/status").read_text()
+kilobytes = int(re.search(r"VmHWM:\\s+(\\d+)", status).group(1))
 print(json.dumps([ends, sorted(set(sys.modules) & set(HEAVY)), kilobytes]))
 """
 
