@@ -66,6 +66,11 @@ def dialect_of(name: str) -> Dialect:
         ) from None
 
 
+def fan_command(ratio: float) -> str:
+    """The line that sets the part's fan, 0 to 1."""
+    return f"M106 S{round(255 * ratio)}" if ratio > 0 else "M107"
+
+
 def number(value: float, digits: int) -> str:
     """A number as firmwares read it: no exponent, no trailing zeros, no minus zero.
 

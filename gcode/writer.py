@@ -12,7 +12,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float
 
-from gcode.dialects import Dialect, dialect_of, number
+from gcode.dialects import Dialect, dialect_of, fan_command, number
 from gcode.errors import SliceError
 from gcode.moves import (
     Comment,
@@ -150,7 +150,7 @@ class _Text:
             self.lines.append("M400")
 
     def _fan(self, ratio: float) -> None:
-        self.lines.append(f"M106 S{round(255 * ratio)}" if ratio > 0 else "M107")
+        self.lines.append(fan_command(ratio))
 
     def _acceleration(self, acceleration_mm_s2: float) -> None:
         self.lines.append(self._dialect.acceleration.format(a=number(acceleration_mm_s2, 0)))

@@ -29,6 +29,7 @@ from amrepair.loop import (
 from amrepair.loop.calibrate import read_calibration
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
+from amrepair.loop.options import UNASKED
 from amrepair.loop.pace import layers_at
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.probing import ProbeScanner
@@ -370,7 +371,7 @@ def print_run(
                 expected,
                 stops=begun.stops,
                 options=replace(setting.options(setup.process), silent_stops=SILENT_STOPS),
-                approval=Approval(word.to_print, word.to_go_on) if ask else Approval(),
+                approval=Approval(word.to_print, word.to_go_on) if ask else UNASKED,
                 records=Records(recorded, begun.folder.keep_scan, begun.tape, find, watch),
                 progress=page.watching(bars),
             )

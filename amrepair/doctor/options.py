@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType, NoneType
+from types import NoneType
 from typing import Any
 
 PACKAGES = ("amrepair", "gcode")
@@ -57,11 +57,7 @@ def options_classes() -> Iterator[type]:
         for path in sorted((root / package).rglob("*.py")):
             for name in _CLASS.findall(path.read_text(encoding="utf-8")):
                 module = ".".join(path.relative_to(root).with_suffix("").parts)
-                yield getattr(_loaded(module.removesuffix(".__init__")), name)
-
-
-def _loaded(module: str) -> ModuleType:
-    return import_module(module)
+                yield getattr(import_module(module.removesuffix(".__init__")), name)
 
 
 def _of(kind: Any) -> Iterator[Tunable]:

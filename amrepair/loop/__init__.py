@@ -1,6 +1,6 @@
 """The closed loop over a job's layers: print, stop, scan, repair, scan again, go on.
 
-`run` is the loop, `decide` its table of decisions, `tape` what it remembers, `replay` the same
+`run` is the loop, `amrepair.policy` decides in it, `tape` what it remembers, `replay` the same
 run looked at again. It knows ports only, and draws nothing.
 """
 

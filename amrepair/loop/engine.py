@@ -354,7 +354,9 @@ class Run:
             strict=False,
             wanted=lambda region: (
                 self._objects.owner(np.asarray(region.box_mm)) not in self._objects.given_up
-                and early_action(region, self._job, site.setup, stop.layer_index)
+                and early_action(
+                    region, self._job, site.setup, stop.layer_index, self._options.policy
+                )
                 is not Action.FILL_WITH_NEXT
             ),
             rng=np.random.default_rng([self._options.seed, number]),

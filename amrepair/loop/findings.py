@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from amrepair.loop.layer_level import FLOW_TEST, FlowOptions, LayerLevel, lie_off
 from amrepair.loop.objects import Objects
+from amrepair.policy import POLICY, PolicyOptions
 from amrepair.policy.table import Action, Cover, Finding, judge
 from amrepair.policy.worth import defect_volumes
 from amrepair.regions import Label, Region
@@ -138,7 +139,7 @@ def findings(
     owners = _owners(objects, regions, line)
     off = lie_off(LayerLevel.of(plan, z_mm, flow_test) if regions else None, regions)
     for region, whole_mm3, is_off, owner in zip(
-        regions, _whole_defects(regions), off, owners, strict=True
+        regions, _whole_defects(regions, plan.policy), off, owners, strict=True
     ):
         reach, hit = 1.0, 0.0
         if region.label is Label.MISSING:
@@ -190,19 +191,30 @@ def _owners(
     return found
 
 
-def _whole_defects(regions: Sequence[Region]) -> Float[np.ndarray, " n"]:
+def _whole_defects(
+    regions: Sequence[Region], policy: PolicyOptions = POLICY
+) -> Float[np.ndarray, " n"]:
     """(n,) volume of the defect that each region is a piece of, mm³."""
     whole_mm3 = np.zeros(len(regions))
     for label in Label:
         mine = [k for k, region in enumerate(regions) if region.label is label]
         boxes = [np.asarray(regions[k].box_mm) for k in mine]
         whole_mm3[mine] = defect_volumes(
-            boxes, [regions[k].volume_mm3 for k in mine], [regions[k].skipped for k in mine]
+            boxes,
+            [regions[k].volume_mm3 for k in mine],
+            [regions[k].skipped for k in mine],
+            policy,
         )
     return whole_mm3
 
 
-def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int | None) -> Action:
+def early_action(
+    region: Region,
+    job: Job,
+    setup: PrintSetup,
+    layer_index: int | None,
+    policy: PolicyOptions = POLICY,
+) -> Action:
     """What the table says of a missing region before anybody knows what can be reached of it."""
     layer_mm = setup.process.layer_height_mm
     finding = Finding(
@@ -219,7 +231,7 @@ def early_action(region: Region, job: Job, setup: PrintSetup, layer_index: int |
         box_mm=_corners(region.box_mm),
         skipped=region.skipped,
     )
-    return judge(finding).action
+    return judge(finding, policy).action
 
 
 def thickness_mm(region: Region) -> float:

@@ -21,7 +21,6 @@ from amrepair.loop import travel
 from amrepair.loop.looks import Stop
 from amrepair.loop.touch_design import Flats, TouchOptions, first_places, flats_of, next_places
 from amrepair.loop.touched import Touches, measured_sigma_mm, scan_of
-from amrepair.regions.options import RegionOptions
 from amrepair.scans import PROBE, Scan, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.hosts.port import Printer
@@ -188,7 +187,7 @@ class ProbeScanner:
         flats = flats_of(self._job, stop, self._setup, standing)
         touches, count = self._touched(stop, flats, standing)
         self._before.append((stop, touches))
-        off = int(touches.is_off(RegionOptions()).sum())
+        off = int(touches.is_off.sum())
         cost = Felt(stop.label, count, off, touches.sigma_mm, self._clock() - began_s)
         self.felt.append(cost)
         self._progress(f"{stop.label}: {cost.told()}", 1.0, 1.0)
@@ -226,7 +225,7 @@ class ProbeScanner:
             felt_mm = np.concatenate([felt_mm, np.column_stack([places, z_mm])])
             touches = Touches(felt_mm, self._planned(felt_mm, flats), sigma_mm)
             places = next_places(
-                flats, felt_mm[:, :2], touches.off_mm, touches.is_off(RegionOptions()),
+                flats, felt_mm[:, :2], touches.off_mm, touches.is_off,
                 reach_mm=self._reach_mm, most=most - count,
             )  # fmt: skip
         self._progress(f"touch {stop.label}: the nozzle gets hot again", float(most), float(most))
@@ -237,7 +236,7 @@ class ProbeScanner:
         """Where a look begins: what was off here before, else far from all that was felt."""
         most = self._options.most - self._options.repeats
         before = [touches for earlier, touches in self._before if earlier == stop]
-        if before and (is_off := before[-1].is_off(RegionOptions())).any():
+        if before and (is_off := before[-1].is_off).any():
             # something was printed since: is it as it should be, and what had no touch left?
             last = before[-1]
             again = last.place_mm[is_off, :2]

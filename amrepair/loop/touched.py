@@ -48,8 +48,10 @@ class Touches:
         """(n,) higher than planned; negative: lower."""
         return np.asarray(self.place_mm[:, 2] - self.planned_mm)
 
-    def is_off(self, options: RegionOptions) -> Bool[np.ndarray, " n"]:
+    @property
+    def is_off(self) -> Bool[np.ndarray, " n"]:
         """(n,) whether a touch is beyond what a region goes on to, and beyond noise."""
+        options = RegionOptions()
         allowed_mm = options.top_allowance_mm + options.registration_sigma_mm
         least_mm = max(options.grow_share * allowed_mm, SURE_SIGMAS * self.sigma_mm)
         return np.asarray(np.abs(self.off_mm) > least_mm)
@@ -75,7 +77,7 @@ def scan_of(
     reach_mm
         How far from its middle a touch speaks.
     """
-    xy_mm, is_low = touches.place_mm[:, :2], touches.is_off(RegionOptions()) & (touches.off_mm < 0)
+    xy_mm, is_low = touches.place_mm[:, :2], touches.is_off & (touches.off_mm < 0)
     rows, columns = np.nonzero(np.isfinite(flats.top_mm))
     cells_mm, tops_mm = flats.xy_mm(rows, columns), flats.top_mm[rows, columns]
     best, nearest_mm = np.full(len(cells_mm), np.inf), np.full(len(cells_mm), np.inf)

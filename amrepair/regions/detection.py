@@ -100,7 +100,7 @@ def detect(
     whole_part = top_z_mm is None and calibration != NORMAL and not pose_is_known
     seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
     progress("detect", 1.0, 4.0)
-    test = _test(seen, sites, scan, template, options, calibration)
+    test = _tested(seen, sites, scan, template, options, calibration)
     progress("detect", 2.0, 4.0)
     evidence, surface_label = _bounded(seen, test, scan, template, options, calibration)
     progress("detect", 3.0, 4.0)
@@ -163,7 +163,7 @@ class _Tested:
     top_mm: float
 
 
-def _test(
+def _tested(
     seen: Observed,
     sites: Sites,
     scan: Scan,
@@ -173,7 +173,7 @@ def _test(
 ) -> _Tested:
     """Test every scale, and grow regions from where it is significant."""
     surfels = seen.surfels
-    levels = _tested(sites, options, calibration)
+    levels = _levels(sites, options, calibration)
     strands = _strands(surfels, template, levels, options, calibration)
     tolerances_mm = tolerances(options, template)
     labels, log_p = grown(
@@ -222,10 +222,10 @@ def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
     """
     assert anomaly.sites is not None
     assert anomaly.options is not None
-    return _tested(anomaly.sites, anomaly.options, None)
+    return _levels(anomaly.sites, anomaly.options, None)
 
 
-def _tested(
+def _levels(
     sites: Sites, options: RegionOptions, calibration: Calibration | None
 ) -> tuple[Level, ...]:
     """The test of every scale."""

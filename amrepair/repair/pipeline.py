@@ -158,9 +158,9 @@ def _align(
     with ThreadPoolExecutor(1) as beside:
         # what rays saw needs no pose, nor it them; a part of the scan has images of its own
         seen = None if in_view.is_cut(site) else beside.submit(range_images, scan)
-        known = scan.frame == PROBE and guess is not None
-        if known and guess is not None:
-            registration = Registration.known(guess)
+        known = guess if scan.frame == PROBE else None
+        if known is not None:
+            registration = Registration.known(known)
         else:
             outer = in_view.outside_open_infill(scan, site, guess)
             registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
@@ -177,7 +177,7 @@ def _align(
         whole,
         in_view.of_layer(in_view.of_the_part(whole, site), site),
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
-        known,
+        known is not None,
     )
 
 

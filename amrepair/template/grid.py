@@ -17,7 +17,6 @@ from scipy import ndimage
 
 from amrepair.errors import TemplateError
 from amrepair.template import trilinear_kernels as kernels
-from amrepair.template.cut import CutTemplate
 from amrepair.template.file import (
     read_template,
     require_kind,
@@ -25,9 +24,7 @@ from amrepair.template.file import (
     stored_metadata,
     write_template,
 )
-from amrepair.template.port import Template
-from amrepair.template.surface import mesh_points
-from gcode.solids import as_manifold
+from amrepair.template.shape import MeshShape
 
 if TYPE_CHECKING:
     import trimesh
@@ -166,7 +163,7 @@ class Coverage:
 
 
 @dataclass(frozen=True, slots=True)
-class GridSdf:
+class GridSdf(MeshShape):
     """The field of a mesh, as exact as its grid is fine (`Template`).
 
     Attributes
@@ -186,11 +183,6 @@ class GridSdf:
     bias_mm: float
     metadata: dict[str, str] = field(default_factory=dict)
     coverage: Coverage | None = None
-
-    @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
-        """(2, 3) box of the part."""
-        return np.array(self.mesh.bounds, dtype=np.float64)
 
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) signed distance, mm, negative inside."""
@@ -221,26 +213,6 @@ class GridSdf:
     def grid_numbers(self) -> tuple[Any, ...]:
         """The field as compiled code asks it (`OnGrid`)."""
         return self.grid.numbers
-
-    def below_z(self, z_mm: float) -> Template:
-        """The part printed so far."""
-        return CutTemplate(self, z_mm)
-
-    def surface_points(
-        self, spacing_mm: float
-    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """(m, 3) points of the part's surface, each for spacing² of area, and their normals."""
-        return mesh_points(self.mesh, spacing_mm)
-
-    def solid(self) -> Any:
-        """The part as a `manifold3d.Manifold`."""
-        return as_manifold(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
-
-    def extracted(self, voxel_mm: float, *, level_mm: float = 0.0) -> trimesh.Trimesh:
-        """A level set as a closed mesh (`extract.extract_mesh`)."""
-        from amrepair.template.extract import extract_mesh
-
-        return extract_mesh(self, voxel_mm, level_mm=level_mm)
 
     def save(self, path: Path) -> None:
         """Write the template's file, whole or not at all."""

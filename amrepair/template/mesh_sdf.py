@@ -7,17 +7,14 @@ state; `GridSdf` is faster.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from amrepair.template.cut import CutTemplate
 from amrepair.template.mesh_file import require_mesh
 from amrepair.template.nearest import Nearest, TriangleTree
-from amrepair.template.port import Template
-from amrepair.template.surface import mesh_points
-from gcode.solids import as_manifold
+from amrepair.template.shape import MeshShape
 
 if TYPE_CHECKING:
     import trimesh
@@ -27,7 +24,7 @@ TOUCHING_MM = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class MeshSdf:
+class MeshSdf(MeshShape):
     """Signed distance to a closed mesh (negative inside), mm.
 
     Attributes
@@ -51,11 +48,6 @@ class MeshSdf:
         closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
         tree = TriangleTree.of(np.asarray(closed.vertices), np.asarray(closed.faces))
         return cls(mesh=closed, _tree=tree)
-
-    @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
-        """(2, 3) box of the mesh."""
-        return np.array(self.mesh.bounds, dtype=np.float64)
 
     @property
     def bias_mm(self) -> float:
@@ -94,23 +86,3 @@ class MeshSdf:
         unclear = np.flatnonzero(found.side == 0)
         outward[unclear] = np.where(self._tree.inside(points_mm[unclear]), -1.0, 1.0)
         return outward
-
-    def below_z(self, z_mm: float) -> Template:
-        """The part printed so far."""
-        return CutTemplate(self, z_mm)
-
-    def surface_points(
-        self, spacing_mm: float
-    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """(m, 3) points on the mesh, each for spacing² of area, and (m, 3) face normals."""
-        return mesh_points(self.mesh, spacing_mm)
-
-    def solid(self) -> Any:
-        """The mesh itself as a `manifold3d.Manifold`."""
-        return as_manifold(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
-
-    def extracted(self, voxel_mm: float, *, level_mm: float = 0.0) -> trimesh.Trimesh:
-        """A level set as a closed mesh (`extract.extract_mesh`)."""
-        from amrepair.template.extract import extract_mesh
-
-        return extract_mesh(self, voxel_mm, level_mm=level_mm)

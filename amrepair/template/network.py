@@ -16,11 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import TemplateError
-from amrepair.template.cut import CutTemplate
 from amrepair.template.file import require_kind, stored_mesh, stored_metadata, write_template
-from amrepair.template.port import Template
-from amrepair.template.surface import mesh_points
-from gcode.solids import as_manifold
+from amrepair.template.shape import MeshShape
 
 if TYPE_CHECKING:
     import torch
@@ -86,7 +83,7 @@ class Architecture:
 
 
 @dataclass(frozen=True, slots=True)
-class PaperSdf:
+class PaperSdf(MeshShape):
     """A fitted network (`Template`).
 
     Attributes
@@ -109,11 +106,6 @@ class PaperSdf:
     mesh: trimesh.Trimesh
     bias_mm: float
     metadata: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
-        """(2, 3) box of the part."""
-        return np.array(self.mesh.bounds, dtype=np.float64)
 
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) signed distance, mm, negative inside."""
@@ -169,20 +161,6 @@ class PaperSdf:
             if k == self.architecture.skip - 1:
                 x = torch.cat([x, inputs], dim=1)
         return x.squeeze(1)
-
-    def below_z(self, z_mm: float) -> Template:
-        """The part printed so far."""
-        return CutTemplate(self, z_mm)
-
-    def surface_points(
-        self, spacing_mm: float
-    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """(m, 3) points of the part's surface, each for spacing² of area, and their normals."""
-        return mesh_points(self.mesh, spacing_mm)
-
-    def solid(self) -> Any:
-        """The part as a `manifold3d.Manifold`."""
-        return as_manifold(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
 
     def save(self, path: Path) -> None:
         """Write the template's file, whole or not at all."""

@@ -7,10 +7,11 @@ RepRapFirmware (S-1: none, A: its name); and the comments of PrusaSlicer and Orc
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from gcode.reader.job import Job
 
@@ -42,10 +43,18 @@ class JobObjects:
 
     def box_mm(self, job: Job, index: int) -> tuple[float, float, float, float]:
         """(x_min, y_min, x_max, y_max) of an object's beads, build frame."""
-        own = self.of_bead == index
-        both = np.concatenate([job.beads.start_mm[own, :2], job.beads.end_mm[own, :2]])
-        (x0, y0), (x1, y1) = both.min(axis=0).tolist(), both.max(axis=0).tolist()
-        return x0, y0, x1, y1
+        return box_of_beads_mm(job, self.of_bead == index)
+
+    def own(self, names: Sequence[str]) -> Bool[np.ndarray, " n"]:
+        """(n,) which of the job's beads are of some objects."""
+        return np.isin(self.of_bead, [self.names.index(name) for name in names])
+
+
+def box_of_beads_mm(job: Job, which: Bool[np.ndarray, " n"]) -> tuple[float, float, float, float]:
+    """(x_min, y_min, x_max, y_max) of some of a job's beads, build frame."""
+    both = np.concatenate([job.beads.start_mm[which, :2], job.beads.end_mm[which, :2]])
+    (x0, y0), (x1, y1) = both.min(axis=0).tolist(), both.max(axis=0).tolist()
+    return x0, y0, x1, y1
 
 
 def objects_of(job: Job) -> JobObjects:

@@ -7,8 +7,9 @@ straight down, and says again what the job had set.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
-from gcode.dialects import number
+from gcode.dialects import fan_command, number
 from gcode.errors import InputError
 from gcode.moves import ModalState
 from gcode.profiles import PrinterProfile, PrintSetup
@@ -58,13 +59,15 @@ def height_over(top_mm: float, state: ModalState, printer: PrinterProfile) -> fl
     return round(clear_mm, 3)
 
 
+def filament_back_mm(job: Job) -> Float[np.ndarray, " m"]:
+    """(m + 1,) filament that is back in the nozzle before each line of a job, and at its end."""
+    pushed_mm = np.concatenate([[0.0], np.cumsum(job.moves()[1])])
+    return np.asarray(np.maximum.accumulate(pushed_mm) - pushed_mm)
+
+
 def pulled_back_mm(job: Job, line: int) -> float:
     """Filament that the job has pulled back and not yet pushed out again."""
-    pulled_mm = 0.0
-    pushed = job.moves()[1][:line]
-    for step in pushed[np.flatnonzero(pushed)]:
-        pulled_mm = max(0.0, pulled_mm - float(step))
-    return pulled_mm
+    return float(filament_back_mm(job)[line])
 
 
 class Head:
@@ -151,9 +154,7 @@ class Head:
         """Limits, fan, extruder position, feed and modes, as the job set them."""
         state = self._state
         self.lines += settings.commands
-        self.lines.append(
-            f"M106 S{round(255 * state.fan_ratio)}" if state.fan_ratio > 0 else "M107"
-        )
+        self.lines.append(fan_command(state.fan_ratio))
         self.lines.append(f"G92 E{number(state.e_mm, 5)}")
         if state.feed_mm_s > 0:
             self.lines.append(f"G1 F{number(mm_min_from_mm_s(state.feed_mm_s), 1)}")

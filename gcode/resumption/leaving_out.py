@@ -17,7 +17,7 @@ from gcode.errors import InputError
 from gcode.moves import ModalState
 from gcode.profiles import PrinterProfile
 from gcode.reader import Job, JobObjects, objects_of
-from gcode.resumption.head import feed
+from gcode.resumption.head import feed, filament_back_mm
 
 MOVE = re.compile(r"^\s*[Gg]0*[0123](?!\d)")
 LEAST_MM = 5e-4
@@ -90,17 +90,11 @@ def _across(job: Job, start: int, stop: int, printer: PrinterProfile) -> list[st
 
 def _filament(job: Job, start: int, stop: int, printer: PrinterProfile) -> list[str]:
     """What is to be pulled back before the way over the gap, as the job has it behind it."""
-    pushed_mm = job.moves()[1]
-    more_mm = _pulled_back(pushed_mm[:stop]) - _pulled_back(pushed_mm[:start])
+    back_mm = filament_back_mm(job)
+    more_mm = float(back_mm[stop] - back_mm[start])
     if abs(more_mm) < LEAST_MM:
         return []
     return [f"G1 E{number(-more_mm, 5)} F{feed(printer.retraction_speed_mm_s)}"]
-
-
-def _pulled_back(pushed_mm: np.ndarray) -> float:
-    """Filament that is back after some moves."""
-    whole = np.concatenate([[0.0], np.cumsum(pushed_mm)])
-    return float(np.maximum.accumulate(whole)[-1] - whole[-1])
 
 
 def modes_as(after: ModalState) -> list[str]:

@@ -22,7 +22,8 @@ from gcode.errors import InputError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader import Job, JobObjects, objects_of, read_job
-from gcode.resumption.head import feed
+from gcode.reader.objects import box_of_beads_mm
+from gcode.resumption.head import feed, filament_back_mm
 from gcode.resumption.leaving_out import LEAST_MM, MOVE, modes_as
 from gcode.surfaces import HeightField
 
@@ -94,11 +95,11 @@ def rest_without(
     if _FIRMWARE_RETRACTION.search("\n".join(lines[first:])):
         raise InputError("the job retracts by G10 and G11, which cannot be followed over a gap")
     objects = objects_of(job)
-    given_up = np.isin(objects.of_bead, [objects.names.index(name) for name in names])
+    given_up = objects.own(names)
     later = job.beads.line >= first
     if not (later & ~given_up).any():
         raise InputError("nothing of the job would be left")
-    pen = _Pen(job, setup, given_up & ~later, standing, pulled_mm)
+    pen = _Pen(job, setup, first, given_up & ~later, standing, pulled_mm)
     for start, stop, kept in _pieces(job, given_up, first, stops):
         (pen.keep if kept else pen.pass_over)(start, stop)
     pen.line_of[len(lines) - 1 :] = first + len(pen.text)
@@ -122,8 +123,7 @@ def given_up_box_mm(
     """(x_min, y_min, x_max, y_max) of some beads and what is beside them; None where none are."""
     if not given_up.any():
         return None
-    xy = np.concatenate([job.beads.start_mm[given_up, :2], job.beads.end_mm[given_up, :2]])
-    (x0, y0), (x1, y1) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
+    x0, y0, x1, y1 = box_of_beads_mm(job, given_up)
     return x0 - BESIDE_MM, y0 - BESIDE_MM, x1 + BESIDE_MM, y1 + BESIDE_MM
 
 
@@ -162,6 +162,7 @@ class _Pen:
 
     job: Job
     setup: PrintSetup
+    first: int
     gone: Bool[np.ndarray, " n"]
     standing: HeightField
     pulled_mm: float
@@ -171,19 +172,16 @@ class _Pen:
     _pushed_mm: np.ndarray = field(init=False)
     _back_mm: np.ndarray = field(init=False)
     _box_mm: tuple[float, float, float, float] | None = field(init=False)
-    _first: int = -1
 
     def __post_init__(self) -> None:
         self._lines = self.job.program.text.split("\n")
         self.line_of = np.zeros(len(self._lines) + 1, dtype=np.int64)
         self._pushed_mm = self.job.moves()[1]
-        whole = np.concatenate([[0.0], np.cumsum(self._pushed_mm)])
-        self._back_mm = np.maximum.accumulate(whole) - whole
+        self._back_mm = filament_back_mm(self.job)
         self._box_mm = given_up_box_mm(self.job, self.gone)
 
     def pass_over(self, start: int, stop: int) -> None:
         """Lay nothing, and go, lifted, to where the job is after it."""
-        self._begin(start)
         for line in range(start, stop):
             self._note(line)
             if not MOVE.match(self._lines[line]):
@@ -193,14 +191,10 @@ class _Pen:
         self.text += ["G90", "M83"]
         if more_mm > LEAST_MM:
             self._push(-more_mm)
-        x, y, z = after.position_mm
-        lifted = f"G1 Z{number(self._over(z), 3)} F{feed(machine.z_speed_mm_s)}"
-        self.text.append(lifted)
+        up, *there = self._way_to(after.position_mm)
+        self.text.append(up)
         if self._lays_next(stop):
-            self.text += [
-                f"G1 X{number(x, 5)} Y{number(y, 5)} F{feed(machine.travel_speed_mm_s)}",
-                f"G1 Z{number(z, 5)} F{feed(machine.z_speed_mm_s)}",
-            ]
+            self.text += there
             self._push(self.pulled_mm - self._as_the_job(stop))
         self.text += modes_as(after)
 
@@ -218,12 +212,8 @@ class _Pen:
             self.text += self._lifted(line) if crossing else [self._lines[line]]
         self.pulled_mm = self._as_the_job(stop)
 
-    def _begin(self, line: int) -> None:
-        if self._first < 0:
-            self._first = line
-
     def _note(self, line: int) -> None:
-        self.line_of[line] = self._first + len(self.text)
+        self.line_of[line] = self.first + len(self.text)
 
     def _lays_next(self, line: int) -> bool:
         return bool(np.isin(line, self.job.beads.line))
@@ -256,19 +246,24 @@ class _Pen:
         return bool(((on >= box[:2]) & (on <= box[2:])).all(axis=1).any())
 
     def _lifted(self, line: int) -> list[str]:
-        machine, after = self.setup.printer, self.job.state_after(line + 1)
-        x, y, z = after.position_mm
-        found = [
-            f"G1 Z{number(self._over(z), 3)} F{feed(machine.z_speed_mm_s)}",
-            f"G1 X{number(x, 5)} Y{number(y, 5)} F{feed(machine.travel_speed_mm_s)}",
-            f"G1 Z{number(z, 5)} F{feed(machine.z_speed_mm_s)}",
-        ]
+        after = self.job.state_after(line + 1)
+        found = self._way_to(after.position_mm)
         return [*found, f"G1 F{feed(after.feed_mm_s)}"] if after.feed_mm_s > 0 else found
+
+    def _way_to(self, place_mm: tuple[float, float, float]) -> list[str]:
+        """Up over all that stands there, across, and straight down."""
+        machine, (x, y, z) = self.setup.printer, place_mm
+        down = f"F{feed(machine.z_speed_mm_s)}"
+        return [
+            f"G1 Z{number(self._over(z), 3)} {down}",
+            f"G1 X{number(x, 5)} Y{number(y, 5)} F{feed(machine.travel_speed_mm_s)}",
+            f"G1 Z{number(z, 5)} {down}",
+        ]
 
 
 def without_beads(job: Job, objects: JobObjects, names: Sequence[str], first: int) -> Job:
     """The same job, as far as what it lays is asked for: of some objects nothing from a line on."""
-    gone = np.isin(objects.of_bead, [objects.names.index(name) for name in names])
+    gone = objects.own(names)
     keep = ~(gone & (job.beads.line >= first))
     beads = job.beads
     per_bead = ("start_mm", "end_mm", "section_mm2", "width_mm", "height_mm", "role", "layer",

@@ -23,12 +23,11 @@ from gcode.profiles import PrinterProfile, PrintSetup, ProbeProfile
 from gcode.progress import Progress, silent
 from gcode.reader import read_job
 from gcode.reader.job import Beads, JobLayer
-from gcode.resumption.head import LIFT_MM, height_over
+from gcode.resumption.head import LIFT_MM, feed, height_over
 from gcode.resumption.resume_at import first_layer
 from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import standing_field
 from gcode.surfaces import HeightField
-from gcode.units import mm_min_from_mm_s
 
 CELL_MM = 0.2
 FLAT_SLACK_MM = 0.01
@@ -178,8 +177,8 @@ def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchO
 
 def _text(touches: tuple[Touch, ...], setup: PrintSetup, high_mm: float, *, meshed: bool) -> str:
     """Above everything, X and Y homed; over each place, down to it, and up again."""
-    z_feed = f" F{number(mm_min_from_mm_s(setup.printer.z_speed_mm_s), 0)}"
-    travel = f" F{number(mm_min_from_mm_s(setup.printer.travel_speed_mm_s), 0)}"
+    z_feed = f" F{feed(setup.printer.z_speed_mm_s)}"
+    travel = f" F{feed(setup.printer.travel_speed_mm_s)}"
     up = f"G1 Z{number(high_mm, 3)}{z_feed}"
     lines = ["; Z found anew: heaters off, never deeper than planned", "G21", "G90", "M83", up]
     lines += ["G28 X Y", "M420 S1"] if meshed else ["G28 X Y"]
@@ -198,7 +197,7 @@ def touch_line(printer: PrinterProfile, *, from_mm: float, lowest_mm: float) -> 
     if COMMANDS[printer.dialect] == "AMREPAIR_TOUCH":
         depth = number(from_mm - lowest_mm, 3)
         return f"AMREPAIR_TOUCH DEPTH={depth} SPEED={number(probe.speed_mm_s, 3)}"
-    return f"G38.2 Z{number(lowest_mm, 3)} F{number(mm_min_from_mm_s(probe.speed_mm_s), 0)}"
+    return f"G38.2 Z{number(lowest_mm, 3)} F{feed(probe.speed_mm_s)}"
 
 
 def _flat(

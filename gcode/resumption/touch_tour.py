@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.check import CheckedProgram, Touch, check
-from gcode.dialects import number
+from gcode.dialects import fan_command, number
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
+from gcode.resumption.head import feed
 from gcode.resumption.touch import touch_line
 from gcode.surfaces import HeightField
-from gcode.units import mm_min_from_mm_s
 
 CLEAR_MM = 2.0
 """Between touches, over all that stands there: what stands out of a layer is mostly lower."""
@@ -51,7 +51,7 @@ def tour(
     tip_mm = np.asarray(places_mm) - probe.offset_mm  # the nozzle's, where the probe's meets
     touches = tuple(Touch(x, y, z, z - probe.depth_mm) for x, y, z in tip_mm.tolist())
     high_mm = standing.top_mm + CLEAR_MM - probe.offset_mm[2]
-    travel, down = _feed(printer.travel_speed_mm_s), _feed(printer.z_speed_mm_s)
+    travel, down = (f" F{feed(v)}" for v in (printer.travel_speed_mm_s, printer.z_speed_mm_s))
     x, y, z = (number(float(v), 3) for v in rest.position_mm)
     lines = ["; touches", "G21", "G90"]
     for touch in touches:
@@ -76,7 +76,7 @@ def cooled(setup: PrintSetup, rest: ModalState) -> CheckedProgram | None:
     cold = number(max(probe.cold_c, rest.bed_c + ABOVE_BED_C), 0)
     waits = {"klipper": [f"TEMPERATURE_WAIT SENSOR=extruder MAXIMUM={cold}"]}
     wait = waits.get(setup.printer.dialect, [f"M109 R{cold}", "M104 S0"])
-    lines = ["; cold, to touch", "M104 S0", "M106 S255", *wait, *_fan(rest)]
+    lines = ["; cold, to touch", "M104 S0", "M106 S255", *wait, fan_command(rest.fan_ratio)]
     program = Program("\n".join(lines) + "\n", setup.printer.dialect)
     return check(program, setup, initial=rest)
 
@@ -88,11 +88,3 @@ def heated(setup: PrintSetup, rest: ModalState) -> CheckedProgram | None:
     text = f"; as hot as before\nM109 S{number(rest.hotend_c, 0)}\n"
     program = Program(text, setup.printer.dialect)
     return check(program, setup, initial=replace(rest, hotend_c=0.0))
-
-
-def _fan(rest: ModalState) -> list[str]:
-    return [f"M106 S{number(255 * rest.fan_ratio, 0)}" if rest.fan_ratio > 0 else "M107"]
-
-
-def _feed(speed_mm_s: float) -> str:
-    return f" F{number(mm_min_from_mm_s(speed_mm_s), 0)}"

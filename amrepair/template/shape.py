@@ -1,0 +1,49 @@
+"""What every template that is told by a closed mesh answers from that mesh."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.template.cut import CutTemplate
+from amrepair.template.surface import mesh_points
+from gcode.solids import as_manifold
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from amrepair.template.port import Template
+
+
+class MeshShape:
+    """The part's surface and solid, for fields with a `mesh` (closed, outward winding)."""
+
+    __slots__ = ()
+    mesh: trimesh.Trimesh
+
+    @property
+    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
+        """(2, 3) box of the part."""
+        return np.array(self.mesh.bounds, dtype=np.float64)
+
+    def below_z(self, z_mm: float) -> Template:
+        """The part printed so far."""
+        return CutTemplate(self, z_mm)  # type: ignore[arg-type]  # distances are the field's
+
+    def surface_points(
+        self, spacing_mm: float
+    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+        """(m, 3) points of the part's surface, each for spacing² of area, and their normals."""
+        return mesh_points(self.mesh, spacing_mm)
+
+    def solid(self) -> Any:
+        """The part as a `manifold3d.Manifold`."""
+        return as_manifold(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
+
+    def extracted(self, voxel_mm: float, *, level_mm: float = 0.0) -> trimesh.Trimesh:
+        """A level set as a closed mesh (`extract.extract_mesh`)."""
+        from amrepair.template.extract import extract_mesh
+
+        return extract_mesh(self, voxel_mm, level_mm=level_mm)  # type: ignore[arg-type]
