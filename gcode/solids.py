@@ -227,7 +227,8 @@ def _binary_stl(path: Path) -> Float[np.ndarray, "v 3"] | None:
             f"its header promises {count} triangles, which are {expected} bytes; it has {len(data)}"
         )
     triangles = np.frombuffer(data, STL_TRIANGLE, offset=STL_HEAD)
-    return np.ascontiguousarray(triangles["corners"].reshape(-1, 3), dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN, which is refused as every other is
+        return np.ascontiguousarray(triangles["corners"].reshape(-1, 3), dtype=np.float64)
 
 
 def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:

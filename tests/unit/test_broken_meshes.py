@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from gcode.errors import InputError
-from gcode.solids import read_solid, read_triangles
+from gcode.solids import read_closed, read_solid, read_triangles
 
 CORE = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
 MESH = (
@@ -91,6 +91,20 @@ def test_an_stl_that_promises_more_than_it_holds_gets_one_sentence(tmp_path: Pat
     path.write_bytes(bytes(80) + (2**31).to_bytes(4, "little") + bytes(500))
     with pytest.raises(InputError, match=r"promises 2147483648 triangles.*it has 584"):
         read_solid(path)
+
+
+SIGNALLING_NAN = (0x7FA00000).to_bytes(4, "little")  # the cast to double precision complains
+
+
+def test_a_corner_that_is_a_signalling_nan_gets_one_sentence(tmp_path: Path) -> None:
+    """regression: a RuntimeWarning, which the fuzz of seed 3 found."""
+    path = tmp_path / "nan.stl"
+    box = trimesh.creation.box((10.0, 20.0, 30.0))
+    data = box.export(file_type="stl")
+    path.write_bytes(data[:96] + SIGNALLING_NAN + data[100:])  # x of the first corner
+    for read in (read_solid, read_closed):
+        with pytest.raises(InputError, match="not finite numbers"):
+            read(path)
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
