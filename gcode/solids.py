@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from gcode.errors import InputError
 from gcode.meshes import ClosedMesh, bodies_apart, closed_mesh
-from gcode.meshes_kernels import index_of_corners, put_in_table
+from gcode.meshes_kernels import index_of_corners, paired, put_in_table
 from gcode.solids_kernels import first_of_each
 from gcode.threemf import read_3mf
 
@@ -232,9 +232,15 @@ def _binary_stl(path: Path) -> Float[np.ndarray, "v 3"] | None:
 
 
 def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
-    """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
+    """A `manifold3d.Manifold` of these triangles; `is_valid` tells whether it is one.
+
+    An empty one where they close no surface, which manifold3d 3.5.4 is not asked: of such meshes it
+    refuses most, and ends the process on others.
+    """
     import manifold3d
 
+    if not are_closed(faces):
+        return manifold3d.Manifold()
     # Arrays are copied: the binding takes no read-only ones, and trimesh's are read-only.
     return manifold3d.Manifold(
         manifold3d.Mesh64(
@@ -242,6 +248,17 @@ def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
             np.array(faces, dtype=np.uint64, order="C"),
         )
     )
+
+
+def are_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Whether every edge of the faces is run as often one way as the other.
+
+    Faces that have a corner twice do not count.
+    """
+    a, b, c = faces.T
+    whole = (a != b) & (b != c) & (c != a)
+    some = faces if whole.all() else faces[whole]
+    return bool(paired(np.ascontiguousarray(some, np.int32))[1] >= 0)
 
 
 def is_valid(solid: Any) -> bool:
