@@ -27,7 +27,7 @@ from amrepair.loop.objects import Course, Objects
 from amrepair.loop.options import Approval, LoopOptions, Records
 from amrepair.loop.sites import Expected
 from amrepair.loop.situation import decide_look
-from amrepair.loop.tape import ANEW, LOOKS, TapeEndsError
+from amrepair.loop.tape import ANEW, LOOK_EVENTS, TapeEndsError
 from amrepair.loop.wire import Mover, Wire
 from amrepair.policy import Action, Decision
 from amrepair.repair import RepairPlan, Site, plan_repair
@@ -297,7 +297,7 @@ class Run:
 
     def _moved_scan(self, stop: Stop) -> Scan | None:
         """What a scanner sees that has the printer move: on the tape its moves precede the look."""
-        if not self._moves or self._tape.peek() in LOOKS:
+        if not self._moves or self._tape.peek() in LOOK_EVENTS:
             return None
         scan = self._scan(stop)
         return scan if self._tape.next_if(ANEW) is None else self._scan(stop)
