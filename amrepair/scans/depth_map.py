@@ -6,6 +6,7 @@ What the JSON file says is told in `gcode.surfaces.depth_maps`; `pose` is frame_
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,12 @@ def refuse_swollen_page(path: Path, page: Any, limit: UnpackLimit) -> None:
     """
     size = length_of(path)
     what = "an image of " + " × ".join(str(n) for n in page.shape)
+    promised, there = math.prod(page.chunked), len(page.dataoffsets)
+    if there < promised:  # what is not there would be read as zeros
+        raise InputError(
+            f"{path}: {what} is in {promised} pieces, and the file has {there}; it is cut off or "
+            "damaged"
+        )
     if page.compression == RAW:
         refuse_short(path, what, page.nbytes, size)
     else:

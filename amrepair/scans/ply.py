@@ -238,6 +238,10 @@ def read_grid(rest: memoryview, header: PlyHeader, path: Path) -> RangeGrid | No
             f"{path}: a pixel of the PLY file's range_grid is neither a gap nor one of its "
             f"{header.elements[0].count} vertices; it is damaged"
         )
+    if int(np.bincount(entries[entries >= 0], minlength=1).max()) > 1:
+        raise InputError(
+            f"{path}: two pixels of the PLY file's range_grid name one vertex; it is damaged"
+        )
     return RangeGrid(entries.astype(np.int32).reshape(rows, columns))
 
 

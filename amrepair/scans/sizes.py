@@ -19,6 +19,7 @@ PARSER_ERRORS = (
     ImportError,
     LookupError,
     MemoryError,
+    NameError,
     NotImplementedError,
     OSError,
     RecursionError,
