@@ -13,8 +13,8 @@ from amrepair.errors import InputError
 from amrepair.scans.range_grid import NO_POINT, RangeGrid
 from amrepair.scans.range_grid_kernels import lists_of_bytes, lists_of_numbers
 from amrepair.scans.scan import Scan
-from amrepair.scans.sizes import refuse_short
 from amrepair.scans.text import filled, read_table
+from gcode.surfaces.sizes import refuse_short
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
