@@ -34,7 +34,7 @@ from amrepair.template import (
     fit_template,
     load_template,
 )
-from amrepair.template.paper import PAPER, PaperOptions
+from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions
 from amrepair.template.port import Template
 from amrepair.template.sound import learn
 from amrepair.template.surface import sample_surface
@@ -49,7 +49,7 @@ _log = logging.getLogger(__name__)
 NEAR_NEIGHBOURS = 12
 WIDE_PASSES = 5  # means of means: as far as 64 neighbours, found in a quarter of the time
 WIDE_WEIGHT = 0.5
-LEAST_SIGMA_MM = 0.001 * DIAGONAL_MM
+LEAST_SET_SIGMA_MM = 0.001 * DIAGONAL_MM
 TOP_RATIO = 0.004
 MIN_TOP = 12
 # Farther out than this share of the part nothing more is learned: clutter must not set the score.
@@ -67,7 +67,7 @@ def class_template(
     cache: Path,
     *,
     recipe: str = "fast",
-    paper: PaperOptions = PAPER,
+    paper: PaperOptions = PUBLISHED_NETWORK,
 ) -> GridSdf | PaperSdf:
     """The class's template; fitted once for each seed, then read from the cache.
 
@@ -217,7 +217,7 @@ class FieldModel:
         spread = getattr(self.template, "spread_mm", None)
         spread_mm = np.zeros(len(placed)) if spread is None else spread(placed)
         # Published clouds may have neither noise nor spread; the unit does not matter then.
-        sigma_mm = np.hypot(max(self.sigma_mm, LEAST_SIGMA_MM), spread_mm)
+        sigma_mm = np.hypot(max(self.sigma_mm, LEAST_SET_SIGMA_MM), spread_mm)
         score = smoothed_score(placed, offset_mm, sigma_mm)
         top = max(MIN_TOP, int(TOP_RATIO * len(score)))
         return Scores(score, top_mean(score, top), np.abs(offset_mm))

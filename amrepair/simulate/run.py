@@ -31,7 +31,7 @@ from amrepair.loop import (
 from amrepair.loop.options import UNASKED
 from amrepair.loop.probing import Felt, PortFeeler, ProbeScanner
 from amrepair.loop.sites import sites
-from amrepair.policy import POLICY, PolicyOptions
+from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.repair import Stopwatch
 from amrepair.scans import PROBE, Scanner
 from amrepair.simulate.defects import Defect, PlacedDefect, place
@@ -275,7 +275,7 @@ def simulate_run(
     run: PreparedRun,
     *,
     wire_log: Path | None = None,
-    policy: PolicyOptions = POLICY,
+    policy: PolicyOptions = USUAL_POLICY,
     approval: Approval = UNASKED,
     record: Callable[[Look], None] = lambda look: None,
     begun: Callable[[Transform, Printer], Tape] = lambda pose, printer: Tape(),

@@ -14,7 +14,7 @@ from gcode.hosts.port import PrintableProgram
 from gcode.protocol import command_in
 
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
-_NAME = re.compile(r"([GM])\s*0*(\d+)")
+_CODE_NAME = re.compile(r"([GM])\s*0*(\d+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ def modes_after(
 def follow(modes: Modes, text: str, dialect: str) -> Modes:
     """Return the modes after one more line."""
     command = text.partition(";")[0].strip().upper()
-    match = _NAME.match(command)
+    match = _CODE_NAME.match(command)
     if match is None:
         return modes
     name = match.group(1) + match.group(2)

@@ -19,7 +19,7 @@ from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
 from gcode.progress import Progress
 
 METHOD = "amrepair_call"
-STEP = "_AMREPAIR_STEP"
+STEP_MACRO = "_AMREPAIR_STEP"
 STEP_LINES = 40
 """Lines a script: some seconds of moves, which Klipper has queued long before they are made."""
 WRITTEN_S = 3.0
@@ -76,7 +76,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
 
     def forget_steps(self) -> None:
         """What an earlier run had counted is none of this one's."""
-        self.command("\n".join(f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE={v} VALUE=0" for v in
+        self.command("\n".join(f"SET_GCODE_VARIABLE MACRO={STEP_MACRO} VARIABLE={v} VALUE=0" for v in
                                ("program", "begun", "done", "hotend", "bed")))  # fmt: skip
 
     def leave_out(self, name: str) -> None:
@@ -144,9 +144,9 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
                     self._session.news.wait(self._timing.poll_s)
             after = min(first + STEP_LINES, lines.stop)
             start = " START=1" if first == 0 else ""
-            script = [f"{STEP} PROGRAM={program} FROM={first} TO={after}{start}"]
+            script = [f"{STEP_MACRO} PROGRAM={program} FROM={first} TO={after}{start}"]
             script += [command for _, command in commands_of(checked, first, after)]
-            script.append(f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE=done VALUE={after}")
+            script.append(f"SET_GCODE_VARIABLE MACRO={STEP_MACRO} VARIABLE=done VALUE={after}")
             self._carry_out("\n".join(script), program, first, after)
             progress("printing", float(after - lines.start), float(len(lines)))
             first = after
@@ -188,11 +188,11 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
 
     def _steps(self) -> dict[str, int]:
         """What the printer's macro has counted."""
-        key = f"gcode_macro {STEP}"
+        key = f"gcode_macro {STEP_MACRO}"
         told = self._session.query({key: None}).get(key)
         if told is None:
             raise LinkError(
-                f"the printer behind {self.address.name} has no macro {STEP}; include amrepair.cfg "
+                f"the printer behind {self.address.name} has no macro {STEP_MACRO}; include amrepair.cfg "
                 "('amrepair agent --macros') in printer.cfg and restart Klipper."
             )
         return {name: int(told.get(name) or 0) for name in ("program", "begun", "done", "hotend",
@@ -242,7 +242,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
             now = self.temperatures()
             for name, value in (("hotend", now.hotend_target_c), ("bed", now.bed_target_c or 0)):
                 if value:
-                    text = f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE={name} VALUE={round(value)}"
+                    text = f"SET_GCODE_VARIABLE MACRO={STEP_MACRO} VARIABLE={name} VALUE={round(value)}"
                     self.command(text)
         super().heaters_off()
 

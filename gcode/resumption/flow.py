@@ -27,9 +27,9 @@ from gcode.reader import Job
 from gcode.surfaces import raster_kernels
 from gcode.units import filament_area_mm2
 
-LEAST_FACTOR, MOST_FACTOR = 0.3, 1.8
+LEAST_FACTOR, MOST_FLOW_FACTOR = 0.3, 1.8
 """Flow of a bead, of what the job plans: below, it tears; above, the nozzle ploughs."""
-STEP_MM = 0.5
+FLOW_STEP_MM = 0.5
 SAME_FACTOR = 0.03
 HEADROOM = 0.98
 """Of the printer's limits, so that rounding does not exceed them."""
@@ -194,12 +194,12 @@ class _Pen:
         for row in rows:
             start, end = beads.start_mm[row], beads.end_mm[row]
             length_mm = float(np.linalg.norm(end - start))
-            count = max(1, math.ceil(length_mm / STEP_MM))
+            count = max(1, math.ceil(length_mm / FLOW_STEP_MM))
             ends = start + (end - start) * (np.arange(1, count + 1) / count)[:, None]
             middles = ends - (end - start) * (0.5 / count)
             section = float(beads.section_mm2[row])
             most = min(
-                MOST_FACTOR,
+                MOST_FLOW_FACTOR,
                 self._most_mm2 / section,
                 self._most_mm3_s / max(section * feed_mm_s, 1e-9),
             )

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align import Registration, align
-from amrepair.align.search import PIECE, QUICK, CoarseField, search, spread_rotations
+from amrepair.align.search import PIECE, QUICK_EFFORT, CoarseField, search, spread_rotations
 from amrepair.align.thinning import Thinned, in_order, thin_out
 from amrepair.bench.bodies import standing_pose
 from amrepair.errors import AlignmentError
@@ -173,7 +173,7 @@ def test_clutter_does_not_mislead() -> None:
 
 
 def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK)
+    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK_EFFORT)
     monkeypatch.setattr("amrepair.align.anywhere.by_features", lambda *_: iter(()))
     template = notched()
     points = 10.0 * sample_surface(template.body, 3.0, seed=4)[0]  # centimetres taken for mm
@@ -299,7 +299,7 @@ def test_a_view_of_a_bent_thin_plate_lies_on_its_larger_piece(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # regression: it was laid 0.7 mm off between its pieces, some of it on either side of the plate
-    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK)
+    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK_EFFORT)
     monkeypatch.setattr("amrepair.align.anywhere._turns", lambda *_: [])
     plate = box((0, 0, 0), (100, 60, 1.2))
     for hole in (

@@ -10,7 +10,7 @@ import pytest
 
 from amrepair.loop.buried import buried, buried_mm3, ways
 from amrepair.loop.looks import Stop
-from amrepair.policy import POLICY, Action, decide
+from amrepair.policy import USUAL_POLICY, Action, decide
 from amrepair.policy.again import decided_again
 from amrepair.policy.table import Situation
 from amrepair.report.collect import loop_result
@@ -74,7 +74,7 @@ def test_below_the_first_layer_nothing_is_cut() -> None:
 
 
 def test_little_is_spanned_and_much_is_offered_whatever_else_is_decided() -> None:
-    least = POLICY.buried_mm3
+    least = USUAL_POLICY.buried_mm3
     assert decide((), Situation(Action.GO_ON, buried_mm3=0.9 * least)).action is Action.GO_ON
     much = Situation(Action.FILL_NOW, last_pass=True, buried_mm3=1.1 * least)
     offered = decide((), much)
@@ -83,7 +83,7 @@ def test_little_is_spanned_and_much_is_offered_whatever_else_is_decided() -> Non
     assert decide((), replace(much, last_pass=False)).action is Action.FILL_NOW
     gone_on = decide((), Situation(Action.GO_ON, buried_mm3=1.1 * least))
     assert decided_again(gone_on.to_json()).action is Action.OFFER
-    other = replace(POLICY, buried_mm3=2.0 * least)
+    other = replace(USUAL_POLICY, buried_mm3=2.0 * least)
     assert decided_again(gone_on.to_json(), other).action is Action.GO_ON
 
 
@@ -108,7 +108,7 @@ def test_nobody_to_ask_the_run_goes_on_and_the_result_has_the_ways(
     reprint, leave = last.ways
     assert reprint.layer in (3, 4)  # it begins at 0.8 mm: to a layer, as the scan has it
     assert reprint.filled_mm3 == pytest.approx(leave.left_mm3)
-    assert POLICY.buried_mm3 < leave.left_mm3 < 5.0 * 7.0 * 1.2
+    assert USUAL_POLICY.buried_mm3 < leave.left_mm3 < 5.0 * 7.0 * 1.2
     result = loop_result(
         report, repaired_ratio=None, gcode=None, seed=0, seconds={}, setup=small.setup
     )
