@@ -42,7 +42,7 @@ from gcode.resumption.head import pulled_back_mm
 from gcode.resumption.rest import rest_without
 from gcode.resumption.standing import with_solid
 
-ENDED_BY_NO = (Action.PAUSE, Action.GIVE_UP)
+ENDED_BY_NO = (Action.PAUSE, Action.GIVE_UP, Action.OFFER)
 
 
 class Run:
@@ -417,7 +417,7 @@ class Run:
         if action is Action.FILL_NOW:
             granted = self._approval.approve(look.plan)
             return replace(look, printed=granted, declined=not granted)
-        if action is Action.GIVE_UP and self._approval.ask is not None:
+        if action in (Action.GIVE_UP, Action.OFFER) and self._approval.ask is not None:
             return replace(look, declined=not self._approval.ask(look.decision))
         if action is Action.PAUSE:
             if self._approval.ask is None or not self._approval.ask(look.decision):
@@ -434,6 +434,7 @@ def _why(decision: Decision) -> str:
     own = [v for v in decision.verdicts if v.action is decision.action]
     kinds = ", ".join(sorted({str(v.finding.type) for v in own}))
     reason = own[0].reason if own else decision.situation.beyond or decision.reason
+    reason = "; ".join([reason, *(way.told for way in decision.ways if way.layer is not None)])
     return f"{decision.action}: {kinds + ': ' if kinds else ''}{reason}"
 
 
