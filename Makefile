@@ -59,6 +59,7 @@ docs: $(EXTRAS) ## the documentation, into out/site; nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 pictures: $(EXTRAS) ## run the examples and draw the documentation's pictures of them anew
+	$(BIN)/python docs/dialogs.py
 	$(BIN)/python docs/pictures.py
 
 clean: ## remove the environment and what runs left behind

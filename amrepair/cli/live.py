@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amrepair.cli.files import is_cloud
+from amrepair.cli.files import is_cloud, refuse_traps
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
@@ -67,6 +67,7 @@ def view(
     token: TokenOption = None,
 ) -> None:
     """Show files together in a browser, each with a box to hide it; Ctrl+C ends it."""
+    refuse_traps(files)  # before what reads them is loaded
     for path in files:
         _refuse(path)
     shown = [_shown(path) for path in files]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -162,3 +163,13 @@ def test_every_example_has_its_picture_on_the_page() -> None:
         picture = DOCS / "images" / f"example-{example.name[:2]}.webp"
         assert f"images/{picture.name}" in page, example.name
         assert 1_000 < picture.stat().st_size < 150_000
+
+
+def test_the_slicers_dialogs_are_as_they_are_drawn() -> None:
+    dialogs = runpy.run_path(str(DOCS / "dialogs.py"))
+    page = (DOCS / "how-to" / "look-from-the-slicer.md").read_text(encoding="utf-8")
+    for name, dialog in dialogs["DIALOGS"].items():
+        picture = DOCS / "images" / f"dialog-{name}.svg"
+        assert picture.read_text(encoding="utf-8") == dialogs["drawn"](dialog)
+        assert f"../images/{picture.name}" in page
+        assert dialog.groups[-1] in page
