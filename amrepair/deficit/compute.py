@@ -17,7 +17,12 @@ from typing import Any
 import manifold3d
 import numpy as np
 
-from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
+from amrepair.deficit.heights import (
+    as_built_heights,
+    standing_heights,
+    with_what_stands_out,
+    without_missing,
+)
 from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import (
     with_even_crests,
@@ -180,7 +185,7 @@ def compute_deficit(
     def stands() -> HeightField:
         seen = look() if early is None else early.result()
         if as_built is not None:
-            return seen
+            return without_missing(seen, missing)
         return _standing(seen, scan, template, build_from_template, missing, excess, evidence)
 
     unseen = anomaly.template_label == int(Label.UNSEEN)

@@ -272,6 +272,22 @@ def _by_chance(off_mm: Float[np.ndarray, "ny nx"], around: int) -> Bool[np.ndarr
     return np.asarray((np.abs(off_mm) < CHANCE_MM) & (np.abs(together) < 0.5 * NOISE_MM))
 
 
+def without_missing(seen: HeightField, missing: manifold3d.Manifold) -> HeightField:
+    """Heights lowered, where nobody saw any, to the bottom of what is missing there.
+
+    What is missing was found to be empty: it does not stand, whatever a steep cell hides below it.
+    """
+    if missing.is_empty():
+        return seen
+    offset, z = columns_of(missing, seen)
+    high_mm, low_mm = (
+        sign * raster_kernels.column_top(offset, sign * z, -np.inf).reshape(seen.shape)
+        for sign in (1.0, -1.0)
+    )
+    hidden = ~seen.seen & (high_mm >= seen.z_mm - NOISE_MM) & (low_mm < seen.z_mm)
+    return HeightField(seen.origin_mm, seen.cell_mm, np.where(hidden, low_mm, seen.z_mm), seen.seen)
+
+
 def columns_of(
     solid: manifold3d.Manifold, field: HeightField
 ) -> tuple[Int[np.ndarray, " cells1"], Float[np.ndarray, " crossings"]]:
