@@ -234,7 +234,7 @@ def inside(job: Job, layer: int, circle: np.ndarray) -> MotionBatch:
     )  # fmt: skip
 
 
-HEADER = ("infill", "cases", "filled, mean", "least", "again, mean", "added, most")
+PAGE_HEADER = ("infill", "cases", "filled, mean", "least", "again, mean", "added, most")
 
 
 def page_rows(rows: list[dict[str, Any]]) -> list[tuple[object, ...]]:
@@ -282,9 +282,9 @@ def main() -> None:
     keyed = [json.loads(line) for line in args.results.read_text().splitlines()]
     latest = {tuple(r[k] for k in ("part", "way", "cut", "late", "seed")): r for r in keyed}
     told = page_rows(list(latest.values()))
-    print(measured_page.table(HEADER, told))
+    print(measured_page.table(PAGE_HEADER, told))
     if args.page:
-        measured_page.write_rows("bench_infill", HEADER, told)
+        measured_page.write_rows("bench_infill", PAGE_HEADER, told)
 
 
 if __name__ == "__main__":
