@@ -1,8 +1,9 @@
-"""`pasdf`, our own method: the class's template, robust alignment, a score on the field.
+"""`pasdf`, our own method: the class's template, robust alignment, a test against sound clouds.
 
-It stands on `template` and `align`. The score is in standard deviations of what sound parts leave
-there, noise and spread together, and averages the signed field over neighbours before taking its
-size: noise falls with the root of their number, a defect's offset does not.
+It stands on `template`, `align` and `regions`. A point's score is in standard errors of what sound
+clouds leave there, and averages the signed deviation over neighbours before taking its size: noise
+falls with the root of their number, a defect's offset does not. What a bend moved along the surface
+scores by how far it was moved. The object's score is the test's p-value.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import align
 from amrepair.align.thinning import order_of
-from amrepair.bench.bodies import standing_pose
+from amrepair.bench.bodies import Pieces, pieces_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge import fit_from_scans
+from amrepair.regions.sound import SoundTest
 from amrepair.scans.scan import Scan
 from amrepair.template import (
     GridSdf,
@@ -50,8 +52,6 @@ NEAR_NEIGHBOURS = 12
 WIDE_PASSES = 5  # means of means: as far as 64 neighbours, found in a quarter of the time
 WIDE_WEIGHT = 0.5
 LEAST_SIGMA_MM = 0.001 * DIAGONAL_MM
-TOP_RATIO = 0.004
-MIN_TOP = 12
 # Farther out than this share of the part nothing more is learned: clutter must not set the score.
 MAX_OFFSET_RATIO = 0.15
 REPAIR_POINTS = 16_384
@@ -106,14 +106,14 @@ def _from_clouds(data: ClassInput, seed: int) -> GridSdf:
     return template
 
 
-def _place(
+def _pieces(
     points_mm: Float[np.ndarray, "n 3"],
     template: Template,
     *,
     sigma_mm: float,
     rng: np.random.Generator,
-) -> Float[np.ndarray, "n 3"]:
-    """Points in the template's frame, the larger piece of a bent part in its place.
+) -> Pieces:
+    """Where the points lie in the template's frame, and a piece that was bent out of it.
 
     A failed alignment is tried again with other draws.
     """
@@ -128,8 +128,7 @@ def _place(
         else:
             poses = (found.template_from_scan, *found.symmetric_alternatives)
             known = [pose.matrix for pose in poses]
-            matrix = standing_pose(points_mm, template, known, sigma_mm, rng)
-            return points_mm @ matrix[:3, :3].T + matrix[:3, 3]
+            return pieces_of(points_mm, template, known, sigma_mm, rng)
     raise AlignmentError("no alignment was tried")  # RETRIES is at least one
 
 
@@ -193,34 +192,28 @@ def smoothed_score(
     return score
 
 
-def top_mean(score: Float[np.ndarray, " n"], count: int) -> float:
-    """Mean of the `count` highest scores."""
-    count = min(count, len(score))
-    return float(np.partition(score, len(score) - count)[len(score) - count :].mean())
-
-
 @dataclass(frozen=True, slots=True)
 class FieldModel:
-    """A template and how to score against it."""
+    """A template, and the test of what sound clouds leave in it."""
 
     template: Template
     sigma_mm: float
+    sound: SoundTest
     template_distance: CloudDistance | None
 
     def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
-        """Align, ask the field, score; what cannot be aligned is not this part."""
+        """Align, test, score; what cannot be aligned is not this part."""
         try:
-            placed = _place(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)
+            pieces = _pieces(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)
         except AlignmentError:
             return Scores(np.zeros(len(points_mm)), np.inf, None, aligned=False)
-        offset_mm = self.template.distance(placed)
-        spread = getattr(self.template, "spread_mm", None)
-        spread_mm = np.zeros(len(placed)) if spread is None else spread(placed)
-        # Published clouds may have neither noise nor spread; the unit does not matter then.
-        sigma_mm = np.hypot(max(self.sigma_mm, LEAST_SIGMA_MM), spread_mm)
-        score = smoothed_score(placed, offset_mm, sigma_mm)
-        top = max(MIN_TOP, int(TOP_RATIO * len(score)))
-        return Scores(score, top_mean(score, top), np.abs(offset_mm))
+        placed = moved(points_mm, pieces.pose)
+        judged = self.sound.judge(placed)
+        # Published clouds may have no noise at all; the unit does not matter then.
+        sigma_mm = np.maximum(judged.sigma_mm, LEAST_SIGMA_MM)
+        score = smoothed_score(placed, judged.off_mm, sigma_mm)
+        aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, LEAST_SIGMA_MM)
+        return Scores(score + aside, -judged.log_expected, np.abs(self.template.distance(placed)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,9 +221,26 @@ class FieldMethod:
     """The fast template with robust alignment."""
 
     def fit(self, data: ClassInput, *, seed: int, cache: Path) -> Model:
-        """Fit the template, and measure it."""
+        """Fit the template, measure it, and test the training clouds against each other.
+
+        Raises
+        ------
+        AlignmentError
+            If no training cloud can be laid in the template.
+        """
         template = class_template(data, seed, cache)
         distance = repair_distance(template, data, np.random.default_rng(seed))
-        model = FieldModel(template, data.sigma_mm, distance)
+        rng = np.random.default_rng(seed)
+        laid, refused = [], None
+        for cloud in data.clouds_mm:
+            try:
+                pieces = _pieces(cloud, template, sigma_mm=data.sigma_mm, rng=rng)
+            except AlignmentError as error:
+                refused = error
+            else:
+                laid.append(moved(cloud, pieces.pose))
+        if refused is not None and not laid:
+            raise refused
+        model = FieldModel(template, data.sigma_mm, SoundTest.of(template, laid), distance)
         model.score(data.clouds_mm[0], np.random.default_rng(seed))  # compiled before it is timed
         return model

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from amrepair.align import Registration, align
 from amrepair.align.search import PIECE, QUICK, CoarseField, search, spread_rotations
 from amrepair.align.thinning import Thinned, in_order, thin_out
-from amrepair.bench.bodies import standing_pose
+from amrepair.bench.bodies import pieces_of
 from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan
@@ -198,7 +198,7 @@ def test_the_larger_piece_of_a_bent_part_stands(
     by_end[:3, :3], by_end[:3, 3] = turn.T, hinge - turn.T @ hinge
     monkeypatch.setattr("amrepair.bench.bodies.search", lambda *_, **__: [])
     for start in (np.eye(4), by_end):
-        pose = standing_pose(points, plate, [start], SIGMA_MM, np.random.default_rng(0))
+        pose = pieces_of(points, plate, [start], SIGMA_MM, np.random.default_rng(0)).pose
         assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.002
 
 
@@ -213,7 +213,7 @@ def test_the_larger_piece_stands_where_the_view_shows_more_of_the_other(
     beyond = np.maximum(points[:, 0] - 34.0, 0.0)  # 26 of 60 mm are bent up
     points[:, 2] += beyond * np.tan(np.deg2rad(7.0))
     points += np.random.default_rng(3).normal(0, SIGMA_MM, points.shape)
-    pose = standing_pose(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(0))
+    pose = pieces_of(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(0)).pose
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.005
 
 
@@ -228,7 +228,7 @@ def test_a_wide_bend_is_one_in_every_draw(seed: int, monkeypatch: pytest.MonkeyP
     beyond = np.maximum(points[:, 0] - 43.0, 0.0)
     points[:, 2] += (along**2 / 36.0 + beyond) * np.tan(np.deg2rad(9.0))
     points += np.random.default_rng(3).normal(0, SIGMA_MM, points.shape)
-    pose = standing_pose(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(seed))
+    pose = pieces_of(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(seed)).pose
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.05
 
 
@@ -242,7 +242,7 @@ def test_a_bent_part_that_was_laid_elsewhere_is_found() -> None:
     points += np.random.default_rng(5).normal(0, SIGMA_MM, points.shape)
     elsewhere = np.diag([1.0, -1.0, -1.0, 1.0])
     elsewhere[:3, 3] = 0.0, 20.0, 4.0
-    pose = standing_pose(points, plate, [elsewhere], SIGMA_MM, np.random.default_rng(0))
+    pose = pieces_of(points, plate, [elsewhere], SIGMA_MM, np.random.default_rng(0)).pose
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.002
 
 
@@ -263,7 +263,7 @@ def test_a_broken_face_is_not_laid_on_the_side_that_is_gone(
     points += rng.normal(0, SIGMA_MM, points.shape)
     on_the_side = np.eye(4)
     on_the_side[0, 3] = gone_mm
-    pose = standing_pose(points, plate, [on_the_side], SIGMA_MM, np.random.default_rng(0))
+    pose = pieces_of(points, plate, [on_the_side], SIGMA_MM, np.random.default_rng(0)).pose
     off = (points @ pose[:3, :3].T + pose[:3, 3] - points)[: len(top)]
     assert float(np.sqrt((off**2).sum(axis=1).mean())) < 0.1
 
