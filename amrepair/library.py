@@ -19,14 +19,14 @@ from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
-SUFFIXES = (".safetensors", ".stl", ".obj", ".3mf", ".ply")
+LIBRARY_SUFFIXES = (".safetensors", ".stl", ".obj", ".3mf", ".ply")
 # Below this the two best parts fit nearly alike, and which it is would be a guess.
 LEAST_CONFIDENCE = 0.2
 # Views of the right part have up to 0.2, since half of it is unseen; of other parts 0.27 and more.
 MOST_MISFIT = 0.25
-POINTS = 20_000
+LIBRARY_POINTS = 20_000
 # Distances count up to this share of the part's diagonal: a lost piece is not another part.
-CAP_RATIO = 0.02
+LOST_PIECE_RATIO = 0.02
 # Surface that the scan does not show says less than points that the part does not explain: a
 # single view shows half of it.
 UNSEEN_WEIGHT = 0.25
@@ -79,13 +79,13 @@ def template_files(folder: Path) -> list[Path]:
         If there are none.
     """
     found: dict[str, Path] = {}
-    for suffix in SUFFIXES:
+    for suffix in LIBRARY_SUFFIXES:
         for path in sorted(folder.iterdir()):
             if path.suffix.lower() == suffix and not path.name.startswith("."):
                 found.setdefault(path.stem, path)
     if not found:
         raise InputError(
-            f"the folder {folder} holds no template ({', '.join(SUFFIXES)}); fit some with "
+            f"the folder {folder} holds no template ({', '.join(LIBRARY_SUFFIXES)}); fit some with "
             "'amrepair template fit'"
         )
     return [found[name] for name in sorted(found)]
@@ -167,10 +167,10 @@ def misfit(
 
     `part_ratio` is the share of the points that are counted, the nearest ones.
     """
-    step = max(1, len(scan) // POINTS)
+    step = max(1, len(scan) // LIBRARY_POINTS)
     placed = found.template_from_scan.apply(scan.points_mm[::step])
     diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-    cap_mm = CAP_RATIO * diagonal_mm
+    cap_mm = LOST_PIECE_RATIO * diagonal_mm
     distance = np.sort(np.minimum(np.abs(template.distance(placed)), cap_mm))
     off = float(distance[: max(1, round(part_ratio * len(distance)))].mean())
     surface = template.surface_points(diagonal_mm / 60.0)[0]

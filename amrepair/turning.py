@@ -23,7 +23,7 @@ from gcode.slicing.patch import slice_patch
 from gcode.surfaces import HeightField
 
 # About the bed's axes, right-handed, degrees; a turn about Z changes what the head's duct meets.
-TURNS: dict[str, tuple[float, float, float]] = {
+NAMED_TURNS: dict[str, tuple[float, float, float]] = {
     "x90": (90.0, 0.0, 0.0),
     "x180": (180.0, 0.0, 0.0),
     "x270": (270.0, 0.0, 0.0),
@@ -35,7 +35,7 @@ TURNS: dict[str, tuple[float, float, float]] = {
 }
 FIELD_CELL_MM = 0.2
 # Around the turned part: more than the head's block beside it.
-AROUND_MM = 30.0
+BESIDE_TURNED_MM = 30.0
 # The foot of what lies on the bed is looked at this far above it.
 FOOT_MM = 0.1
 # Nearer to the edge of its foot than this a nozzle's touch tips it over.
@@ -49,7 +49,7 @@ class Turn:
     Attributes
     ----------
     name
-        A key of `TURNS`.
+        A key of `NAMED_TURNS`.
     reachable_ratio
         Share of what is missing that beads would fill; 0 where the part does not fit the printer.
     stands
@@ -71,9 +71,9 @@ def turns_named(words: Sequence[str]) -> tuple[str, ...]:
     """
     names: list[str] = []
     for word in words:
-        if word != "any" and word not in TURNS:
-            raise InputError(f"--turn is {word!r}; it is one of any, {', '.join(TURNS)}")
-        names += list(TURNS) if word == "any" else [word]
+        if word != "any" and word not in NAMED_TURNS:
+            raise InputError(f"--turn is {word!r}; it is one of any, {', '.join(NAMED_TURNS)}")
+        names += list(NAMED_TURNS) if word == "any" else [word]
     return tuple(dict.fromkeys(names))
 
 
@@ -107,7 +107,7 @@ def rank_turns(
     missing, standing
         Solids, build frame, mm.
     names
-        Keys of `TURNS` that the user allows.
+        Keys of `NAMED_TURNS` that the user allows.
     """
     found = []
     for k, name in enumerate(names):
@@ -124,7 +124,7 @@ def _tried(
     grid: LayerGrid,
 ) -> Turn:
     """Slice the turned deficit onto the turned rest, in the middle of the bed."""
-    turn = TURNS[name]
+    turn = NAMED_TURNS[name]
     printer = setup.printer
     rest = standing.rotate(turn)
     low, high = np.array(rest.bounding_box()).reshape(2, 3)
@@ -137,7 +137,7 @@ def _tried(
     patch = slice_patch(
         wanted,
         setup,
-        as_built=HeightField.from_manifold(rest, FIELD_CELL_MM, margin_mm=AROUND_MM),
+        as_built=HeightField.from_manifold(rest, FIELD_CELL_MM, margin_mm=BESIDE_TURNED_MM),
         grid=grid,
         standalone=True,
     )

@@ -14,7 +14,7 @@ import platform
 import tempfile
 from pathlib import Path
 
-from amrepair.bench import METHODS, SynthOptions, run_bench, synthesize
+from amrepair.bench import BENCH_METHODS, SynthOptions, run_bench, synthesize
 from amrepair.bench.samples import Format
 from amrepair.simulate.part_files import part_names, part_path
 
@@ -29,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", type=Path)
     parser.add_argument("--format", default=str(Format.SHAPENET), choices=[*Format])
-    parser.add_argument("--methods", nargs="+", default=DEFAULT_METHODS, choices=METHODS)
+    parser.add_argument("--methods", nargs="+", default=DEFAULT_METHODS, choices=BENCH_METHODS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--points", type=int, default=SynthOptions().points)
     parser.add_argument("--jobs", type=int, default=1)

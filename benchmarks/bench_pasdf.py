@@ -28,7 +28,7 @@ from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan
 from amrepair.simulate.part_files import part_names, part_path
 from amrepair.template import MeshSdf, load_mesh, load_or_fit
-from amrepair.template.paper import VARIANTS
+from amrepair.template.paper import NETWORK_VARIANTS
 
 POINTS, SIGMA_MM, BALL_MM, GOOD_MM = 200_000, 0.05, 5.0, 0.1
 METHODS = ("pasdf", "pasdf-paper", "patchcore-fpfh+pam")
@@ -132,7 +132,9 @@ def main() -> None:
             data = out / "data"
             if not (data / "synth.json").is_file():
                 synthesize(said.parts, data, "anomaly-shapenet", 0, options=options)
-            recipe = with_settings({"bench": BENCH_PAPER, **VARIANTS}, said.paper, "--paper")
+            recipe = with_settings(
+                {"bench": BENCH_PAPER, **NETWORK_VARIANTS}, said.paper, "--paper"
+            )
             report = run_bench(
                 data,
                 format="anomaly-shapenet",

@@ -27,7 +27,7 @@ from amrepair.simulate.part_files import part_path
 from amrepair.template import MeshSdf, extract_mesh, load_mesh
 from amrepair.template.fit import fit_fast
 from amrepair.template.grid import Grid, GridSdf
-from amrepair.template.paper import PAPER, fit_paper
+from amrepair.template.paper import PUBLISHED_NETWORK, fit_paper
 from amrepair.template.port import Template
 
 OFFSETS_MM = (0.05, 0.2, 0.5, 2.0, 5.0)
@@ -79,7 +79,7 @@ def fits(exact: MeshSdf, steps: int) -> dict[str, Template]:
     bare = Grid.bare(grid.origin_mm, grid.cell_mm, grid.base)
     accuracy("its coarse grid alone", replace(template, grid=bare), exact, float("nan"))
     if steps:
-        options = replace(PAPER, batch=8_192, rate=5e-4, epochs=steps // 2, dropout=0.0)
+        options = replace(PUBLISHED_NETWORK, batch=8_192, rate=5e-4, epochs=steps // 2, dropout=0.0)
         network, seconds = timed(lambda: fit_paper(exact, options=options, device="cpu"))
         made["paper"] = network  # type: ignore[assignment]
         accuracy(f"paper, {steps} steps of 8,192", made["paper"], exact, seconds)

@@ -34,11 +34,11 @@ from numba import get_num_threads, prange, set_num_threads
 
 __all__ = ["get_num_threads", "njit", "prange", "set_num_threads"]
 
-_PACKAGES = ("gcode", "amrepair")
-_TOKEN = secrets.token_hex(4)
+_KERNEL_PACKAGES = ("gcode", "amrepair")
+_PROCESS_TOKEN = secrets.token_hex(4)
 # The slowest kernel takes six seconds alone, with all that it calls eleven.
 LONGEST_COMPILE_S = 60.0
-POLL_S = 0.02
+COMPILE_POLL_S = 0.02
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
@@ -68,7 +68,7 @@ def keep_safely(kept: Any) -> None:
     """
     base = kept._data_name(0).removesuffix(".0.nbc")
     # A forked process has its parent's token, but a process number of its own.
-    kept._data_name = lambda number: f"{base}.{os.getpid():x}-{_TOKEN}.{number}.nbc"
+    kept._data_name = lambda number: f"{base}.{os.getpid():x}-{_PROCESS_TOKEN}.{number}.nbc"
     kept._source_stamp = (*kept._source_stamp, kernels_stamp())
 
 
@@ -125,7 +125,7 @@ class _Turn:
                 if time.monotonic() > until_s:
                     os.close(fd)
                     return False
-                time.sleep(POLL_S)
+                time.sleep(COMPILE_POLL_S)
             else:
                 self._fd = fd
                 return True
@@ -148,7 +148,7 @@ def sources_stamp(ending: str) -> tuple[tuple[str, int, int], ...]:
     """Name, time of change and size of every file of both packages that ends so."""
     root = Path(__file__).parents[1]
     found = []
-    for package in _PACKAGES:
+    for package in _KERNEL_PACKAGES:
         for folder, _, names in os.walk(root / package):
             for name in names:
                 if name.endswith(ending):

@@ -7,9 +7,13 @@ which must not share a mistake with the writer, has a table of its own in `check
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from gcode.errors import InputError
+
+WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
+"""A letter and its number."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from gcode.threemf import read_3mf
 
 _log = logging.getLogger(__name__)
 
-SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
+SOLID_SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
 WELD_RATIO = 1e-6  # of the extent: STL holds single precision
 EQUAL_DIGITS = 8  # of mm
 STL_HEAD = 84
@@ -31,7 +31,7 @@ STL_PIECE = 1 << 15  # triangles that are read at a time
 STL_TEXT_BYTES = 256  # spaces before a text file's first word
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("of_colour", "<u2")])
 # trimesh's readers raise whatever their parsing hits; these are the kinds seen in malformed files
-READ_ERRORS = (
+MESH_READ_ERRORS = (
     ValueError, ArithmeticError, LookupError, TypeError, AttributeError, NameError, OSError,
     EOFError, NotImplementedError, RuntimeError, MemoryError,
 )  # fmt: skip
@@ -60,11 +60,11 @@ def read_solid(path: Path) -> Any:
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
         raise InputError(f"{path}: {what}.")
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: a solid is one of {', '.join(SUFFIXES)}.")
+    if path.suffix.lower() not in SOLID_SUFFIXES:
+        raise InputError(f"{path}: a solid is one of {', '.join(SOLID_SUFFIXES)}.")
     try:
         vertices, faces = read_triangles(path)
-    except READ_ERRORS as error:
+    except MESH_READ_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: the mesh cannot be read ({reason}); export it again.") from error
     if len(faces) == 0:
@@ -105,7 +105,7 @@ def read_closed(path: Path) -> ClosedMesh:
     """
     mesh = None
     if path.is_file():
-        with contextlib.suppress(*READ_ERRORS):  # told by `read_solid`, in one sentence
+        with contextlib.suppress(*MESH_READ_ERRORS):  # told by `read_solid`, in one sentence
             mesh = _as_it_is(path)
     return closed_mesh(read_solid(path)) if mesh is None else mesh
 
@@ -115,7 +115,7 @@ def _as_it_is(path: Path) -> ClosedMesh | None:
     if path.suffix.lower() == ".stl":
         shared = _shared_corners(path)
     else:
-        shared = read_triangles(path) if path.suffix.lower() in SUFFIXES else None
+        shared = read_triangles(path) if path.suffix.lower() in SOLID_SUFFIXES else None
     if shared is None or len(shared[1]) == 0 or not np.isfinite(shared[0]).all():
         return None
     if float(np.abs(shared[0]).max()) > LARGEST_MM:
@@ -174,7 +174,7 @@ def read_triangles(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray
     ------
     ValueError
         Where a face has a corner that is no vertex, or a vertex lies beyond all measure; and what
-        else is in `READ_ERRORS`, where the file is damaged.
+        else is in `MESH_READ_ERRORS`, where the file is damaged.
     """
     vertices, faces = _triangles_in(path)
     if len(faces):

@@ -38,7 +38,7 @@ from gcode.writer_kernels import bead_lines
 
 XYZ_DIGITS = 3
 E_DIGITS = 5
-SAME_MM = 5e-4  # half of the last digit that is written
+SAME_TEXT_MM = 5e-4  # half of the last digit that is written
 JOINT_MM = 0.01  # a bead that begins further from the nozzle than this was not travelled to
 
 
@@ -203,7 +203,7 @@ class _Text:
         if self._place is None:
             self._place = [math.nan] * 3
         for axis, letter in enumerate("XYZ"):
-            if not abs(target[axis] - self._place[axis]) < SAME_MM:
+            if not abs(target[axis] - self._place[axis]) < SAME_TEXT_MM:
                 text = number(target[axis], XYZ_DIGITS)
                 self._place[axis] = float(text)
                 words += f" {letter}{text}"

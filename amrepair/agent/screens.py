@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 END_PROMPT = 'RESPOND TYPE=command MSG="action:prompt_end"'
 # A line of G-code ends at a comment; a quote ends its text, a bar a prompt's.
 _UNSAID = re.compile(r"[\x00-\x1f;#\"|*\\]+")
-_MACROS = {
+_ANSWER_MACROS = {
     "approve": "AMREPAIR_APPROVE ANSWER={answer} QUESTION={question}",
     "go on": "AMREPAIR_RESUME",
     "cancel": "CANCEL_PRINT",
@@ -80,7 +80,7 @@ class KlipperScreens:
         rows = ["prompt_end", "prompt_begin amrepair"]
         rows += [f"prompt_text {plain(line)}" for line in lines]
         for label, call, colour in buttons:
-            macro = _MACROS[call["what"]].format(**call)
+            macro = _ANSWER_MACROS[call["what"]].format(**call)
             rows.append(f"prompt_footer_button {label}|{macro}|{colour}")
         self._command("\n".join(f'RESPOND TYPE=command MSG="action:{row}"' for row in
                                 [*rows, "prompt_show"]))  # fmt: skip

@@ -10,8 +10,8 @@ from amrepair.agent.screens import Button, Screens
 from amrepair.errors import LoopError
 from gcode.errors import GcodeError, LinkError
 
-POLL_S = 0.5
-IDLE = "waiting for a print"
+TALK_POLL_S = 0.5
+NO_PRINT_YET = "waiting for a print"
 _QUIET = frozenset({"print", "printing"})  # the printer's own screens show how far that is
 
 
@@ -41,7 +41,7 @@ class Talk:
 
     def __init__(self, host: Host, screens: Screens, note: Callable[[str], None]) -> None:
         self._host, self._screens, self._note = host, screens, note
-        self._doing = IDLE
+        self._doing = NO_PRINT_YET
         self._number = 0
         self._answers = threading.Condition()
         self._open, self._answer = False, False
@@ -71,7 +71,7 @@ class Talk:
 
     def rest(self) -> None:
         """Nothing is being done."""
-        self._doing = IDLE
+        self._doing = NO_PRINT_YET
 
     def say(self, text: str, *, wrong: bool = False) -> None:
         """One sentence, in the printer's console and on its display."""
@@ -116,7 +116,7 @@ class Talk:
         try:
             while True:
                 with self._answers:
-                    if self._answers.wait_for(lambda: self._answered, POLL_S):
+                    if self._answers.wait_for(lambda: self._answered, TALK_POLL_S):
                         return self._answer
                 if not self._still_rests():
                     raise LoopError(
@@ -138,7 +138,7 @@ class Talk:
 
     def _hear(self) -> None:
         while not self._ended.is_set():
-            for call in self._host.calls(POLL_S):
+            for call in self._host.calls(TALK_POLL_S):
                 what = call.get("what")
                 if what == "approve":
                     self._take(call)

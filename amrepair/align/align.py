@@ -16,7 +16,7 @@ from amrepair.align.anywhere import (
 )
 from amrepair.align.bed import bed_prior, level_on_bed
 from amrepair.align.checks import refuse_repeated
-from amrepair.align.pam import PAPER, PamOptions, align_paper
+from amrepair.align.pam import PUBLISHED_PAM, PamOptions, align_paper
 from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.thinning import in_order, thin_out
@@ -26,9 +26,9 @@ from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
 
-METHODS = ("robust", "paper")
+ALIGN_METHODS = ("robust", "paper")
 FINE_POINTS, MOST_LOOKED_AT, SEEN_POINTS = 15_000, 150_000, 4_000
-LEAST_POINTS = 50
+LEAST_SCAN_POINTS = 50
 # A guess from a calibration is good to this; what is farther is not the part that was meant.
 BOUND_MM, BOUND_DEG = 3.0, 3.0
 # From a guess much of what is seen may be bed. From any pose less than this is another part: views
@@ -40,9 +40,9 @@ MUCH_LEFT_OUT, LEAST_OF_REST = 0.4, 0.95
 MIRRORED_BETTER = 0.4  # of what is left unexplained, where the mirror image is meant
 # Sizes that differ by more are another unit, or too little of the part; large scans hold the bed.
 SMALLEST_RATIO, LARGEST_RATIO = 0.15, 20.0
-UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3}
+SCAN_UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3}
 UNIT_SLACK = 1.8  # a view may show less than the part, a turned box more
-SIZE_JUMP = 1.6  # sizes that differ by more are worth a word
+TOLD_SIZE_JUMP = 1.6  # sizes that differ by more are worth a word
 
 
 def align(
@@ -54,7 +54,7 @@ def align(
     bound_mm: float = BOUND_MM,
     bound_deg: float = BOUND_DEG,
     part_is_known: bool = False,
-    pam_options: PamOptions = PAPER,
+    pam_options: PamOptions = PUBLISHED_PAM,
     rng: np.random.Generator | None = None,
     progress: Progress = silent,
 ) -> Registration:
@@ -93,14 +93,16 @@ def align(
     >>> found.rmse_mm < 0.05
     True
     """
-    if method not in METHODS:
-        raise InputError(f"the method '{method}' is unknown; choose one of {', '.join(METHODS)}")
-    if len(scan) < LEAST_POINTS:
+    if method not in ALIGN_METHODS:
+        raise InputError(
+            f"the method '{method}' is unknown; choose one of {', '.join(ALIGN_METHODS)}"
+        )
+    if len(scan) < LEAST_SCAN_POINTS:
         raise AlignmentError(
             f"the scan {scan.source} has fewer points ({len(scan)}) than an alignment needs "
-            f"({LEAST_POINTS})"
+            f"({LEAST_SCAN_POINTS})"
         )
-    refuse_repeated(scan, LEAST_POINTS)
+    refuse_repeated(scan, LEAST_SCAN_POINTS)
     rng = rng if rng is not None else np.random.default_rng(0)
     if method == "paper":
         _refuse_other_size(scan, template)
@@ -262,7 +264,7 @@ def _from_guess(
         levelled, on_bed = level_on_bed(scan.points_mm, template, guess.matrix)
     step = max(1, len(scan) // MOST_LOOKED_AT)
     points = _part_only(scan.points_mm[::step], template, levelled)
-    if len(points) < LEAST_POINTS:
+    if len(points) < LEAST_SCAN_POINTS:
         raise AlignmentError(
             f"the scan {scan.source} has {len(points)} points where the part should stand; check "
             "the scanner's calibration and the part's pose"
@@ -303,7 +305,7 @@ def _part_only(
     near = in_box(placed, low - 3.0, high + 3.0)
     above = placed[:, 2] > low[2] + 0.35
     # A flat part seen from below has no other points: then all points in the box count.
-    keep = near & above if (near & above).sum() >= LEAST_POINTS else near
+    keep = near & above if (near & above).sum() >= LEAST_SCAN_POINTS else near
     return points_mm[keep]
 
 
@@ -311,7 +313,7 @@ def _other_size(scan: Scan, template: Template) -> str:
     """What to add to a refusal, where the sizes differ much."""
     size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
     other = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-    if 1.0 / SIZE_JUMP < size / max(other, 1e-12) < SIZE_JUMP:
+    if 1.0 / TOLD_SIZE_JUMP < size / max(other, 1e-12) < TOLD_SIZE_JUMP:
         return ""
     return f" (the scan is {size:.3g} mm across, its template {other:.3g} mm)"
 
@@ -322,10 +324,10 @@ def _refuse_other_size(scan: Scan, template: Template) -> None:
     ratio = size / max(other, 1e-12)
     if SMALLEST_RATIO <= ratio <= LARGEST_RATIO:
         return
-    near = [unit for unit, mm in UNITS.items() if 1 / UNIT_SLACK < ratio * mm < UNIT_SLACK]
+    near = [unit for unit, mm in SCAN_UNITS.items() if 1 / UNIT_SLACK < ratio * mm < UNIT_SLACK]
     near += [  # no drawing is in micrometres
         f"a template in {unit}"
-        for unit, mm in UNITS.items()
+        for unit, mm in SCAN_UNITS.items()
         if mm > 1.0 and 1 / UNIT_SLACK < ratio / mm < UNIT_SLACK
     ]
     hint = f" ({' or '.join(near)} for millimetres?)" if near else ""

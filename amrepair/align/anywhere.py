@@ -36,7 +36,7 @@ from amrepair.align.refine import Refined
 from amrepair.align.search import (
     PIECE,
     PIECE_AGAIN,
-    QUICK,
+    QUICK_EFFORT,
     THOROUGH,
     TWINS,
     CoarseField,
@@ -55,7 +55,7 @@ GOOD_CELLS = 0.2  # what the coarse field is off by, at most, on a scan that fit
 # Another pose fits as well if its score is of the best one's size, and no more than a few points
 # lie on the part in the best pose and clearly off it in the other. Clearly: beyond the noise, and
 # beyond what prints of one part differ by.
-SAME_FIT = 1.5
+AS_GOOD_FIT = 1.5
 CONTRADICTED_RATIO, CONTRADICTED_SIGMAS = 0.003, 4.0
 NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
 INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
@@ -68,7 +68,7 @@ BIAS_SIGMAS = 2.6  # a template's bias is the 99th percentile of its error
 # With fewer points on the part the search goes on, and is made thorough; with more than the last
 # the pose is worth turning.
 WELL_EXPLAINED, MOSTLY_EXPLAINED, EXPLAINED = 0.97, 0.95, 0.7
-BETWEEN = rotation_from_vector(np.array([0.15, -0.1, 0.08]))  # half the gap between rotations
+HALF_GAP = rotation_from_vector(np.array([0.15, -0.1, 0.08]))  # half the gap between rotations
 FEW_TRIED = 3  # poses refined of what is left without clutter, and of the mirror image
 CLEARED = 0.85  # with fewer on the part clutter is looked for, until so many are
 # A pose lays so much more of all on the part than one found without clutter: that was none.
@@ -191,7 +191,7 @@ def pose_from_anywhere(
     clouds, field = Clouds.of(points_mm, template, sigma_mm, rng), CoarseField.of(template)
     hunt = _Hunt(template, field, clouds, points_mm, sigma_mm, inlier_mm)
     progress("align", 0.1, 1.0)
-    hunt.take(_worth_refining(clouds, field, QUICK))
+    hunt.take(_worth_refining(clouds, field, QUICK_EFFORT))
     if hunt.share < DOUBTFUL and not noise_is_measured:
         most_mm = max(MOST_NOISE_MM, MOST_NOISE_RATIO * clouds.diagonal_mm)
         measured_mm = min(noise_across(points_mm, rng), most_mm)
@@ -221,7 +221,7 @@ def pose_from_anywhere(
         progress("align", 0.5, 1.0)
         hunt.take(_worth_refining(hunt.clouds, field, PIECE))
         if hunt.share < WELL_EXPLAINED:
-            hunt.take(_worth_refining(hunt.clouds, field, PIECE_AGAIN, turn=BETWEEN))
+            hunt.take(_worth_refining(hunt.clouds, field, PIECE_AGAIN, turn=HALF_GAP))
     if hunt.share < least_ratio:
         progress("align", 0.6, 1.0)
         _ask_features(hunt)
@@ -273,7 +273,7 @@ def _leave_clutter(
     """Search again without what may be clutter; kept where more of the rest lies on the part."""
     for kept in without_clutter(points_mm, rng):
         fewer = Clouds.of(kept.points_mm, hunt.template, hunt.sigma_mm, rng)
-        starts = _worth_refining(fewer, hunt.field, QUICK)[:FEW_TRIED]
+        starts = _worth_refining(fewer, hunt.field, QUICK_EFFORT)[:FEW_TRIED]
         again = refined(starts, fewer, hunt.template)
         if explained(again[0][1], hunt.inlier_mm) > hunt.share:
             hunt.clouds, hunt.found, hunt.part_mm = fewer, again, kept.points_mm
@@ -290,7 +290,7 @@ def _search_on(hunt: _Hunt, *, thorough: bool) -> None:
         if thorough:
             starts += _worth_refining(hunt.clouds, hunt.field, THOROUGH)
     else:
-        starts += _worth_refining(hunt.clouds, hunt.field, QUICK, turn=BETWEEN)
+        starts += _worth_refining(hunt.clouds, hunt.field, QUICK_EFFORT, turn=HALF_GAP)
     hunt.take(starts)
 
 
@@ -312,7 +312,7 @@ def _best_and_others(hunt: _Hunt) -> tuple[Refined, tuple[Float[np.ndarray, "4 4
     slid = [pose for _, pose in refined(beside, clouds, template, finish=False)]
     others: list[Float[np.ndarray, "4 4"]] = []
     for score, other in sorted(hunt.found[1:] + on_all(slid, clouds, template), key=by_score):
-        if score > SAME_FIT * best_score + SAME_FIT_MM:
+        if score > AS_GOOD_FIT * best_score + SAME_FIT_MM:
             break
         new = all(clouds.apart(other.matrix, known) for known in (best.matrix, *others))
         if new and not _contradicted(other, best, hunt.sigma_mm):
@@ -326,7 +326,7 @@ def explained_if_mirrored(
     """Share of the points that lie on the part where they are mirrored first."""
     clouds = Clouds.of(points_mm * np.array([-1.0, 1.0, 1.0]), template, found.sigma_mm, rng)
     field = found.field if found.field is not None else CoarseField.of(template)
-    starts = _worth_refining(clouds, field, QUICK)[:FEW_TRIED]
+    starts = _worth_refining(clouds, field, QUICK_EFFORT)[:FEW_TRIED]
     return explained(refined(starts, clouds, template)[0][1], found.inlier_mm)
 
 
@@ -389,7 +389,7 @@ def _turns(
     rng: np.random.Generator,
 ) -> list[Float[np.ndarray, "4 4"]]:
     """Starts where poses like the best can turn freely, or nearly."""
-    limit = SAME_FIT * found[0][0] + SAME_FIT_MM
+    limit = AS_GOOD_FIT * found[0][0] + SAME_FIT_MM
     return best_turns(
         [pose for score, pose in found if score <= limit],
         clouds.dense_mm,

@@ -12,10 +12,10 @@ from amrepair.align.refine import Prior
 from amrepair.frames import moved, rotation_from_vector
 from amrepair.template.port import Template
 
-MOST_LOOKED_AT, MOST_FITTED = 80_000, 10_000  # points: the bed is a plane
-BAND_MM = 1.0  # how far off the guess may have the bed
-BESIDE_MM = 2.0  # bed points this near to the part may be its skirt or its foot
-LEAST_POINTS = 300
+MOST_BED_POINTS, MOST_FITTED = 80_000, 10_000  # points: the bed is a plane
+BED_BAND_MM = 1.0  # how far off the guess may have the bed
+SKIRT_MM = 2.0  # bed points this near to the part may be its skirt or its foot
+LEAST_BED_POINTS = 300
 LEAST_SPREAD_MM = 3.0  # root mean square, across the bed that is seen
 # What the bed leaves open: a few micrometres of height, and tilt over a part's length.
 HEIGHT_SIGMA_MM = 0.01
@@ -39,14 +39,14 @@ def level_on_bed(
     The corrected guess, and whether enough bed was seen to correct it.
     """
     low = template.bounds_mm[0]
-    placed = moved(points_mm[:: max(1, len(points_mm) // MOST_LOOKED_AT)], matrix)
-    near = np.flatnonzero(np.abs(placed[:, 2] - low[2]) < BAND_MM)
-    if len(near) < LEAST_POINTS:
+    placed = moved(points_mm[:: max(1, len(points_mm) // MOST_BED_POINTS)], matrix)
+    near = np.flatnonzero(np.abs(placed[:, 2] - low[2]) < BED_BAND_MM)
+    if len(near) < LEAST_BED_POINTS:
         return matrix, False
     near = near[:: -(-len(near) // MOST_FITTED)]
     apart = template.distance(placed[near])
-    bed = placed[near[apart > BESIDE_MM]]
-    if len(bed) < LEAST_POINTS:
+    bed = placed[near[apart > SKIRT_MM]]
+    if len(bed) < LEAST_BED_POINTS:
         return matrix, False
     centre = bed.mean(axis=0)
     local = bed - centre
@@ -55,7 +55,7 @@ def level_on_bed(
         return matrix, False
     design = np.column_stack([local[:, :2], np.ones(len(local))])
     target = bed[:, 2] - low[2]
-    fit, scale = np.zeros(3), BAND_MM
+    fit, scale = np.zeros(3), BED_BAND_MM
     for _ in range(12):
         residual = target - design @ fit
         weight = (scale**2 / (residual**2 + scale**2)) ** 2

@@ -14,21 +14,21 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-LOOKED_AT = 60_000
-NEIGHBOURS = 9
+CLUTTER_POINTS = 60_000
+CLUTTER_NEIGHBOURS = 9
 # A surface's points lie in planes and near each other; scattered ones fill space.
 FAR_FACTOR, USUAL_QUANTILE = 3.0, 0.3
 THICK_RATIO = 0.1  # of the neighbours' variance, across their plane; an edge of 90° has about this
 LEAST_KEPT = 0.3  # less left over: the scan is too noisy or sparse to tell
 # The bed: a plane with much of the scan in it and nearly all the rest on one side.
-HYPOTHESES, ROUNDS = 40, 6
+HYPOTHESES, BED_PLANE_ROUNDS = 40, 6
 LEAST_PLANE, ONE_SIDE = 0.12, 0.97
 FIRST_TOLERANCE, LAST_TOLERANCE = 0.02, 0.004  # of the scan's diagonal
 PLANE_SIGMAS = 4.0
 GAP_FACTOR = 2.5  # pieces farther apart than so many usual distances are separate
-LEAST_PIECE, MOST_PIECES, MOST_CELLS = 0.1, 3, 4_000_000
+LEAST_PIECE, MOST_PIECES, MOST_CLUTTER_CELLS = 0.1, 3, 4_000_000
 LEAST_LEFT = 500
-NOISE_PLACES, NOISE_NEIGHBOURS, NOISE_QUANTILE = 2_000, 24, 0.2
+NOISE_PLACES, NOISE_NEIGHBOURS, PLACE_NOISE_QUANTILE = 2_000, 24, 0.2
 WORTH = 0.02  # leaving out less than this changes nothing
 
 
@@ -57,8 +57,8 @@ def without_clutter(points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generato
         (n, 3) in any frame.
     """
     cloud = points_mm
-    if len(cloud) > LOOKED_AT:
-        cloud = cloud[rng.permutation(len(cloud))[:LOOKED_AT]]
+    if len(cloud) > CLUTTER_POINTS:
+        cloud = cloud[rng.permutation(len(cloud))[:CLUTTER_POINTS]]
     if len(cloud) < LEAST_LEFT:
         return []
     reach, normals, across, thick = _neighbourhoods(cloud)
@@ -99,8 +99,8 @@ def noise_across(points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) 
     z, y, x = np.moveaxis(np.einsum("nki,nij->nkj", near, axes), 2, 0)
     basis = np.linalg.qr(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2))[0]
     left = (z**2).sum(axis=1) - (np.einsum("nkc,nk->nc", basis, z) ** 2).sum(axis=1)
-    low = float(np.quantile(np.maximum(left, 0.0), NOISE_QUANTILE))
-    return float(np.sqrt(low / chi2.ppf(NOISE_QUANTILE, count - 6)))
+    low = float(np.quantile(np.maximum(left, 0.0), PLACE_NOISE_QUANTILE))
+    return float(np.sqrt(low / chi2.ppf(PLACE_NOISE_QUANTILE, count - 6)))
 
 
 def _neighbourhoods(
@@ -112,9 +112,9 @@ def _neighbourhoods(
     Float[np.ndarray, " n"],
 ]:
     """Reach of the neighbours, their plane's normal, the noise across it, its share of variance."""
-    reach, index = cKDTree(cloud).query(cloud, k=[*range(1, NEIGHBOURS + 1)], workers=2)
+    reach, index = cKDTree(cloud).query(cloud, k=[*range(1, CLUTTER_NEIGHBOURS + 1)], workers=2)
     near = cloud[index] - cloud[index].mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / NEIGHBOURS)
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / CLUTTER_NEIGHBOURS)
     values = np.maximum(values, 0.0)
     return (
         reach[:, -1],
@@ -140,7 +140,7 @@ def _bed(
     best, best_count = None, 0
     for k in rng.permutation(here)[:HYPOTHESES]:
         point, normal = cloud[k], normals[k]
-        for tolerance_mm in np.geomspace(FIRST_TOLERANCE * diagonal_mm, last_mm, ROUNDS):
+        for tolerance_mm in np.geomspace(FIRST_TOLERANCE * diagonal_mm, last_mm, BED_PLANE_ROUNDS):
             inside = np.abs((few - point) @ normal) <= tolerance_mm
             if inside.sum() < 10:
                 break
@@ -165,7 +165,7 @@ def _pieces(
     here: Int[np.ndarray, " k"] = np.flatnonzero(mask)
     low = cloud[here].min(axis=0)
     size = np.ptp(cloud[here], axis=0)
-    edge_mm = max(gap_mm, float(np.cbrt(np.prod(size + gap_mm) / MOST_CELLS)), 1e-9)
+    edge_mm = max(gap_mm, float(np.cbrt(np.prod(size + gap_mm) / MOST_CLUTTER_CELLS)), 1e-9)
     index = np.floor((cloud[here] - low) / edge_mm).astype(np.int64)
     grid = np.zeros(index.max(axis=0) + 1, dtype=bool)
     grid[tuple(index.T)] = True

@@ -25,7 +25,7 @@ from gcode.progress import Progress, silent
 
 LOSSES = ("chamfer", "directed")
 LEAST_INLIERS = 0.5
-INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
+PAM_INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
 # What the directed loss of the released code is multiplied by.
 DIRECTED_FACTOR = 100.0
 
@@ -92,16 +92,16 @@ class PamOptions:
             )
 
 
-PAPER = PamOptions()
+PUBLISHED_PAM = PamOptions()
 # The released code: its loss is directed, on 5,000 points of the down-sampled clouds.
-CODE = PamOptions(
+RELEASED_PAM = PamOptions(
     threshold=1.6,
     threshold_step=0.1,
     loss="directed",
     loss_points=5_000,
     loss_on_voxels=True,
 )
-VARIANTS = {"paper": PAPER, "code": CODE}
+PAM_VARIANTS = {"paper": PUBLISHED_PAM, "code": RELEASED_PAM}
 
 
 class PamError(AlignmentError):
@@ -145,7 +145,7 @@ def pam(
     source_mm: Float[np.ndarray, "n 3"],
     target_mm: Float[np.ndarray, "m 3"],
     *,
-    options: PamOptions = PAPER,
+    options: PamOptions = PUBLISHED_PAM,
     rng: np.random.Generator,
     source: str = "source",
     progress: Progress = silent,
@@ -301,7 +301,7 @@ def align_paper(
     scan: Scan,
     template: Template,
     *,
-    options: PamOptions = PAPER,
+    options: PamOptions = PUBLISHED_PAM,
     guess: Transform | None = None,
     rng: np.random.Generator,
     progress: Progress = silent,
@@ -327,7 +327,7 @@ def align_paper(
     residual_mm, gradient = template.distance_and_gradient(placed)
     # The method cannot place a scan better than its own last search radius.
     reach = options.icp_voxels if options.icp else options.ransac_voxels
-    limit_mm = max(INLIER_MM, reach * options.voxel * found.radius_mm)
+    limit_mm = max(PAM_INLIER_MM, reach * options.voxel * found.radius_mm)
     inlier = np.abs(residual_mm) <= limit_mm
     ratio = float(inlier.mean())
     if ratio < LEAST_INLIERS:

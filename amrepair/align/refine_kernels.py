@@ -13,14 +13,14 @@ from amrepair.align.pose_kernels import solve, turn
 from amrepair.template.trilinear_kernels import field_at
 from gcode.compiled import njit, prange
 
-SHRINK = 0.6  # of the loss's scale, from one iteration to the next
-STEP_MM = 2e-4  # of the scan's far points: below this nothing moves any more
+REFINE_SHRINK = 0.6  # of the loss's scale, from one iteration to the next
+STILL_MM = 2e-4  # of the scan's far points: below this nothing moves any more
 STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
 HASTE = 15  # iterations with whole steps
 SLOWEST = 1.0 / 32  # of a step
-FREE_RATIO = 0.1  # of the limit: distances that change by less do not hinder the motion
-WIDEST_TURN_RAD = 0.2  # a step this wide has left the linear range
-DAMPING = 1e-9
+UNHINDERED_RATIO = 0.1  # of the limit: distances that change by less do not hinder the motion
+WIDEST_REFINE_RAD = 0.2  # a step this wide has left the linear range
+REFINE_DAMPING = 1e-9
 GO_ON, CONVERGED, ENOUGH = 0, 1, 2  # how a step may end
 
 
@@ -96,7 +96,7 @@ def step(hessian, slope, known, first, rotation, place, last, pace, scale, itera
     for a in range(6):
         for c in range(6):
             h[a, c] = share * hessian[a, c]
-        h[a, a] += share * DAMPING * trace / 6.0 + known[a]
+        h[a, a] += share * REFINE_DAMPING * trace / 6.0 + known[a]
         b[a] = -share * slope[a]
     for a in range(3):
         # the axis-angle vector of the small rotation away from the guess
@@ -108,9 +108,9 @@ def step(hessian, slope, known, first, rotation, place, last, pace, scale, itera
         b[3 + a] -= known[3 + a] * (place[a] - first[a, 3])
     solve(h, b)
     angle = np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-    if angle > WIDEST_TURN_RAD:
+    if angle > WIDEST_REFINE_RAD:
         for a in range(6):
-            b[a] *= WIDEST_TURN_RAD / angle
+            b[a] *= WIDEST_REFINE_RAD / angle
     if iteration > HASTE:
         # to and fro across an edge of the field, where its gradient turns at once
         along = 0.0
@@ -125,18 +125,18 @@ def step(hessian, slope, known, first, rotation, place, last, pace, scale, itera
         place[a] += b[3 + a]
     moved = np.sqrt(b[3] ** 2 + b[4] ** 2 + b[5] ** 2)
     moved += reach * np.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-    limit = max(STEP_MM, STEP_SIGMAS * sigma)
+    limit = max(STILL_MM, STEP_SIGMAS * sigma)
     still = moved < limit
     if iteration > HASTE:  # a rod turns on for ever: what counts is what its points would see
         square = 0.0
         for a in range(6):
             for c in range(6):
                 square += b[a] * hessian[a, c] * b[c]
-        still |= np.sqrt(max(square, 0.0) / count) < FREE_RATIO * limit
+        still |= np.sqrt(max(square, 0.0) / count) < UNHINDERED_RATIO * limit
     if scale <= last_scale * (1 + 1e-9) and (still or moved < enough):
         return CONVERGED if still else ENOUGH, pace, scale
     if moved < 0.25 * scale:
-        scale = max(last_scale, scale * SHRINK)
+        scale = max(last_scale, scale * REFINE_SHRINK)
     return GO_ON, pace, scale
 
 

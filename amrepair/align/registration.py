@@ -9,8 +9,10 @@ from jaxtyping import Float
 
 from amrepair.frames import Transform
 
-SURE = 1e12  # of a pose that is known: a micrometre, a millionth of a turn
-FREE_RATIO = 1e-12  # of the best known motion's information: a motion with less is free
+KNOWN_INFORMATION = 1e12  # of a pose that is known: a micrometre, a millionth of a turn
+UNKNOWN_INFORMATION_RATIO = (
+    1e-12  # of the best known motion's information: a motion with less is free
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class Registration:
     @classmethod
     def known(cls, template_from_scan: Transform) -> Registration:
         """A pose that nobody need find: the scan is in the printer's own axes."""
-        return cls(template_from_scan, 0.0, 1.0, SURE * np.eye(6), (), "known", 0)
+        return cls(template_from_scan, 0.0, 1.0, KNOWN_INFORMATION * np.eye(6), (), "known", 0)
 
     @property
     def covariance(self) -> Float[np.ndarray, "6 6"]:
@@ -56,7 +58,7 @@ class Registration:
 
         Very large, never infinite, along motions that nothing hinders.
         """
-        return bounded_inverse(self.information, FREE_RATIO)
+        return bounded_inverse(self.information, UNKNOWN_INFORMATION_RATIO)
 
 
 def bounded_inverse(

@@ -20,8 +20,8 @@ from amrepair.align import search_kernels as kernels
 from amrepair.align.thinning import Thinned
 from amrepair.template.port import Template
 
-CELLS = 56  # of the coarse field, along the longest side of the part
-MARGIN_RATIO = 0.15  # of the diagonal, around the part
+COARSE_CELLS = 56  # of the coarse field, along the longest side of the part
+SEARCH_MARGIN_RATIO = 0.15  # of the diagonal, around the part
 # Roots of x⁴ = x + 4 and 2 (Alexa, eq. 5).
 _PSI, _PHI = 1.533751168755204288118041, np.sqrt(2.0)
 
@@ -66,7 +66,7 @@ class Effort:
 
 
 # About 23° apart; of 120 scans of our own parts, whole and single views, none was lost.
-QUICK = Effort(
+QUICK_EFFORT = Effort(
     1_200,
     (
         Stage(120, 6, 0.10, 0.03, 160),
@@ -104,8 +104,8 @@ TWINS = Effort(
         Stage(1_000, 6, 0.01, 0.005, 16),
     ),
 )
-CAP_RATIO = 0.03  # of the diagonal: farther off is as bad
-SAME_RATIO = 0.007  # of the diagonal: poses that move the points by less are one
+DISTANCE_CAP_RATIO = 0.03  # of the diagonal: farther off is as bad
+SAME_POSE_RATIO = 0.007  # of the diagonal: poses that move the points by less are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +139,8 @@ class CoarseField:
     def _asked(cls, template: Template) -> CoarseField:
         box = template.bounds_mm
         size = box[1] - box[0]
-        cell_mm = float(size.max()) / CELLS
-        margin_mm = MARGIN_RATIO * float(np.linalg.norm(size))
+        cell_mm = float(size.max()) / COARSE_CELLS
+        margin_mm = SEARCH_MARGIN_RATIO * float(np.linalg.norm(size))
         origin = box[0] - margin_mm
         shape = np.ceil((size + 2 * margin_mm) / cell_mm).astype(int) + 1
         axes = [origin[a] + cell_mm * np.arange(shape[a]) for a in range(3)]
@@ -177,7 +177,7 @@ def search(
     cloud: Thinned,
     field: CoarseField,
     *,
-    effort: Effort = QUICK,
+    effort: Effort = QUICK_EFFORT,
     turn: Float[np.ndarray, "3 3"] | None = None,
     only: tuple[Float[np.ndarray, "4 4"], ...] | None = None,
 ) -> list[Pose]:
@@ -222,11 +222,11 @@ def search(
         rotations, places = np.ascontiguousarray(rotations), np.ascontiguousarray(places)
         scales = stage.scales(diagonal)
         scores = kernels.descend(
-            _rows(local), rotations, places, *grid, scales, CAP_RATIO * diagonal
+            _rows(local), rotations, places, *grid, scales, DISTANCE_CAP_RATIO * diagonal
         )
         radius = float(np.sqrt((local**2).sum(axis=1).mean()))
         order = np.argsort(scores, kind="stable")
-        apart = SAME_RATIO * diagonal
+        apart = SAME_POSE_RATIO * diagonal
         chosen = kernels.peaks(order, rotations, places, radius, apart, stage.keep)
         rotations, places, scores = rotations[chosen], places[chosen], scores[chosen]
     return [

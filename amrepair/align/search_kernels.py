@@ -15,8 +15,8 @@ from gcode.compiled import njit, prange
 
 LEAST_ALONG, MOST_ALONG = 3, 8  # places along an axis
 TRIM = 0.02  # of the points at each end of the box: outliers
-DAMPING = 1e-4
-WIDEST_TURN_RAD = 0.35  # of one step
+SEARCH_DAMPING = 1e-4
+WIDEST_SEARCH_RAD = 0.35  # of one step
 SHORTEST = np.float32(1e-9)  # nothing is divided by less
 
 # What runs in vectors of single precision stores nothing but sums and branches nowhere; numbers of
@@ -227,7 +227,7 @@ def descend(points, rotations, places, values, shape, scales, cap):
         h, b = np.empty((6, 6)), np.empty(6)
         for step in range(len(scales)):
             _accumulate(points, r, p, values, shape, scales[step], cap, h, b)
-            step_down(r, p, h, b, DAMPING, 1e-12, WIDEST_TURN_RAD, reach)
+            step_down(r, p, h, b, SEARCH_DAMPING, 1e-12, WIDEST_SEARCH_RAD, reach)
         total = _accumulate(points, r, p, values, shape, scales[-1], cap, h, b)
         scores[k] = total / points.shape[1]
     return scores

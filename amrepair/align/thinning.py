@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from amrepair.align.thinning_kernels import first_of_voxels, morton_keys
 from amrepair.frames import box_of
 
-MOST_LOOKED_AT = 200_000
-ROUNDS, CLOSE_ENOUGH = 12, 0.95
+MOST_THINNED = 200_000
+THINNING_ROUNDS, CLOSE_ENOUGH = 12, 0.95
 ORDER_BITS = 7  # 128 cubes along the longest side
 
 
@@ -21,7 +21,7 @@ def thin_out(
     """About `count` points, never more: one of each voxel, chosen by the generator."""
     if len(points_mm) <= count:
         return np.array(points_mm, dtype=np.float64)
-    order = rng.permutation(len(points_mm))[: max(MOST_LOOKED_AT, count)]
+    order = rng.permutation(len(points_mm))[: max(MOST_THINNED, count)]
     shuffled = np.ascontiguousarray(points_mm.take(order, axis=0), dtype=np.float64)
     low, high = box_of(shuffled)
     extent_mm = float((high - low).max())
@@ -32,7 +32,7 @@ def thin_out(
     # number with the inverse square of their edge
     small, large = extent_mm / 1e5, extent_mm
     voxel_mm = max(extent_mm / np.sqrt(2.0 * count), 1e-9)
-    for _ in range(ROUNDS):
+    for _ in range(THINNING_ROUNDS):
         found = int(first_of_voxels(shuffled, low, voxel_mm, count, slots, chosen))
         if found > count:
             small = voxel_mm

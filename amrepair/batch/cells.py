@@ -31,7 +31,7 @@ REACH_CELLS = 1.5
 MOST_UNITS = 100_000
 # The quickest: most columns are zero at most cells, and pack well.
 PACKING = 1
-COLUMNS = ("seen", "missing", "excess", "deviation", "squared", "missing_mm3", "excess_mm3")
+CELL_COLUMNS = ("seen", "missing", "excess", "deviation", "squared", "missing_mm3", "excess_mm3")
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ class CellSums:
     Attributes
     ----------
     table
-        (k, 7) in the order of `COLUMNS`: scans that saw the cell, that found something missing or
-        too much there, Σ of their mean deviations and of its squares in units of 0.1 µm, and the
-        volumes of regions there in units of 10⁻⁶ mm³.
+        (k, 7) in the order of `CELL_COLUMNS`: scans that saw the cell, that found something
+        missing or too much there, Σ of their mean deviations and of its squares in units of
+        0.1 µm, and the volumes of regions there in units of 10⁻⁶ mm³.
     """
 
     table: Int[np.ndarray, "k 7"]
@@ -86,7 +86,7 @@ class CellSums:
     @classmethod
     def zero(cls, count: int) -> CellSums:
         """Of no scan."""
-        return cls(np.zeros((count, len(COLUMNS)), np.int64))
+        return cls(np.zeros((count, len(CELL_COLUMNS)), np.int64))
 
     def __add__(self, other: CellSums) -> CellSums:
         if self.table.shape != other.table.shape:
@@ -98,7 +98,7 @@ class CellSums:
 
     def column(self, name: str) -> Int[np.ndarray, " k"]:
         """(k,) one of the sums."""
-        return self.table[:, COLUMNS.index(name)]
+        return self.table[:, CELL_COLUMNS.index(name)]
 
     def mean_mm(self) -> Float[np.ndarray, " k"]:
         """(k,) mean deviation, mm; NaN where no scan saw the cell."""
@@ -118,7 +118,7 @@ class CellSums:
     def from_bytes(cls, data: bytes) -> CellSums:
         """As `to_bytes` wrote them."""
         flat = np.frombuffer(zlib.decompress(data), dtype="<i8").astype(np.int64)
-        return cls(flat.reshape(len(COLUMNS), -1).T.copy())
+        return cls(flat.reshape(len(CELL_COLUMNS), -1).T.copy())
 
 
 def sums_of(
@@ -151,7 +151,7 @@ def sums_of(
     gone = _cells_of(cells, anomaly, Label.MISSING)
     for name, which in (("missing", Label.MISSING), ("excess", Label.EXCESS)):
         found = np.bincount(at[label == int(which)], minlength=count) > 0
-        table[:, COLUMNS.index(name)] = found | gone if which is Label.MISSING else found
+        table[:, CELL_COLUMNS.index(name)] = found | gone if which is Label.MISSING else found
     table[:, 0] = (points > 0) | gone
     table[:, 3], table[:, 4] = mean, mean * mean
     _add_volumes(sums, regions, centres_mm, cells)

@@ -56,11 +56,11 @@ def read_entries(source: str) -> list[Entry]:
             f"{source}: there is no such folder, and a manifest is named "
             f"{', '.join('*' + s for s in MANIFEST_SUFFIXES)}"
         )
-    from amrepair.scans.files import SUFFIXES
+    from amrepair.scans.files import SCAN_SUFFIXES
 
-    found = [Entry(name, uri) for name, uri in listed(source) if suffix_of(uri) in SUFFIXES]
+    found = [Entry(name, uri) for name, uri in listed(source) if suffix_of(uri) in SCAN_SUFFIXES]
     if not found:
-        raise InputError(f"{source} holds no scan ({', '.join(sorted(SUFFIXES))})")
+        raise InputError(f"{source} holds no scan ({', '.join(sorted(SCAN_SUFFIXES))})")
     return found
 
 

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 from amrepair.batch.options import Outcome, Task, Work
 from amrepair.errors import InputError
 
-NAMES = ("process", "serial", "ray")
+EXECUTOR_NAMES = ("process", "serial", "ray")
 
 
 @runtime_checkable
@@ -59,8 +59,8 @@ def make_executor(
     MissingDependencyError
         If Ray is not installed.
     """
-    if name not in NAMES:
-        raise InputError(f"--executor is {name!r}; it is one of {', '.join(NAMES)}")
+    if name not in EXECUTOR_NAMES:
+        raise InputError(f"--executor is {name!r}; it is one of {', '.join(EXECUTOR_NAMES)}")
     if address is not None and name != "ray":
         raise InputError(f"--address belongs to --executor ray, the executor is {name}")
     count = workers or len(os.sched_getaffinity(0))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from amrepair.batch.work import Bench
 
 # Tasks under way a worker: one that is done and one that waits, so that none is idle meanwhile.
-DEPTH = 2
+TASKS_A_WORKER = 2
 
 
 class OnRay:
@@ -59,7 +59,7 @@ class OnRay:
 
     def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
         """Never more than two tasks a worker are under way."""
-        free = [actor for _ in range(DEPTH) for actor in self._actors]
+        free = [actor for _ in range(TASKS_A_WORKER) for actor in self._actors]
         under_way: dict[Any, tuple[Any, Task]] = {}
         more = True
         while more or under_way:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gcode.profiles import PrintSetup
 
 # Raised when results of the same name would come out differently: old ones are then not taken.
-LAYOUT_VERSION = 1
+BATCH_LAYOUT_VERSION = 1
 
 
 class Kind(StrEnum):
@@ -93,7 +93,7 @@ class Work:
         from amrepair import __version__
 
         said = {
-            "layout": LAYOUT_VERSION,
+            "layout": BATCH_LAYOUT_VERSION,
             "version": __version__,
             "options": asdict(self.options),
             "templates": {one.name: one.sha256 for one in self.templates},

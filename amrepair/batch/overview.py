@@ -11,10 +11,10 @@ from jaxtyping import Float
 
 from amrepair.batch.cells import Cells, CellSums
 from amrepair.batch.options import Kind
-from amrepair.batch.table import OK
+from amrepair.batch.table import DONE
 
 WORST = 20
-BUCKETS = 24
+HISTOGRAM_BARS = 24
 HEIGHT_BANDS = 12
 # Squares of a picture along the part's diagonal; a square shows its highest cell.
 PICTURE_CELLS = 56
@@ -39,7 +39,7 @@ td.n,th.n{text-align:right}tr+tr td{border-top:1px solid #8884}
 font-size:1.35rem}figure{display:inline-block;margin:0 1.2rem 1rem 0}figcaption{font-size:.85rem}
 svg{max-width:100%;height:auto}svg text{fill:currentColor;font:11px system-ui,sans-serif}
 """
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"
+NO_SCRIPT_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 
 
 class Part:
@@ -69,7 +69,7 @@ def overview(rows: Sequence[Mapping[str, Any]], parts: Mapping[str, Part], kind:
     sections.append(_sentences(rows))
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        f'<meta http-equiv="Content-Security-Policy" content="{NO_SCRIPT_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{_STYLE}</style></head>\n<body>"
         f"<h1>{escape(title)}</h1>\n{''.join(sections)}</body></html>\n"
@@ -77,7 +77,7 @@ def overview(rows: Sequence[Mapping[str, Any]], parts: Mapping[str, Part], kind:
 
 
 def _key_figures(rows: Sequence[Mapping[str, Any]]) -> str:
-    good = [row for row in rows if row["status"] == OK]
+    good = [row for row in rows if row["status"] == DONE]
     figures = [("scans", f"{len(rows):,}"), ("with a sentence", f"{len(rows) - len(good):,}")]
     if good and "regions" in good[0]:
         defective = sum(row["regions"] > 0 for row in good)
@@ -96,12 +96,12 @@ def _total(rows: Iterable[Mapping[str, Any]], name: str) -> float:
 
 def _over_time(rows: Sequence[Mapping[str, Any]]) -> str:
     """Share of scans with a defect, by when they were taken; by name where nobody said."""
-    good = [row for row in rows if row["status"] == OK]
+    good = [row for row in rows if row["status"] == DONE]
     if not good:
         return ""
     timed = all(row["time"] for row in good)
     ordered = sorted(good, key=lambda row: (row["time"], row["name"])) if timed else good
-    buckets = np.array_split(np.arange(len(ordered)), min(BUCKETS, len(ordered)))
+    buckets = np.array_split(np.arange(len(ordered)), min(HISTOGRAM_BARS, len(ordered)))
     rates = [float(np.mean([ordered[k]["regions"] > 0 for k in bucket])) for bucket in buckets]
     key = "time" if timed else "name"
     labels = [
@@ -214,7 +214,7 @@ def _heights(name: str, part: Part) -> str:
 
 def _worst(rows: Sequence[Mapping[str, Any]]) -> str:
     """The scans with most missing and too much."""
-    found = [row for row in rows if row["status"] == OK and row["regions"]]
+    found = [row for row in rows if row["status"] == DONE and row["regions"]]
     if not found:
         return ""
     found.sort(key=lambda row: (-(row["missing_mm3"] + row["excess_mm3"]), row["name"]))
@@ -243,7 +243,7 @@ def _sentences(rows: Sequence[Mapping[str, Any]]) -> str:
     """What is wrong with scans, the most frequent first; each with one scan that has it."""
     grouped: dict[str, list[str]] = {}
     for row in rows:
-        if row["status"] != OK:
+        if row["status"] != DONE:
             said = row["sentence"].replace(row["name"], "…")
             grouped.setdefault(said, []).append(row["name"])
     if not grouped:

@@ -20,7 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 from amrepair.errors import InputError, MissingDependencyError
 from gcode.whole import write_bytes
 
-_CHUNK_BYTES = 1 << 20
+_STREAM_BYTES = 1 << 20
 
 
 def is_remote(uri: str) -> bool:
@@ -164,7 +164,7 @@ def digest_of(uri: str) -> tuple[str, int]:
     """
     digest, size = hashlib.sha256(), 0
     with _as_os_errors(), _opened(uri) as stream:
-        while chunk := stream.read(_CHUNK_BYTES):
+        while chunk := stream.read(_STREAM_BYTES):
             digest.update(chunk)
             size += len(chunk)
     return digest.hexdigest(), size
@@ -179,7 +179,7 @@ def at_hand(uri: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="amrepair-batch-") as folder:
         path = Path(folder) / f"scan{suffix_of(uri)}"
         with _as_os_errors(), _opened(uri) as stream, path.open("wb") as copy:
-            while chunk := stream.read(_CHUNK_BYTES):
+            while chunk := stream.read(_STREAM_BYTES):
                 copy.write(chunk)
         yield path
 

@@ -35,7 +35,7 @@ from amrepair.batch.options import (
 )
 from amrepair.batch.overview import Part, overview
 from amrepair.batch.places import Place, digest_of, is_remote, open_place, suffix_of
-from amrepair.batch.table import OK, as_csv, as_parquet, row_of
+from amrepair.batch.table import DONE, as_csv, as_parquet, row_of
 from amrepair.batch.work import PROGRAM, SUMS
 from amrepair.errors import InputError
 from amrepair.library import template_files
@@ -79,7 +79,7 @@ class BatchReport:
     @property
     def refused(self) -> int:
         """Rows with a sentence instead of figures."""
-        return sum(row["status"] != OK for row in self.rows)
+        return sum(row["status"] != DONE for row in self.rows)
 
 
 @dataclass(slots=True)
@@ -294,7 +294,7 @@ def _written(
     else:
         place.write("table.parquet", parquet)
         files.insert(1, "table.parquet")
-    refused = [row for row in rows if row["status"] != OK]
+    refused = [row for row in rows if row["status"] != DONE]
     if refused:
         notes.append(
             f"{len(refused)} of {len(rows)} scans have a sentence instead of figures; the first: "

@@ -14,19 +14,19 @@ from typing import Any
 from amrepair.batch.entries import Entry
 from amrepair.batch.options import Kind
 
-_HEAD = ("name", "label", "time", "scan_id", "status", "sentence")
+_FIRST_COLUMNS = ("name", "label", "time", "scan_id", "status", "sentence")
 _POSE = ("template", "confidence", "rmse_mm", "inlier_ratio", "clutter_ratio",
          "symmetric_alternatives")  # fmt: skip
 _FOUND = ("regions", "missing_mm3", "excess_mm3", "worst_label", "worst_type", "worst_mm3",
           "worst_depth_mm", "worst_x_mm", "worst_y_mm", "worst_z_mm", "object_score_mm",
           "threshold_mm", "sigma_mm")  # fmt: skip
-_REPAIR = ("within_tolerance", "unreachable_mm3", "filament_mm", "print_time_s", "gcode")
-COLUMNS = {
-    Kind.ALIGN: (*_HEAD, *_POSE, "template_from_scan"),
-    Kind.DETECT: (*_HEAD, *_POSE, *_FOUND),
-    Kind.REPAIR: (*_HEAD, *_POSE, *_FOUND, *_REPAIR),
+_REPAIR_COLUMNS = ("within_tolerance", "unreachable_mm3", "filament_mm", "print_time_s", "gcode")
+TABLE_COLUMNS = {
+    Kind.ALIGN: (*_FIRST_COLUMNS, *_POSE, "template_from_scan"),
+    Kind.DETECT: (*_FIRST_COLUMNS, *_POSE, *_FOUND),
+    Kind.REPAIR: (*_FIRST_COLUMNS, *_POSE, *_FOUND, *_REPAIR_COLUMNS),
 }
-OK, REFUSED = "ok", "refused"
+DONE, REFUSED = "ok", "refused"
 
 
 def row_of(
@@ -38,7 +38,7 @@ def row_of(
         "label": entry.label,
         "time": entry.time,
         "scan_id": scan_id,
-        "status": REFUSED if sentence else OK,
+        "status": REFUSED if sentence else DONE,
         "sentence": sentence.replace("{scan}", entry.name),
         **figures,
         "gcode": gcode,
@@ -62,7 +62,7 @@ def row_of(
 def as_csv(rows: Sequence[Mapping[str, Any]], kind: Kind) -> bytes:
     """With every digit that a figure has."""
     stream = io.StringIO()
-    writer = csv.DictWriter(stream, COLUMNS[kind], extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(stream, TABLE_COLUMNS[kind], extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return stream.getvalue().encode()
@@ -75,8 +75,8 @@ def as_parquet(rows: Sequence[Mapping[str, Any]], kind: Kind) -> bytes | None:
         from pyarrow import parquet
     except ImportError:
         return None
-    columns = {name: [row.get(name) for row in rows] for name in COLUMNS[kind]}
-    schema = pa.schema([(name, _type(pa, name)) for name in COLUMNS[kind]])
+    columns = {name: [row.get(name) for row in rows] for name in TABLE_COLUMNS[kind]}
+    schema = pa.schema([(name, _type(pa, name)) for name in TABLE_COLUMNS[kind]])
     sink = pa.BufferOutputStream()
     parquet.write_table(pa.table(columns, schema=schema), sink)
     return bytes(sink.getvalue().to_pybytes())

@@ -20,6 +20,7 @@ from PIL import Image
 
 from amrepair.bench.samples import GOOD, BenchClass, Cloud, Points, Sample
 from amrepair.errors import InputError
+from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.scans.depth_map import refuse_swollen_page
 from amrepair.scans.sizes import PARSER_ERRORS, UnpackLimit, in_words
 
@@ -28,7 +29,6 @@ BORDER_RATIO = 0.03  # of the image's shorter side: the part does not reach so f
 # camera's own bow is a tenth of it). What lies within three of them cannot be told from it.
 FLAT_RATIO, TABLE_SIGMAS = 0.005, 3.0
 PLANE_DRAWS, PLANE_POINTS = 200, 2_000
-NORMAL_MAD = 0.6745  # median absolute deviation of a standard normal
 
 
 def find_classes(root: Path) -> tuple[BenchClass, ...]:
@@ -143,14 +143,14 @@ def _plane(points: Points) -> tuple[Float[np.ndarray, " 3"], float, float] | Non
     away = np.abs(some @ normals.T - (normals * a).sum(axis=1))
     median = np.median(away, axis=0)
     best = int(np.argmin(median))
-    sigma = float(median[best]) / NORMAL_MAD
+    sigma = MAD_TO_SIGMA * float(median[best])
     if sigma > FLAT_RATIO * float(np.linalg.norm(np.ptp(some, axis=0))):
         return None
     near = some[away[:, best] <= TABLE_SIGMAS * sigma]
     middle = near.mean(axis=0)
     normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
     offset = float(middle @ normal)
-    sigma = float(np.median(np.abs(near @ normal - offset))) / NORMAL_MAD
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(near @ normal - offset)))
     return normal, offset, sigma
 
 

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from amrepair.frames import unit_vectors
 from amrepair.template.port import Template
 
-CUTS = np.arange(0.2, 0.81, 0.05)  # shares of the points on one side of a cut
-RIDGE = 1e-6  # of a motion that the points of a side do not show
+CUT_SHARES = np.arange(0.2, 0.81, 0.05)  # shares of the points on one side of a cut
+MOTION_RIDGE = 1e-6  # of a motion that the points of a side do not show
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Cut:
         deviations, beyond what one motion of all does: χ² of six degrees of freedom if nothing is
         bent.
     normal, height_mm
-        Points p with p · normal < height lie on the first side.
+        Places p of the surface with p · normal < height lie on the first side.
     """
 
     gain: float
@@ -59,6 +59,8 @@ def best_cuts(
     """
     f_mm, gradient = template.distance_and_gradient(points_mm)
     normals = unit_vectors(gradient)
+    # by where a point is due: noise must not choose on which side of a face's own plane it is
+    feet_mm = points_mm - f_mm[:, None] * normals
     local = points_mm - points_mm.mean(axis=0)
     reach_mm = float(np.linalg.norm(local, axis=1).max())
     motion = np.concatenate([np.cross(local, normals) / reach_mm, normals], axis=1)
@@ -74,7 +76,7 @@ def best_cuts(
     middle = surface_mm - surface_mm.mean(axis=0)
     found = []
     for axis in np.linalg.eigh(middle.T @ middle)[1].T:
-        height = points_mm @ axis
+        height = feet_mm @ axis
         order = np.argsort(height)
         below = np.cumsum(products[order], axis=0)
         cuts = [
@@ -84,7 +86,7 @@ def best_cuts(
                 axis,
                 float(height[order[i]]),
             )
-            for i in (CUTS * len(height)).astype(int)
+            for i in (CUT_SHARES * len(height)).astype(int)
         ]
         found.append(max(cuts, key=lambda cut: cut.gain))
     return sorted(found, key=lambda cut: -cut.gain)
@@ -93,5 +95,5 @@ def best_cuts(
 def _explained(sums: Float[np.ndarray, " 42"]) -> float:
     """What the best motion takes from the sum of squares, from the sums of a side."""
     matrix, right = sums[:36].reshape(6, 6), sums[36:]
-    matrix = matrix + RIDGE * max(float(np.trace(matrix)), 1e-12) * np.eye(6)
+    matrix = matrix + MOTION_RIDGE * max(float(np.trace(matrix)), 1e-12) * np.eye(6)
     return float(right @ np.linalg.solve(matrix, right))

@@ -22,18 +22,21 @@ from amrepair.align.refine import refine_all
 from amrepair.align.search import THOROUGH, CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.bench.bends import best_cuts
-from amrepair.frames import moved, rotation_from_vector, ways_across
+from amrepair.frames import moved, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
-LEAST_SHARE = 0.1  # of the points: with fewer off the template nothing was bent
-POINTS, FEW_POINTS, PIECE_POINTS, LAST_POINTS = 4_000, 1_200, 600, 15_000
+LEAST_BENT_SHARE = 0.1  # of the points: with fewer off the template nothing was bent
+BODY_POINTS, START_POINTS, PIECE_POINTS, LAST_POINTS = 4_000, 1_200, 600, 15_000
 CLEAR_SIGMAS, CLEAR_RATIO = 4.0, 0.002  # a point is off the surface; the ratio is of the diagonal
-FIRST_RATIO, PIECE_RATIO = 0.02, 0.04  # scale of the loss to begin with, of the diagonal
+FIRST_PIECE_RATIO, SECOND_PIECE_RATIO = (
+    0.02,
+    0.04,
+)  # scale of the loss to begin with, of the diagonal
 SHARP = 0.4  # of the limit: the loss's scale where a piece's pose ends
-ITERATIONS, ROUNDS = 40, 6
+ITERATIONS, BODY_ROUNDS = 40, 6
 ENOUGH_SIGMAS = 0.05  # of the noise: a smaller step changes nothing that is asked
 NEARBY = 3.0  # limits: a point this near may yet come to lie on a piece
-ENOUGH = 0.93  # of the points, explained by two poses: nothing better is looked for
+EXPLAINED_SHARE = 0.93  # of the points, explained by two poses: nothing better is looked for
 # Nor where they explain all but outliers off the bend itself, which is neither piece's: so far from
 # the plane between them (of the diagonal), where at least so many of the points lie.
 BENT_RATIO, ENOUGH_BEYOND, LEAST_BEYOND = 0.06, 0.985, 0.5
@@ -43,15 +46,15 @@ LEAST_OF_PAIR = 0.87
 MOST_POLISHED = 2  # pairs of each pose, the best ones to begin with
 MOST_TRIED = 4  # poses of which a second piece is asked
 NEIGHBOURS, MOSTLY = 24, 0.9  # a place lies on the template where its neighbours do
-SAME_RATIO = 0.01  # of the diagonal: poses that move the scan by less are one
-TURN_RAD = 0.14  # starts of the second piece, about the middle of what the first leaves
+SAME_BODY_RATIO = 0.01  # of the diagonal: poses that move the scan by less are one
+PIECE_TURN_RAD = 0.14  # starts of the second piece, about the middle of what the first leaves
 CUTS = (0.3, 0.5, 0.7)  # shares of the scan on one side, along each of its main axes
 LEAST_TURNED_RAD, MOST_TURNED_RAD = 0.01, 0.5  # farther is another place that fits by chance
 HINGE_RATIO = 0.04  # of the diagonal: at the plane between the pieces both poses agree to this
-LEAST_PIECE = 0.05  # of the points
+LEAST_PIECE_SHARE = 0.05  # of the points
 LEAST_GAINED = 0.08  # of the points, by the second pose
 MOST_WRONG = 0.2  # of either piece, on the wrong side of the plane between them
-ANGLES, ALIKE = 36, 0.02  # of planes about the hinge; wrong by so little more is as good
+ANGLES, AS_GOOD_RATIO = 36, 0.02  # of planes about the hinge; wrong by so little more is as good
 MOST_OF_BROKEN = 0.5  # where a pose holds more, the rest is a matter of its own
 MOST_OUTSIDE = 0.01  # of the points, beyond the noise, where something broke off
 SUNK_RATIOS = (0.01, 0.003)  # the loss's scale to begin with, of the diagonal
@@ -118,14 +121,14 @@ def pieces_of(
     thinned = Thinned(points_mm, rng)
     limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * _diagonal_mm(template))
     scene = _Scene.of(thinned, template, sigma_mm, limit_mm)
-    if (~scene.on(known[0])).mean() < LEAST_SHARE:
+    if (~scene.on(known[0])).mean() < LEAST_BENT_SHARE:
         return _little_bent(known[0], scene)
-    tried = scene.distinct(scene.refined(scene.thinned.to(FEW_POINTS), known))
+    tried = scene.distinct(scene.refined(scene.thinned.to(START_POINTS), known))
     best = _best_pair(tried, scene)
     if best is None or not best.is_enough:
         coarse = CoarseField.of(template)
         found = [pose.matrix for pose in search(scene.thinned, coarse, effort=THOROUGH)]
-        more = scene.distinct([*tried, *scene.refined(scene.thinned.to(FEW_POINTS), found)])
+        more = scene.distinct([*tried, *scene.refined(scene.thinned.to(START_POINTS), found)])
         untried = [pose for pose in more if not any(pose is one for one in tried)]
         best = _best_pair(untried[:MOST_TRIED], scene, best)
         tried = more
@@ -173,11 +176,11 @@ def _parted(
 ) -> tuple[float, Pieces]:
     """What is off, and the pieces on either side of a cut: each moved by itself, then the cut."""
     cloud = scene.cloud
-    height = moved(cloud, whole) @ axis
+    height = scene.feet(whole) @ axis
     order = np.argsort(height)
     first, last = (int(share * len(order)) for share in CUT_RANGE)
     poses, off, at = [whole, whole], [np.zeros(len(cloud))] * 2, height_mm
-    for round_ in range(ROUNDS // 2):
+    for round_ in range(BODY_ROUNDS // 2):
         for k, own in enumerate((height < at, height >= at)):
             scale = BENT_SCALE_RATIO if round_ == 0 else 0.0
             some = np.ascontiguousarray(cloud[own])
@@ -200,7 +203,7 @@ def _nothing_outside(poses: Sequence[Pose], scene: _Scene) -> Pose | None:
     A view into a broken face: on the template lies what is left beside it, below all the rest. Laid
     on a flat side near by, half of the face sticks out, and nothing that breaks makes that.
     """
-    few, best, most = scene.thinned.to(FEW_POINTS), None, LEAST_PIECE
+    few, best, most = scene.thinned.to(START_POINTS), None, LEAST_PIECE_SHARE
     for ratio in SUNK_RATIOS:
         for pose in scene.refined(few, poses, ratio, outside=False):
             distance = scene.template.distance(moved(scene.cloud, pose))
@@ -249,7 +252,7 @@ class _Pair:
     @property
     def is_enough(self) -> bool:
         """Whether nothing better need be looked for."""
-        return self.explained > ENOUGH or self.beyond > ENOUGH_BEYOND
+        return self.explained > EXPLAINED_SHARE or self.beyond > ENOUGH_BEYOND
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,7 +270,7 @@ class _Scene:
 
     @classmethod
     def of(cls, thinned: Thinned, template: Template, sigma_mm: float, limit_mm: float) -> _Scene:
-        cloud, diagonal_mm = thinned.to(POINTS), _diagonal_mm(template)
+        cloud, diagonal_mm = thinned.to(BODY_POINTS), _diagonal_mm(template)
         near = [*range(1, min(NEIGHBOURS, len(cloud)) + 1)]
         index = cKDTree(cloud).query(cloud, k=near)[1]
         surface = template.surface_points(SURFACE_RATIO * diagonal_mm)[0]
@@ -297,11 +300,17 @@ class _Scene:
         distance = np.abs(self.template.distance(moved(self.cloud, pose)))
         return np.asarray(np.minimum(distance / self.limit_mm, 1.0))
 
+    def feet(self, pose: Pose) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) places of the template's surface that the points lie over."""
+        placed = moved(self.cloud, pose)
+        f_mm, gradient = self.template.distance_and_gradient(placed)
+        return np.asarray(placed - f_mm[:, None] * unit_vectors(gradient))
+
     def refined(
         self,
         points: Float[np.ndarray, "k 3"],
         starts: Sequence[Pose],
-        first_ratio: float = FIRST_RATIO,
+        first_ratio: float = FIRST_PIECE_RATIO,
         *,
         outside: bool = True,
     ) -> list[Pose]:
@@ -336,7 +345,7 @@ class _Scene:
             own = np.abs(self.template.distance(placed)) <= self.limit_mm
             if away is not None and through_mm is not None:
                 own &= (placed - through_mm) @ away < -HINGE_RATIO * self.diagonal_mm
-            if own.sum() < LEAST_PIECE * len(points):
+            if own.sum() < LEAST_PIECE_SHARE * len(points):
                 break
             pose = refine_all(
                 np.ascontiguousarray(points[own]),
@@ -357,7 +366,8 @@ class _Scene:
         for k in np.argsort(shares, kind="stable")[::-1]:
             here = moved(few, poses[k])
             if all(
-                np.linalg.norm(here - moved(few, one), axis=1).max() > SAME_RATIO * self.diagonal_mm
+                np.linalg.norm(here - moved(few, one), axis=1).max()
+                > SAME_BODY_RATIO * self.diagonal_mm
                 for one in kept
             ):
                 kept.append(poses[k])
@@ -376,7 +386,9 @@ def _seeds(poses: Sequence[Pose], scene: _Scene) -> Iterator[list[tuple[Pose, Po
         height = local @ axis
         for cut in np.quantile(height, CUTS):
             for side in (height <= cut, height > cut):
-                sides.append(scene.refined(_some(cloud[side], PIECE_POINTS), poses, PIECE_RATIO))
+                sides.append(
+                    scene.refined(_some(cloud[side], PIECE_POINTS), poses, SECOND_PIECE_RATIO)
+                )
     for pose, *moved_sides in zip(poses, *sides, strict=True):
         found = list(zip(moved_sides[::2], moved_sides[1::2], strict=True))
         yield [*_of_the_rest(pose, scene), *found]
@@ -386,18 +398,18 @@ def _of_the_rest(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
     """The pose, and that of what it leaves, where this is a piece."""
     on = scene.on(first)
     rest = scene.cloud[~on]
-    if len(rest) <= LEAST_PIECE * len(on):
+    if len(rest) <= LEAST_PIECE_SHARE * len(on):
         return
     few = _some(rest, PIECE_POINTS)
     middle = moved(few, first).mean(axis=0)
     starts = [first]
     for vector in (*np.eye(3), *-np.eye(3)):
-        turn = rotation_from_vector(TURN_RAD * vector)
+        turn = rotation_from_vector(PIECE_TURN_RAD * vector)
         start = np.eye(4)
         start[:3, :3] = turn @ first[:3, :3]
         start[:3, 3] = turn @ (first[:3, 3] - middle) + middle
         starts.append(start)
-    found = scene.refined(few, starts, PIECE_RATIO)
+    found = scene.refined(few, starts, SECOND_PIECE_RATIO)
     yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
 
 
@@ -412,17 +424,17 @@ def _some(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 
 def _polished(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     """Both poses, each moved on the points that it explains better; None if that is no bend."""
     poses = [first, second]
-    for _ in range(ROUNDS):
+    for _ in range(BODY_ROUNDS):
         off = np.stack([np.abs(scene.template.distance(moved(scene.cloud, one))) for one in poses])
         nearer = off[1] < off[0]
-        if min(nearer.mean(), 1.0 - nearer.mean()) < LEAST_PIECE:
+        if min(nearer.mean(), 1.0 - nearer.mean()) < LEAST_PIECE_SHARE:
             return None
         near = off.min(axis=0) <= NEARBY * scene.limit_mm
         own = (near & ~nearer, near & nearer)
-        if min(which.sum() for which in own) < LEAST_PIECE * len(nearer):
+        if min(which.sum() for which in own) < LEAST_PIECE_SHARE * len(nearer):
             return None
         poses = [
-            scene.refined(_some(scene.cloud[which], FEW_POINTS), [one], 0.0)[0]
+            scene.refined(_some(scene.cloud[which], START_POINTS), [one], 0.0)[0]
             for which, one in zip(own, poses, strict=True)
         ]
     return _judged(poses[0], poses[1], scene)
@@ -438,7 +450,7 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     off = np.stack([np.abs(scene.template.distance(one + through)) for one in placed])
     on = off <= scene.limit_mm
     only = (on[0] & ~on[1], on[1] & ~on[0])
-    if min(which.sum() for which in only) < LEAST_PIECE * on.shape[1]:
+    if min(which.sum() for which in only) < LEAST_PIECE_SHARE * on.shape[1]:
         return None
     # Of the planes through the axis, the one with the fewest points on the wrong side is taken.
     u, v = ways_across(axis)
@@ -446,7 +458,7 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     normals = np.outer(np.cos(angles), u) + np.outer(np.sin(angles), v)
     wrong = (placed[0][only[0]] @ normals.T > 0.0).mean(axis=0)
     wrong += (placed[1][only[1]] @ normals.T < 0.0).mean(axis=0)
-    least = wrong <= wrong.min() + ALIKE
+    least = wrong <= wrong.min() + AS_GOOD_RATIO
     normal = normals[least].sum(axis=0)
     normal /= max(float(np.linalg.norm(normal)), 1e-9)
     if 0.5 * wrong.min() > MOST_WRONG:

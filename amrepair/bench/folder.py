@@ -20,7 +20,7 @@ from jaxtyping import Int
 
 from amrepair.bench.samples import (
     GOOD,
-    UNKNOWN,
+    UNLABELLED,
     BenchClass,
     Cloud,
     Sample,
@@ -30,7 +30,7 @@ from amrepair.bench.samples import (
 )
 from amrepair.bench.shapenet import match_labels
 from amrepair.errors import InputError
-from amrepair.scans.files import SUFFIXES
+from amrepair.scans.files import SCAN_SUFFIXES
 from amrepair.scans.readers import MESH_SUFFIXES
 
 MASKS = "masks"
@@ -65,7 +65,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        if path.is_file() and path.suffix.lower() in SCAN_SUFFIXES and not path.name.startswith(".")
     )
 
 
@@ -97,7 +97,7 @@ def load(sample: Sample) -> Cloud:
     """
     points = read_points(sample.cloud_path)
     if sample.truth_path is None:
-        return without_labels(points, UNKNOWN if sample.anomalous else 0)
+        return without_labels(points, UNLABELLED if sample.anomalous else 0)
     if _columns(sample.truth_path) == 1:
         labels = _mask_labels(sample.truth_path)
         if len(labels) != len(points):

@@ -36,7 +36,7 @@ from amrepair.template import (
     fit_template,
     load_template,
 )
-from amrepair.template.paper import PAPER, PaperOptions
+from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions
 from amrepair.template.port import Template
 from amrepair.template.sound import learn
 from amrepair.template.surface import sample_surface
@@ -51,7 +51,7 @@ _log = logging.getLogger(__name__)
 NEAR_NEIGHBOURS = 12
 WIDE_PASSES = 5  # means of means: as far as 64 neighbours, found in a quarter of the time
 WIDE_WEIGHT = 0.5
-LEAST_SIGMA_MM = 0.001 * DIAGONAL_MM
+LEAST_SET_SIGMA_MM = 0.001 * DIAGONAL_MM
 # Farther out than this share of the part nothing more is learned: clutter must not set the score.
 MAX_OFFSET_RATIO = 0.15
 REPAIR_POINTS = 16_384
@@ -67,7 +67,7 @@ def class_template(
     cache: Path,
     *,
     recipe: str = "fast",
-    paper: PaperOptions = PAPER,
+    paper: PaperOptions = PUBLISHED_NETWORK,
 ) -> GridSdf | PaperSdf:
     """The class's template; fitted once for each seed, then read from the cache.
 
@@ -210,9 +210,9 @@ class FieldModel:
         placed = moved(points_mm, pieces.pose)
         judged = self.sound.judge(placed)
         # Published clouds may have no noise at all; the unit does not matter then.
-        sigma_mm = np.maximum(judged.sigma_mm, LEAST_SIGMA_MM)
+        sigma_mm = np.maximum(judged.sigma_mm, LEAST_SET_SIGMA_MM)
         score = smoothed_score(placed, judged.off_mm, sigma_mm)
-        aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, LEAST_SIGMA_MM)
+        aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, LEAST_SET_SIGMA_MM)
         return Scores(score + aside, -judged.log_expected, np.abs(self.template.distance(placed)))
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import trimesh
 
 DIAGONAL_MM = 100.0
-NOISE_POINTS, NOISE_NEIGHBOURS, NOISE_QUANTILE = 4000, 10, 0.1
+NOISE_POINTS, CLOUD_NOISE_NEIGHBOURS, CLOUD_NOISE_QUANTILE = 4000, 10, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +121,11 @@ def noise_mm(points_mm: Float[np.ndarray, "n 3"]) -> float:
     one place in five must be flat, not one in two.
     """
     step = max(1, len(points_mm) // NOISE_POINTS)
-    count = min(NOISE_NEIGHBOURS, len(points_mm))
+    count = min(CLOUD_NOISE_NEIGHBOURS, len(points_mm))
     if count <= 3:
         return 0.0
     index = cKDTree(points_mm).query(points_mm[::step], k=[*range(1, count + 1)])[1]
     near = points_mm[index] - points_mm[index].mean(axis=1, keepdims=True)
     smallest = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", near, near))[:, 0]
-    low = float(np.quantile(np.maximum(smallest, 0.0), NOISE_QUANTILE))
-    return float(np.sqrt(low / chi2.ppf(NOISE_QUANTILE, count - 3)))
+    low = float(np.quantile(np.maximum(smallest, 0.0), CLOUD_NOISE_QUANTILE))
+    return float(np.sqrt(low / chi2.ppf(CLOUD_NOISE_QUANTILE, count - 3)))

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from amrepair.align.pam import CODE, PAPER, PamError, PamOptions, pam
+from amrepair.align.pam import PUBLISHED_PAM, RELEASED_PAM, PamError, PamOptions, pam
 from amrepair.bench.baselines import Aligner
 from amrepair.bench.house import class_template, repair_distance
 from amrepair.bench.method import ClassInput, Model, Scores
@@ -24,7 +24,7 @@ from amrepair.bench.metrics import CloudDistance
 from amrepair.bench.samples import Format
 from amrepair.merge.cloud import planes, spacing_of
 from amrepair.template import MeshSdf
-from amrepair.template.paper import CODE as CODE_RECIPE
+from amrepair.template.paper import RELEASED_NETWORK as CODE_RECIPE
 from amrepair.template.paper import PaperOptions
 from amrepair.template.port import Template
 from amrepair.template.surface import sample_surface
@@ -34,17 +34,17 @@ from amrepair.template.surface import sample_surface
 # published system found nothing.
 BENCH_PAPER = replace(CODE_RECIPE, batch=8_192, rate=5e-4, epochs=500)
 TOP_SCORES = 1_000
-BESIDE = 2.0  # spacings of the cloud: a point of the surface has one of it so near
+ON_SURFACE_SPACINGS = 2.0  # spacings of the cloud: a point of the surface has one of it so near
 TARGET_POINTS = 20_000  # of the template's cloud: as many as the largest test clouds need
 
 
 # The released configuration of that data set.
-REAL3D_PAM = replace(CODE, threshold=1.8)
+REAL3D_PAM = replace(RELEASED_PAM, threshold=1.8)
 
 
 def pam_options(format: str) -> PamOptions:
     """The paper's, or the released code's where only parts of the surface are seen."""
-    return REAL3D_PAM if format == Format.REAL3D else PAPER
+    return REAL3D_PAM if format == Format.REAL3D else PUBLISHED_PAM
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,9 @@ class Target:
         offset = points_mm - self.cloud_mm[index]
         height = np.abs((offset * self._normals[index]).sum(axis=1))
         beside = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
-        return np.asarray(np.hypot(height, np.maximum(beside - BESIDE * self._spacing_mm, 0.0)))
+        return np.asarray(
+            np.hypot(height, np.maximum(beside - ON_SURFACE_SPACINGS * self._spacing_mm, 0.0))
+        )
 
 
 def make_pam_aligner(data: ClassInput, seed: int, cache: Path) -> Aligner:

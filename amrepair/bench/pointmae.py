@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import torch
 
 GROUPS, GROUP_SIZE = 1024, 128
-WIDTH, HEADS, DEPTH = 384, 6, 12
+TOKEN_WIDTH, HEADS, DEPTH = 384, 6, 12
 TAKEN_BLOCKS = (3, 7, 11)
 NORM_EPSILON = 1e-5
 PREFIXES = ("module.", "base_model.", "MAE_encoder.", "transformer_q.")
@@ -83,8 +83,8 @@ class PointTransformer:
         position = nn.linear(nn.gelu(position), w["pos_embed.2.weight"], w["pos_embed.2.bias"])
         if self.has_class_token:
             tokens = nn.linear(tokens, w["reduce_dim.weight"], w["reduce_dim.bias"])
-            tokens = torch.cat([w["cls_token"].reshape(1, WIDTH), tokens])
-            position = torch.cat([w["cls_pos"].reshape(1, WIDTH), position])
+            tokens = torch.cat([w["cls_token"].reshape(1, TOKEN_WIDTH), tokens])
+            position = torch.cat([w["cls_pos"].reshape(1, TOKEN_WIDTH), position])
         taken = []
         for i in range(DEPTH):
             tokens = self._block(tokens + position, f"blocks.blocks.{i}.")
@@ -117,7 +117,7 @@ class PointTransformer:
         from torch.nn import functional as nn
 
         w = self.weights
-        return nn.layer_norm(x, (WIDTH,), w[name + "weight"], w[name + "bias"], NORM_EPSILON)
+        return nn.layer_norm(x, (TOKEN_WIDTH,), w[name + "weight"], w[name + "bias"], NORM_EPSILON)
 
     def _block(self, x: torch.Tensor, name: str) -> torch.Tensor:
         """Pre-norm attention and MLP, each with its residual."""
@@ -125,9 +125,9 @@ class PointTransformer:
 
         w = self.weights
         qkv = nn.linear(self._norm(x, name + "norm1."), w[name + "attn.qkv.weight"])
-        q, k, v = qkv.reshape(len(x), 3, HEADS, WIDTH // HEADS).permute(1, 2, 0, 3)
+        q, k, v = qkv.reshape(len(x), 3, HEADS, TOKEN_WIDTH // HEADS).permute(1, 2, 0, 3)
         mixed = nn.scaled_dot_product_attention(q[None], k[None], v[None])[0]
-        mixed = mixed.transpose(0, 1).reshape(len(x), WIDTH)
+        mixed = mixed.transpose(0, 1).reshape(len(x), TOKEN_WIDTH)
         x = x + nn.linear(mixed, w[name + "attn.proj.weight"], w[name + "attn.proj.bias"])
         hidden = nn.linear(
             self._norm(x, name + "norm2."), w[name + "mlp.fc1.weight"], w[name + "mlp.fc1.bias"]
@@ -161,7 +161,7 @@ def load_checkpoint(path: Path | None, kind: str) -> PointTransformer:
         raise InputError(f"{path}: there is no such checkpoint; give the path of {published}")
     weights = {_bare(name): value for name, value in _read(path).items()}
     extra = POINT_BERT_EXTRA if kind == "pointbert" else ()
-    wanted = _shapes(256 if kind == "pointbert" else WIDTH)
+    wanted = _shapes(256 if kind == "pointbert" else TOKEN_WIDTH)
     for name, shape in wanted.items():
         if name not in weights or tuple(weights[name].shape) != shape:
             got = tuple(weights[name].shape) if name in weights else "nothing"
@@ -206,10 +206,10 @@ def _shapes(channels: int) -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {
         "pos_embed.0.weight": (128, 3),
         "pos_embed.0.bias": (128,),
-        "pos_embed.2.weight": (WIDTH, 128),
-        "pos_embed.2.bias": (WIDTH,),
-        "norm.weight": (WIDTH,),
-        "norm.bias": (WIDTH,),
+        "pos_embed.2.weight": (TOKEN_WIDTH, 128),
+        "pos_embed.2.bias": (TOKEN_WIDTH,),
+        "norm.weight": (TOKEN_WIDTH,),
+        "norm.bias": (TOKEN_WIDTH,),
     }
     for name, sizes in (("first", (3, 128, 256)), ("second", (512, 512, channels))):
         stem = f"encoder.{name}_conv."
@@ -219,14 +219,14 @@ def _shapes(channels: int) -> dict[str, tuple[int, ...]]:
             shapes[f"{stem}1.{part}"] = (sizes[1],)
     for i in range(DEPTH):
         stem = f"blocks.blocks.{i}."
-        shapes |= {f"{stem}norm{k}.{p}": (WIDTH,) for k in (1, 2) for p in ("weight", "bias")}
+        shapes |= {f"{stem}norm{k}.{p}": (TOKEN_WIDTH,) for k in (1, 2) for p in ("weight", "bias")}
         shapes |= {
-            f"{stem}attn.qkv.weight": (3 * WIDTH, WIDTH),
-            f"{stem}attn.proj.weight": (WIDTH, WIDTH),
-            f"{stem}attn.proj.bias": (WIDTH,),
-            f"{stem}mlp.fc1.weight": (4 * WIDTH, WIDTH),
-            f"{stem}mlp.fc1.bias": (4 * WIDTH,),
-            f"{stem}mlp.fc2.weight": (WIDTH, 4 * WIDTH),
-            f"{stem}mlp.fc2.bias": (WIDTH,),
+            f"{stem}attn.qkv.weight": (3 * TOKEN_WIDTH, TOKEN_WIDTH),
+            f"{stem}attn.proj.weight": (TOKEN_WIDTH, TOKEN_WIDTH),
+            f"{stem}attn.proj.bias": (TOKEN_WIDTH,),
+            f"{stem}mlp.fc1.weight": (4 * TOKEN_WIDTH, TOKEN_WIDTH),
+            f"{stem}mlp.fc1.bias": (4 * TOKEN_WIDTH,),
+            f"{stem}mlp.fc2.weight": (TOKEN_WIDTH, 4 * TOKEN_WIDTH),
+            f"{stem}mlp.fc2.bias": (TOKEN_WIDTH,),
         }
     return shapes

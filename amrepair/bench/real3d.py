@@ -26,8 +26,8 @@ from amrepair.bench.samples import (
 from amrepair.errors import InputError
 from amrepair.scans.pcd import count_of_pcd
 
-DEFECTS = ("bulge", "sink", "concavity", "hole", "break", "bend", "crack")
-TRUTH_FOLDERS = ("gt", "GT")
+REAL3D_DEFECTS = ("bulge", "sink", "concavity", "hole", "break", "bend", "crack")
+REAL3D_TRUTH_FOLDERS = ("gt", "GT")
 LEAST_OF_CLOUD = 0.5  # of the published pairs none differs by so much
 
 
@@ -45,9 +45,9 @@ def find_classes(root: Path) -> tuple[BenchClass, ...]:
 def _read_class(folder: Path) -> BenchClass:
     clouds = sorted((folder / "train").glob("*.pcd"))
     named = [path for path in clouds if "template" in path.name or "prototype" in path.name]
-    truth = next((folder / name for name in TRUTH_FOLDERS if (folder / name).is_dir()), None)
+    truth = next((folder / name for name in REAL3D_TRUTH_FOLDERS if (folder / name).is_dir()), None)
     samples = [
-        _sample(folder.name, path, truth or folder / TRUTH_FOLDERS[0])
+        _sample(folder.name, path, truth or folder / REAL3D_TRUTH_FOLDERS[0])
         for path in sorted((folder / "test").glob("*.pcd"))
         if "temp" not in path.name
     ]
@@ -59,7 +59,7 @@ def _sample(class_name: str, path: Path, truth: Path) -> Sample:
     return Sample(
         class_name=class_name,
         name=path.stem,
-        kind=GOOD if normal else defect_word(path.stem, DEFECTS),
+        kind=GOOD if normal else defect_word(path.stem, REAL3D_DEFECTS),
         cloud_path=path,
         truth_path=None if normal else truth / f"{path.stem}.txt",
         read=load,

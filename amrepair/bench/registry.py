@@ -21,11 +21,11 @@ from amrepair.template.paper import PaperOptions
 
 PAM = "+pam"
 PAPER_METHOD = "pasdf-paper"
-OWN = ("pasdf", PAPER_METHOD)
+OWN_METHODS = ("pasdf", PAPER_METHOD)
 BASELINES = ("btf-raw", "btf-fpfh", "patchcore-fpfh", "patchcore-fpfh-raw")
 PRETRAINED = ("patchcore-pointmae", "patchcore-pointbert")  # with a checkpoint of the user's
-METHODS = (
-    *OWN,
+BENCH_METHODS = (
+    *OWN_METHODS,
     *(name + pam for name in (*BASELINES, *PRETRAINED) for pam in ("", PAM)),
 )
 
@@ -94,8 +94,8 @@ def make_method(
     InputError
         If the name is unknown, or the weights it needs are not given or not right.
     """
-    if name not in METHODS:
-        raise InputError(f"the method '{name}' is unknown; choose from {', '.join(METHODS)}")
+    if name not in BENCH_METHODS:
+        raise InputError(f"the method '{name}' is unknown; choose from {', '.join(BENCH_METHODS)}")
     base, pam = name.removesuffix(PAM), name.endswith(PAM)
     if name == "pasdf":
         from amrepair.bench.house import FieldMethod

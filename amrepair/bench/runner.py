@@ -24,7 +24,7 @@ from pathlib import Path
 from amrepair.bench.cells import Cell, Row, run_cell
 from amrepair.bench.dataset import open_dataset
 from amrepair.bench.paper import BENCH_PAPER
-from amrepair.bench.registry import METHODS, PAPER_METHOD, make_method
+from amrepair.bench.registry import BENCH_METHODS, PAPER_METHOD, make_method
 from amrepair.bench.samples import BenchData
 from amrepair.bench.synth import MANIFEST
 from amrepair.bench.tables import as_csv, as_json, as_markdown
@@ -37,7 +37,7 @@ from gcode.whole import left_behind, write_bytes
 
 DEFAULT_SEEDS = (0, 1, 2)
 # Raised when scores of the same name would come out differently: old cells are then refused.
-LAYOUT_VERSION = 2
+SCORES_LAYOUT_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def run_bench(
     format
         A name in `LAYOUTS`.
     methods
-        Names out of `METHODS`.
+        Names out of `BENCH_METHODS`.
     out
         Folder of the results; one with results of the same data set is gone on with.
     jobs
@@ -147,7 +147,7 @@ def _claim(out: Path, data: BenchData, paper: PaperOptions | None) -> None:
     said: dict[str, object] = {
         "format": str(data.format),
         "files": listing.hexdigest(),
-        "layout": LAYOUT_VERSION,
+        "layout": SCORES_LAYOUT_VERSION,
     }
     path = out / "run.json"
     if path.is_file():
@@ -204,7 +204,7 @@ def _begin_worker(count: int) -> None:
 def _write(
     out: Path, data: BenchData, rows: Sequence[Row], cells: int, paper: PaperOptions
 ) -> BenchReport:
-    ordered = sorted(rows, key=lambda r: (METHODS.index(r.method), r.class_name, r.seed))
+    ordered = sorted(rows, key=lambda r: (BENCH_METHODS.index(r.method), r.class_name, r.seed))
     synthetic = (data.root / MANIFEST).is_file()
     report = BenchReport(
         tuple(ordered), out / "results.json", out / "results.csv", out / "results.md"

@@ -19,7 +19,7 @@ from amrepair.errors import InputError
 from amrepair.scans import read_scan
 
 GOOD = "good"  # the kind of a normal sample
-UNKNOWN = -1  # the label of a point of which nobody has said whether it is anomalous
+UNLABELLED = -1  # the label of a point of which nobody has said whether it is anomalous
 
 
 class Format(StrEnum):
@@ -40,7 +40,7 @@ class Cloud:
     points
         (n, 3), the file's unit and frame.
     labels
-        (n,) 0 normal, 1 anomalous; `UNKNOWN` where the data set does not say.
+        (n,) 0 normal, 1 anomalous; `UNLABELLED` where the data set does not say.
     """
 
     points: Float[np.ndarray, "n 3"]

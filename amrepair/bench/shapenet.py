@@ -33,10 +33,20 @@ from amrepair.errors import InputError
 
 _log = logging.getLogger(__name__)
 
-VARIANTS = ("pcd", "new_pcd", "16384")
-DEFECTS = ("bulge", "concavity", "sink", "hole", "broken", "break", "bending", "bend", "crack")
-CLOUD_SUFFIXES = frozenset({".pcd", ".ply", ".xyz"})
-TRUTH_FOLDERS = ("GT", "gt")
+CLOUD_FOLDERS = ("pcd", "new_pcd", "16384")
+SHAPENET_DEFECTS = (
+    "bulge",
+    "concavity",
+    "sink",
+    "hole",
+    "broken",
+    "break",
+    "bending",
+    "bend",
+    "crack",
+)
+SAMPLE_SUFFIXES = frozenset({".pcd", ".ply", ".xyz"})
+SHAPENET_TRUTH_FOLDERS = ("GT", "gt")
 # Wrong counts leave a few points without a row of their own; farther than this part of the
 # shape's diagonal for half the points, the truth is another shape's.
 MAX_GAP_RATIO = 0.02
@@ -45,7 +55,7 @@ MAX_GAP_RATIO = 0.02
 def find_classes(root: Path) -> tuple[BenchClass, ...]:
     """Classes of the variant that `root` names, else of the first of pcd, new_pcd, 16384."""
     for base in (root, root / "dataset"):
-        for folder in (base, *(base / variant for variant in VARIANTS)):
+        for folder in (base, *(base / variant for variant in CLOUD_FOLDERS)):
             if folder.is_dir() and class_folders(folder):
                 meshes = folder.parent / "obj"
                 return tuple(_read_class(one, meshes) for one in class_folders(folder))
@@ -53,9 +63,11 @@ def find_classes(root: Path) -> tuple[BenchClass, ...]:
 
 
 def _read_class(folder: Path, meshes: Path) -> BenchClass:
-    truth = next((folder / name for name in TRUTH_FOLDERS if (folder / name).is_dir()), None)
+    truth = next(
+        (folder / name for name in SHAPENET_TRUTH_FOLDERS if (folder / name).is_dir()), None
+    )
     samples = [
-        _sample(folder.name, path, truth or folder / TRUTH_FOLDERS[0])
+        _sample(folder.name, path, truth or folder / SHAPENET_TRUTH_FOLDERS[0])
         for path in _clouds(folder / "test")
         if "template" not in path.stem.removeprefix(folder.name)
     ]
@@ -64,7 +76,7 @@ def _read_class(folder: Path, meshes: Path) -> BenchClass:
 
 
 def _clouds(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in CLOUD_SUFFIXES)
+    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SAMPLE_SUFFIXES)
 
 
 def _mesh_of(meshes: Path, class_name: str) -> Path | None:
@@ -87,7 +99,7 @@ def _sample(class_name: str, path: Path, truth: Path) -> Sample:
     return Sample(
         class_name=class_name,
         name=path.stem,
-        kind=GOOD if normal else defect_word(word, DEFECTS),
+        kind=GOOD if normal else defect_word(word, SHAPENET_DEFECTS),
         cloud_path=path,
         truth_path=None if normal else _truth_path(truth, class_name, path.stem),
         read=load,

@@ -18,7 +18,7 @@ import numpy as np
 from amrepair.bench.cells import Row
 from amrepair.bench.metrics import mean_and_spread
 from amrepair.bench.registry import PAPER_METHOD, PUBLISHED, PUBLISHED_REPAIR
-from amrepair.template.paper import PAPER, PaperOptions
+from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions
 
 AREAS = ("o_auroc", "p_auroc", "o_aupr", "p_aupr")
 FIGURES = (
@@ -62,7 +62,7 @@ def _null(value: float) -> float | None:
 
 def recipe_note(paper: PaperOptions) -> str:
     """One sentence: where the recipe that ran differs from the published one."""
-    was, now = asdict(PAPER), asdict(paper)
+    was, now = asdict(PUBLISHED_NETWORK), asdict(paper)
     changes = [
         f"{name} {now[name]} instead of {was[name]}" for name in was if now[name] != was[name]
     ]
@@ -77,7 +77,7 @@ def as_json(
     *,
     synthetic: bool,
     complete: bool,
-    paper: PaperOptions = PAPER,
+    paper: PaperOptions = PUBLISHED_NETWORK,
 ) -> str:
     """One object: rows by method, class and seed; means with spread; published figures."""
     means = []
@@ -179,7 +179,7 @@ def as_markdown(
     *,
     synthetic: bool,
     complete: bool,
-    paper: PaperOptions = PAPER,
+    paper: PaperOptions = PUBLISHED_NETWORK,
 ) -> str:
     """Means over classes with the spread over seeds, then every class."""
     seeds = sorted({row.seed for row in rows})

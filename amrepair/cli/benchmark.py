@@ -70,9 +70,9 @@ def bench(
         from amrepair.bench.paper import BENCH_PAPER
         from amrepair.bench.runner import run_bench
         from amrepair.bench.tables import in_short
-        from amrepair.template.paper import VARIANTS
+        from amrepair.template.paper import NETWORK_VARIANTS
 
-    recipe = with_settings({"bench": BENCH_PAPER, **VARIANTS}, paper, "--paper")
+    recipe = with_settings({"bench": BENCH_PAPER, **NETWORK_VARIANTS}, paper, "--paper")
     bars = console.Bars()
     with bars.shown():
         report = run_bench(

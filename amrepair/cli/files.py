@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     """Meshes and scans among a template's inputs; a PLY without faces is a scan."""
-    from gcode.solids import SUFFIXES
+    from gcode.solids import SOLID_SUFFIXES
 
     meshes: list[Path] = []
     scans: list[Path] = []
     for path in paths:
-        is_mesh = path.suffix.lower() in SUFFIXES and not is_cloud(path)
+        is_mesh = path.suffix.lower() in SOLID_SUFFIXES and not is_cloud(path)
         (meshes if is_mesh else scans).append(path)
     return meshes, scans
 
@@ -80,8 +80,8 @@ def write_mesh(mesh: Any, path: Path) -> None:
     InputError
         If the ending is none of a mesh.
     """
-    from gcode.solids import SUFFIXES
+    from gcode.solids import SOLID_SUFFIXES
 
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: a mesh is written as one of {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in SOLID_SUFFIXES:
+        raise InputError(f"{path}: a mesh is written as one of {', '.join(SOLID_SUFFIXES)}")
     write_whole(path, mesh.export)

@@ -13,8 +13,8 @@ from amrepair.cli.options import JsonOption
 from amrepair.doctor import Finding, State, examine
 from gcode.cli import console
 
-_MARKS = {State.OK: "ok  ", State.NOTE: "note", State.BAD: "BAD "}
-_COLOURS = {State.OK: "green", State.NOTE: "yellow", State.BAD: "bold red"}
+_STATE_MARKS = {State.OK: "ok  ", State.NOTE: "note", State.BAD: "BAD "}
+_STATE_COLOURS = {State.OK: "green", State.NOTE: "yellow", State.BAD: "bold red"}
 BAD_EXIT = 2
 
 
@@ -74,8 +74,8 @@ def _tell_options(*, as_json: bool) -> None:
 
 
 def _say(finding: Finding) -> None:
-    colour = _COLOURS[finding.state]
-    console.out.print(_MARKS[finding.state], style=colour, end=" ")
+    colour = _STATE_COLOURS[finding.state]
+    console.out.print(_STATE_MARKS[finding.state], style=colour, end=" ")
     console.out.print(f"{finding.name:<17}{finding.found}", markup=False)
     if finding.mend:
         console.out.print(f"{'':22}→ {finding.mend}", markup=False)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from amrepair.report.folder import RunFolder
     from amrepair.scans import Scan
 
-_COLOURS = ((180, 180, 180), (0, 90, 200), (220, 120, 0))  # ok, missing, excess
+_POINT_COLOURS = ((180, 180, 180), (0, 90, 200), (220, 120, 0))  # ok, missing, excess
 
 TemplateOption = Annotated[
     Path,
@@ -97,12 +97,12 @@ def align(
         import numpy as np
 
         from amrepair.align import align as align_scan
-        from amrepair.align.pam import VARIANTS
+        from amrepair.align.pam import PAM_VARIANTS
         from amrepair.repair import Stopwatch
         from amrepair.scans import write_ply
         from amrepair.template import open_template
 
-    settings = with_settings(VARIANTS, pam, "--pam")
+    settings = with_settings(PAM_VARIANTS, pam, "--pam")
     watch = Stopwatch()
     with bars.shown():
         if template.is_dir():
@@ -349,7 +349,7 @@ def _keep(folder: RunFolder, cloud: Scan, anomaly: AnomalyMap) -> None:
         lambda path: write_ply(
             cloud,
             path,
-            colours=np.array(_COLOURS)[anomaly.label],
+            colours=np.array(_POINT_COLOURS)[anomaly.label],
             scalars={"deviation": anomaly.deviation_mm, "label": anomaly.label},
         ),
     )

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:
     from amrepair.report.live import LiveView
 
-JOB_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".nc"})
+PROGRAM_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".nc"})
 VIEW_PORT = 8642
 TOKEN_VARIABLE = "AMREPAIR_TOKEN"
 
@@ -100,10 +100,10 @@ def _shown(path: Path) -> Callable[[LiveView], None]:
     """Read a file, before any page is loaded; what puts it there."""
     import numpy as np
 
-    from gcode.solids import SUFFIXES as MESH_SUFFIXES
+    from gcode.solids import SOLID_SUFFIXES as MESH_SUFFIXES
 
     suffix, name = path.suffix.lower(), path.name
-    if suffix in JOB_SUFFIXES:
+    if suffix in PROGRAM_SUFFIXES:
         from gcode.reader import read_job
 
         job = read_job(path.read_text(encoding="utf-8", errors="replace"))
@@ -126,16 +126,16 @@ def _shown(path: Path) -> Callable[[LiveView], None]:
 
 
 def _colour() -> tuple[int, int, int]:
-    from amrepair.report.live import PART
+    from amrepair.report.live import PART_RGB
 
-    return PART
+    return PART_RGB
 
 
 def _refuse(path: Path) -> None:
-    from amrepair.scans.files import SUFFIXES as SCAN_SUFFIXES
-    from gcode.solids import SUFFIXES as MESH_SUFFIXES
+    from amrepair.scans.files import SCAN_SUFFIXES
+    from gcode.solids import SOLID_SUFFIXES as MESH_SUFFIXES
 
-    known = JOB_SUFFIXES | {".safetensors"} | set(MESH_SUFFIXES) | SCAN_SUFFIXES
+    known = PROGRAM_SUFFIXES | {".safetensors"} | set(MESH_SUFFIXES) | SCAN_SUFFIXES
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
         raise InputError(f"{path}: {what}")
@@ -206,9 +206,9 @@ class ShownRun:
 
     def show_run(self, job: Job, part: Any) -> None:
         """The part as it should be, and the beads that will appear."""
-        from amrepair.report.live import PART
+        from amrepair.report.live import PART_RGB
 
-        self.page.show_solid("part", part, PART, opacity=0.25)
+        self.page.show_solid("part", part, PART_RGB, opacity=0.25)
         self.page.show_job(job)
 
     def drives(self, pause: Callable[[], None], resume: Callable[[], None]) -> None:

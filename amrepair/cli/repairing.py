@@ -42,7 +42,7 @@ OF_JOB = "job"  # as --part-pose
 # Less than this share out of reach is not worth turning the part over.
 WORTH_TURNING_RATIO = 0.05
 # A foot higher or lower than this is worth a word: no calibration and no squashed layer does it.
-ON_BED_MM = 0.15
+SAME_AS_BED_MM = 0.15
 
 
 def add_to(app: typer.Typer) -> None:
@@ -254,7 +254,7 @@ def _taken_for_granted(result: Mapping[str, Any]) -> list[str]:
             f"{clutter:.0%} of the scan is not the part (scattered points, what it stands on, "
             "other pieces) and was left aside where it was aligned."
         )
-    if abs(foot_mm := result["foot_z_mm"]) > ON_BED_MM:
+    if abs(foot_mm := result["foot_z_mm"]) > SAME_AS_BED_MM:
         where = f"{foot_mm:.2f} mm above" if foot_mm > 0 else f"{-foot_mm:.2f} mm in"
         lines.append(
             f"The part's foot is taken to be {where} the bed; if it stands on no raft and no "

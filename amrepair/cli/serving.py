@@ -32,11 +32,11 @@ from gcode.hosts.octoprint_job import OctoPrintJob
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.served_job import ServedJob, UnderWay
 from gcode.hosts.web import Address
-from gcode.solids import SUFFIXES
+from gcode.solids import SOLID_SUFFIXES
 from gcode.whole import write_bytes
 
 LOOK_S = 1.0  # between looks at whether something is printed
-PARTS = frozenset({".safetensors", *SUFFIXES})
+PARTS = frozenset({".safetensors", *SOLID_SUFFIXES})
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,11 +86,11 @@ def fit(
     with console.starting():
         from amrepair.merge import fit_mesh
         from amrepair.template import fit_template
-        from amrepair.template.paper import VARIANTS
+        from amrepair.template.paper import NETWORK_VARIANTS
 
     if paper and recipe != "paper":
         raise InputError(f"--paper belongs to --recipe paper, the recipe is {recipe}")
-    settings = with_settings(VARIANTS, paper, "--paper")
+    settings = with_settings(NETWORK_VARIANTS, paper, "--paper")
     if output.suffix != ".safetensors":
         raise InputError(f"{output}: a template is written as .safetensors; rename it")
     console.writable(output)

@@ -16,7 +16,7 @@ from amrepair.template.port import Template
 
 BOX_MARGIN_MM = 1.0
 # Beside what is deep, a film on an even surface is sampled as finely as if it were alone.
-FILM_MM, EVEN_MM, LEAST_FILM_MM2, FACES_OUT = 0.5, 0.05, 5.0, 0.5
+SAMPLED_FILM_MM, EVEN_MM, LEAST_FILM_MM2, FACES_OUT = 0.5, 0.05, 5.0, 0.5
 PATH_STEP_MM = 1.0
 
 
@@ -72,7 +72,7 @@ def _films(
     """
     s = evidence.surfels
     depth_mm, wide_mm = np.abs(s.deviation_mm[which]), np.abs(s.wide_deviation_mm[which])
-    film = (depth_mm < FILM_MM) & (np.abs(depth_mm - wide_mm) < EVEN_MM)
+    film = (depth_mm < SAMPLED_FILM_MM) & (np.abs(depth_mm - wide_mm) < EVEN_MM)
     some = which[film]
     outward = template.distance_and_gradient(s.place_mm[some])[1]
     film[film] = (outward * evidence.normal[some]).sum(axis=1) > FACES_OUT

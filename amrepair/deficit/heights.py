@@ -27,13 +27,13 @@ from gcode.surfaces import HeightField, raster_kernels
 
 UNSEEN_MARGIN_MM = 1.0
 # Around the part: more than a nozzle's cone, so that what stands beside it is in the field.
-AROUND_MM = 8.0
+BESIDE_PART_MM = 8.0
 # Points within this of a cell's top are one surface with its noise.
 TOP_BAND_MM = 0.3
 AROUND_CELL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
 # An unseen patch smaller than this between seen ones is a gap of sampling, not a place to hide.
 GAP_MM2 = 1.0
-FINE_CELL_MM, MOST_CELLS = 0.1, 2_000_000
+FINE_CELL_MM, MOST_FINE_CELLS = 0.1, 2_000_000
 # In cells of the scan: one that a wall's noise touches, and a gap beside it that took its height.
 BY_WALL_CELLS = 2.5
 # The scan may stand out this much before it overrules the solids: their tolerance, and noise.
@@ -49,11 +49,11 @@ FIN_CELLS, UNSEEN_FIN_CELLS = 2, 8
 # Around what is missing: where fins are looked for, and as far again as they are told from there.
 FIN_WINDOW_CELLS = 3 * UNSEEN_FIN_CELLS
 CHANCE_CELLS = 5
-MOST_STEPS = 64  # by which what nobody saw is followed down
+MOST_STEPS_DOWN = 64  # by which what nobody saw is followed down
 # In the scan's noise: how far a point is off upwards or aside, and tells of nothing.
 OFF_SIGMA = 2.0
 # On any surface so many others lie within so many spacings: 4 π are expected on a flat one.
-OTHERS, BESIDE_SPACINGS = 2, 2.0
+OTHERS_NEAR, BESIDE_SPACINGS = 2, 2.0
 
 
 def as_built_heights(
@@ -83,7 +83,7 @@ def as_built_heights(
     points = build_from_template.apply(scan.points_mm)
     corners = box_corners(template.bounds_mm)
     box = build_from_template.apply(corners)
-    low, high = box.min(axis=0) - AROUND_MM, box.max(axis=0) + AROUND_MM
+    low, high = box.min(axis=0) - BESIDE_PART_MM, box.max(axis=0) + BESIDE_PART_MM
     cell_mm = max(cell_mm, 1.2 * spacing_mm)
     nx, ny = (math.ceil(v) for v in (high[:2] - low[:2]) / cell_mm)
     shape = (ny, nx)
@@ -121,7 +121,7 @@ def _crossed(
     """Heights lowered, column by column from above, as far as rays went through them."""
     iy, ix = unseen.nonzero()
     z_mm = solid_z_mm.copy()
-    step_mm = max(cell_mm, (float(z_mm.max()) - max(float(low_mm[2]), 0.0)) / MOST_STEPS)
+    step_mm = max(cell_mm, (float(z_mm.max()) - max(float(low_mm[2]), 0.0)) / MOST_STEPS_DOWN)
     while len(iy):
         down_mm = np.maximum(z_mm[iy, ix] - step_mm, 0.0)
         xy_mm = low_mm[:2] + (np.stack([ix, iy], axis=1) + 0.5) * cell_mm
@@ -158,7 +158,7 @@ def standing_heights(
     """
     box = seen.box_mm
     area_mm2 = (box[2] - box[0]) * (box[3] - box[1])
-    cell_mm = max(FINE_CELL_MM, float(np.sqrt(area_mm2 / MOST_CELLS)))
+    cell_mm = max(FINE_CELL_MM, float(np.sqrt(area_mm2 / MOST_FINE_CELLS)))
     ny, nx = (math.ceil((box[k + 2] - box[k]) / cell_mm - 1e-9) for k in (1, 0))
     fine = HeightField(
         np.array(box[:2]), cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool)
@@ -236,7 +236,7 @@ def with_what_stands_out(
     if len(out) == 0:
         return field
     # itself is one of them
-    out = out[has_near(out, points_mm, BESIDE_SPACINGS * spacing_mm, enough=OTHERS + 1)]
+    out = out[has_near(out, points_mm, BESIDE_SPACINGS * spacing_mm, enough=OTHERS_NEAR + 1)]
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)

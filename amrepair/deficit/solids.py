@@ -20,7 +20,7 @@ from gcode.progress import Progress
 # A corner of a cube of side τ lies √3 τ from the eroded template.
 GROW_FACTOR = 3**0.5
 # Under a layer's top, of the limit: what the surfel nearest to it is labelled for is missing.
-THIN_RATIO = 0.25
+SLIVER_RATIO = 0.25
 # Pieces below this share of a bead are what marching cubes makes of noise at a rim.
 CRUMB_MM3 = 0.02
 
@@ -238,5 +238,5 @@ def _limits(
     if anomaly.top_z_mm is not None and label is Label.MISSING:
         under = np.abs(f_mm - (samples_mm[:, 2] - anomaly.top_z_mm)) < ON_PLANE_MM
         limit_mm[under] = min(tau_mm, anomaly.top_threshold_mm)
-        thin_mm[under] = np.minimum(thin_mm[under], THIN_RATIO * limit_mm[under])
+        thin_mm[under] = np.minimum(thin_mm[under], SLIVER_RATIO * limit_mm[under])
     return limit_mm, thin_mm

@@ -13,7 +13,7 @@ from skimage import measure
 
 from amrepair.errors import DeficitError
 
-MAX_VOXELS = 1_000_000
+MAX_DEFICIT_VOXELS = 1_000_000
 FINEST_MM, COARSEST_MM = 0.05, 0.25
 # Samples across a defect, and what must be left of them where a box is large.
 FINE_RATIO, LEAST_RATIO = 4.0, 2.5
@@ -58,7 +58,7 @@ class VoxelBox:
         extent = np.maximum(high_mm - low_mm, 1e-6)
 
         def over() -> float:
-            return max(float(np.prod(extent / step + 1)) / MAX_VOXELS, 1.0)
+            return max(float(np.prod(extent / step + 1)) / MAX_DEFICIT_VOXELS, 1.0)
 
         step[along] *= min(np.sqrt(over()), COARSEST_MM / step[along][0])
         step[across] *= min(over(), max(min(thickness_mm / LEAST_RATIO, COARSEST_MM) / fine, 1.0))

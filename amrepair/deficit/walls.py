@@ -19,7 +19,7 @@ from amrepair.frames import in_box
 from gcode.surfaces import HeightField
 
 # A step from column to column that is a wall, not a slope.
-STEP_MM = 0.3
+WALL_STEP_MM = 0.3
 # Around what is missing, so many cells: there the solids' walls are the scan's.
 BESIDE_CELLS = 3
 # Around a column; a round wall of 4 mm across leaves its plane by no more than noise within it.
@@ -65,7 +65,7 @@ def with_sharp_walls(
     near = z_mm[rows, columns]
     beside = ndimage.maximum_filter(gone[rows, columns], 2 * BESIDE_CELLS + 1)
     step_mm = ndimage.maximum_filter(near, 3) - ndimage.minimum_filter(near, 3)
-    iy, ix = (beside & (step_mm > STEP_MM)).nonzero()
+    iy, ix = (beside & (step_mm > WALL_STEP_MM)).nonzero()
     corner_mm = field.origin_mm + np.array([columns.start, rows.start]) * field.cell_mm
     sorted_mm, start = _by_cell(points_mm, corner_mm, field.cell_mm, near.shape)
     near[iy, ix] = kernels.sharpened(
@@ -104,7 +104,7 @@ def with_even_crests(
     reach = 2 * CREST_REACH_CELLS + 1
     # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
     thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, CREST_CELLS), reach)
-    crest = beside & (near - thick_mm > STEP_MM)
+    crest = beside & (near - thick_mm > WALL_STEP_MM)
     highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
     cut = highest_mm - foot_mm > STEEP_MM  # the tip of a worn edge falls off on its outside alone
     whole = cut & (designed > highest_mm) & (designed < highest_mm + SPLINTER_MM)

@@ -10,9 +10,9 @@ from gcode.compiled import njit
 
 # Around a column, so many cells: as high as what stands there; on which side of it that is.
 AROUND_CELLS, SIDE_CELLS = 2, 3
-LEAST_POINTS = 8
+LEAST_WALL_POINTS = 8
 # Millimetres of height per cell away: what is steeper is another surface.
-STEEPEST = 0.15
+STEEPEST_CELL_MM = 0.15
 
 
 @njit(cache=True, nogil=True)
@@ -49,7 +49,7 @@ def plane_of(
                 mean[m] += at[m]
                 for n in range(3):
                     second[m, n] += at[m] * at[n]
-    if count < LEAST_POINTS:
+    if count < LEAST_WALL_POINTS:
         return found
     mean /= count
     for m in range(3):
@@ -136,8 +136,8 @@ def extended(z: Any, iy: Any, ix: Any, sound: Any, reach: int, least: int, sprea
     """(q,) heights of the columns asked about, on planes through what is sound around each.
 
     `iy`, `ix` (q,); `sound` (ny, nx): columns that a plane goes through, within `reach` cells and
-    no steeper than `STEEPEST` from the one asked about. −∞ where there are fewer than `least`, or
-    they are farther from their plane than `spread` on average.
+    no steeper than `STEEPEST_CELL_MM` from the one asked about. −∞ where there are fewer than
+    `least`, or they are farther from their plane than `spread` on average.
     """
     ny, nx = z.shape
     out = np.full(len(iy), -np.inf)
@@ -148,7 +148,11 @@ def extended(z: Any, iy: Any, ix: Any, sound: Any, reach: int, least: int, sprea
             for column in range(max(j - reach, 0), min(j + reach + 1, nx)):
                 away = np.hypot(row - i, column - j)
                 off = z[row, column] - z[i, j]
-                if not sound[row, column] or away > reach or abs(off) > STEEPEST * (away + 1.0):
+                if (
+                    not sound[row, column]
+                    or away > reach
+                    or abs(off) > STEEPEST_CELL_MM * (away + 1.0)
+                ):
                     continue
                 at = np.array((1.0, float(row - i), float(column - j)))
                 for m in range(3):

@@ -15,9 +15,9 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-PACKAGES = ("amrepair", "gcode")
+OPTION_PACKAGES = ("amrepair", "gcode")
 _CLASS = re.compile(r"^class (\w+Options)\b", re.MULTILINE)
-_UNITS = (
+_NAME_UNITS = (
     ("_mm_s", "mm/s"), ("_mm3_s", "mm³/s"), ("_mm3", "mm³"), ("_mm2", "mm²"), ("_mm", "mm"),
     ("_deg", "°"), ("_rad", "rad"), ("_ratio", "ratio"), ("_share", "ratio"), ("_s", "s"),
     ("_layers", "layers"), ("_mb", "MB"),
@@ -53,7 +53,7 @@ def tunables() -> tuple[Tunable, ...]:
 def options_classes() -> Iterator[type]:
     """The options classes of both packages."""
     root = Path(__file__).parents[2]
-    for package in PACKAGES:
+    for package in OPTION_PACKAGES:
         for path in sorted((root / package).rglob("*.py")):
             for name in _CLASS.findall(path.read_text(encoding="utf-8")):
                 module = ".".join(path.relative_to(root).with_suffix("").parts)
@@ -74,7 +74,7 @@ def _of(kind: Any) -> Iterator[Tunable]:
             f"{kind.__module__}.{kind.__name__}",
             field.name,
             value if isinstance(value, (int, float, str, NoneType)) else str(value),
-            next((unit for end, unit in _UNITS if field.name.endswith(end)), ""),
+            next((unit for end, unit in _NAME_UNITS if field.name.endswith(end)), ""),
             reasons.get(field.name, ""),
         )
 

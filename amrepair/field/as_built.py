@@ -23,7 +23,7 @@ from amrepair.template.port import Template
 # A plane fitted to a void's floor speaks for what lies above it, not for what lies beside it:
 # sideways by one cell plus this many times the height.
 SIDEWAYS_PER_HEIGHT = 1.0
-NEIGHBOURS = 4
+HEIGHT_NEIGHBOURS = 4
 # "Solid, as far as anybody knows": a clearance well below every threshold.
 SOLID_MM = -5.0
 # A pixel beside a silhouette, seen aslant, is off by no more than this many of its steps.
@@ -150,7 +150,7 @@ class Evidence:
             deviation_mm=s.deviation_mm,
             off=self.off,
             normal=self.normal,
-            count=NEIGHBOURS,
+            count=HEIGHT_NEIGHBOURS,
             blur_mm=s.cell_mm,
         )
         # beside, not above: the nearest plane does not reach there

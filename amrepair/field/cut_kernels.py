@@ -12,7 +12,7 @@ import numpy as np
 
 from gcode.compiled import njit
 
-FREE, SOURCE, SINK = 0, 1, 2
+FREE_NODE, SOURCE, SINK = 0, 1, 2
 ROOT, ORPHAN = 6, -1  # instead of the direction to a parent
 
 
@@ -38,7 +38,7 @@ def least_cut(neighbour, room, rest):
     now = 0
     while ends[0] != ends[1]:
         u = queue[ends[0]]
-        if tree[u] == FREE:
+        if tree[u] == FREE_NODE:
             k = -1
         else:
             k = grown(u, neighbour, room, tree, parent, stamp, depth, queue, queued, ends)
@@ -79,7 +79,7 @@ def grown(u, neighbour, room, tree, parent, stamp, depth, queue, queued, ends):
         fits = room[u, k] if tree[u] == SOURCE else room[v, k ^ 1]
         if fits <= 0:
             continue
-        if tree[v] == FREE:
+        if tree[v] == FREE_NODE:
             tree[v], parent[v] = tree[u], k ^ 1
             stamp[v], depth[v] = stamp[u], depth[u] + 1
             put(v, queue, queued, ends)
@@ -195,5 +195,5 @@ def let_go(u, neighbour, room, tree, parent, orphans, count, queue, queued, ends
             parent[v] = ORPHAN
             orphans[count] = v
             count += 1
-    tree[u] = FREE
+    tree[u] = FREE_NODE
     return count

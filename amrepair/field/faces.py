@@ -22,12 +22,12 @@ from amrepair.scans import Scan
 from amrepair.template.port import Template
 
 # The scan is looked at point by point within this of what lies off the template.
-AROUND_MM = 1.5
+LOOKED_AROUND_MM = 1.5
 # Points of one plane: at the spacing s of the scan a disc of about 2 s.
-PLANE_POINTS = 16
+FACE_PLANE_POINTS = 16
 PLANE_ROUNDS = 4
 LONE_RATIO = 0.2  # of its neighbours must be broken, too
-NEIGHBOURS = 6
+FACE_NEIGHBOURS = 6
 # Planes more than 40° off the template's own slope are another surface, if they lie below it.
 STRIP_COSINE, STRIP_MM = 0.77, 0.03
 # A face answers for what lies over it: sideways within a spacing and this share of the height.
@@ -129,7 +129,7 @@ class Faces:
             deviation_mm=self.deviation_mm,
             off=self.off,
             normal=self.normal,
-            count=NEIGHBOURS,
+            count=FACE_NEIGHBOURS,
             blur_mm=2 * self.spacing_mm,
         )
         best, distance = near.value_mm, near.distance_mm
@@ -163,9 +163,9 @@ def find_faces(
     surface
         Places evenly spread on the template's surface, and outward unit normals.
     threshold_mm
-        Deviation from the template that is more than noise for a mean of `PLANE_POINTS` points.
+        Deviation from the template that is more than noise for a mean of `FACE_PLANE_POINTS`.
     """
-    near_cell = has_near(surfels.place_mm, surfels.place_mm[off], AROUND_MM)
+    near_cell = has_near(surfels.place_mm, surfels.place_mm[off], LOOKED_AROUND_MM)
     chosen = np.zeros(len(scan.points_mm), bool)
     kept = surfels.of_point >= 0
     chosen[kept] = near_cell[surfels.of_point[kept]]
@@ -234,7 +234,7 @@ def _planes(
     Int[np.ndarray, "n k"],
 ]:
     """Points moved onto the planes through their neighbours, those planes' normals, and areas."""
-    k = min(PLANE_POINTS, len(points_mm))
+    k = min(FACE_PLANE_POINTS, len(points_mm))
     distance, index = cKDTree(points_mm).query(points_mm, k=k, workers=2)
     distance, index = distance.reshape(-1, k), index.reshape(-1, k)
     place, normal = kernels.smoothed(points_mm, index, PLANE_ROUNDS, spacing_mm, 2 * sigma_mm)

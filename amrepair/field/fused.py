@@ -20,9 +20,9 @@ MIN_CELL_MM, MAX_CELL_MM = 0.3, 2.0
 # Occupied unit cells hold about 1.5 cell² of surface each (a plane at a random slope).
 AREA_PER_CELL = 1.5
 # A grid of so many cells is counted in place; points of a larger one are sorted.
-MOST_CELLS = 16_000_000
+MOST_COUNTED_CELLS = 16_000_000
 # Columns of a neighbour table: the cells before and behind along each axis.
-BEHIND = ((4, 22), (10, 16), (12, 14))
+CELLS_BEFORE_AND_BEHIND = ((4, 22), (10, 16), (12, 14))
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,9 @@ class Surfels:
         """
         place = self.place_mm.copy()
         axis = np.abs(normal).argmax(axis=1)
-        beside = self.table[which[:, None], np.array(BEHIND)[axis]]  # (q, 2), −1 where empty
+        beside = self.table[
+            which[:, None], np.array(CELLS_BEFORE_AND_BEHIND)[axis]
+        ]  # (q, 2), −1 where empty
         apart_mm = ((self.place_mm[beside] - place[which, None]) * normal[:, None]).sum(axis=2)
         same = (beside >= 0) & (np.abs(apart_mm) < 0.5 * self.cell_mm)
         count = np.where(same, self.count[beside], 0)
@@ -191,7 +193,7 @@ def _spacing(
     cell_mm = 1.0
     while True:
         shape = _shape(box_mm, cell_mm)
-        if np.prod(shape.astype(float)) <= MOST_CELLS:
+        if np.prod(shape.astype(float)) <= MOST_COUNTED_CELLS:
             occupied = int(kernels.occupied(points_mm, keep, box_mm[0], cell_mm, shape))
         else:
             occupied = len(np.unique(_keys(points_mm[keep], box_mm, cell_mm, 0)))
@@ -216,7 +218,7 @@ def _by_cell(
     """Points in the order of their cells, where cells begin, their keys, each point's, strides."""
     shape = _shape(box_mm, cell_mm) + 2
     strides = (int(shape[1] * shape[2]), int(shape[2]))
-    if np.prod(shape.astype(float)) <= MOST_CELLS:
+    if np.prod(shape.astype(float)) <= MOST_COUNTED_CELLS:
         return *kernels.sort_by_cell(points_mm, keep, box_mm[0], cell_mm, shape), strides
     chosen = np.flatnonzero(keep)
     keys = _keys(points_mm[chosen], box_mm, cell_mm, 1)

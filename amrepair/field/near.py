@@ -9,7 +9,7 @@ from amrepair.field import near_kernels as kernels
 from amrepair.frames import box_of
 
 # In one grid; cells of a larger one are wider than the distance asked for.
-MOST_CELLS = 16_000_000
+MOST_NEAR_CELLS = 16_000_000
 
 
 def has_near(
@@ -55,7 +55,7 @@ def cells_of(
     low, high = box_of(asked_mm)
     size_mm = high - low + 3.0 * within_mm
     # by a hair wider: what rounding puts into the next cell is looked for there
-    cell_mm = max(1.0001 * within_mm, float(np.cbrt(np.prod(size_mm) / MOST_CELLS)))
+    cell_mm = max(1.0001 * within_mm, float(np.cbrt(np.prod(size_mm) / MOST_NEAR_CELLS)))
     corner = low - 1.0001 * cell_mm  # the lowest place must not round into the empty layer
     shape = np.floor((high - corner) / cell_mm).astype(np.int64) + 2
     points = np.ascontiguousarray(points_mm)

@@ -23,16 +23,16 @@ from amrepair.template.port import Template
 # Capacities are whole numbers of this share of a nat; none is larger than that many.
 UNIT_NATS, MOST_NATS = 0.01, 1e4
 # Surface faces a way if it is less than 45° askew to it.
-FACING_COSINE = 0.7
+WAY_FACING = 0.7
 # Before and behind a plane, in voxels: there its sides are looked up.
 LOOK_VOXELS = (0.75, 1.5, 2.5)
 # So many bare places make a hole, and so many broken ones are asked what they look out of.
-HOLE_PLACES, LOOKING = 5, 2000
+HOLE_PLACES, LOOKING_PLACES = 5, 2000
 # A box holds at most so many times as many voxels as are to be labelled.
 BOX_RATIO = 30.0
 # Blocks of so many voxels a side whose middle is so many sides from the template's surface are
 # wholly in it or outside it: √3 / 2, and a little.
-BLOCK, FAR_BLOCKS = 4, 1.1
+TRACED_BLOCK, FAR_BLOCKS = 4, 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +257,7 @@ def _ways_out(
     template: Template, broken: Broken, options: OccupancyOptions
 ) -> Float[np.ndarray, "e 3"]:
     """Where lines from broken surface along its planes' normals first leave the template."""
-    some = slice(None, None, max(1, len(broken.f_mm) // LOOKING))
+    some = slice(None, None, max(1, len(broken.f_mm) // LOOKING_PLACES))
     front_mm = np.concatenate([broken.place_mm[some]] * 2)
     along = np.concatenate([broken.plane[some], -broken.plane[some]])
     step_mm = 0.5 * options.hole_mm
@@ -307,15 +307,15 @@ def _distances(
     shape: Int[np.ndarray, " 3"],
 ) -> Float[np.ndarray, "x y z"]:
     """The template's distance at each voxel's middle; far from its surface that of a block's."""
-    blocks = -(-shape // BLOCK)
-    middles = BLOCK * (np.argwhere(np.ones(blocks, bool)) + 0.5)
+    blocks = -(-shape // TRACED_BLOCK)
+    middles = TRACED_BLOCK * (np.argwhere(np.ones(blocks, bool)) + 0.5)
     coarse = template.distance(low_mm + voxel_mm * middles)
     whole = coarse.reshape(blocks)
     for axis in range(3):
-        whole = whole.repeat(BLOCK, axis=axis)
+        whole = whole.repeat(TRACED_BLOCK, axis=axis)
     f_mm = whole[tuple(slice(size) for size in shape)].copy()
     # no voxel of a block lies farther from its middle
-    near = np.argwhere(np.abs(f_mm) < FAR_BLOCKS * BLOCK * voxel_mm)
+    near = np.argwhere(np.abs(f_mm) < FAR_BLOCKS * TRACED_BLOCK * voxel_mm)
     f_mm[tuple(near.T)] = template.distance(low_mm + voxel_mm * (near + 0.5))
     return f_mm
 
@@ -350,7 +350,7 @@ def _nats_unseen(
     for axis in range(3):
         for k, way in enumerate((1.0, -1.0)):
             cosine = way * normals[:, axis]
-            weight = np.where(cosine > FACING_COSINE, cosine**2, 0.0)
+            weight = np.where(cosine > WAY_FACING, cosine**2, 0.0)
             cover = float((weight * seen).sum() / weight.sum()) if weight.any() else 1.0
             chance = min(cover, options.largest_cover) * (1.0 - np.exp(-points))
             nats[axis, k] = -np.log1p(-chance)

@@ -16,7 +16,7 @@ from amrepair.field import scales_kernels as kernels
 
 # Neighbours of one window face within 60° of each other: a curved surface is one, the two sides
 # of a wall and the faces of an edge are not.
-FACING_COSINE = 0.5
+WINDOW_FACING = 0.5
 # The third lowest and highest of a window: three cells together are a surface, two may be chance.
 RANK = 3
 
@@ -122,7 +122,7 @@ def _scale(
         if medians
         else np.add.reduceat((value_mm * weight)[order], first) / total
     )
-    table, count = kernels.neighbours(keys, *strides, facing, value, FACING_COSINE, 0.5 * cell_mm)
+    table, count = kernels.neighbours(keys, *strides, facing, value, WINDOW_FACING, 0.5 * cell_mm)
     seen = kernels.window_statistics(table, count, place, value, total, RANK)
     noise = kernels.window_medians(table, count, np.ascontiguousarray(seen[:, 3]))
     known = noise[np.isfinite(noise)]

@@ -13,7 +13,7 @@ from typing import Any
 from amrepair.errors import InputError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_PRINTER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def read_config(path: Path) -> FleetConfig:
         for number, table in enumerate(tables, start=1)
     )
     for spec in printers:
-        if not _NAME.fullmatch(spec.name):
+        if not _PRINTER_NAME.fullmatch(spec.name):
             raise InputError(
                 f"{path}: the name {spec.name!r} becomes a folder; use letters, digits, - and _"
             )

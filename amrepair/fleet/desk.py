@@ -20,7 +20,7 @@ from gcode.whole import put_in_place
 STATUS, ANSWER = "status.json", "answer.json"
 # Where scans may be sent to be judged, and how long to wait: the supervisor's word.
 JUDGES = "judges.json"
-POLL_S = 0.2
+DESK_POLL_S = 0.2
 # So often at most is progress written: a page is looked at once a second.
 TELL_S = 0.5
 
@@ -82,7 +82,7 @@ class Desk:
                         "nobody answers: the fleet's supervisor has ended; start 'amrepair fleet' "
                         "again, it goes on with this run"
                     )
-                self._sleep(POLL_S)
+                self._sleep(DESK_POLL_S)
         finally:
             self._said["question"] = None
             self._tell()

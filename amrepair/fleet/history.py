@@ -18,9 +18,9 @@ from amrepair.fleet.chart import Chart, ChartOptions, chart
 from amrepair.loop.tape import read_events
 
 # Looks within so much of height are looks at the same height.
-BAND_MM = 5.0
-VERSION = 1
-_SCHEMA = """
+SAME_HEIGHT_MM = 5.0
+HISTORY_VERSION = 1
+_HISTORY_SCHEMA = """
 CREATE TABLE run (
     id TEXT PRIMARY KEY,          -- printer and when it began
     printer TEXT NOT NULL,
@@ -92,15 +92,16 @@ class History:
             tables = self._db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
             if not tables:
                 self._db.executescript(
-                    f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;"
+                    f"BEGIN IMMEDIATE; {_HISTORY_SCHEMA} "
+                    f"PRAGMA user_version = {HISTORY_VERSION}; COMMIT;"
                 )
             version = self._db.execute("PRAGMA user_version").fetchone()[0]
         except (sqlite3.Error, OSError) as error:
             raise InputError(f"the history {path} cannot be used ({error})") from error
-        if version != VERSION:
+        if version != HISTORY_VERSION:
             raise InputError(
-                f"the history {path} is of version {version}, this program's is {VERSION}; move it "
-                "away"
+                f"the history {path} is of version {version}, this program's is {HISTORY_VERSION}; "
+                "move it away"
             )
 
     def close(self) -> None:
@@ -158,7 +159,7 @@ class History:
             rows = self._db.execute(
                 "SELECT printer, CAST(z_mm / ? AS INTEGER), time_s, missing_mm3 FROM look"
                 " JOIN run ON look.run = run.id WHERE first ORDER BY 1, 2, time_s, run.id",
-                (BAND_MM,),
+                (SAME_HEIGHT_MM,),
             ).fetchall()
         series: dict[tuple[str, int], list[tuple[float, float]]] = {}
         for printer, band, time_s, missing_mm3 in rows:
@@ -172,6 +173,6 @@ def _lesson(
     printer, band = key
     times_s, values_mm3 = zip(*found, strict=True)
     return Lesson(
-        printer, band * BAND_MM, (band + 1) * BAND_MM, times_s, values_mm3,
+        printer, band * SAME_HEIGHT_MM, (band + 1) * SAME_HEIGHT_MM, times_s, values_mm3,
         chart(values_mm3, options),
     )  # fmt: skip

@@ -16,12 +16,12 @@ from amrepair.fleet.history import History
 from amrepair.fleet.supervisor import Fleet, State
 from amrepair.report.guarded import COOKIE, Guard, is_loopback
 
-POLICY = (
+PAGE_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
 MOST_BODY_BYTES = 10_000
-WORDS = ("approve", "skip", "stop", "resume")
+BUTTONS = ("approve", "skip", "stop", "resume")
 
 
 class Page:
@@ -114,7 +114,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         length = int(self.headers.get("Content-Length") or 0)
         words = [unquote(word) for word in urlsplit(self.path).path.split("/")]
-        if len(words) != 4 or words[1] != "printers" or words[3] not in WORDS:
+        if len(words) != 4 or words[1] != "printers" or words[3] not in BUTTONS:
             self._say(HTTPStatus.NOT_FOUND, b"there is no such button\n", "text/plain")
             return
         try:
@@ -146,7 +146,7 @@ class _Handler(BaseHTTPRequestHandler):
         given = {
             "Content-Type": kind,
             "Content-Length": str(len(body)),
-            "Content-Security-Policy": POLICY,
+            "Content-Security-Policy": PAGE_POLICY,
             "Cache-Control": "no-store",
             "X-Content-Type-Options": "nosniff",
             **(headers or {}),

@@ -29,7 +29,7 @@ from gcode.progress import Progress, silent
 
 BY_ITSELF = "no shared detection"
 _SIZE = struct.Struct("!Q")
-_CHUNK_BYTES = 1 << 20
+_PIPE_BYTES = 1 << 20
 
 
 def mark() -> bytes:
@@ -132,7 +132,7 @@ def _exactly(pipe: socket.socket, size: int, left_s: Callable[[], float]) -> byt
     data = bytearray()
     while len(data) < size:
         pipe.settimeout(left_s())
-        chunk = pipe.recv(min(size - len(data), _CHUNK_BYTES))
+        chunk = pipe.recv(min(size - len(data), _PIPE_BYTES))
         if not chunk:
             raise EOFError("the other side has gone")
         data += chunk

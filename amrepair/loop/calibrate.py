@@ -24,16 +24,16 @@ from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
 from gcode.whole import put_in_place
 
-RIGID = 1e-4
+SENSOR_RIGID = 1e-4
 """A rotation's rows are orthonormal to this."""
 MAX_RESIDUAL_MM = 0.15
 """Beyond it the refinement of every scan may start from the wrong place."""
 TARGET_MM = 1.0
-TURNS = 90
+TURNS_TRIED = 90
 TRIED_POINTS, FIT_POINTS, FIT_STEPS = 1_000, 10_000, 24
-PLANE_TRIES, PLANE_MM, LEAST_BED = 200, 0.15, 0.2
+BED_TRIES, PLANE_MM, LEAST_BED = 200, 0.15, 0.2
 CAP_MM = 3.0
-SAME_FIT = 1.25
+SAME_TURN_FIT = 1.25
 """Another turn that fits within this factor may as well be the true one."""
 LEAST_APART_RAD = float(np.deg2rad(20.0))
 
@@ -116,7 +116,9 @@ def calibrate(
         )
     centre = _middle(standing)
     tried = thin_out(flat[above], TRIED_POINTS, rng)
-    turns = [_turned(angle, tried, centre) for angle in np.arange(TURNS) * 2 * np.pi / TURNS]
+    turns = [
+        _turned(angle, tried, centre) for angle in np.arange(TURNS_TRIED) * 2 * np.pi / TURNS_TRIED
+    ]
     cost = np.array([_cost(standing, turn, tried) for turn in turns])
     near = np.abs(flat[:, 2]) < top_mm + 1.0
     cloud = thin_out(scan.points_mm[near & _around(flat, flat[above])], FIT_POINTS, rng)
@@ -136,10 +138,11 @@ def calibrate(
             f"the target lies {residual_mm:.3f} mm off where it should be (root mean square), the "
             f"limit is {max_residual_mm:g} mm; clean the bed, let the printer finish, scan again"
         )
-    if runner_up < SAME_FIT:
+    if runner_up < SAME_TURN_FIT:
         raise AlignmentError(
             f"another turn of the scan fits nearly as well ({runner_up:.2f} times the residual, at "
-            f"least {SAME_FIT:g} is needed); use a target that looks like itself from one side only"
+            f"least {SAME_TURN_FIT:g} is needed); use a target that looks like itself from one "
+            "side only"
         )
     return Calibration(pose, residual_mm, bed_mm, float(min(runner_up, 1e3)), len(cloud))
 
@@ -166,7 +169,7 @@ def _level(scan: Scan, rng: np.random.Generator) -> tuple[Transform, float]:
     points = thin_out(scan.points_mm, FIT_POINTS, rng)
     limit_mm = max(PLANE_MM, 3 * scan.sigma_mm)
     best: tuple[int, Float[np.ndarray, " 3"], float] = (0, np.array([0.0, 0.0, 1.0]), 0.0)
-    for _ in range(PLANE_TRIES):
+    for _ in range(BED_TRIES):
         a, b, c = points[rng.choice(len(points), 3, replace=False)]
         normal = np.cross(b - a, c - a)
         size = float(np.linalg.norm(normal))
@@ -300,7 +303,7 @@ def read_calibration(path: Path | None) -> Transform:
     if matrix.shape != (4, 4):
         raise InputError(f"the calibration {path} holds {matrix.shape}, not 4×4")
     turn = matrix[:3, :3]
-    if not (np.abs(turn @ turn.T - np.eye(3)).max() < RIGID and np.linalg.det(turn) > 0):
+    if not (np.abs(turn @ turn.T - np.eye(3)).max() < SENSOR_RIGID and np.linalg.det(turn) > 0):
         raise InputError(
             f"the calibration {path} is no rigid motion: its rotation stretches or mirrors; "
             "calibrate again"

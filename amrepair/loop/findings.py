@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from amrepair.loop.layer_level import FLOW_TEST, FlowOptions, LayerLevel, lie_off
 from amrepair.loop.objects import Objects
-from amrepair.policy import POLICY, PolicyOptions
+from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.policy.table import Action, Cover, Finding, judge
 from amrepair.policy.worth import defect_volumes
 from amrepair.regions import Label, Region
@@ -29,7 +29,7 @@ from gcode.surfaces import HeightField
 # Of a region's box, filled by the next layer's beads.
 SOLID_SHARE, OPEN_SHARE = 0.6, 0.05
 EXCESS_CELL_MM = 0.2
-AROUND_MM = 0.5
+FINDING_MARGIN_MM = 0.5
 # What stands out less than this is pressed down by the nozzle's flat.
 LEAST_HIT_LAYERS = 1.0
 _HITS = "hits what stands there"
@@ -92,7 +92,12 @@ def hit_mm(
     The checker's own sweep judges, tool head and all.
     """
     x0, y0, _, x1, y1, _ = excess.bounding_box()
-    box = (x0 - AROUND_MM, y0 - AROUND_MM, x1 + AROUND_MM, y1 + AROUND_MM)
+    box = (
+        x0 - FINDING_MARGIN_MM,
+        y0 - FINDING_MARGIN_MM,
+        x1 + FINDING_MARGIN_MM,
+        y1 + FINDING_MARGIN_MM,
+    )
     field = HeightField.from_manifold(excess, EXCESS_CELL_MM, box_mm=box)
     text = "\n".join(job.program.text.split("\n")[line:end_line]) + "\n"
     try:
@@ -192,7 +197,7 @@ def _owners(
 
 
 def _whole_defects(
-    regions: Sequence[Region], policy: PolicyOptions = POLICY
+    regions: Sequence[Region], policy: PolicyOptions = USUAL_POLICY
 ) -> Float[np.ndarray, " n"]:
     """(n,) volume of the defect that each region is a piece of, mm³."""
     whole_mm3 = np.zeros(len(regions))
@@ -213,7 +218,7 @@ def early_action(
     job: Job,
     setup: PrintSetup,
     layer_index: int | None,
-    policy: PolicyOptions = POLICY,
+    policy: PolicyOptions = USUAL_POLICY,
 ) -> Action:
     """What the table says of a missing region before anybody knows what can be reached of it."""
     layer_mm = setup.process.layer_height_mm

@@ -30,8 +30,8 @@ MOVED_MM, MOVED_RAD = 0.8, float(np.deg2rad(1.5))
 SHIFT_LAYERS, SHIFT_SHARE = 1.0, 0.35
 LEAST_POINTS, MOST_POINTS = 120, 6_000
 # Walls are looked at off the bed and off the top's rim; the bed, off the part.
-LOW_WALL_MM, HIGH_WALL_MM, BESIDE_MM, TOP_BAND_MM = 0.8, 0.5, 1.5, 1.2
-BELOW_MM, RIM_MM = 0.7, 0.5
+LOW_WALL_MM, HIGH_WALL_MM, BESIDE_LAYER_MM, TOP_RIM_MM = 0.8, 0.5, 1.5, 1.2
+BELOW_LAYER_MM, LAYER_RIM_MM = 0.7, 0.5
 # Of a layer's height: less than this is what a layer's beads differ by themselves.
 SHORT = 0.3
 # A surface that bends: range of its parabola, in layers; share of the deviation it explains.
@@ -160,7 +160,7 @@ def _surfaces(plan: RepairPlan, site: Site) -> tuple[_Surface, _Surface] | None:
     points, deviation = plan.anomaly.points_mm[::every], plan.anomaly.deviation_mm[::every]
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     height = placed.apply(points)[:, 2]
-    beside = np.flatnonzero((deviation > BESIDE_MM) & (np.abs(height) < 0.5))
+    beside = np.flatnonzero((deviation > BESIDE_LAYER_MM) & (np.abs(height) < 0.5))
     bed_mm = float(np.median(height[beside])) if len(beside) >= LEAST_POINTS else 0.0
     near = np.flatnonzero((np.abs(deviation) < 3.0) & (height > LOW_WALL_MM))
     near = near[:: max(1, -(-len(near) // (4 * MOST_POINTS)))]
@@ -173,7 +173,7 @@ def _surfaces(plan: RepairPlan, site: Site) -> tuple[_Surface, _Surface] | None:
     noise_mm = max(float(evidence.surfels.spread_mm), plan.scan.sigma_mm)
     seen = _Surface(place, corrected, outward, noise_mm)
     level_mm = float(placed.apply(expected.bounds_mm)[:, 2].max())
-    top = seen.part((outward[:, 2] > TOP_COSINE) & (place[:, 2] > level_mm - TOP_BAND_MM))
+    top = seen.part((outward[:, 2] > TOP_COSINE) & (place[:, 2] > level_mm - TOP_RIM_MM))
     walls = (np.abs(outward[:, 2]) < WALL_COSINE) & (place[:, 2] < level_mm - HIGH_WALL_MM)
     return top, seen.part(walls)
 
@@ -324,12 +324,12 @@ def _of_region(
 def _at_rim(plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"]) -> bool:
     """Whether a region reaches the part's outline seen from above, a little below its floor."""
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
-    z = max(float(box_mm[0, 2]) - BELOW_MM, 0.5 * float(box_mm[0, 2]))
+    z = max(float(box_mm[0, 2]) - BELOW_LAYER_MM, 0.5 * float(box_mm[0, 2]))
     around = np.array([[box_mm[i, 0], box_mm[j, 1], z] for i in (0, 1) for j in (0, 1)])
     inside = site.template.distance(placed.inverse().apply(around))
     foot_mm = float(placed.apply(site.template.bounds_mm)[:, 2].min())
     # near the bed the foot is nearer than any rim
-    return bool((inside > -min(RIM_MM, 0.8 * (z - foot_mm))).any())
+    return bool((inside > -min(LAYER_RIM_MM, 0.8 * (z - foot_mm))).any())
 
 
 def _everywhere(plan: RepairPlan, site: Site, whole: Kind) -> Region:

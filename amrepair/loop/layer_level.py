@@ -15,11 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from amrepair.policy import POLICY
+from amrepair.observe.robust import MAD_TO_SIGMA
+from amrepair.policy import USUAL_POLICY
 from amrepair.regions import Region
 from amrepair.repair import RepairPlan
-
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +43,7 @@ class FlowOptions:
 
     false_alarm: float = 1e-3
     patch_mm: float = 2.0
-    tolerance_layers: float = POLICY.least_layers
+    tolerance_layers: float = USUAL_POLICY.least_layers
     band_layers: float = 2.0
     least_points: int = 5
     least_patches: int = 6

@@ -14,13 +14,13 @@ import numpy as np
 from amrepair.loop.looks import Stop
 from amrepair.policy.table import Action, Decision
 from amrepair.regions.calibrating import calibrated
-from amrepair.regions.calibration import NORMAL, Calibration
+from amrepair.regions.calibration import NORMAL_NOISE, Calibration
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.significance import Level
 from amrepair.repair import RepairPlan, Site
 
 FIRST_LOOKS = 3  # clean layers that are learned from
-OWN = "this run's first layers"
+OWN_CALIBRATION = "this run's first layers"
 
 
 class Learning:
@@ -39,7 +39,7 @@ class Learning:
 
     def judged_by(self, site: Site) -> Site:
         """What is expected, with what is known of the scanner's errors."""
-        if self.calibration is None or site.calibration != NORMAL:
+        if self.calibration is None or site.calibration != NORMAL_NOISE:
             return site
         return replace(site, calibration=self.calibration)
 
@@ -52,7 +52,9 @@ class Learning:
         if len(self._seen) < FIRST_LOOKS:
             return None
         self._done = True
-        learned = NORMAL if _as_normal(self._seen) else calibrated(OWN, self._seen)
+        learned = (
+            NORMAL_NOISE if _as_normal(self._seen) else calibrated(OWN_CALIBRATION, self._seen)
+        )
         self._seen = []
         self.calibration = learned
         return learned
@@ -69,9 +71,9 @@ def _as_normal(seen: list[tuple[Level, ...]]) -> bool:
 
 def told(calibration: Calibration) -> str:
     """What was learned, in a sentence."""
-    if calibration == NORMAL:
+    if calibration == NORMAL_NOISE:
         return f"The first {FIRST_LOOKS} clean layers show normal noise and nothing else."
-    if calibration.name != OWN:
+    if calibration.name != OWN_CALIBRATION:
         return calibration.told()
     widths = ", ".join(
         f"{wander[0]:.3f} mm over {width:g} mm"

@@ -33,7 +33,7 @@ BESIDE_THE_PART = frozenset(
         "prime tower", "prime-tower", "custom",
     }
 )  # fmt: skip
-WALL_STEP_MM, THING_CELL_MM = 0.8, 0.2
+THING_STEP_MM, THING_CELL_MM = 0.8, 0.2
 UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
 
@@ -187,7 +187,7 @@ def _walls(beads: Beads, which: Int[np.ndarray, " w"]) -> Scan:
     """Points along the middles of some beads."""
     start, end, height_mm = beads.start_mm[which], beads.end_mm[which], beads.height_mm[which]
     lengths = np.linalg.norm(end - start, axis=1)
-    count = np.maximum(1, np.ceil(lengths / WALL_STEP_MM).astype(np.int64))
+    count = np.maximum(1, np.ceil(lengths / THING_STEP_MM).astype(np.int64))
     owner = np.repeat(np.arange(len(count)), count)
     step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     points = start[owner] + (end - start)[owner] * ((step + 0.5) / count[owner])[:, None]

@@ -11,10 +11,10 @@ from amrepair.errors import InputError
 from amrepair.loop.looks import Stop
 from gcode.reader import Job
 
-MARK = ";AMREPAIR_LOOK"
+LOOK_MARK = ";AMREPAIR_LOOK"
 ASKS = ("AMREPAIR_SCAN", "@amrepair scan")
 """What a host pauses at and hands on; anything else that stands at a mark is the firmware's own."""
-_MARKED = re.compile(rf"^{MARK} LAYER=(\d+) Z=(\S+)\s*$")
+_MARKED = re.compile(rf"^{LOOK_MARK} LAYER=(\d+) Z=(\S+)\s*$")
 
 
 def marked_stops(job: Job, name: str, *, start: int = 0) -> tuple[Stop, ...]:

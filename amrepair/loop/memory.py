@@ -21,7 +21,7 @@ from gcode.surfaces import HeightField
 
 CLEAN_POINTS, FOUND_POINTS = 8_000, 120_000
 """Points that are kept of a look at which nothing was found, and of another."""
-AROUND_MM = 10.0
+MEMORY_MARGIN_MM = 10.0
 """So far beside the part a scan is kept; the bed beyond is most of it, and tells nothing."""
 
 
@@ -93,7 +93,10 @@ def _around_the_part(plan: RepairPlan, most: int) -> tuple[Int[np.ndarray, " k"]
     near = np.arange(len(plan.scan))
     if len(expected_mm):
         points_mm = plan.scan.points_mm  # in the template's frame, as planned
-        low, high = expected_mm.min(axis=0) - AROUND_MM, expected_mm.max(axis=0) + AROUND_MM
+        low, high = (
+            expected_mm.min(axis=0) - MEMORY_MARGIN_MM,
+            expected_mm.max(axis=0) + MEMORY_MARGIN_MM,
+        )
         inside = np.flatnonzero(in_box(points_mm, low, high))
         near = inside if len(inside) else near
     every = max(1, -(-len(near) // most))

@@ -15,7 +15,7 @@ from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.resumption.flow import ChangedLayer, GapField, change_flow
 
-CELL_MM = 0.2
+NEXT_LAYER_CELL_MM = 0.2
 
 
 def rewritten_layer(
@@ -35,7 +35,7 @@ def rewritten_layer(
     solids = gap_solids(deficit.missing, deficit.excess, verdicts, floor_mm=floor_mm)
     if not solids:
         return None
-    gap = GapField.from_solids(solids, CELL_MM)
+    gap = GapField.from_solids(solids, NEXT_LAYER_CELL_MM)
     try:
         return change_flow(job, setup, job.layers[layer].index, gap)
     except GcodeError:

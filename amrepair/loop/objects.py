@@ -18,7 +18,7 @@ from gcode.resumption.rest import Rest, without_beads
 
 OWN_SHARE = 0.9
 """Of the beads over a finding, so many must be one object's: else nobody knows whose it is."""
-AROUND_MM = 1.0
+OBJECT_MARGIN_MM = 1.0
 SAME_Z_MM = 1e-3
 
 
@@ -50,7 +50,11 @@ class Objects:
         """The object that a box lies in, seen from above; empty where that is in doubt."""
         if len(self.found.names) < 2:
             return ""
-        beads, low, high = self.job.beads, box_mm[0, :2] - AROUND_MM, box_mm[1, :2] + AROUND_MM
+        beads, low, high = (
+            self.job.beads,
+            box_mm[0, :2] - OBJECT_MARGIN_MM,
+            box_mm[1, :2] + OBJECT_MARGIN_MM,
+        )
         first = np.minimum(beads.start_mm[:, :2], beads.end_mm[:, :2])
         last = np.maximum(beads.start_mm[:, :2], beads.end_mm[:, :2])
         over = ((last >= low) & (first <= high)).all(axis=1) & (beads.layer >= 0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from amrepair.loop.looks import Look
 from amrepair.loop.pace import Pace
 from amrepair.loop.tape import Sent, Tape
-from amrepair.policy import POLICY, Decision, PolicyOptions
+from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions
 from amrepair.policy.unasked import Limits
 from amrepair.regions.calibration import Calibration
 from amrepair.repair import RepairPlan, Stopwatch
@@ -41,7 +41,7 @@ class LoopOptions:
         Of the searches for a pose.
     """
 
-    policy: PolicyOptions = POLICY
+    policy: PolicyOptions = USUAL_POLICY
     pace: Pace | None = None
     limits: Limits | None = None
     silent_stops: int = 0

@@ -21,7 +21,7 @@ from amrepair.loop.looks import Stop, plan_stops
 from amrepair.loop.marks import marked_stops
 from amrepair.loop.options import LoopOptions
 from amrepair.loop.pace import Pace
-from amrepair.policy import POLICY, PolicyOptions
+from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.policy.unasked import Limits
 from amrepair.regions.calibration import Calibration
 from amrepair.scans import PROBE
@@ -33,7 +33,7 @@ from gcode.reader import Job, job_for
 from gcode.whole import put_in_place
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
-VERSION = 2
+RUN_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Setting:
     build_from_template: tuple[tuple[float, ...], ...]
     build_from_scanner: tuple[tuple[float, ...], ...]
     seed: int
-    policy: PolicyOptions = POLICY
+    policy: PolicyOptions = USUAL_POLICY
     limited: bool = False
     adaptive: int = 0
     port: str = ""
@@ -192,7 +192,7 @@ def keep(folder: Path, setting: Setting, job_text: str, template: Template) -> N
         _keep_template(folder, template)
         _put(
             folder / SETTING,
-            json.dumps({"version": VERSION, **asdict(setting)}, indent=2, ensure_ascii=False)
+            json.dumps({"version": RUN_VERSION, **asdict(setting)}, indent=2, ensure_ascii=False)
             + "\n",
         )
     except OSError as error:
@@ -217,8 +217,8 @@ def open_run(folder: Path) -> Recorded:
             f"{folder} is not the folder of a recorded run ({error}); name the one that 'loop' or "
             "'simulate' wrote"
         ) from error
-    if not isinstance(said, dict) or said.pop("version", None) != VERSION:
-        raise InputError(f"{folder / SETTING} is of another version than {VERSION}")
+    if not isinstance(said, dict) or said.pop("version", None) != RUN_VERSION:
+        raise InputError(f"{folder / SETTING} is of another version than {RUN_VERSION}")
     try:
         policy = PolicyOptions(**said.pop("policy"))
         setting = Setting(policy=policy, **{key: _tuples(value) for key, value in said.items()})

@@ -12,7 +12,7 @@ from amrepair.frames import Transform, box_of
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
 from amrepair.regions import detect
-from amrepair.regions.calibration import NORMAL
+from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Detector, Site
@@ -25,7 +25,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.surfaces import HeightField, raster_kernels
 
 # Around what the job lays beside the part: strands spread, and stringy ones stray.
-BESIDE_MM, BESIDE_CELL_MM = 0.4, 0.25
+STRINGS_MM, BESIDE_CELL_MM = 0.4, 0.25
 RIMS = ("perimeter", "wall")  # what slicers call it
 
 
@@ -80,7 +80,7 @@ def sites(
                 setup,
                 grid,
                 build_from_template,
-                calibration=NORMAL,
+                calibration=NORMAL_NOISE,
                 lines=_lines(job, every),
                 beside=_beside(job, every),
                 laid=_laid(job, every),
@@ -101,7 +101,7 @@ def sites(
             grid,
             build_from_template,
             stop.z_mm,
-            calibration=NORMAL,
+            calibration=NORMAL_NOISE,
             planned=planned,
             beads=recent,
             lines=_lines(job, done),
@@ -134,7 +134,7 @@ def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:
     pick = which & of_roles(beads, BESIDE_THE_PART)
     if not pick.any():
         return None
-    return _as_high_as(job, pick, BESIDE_MM)
+    return _as_high_as(job, pick, STRINGS_MM)
 
 
 def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> HeightField:

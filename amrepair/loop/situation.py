@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
 from amrepair.loop.objects import Objects
-from amrepair.policy import POLICY, Decision, PolicyOptions, decide, gravest, judge
+from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions, decide, gravest, judge
 from amrepair.policy.passes import is_little, is_stuck
 from amrepair.policy.table import Situation
 from amrepair.policy.unasked import Limits
@@ -25,7 +25,7 @@ def decide_look(
     *,
     seen_twice: bool,
     limits: Limits | None,
-    policy: PolicyOptions = POLICY,
+    policy: PolicyOptions = USUAL_POLICY,
     objects: Objects | None = None,
 ) -> Decision:
     """What the table says of a plan.

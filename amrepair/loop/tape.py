@@ -21,7 +21,7 @@ from gcode.check import CheckedProgram
 from gcode.hosts.port import PrintReport
 
 TAPE = "run.jsonl"
-LOOKS = ("look", "no_look")
+LOOK_EVENTS = ("look", "no_look")
 
 
 class TapeEndsError(LoopError):
@@ -69,7 +69,7 @@ class Tape:
         self._clock = clock
         self._events = [] if path is None else read_events(path)
         if only_read:  # what was sent follows from what was seen and answered
-            self._events = [e for e in self._events if e.get("event") in LOOKS]
+            self._events = [e for e in self._events if e.get("event") in LOOK_EVENTS]
         self._at = 0
         self._fd: int | None = None
 
@@ -108,7 +108,7 @@ class Tape:
 
     def labels(self) -> list[str]:
         """Labels of the stops that were looked at, in order, one for every look."""
-        return [str(e["stop"]) for e in self._events if e.get("event") in LOOKS]
+        return [str(e["stop"]) for e in self._events if e.get("event") in LOOK_EVENTS]
 
     def next_stop(self) -> str | None:
         """The label of the stop of the next recorded look."""

@@ -31,13 +31,13 @@ from gcode.reader import Job
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField, raster_kernels
 
-CELL_MM = 0.25
+DESIGN_CELL_MM = 0.25
 FLAT_MM = 0.02
 """Of one flat: digits of the text, and what the nozzle's own flat evens out."""
 LEAST_COVER = 0.4
 """Of the tip's flat that rests on planned beads: a single line of open infill is as much."""
 CANDIDATE_MM = 0.75
-AROUND_MM = 2.0
+LINE_MARGIN_MM = 2.0
 """Plastic is weighed over so far around: some beads."""
 CENTRED = 12
 """Steps towards the middle of a cell: to a twelfth of its radius."""
@@ -91,11 +91,11 @@ class Flats:
 
     def xy_mm(self, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "k 2"]:
         """(k, 2) middles of cells."""
-        return self.origin_mm + (np.column_stack([columns, rows]) + 0.5) * CELL_MM
+        return self.origin_mm + (np.column_stack([columns, rows]) + 0.5) * DESIGN_CELL_MM
 
     def at(self, xy_mm: Float[np.ndarray, "k 2"]) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the cells that hold places; the nearest where they lie outside."""
-        index = np.floor((xy_mm - self.origin_mm) / CELL_MM).astype(np.int64)
+        index = np.floor((xy_mm - self.origin_mm) / DESIGN_CELL_MM).astype(np.int64)
         ny, nx = self.top_mm.shape
         return np.clip(index[:, 1], 0, ny - 1), np.clip(index[:, 0], 0, nx - 1)
 
@@ -116,12 +116,14 @@ def flats_of(job: Job, stop: Stop, setup: PrintSetup, standing: HeightField) -> 
         raise ScannerError(f"the probe has nothing to touch at {stop.label}: no bead lies there")
     start, end = beads.start_mm[pick], beads.end_mm[pick]
     half_mm = 0.5 * beads.width_mm[pick]
-    rim_mm = float(half_mm.max()) + AROUND_MM
+    rim_mm = float(half_mm.max()) + LINE_MARGIN_MM
     low = np.minimum(start, end).min(axis=0)[:2] - rim_mm
     high = np.maximum(start, end).max(axis=0)[:2] + rim_mm
-    nx, ny = (int(v) for v in np.ceil((high - low) / CELL_MM))
+    nx, ny = (int(v) for v in np.ceil((high - low) / DESIGN_CELL_MM))
     flat = [np.ascontiguousarray(xyz[:, :2]) for xyz in (start, end)]
-    top_mm = raster_kernels.beside_lines(*flat, half_mm, end[:, 2].copy(), low, CELL_MM, ny, nx)
+    top_mm = raster_kernels.beside_lines(
+        *flat, half_mm, end[:, 2].copy(), low, DESIGN_CELL_MM, ny, nx
+    )
     laid = np.isfinite(top_mm)
     tip = _disc(probe.tip_radius_mm)
     highest = ndimage.maximum_filter(np.where(laid, top_mm, -np.inf), footprint=tip)
@@ -142,7 +144,7 @@ def first_places(
     flats: Flats, count: int, earlier_mm: Float[np.ndarray, "e 3"]
 ) -> Float[np.ndarray, "k 2"]:
     """(k, 2) farthest places, weighted; `earlier_mm`: places felt before, and what they fade by."""
-    step = round(CANDIDATE_MM / CELL_MM)
+    step = round(CANDIDATE_MM / DESIGN_CELL_MM)
     rows, columns = np.nonzero(flats.may)
     some = (rows % step == 0) & (columns % step == 0)
     rows, columns = (rows[some], columns[some]) if some.any() else (rows, columns)
@@ -247,15 +249,15 @@ def _clear(flats: Flats, setup: PrintSetup, standing: HeightField) -> Bool[np.nd
 
 def _density(laid: Bool[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
     """(ny, nx) how much of the area around is laid, of what lies within the layer's outline."""
-    wide = 2 * round(AROUND_MM / CELL_MM) + 1
+    wide = 2 * round(LINE_MARGIN_MM / DESIGN_CELL_MM) + 1
     within = ndimage.minimum_filter(ndimage.maximum_filter(laid, wide), wide) | laid
     full, share = (ndimage.uniform_filter(a.astype(float), wide) for a in (within, laid))
     return np.asarray(share / np.maximum(full, 1e-9))
 
 
 def _disc(radius_mm: float) -> Bool[np.ndarray, "d d"]:
-    half = int(np.ceil(radius_mm / CELL_MM))
-    y, x = np.mgrid[-half : half + 1, -half : half + 1] * CELL_MM
+    half = int(np.ceil(radius_mm / DESIGN_CELL_MM))
+    y, x = np.mgrid[-half : half + 1, -half : half + 1] * DESIGN_CELL_MM
     return np.asarray(np.hypot(x, y) <= radius_mm + 1e-9)
 
 

@@ -15,12 +15,12 @@ from scipy.stats import chi2
 
 from amrepair.merge import fuse_kernels as kernels
 
-PLANE_POINTS = 25  # that a plane is fitted to, on average
+CLOUD_PLANE_POINTS = 25  # that a plane is fitted to, on average
 # A plane's radius over the noise, at least: 4 of them tilt it by some 3°. And how often it grows.
 PLANE_NOISES, GROWTHS, GROWTH = 8.0, 3, 1.6
-DIRECTIONS = 256  # a deep hole is open in one direction of a hundred
+OPEN_DIRECTIONS = 256  # a deep hole is open in one direction of a hundred
 # Cells that look around themselves; the others are told by their neighbours.
-LOOKING = 4
+EVERY_CELL = 4
 # Rays start this many cells away from a surface, so that it does not hide itself.
 SKIP_CELLS = 2.2
 NOISE_QUANTILE = 0.1
@@ -99,7 +99,7 @@ def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
     On flat ground the least variance of m points is σ²/m χ² with m − 3 degrees of freedom; edges
     and curves only add to it, so a low quantile is compared.
     """
-    radius_mm = float(np.sqrt(PLANE_POINTS / np.pi)) * spacing_mm
+    radius_mm = float(np.sqrt(CLOUD_PLANE_POINTS / np.pi)) * spacing_mm
     for _ in range(GROWTHS):
         found = _planes(points_mm, radius_mm)
         if radius_mm >= PLANE_NOISES * found.sigma_mm:
@@ -123,7 +123,7 @@ def _planes(points_mm: Float[np.ndarray, "n 3"], radius_mm: float) -> Planes:
     return Planes(normals, sigma_mm, np.sqrt(np.maximum(variance - sigma_mm**2, 0.0)))
 
 
-def directions(count: int = DIRECTIONS) -> Float[np.ndarray, "k 3"]:
+def directions(count: int = OPEN_DIRECTIONS) -> Float[np.ndarray, "k 3"]:
     """Directions spread evenly over the sphere (Fibonacci)."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
@@ -160,13 +160,13 @@ def outward(
     plane = total(normals * same[:, None])
     plane /= np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
     votes = np.zeros_like(centre)
-    votes[::LOOKING] = kernels.open_side(
-        centre[::LOOKING], directions(), occupied, low, cell_mm, SKIP_CELLS
+    votes[::EVERY_CELL] = kernels.open_side(
+        centre[::EVERY_CELL], directions(), occupied, low, cell_mm, SKIP_CELLS
     )
     side = _agreed(centre, plane, (plane * votes).sum(axis=1), cell_mm)
     along = (normals * plane[cell_of]).sum(axis=1)
     # where a cell holds two planes, the nearest that looked around decides for the other
-    looked = votes[::LOOKING][cKDTree(centre[::LOOKING]).query(centre)[1]]
+    looked = votes[::EVERY_CELL][cKDTree(centre[::EVERY_CELL]).query(centre)[1]]
     own = (normals * looked[cell_of]).sum(axis=1)
     sign = np.where(np.abs(along) > 0.5, along * np.sign(side)[cell_of], own)
     return normals * np.where(sign < 0, -1.0, 1.0)[:, None]

@@ -18,7 +18,7 @@ from amrepair.merge.fuse import Cloud, Fused, fuse
 from amrepair.merge.joint import Slack
 from amrepair.merge.options import MergeOptions
 from amrepair.merge.place import Placement, place
-from amrepair.merge.views import LEAST_POINTS, View
+from amrepair.merge.views import LEAST_VIEW_POINTS, View
 from amrepair.scans import Scan
 from amrepair.template import GridSdf, MeshSdf
 from amrepair.template.fit import fit_fast
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # Of one point's noise: a template that follows what is finer is larger, slower, and no truer (4
 # scans of 200,000 points, noise 30 µm: 8.8 µm off, 8.2 so).
 FOLLOWED = 0.5
-SIZE_JUMP = 3.0  # scans of one part in one unit differ by less
+UNIT_SIZE_JUMP = 3.0  # scans of one part in one unit differ by less
 METRE_MM, LEAST_PART_MM = 1000.0, 1.0  # no printed part is smaller: its numbers are metres
 # A scan that is held worse than its points are noisy is named. So is one that was outvoted on more
 # surface than chance marks: so many spacings square, that share of the part's area, and so many
@@ -178,15 +178,15 @@ def _refuse(scans: Sequence[Scan]) -> None:
     if not scans:
         raise InputError("a template from scans needs at least one scan; none was given")
     for scan in scans:
-        if len(scan) < LEAST_POINTS:
+        if len(scan) < LEAST_VIEW_POINTS:
             raise InputError(
                 f"the scan {scan.source} has {len(scan)} points; a template needs at least "
-                f"{LEAST_POINTS:,} of each scan"
+                f"{LEAST_VIEW_POINTS:,} of each scan"
             )
     sizes = [float(np.linalg.norm(np.ptp(scan.points_mm, axis=0))) for scan in scans]
     usual = float(np.median(sizes))
     for scan, size in zip(scans, sizes, strict=True):
-        if not usual / SIZE_JUMP < size < usual * SIZE_JUMP:
+        if not usual / UNIT_SIZE_JUMP < size < usual * UNIT_SIZE_JUMP:
             hint = " (metres for millimetres?)" if size < usual / 100 else ""
             raise InputError(
                 f"the scan {scan.source} is {size:.3g} mm across, the scans' median is "

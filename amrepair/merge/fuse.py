@@ -27,19 +27,19 @@ from gcode.solids import as_manifold, is_valid
 if TYPE_CHECKING:
     import trimesh
 
-LEAST_POINTS = 6  # in reach of a node, or it has no support
-ROUNDS = 3  # of the robust fit
-OUTLIER_SIGMAS, OUTLIER_SPACINGS = 5.0, 0.05
+LEAST_NODE_POINTS = 6  # in reach of a node, or it has no support
+FIT_ROUNDS = 3  # of the robust fit
+FIT_OUTLIER_SIGMAS, OUTLIER_SPACINGS = 5.0, 0.05
 FAR_SPACINGS = 24.0  # how far along the normal another scan's surface contradicts a point
-FACING = 0.3
+SUPPORT_FACING = 0.3
 MAX_NODES = 60_000_000
-BLOCK = 8  # nodes along its edge
+BLOCK_NODES = 8  # nodes along its edge
 POISSON_DEPTH, POISSON_POINTS = 8, 150_000
 MOST_EDGES = 400  # of the grid, along the longest side
-OUTVOTED_TIMES = 2  # marks in a cell, or it is chance
+OUTVOTED_MARKS = 2  # marks in a cell, or it is chance
 # Surface farther than so many of the sparsest scan's spacings from any point was not seen.
 SEEN_SPACINGS = 3.0
-SURE = 0.97  # share of a component's neighbours that must agree about its side
+SIDE_AGREEMENT = 0.97  # share of a component's neighbours that must agree about its side
 DUST_RATIO = 1e-3  # closed pieces smaller than this share of the whole are clutter
 SPREAD_CELLS = 5  # nodes along the edge of a cell of the stored spread
 WANTED_SPACINGS = 0.05
@@ -172,8 +172,8 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
         np.ascontiguousarray(normals[cells.order]), np.ascontiguousarray(scan[cells.order]),
         cloud.scans, cells.grid,
         kernels.Rules(
-            radius_mm, max(cloud.sigma_mm, 1e-4 * cloud.spacing_mm), ROUNDS, LEAST_POINTS,
-            OUTLIER_SIGMAS, OUTLIER_SPACINGS * cloud.spacing_mm,
+            radius_mm, max(cloud.sigma_mm, 1e-4 * cloud.spacing_mm), FIT_ROUNDS, LEAST_NODE_POINTS,
+            FIT_OUTLIER_SIGMAS, OUTLIER_SPACINGS * cloud.spacing_mm,
         ),
     )  # fmt: skip
     # a plane fitted to points far below says little about a node high above them
@@ -222,7 +222,7 @@ def _outvoted(
         cell, count = np.unique(
             np.floor((places - low) / radius_mm).astype(np.int64), axis=0, return_counts=True
         )
-        cell = cell[count >= OUTVOTED_TIMES]
+        cell = cell[count >= OUTVOTED_MARKS]
         if not len(cell):
             continue
         box = np.zeros(tuple(np.ptp(cell, axis=0) + 1), bool)
@@ -280,7 +280,7 @@ def _contradicted(cloud: Cloud) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray
     near_mm = max(0.7 * reach_mm(cloud), 5.0 * cloud.sigma_mm)
     far_mm = max(FAR_SPACINGS * cloud.spacing_mm, 6.0 * near_mm)
     support, conflict, _ = kernels.columns(
-        place, normal, whose, table, low, cell_mm, near_mm, far_mm, FACING
+        place, normal, whose, table, low, cell_mm, near_mm, far_mm, SUPPORT_FACING
     )
     against = conflict > support + 1
     if cloud.scans == 2:  # one word against one: the first scan's stands
@@ -288,7 +288,7 @@ def _contradicted(cloud: Cloud) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray
     around = ndimage.uniform_filter(
         np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.float32), 3
     ).reshape(-1)
-    lonely = (27.0 * around[places % int(np.prod(shape))] < LEAST_POINTS) & (support == 0)
+    lonely = (27.0 * around[places % int(np.prod(shape))] < LEAST_NODE_POINTS) & (support == 0)
     return against[surfel], lonely[surfel]
 
 
@@ -338,11 +338,11 @@ def _fill(
             positive += np.bincount(labels, weights=sides, minlength=count + 1)
     share = positive / np.maximum(touching, 1)
     outer = parts[0, 0, 0]
-    clear = (share >= SURE) | (share <= 1 - SURE) | (touching < 30)
+    clear = (share >= SIDE_AGREEMENT) | (share <= 1 - SIDE_AGREEMENT) | (touching < 30)
     side = np.where(share > 0.5, edge, -edge).astype(np.float32)
     side[outer] = edge
     grid[~seen] = side[parts[~seen]]
-    is_leaking = share[outer] < SURE and touching[outer] > 0
+    is_leaking = share[outer] < SIDE_AGREEMENT and touching[outer] > 0
     doubtful = [k for k in range(1, count + 1) if not clear[k] and k != outer]
     if is_leaking or doubtful:
         asked = np.isin(parts, [outer, *doubtful]) & ~seen
@@ -360,10 +360,10 @@ def _ask(
 
     A block whose middle lies farther off than its half diagonal holds none of the surface.
     """
-    block = np.argwhere(asked) // BLOCK
+    block = np.argwhere(asked) // BLOCK_NODES
     blocks, of_block = np.unique(block, axis=0, return_inverse=True)
-    half_mm = 0.5 * np.sqrt(3.0) * BLOCK * edge
-    far = closing.distance(low + edge * (BLOCK * blocks + 0.5 * (BLOCK - 1)))
+    half_mm = 0.5 * np.sqrt(3.0) * BLOCK_NODES * edge
+    far = closing.distance(low + edge * (BLOCK_NODES * blocks + 0.5 * (BLOCK_NODES - 1)))
     found = np.copysign(edge, far)[of_block.ravel()].astype(np.float32)
     near = (np.abs(far) <= half_mm)[of_block.ravel()]
     where = np.argwhere(asked)

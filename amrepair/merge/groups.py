@@ -29,7 +29,7 @@ from gcode.progress import Progress, silent
 
 TRIED = 4  # poses of two groups that are looked at closely
 GROUP_POINTS = 3_000  # of each view, that groups are settled on
-STEPS = 8
+GROUP_STEPS = 8
 
 Pairs = dict[tuple[int, int], list[Fit]]
 
@@ -90,7 +90,7 @@ class Graph:
             whole, own = (joined(self.views, g, GROUP_POINTS) for g in (fixed, moving))
             spacing_mm = max(self.views[k].thin_spacing_mm for k in (*fixed, *moving))
             reach_mm = self.options.reach_spacings * spacing_mm
-            within = np.geomspace(2.0 * reach_mm, reach_mm, STEPS)
+            within = np.geomspace(2.0 * reach_mm, reach_mm, GROUP_STEPS)
             for pose in poses:
                 there = settled(whole, own, pose, within, GROUP_POINTS)
                 fits.append(judged(self.views, fixed, moving, there, self.options))

@@ -24,25 +24,25 @@ from amrepair.frames import motion_about, moved
 from amrepair.merge.views import View, loss_weight
 
 SAMPLED, LEAST_SAMPLED = 48_000, 4_000  # points of all scans together; of each
-ROUNDS = 15
-SHRINK = 0.6
+JOINT_ROUNDS = 15
+JOINT_SHRINK = 0.6
 WITHIN_SPACINGS = 4.0  # of the other scan: farther apart are no pair
-AGREES = 0.9  # cosine of the normals of a pair: edges are blends of two faces
-LEAST_PAIRS = 100  # of two scans, or they say nothing of each other
+PAIR_AGREES = 0.9  # cosine of the normals of a pair: edges are blends of two faces
+LEAST_SHARED_PAIRS = 100  # of two scans, or they say nothing of each other
 STILL_SPACINGS = 1e-3  # a smaller step ends it
 # Scale of the Geman–McClure loss: of the noise; at first, of the residuals' median and the spacing,
 # so that poses find together which the groups left a millimetre apart. And the least, of a spacing:
 # scans without noise differ by rounding.
 SCALE_NOISES, FIRST_MEDIANS, FIRST_SPACINGS, LEAST_SPACINGS = 4.0, 4.0, 0.5, 5e-3
-DAMPING = 1e-7
+JOINT_DAMPING = 1e-7
 # Residuals of one facing within this share of the part err alike.
 PATCH_RATIO = 0.04
 # What all points of a patch may share: what of the spacing a fit cannot tell (`fuse.reach_mm` asks
 # no more), and how far points lie from their plane beyond the noise, at edges and curves.
 SHARED_SPACINGS = 0.05
-LOOKED_AT = 20_000  # points of a scan, for where its surface is held worst
+WORST_HELD_POINTS = 20_000  # points of a scan, for where its surface is held worst
 # A motion with less information than this share of the best known one's is free.
-FREE_RATIO = 1e-6
+JOINT_FREE_RATIO = 1e-6
 # Slips of more than so many spacings are contradicted by what the sensors saw through.
 HELD_SPACINGS = 3.0
 
@@ -113,9 +113,9 @@ def together(
     sample = _samples(views, rng)
     last_mm, spacing_mm = _scale_mm(views), max(view.spacing_mm for view in views)
     scale_mm = rmse_mm = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(JOINT_ROUNDS):
         pairs = _pairs(views, found, sample)
-        if len(pairs.of) < LEAST_PAIRS:
+        if len(pairs.of) < LEAST_SHARED_PAIRS:
             break
         if scale_mm == 0.0:
             median_mm = float(np.median(np.abs(pairs.height_mm)))
@@ -125,15 +125,15 @@ def together(
         centre, size_mm = _frame(pairs)
         along = _jacobian(pairs.points_mm, pairs.planes, centre, size_mm)
         information, push = _equations(pairs, along, along, weight, len(found))
-        free = information[6:, 6:] + DAMPING * np.trace(information) / len(information) * np.eye(
-            len(information) - 6
-        )
+        free = information[6:, 6:] + JOINT_DAMPING * np.trace(information) / len(
+            information
+        ) * np.eye(len(information) - 6)
         step = -np.linalg.solve(free, push[6:]).reshape(-1, 6)
         for k, own in enumerate(step, 1):
             found[k] = motion_about(centre, own[:3] / size_mm, own[3:]) @ found[k]
         if float(np.abs(step).max()) < STILL_SPACINGS * spacing_mm and scale_mm <= last_mm:
             break
-        scale_mm = max(last_mm, SHRINK * scale_mm)
+        scale_mm = max(last_mm, JOINT_SHRINK * scale_mm)
     return found, rmse_mm
 
 
@@ -209,7 +209,7 @@ def _pairs(
             plane = other.surface.normals[index] @ poses[r][:3, :3].T
             cosine = (plane * facing[near]).sum(axis=1)
             signed = bool(view.looks.each and other.looks.each)
-            agrees = (cosine if signed else np.abs(cosine)) > AGREES
+            agrees = (cosine if signed else np.abs(cosine)) > PAIR_AGREES
             near, index, plane = near[agrees], index[agrees], plane[agrees]
             height = (
                 (local[near] - other.surface.points_mm[index]) * other.surface.normals[index]
@@ -306,7 +306,7 @@ def _open(
     """Each scan's covariance, with one of them held still."""
     count = len(information) // 6
     moving: Bool[np.ndarray, " n"] = np.arange(6 * count) // 6 != home
-    inverse = bounded_inverse(information[np.ix_(moving, moving)], FREE_RATIO)
+    inverse = bounded_inverse(information[np.ix_(moving, moving)], JOINT_FREE_RATIO)
     whole = np.zeros_like(information)
     whole[np.ix_(moving, moving)] = inverse @ scatter[np.ix_(moving, moving)] @ inverse
     return [whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)]
@@ -319,7 +319,7 @@ def _slack(
     centre_mm: Float[np.ndarray, " 3"],
     size_mm: float,
 ) -> Slack:
-    some = slice(None, None, len(view.surface.points_mm) // LOOKED_AT + 1)
+    some = slice(None, None, len(view.surface.points_mm) // WORST_HELD_POINTS + 1)
     points = moved(view.surface.points_mm[some], pose)
     normals = view.surface.normals[some] @ pose[:3, :3].T
     most_mm = HELD_SPACINGS * view.spacing_mm

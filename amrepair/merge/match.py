@@ -31,7 +31,7 @@ CAP = 0.1  # sizes: as bad as farther in free space
 FREE_COUNTS, FREE_COUNTS_GUESSED = 1.5, 0.75
 # Pairs of points within so many sizes, at first (features, search) and at last.
 FEATURES_WITHIN, SEARCH_WITHIN, LAST_WITHIN = 0.05, 0.03, 0.012
-ROUGH_POINTS, FINE_POINTS, MOST_POSES = 800, 3_000, 6
+ROUGH_POINTS, MATCHED_POINTS, MOST_POSES = 800, 3_000, 6
 SURE_OVERLAP = 0.3  # of a pair that features lay on each other without contradiction
 APART_POINTS = 60  # of a view, that tell two poses apart
 
@@ -47,7 +47,7 @@ class Round:
     keep: int
 
 
-ROUNDS = (
+MATCH_ROUNDS = (
     Round(150, 8, 0.15, 0.05, 400),
     Round(300, 8, 0.05, 0.02, 120),
     Round(800, 6, 0.02, 0.01, 20),
@@ -134,7 +134,7 @@ def _fitted(
                   options.same_size * size_mm)[:MOST_POSES]  # fmt: skip
     fits = [
         judged(views, {i: np.eye(4)}, {j: np.eye(4)},
-               settled(fixed, moving, pose, within, FINE_POINTS), options)
+               settled(fixed, moving, pose, within, MATCHED_POINTS), options)
         for pose in poses
     ]  # fmt: skip
     return distinct(fits, moving, options.same_size * size_mm)
@@ -170,7 +170,7 @@ def _search(
     guessed = first.looks.guessed or second.looks.guessed
     free_counts = FREE_COUNTS_GUESSED if guessed else FREE_COUNTS
     size = size_mm / cell_mm
-    for step in ROUNDS:
+    for step in MATCH_ROUNDS:
         own = _sample(first, space, step.points, rng)
         others = _sample(second, other, step.points, rng)
         scores = kernels.reconcile(

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import trimesh
 
 SAMPLES_ACROSS = 4  # of the surface, along the largest hole that is closed
-BLOCK, BLOCKS_AT_ONCE = 8, 2_000  # nodes along an edge; looked at together
+BLOCK_NODES, BLOCKS_TOGETHER = 8, 2_000  # nodes along an edge; looked at together
 LID_RATIO = 1e-3  # of the diagonal: a lid lies farther off the triangles
 SURE_WINDING = 0.45  # from a half: so far within or without, that no triangle's side counts
 
@@ -199,22 +199,24 @@ def _field(
     holes a half less the winding number, in cells.
     """
     low = vertices.min(axis=0) - 4.0 * edge
-    blocks = np.ceil((vertices.max(axis=0) + 4.0 * edge - low) / (BLOCK * edge)).astype(int) + 1
-    close = np.zeros(tuple(BLOCK * blocks), bool)
+    blocks = (
+        np.ceil((vertices.max(axis=0) + 4.0 * edge - low) / (BLOCK_NODES * edge)).astype(int) + 1
+    )
+    close = np.zeros(tuple(BLOCK_NODES * blocks), bool)
     close[tuple(np.rint(shell.place_mm - low / edge).astype(int).T)] = True
     close = ndimage.binary_dilation(close, iterations=2)
     every = np.argwhere(np.ones(tuple(blocks), bool))
-    middle = 0.5 - shell.winding(low / edge + BLOCK * every + 0.5 * (BLOCK - 1))
-    cut = close.reshape([n for b in blocks for n in (b, BLOCK)]).any(axis=(1, 3, 5)).ravel()
+    middle = 0.5 - shell.winding(low / edge + BLOCK_NODES * every + 0.5 * (BLOCK_NODES - 1))
+    cut = close.reshape([n for b in blocks for n in (b, BLOCK_NODES)]).any(axis=(1, 3, 5)).ravel()
     cut |= np.abs(middle) < SURE_WINDING
-    grid = np.repeat(np.repeat(np.repeat(
-        middle.reshape(tuple(blocks)).astype(np.float32), BLOCK, 0), BLOCK, 1), BLOCK, 2
-    )  # fmt: skip
-    inner = np.argwhere(np.ones((BLOCK,) * 3, bool))
-    for done, first in enumerate(range(0, len(every), BLOCKS_AT_ONCE)):
-        progress("winding number", float(done * BLOCKS_AT_ONCE), float(len(every)))
-        some = every[first : first + BLOCKS_AT_ONCE][cut[first : first + BLOCKS_AT_ONCE]]
-        nodes = (BLOCK * some[:, None] + inner).reshape(-1, 3)
+    grid = middle.reshape(tuple(blocks)).astype(np.float32)
+    for axis in range(3):
+        grid = np.repeat(grid, BLOCK_NODES, axis)
+    inner = np.argwhere(np.ones((BLOCK_NODES,) * 3, bool))
+    for done, first in enumerate(range(0, len(every), BLOCKS_TOGETHER)):
+        progress("winding number", float(done * BLOCKS_TOGETHER), float(len(every)))
+        some = every[first : first + BLOCKS_TOGETHER][cut[first : first + BLOCKS_TOGETHER]]
+        nodes = (BLOCK_NODES * some[:, None] + inner).reshape(-1, 3)
         grid[tuple(nodes.T)] = 0.5 - shell.winding(low / edge + nodes)
     near = np.argwhere(close)
     places = low + edge * near

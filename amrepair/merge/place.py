@@ -18,7 +18,7 @@ from amrepair.merge.views import JUDGED_POINTS, Fit, Placed, View, joined, judge
 from gcode.progress import Progress, silent
 
 # Sensors within this of one direction (cosine) did not walk round the part: it turned.
-ONE_SIDE = 0.9
+ONE_SENSOR_SIDE = 0.9
 GAP_SPACINGS = 8.0  # how far off a contradicting view's surface is looked for
 
 
@@ -110,7 +110,7 @@ def _as_given(views: Sequence[View], options: MergeOptions) -> Placed:
     for view in views:
         way = (view.looks.sensors_mm - view.thin.points_mm.mean(axis=0)).mean(axis=0)
         sides.append(way / max(float(np.linalg.norm(way)), 1e-12))
-    if (np.array(sides) @ np.array(sides).T).min() > ONE_SIDE:
+    if (np.array(sides) @ np.array(sides).T).min() > ONE_SENSOR_SIDE:
         return {}
     rest: Placed = {k: np.eye(4) for k in range(len(views))}
     kept, dropped = _consistent(views, rest, options)

@@ -12,10 +12,10 @@ from amrepair.align.pose_kernels import step_down
 from amrepair.align.search_kernels import field_at
 from gcode.compiled import njit, prange
 
-DAMPING = 1e-3
-WIDEST_TURN_RAD = 0.3
-FACING = 0.6  # cosine: surfaces that pull on each other, at least
-BEHIND = 2.0  # scales: deeper behind the other's surface nothing pulls
+PAIR_DAMPING = 1e-3
+WIDEST_PAIR_RAD = 0.3
+PULL_FACING = 0.6  # cosine: surfaces that pull on each other, at least
+DEEPEST_BEHIND = 2.0  # scales: deeper behind the other's surface nothing pulls
 PULL = 0.5  # of surface that lies behind, beside what lies in free space
 
 
@@ -47,7 +47,7 @@ def _row(place, gradient, f, weight, h, b, j):
 @njit(inline="always", cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _weight(f, scale, along):
     """Of an equation: Geman–McClure; none where hidden surface faces another way or lies deep."""
-    if f <= 0.0 and (f < -BEHIND * scale or along < FACING):
+    if f <= 0.0 and (f < -DEEPEST_BEHIND * scale or along < PULL_FACING):
         return 0.0
     w = scale * scale / (f * f + scale * scale)
     return w * w if f > 0.0 else PULL * w * w
@@ -80,7 +80,7 @@ def _both(pair, r, p, scale, cap, h, b, j):
         along += gy * (r[1, 0] * u + r[1, 1] * v + r[1, 2] * w)
         along += gz * (r[2, 0] * u + r[2, 1] * v + r[2, 2] * w)
         free += min(max(float(f), 0.0), cap)
-        if abs(f) < scale and along > FACING:
+        if abs(f) < scale and along > PULL_FACING:
             agreed += 1.0 - abs(f) / scale
         weight = _weight(float(f), scale, along)
         if weight > 0.0:
@@ -99,7 +99,7 @@ def _both(pair, r, p, scale, cap, h, b, j):
         gz = r[2, 0] * ex + r[2, 1] * ey + r[2, 2] * ez
         along = gx * normals[q, 0] + gy * normals[q, 1] + gz * normals[q, 2]
         free += min(max(float(f), 0.0), cap)
-        if abs(f) < scale and along > FACING:
+        if abs(f) < scale and along > PULL_FACING:
             agreed += 1.0 - abs(f) / scale
         weight = _weight(float(f), scale, along)
         if weight > 0.0:
@@ -121,6 +121,6 @@ def reconcile(pair, rotations, places, scales, cap, reach):
         h, b, j = np.empty((6, 6)), np.empty(6), np.empty(6)
         for step in range(len(scales)):
             _both(pair, r, p, scales[step], cap, h, b, j)
-            step_down(r, p, h, b, DAMPING, 1e-9, WIDEST_TURN_RAD, reach)
+            step_down(r, p, h, b, PAIR_DAMPING, 1e-9, WIDEST_PAIR_RAD, reach)
         scores[k, 0], scores[k, 1] = _both(pair, r, p, scales[-1], cap, h, b, j)
     return scores

@@ -33,7 +33,7 @@ HIDDEN_RATIO, ABOVE_LEAST = 0.02, 0.01
 VIEW_RATIO = 0.05
 MOST_GUESSES = 10
 FEW_GUESSES, RING_RAD = 8, 0.16  # fewer are widened to what lies beside them
-DISTANCES = (2.0, 8.0)  # of the view's diagonal: nearer and farther than scanners stand
+SENSOR_DISTANCES = (2.0, 8.0)  # of the view's diagonal: nearer and farther than scanners stand
 LEAST_SEEN = 100  # points of one sensor, or it saw nothing to speak of
 # Places of one sensor that lie within this share of their length of a line are its way.
 WAY_RATIO = 1e-3
@@ -261,7 +261,7 @@ def guessed(points_mm: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, "k 3
         tuple(
             Look.of(points_mm, centre + ratio * diagonal_mm * way, edge_on=EDGE_ON_GUESSED)
             for way in towards
-            for ratio in DISTANCES
+            for ratio in SENSOR_DISTANCES
         ),
         len(towards) > 0,
     )

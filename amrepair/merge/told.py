@@ -20,9 +20,9 @@ from amrepair.merge.options import MergeOptions
 from amrepair.merge.views import Fit, Placed, View, joined
 
 POSES_FILE = "poses.json"
-RIGID = 1e-3  # how far a rotation may be from one: files round to five digits or so
+TOLD_RIGID = 1e-3  # how far a rotation may be from one: files round to five digits or so
 TRIAL_POINTS = 1_000  # of a view, that decide which way round a rotation is written
-TURN_RAD = 0.06  # 3.5°: how far a pair's own turn may be from the table's
+TABLE_TURN_RAD = 0.06  # 3.5°: how far a pair's own turn may be from the table's
 
 
 def read_poses(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
@@ -50,10 +50,10 @@ def read_poses(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
     for name, pose in found.items():
         turn = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
         off = float(np.abs(turn @ turn.T - np.eye(3)).max())
-        if not off < RIGID or np.linalg.det(turn) < 0 or not np.isfinite(pose).all():
+        if not off < TOLD_RIGID or np.linalg.det(turn) < 0 or not np.isfinite(pose).all():
             raise InputError(
                 f"the pose of {name} in {path} is no rigid motion (its rotation is off by "
-                f"{off:.2g}, {RIGID:g} is allowed); a pose is a (4, 4) common frame from view"
+                f"{off:.2g}, {TOLD_RIGID:g} is allowed); a pose is a (4, 4) common frame from view"
             )
     return found
 
@@ -136,7 +136,7 @@ def on_turntable(
         for k in range(len(views) - 1):
             for fit in ask(views, k, k + 1, size_mm, options):
                 turn = Rotation.from_matrix(fit.pose[:3, :3]).as_rotvec()
-                turns = abs(np.linalg.norm(turn) - abs(angle)) < TURN_RAD
+                turns = abs(np.linalg.norm(turn) - abs(angle)) < TABLE_TURN_RAD
                 better = best is None or fit.score > best[0]
                 if turns and better and not fit.why_not(options):
                     best = fit.score, fit.pose

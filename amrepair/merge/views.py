@@ -20,13 +20,13 @@ from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.options import MergeOptions
 from amrepair.scans import Scan
 
-LEAST_POINTS = 2_000
+LEAST_VIEW_POINTS = 2_000
 MAX_POINTS = 400_000  # of one scan; more add time, not accuracy
 THIN_POINTS, IMAGE_POINTS, GUESS_POINTS = 15_000, 40_000, 8_000
 CLEAR = 0.2  # cosine of a normal to a sensor's ray, or it is not clear which way it faces
 JUDGED_POINTS = 3_000
 PAIRED, AGREES = 0.5, 0.8  # cosine between normals of points that may be, and that are, one surface
-LEAST_PAIRS = 30
+LEAST_VIEW_PAIRS = 30
 LOSS_REACH = 0.3  # scale of the loss, of how far pairs may lie apart
 # Over or under a surface is where it has a point within so many spacings; chance leaves such a
 # place without one in exp(-pi) = 4 %.
@@ -94,15 +94,16 @@ class View:
             If too few of its points are different.
         """
         chosen = np.arange(len(scan))
-        if scan.edge is not None and int((scan.edge == 0).sum()) >= LEAST_POINTS:
+        if scan.edge is not None and int((scan.edge == 0).sum()) >= LEAST_VIEW_POINTS:
             chosen = np.flatnonzero(scan.edge == 0)
         if len(chosen) > MAX_POINTS:
             chosen = np.sort(rng.permutation(chosen)[:MAX_POINTS])
         points, first = np.unique(scan.points_mm[chosen], axis=0, return_index=True)
-        if len(points) < LEAST_POINTS:
+        if len(points) < LEAST_VIEW_POINTS:
             raise InputError(
                 f"the scan {scan.source} has only {len(points)} different points among "
-                f"{len(chosen)}; a template needs {LEAST_POINTS:,} of each scan: check the export"
+                f"{len(chosen)}; a template needs {LEAST_VIEW_POINTS:,} of each scan: check the "
+                "export"
             )
         sensors, index = scan.sensors_mm, scan.sensor_index
         if index is not None:
@@ -248,7 +249,7 @@ def settled(
         index = index[near]
         normals = moving.normals[some][near] @ found[:3, :3].T
         facing = (normals * fixed.normals[index]).sum(axis=1) > PAIRED
-        if facing.sum() < LEAST_PAIRS:
+        if facing.sum() < LEAST_VIEW_PAIRS:
             return found
         here, normal = points[near][facing], fixed.normals[index[facing]]
         height = ((here - fixed.points_mm[index[facing]]) * normal).sum(axis=1)

@@ -12,13 +12,13 @@ from amrepair.template.port import Template
 # Excess farther out than this is not part of the print (clutter, the bed's rim).
 MAX_EXCESS_MM = 12.0
 # Bed, skirt and first-layer ooze: one thick layer above the lowest plane of the part.
-BED_BAND_MM = 0.35
+BACKGROUND_BAND_MM = 0.35
 # Of a plane's points one in 30,000 lies farther from it, by noise of so many sigmas.
 NOISE_SIGMAS = 4.0
 # The template's distance is the height under a plane: to rounding.
 ON_PLANE_MM = 1e-4
 # So much of the underside seen, so far from its rim: nothing lies under the part, there is no bed.
-SEEN_UNDERSIDE, RIM_MM, FOOT_CELL_MM, MOST_FOOT = 0.3, 0.15, 1.0, 20_000
+SEEN_UNDERSIDE, UNDERSIDE_RIM_MM, FOOT_CELL_MM, MOST_FOOT = 0.3, 0.15, 1.0, 20_000
 # So many points tell a scan's size, to the factor between two units.
 SIZE_POINTS = 20_000
 
@@ -52,9 +52,9 @@ def background(
         # what lies beside the part in its lowest plane is where it stood when seen from above
         rim_mm = _rim_mm(scan)
         in_plane = np.abs(scan.points_mm[:, 2] - low_z) < rim_mm
-        beside = in_plane & (f_mm > max(rim_mm, BED_BAND_MM / 2))
+        beside = in_plane & (f_mm > max(rim_mm, BACKGROUND_BAND_MM / 2))
         return np.asarray((f_mm > MAX_EXCESS_MM) | beside)
-    band_mm = max(BED_BAND_MM, NOISE_SIGMAS * scan.sigma_mm)
+    band_mm = max(BACKGROUND_BAND_MM, NOISE_SIGMAS * scan.sigma_mm)
     bed = (scan.points_mm[:, 2] < low_z + band_mm) & (f_mm > band_mm / 2)
     inside_band = scan.points_mm[:, 2] > low_z - band_mm
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
@@ -63,7 +63,7 @@ def background(
 
 def _rim_mm(scan: Scan) -> float:
     """How far from the lowest plane a point may lie that is on it."""
-    return max(RIM_MM, NOISE_SIGMAS * scan.sigma_mm)
+    return max(UNDERSIDE_RIM_MM, NOISE_SIGMAS * scan.sigma_mm)
 
 
 def _shows_underside(
@@ -79,7 +79,7 @@ def _shows_underside(
 
     def cells_within(points_mm: Float[np.ndarray, "k 3"]) -> set[tuple[int, int]]:
         above = points_mm.copy()
-        above[:, 2] = low_z + rim_mm + RIM_MM
+        above[:, 2] = low_z + rim_mm + UNDERSIDE_RIM_MM
         under = above[template.distance(above) < -rim_mm, :2] if len(above) else above[:, :2]
         index = np.unique(np.floor(under / FOOT_CELL_MM).astype(np.int64), axis=0)
         return {(int(x), int(y)) for x, y in index}

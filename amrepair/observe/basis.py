@@ -13,7 +13,7 @@ from amrepair.errors import InputError
 BOWS = ((0, 1), (0, 2), (1, 2))  # (along, towards): a long axis bends towards a shorter one
 SCALE_AT, BOW_AT, VIEWS_AT = 6, 7, 11  # pose 0:6, bends 7:10, twist 10, views from 11 on
 EXTENT_PERCENT = (1.0, 99.0)  # fliers do not lengthen the part
-FLAT_RATIO = 1e-6  # what is thinner than this part of its length is a line or a point
+THIN_RATIO = 1e-6  # what is thinner than this part of its length is a line or a point
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ def shape_columns(
     """
     off = place_mm - frame.centre_mm
     x, n = off @ frame.axes.T, normal @ frame.axes.T
-    h = np.maximum(frame.half_extent_mm, FLAT_RATIO * max(float(frame.half_extent_mm[0]), 1e-9))
+    h = np.maximum(frame.half_extent_mm, THIN_RATIO * max(float(frame.half_extent_mm[0]), 1e-9))
     rotation = np.cross(off, normal)  # n·(ω × x) = ω·(x × n)
     scale = np.sum(off * normal, axis=1)
     bends = [x[:, i] * (x[:, i] * n[:, j] - 2 * x[:, j] * n[:, i]) / h[i] ** 2 for i, j in BOWS]

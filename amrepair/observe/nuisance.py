@@ -28,7 +28,7 @@ from amrepair.observe.robust import Problem, Solution, covariance, solve, starts
 
 CELLS_ACROSS = 48  # a nuisance is smooth: cells finer than this say nothing more about it
 STATIONS = np.linspace(-1, 1, 21)  # from end to end of an axis
-NORMAL = NuisanceOptions()
+USUAL_NUISANCE = NuisanceOptions()
 BESIDE_RATIO = 0.1  # a bow along one axis alone is told with that axis's length
 
 
@@ -205,7 +205,7 @@ def fit_nuisance(
     view: Int[np.ndarray, " s"] | None = None,
     tolerance_mm: float,
     correlation_mm: float,
-    options: NuisanceOptions = NORMAL,
+    options: NuisanceOptions = USUAL_NUISANCE,
 ) -> Nuisance:
     """Fit what is common to the whole part or to a whole view.
 

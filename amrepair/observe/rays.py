@@ -18,7 +18,7 @@ from amrepair.scans import Scan
 from gcode.compiled import get_num_threads
 
 MAX_PIXELS = 4_000_000
-LEAST_POINTS = 16
+LEAST_RAY_POINTS = 16
 # A ray that grazes the surface says little about depth across it: 80° is the limit used.
 MIN_COSINE = 0.17
 
@@ -113,7 +113,7 @@ def _image(scan: Scan, k: int) -> RangeImage | None:
     assert scan.sensors_mm is not None
     sensor_mm = scan.sensors_mm[k]
     count, mean = kernels.mean_seen_by(scan.points_mm, scan.sensor_index, k)
-    if count < LEAST_POINTS:
+    if count < LEAST_RAY_POINTS:
         return None
     axes = _facing(mean - sensor_mm)
     rays = kernels.directions(scan.points_mm, scan.sensor_index, k, sensor_mm, axes, count)

@@ -25,7 +25,7 @@ FINAL_STEPS = 60
 SCALE_STEPS = 30
 FINALISTS = 3  # descents that are followed to their end
 NARROW = 4.0  # data without any noise are judged by a quarter of what a part is allowed
-CONVERGED = 1e-6  # of a prior's standard deviation
+CONVERGED_RATIO = 1e-6  # of a prior's standard deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ def _descend(
     for _ in range(steps):
         weight = biweight(problem.residual_mm(unknown), width_mm)
         before, unknown = unknown, _step(problem, weight, width_mm / BIWEIGHT_EFFICIENT)
-        if np.abs(unknown - before).max() < CONVERGED:
+        if np.abs(unknown - before).max() < CONVERGED_RATIO:
             break
     return unknown
 

@@ -12,7 +12,7 @@ from amrepair.observe.robust import MAD_TO_SIGMA
 
 LEAST_PLACES = 30  # that a view shares with others: fewer tell nothing of it
 # Two views contradict each other alike, within so much: the template says which of them is off.
-ALIKE = 1.1
+CONTRADICT_ALIKE = 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,9 @@ def contradictions(
         if not table:
             return tuple(found)
         most_mm = max(row[0] for row in table)
-        worst = max((row for row in table if ALIKE * row[0] >= most_mm), key=lambda row: row[1])[2]
+        worst = max(
+            (row for row in table if CONTRADICT_ALIKE * row[0] >= most_mm), key=lambda row: row[1]
+        )[2]
         found.append(worst)
         stays = view != worst.view
         cell, view, value_mm, count = cell[stays], view[stays], value_mm[stays], count[stays]

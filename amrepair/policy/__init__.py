@@ -4,10 +4,10 @@ Frozen rules with their reasons, and pure functions on results: nothing here mea
 or reads a file. A recorded run is judged again by this room alone (`policy.again`).
 """
 
-from amrepair.policy.options import POLICY, PolicyOptions
+from amrepair.policy.options import USUAL_POLICY, PolicyOptions
 from amrepair.policy.table import (
     FINDINGS,
-    STOPS,
+    STOP_ROWS,
     Action,
     Condition,
     Decision,
@@ -20,6 +20,17 @@ from amrepair.policy.table import (
 )
 
 __all__ = [
-    "FINDINGS", "POLICY", "STOPS", "Action", "Condition", "Decision", "PolicyOptions", "Row",
-    "Verdict", "decide", "gravest", "judge", "tables",
+    "FINDINGS",
+    "STOP_ROWS",
+    "USUAL_POLICY",
+    "Action",
+    "Condition",
+    "Decision",
+    "PolicyOptions",
+    "Row",
+    "Verdict",
+    "decide",
+    "gravest",
+    "judge",
+    "tables",
 ]  # fmt: skip

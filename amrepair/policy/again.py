@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 from amrepair.errors import InputError
-from amrepair.policy.options import POLICY, PolicyOptions
+from amrepair.policy.options import USUAL_POLICY, PolicyOptions
 from amrepair.policy.table import Action, Cover, Decision, Finding, Situation, decide, judge
 from amrepair.policy.table import gravest as gravest_of
 from amrepair.regions.anomaly import DefectType
@@ -17,7 +17,7 @@ _MEANT: dict[str, type[DefectType] | type[Cover] | type[Action]] = {
 }  # fmt: skip
 
 
-def decided_again(recorded: Mapping[str, Any], options: PolicyOptions = POLICY) -> Decision:
+def decided_again(recorded: Mapping[str, Any], options: PolicyOptions = USUAL_POLICY) -> Decision:
     """What the tables say of a decision's own facts (`Decision.to_json`).
 
     What the facts themselves rest on stays as it was: whether a pass was the last, or changed

@@ -76,5 +76,5 @@ class PolicyOptions:
     left_ratio: float = 0.08
 
 
-POLICY = PolicyOptions()
+USUAL_POLICY = PolicyOptions()
 """What the loop and the command line go by."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from amrepair.policy.options import POLICY, PolicyOptions
+from amrepair.policy.options import USUAL_POLICY, PolicyOptions
 
 
-def is_stuck(before_mm3: float, left_mm3: float, options: PolicyOptions = POLICY) -> bool:
+def is_stuck(before_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_POLICY) -> bool:
     """Whether the last repair changed next to nothing of what is missing."""
     return left_mm3 > options.stuck_ratio * before_mm3
 
 
-def is_little(found_mm3: float, left_mm3: float, options: PolicyOptions = POLICY) -> bool:
+def is_little(found_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_POLICY) -> bool:
     """Whether what is left is a small share of what was found: more passes would only add rims."""
     return left_mm3 <= options.little_ratio * found_mm3
 
@@ -21,7 +21,7 @@ def may_be_left(
     missing_mm3: float,
     excess_mm3: float,
     excess_before_mm3: float,
-    options: PolicyOptions = POLICY,
+    options: PolicyOptions = USUAL_POLICY,
 ) -> bool:
     """Whether a stop was left within tolerance.
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from amrepair.policy.options import POLICY, PolicyOptions
+from amrepair.policy.options import USUAL_POLICY, PolicyOptions
 from amrepair.regions.anomaly import DefectType
 
 
@@ -131,7 +131,7 @@ class Condition:
     test: str
     value: Any
 
-    def fits(self, facts: Finding | Situation, options: PolicyOptions = POLICY) -> bool:
+    def fits(self, facts: Finding | Situation, options: PolicyOptions = USUAL_POLICY) -> bool:
         """Whether it holds."""
         found = getattr(facts, self.fact)
         if self.test == "is":
@@ -156,13 +156,14 @@ class Condition:
             return f"{self._name()} is {' or '.join(str(v) for v in self.value)}"
         if self.test == "is":
             return f"{self._name()} is {self.value}"
-        return f"{self._name()} {self.test} {self.limit(POLICY):g}{_UNITS.get(self.fact, '')}"
+        unit = _QUANTITY_UNITS.get(self.fact, "")
+        return f"{self._name()} {self.test} {self.limit(USUAL_POLICY):g}{unit}"
 
     def _name(self) -> str:
-        return _NAMES.get(self.fact, self.fact)
+        return _QUANTITY_NAMES.get(self.fact, self.fact)
 
 
-_NAMES = {
+_QUANTITY_NAMES = {
     "thickness_layers": "mean thickness",
     "height_layers": "height",
     "volume_mm3": "volume",
@@ -183,7 +184,7 @@ _NAMES = {
     "gravest": "gravest",
     "beyond": "beyond a limit for printing unasked",
 }
-_UNITS = {
+_QUANTITY_UNITS = {
     "thickness_layers": " layers",
     "height_layers": " layers",
     "volume_mm3": " mm³",
@@ -201,13 +202,13 @@ class Row:
     when: tuple[Condition, ...]
     reason: str
 
-    def fits(self, facts: Finding | Situation, options: PolicyOptions = POLICY) -> bool:
+    def fits(self, facts: Finding | Situation, options: PolicyOptions = USUAL_POLICY) -> bool:
         """Whether all its conditions hold."""
         return all(condition.fits(facts, options) for condition in self.when)
 
 
-ENDS = (DefectType.DETACHED, DefectType.LAYER_SHIFT)
-BEYOND_MENDING = (*ENDS, DefectType.WARP, DefectType.CLOG)
+ENDING_DEFECTS = (DefectType.DETACHED, DefectType.LAYER_SHIFT)
+BEYOND_MENDING = (*ENDING_DEFECTS, DefectType.WARP, DefectType.CLOG)
 """What adding material cannot mend."""
 
 
@@ -229,26 +230,26 @@ _THIN = (
     _is("cover", Cover.SOLID),
 )  # fmt: skip
 _MISSING, _EXCESS = _is("kind", "missing"), _is("kind", "excess")
-_OWN = Condition("object", "stated", None)
+_OWN_OBJECT = Condition("object", "stated", None)
 
 FINDINGS: tuple[Row, ...] = (
     Row("F0a", Action.GO_ON, (_is("given_up", True),),
         "nothing more is printed of that object"),
-    Row("F0b", Action.LOOK_AGAIN, (_MISSING, _OWN, _from("lost_ratio", "lost_ratio"),
+    Row("F0b", Action.LOOK_AGAIN, (_MISSING, _OWN_OBJECT, _from("lost_ratio", "lost_ratio"),
                                    _is("seen_twice", False)),
         "a false alarm would cost the object"),
-    Row("F0c", Action.GIVE_UP, (_MISSING, _OWN, _from("lost_ratio", "lost_ratio")),
+    Row("F0c", Action.GIVE_UP, (_MISSING, _OWN_OBJECT, _from("lost_ratio", "lost_ratio")),
         "too little is left of the object to repair it; the others can go on"),
-    Row("F1", Action.STOP, (_is("type", ENDS), _from("confidence", "sure")),
+    Row("F1", Action.STOP, (_is("type", ENDING_DEFECTS), _from("confidence", "sure")),
         "what is printed from here on would land beside the part"),
     Row("F2", Action.LOOK_AGAIN, (_is("type", BEYOND_MENDING), _below("confidence", "sure"),
                                   _is("seen_twice", False)),
         "a false alarm would cost the print"),
-    Row("F3a", Action.GIVE_UP, (_is("type", (DefectType.WARP,)), _OWN),
+    Row("F3a", Action.GIVE_UP, (_is("type", (DefectType.WARP,)), _OWN_OBJECT),
         "adding material cannot mend it; the other objects can go on"),
     Row("F3", Action.PAUSE, (_is("type", BEYOND_MENDING),),
         "adding material cannot mend it; somebody has to look"),
-    Row("F4a", Action.GIVE_UP, (_EXCESS, _OWN, _from("volume_mm3", "least_hit_mm3"),
+    Row("F4a", Action.GIVE_UP, (_EXCESS, _OWN_OBJECT, _from("volume_mm3", "least_hit_mm3"),
                                 _from("hit_mm", 1e-6)),
         "the head would hit it on its next moves; the other objects can go on"),
     Row("F4", Action.PAUSE, (_EXCESS, _from("volume_mm3", "least_hit_mm3"), _from("hit_mm", 1e-6)),
@@ -289,7 +290,7 @@ FINDINGS: tuple[Row, ...] = (
 """What is done about one finding."""
 
 _FILL = _is("gravest", Action.FILL_NOW)
-STOPS: tuple[Row, ...] = (
+STOP_ROWS: tuple[Row, ...] = (
     Row("S1", Action.STOP, (_is("gravest", Action.STOP),),
         "a finding ends the run: parked, heaters off"),
     Row("S2", Action.PAUSE, (_is("gravest", Action.PAUSE),),
@@ -364,7 +365,7 @@ class Decision:
         }  # fmt: skip
 
 
-def judge(finding: Finding, options: PolicyOptions = POLICY) -> Verdict:
+def judge(finding: Finding, options: PolicyOptions = USUAL_POLICY) -> Verdict:
     """The first row that fits a finding."""
     row = next(row for row in FINDINGS if row.fits(finding, options))
     return Verdict(finding, row.action, row.id, row.reason)
@@ -381,11 +382,11 @@ def decide(verdicts: Sequence[Verdict], situation: Situation) -> Decision:
     A patch that is not to be printed does not hide what else was found: then the next gravest
     counts.
     """
-    row = next(row for row in STOPS if row.fits(situation))
+    row = next(row for row in STOP_ROWS if row.fits(situation))
     if situation.gravest is Action.FILL_NOW and row.action is Action.GO_ON:
         rest = gravest([v for v in verdicts if v.action is not Action.FILL_NOW])
         if rest is not Action.GO_ON:
-            also = next(other for other in STOPS if other.when == (_is("gravest", rest),))
+            also = next(other for other in STOP_ROWS if other.when == (_is("gravest", rest),))
             return Decision(
                 also.action, f"{row.id}, {also.id}", f"{row.reason}; {also.reason}",
                 situation, tuple(verdicts),
@@ -396,7 +397,7 @@ def decide(verdicts: Sequence[Verdict], situation: Situation) -> Decision:
 def tables() -> str:
     """Both tables as they stand in the documentation."""
     parts = []
-    for title, rows in (("What is done about a finding", FINDINGS), ("At the stop", STOPS)):
+    for title, rows in (("What is done about a finding", FINDINGS), ("At the stop", STOP_ROWS)):
         lines = [f"### {title}", "", "| row | when | decision | because |", "|---|---|---|---|"]
         for row in rows:
             when = ", ".join(str(condition) for condition in row.when) or "otherwise"

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from amrepair.policy.options import POLICY, PolicyOptions
+from amrepair.policy.options import USUAL_POLICY, PolicyOptions
 from amrepair.regions import Label, Region
 
 
@@ -17,7 +17,7 @@ def defect_volumes(
     boxes_mm: Sequence[Float[np.ndarray, "2 3"]],
     volumes_mm3: Sequence[float],
     skipped: Sequence[bool],
-    options: PolicyOptions = POLICY,
+    options: PolicyOptions = USUAL_POLICY,
 ) -> Float[np.ndarray, " n"]:
     """Volume of the defect that each piece belongs to.
 
@@ -56,7 +56,7 @@ def worth_mending(
     boxes_mm: Sequence[Float[np.ndarray, "2 3"]],
     volumes_mm3: Sequence[float],
     skipped: Sequence[bool],
-    options: PolicyOptions = POLICY,
+    options: PolicyOptions = USUAL_POLICY,
 ) -> Bool[np.ndarray, " n"]:
     """(n,) pieces of a defect that is worth a repair; see `defect_volumes`."""
     least_mm3 = np.where(
@@ -65,7 +65,7 @@ def worth_mending(
     return np.asarray(defect_volumes(boxes_mm, volumes_mm3, skipped, options) >= least_mm3)
 
 
-def to_fill(regions: Sequence[Region], options: PolicyOptions = POLICY) -> tuple[Region, ...]:
+def to_fill(regions: Sequence[Region], options: PolicyOptions = USUAL_POLICY) -> tuple[Region, ...]:
     """Missing regions that are worth a repair: alone, or with those beside them."""
     missing = [region for region in regions if region.label is Label.MISSING]
     keep = worth_mending(
@@ -83,7 +83,7 @@ def volume_mm3(regions: Sequence[Region]) -> float:
 
 
 def too_much(
-    regions: Sequence[Region], layer_mm: float, options: PolicyOptions = POLICY
+    regions: Sequence[Region], layer_mm: float, options: PolicyOptions = USUAL_POLICY
 ) -> tuple[Region, ...]:
     """Regions in excess that stand out."""
     return tuple(

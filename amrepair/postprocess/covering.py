@@ -12,8 +12,8 @@ from scipy import ndimage
 from gcode.reader import Job
 from gcode.surfaces import raster_kernels
 
-CELL_MM = 0.4  # about a bead
-MOST_CELLS = 1_000_000  # of a layer: a bed of 400 mm, some hundredths of a second
+COVER_CELL_MM = 0.4  # about a bead
+MOST_LAYER_CELLS = 1_000_000  # of a layer: a bed of 400 mm, some hundredths of a second
 
 
 def covered_mm2(job: Job) -> Float[np.ndarray, " layers"]:
@@ -23,9 +23,9 @@ def covered_mm2(job: Job) -> Float[np.ndarray, " layers"]:
     them.
     """
     beads = job.beads
-    low = np.minimum(beads.start_mm, beads.end_mm)[:, :2].min(axis=0) - CELL_MM
-    high = np.maximum(beads.start_mm, beads.end_mm)[:, :2].max(axis=0) + CELL_MM
-    cell_mm = max(CELL_MM, float(np.sqrt(np.prod(high - low) / MOST_CELLS)))
+    low = np.minimum(beads.start_mm, beads.end_mm)[:, :2].min(axis=0) - COVER_CELL_MM
+    high = np.maximum(beads.start_mm, beads.end_mm)[:, :2].max(axis=0) + COVER_CELL_MM
+    cell_mm = max(COVER_CELL_MM, float(np.sqrt(np.prod(high - low) / MOST_LAYER_CELLS)))
     nx, ny = (int(v) for v in np.ceil((high - low) / cell_mm))
     bounds = np.searchsorted(beads.layer, np.arange(len(job.layers) + 1))
     areas, open_before = np.zeros(len(job.layers)), np.zeros((ny, nx), bool)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amrepair.errors import InputError
-from amrepair.loop.marks import MARK
+from amrepair.loop.marks import LOOK_MARK
 from amrepair.loop.pace import layers_at
 from amrepair.postprocess.covering import covered_mm2
 from amrepair.postprocess.places import Place, Places
@@ -18,7 +18,7 @@ from gcode.reader import Job, read_job
 # What the smallest repair that is worth its stop would lie under: a square of 5 mm.
 COVERS_MM2 = 25.0
 BINARY = b"GCDE"  # the first bytes of Prusa's binary G-code
-DIALECTS = {"octoprint": "marlin"}  # whose modes a job follows, where a host reads the marks
+HOST_DIALECTS = {"octoprint": "marlin"}  # whose modes a job follows, where a host reads the marks
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +104,11 @@ def mark(text: str, name: str, target: Target, asked: Asked) -> Marked:
     LoopError
         If a height is not in the job.
     """
-    if f"\n{MARK} " in text:
+    if f"\n{LOOK_MARK} " in text:
         return Marked(text, (), 0, 0, 0, marked_before=True)
     plain = text.encode("utf-8", "replace").decode("utf-8")
     try:
-        job = read_job(plain, dialect=DIALECTS.get(target, target))
+        job = read_job(plain, dialect=HOST_DIALECTS.get(target, target))
     except ReadError as error:
         raise InputError(f"{name}: {error}") from error
     places = Places(job)

@@ -19,7 +19,9 @@ SPIRAL_RATIO = 0.5  # of its height: a layer that climbs so much within itself i
 PULLED_MM = 0.01  # of filament: numbers in a file are rounded to less
 MOST_FOOTER_LINES = 60
 # From here on a job's end is under way: heaters off, homing, motors off.
-_ENDS = re.compile(r"^\s*(M104|M109|M140|M190|G28|M84|M18|END_PRINT|PRINT_END)\b", re.IGNORECASE)
+_ENDING_COMMAND = re.compile(
+    r"^\s*(M104|M109|M140|M190|G28|M84|M18|END_PRINT|PRINT_END)\b", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ class Places:
         lines = self._job.program.text.split("\n")
         stop = min(len(lines) - 1, last + MOST_FOOTER_LINES)
         for line in range(last + 1, stop):
-            if _ENDS.match(lines[line]):
+            if _ENDING_COMMAND.match(lines[line]):
                 return line
         return stop
 

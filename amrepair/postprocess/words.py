@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Literal, get_args
 
 from amrepair.errors import InputError
-from amrepair.loop.marks import MARK
+from amrepair.loop.marks import LOOK_MARK
 from gcode.profiles.own_settings import own_settings
 
 Target = Literal["klipper", "prusa", "marlin", "reprap", "octoprint"]
@@ -14,7 +14,7 @@ TARGETS: tuple[Target, ...] = get_args(Target)
 # Klipper: the macro of our cfg file. Prusa: pause and park (M601). Marlin: M0 waits for a click or
 # M108; M125 and M600 park, too, where they were built in. RepRapFirmware: M226, a pause that comes
 # from the file. OctoPrint takes lines with @ for itself and sends nothing.
-COMMANDS: Mapping[Target, tuple[str, ...]] = {
+PAUSE_COMMANDS: Mapping[Target, tuple[str, ...]] = {
     "klipper": ("AMREPAIR_SCAN LAYER={layer} Z={z}",),
     "prusa": ("M601",),
     "marlin": ("M400", "M0"),
@@ -76,11 +76,11 @@ def lines_of(
     InputError
         If it names anything else.
     """
-    words = tuple(command.split("\\n")) if command is not None else COMMANDS[target]
+    words = tuple(command.split("\\n")) if command is not None else PAUSE_COMMANDS[target]
     try:
         filled = tuple(line.format(layer=layer, z=f"{z_mm:.3f}") for line in words)
     except (KeyError, IndexError, ValueError) as error:
         raise InputError(
             f"--command is {command!r}; it may name {{{'}, {'.join(_FIELDS)}}} and nothing else"
         ) from error
-    return (f"{MARK} LAYER={layer} Z={z_mm:.3f}", *filled)
+    return (f"{LOOK_MARK} LAYER={layer} Z={z_mm:.3f}", *filled)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from amrepair.field.as_built import Evidence
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
-from amrepair.regions.calibration import NORMAL, Calibration
+from amrepair.regions.calibration import NORMAL_NOISE, Calibration
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import Sites
@@ -141,5 +141,5 @@ class AnomalyMap:
         """What belongs to the whole part or to whole views, in sentences."""
         whole = () if self.nuisance is None else self.nuisance.told()
         by = self.calibration
-        judged = () if by is None or by == NORMAL else (by.told(),)
+        judged = () if by is None or by == NORMAL_NOISE else (by.told(),)
         return (*judged, *(one.told() for one in self.contradicting), *whole)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from amrepair.errors import InputError
 from gcode.whole import put_in_place
 
-VERSION = 2
+CALIBRATION_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,9 @@ class Calibration:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with put_in_place(path) as draft:
-                draft.write_text(json.dumps({"version": VERSION, **asdict(self)}, indent=1) + "\n")
+                draft.write_text(
+                    json.dumps({"version": CALIBRATION_VERSION, **asdict(self)}, indent=1) + "\n"
+                )
         except OSError as e:
             raise InputError(f"{path}: the calibration cannot be written ({e.strerror})") from e
         return path
@@ -133,8 +135,10 @@ class Calibration:
             )
         try:
             said: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            if said.pop("version") != VERSION:
-                raise InputError(f"{path}: the calibration is of another version than {VERSION}")
+            if said.pop("version") != CALIBRATION_VERSION:
+                raise InputError(
+                    f"{path}: the calibration is of another version than {CALIBRATION_VERSION}"
+                )
             return cls(**{key: _tuples(value) for key, value in said.items()})
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
             raise InputError(f"{path}: the calibration cannot be read ({e}); make it again") from e
@@ -155,7 +159,7 @@ def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:
 
 
 # Independent normal errors and nothing else: what the simulated scanner leaves by default.
-NORMAL = Calibration("normal noise", 0)
+NORMAL_NOISE = Calibration("normal noise", 0)
 
 
 def file_of(name: str, folder: Path) -> Path:

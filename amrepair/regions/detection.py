@@ -15,7 +15,7 @@ from amrepair.field.near import nearest_within
 from amrepair.field.scales import scales_of
 from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
-from amrepair.regions.calibration import NORMAL, Calibration
+from amrepair.regions.calibration import NORMAL_NOISE, Calibration
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
@@ -97,7 +97,7 @@ def detect(
         return seen, sites_of(seen, scan, template, options, top_z_mm, rounded_up)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
-    whole_part = top_z_mm is None and calibration != NORMAL and not pose_is_known
+    whole_part = top_z_mm is None and calibration != NORMAL_NOISE and not pose_is_known
     seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
     progress("detect", 1.0, 4.0)
     test = _tested(seen, sites, scan, template, options, calibration)
@@ -259,7 +259,7 @@ def _strands(
     What errors leave in strips neither a scan nor a calibration tells: only where they are known to
     be normal is there any.
     """
-    if calibration != NORMAL:
+    if calibration != NORMAL_NOISE:
         return np.zeros(len(surfels), bool)
     first = levels[1]
     at = first.scale.of_base[: len(surfels)]

@@ -20,7 +20,7 @@ from scipy.special import comb
 from scipy.stats import norm
 
 from amrepair.field import scales_kernels
-from amrepair.field.scales import FACING_COSINE, RANK, Scale
+from amrepair.field.scales import RANK, WINDOW_FACING, Scale
 from amrepair.regions.calibration import Calibration, Tail
 from amrepair.regions.options import RegionOptions
 
@@ -248,7 +248,7 @@ def _wander(
     pairs = cKDTree(scale.place_mm[pick]).query_pairs(options.far_mm, output_type="ndarray")
     one, other = pick[pairs.T]
     apart_mm = np.linalg.norm(scale.place_mm[one] - scale.place_mm[other], axis=1)
-    alike = (scale.normal[one] * scale.normal[other]).sum(axis=1) > FACING_COSINE
+    alike = (scale.normal[one] * scale.normal[other]).sum(axis=1) > WINDOW_FACING
     kept = alike & (apart_mm > 0.5 * options.far_mm)
     one, other = one[kept], other[kept]
     off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_QUARTILE

@@ -16,9 +16,9 @@ from amrepair.field.as_built import SOLID_MM, Evidence
 from amrepair.regions import skipped_kernels as kernels
 from amrepair.template.port import Template
 
-STEP_MM = 0.25
-LOOKS = 5  # along a line that are judged together: a millimetre and a quarter
-LEAST_MM = 1.5  # shorter stretches are seams, corners and curves
+LOOK_STEP_MM = 0.25
+LOOKS_TOGETHER = 5  # along a line that are judged together: a millimetre and a quarter
+LEAST_STRETCH_MM = 1.5  # shorter stretches are seams, corners and curves
 # How far the middle of a bead lies in the open where it is gone, as a share of half its height.
 # Half of its plastic would put it at the surface, and noise is averaged over a stretch.
 GONE_SHARE = 0.4
@@ -27,11 +27,11 @@ GONE_SHARE = 0.4
 GONE_BY_BOTH, SURE_BY_BOTH, MOST_SHARE = 0.5, 0.65, 1.5
 # In a layer of which a stretch is gone others need less, and may be shorter; but rays alone do not
 # do: between thin walls of infill they say "open" of many.
-GONE_AGAIN, LEAST_AGAIN_MM, SAME_LAYER_MM = 0.35, 1.0, 0.05
+GONE_AGAIN, LEAST_AGAIN_MM, SAME_LINE_LAYER_MM = 0.35, 1.0, 0.05
 # The walls that tell how far in a line stands: so far below the last lines' middles and so deep,
 # upright, as far off as a part shrinks and no farther; of so many cells near a line those of the
 # nearest wall, a few at least.
-BELOW_LINE_MM, WALL_MM, MOST_SHIFT_MM, UPRIGHT = 0.1, 2.0, 0.35, 0.4
+BELOW_LINE_MM, WALL_MM, MOST_SHIFT_MM, UPRIGHT_WALL = 0.1, 2.0, 0.35, 0.4
 WALL_CELLS, LEAST_WALL_CELLS, BESIDE_WALL_MM, SAME_WALL = 12, 4, 1.5, 0.7
 # Cells about a look that are asked for its line's top; how near to it, as a share of half a line.
 ABOUT, TOP_SHARE = 6, 1.0
@@ -76,9 +76,9 @@ class PlannedBeads:
         )
 
     def samples_mm(self) -> Float[np.ndarray, "p 3"]:
-        """(p, 3) places along the middles of their tops, `STEP_MM` apart."""
+        """(p, 3) places along the middles of their tops, `LOOK_STEP_MM` apart."""
         length_mm = np.linalg.norm(self.end_mm - self.start_mm, axis=1)
-        count = np.ceil(length_mm / STEP_MM).astype(np.int64) + 1
+        count = np.ceil(length_mm / LOOK_STEP_MM).astype(np.int64) + 1
         line = np.repeat(np.arange(len(count)), count)
         step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
         share = step / np.maximum(count[line] - 1, 1)
@@ -110,10 +110,13 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
         Of a scan whose sensors are known; without rays nothing is said.
     """
     length_mm = np.linalg.norm(beads.end_mm - beads.start_mm, axis=1)
-    lines, length_mm = beads.some(length_mm >= LEAST_MM), length_mm[length_mm >= LEAST_MM]
+    lines, length_mm = (
+        beads.some(length_mm >= LEAST_STRETCH_MM),
+        length_mm[length_mm >= LEAST_STRETCH_MM],
+    )
     if not evidence.has_rays or not len(length_mm):
         return lines.some(np.zeros(len(length_mm), dtype=bool))
-    count = np.ceil(length_mm / STEP_MM).astype(np.int64)
+    count = np.ceil(length_mm / LOOK_STEP_MM).astype(np.int64)
     line = np.repeat(np.arange(len(count)), count)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     share = (np.arange(len(line)) - first[line] + 0.5) / count[line]
@@ -143,15 +146,17 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     gone = sure | (both >= GONE_BY_BOTH)
     sure |= both >= SURE_BY_BOTH
     step_mm = length_mm / count
-    found = _stretches(lines, line, share, gone, sure, step_mm, np.full(len(step_mm), LEAST_MM))
+    found = _stretches(
+        lines, line, share, gone, sure, step_mm, np.full(len(step_mm), LEAST_STRETCH_MM)
+    )
     if not len(found.width_mm):
         return found
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
-    again = (np.abs(high_mm[:, None] - slipped_mm) < SAME_LAYER_MM).any(axis=1)
+    again = (np.abs(high_mm[:, None] - slipped_mm) < SAME_LINE_LAYER_MM).any(axis=1)
     likely = again[line] & (both >= GONE_AGAIN)
     sure |= likely & (surface_says > 0)
-    least_mm = np.where(again, LEAST_AGAIN_MM, LEAST_MM)
+    least_mm = np.where(again, LEAST_AGAIN_MM, LEAST_STRETCH_MM)
     return _stretches(lines, line, share, gone | likely, sure, step_mm, least_mm)
 
 
@@ -178,7 +183,7 @@ def _wall_shift(
         return shift
     outward = template.distance_and_gradient(s.place_mm[which])[1]
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    wall = np.abs(outward[:, 2]) < UPRIGHT
+    wall = np.abs(outward[:, 2]) < UPRIGHT_WALL
     which, outward = which[wall], outward[wall, :2]
     if not len(which):
         return shift
@@ -212,15 +217,15 @@ def _topped(
 def _together(
     value: Float[np.ndarray, " m"], line: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, " m"]:
-    """(m,) the best mean of `LOOKS` neighbours on one line that each belongs to."""
+    """(m,) the best mean of `LOOKS_TOGETHER` neighbours on one line that each belongs to."""
     m = len(value)
     whole = np.full(m, -np.inf)
-    if m < LOOKS:
+    if m < LOOKS_TOGETHER:
         return whole
     total = np.concatenate([[0.0], np.cumsum(value)])
-    mean = (total[LOOKS:] - total[:-LOOKS]) / LOOKS
-    mean[line[LOOKS - 1 :] != line[: m - LOOKS + 1]] = -np.inf
-    for k in range(LOOKS):
+    mean = (total[LOOKS_TOGETHER:] - total[:-LOOKS_TOGETHER]) / LOOKS_TOGETHER
+    mean[line[LOOKS_TOGETHER - 1 :] != line[: m - LOOKS_TOGETHER + 1]] = -np.inf
+    for k in range(LOOKS_TOGETHER):
         np.maximum(whole[k : k + len(mean)], mean, out=whole[k : k + len(mean)])
     return np.where(value > 0, whole, -np.inf)  # an end that is there does not belong to it
 

@@ -20,7 +20,7 @@ from amrepair.template.port import Template
 LONG_MM, WIDE_MM, TALL_MM = 2.5, 0.4, 1.5
 WAYS = 16
 # Lower ridges are a process's own: seams, the last lines of a fill.
-LEAST_MM = 0.3
+LEAST_RIDGE_MM = 0.3
 # Of the points that a strip has on a surface: what was left over of noise lies scattered.
 SEEN = 0.5
 
@@ -55,7 +55,7 @@ def on_strands(
     over_mm, way = kernels.best_strips(
         places, np.stack([outward, *ways_across(outward)]), cells,
         surfels.deviation_mm, surfels.count, reach, WAYS,
-        np.array([systematic_mm, noise_mm, LEAST_MM, enough]),
+        np.array([systematic_mm, noise_mm, LEAST_RIDGE_MM, enough]),
     )  # fmt: skip
     # as all cells of a window are part of a region, all of a strip that `maybe` belong to it are
     found = over_mm > 0

@@ -41,5 +41,5 @@ class RepairOptions:
     same_repair_ratio: float = 0.8
 
 
-REPAIR = RepairOptions()
+USUAL_REPAIR = RepairOptions()
 """What the loop and the command line go by."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from amrepair.align.registration import Registration
 from amrepair.deficit import Deficit
 from amrepair.frames import Transform
-from amrepair.policy import POLICY, PolicyOptions, worth
+from amrepair.policy import USUAL_POLICY, PolicyOptions, worth
 from amrepair.regions import AnomalyMap, Region
 from amrepair.scans import Scan
 from gcode.check import CheckedProgram
@@ -51,7 +51,7 @@ class RepairPlan:
     build_from_scan: Transform
     layer_height_mm: float
     scan: Scan
-    policy: PolicyOptions = POLICY
+    policy: PolicyOptions = USUAL_POLICY
     patch: PatchPlan | None = None
     checked: CheckedProgram | None = None
     estimate: Estimate | None = None

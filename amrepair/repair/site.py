@@ -11,11 +11,11 @@ from jaxtyping import Float
 from amrepair.align.registration import Registration
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
-from amrepair.policy import POLICY, PolicyOptions
+from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.regions import AnomalyMap, detect
 from amrepair.regions.calibration import Calibration
 from amrepair.regions.skipped import PlannedBeads
-from amrepair.repair.options import REPAIR, RepairOptions
+from amrepair.repair.options import USUAL_REPAIR, RepairOptions
 from amrepair.scans import Scan
 from amrepair.template.laid import LaidBeads
 from amrepair.template.port import Template
@@ -100,8 +100,8 @@ class Site:
     beside: HeightField | None = None
     laid: LaidBeads | None = None
     detector: Detector = detect
-    options: RepairOptions = REPAIR
-    policy: PolicyOptions = POLICY
+    options: RepairOptions = USUAL_REPAIR
+    policy: PolicyOptions = USUAL_POLICY
 
     @classmethod
     def of_part(

@@ -18,8 +18,8 @@ from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
 from amrepair.loop.findings import reach_of
 from amrepair.loop.learning import to_json
-from amrepair.observe.background import BED_BAND_MM
-from amrepair.policy.table import FINDINGS, STOPS
+from amrepair.observe.background import BACKGROUND_BAND_MM
+from amrepair.policy.table import FINDINGS, STOP_ROWS
 from amrepair.regions import Label
 from amrepair.repair import RepairPlan
 from amrepair.report.data import (
@@ -280,7 +280,7 @@ def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
     foot_mm = (
         float(anomaly.template_points_mm[:, 2].min()) if len(anomaly.template_points_mm) else 0
     )
-    flat = plan.scan.points_mm[:, 2] < foot_mm + BED_BAND_MM
+    flat = plan.scan.points_mm[:, 2] < foot_mm + BACKGROUND_BAND_MM
     outside = anomaly.deviation_mm > anomaly.threshold_mm
     far = anomaly.deviation_mm > STRAY_LIMITS * anomaly.threshold_mm
     return ~(((flat & outside) | far) & (anomaly.label == int(Label.OK)))
@@ -328,7 +328,9 @@ def decision_of(look: LoopLook) -> Decision:
         reasons.append(f"The nozzle cannot reach {quantity(plan.unreachable_mm3, 'mm³')}.")
     where = f"{look_label(look)}, z = {look.stop.z_mm:.2f} mm"
     rows = {decided.row, *(verdict.row for verdict in decided.verdicts)}
-    return Decision(where, choice, tuple(reasons), tuple(r for r in _RULES if r.id in rows))
+    return Decision(
+        where, choice, tuple(reasons), tuple(r for r in _REPORTED_RULES if r.id in rows)
+    )
 
 
 def look_label(look: LoopLook) -> str:
@@ -338,13 +340,13 @@ def look_label(look: LoopLook) -> str:
     return f"{where}, scan {look.number}"
 
 
-_RULES = tuple(
+_REPORTED_RULES = tuple(
     Rule(
         row.id,
         ", ".join(map(str, row.when)) or "in any other case",
         f"{row.action}: {row.reason}",
     )
-    for row in (*STOPS, *FINDINGS)
+    for row in (*STOP_ROWS, *FINDINGS)
 )
 
 

@@ -16,7 +16,7 @@ from amrepair.report.tables import escape
 from gcode.whole import put_in_place
 
 # The browser itself refuses every request, whatever a library may try.
-POLICY = (
+REPORT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data: blob:; font-src data:; form-action 'none'; base-uri 'none'"
 )
@@ -27,7 +27,7 @@ def render_report(data: ReportData) -> str:
     values = json.dumps(payload(data), separators=(",", ":"), allow_nan=False, sort_keys=True)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        f'<meta http-equiv="Content-Security-Policy" content="{REPORT_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
         f"<title>{escape(data.title)} · repair report</title>"

@@ -21,7 +21,7 @@ SIMPLIFY_START_MM = 0.01
 SIMPLIFY_STEPS = 7
 # Sharper than this is an edge of the part, not the facet of a cylinder.
 FEATURE_ANGLE_RAD = np.deg2rad(28.0)
-NORMAL_NEIGHBOURS = 10
+SHADING_NEIGHBOURS = 10
 SHADE_LEVELS = 16
 # Head-high light from where the first view looks, as drawings have it.
 LIGHT = np.array([0.42, 0.54, 0.73])
@@ -105,10 +105,10 @@ def shading(
     side
         Signs of X and Y of the corner that the light stands at.
     """
-    if len(points_mm) < NORMAL_NEIGHBOURS:
+    if len(points_mm) < SHADING_NEIGHBOURS:
         return np.full(len(points_mm), SHADE_LEVELS - 1)
     if normals is None:
-        neighbours = cKDTree(points_mm).query(points_mm, k=NORMAL_NEIGHBOURS)[1]
+        neighbours = cKDTree(points_mm).query(points_mm, k=SHADING_NEIGHBOURS)[1]
         around = points_mm[neighbours] - points_mm[neighbours].mean(axis=1, keepdims=True)
         axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
         # which side is out is not known, so the two sides of a face must look the same

@@ -24,13 +24,13 @@ from gcode.progress import Progress
 from gcode.reader import Job
 
 # Blue is missing, grey agrees, orange is too much: as in the report, safe for the colour-blind.
-STOPS = np.array(
+COLOUR_STOPS = np.array(
     [[8, 64, 129], [33, 113, 181], [94, 160, 211], [203, 207, 210], [240, 160, 92], [214, 92, 16],
      [133, 45, 2]], dtype=np.float64,
 )  # fmt: skip
-MISSING, EXCESS, BEADS = (10, 98, 180), (207, 82, 0), (18, 144, 111)
-PART, JOB = (125, 139, 152), (176, 186, 194)
-MOST_POINTS = 300_000
+MISSING_RGB, EXCESS_RGB, BEADS = (10, 98, 180), (207, 82, 0), (18, 144, 111)
+PART_RGB, JOB_RGB = (125, 139, 152), (176, 186, 194)
+MOST_SHOWN_POINTS = 300_000
 MOST_SEGMENTS = 400_000
 JOB_STEPS = 60  # how many pieces the growing part is shown in
 POINT_MM, BEAD_MM = 0.25, 0.35
@@ -38,9 +38,11 @@ POINT_MM, BEAD_MM = 0.25, 0.35
 
 def deviation_colours(deviation_mm: Float[np.ndarray, " n"], range_mm: float) -> np.ndarray:
     """(n, 3) 0…255 colours of signed deviations, −range…range."""
-    at = (np.clip(deviation_mm / max(range_mm, 1e-9), -1.0, 1.0) + 1.0) / 2 * (len(STOPS) - 1)
-    steps = np.arange(len(STOPS))
-    channels = [np.interp(at, steps, STOPS[:, c]) for c in range(3)]
+    at = (
+        (np.clip(deviation_mm / max(range_mm, 1e-9), -1.0, 1.0) + 1.0) / 2 * (len(COLOUR_STOPS) - 1)
+    )
+    steps = np.arange(len(COLOUR_STOPS))
+    channels = [np.interp(at, steps, COLOUR_STOPS[:, c]) for c in range(3)]
     return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
 
 
@@ -180,7 +182,7 @@ class LiveView:
     ) -> None:
         """Draw points, coloured by deviation where it is known; many are thinned."""
         self._look_at(points_mm)
-        step = max(1, -(-len(points_mm) // MOST_POINTS))
+        step = max(1, -(-len(points_mm) // MOST_SHOWN_POINTS))
         colours: Any = (140, 146, 152)
         if deviation_mm is not None:
             colours = deviation_colours(np.asarray(deviation_mm[::step]), range_mm)
@@ -229,7 +231,7 @@ class LiveView:
         real = np.flatnonzero(beads.layer >= 0)
         for k, part in enumerate(np.array_split(real, min(JOB_STEPS, len(real)))):
             handle = self.show_segments(
-                f"{name}/{k}", beads.start_mm[part], beads.end_mm[part], JOB
+                f"{name}/{k}", beads.start_mm[part], beads.end_mm[part], JOB_RGB
             )
             handle.visible = grown
             self._job_steps.append((int(beads.line[part[-1]]), handle))
@@ -280,8 +282,8 @@ class LiveView:
             np.asarray(anomaly.deviation_mm[near]),
             range_mm=4 * anomaly.threshold_mm,
         )
-        self.show_solid("missing", plan.deficit.missing, MISSING, opacity=0.6)
-        self.show_solid("too much", plan.deficit.excess, EXCESS)
+        self.show_solid("missing", plan.deficit.missing, MISSING_RGB, opacity=0.6)
+        self.show_solid("too much", plan.deficit.excess, EXCESS_RGB)
         if plan.patch is not None:
             self.show_toolpath("repair", plan.patch.toolpath)
         else:

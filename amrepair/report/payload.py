@@ -28,8 +28,8 @@ CELLS_TOTAL = 400_000
 SAMPLES_PER_SERIES = 2_000
 LOOKS_DRAWN = 12
 HISTOGRAM_BINS = 80
-ASIDE_RATIO = 0.15  # of the part's side: a defect so far off its middle is seen from there
-OK, MISSING, EXCESS = 0, 1, 2
+VIEW_ASIDE_RATIO = 0.15  # of the part's side: a defect so far off its middle is seen from there
+AGREES_LABEL, MISSING_LABEL, EXCESS_LABEL = 0, 1, 2
 
 Json = dict[str, object]
 
@@ -102,7 +102,7 @@ def facing(data: ReportData, drawn: tuple[int, ...], box_mm: np.ndarray) -> tupl
     if defect is None or len(defect.vertices_mm) == 0:
         return -1, -1
     away = defect.vertices_mm.mean(axis=0) - box_mm.mean(axis=0)
-    x, y = (1 if away[axis] > ASIDE_RATIO * np.ptp(box_mm[:, axis]) else -1 for axis in (0, 1))
+    x, y = (1 if away[axis] > VIEW_ASIDE_RATIO * np.ptp(box_mm[:, axis]) else -1 for axis in (0, 1))
     return x, y
 
 
@@ -139,9 +139,9 @@ def colour_scales(data: ReportData) -> list[float]:
     """Three half-ranges for the colours, mm: close to the threshold, usual, everything."""
     threshold_mm = max((look.threshold_mm for look in data.looks), default=0.1) or 0.1
     flagged = [
-        np.abs(look.deviation_mm[look.label_of_point != OK])
+        np.abs(look.deviation_mm[look.label_of_point != AGREES_LABEL])
         for look in data.looks
-        if (look.label_of_point != OK).any()
+        if (look.label_of_point != AGREES_LABEL).any()
     ]
     largest = max((float(part.max()) for part in flagged), default=2 * threshold_mm)
     usual = float(np.quantile(np.concatenate(flagged), 0.9)) if flagged else 2 * threshold_mm
@@ -163,7 +163,7 @@ def nice_ceiling(value: float) -> float:
 
 def _look(look: Look, index: int, share: int, scale_mm: float, side: tuple[int, int]) -> Json:
     budget = min(POINTS_PER_LOOK, POINTS_TOTAL // share)
-    kept = encode.thinned(look.points_mm, look.label_of_point != OK, budget=budget)
+    kept = encode.thinned(look.points_mm, look.label_of_point != AGREES_LABEL, budget=budget)
     points_mm = look.points_mm[kept]
     normals = None if look.normals is None else look.normals[kept]
     faces = FACES_TOTAL // (2 * share)
@@ -173,7 +173,7 @@ def _look(look: Look, index: int, share: int, scale_mm: float, side: tuple[int, 
         "threshold": _rounded(look.threshold_mm),
         "total": max(look.scanned_points, len(look.points_mm)),
         "shown": len(kept),
-        "flagged": int((look.label_of_point != OK).sum()),
+        "flagged": int((look.label_of_point != AGREES_LABEL).sum()),
         "points": encode.quantised(points_mm),
         "deviation": encode.quantised(look.deviation_mm[kept]),
         "shade": encode.integers(encode.shading(points_mm, normals, side)),

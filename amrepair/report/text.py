@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 # Below this a volume is less than half of the smallest bead that can be placed (0.08 mm³).
 NEGLIGIBLE_MM3 = 0.04
-UNKNOWN = "not known"
-_NAMES = {
+NOT_KNOWN = "not known"
+_DEFECT_NAMES = {
     "void": ("void", "voids"),
     "under_extrusion": ("patch of thin extrusion", "patches of thin extrusion"),
     "chip": ("chip", "chips"),
@@ -53,7 +53,7 @@ def quantity(value: float, unit: str, *, digits: int = 3) -> str:
     ('1,235 mm³', '12.3 mm³', '0.04 mm')
     """
     if not math.isfinite(value):
-        return UNKNOWN
+        return NOT_KNOWN
     magnitude = abs(value)
     decimals = 0 if magnitude >= 100 else 1 if magnitude >= 10 else 2
     decimals = min(decimals, max(digits - 1, 0))
@@ -72,7 +72,7 @@ def length(length_mm: float) -> str:
     ('36 mm', '1.24 m')
     """
     if not math.isfinite(length_mm):
-        return UNKNOWN
+        return NOT_KNOWN
     if abs(length_mm) < 1000:
         return f"{length_mm:.0f} mm" if abs(length_mm) >= 10 else quantity(length_mm, "mm")
     return quantity(length_mm / 1000, "m")
@@ -87,7 +87,7 @@ def percent(ratio: float) -> str:
     ('95 %', '99.9 %', '100 %')
     """
     if not math.isfinite(ratio):
-        return UNKNOWN
+        return NOT_KNOWN
     if ratio <= 0 or ratio >= 1:
         return f"{100 * ratio:.0f} %"
     if ratio >= 0.99 or ratio < 0.01:
@@ -104,7 +104,7 @@ def duration(seconds: float) -> str:
     ('1 h 05 min', '6 min 40 s', '12 s', '0.8 s')
     """
     if not math.isfinite(seconds):
-        return UNKNOWN
+        return NOT_KNOWN
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)
@@ -124,7 +124,7 @@ def kind_name(name: str) -> str:
     >>> kind_name("under_extrusion"), kind_name("scratch_mark")
     ('patch of thin extrusion', 'scratch mark')
     """
-    return _NAMES.get(name, (name.replace("_", " "),))[0]
+    return _DEFECT_NAMES.get(name, (name.replace("_", " "),))[0]
 
 
 def kinds(regions: Sequence[RegionRow]) -> str:
@@ -132,7 +132,7 @@ def kinds(regions: Sequence[RegionRow]) -> str:
     tally = Tally(region.type for region in regions)
     parts = []
     for name, count in tally.items():
-        one, many = _NAMES.get(name, (kind_name(name), kind_name(name) + "s"))
+        one, many = _DEFECT_NAMES.get(name, (kind_name(name), kind_name(name) + "s"))
         parts.append(f"{_article(one)} {one}" if count == 1 else f"{count} {many}")
     if len(parts) < 2:
         return "".join(parts)

@@ -22,7 +22,7 @@ from amrepair.scans.scanner import ScanRequest
 
 _log = logging.getLogger(__name__)
 
-SUFFIXES = POINT_SUFFIXES | MESH_SUFFIXES | HEIGHT_SUFFIXES
+SCAN_SUFFIXES = POINT_SUFFIXES | MESH_SUFFIXES | HEIGHT_SUFFIXES
 LAYER_IN_NAME = re.compile(r"layer[-_ ]?(\d+)", re.IGNORECASE)
 
 
@@ -152,7 +152,9 @@ class WatchedFolderScanner:
         return sorted(
             p
             for p in self._folder.iterdir()
-            if p.suffix.lower() in SUFFIXES and not p.name.startswith((".", "~")) and p.is_file()
+            if p.suffix.lower() in SCAN_SUFFIXES
+            and not p.name.startswith((".", "~"))
+            and p.is_file()
         )
 
     def _settled(self) -> list[Path]:

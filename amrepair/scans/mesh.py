@@ -14,7 +14,7 @@ from amrepair.scans.sizes import PARSER_ERRORS, UnpackLimit, in_words, length_of
 MESH_SPACING_MM = 0.2
 MAX_MESH_SAMPLES = 2_000_000
 # Where a declaration of types stands: before the first element. 3MF forbids them (core, 2.3).
-PROLOGUE_BYTES = 65536
+DECLARED_BYTES = 65536
 
 
 def read_mesh(path: Path, frame: str, sigma_mm: float, *, unit_mm: float = 1.0) -> Scan:
@@ -57,7 +57,7 @@ def _refuse_3mf(path: Path) -> None:
             for info in infos:
                 if info.filename.lower().endswith((".model", ".rels", ".xml")):
                     with archive.open(info) as file:
-                        head = file.read(PROLOGUE_BYTES)
+                        head = file.read(DECLARED_BYTES)
                     if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
                         raise InputError(
                             f"{path}: {info.filename} declares types or entities, which 3MF "

@@ -21,7 +21,7 @@ from amrepair.scans.lzf_kernels import lzf_decompress
 from amrepair.scans.sizes import UnpackLimit, refuse_short
 from amrepair.scans.text import filled, read_table
 
-KINDS = {"F": "f", "I": "i", "U": "u"}
+NUMBER_KINDS = {"F": "f", "I": "i", "U": "u"}
 HEADER_BYTES = 65536
 # A back reference of LZF: three bytes give at most 264.
 LZF_MOST = UnpackLimit(least_bytes=1024, ratio=88.0)
@@ -149,7 +149,7 @@ def _layout(
     dtype = np.dtype(
         {
             "names": [fields[k] for k in one],
-            "formats": [f"<{KINDS[kinds[k]]}{sizes[k]}" for k in one],
+            "formats": [f"<{NUMBER_KINDS[kinds[k]]}{sizes[k]}" for k in one],
             "offsets": [starts[k] for k in one],
             "itemsize": starts[-1],
         }

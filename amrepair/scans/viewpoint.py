@@ -22,7 +22,7 @@ from amrepair.scans import range_grid_kernels as kernels
 from amrepair.scans.range_grid import EdgeOptions, Kind, RangeGrid, depths_of
 
 # A sensor at infinity stands this far away: its rays over a bed are parallel to a micrometre.
-FAR_MM = 10_000.0
+INFINITY_MM = 10_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +276,7 @@ def straight_from(
     middle = points_mm.mean(axis=0)
     depth_mm = float(np.ptp(points_mm @ towards))
     wide_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
-    far_mm = max(FAR_MM, wide_mm * depth_mm / pixel_mm)
+    far_mm = max(INFINITY_MM, wide_mm * depth_mm / pixel_mm)
     sensor = middle + towards * far_mm
     return Viewpoint("orthographic", sensor[None], np.zeros(len(points_mm), np.int64))
 

@@ -16,15 +16,15 @@ import numpy as np
 from gcode.compiled import njit
 
 TOUCH_MM = 1e-9  # intervals this close are one: far below any layer, far above float64 rounding
-FRESH, FREE = 0, 1  # entries of `meta`
+FRESH, FREE_ENTRY = 0, 1  # entries of `meta`
 
 
 @njit(cache=True, nogil=True, inline="never")
 def allocate(pool, pool_next, meta, lo, hi, following):
     """Take a pool node for (lo, hi); the caller has made sure that there is room."""
-    node = meta[FREE]
+    node = meta[FREE_ENTRY]
     if node != 0:
-        meta[FREE] = pool_next[node]
+        meta[FREE_ENTRY] = pool_next[node]
     else:
         node = meta[FRESH]
         meta[FRESH] = node + 1
@@ -38,8 +38,8 @@ def allocate(pool, pool_next, meta, lo, hi, following):
 def release(pool_next, meta, node):
     """Give a pool node back; returns what followed it."""
     following = pool_next[node]
-    pool_next[node] = meta[FREE]
-    meta[FREE] = node
+    pool_next[node] = meta[FREE_ENTRY]
+    meta[FREE_ENTRY] = node
     return following
 
 

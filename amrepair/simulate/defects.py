@@ -1,8 +1,8 @@
 """Kinds of defects of the simulated world: one table of what each is told and where it goes.
 
 A defect is text (`void:diameter=8,layers=4`) until `place` finds room for it on a part; then it is
-a `PlacedDefect` that the world can act out. A new kind is a row of `KINDS`. Nothing here looks at
-scans.
+a `PlacedDefect` that the world can act out. A new kind is a row of `DEFECT_KINDS`. Nothing here
+looks at scans.
 """
 
 from __future__ import annotations
@@ -20,9 +20,18 @@ from amrepair.simulate import placement
 from amrepair.simulate.placed import Defect, Option, PlacedDefect, Printed
 from gcode.reader.job import Beads
 
-__all__ = ["KINDS", "Defect", "Kind", "Option", "PlacedDefect", "Printed", "parse_defect", "place"]
+__all__ = [
+    "DEFECT_KINDS",
+    "Defect",
+    "Kind",
+    "Option",
+    "PlacedDefect",
+    "Printed",
+    "parse_defect",
+    "place",
+]
 
-_SHRINK = tuple(0.85**k for k in range(9))  # down to a quarter of the size asked for
+_SMALLER = tuple(0.85**k for k in range(9))  # down to a quarter of the size asked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +53,7 @@ class Kind:
 
 
 # A void of default size is some 50 mm³; a chip or blob a few dozen.
-KINDS: dict[str, Kind] = {
+DEFECT_KINDS: dict[str, Kind] = {
     "void": Kind(
         {
             "diameter": Option(10.0, 2.0, 40.0, "mm across"),
@@ -100,9 +109,9 @@ def parse_defect(text: str) -> Defect:
         If type, key or value is not one that there is.
     """
     kind, _, tail = text.strip().partition(":")
-    if kind not in KINDS:
-        raise InputError(f"there is no defect type {kind!r}; there are {', '.join(KINDS)}")
-    options = KINDS[kind].options
+    if kind not in DEFECT_KINDS:
+        raise InputError(f"there is no defect type {kind!r}; there are {', '.join(DEFECT_KINDS)}")
+    options = DEFECT_KINDS[kind].options
     values = {key: option.default for key, option in options.items()}
     for item in filter(None, (part.strip() for part in tail.split(","))):
         key, equals, word = (piece.strip() for piece in item.partition("="))
@@ -152,13 +161,13 @@ def place(
         If the part has no room for it, even at a quarter of its size.
     """
     printed = Printed(part, np.asarray(tops_mm), beads)
-    for scale in _SHRINK:
-        placed = KINDS[defect.kind].place(defect, printed, rng, scale)
+    for scale in _SMALLER:
+        placed = DEFECT_KINDS[defect.kind].place(defect, printed, rng, scale)
         if placed is not None:
             return placed
     box = part.bounding_box()
     raise InputError(
         f"the part of {box[3] - box[0]:.1f}×{box[4] - box[1]:.1f}×{box[5] - box[2]:.1f} mm has no "
-        f"room for the defect {defect}, even at {_SHRINK[-1]:.0%} of its size; "
+        f"room for the defect {defect}, even at {_SMALLER[-1]:.0%} of its size; "
         "ask for a smaller one"
     )

@@ -48,18 +48,18 @@ CARRY, LAST_X, LAST_Y, LAST_Z, LOST, LAST_T = 0, 1, 2, 3, 4, 5
 HELD, RUN_DONE, RUN_LENGTH, RUN_KIND = 6, 7, 8, 9
 LAST_GAP = 10  # how deep below the nozzle the last strand reached
 LAID_Z, LAYER = 11, 12  # height of the layer that is being laid, and its number
-FREE = 13  # how far from its axis a strand spreads without pressure, columns
+FREE_SPREAD = 13  # how far from its axis a strand spreads without pressure, columns
 STATE_SIZE = 14
 NEW_LAYER_MM = 0.03  # strands that differ by less in height are of one layer
 # Additive recurrence of the plastic number: the 2-D low-discrepancy sequence R2 (M. Roberts, 2018)
 R2_X, R2_Y = 0.7548776662466927, 0.5698402909980532
-LEAST_MM = 1e-9  # mm of column: less than this waits for the next step
+LEAST_COLUMN_MM = 1e-9  # mm of column: less than this waits for the next step
 RIDGE_STEP_MM = 0.05  # a ridge grows evenly, by this much at a time
 MOST_RIDGE_STEPS = 4000
 # A void lower than this is filled: fewer voids, and the top sinks by no more than this over one.
 LEAST_VOID_MM = 0.03
 MENISCUS = np.pi / 8  # mean depth of half a circle over a groove, in groove widths
-LEAST_RIDGE_MM = 0.005  # what stands less above the nozzle is not planed off
+LEAST_SPILL_MM = 0.005  # what stands less above the nozzle is not planed off
 FREE_COLUMNS = 0.5  # a column that the strand's edge crosses is its own
 NARROWEST_BORES = 0.45  # half width: with less plastic a strand is lower, not narrower
 BESIDE_COLUMNS = 1.5  # from a column at a strand's edge to what lies beside the strand
@@ -120,7 +120,7 @@ def floor_under(
     """Where plastic coming from height z begins to stack: on what lies below, or hanging."""
     surface = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
     underside = z - bead.thickness
-    if z - surface > bead.gap_limit + LEAST_MM:
+    if z - surface > bead.gap_limit + LEAST_COLUMN_MM:
         surface = underside
     elif underside - surface > LEAST_VOID_MM:
         across = groove_columns(
@@ -181,7 +181,7 @@ def planed(hi, lo, near, row, count, cx, cy, z, most):
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
         over = hi[iy, ix] - z
-        if LEAST_RIDGE_MM < over <= most and lo[iy, ix] < z:
+        if LEAST_SPILL_MM < over <= most and lo[iy, ix] < z:
             hi[iy, ix] = z
             taken += over
     return taken
@@ -192,7 +192,7 @@ def pressed(hi, lo, nxt, pool, pool_next, meta, near, row, count, cx, cy, z, amo
     """Press plastic into the voids right under what was just laid; returns what finds no room."""
     ny, nx = hi.shape
     for k in range(count):
-        if amount <= LEAST_MM:
+        if amount <= LEAST_COLUMN_MM:
             break
         iy, ix = cy + near[row, k, 0], cx + near[row, k, 1]
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
@@ -201,14 +201,14 @@ def pressed(hi, lo, nxt, pool, pool_next, meta, near, row, count, cx, cy, z, amo
         if (
             roof <= 0.0
             or roof >= z
-            or hi[iy, ix] < z - LEAST_MM
+            or hi[iy, ix] < z - LEAST_COLUMN_MM
             or z - roof > OPEN_LAYERS * thickness
         ):
             continue
         node = nxt[iy, ix]
         floor = pool[node, 1] if node != 0 else 0.0
         deep = roof - floor
-        if deep <= LEAST_MM or deep > thickness:
+        if deep <= LEAST_COLUMN_MM or deep > thickness:
             continue
         fill = min(amount, deep)
         insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, floor, floor + fill)
@@ -310,7 +310,7 @@ def lay(world, head, bead, room, state, x, y, z, amount, flush):
     wide = False
     for k in range(bore, spread):
         iy, ix = cy + near[phase, k, 0], cx + near[phase, k, 1]
-        if not wide and (k >= reach or np.hypot(ix + 0.5 - gx, iy + 0.5 - gy) > state[FREE]):
+        if not wide and (k >= reach or np.hypot(ix + 0.5 - gx, iy + 0.5 - gy) > state[FREE_SPREAD]):
             wide = True  # the strand is as wide as it is meant to be: more takes pressure
             if flush or amount > PRESSED_SHARE * carry_limit:
                 amount = pressed(
@@ -329,7 +329,7 @@ def lay(world, head, bead, room, state, x, y, z, amount, flush):
                     amount,
                     bead.thickness,
                 )
-        if amount <= LEAST_MM or (k == reach and not flush and amount <= carry_limit):
+        if amount <= LEAST_COLUMN_MM or (k == reach and not flush and amount <= carry_limit):
             break
         if iy < 0 or ix < 0 or iy >= ny or ix >= nx:
             continue
@@ -347,7 +347,7 @@ def lay(world, head, bead, room, state, x, y, z, amount, flush):
             )
             amount -= level - bottom
     ridge = 0
-    while amount > LEAST_MM and (flush or amount > carry_limit) and ridge < MOST_RIDGE_STEPS:
+    while amount > LEAST_COLUMN_MM and (flush or amount > carry_limit) and ridge < MOST_RIDGE_STEPS:
         ridge += 1
         top = z + ridge * RIDGE_STEP_MM
         for k in range(flat, spread):
@@ -374,7 +374,7 @@ def lay(world, head, bead, room, state, x, y, z, amount, flush):
                     level,
                 )
                 amount -= level - bottom
-                if amount <= LEAST_MM:
+                if amount <= LEAST_COLUMN_MM:
                     break
         flush = True
     state[CARRY] = max(amount, 0.0)
@@ -476,12 +476,12 @@ def deposit(world, head, path, window, state):
         dx, dy, dz = end[s, 0] - start[s, 0], end[s, 1] - start[s, 1], end[s, 2] - start[s, 2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if volume[s] > 0.0:
-            half = 0.5 * volume[s] / max(length * thickness[s], LEAST_MM)
+            half = 0.5 * volume[s] / max(length * thickness[s], LEAST_COLUMN_MM)
             half = max(half, least_half)
-            state[FREE] = half / cell + FREE_COLUMNS
-            flat = max(np.sqrt(dx * dx + dy * dy), LEAST_MM)
+            state[FREE_SPREAD] = half / cell + FREE_COLUMNS
+            flat = max(np.sqrt(dx * dx + dy * dy), LEAST_COLUMN_MM)
             axis[2], axis[3] = -dy / flat, dx / flat
-            axis[4] = half / cell if flat > LEAST_MM else np.inf
+            axis[4] = half / cell if flat > LEAST_COLUMN_MM else np.inf
             steps = max(1, int(np.ceil(length / head.step_mm)))
             share = volume[s] / steps
             seed = np.abs(np.sin(12.9898 * start[s, 0] + 78.233 * start[s, 1]) * 43758.5453)

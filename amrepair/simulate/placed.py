@@ -29,7 +29,7 @@ class Defect:
     Attributes
     ----------
     kind
-        What goes wrong: a name in `defects.KINDS`.
+        What goes wrong: a name in `defects.DEFECT_KINDS`.
     values
         Every option of that kind, defaults filled in.
     """

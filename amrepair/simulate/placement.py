@@ -14,8 +14,8 @@ from amrepair.simulate.placed import Defect, PlacedDefect, Printed
 from gcode.reader.job import Beads
 
 _LEAST_ROOM_MM2 = 0.02
-_TRIES = 60
-_CRUMB_MM3 = 0.05  # too small to be found, let alone printed
+_PLACE_TRIES = 60
+_LEAST_PIECE_MM3 = 0.05  # too small to be found, let alone printed
 _EVERYWHERE_MM = 1e9
 EVEN_RATIO = 0.97
 # Skipped lines: shorter ones are pieces of curves. Flow stops on the centre line and no wider.
@@ -36,7 +36,7 @@ def _layer_ranges(
         return [range(max(0, asked - count + 1), asked + 1)]
     first_last = min(count + 1, len(tops_mm) - 1)  # the first two layers hold the part: not there
     lasts = rng.permutation(np.arange(first_last, max(first_last + 1, len(tops_mm) - 1)))
-    return [range(int(last) - count + 1, int(last) + 1) for last in lasts[:_TRIES]]
+    return [range(int(last) - count + 1, int(last) + 1) for last in lasts[:_PLACE_TRIES]]
 
 
 def _z_range(layers: range, tops_mm: Float[np.ndarray, " n"]) -> tuple[float, float]:
@@ -258,7 +258,7 @@ def chip(
     ends = np.concatenate([np.roll(o, -1, axis=0) for o in outlines])
     weight = np.concatenate(lengths)
     whole = len(part.decompose())  # parts of several bodies, or with closed cavities
-    for _ in range(_TRIES):
+    for _ in range(_PLACE_TRIES):
         pick = int(rng.choice(len(starts), p=weight / weight.sum()))
         on_edge = starts[pick] + rng.random() * (ends[pick] - starts[pick])
         centre = np.array([*on_edge, height_mm])
@@ -270,7 +270,7 @@ def chip(
             continue
         pieces = (part - bite).decompose()
         # A piece that falls off with the bite would lie loose on the bed: that is no chip.
-        if sum(abs(piece.volume()) > _CRUMB_MM3 for piece in pieces) > whole:
+        if sum(abs(piece.volume()) > _LEAST_PIECE_MM3 for piece in pieces) > whole:
             continue
         box = np.array(broken.bounding_box()).reshape(2, 3)
         grow_mm = np.array([0.5, 0.5, 0.5])  # the print stands a little off the CAD

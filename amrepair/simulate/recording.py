@@ -23,9 +23,9 @@ from scipy.spatial import cKDTree
 
 from amrepair.errors import InputError
 
-VERSION = 1
+RECORDING_VERSION = 1
 FARTHEST_MM = 5.0  # a residual beyond is another surface's point, or none
-STEEPEST = np.tan(np.deg2rad(80.0))  # depth that changes faster than this is an edge
+STEEPEST_DEPTH = np.tan(np.deg2rad(80.0))  # depth that changes faster than this is an edge
 SIGMA_OF_MAD = 1.4826  # normal distribution
 CLIP_SIGMAS = 3.0  # pairs are compared within: a few points far off would say all
 LAGS_MM = 12.0  # how far apart pairs are compared
@@ -171,7 +171,7 @@ def edge_distance_mm(
     depth[at[:, 0], at[:, 1]] = depth_mm
     edge = ~np.isfinite(depth)
     for axis in range(2):
-        step = np.abs(np.diff(depth, axis=axis)) > STEEPEST * cell_mm
+        step = np.abs(np.diff(depth, axis=axis)) > STEEPEST_DEPTH * cell_mm
         before = [slice(None)] * 2
         after = [slice(None)] * 2
         before[axis], after[axis] = slice(None, -1), slice(1, None)
@@ -263,7 +263,7 @@ def save_recording(recording: Recording, path: Path) -> None:
     with path.open("wb") as file:
         np.savez_compressed(
             file,
-            version=np.array(VERSION),
+            version=np.array(RECORDING_VERSION),
             pitch_mm=np.array(recording.pitch_mm),
             residual_mm=recording.residual_mm.astype(np.float32),
             cosine=recording.cosine.astype(np.float32),
@@ -296,8 +296,8 @@ def load_recording(path: Path) -> Recording:
     if lacking:
         raise InputError(f"{path} is no recording of a scanner: it lacks {lacking[0]}; {_HOW}")
     version = content["version"]
-    if version.shape != () or version.dtype.kind not in "iu" or int(version) != VERSION:
-        raise InputError(f"{path}: recording of version {version}, not {VERSION}; {_HOW}")
+    if version.shape != () or version.dtype.kind not in "iu" or int(version) != RECORDING_VERSION:
+        raise InputError(f"{path}: recording of version {version}, not {RECORDING_VERSION}; {_HOW}")
     wrong = _wrong(content)
     if wrong:
         raise InputError(f"{path}: the recording's {wrong}; {_HOW}")

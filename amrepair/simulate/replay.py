@@ -18,12 +18,12 @@ from scipy import ndimage
 from amrepair.simulate.recording import Recording, edge_distance_mm
 
 BLOCK_MM = 12.0  # no piece is smaller: errors of the first recordings hang together over 6 mm
-EDGE_MM = 1.5  # so near to an edge a surface is measured with part of a spot
+SPOT_EDGE_MM = 1.5  # so near to an edge a surface is measured with part of a spot
 SIMILAR_COSINE = 0.2  # 0 to 37°, or 46 to 72°
 # A block meets cells away from edges, or by an edge, if the next is so near, on average over it.
-NEAR_MM = (2.0, 4.0)
-LEAST_SHARE = 0.25  # of fewer points of a kind a block does not ask
-TRIES = 24  # the piece that covers most, of so many
+NEAR_EDGE_MM = (2.0, 4.0)
+LEAST_KIND_SHARE = 0.25  # of fewer points of a kind a block does not ask
+PIECE_TRIES = 24  # the piece that covers most, of so many
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Replay:
         self._offset_mm = recording.offset_mm
         self._residual_mm = recording.residual_mm
         known = np.isfinite(recording.residual_mm)
-        by_edge = known & (recording.edge_mm < EDGE_MM)
+        by_edge = known & (recording.edge_mm < SPOT_EDGE_MM)
         away = known & ~by_edge
         found = [_kind(recording, mask) for mask in (away, by_edge)]
         # A recording without edges says nothing about them.
@@ -126,7 +126,7 @@ class Replay:
         rng: np.random.Generator,
     ) -> Float[np.ndarray, " n"]:
         """(n,) recorded residuals for points of an image plane, by incidence and edges."""
-        by_edge = (edge_mm < EDGE_MM).astype(np.int64)
+        by_edge = (edge_mm < SPOT_EDGE_MM).astype(np.int64)
         shifted = (plane_mm - plane_mm.min(axis=0)) / BLOCK_MM + rng.random(2)
         _, block = np.unique(np.floor(shifted).astype(np.int64), axis=0, return_inverse=True)
         block = block.ravel()
@@ -147,7 +147,7 @@ class Replay:
                 _Piece(
                     _turned(rng), _like(kind, wanted.cosine[first], rng), wanted.middle_mm[first]
                 )
-                for _ in range(TRIES)
+                for _ in range(PIECE_TRIES)
             ]
             fits = [self._met(piece, wanted, todo) for piece in pieces]
             best = int(np.argmax([count[todo[fit]].sum() for fit in fits]))
@@ -169,7 +169,9 @@ class Replay:
         fits = np.ones(len(todo), dtype=bool)
         for k, kind in enumerate(self._kinds):
             share = wanted.edge_share[todo] if k else 1.0 - wanted.edge_share[todo]
-            fits &= (kind.reach_mm[view, row, column] <= NEAR_MM[k]) | (share < LEAST_SHARE)
+            fits &= (kind.reach_mm[view, row, column] <= NEAR_EDGE_MM[k]) | (
+                share < LEAST_KIND_SHARE
+            )
         cosine = self._kinds[0].cosine[view, row, column]
         return np.asarray(fits & (np.abs(cosine - wanted.cosine[todo]) <= SIMILAR_COSINE))
 

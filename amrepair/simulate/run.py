@@ -31,7 +31,7 @@ from amrepair.loop import (
 from amrepair.loop.options import UNASKED
 from amrepair.loop.probing import Felt, PortFeeler, ProbeScanner
 from amrepair.loop.sites import sites
-from amrepair.policy import POLICY, PolicyOptions
+from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.repair import Stopwatch
 from amrepair.scans import PROBE, Scanner
 from amrepair.simulate.defects import Defect, PlacedDefect, place
@@ -275,7 +275,7 @@ def simulate_run(
     run: PreparedRun,
     *,
     wire_log: Path | None = None,
-    policy: PolicyOptions = POLICY,
+    policy: PolicyOptions = USUAL_POLICY,
     approval: Approval = UNASKED,
     record: Callable[[Look], None] = lambda look: None,
     begun: Callable[[Transform, Printer], Tape] = lambda pose, printer: Tape(),
@@ -301,15 +301,13 @@ def simulate_run(
         Whatever stops the loop.
     """
     watch = watch or Stopwatch()
-    printer_profile = run.setup.printer
+    profile = run.setup.printer
+    built = sites(run.job, run.template, run.build_from_template, run.setup, by_beads=run.by_beads)
     temperatures: list[tuple[float, float, float]] = []
-    with EmulatedPrinterProcess(printer_profile.dialect, printer=printer_profile) as machine:
+    with EmulatedPrinterProcess(profile.dialect, printer=profile) as machine:
         stage = set_stage(run, machine.take_motion, world=world, scanner=scanner)
         printer = connect(
-            machine.port,
-            dialect=printer_profile.dialect,
-            baud=printer_profile.baud,
-            wire_log=wire_log,
+            machine.port, dialect=profile.dialect, baud=profile.baud, wire_log=wire_log
         )
         printer.connect()
         eye, costs = _looked_at(run, stage, scanner, machine, printer, progress)
@@ -326,9 +324,7 @@ def simulate_run(
                 run.checked,
                 printer,
                 eye,
-                sites(
-                    run.job, run.template, run.build_from_template, run.setup, by_beads=run.by_beads
-                ),
+                built,
                 stops=run.stops,
                 options=LoopOptions(policy=policy, seed=run.seed),
                 approval=approval,

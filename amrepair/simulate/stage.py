@@ -26,7 +26,7 @@ from gcode.firmware.motion import MotionBatch
 from gcode.surfaces import HeightField
 
 # Beads of a repair spread, and crumble over a rim, no farther than this from the defect.
-AROUND_MM = 3.0
+REPAIR_SPREADS_MM = 3.0
 # A column lacks something where it lacks more than a bead's own roughness.
 LEAST_MISSING_MM = 0.02
 
@@ -253,7 +253,7 @@ class Stage:
         if self._design is not None:
             extra = extra.minus(self._design)
         even = _even(standing, wanted, 0.5 * self._layer_height_mm)
-        around = np.array([[-1.0], [1.0]]) * AROUND_MM
+        around = np.array([[-1.0], [1.0]]) * REPAIR_SPREADS_MM
         for wound in wounds:
             wound.filled_mm3 = sum(m.common(standing).volume_mm3 for m in wound.missing)
             added = extra.minus(wound.standing_out).clipped(wound.defect.box_mm + around)

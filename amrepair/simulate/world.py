@@ -29,7 +29,7 @@ from amrepair.simulate.truth import Difference
 from gcode.firmware.motion import MotionBatch
 from gcode.surfaces import HeightField
 
-MAX_CELL_MM = 0.15
+MAX_WORLD_CELL_MM = 0.15
 _PHASES = 8  # sub-column positions of the nozzle that have a list of neighbours of their own
 
 
@@ -69,9 +69,9 @@ class World:
         thermal: ThermalModel | None = None,
         middle_mm: tuple[float, float] | None = None,
     ) -> None:
-        if not 0.02 <= cell_mm <= MAX_CELL_MM:
+        if not 0.02 <= cell_mm <= MAX_WORLD_CELL_MM:
             raise InputError(
-                f"a world's columns must be 0.02 to {MAX_CELL_MM} mm wide, not {cell_mm} mm"
+                f"a world's columns must be 0.02 to {MAX_WORLD_CELL_MM} mm wide, not {cell_mm} mm"
             )
         self.bead = bead or BeadModel()
         self.thermal = thermal or ThermalModel()

@@ -23,7 +23,7 @@ BLOCK_CELLS = 8
 BLOCKS_AT_ONCE = 1_000  # what fits into a processor's cache
 # Learned fields are Lipschitz 1 only nearly; the band is wider by this factor.
 BAND_SAFETY = 1.25
-MAX_CELLS = 400_000_000
+MAX_EXTRACTED_CELLS = 400_000_000
 LEAST_VOXELS = 1e-3  # far below what the field is good to
 
 
@@ -98,10 +98,10 @@ def band_field(
     low_mm = bounds_mm[0] - margin_mm
     blocks = np.ceil((bounds_mm[1] + margin_mm - low_mm) / (BLOCK_CELLS * voxel_mm)).astype(int)
     shape = tuple(int(n) for n in blocks * BLOCK_CELLS)
-    if np.prod([float(n) for n in shape]) > MAX_CELLS:
+    if np.prod([float(n) for n in shape]) > MAX_EXTRACTED_CELLS:
         raise TemplateError(
             f"a voxel of {voxel_mm} mm needs {shape[0]}×{shape[1]}×{shape[2]} cells, the limit is "
-            f"{MAX_CELLS:,}; choose a larger voxel"
+            f"{MAX_EXTRACTED_CELLS:,}; choose a larger voxel"
         )
     edge_mm = BLOCK_CELLS * voxel_mm
     block_index = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), -1).reshape(-1, 3)

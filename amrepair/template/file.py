@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 FORMAT = "amrepair-template"
 FORMAT_VERSION = 3  # templates with a spread are a kind of their own
-HEAD = "amrepair"
+FILE_HEAD = "amrepair"
 
 
 def write_template(path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]) -> None:
@@ -42,7 +42,7 @@ def write_template(path: Path, arrays: dict[str, np.ndarray], head: dict[str, An
         "crc32": _crc32(arrays),
         **head,
     }
-    data = save(arrays, metadata={HEAD: json.dumps(said)})
+    data = save(arrays, metadata={FILE_HEAD: json.dumps(said)})
     try:
         with put_in_place(path) as draft:
             draft.write_bytes(data)
@@ -64,7 +64,7 @@ def read_template(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise TemplateError(f"the template {path} does not exist or is not a file")
     try:
         with safe_open(path, framework="np") as file:
-            head = json.loads((file.metadata() or {}).get(HEAD, "null"))
+            head = json.loads((file.metadata() or {}).get(FILE_HEAD, "null"))
             if not isinstance(head, dict) or head.get("format") != FORMAT:
                 raise TemplateError(
                     f"{path} is a safetensors file, but no template of ours; fit one with "

@@ -27,12 +27,12 @@ GRID_CELLS = 128  # along the longest side, at least
 # Long and flat parts have flat boxes: as many nodes as a stocky part's, in smaller cells.
 STOCKY_RATIO = 0.5  # of the cube over the longest side
 MOST_DIVIDED = 4.0  # times as many cells along it
-MARGIN_RATIO = 6.0 / 128.0  # of the longest side, around the part
+TEMPLATE_MARGIN_RATIO = 6.0 / 128.0  # of the longest side, around the part
 EXACT_CELLS = 2.0  # nearer nodes are measured against every triangle
 FINE = 4  # a cell that bends is divided into so many along each edge
 SAMPLES = 300_000
 AT_ONCE = 100_000  # distances: a second of a large mesh
-HELD_OUT = 40_000
+HELD_OUT_POINTS = 40_000
 BAND_CELLS = 1.0  # the field is looked at this far around the surface
 LEAST_RESIDUAL_MM = 0.008  # cells where the grid is better than this are left as they are
 MAX_BLOCKS = 120_000  # 60 MB; the worst cells go first
@@ -60,7 +60,7 @@ def fit_fast(
     """
     rng = np.random.default_rng(seed)
     low, high = exact.bounds_mm
-    margin = MARGIN_RATIO * float((high - low).max())
+    margin = TEMPLATE_MARGIN_RATIO * float((high - low).max())
     cell = _cell_mm(high - low, margin)
     origin = low - margin
     shape = np.ceil((high - low + 2 * margin) / cell).astype(int) + 1
@@ -72,7 +72,7 @@ def fit_fast(
     )
     cells = _bent(bare, points, residual, max(LEAST_RESIDUAL_MM, least_residual_mm))
     grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, progress))
-    held = _on_surface(exact, HELD_OUT, rng)
+    held = _on_surface(exact, HELD_OUT_POINTS, rng)
     bias_mm = float(np.quantile(np.abs(grid.distance(held)), 0.99))
     return GridSdf(grid=grid, mesh=exact.mesh, bias_mm=bias_mm, metadata=metadata or {})
 

@@ -16,13 +16,13 @@ from amrepair.errors import TemplateError
 from amrepair.template.file import FORMAT_VERSION, read_template
 from amrepair.template.fit import FIT_VERSION, fit_fast
 from amrepair.template.grid import GridSdf
-from amrepair.template.learned import KIND as LEARNED
+from amrepair.template.learned import LEARNED_KIND as LEARNED
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh, require_mesh
 from amrepair.template.mesh_sdf import MeshSdf
-from amrepair.template.network import KIND as NETWORK
+from amrepair.template.network import NETWORK_KIND as NETWORK
 from amrepair.template.network import PaperSdf
-from amrepair.template.paper import PAPER, PaperOptions, fit_paper
+from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions, fit_paper
 from gcode.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def fit_template(
     source: Path | str | trimesh.Trimesh | Sequence[Path],
     *,
     recipe: str = "fast",
-    paper: PaperOptions = PAPER,
+    paper: PaperOptions = PUBLISHED_NETWORK,
     device: str = "auto",
     seed: int = 0,
     progress: Progress = silent,

@@ -29,7 +29,7 @@ from amrepair.template.shape import MeshShape
 if TYPE_CHECKING:
     import trimesh
 
-KIND = "grid"
+GRID_KIND = "grid"
 MOST_COVER_CELLS = 200  # of what is known, along the longest side: 8 MB
 _ARRAYS = ("base", "cells", "blocks", "vertices_mm", "faces")
 
@@ -228,7 +228,7 @@ class GridSdf(MeshShape):
             "faces": np.asarray(self.mesh.faces, dtype=np.int32),
         }
         head = {
-            "kind": KIND,
+            "kind": GRID_KIND,
             "origin_mm": self.grid.origin_mm.tolist(),
             "cell_mm": self.grid.cell_mm,
             "bias_mm": self.bias_mm,
@@ -255,14 +255,14 @@ class GridSdf(MeshShape):
     @classmethod
     def unpacked(cls, path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]) -> GridSdf:
         """The template in a file's arrays and head."""
-        return cls(**stored_grid(path, arrays, head, KIND))
+        return cls(**stored_grid(path, arrays, head, GRID_KIND))
 
 
 def stored_grid(
     path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any], kind: str
 ) -> dict[str, Any]:
     """The attributes of a `GridSdf` in the arrays and head of a file of that kind."""
-    require_kind(path, head.get("kind", KIND), kind)
+    require_kind(path, head.get("kind", GRID_KIND), kind)
     if not set(_ARRAYS) <= set(arrays):
         raise TemplateError(f"{path} lacks parts of a template; fit it again")
     grid = Grid.refined(

@@ -19,7 +19,7 @@ from amrepair.errors import TemplateError
 from amrepair.template import laid_kernels as kernels
 
 # A slicer cuts in the middle of a layer: tops are rounded by no more than half of one.
-ROUNDS = 0.55
+ROUNDED_LAYERS = 0.55
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,8 +195,8 @@ class LaidBeads:
         for k in range(len(self.top_mm)):
             h, over, below = float(self.layer_mm[k]), surface[:, 2] - self.top_mm[k], fill
             walls = np.flatnonzero(wall & (np.abs(over + 0.5 * h) < (o.around_layers + 0.5) * h))
-            tops = np.flatnonzero(~wall & up & (np.abs(over) < ROUNDS * h))
-            unders = np.flatnonzero(~wall & ~up & (np.abs(over + h) < ROUNDS * h))
+            tops = np.flatnonzero(~wall & up & (np.abs(over) < ROUNDED_LAYERS * h))
+            unders = np.flatnonzero(~wall & ~up & (np.abs(over + h) < ROUNDED_LAYERS * h))
             fill = None
             if not len(walls) + len(tops) + len(unders):
                 continue

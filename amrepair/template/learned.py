@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from amrepair.template.grid import GridSdf, stored_grid
 
-KIND = "learned"
+LEARNED_KIND = "learned"
 # Sound parts lie within three standard deviations of what they differ by.
 TOLERATED_SPREADS = 3.0
 
@@ -70,7 +70,7 @@ class LearnedSdf(GridSdf):
         arrays["spread_mm"] = self.tolerance.spread_mm.astype(np.float32)
         return arrays, {
             **head,
-            "kind": KIND,
+            "kind": LEARNED_KIND,
             "spread_origin_mm": self.tolerance.origin_mm.tolist(),
             "spread_cell_mm": self.tolerance.cell_mm,
         }
@@ -85,4 +85,4 @@ class LearnedSdf(GridSdf):
             float(head["spread_cell_mm"]),
             arrays["spread_mm"],
         )
-        return cls(**stored_grid(path, arrays, head, KIND), tolerance=tolerance)
+        return cls(**stored_grid(path, arrays, head, LEARNED_KIND), tolerance=tolerance)

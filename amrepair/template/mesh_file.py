@@ -18,8 +18,8 @@ from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
 from gcode.solids import (
-    READ_ERRORS,
-    SUFFIXES,
+    MESH_READ_ERRORS,
+    SOLID_SUFFIXES,
     as_manifold,
     first_closed,
     is_valid,
@@ -119,13 +119,13 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 
     if not path.is_file():
         raise TemplateError(f"the mesh {path} does not exist or is not a file; check the path")
-    if path.suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() not in SOLID_SUFFIXES:
         raise TemplateError(
-            f"the mesh {path.name} ends in '{path.suffix}'; use one of {', '.join(SUFFIXES)}"
+            f"the mesh {path.name} ends in '{path.suffix}'; use one of {', '.join(SOLID_SUFFIXES)}"
         )
     try:
         vertices, faces = read_triangles(path)
-    except READ_ERRORS as error:
+    except MESH_READ_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise TemplateError(
             f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} ({reason}); "

@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float, Int
 from amrepair.template import nearest_kernels as kernels
 
 # A point starts from its neighbour's triangle: many are asked in an order in which they are near.
-SORTED, CELLS = 20_000, 64
+SORTED, SORT_CELLS = 20_000, 64
 # No edge of any part runs this way, so that a ray meets none.
 WAY = np.array([0.5389207, 0.7071392, 0.4576831])
 FOLDED = -0.999  # cosine between neighbours' normals: one lies on the other
-ASIDE_RATIO = 1e-6  # of the part's size
+EDGE_ASIDE_RATIO = 1e-6  # of the part's size
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class TriangleTree:
         normals = normals / np.maximum(length, 1e-300)
         if not _has_folds(faces[order], normals):
             return tree
-        aside = ASIDE_RATIO * float(np.ptp(vertices_mm, axis=0).max()) * normals
+        aside = EDGE_ASIDE_RATIO * float(np.ptp(vertices_mm, axis=0).max()) * normals
         middle = corners.mean(axis=1)
         return replace(tree, sure=tree.inside(middle - aside) & ~tree.inside(middle + aside))
 
@@ -99,9 +99,11 @@ class TriangleTree:
             size, which, place, side = kernels.nearest(points, self.sure, *self._numbers)
             return Nearest(size, side, self.face[which], place)
         low = points.min(axis=0)
-        cell = (points.max(axis=0) - low) / CELLS + 1e-12
-        index = np.minimum((points - low) / cell, CELLS - 1).astype(np.int64)
-        order = np.argsort((index[:, 0] * CELLS + index[:, 1]) * CELLS + index[:, 2], kind="stable")
+        cell = (points.max(axis=0) - low) / SORT_CELLS + 1e-12
+        index = np.minimum((points - low) / cell, SORT_CELLS - 1).astype(np.int64)
+        order = np.argsort(
+            (index[:, 0] * SORT_CELLS + index[:, 1]) * SORT_CELLS + index[:, 2], kind="stable"
+        )
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         size, which, place, side = kernels.nearest(points[order], self.sure, *self._numbers)

@@ -14,8 +14,8 @@ from gcode.compiled import njit, prange
 
 LEAF = 4  # triangles
 DEEP = 64  # of the stack: halves of any mesh that fits into memory
-TINY = 1e-300  # of triangles without area
-WITHIN, UPRIGHT = 1e-6, 0.99  # of a triangle's weights; the cosine from its normal
+TINY_AREA = 1e-300  # of triangles without area
+WITHIN, UPRIGHT_TRIANGLE = 1e-6, 0.99  # of a triangle's weights; the cosine from its normal
 TOGETHER = 256  # points by one thread; each starts from the triangle of the one before
 
 
@@ -84,16 +84,16 @@ def _on_triangle(px, py, pz, t):
     elif d3 >= 0.0 and d4 <= d3:
         s = 1.0
     elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        s = d1 / max(d1 - d3, TINY)
+        s = d1 / max(d1 - d3, TINY_AREA)
     elif d6 >= 0.0 and d5 <= d6:
         w = 1.0
     elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / max(d2 - d6, TINY)
+        w = d2 / max(d2 - d6, TINY_AREA)
     elif va <= 0.0 and d4 >= d3 and d5 >= d6:
-        w = (d4 - d3) / max((d4 - d3) + (d5 - d6), TINY)
+        w = (d4 - d3) / max((d4 - d3) + (d5 - d6), TINY_AREA)
         s = 1.0 - w
     else:
-        total = max(va + vb + vc, TINY)
+        total = max(va + vb + vc, TINY_AREA)
         s, w = vb / total, vc / total
     dx = ax - s * ux - w * vx
     dy = ay - s * uy - w * vy
@@ -109,7 +109,7 @@ def _above(x, y, z, t, size):
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     long = np.sqrt(nx * nx + ny * ny + nz * nz)
     high = nx * (x - t[0, 0]) + ny * (y - t[0, 1]) + nz * (z - t[0, 2])
-    if abs(high) < UPRIGHT * size * long:
+    if abs(high) < UPRIGHT_TRIANGLE * size * long:
         return 0
     return 1 if high > 0.0 else -1
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import torch
     import trimesh
 
-KIND = "network"
+NETWORK_KIND = "network"
 CHUNK = 1 << 16  # bounds the memory of one pass
 # The network was trained on [-1, 1]³; farther out it is asked at the nearest point of this cube.
 CUBE = 1.05
@@ -171,7 +171,7 @@ class PaperSdf(MeshShape):
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
         head = {
-            "kind": KIND,
+            "kind": NETWORK_KIND,
             "architecture": asdict(self.architecture),
             "centre_mm": self.centre_mm.tolist(),
             "radius_mm": self.radius_mm,
@@ -183,7 +183,7 @@ class PaperSdf(MeshShape):
     @classmethod
     def unpacked(cls, path: Path, arrays: dict[str, np.ndarray], head: dict[str, Any]) -> PaperSdf:
         """The template in a file's arrays and head."""
-        require_kind(path, head.get("kind"), KIND)
+        require_kind(path, head.get("kind"), NETWORK_KIND)
         known = {f.name for f in fields(Architecture)}
         said = head["architecture"]
         if not isinstance(said, dict) or set(said) != known:

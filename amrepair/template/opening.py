@@ -8,7 +8,7 @@ from amrepair.errors import InputError
 from amrepair.template.fitting import load_or_fit, load_template
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
-from gcode.solids import SUFFIXES
+from gcode.solids import SOLID_SUFFIXES
 
 TEMPLATE_SUFFIX = ".safetensors"
 
@@ -33,9 +33,9 @@ def open_template(path: Path, *, progress: Progress = silent) -> Template:
     suffix = path.suffix.lower()
     if suffix == TEMPLATE_SUFFIX:
         return load_template(path)
-    if suffix in SUFFIXES:
+    if suffix in SOLID_SUFFIXES:
         return load_or_fit(path, progress=progress)
     raise InputError(
         f"the template {path} is neither a {TEMPLATE_SUFFIX} file nor a mesh "
-        f"({', '.join(SUFFIXES)}); fit one with 'amrepair template fit'"
+        f"({', '.join(SOLID_SUFFIXES)}); fit one with 'amrepair template fit'"
     )

@@ -25,9 +25,9 @@ from gcode.progress import Progress, silent
 if TYPE_CHECKING:
     import torch
 
-HELD_OUT = 20_000
+NETWORK_HELD_OUT_POINTS = 20_000
 CLOUD_POINTS = 200_000  # that stand for the surface where distances are taken from a cloud
-DISTANCES = ("mesh", "cloud")
+DISTANCE_KINDS = ("mesh", "cloud")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +81,9 @@ class PaperOptions:
     validation: float = 0.15
 
     def __post_init__(self) -> None:
-        if self.distances not in DISTANCES:
+        if self.distances not in DISTANCE_KINDS:
             raise TemplateError(
-                f"distances from '{self.distances}' are unknown; choose {', '.join(DISTANCES)}"
+                f"distances from '{self.distances}' are unknown; choose {', '.join(DISTANCE_KINDS)}"
             )
         if self.epochs < 1 or self.batch < 1 or self.surface + self.box + self.volume < 100:
             raise TemplateError(
@@ -109,16 +109,16 @@ class PaperOptions:
         )
 
 
-PAPER = PaperOptions()
+PUBLISHED_NETWORK = PaperOptions()
 # The released code: no dropout, the plain box, the skip layer without weight norm.
-CODE = replace(PAPER, dropout=0.0, box_ratio=1.0, norm_skip=False)
-VARIANTS = {"paper": PAPER, "code": CODE}
+RELEASED_NETWORK = replace(PUBLISHED_NETWORK, dropout=0.0, box_ratio=1.0, norm_skip=False)
+NETWORK_VARIANTS = {"paper": PUBLISHED_NETWORK, "code": RELEASED_NETWORK}
 
 
 def fit_paper(
     exact: MeshSdf,
     *,
-    options: PaperOptions = PAPER,
+    options: PaperOptions = PUBLISHED_NETWORK,
     device: str = "auto",
     seed: int = 0,
     metadata: dict[str, str] | None = None,
@@ -157,7 +157,9 @@ def fit_paper(
         bias_mm=0.0,
         metadata=said,
     )
-    held = sample_surface(vertices, faces, count=HELD_OUT, offset=float(rng.random()))[0]
+    held = sample_surface(
+        vertices, faces, count=NETWORK_HELD_OUT_POINTS, offset=float(rng.random())
+    )[0]
     return replace(made, bias_mm=float(np.quantile(np.abs(made.distance(held)), 0.99)))
 
 

@@ -22,9 +22,9 @@ from amrepair.template.port import Template
 DEPTH_MM = 4.0
 MARGIN_MM = 3.0
 # Below its lowest beads nothing is planned: the bed is there, or what was looked at before.
-BELOW_MM = 1.5
+BELOW_BEADS_MM = 1.5
 LEAST_VOXEL_MM, MOST_VOXEL_MM = 0.1, 0.25
-MAX_VOXELS = 60_000_000
+MAX_PLANNED_VOXELS = 60_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,15 +86,15 @@ class PlannedSdf:
         high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
         # The voxels are placed so that faces of theirs lie on the last layer's top.
         levels = int(np.ceil((top_mm - low[2]) / voxel_mm - 1e-6))
-        above, below = (int(np.ceil(margin / voxel_mm)) for margin in (MARGIN_MM, BELOW_MM))
+        above, below = (int(np.ceil(margin / voxel_mm)) for margin in (MARGIN_MM, BELOW_BEADS_MM))
         foot_mm = top_mm - levels * voxel_mm
         origin = np.array([low[0] - MARGIN_MM, low[1] - MARGIN_MM, foot_mm - below * voxel_mm])
         size = np.ceil((high[:2] + MARGIN_MM - origin[:2]) / voxel_mm).astype(int)
         shape = (int(size[0]), int(size[1]), below + levels + above)
-        if np.prod([float(n) for n in shape]) > MAX_VOXELS:
+        if np.prod([float(n) for n in shape]) > MAX_PLANNED_VOXELS:
             raise TemplateError(
                 f"a planned template of {shape[0]}×{shape[1]}×{shape[2]} voxels is over the limit "
-                f"of {MAX_VOXELS:,}; look at fewer copies at once"
+                f"of {MAX_PLANNED_VOXELS:,}; look at fewer copies at once"
             )
         solid = np.zeros(shape, dtype=bool)
         kernels.fill(

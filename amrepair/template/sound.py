@@ -28,8 +28,8 @@ from amrepair.frames import unit_vectors
 from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.learned import TOLERATED_SPREADS, LearnedSdf, Tolerance
 
-BESIDE = [1, 2, 3, 4, 5]  # a site and its four neighbours, nearest first
-NORMAL_MAD = 0.6745  # median absolute deviation of a standard normal
+MAD_TO_SIGMA = 1.4826  # of a Gaussian
+SITE_AND_NEIGHBOURS = [1, 2, 3, 4, 5]  # a site and its four neighbours, nearest first
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +192,7 @@ def _means(
     total = np.bincount(at, value, minlength=len(sites.place_mm)).astype(np.float64)
     few = np.flatnonzero(count < options.least_points)
     if len(few):  # then with the sites beside it that face the same way
-        beside = sites.tree.query(sites.tree.data[few], k=BESIDE, workers=-1)[1]
+        beside = sites.tree.query(sites.tree.data[few], k=SITE_AND_NEIGHBOURS, workers=-1)[1]
         wide = count[beside].sum(axis=1), total[beside].sum(axis=1)
         count[few], total[few] = wide
     mean = total / np.maximum(count, 1.0)
@@ -243,7 +243,7 @@ def _robust_deviation(
     count = seen.sum(axis=0)
     spread = np.zeros(off.shape[1])
     some = count > 1
-    spread[some] = np.nanmedian(np.where(seen, np.abs(off), np.nan)[:, some], axis=0) / NORMAL_MAD
+    spread[some] = MAD_TO_SIGMA * np.nanmedian(np.where(seen, np.abs(off), np.nan)[:, some], axis=0)
     return spread * np.sqrt(np.maximum(count, 1) / np.maximum(count - 1, 1))
 
 

@@ -6,7 +6,7 @@ import math
 
 Point = tuple[float, float, float]
 LEAST_RADIUS_MM = 1e-3
-APART_MM, APART_RATIO = 0.05, 0.002  # the ends' distances from the centre, which slicers round
+CENTRE_MM, CENTRE_RATIO = 0.05, 0.002  # the ends' distances from the centre, which slicers round
 PIECE_MM = 0.3  # at a radius of 1 mm
 
 
@@ -20,7 +20,7 @@ def points_of_arc(
     (x0, y0, z0), (x1, y1, z1) = start_mm, end_mm
     cx, cy = x0 + centre_mm[0], y0 + centre_mm[1]
     r0, r1 = math.hypot(x0 - cx, y0 - cy), math.hypot(x1 - cx, y1 - cy)
-    if r0 < LEAST_RADIUS_MM or abs(r0 - r1) > max(APART_MM, APART_RATIO * r0):
+    if r0 < LEAST_RADIUS_MM or abs(r0 - r1) > max(CENTRE_MM, CENTRE_RATIO * r0):
         return abs(r0 - r1), []
     a0 = math.atan2(y0 - cy, x0 - cx)
     sweep = math.atan2(y1 - cy, x1 - cx) - a0

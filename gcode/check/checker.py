@@ -11,7 +11,7 @@ from gcode.check.findings import Moves, Policy, Refusal, Text, Touch
 from gcode.check.proof import CheckedProgram, CheckReport, _prove
 from gcode.check.rules import Judge
 from gcode.check.sweep import sweep
-from gcode.check.words import COMMANDS
+from gcode.check.words import KNOWN_COMMANDS
 from gcode.errors import CheckRefusedError, InputError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
@@ -135,9 +135,10 @@ def judge(
     progress: Progress = silent,
 ) -> Verdict:
     """What `check` goes by, for whoever wants to know and not to print."""
-    if program.dialect not in COMMANDS:
+    if program.dialect not in KNOWN_COMMANDS:
         raise InputError(
-            f"There is no dialect '{program.dialect}' to check; there are {', '.join(COMMANDS)}."
+            f"There is no dialect '{program.dialect}' to check; "
+            f"there are {', '.join(KNOWN_COMMANDS)}."
         )
     if as_built is not None:
         _ = setup.printer.head  # nobody judges what a head of unknown shape would hit

@@ -19,10 +19,10 @@ from gcode.check.sweep import deepest_along
 from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
 
-STEPS = 200  # along the move
-MOST_PIXELS = 1200  # on a side of the picture
+MOVE_STEPS = 200  # along the move
+MOST_PICTURE_PIXELS = 1200  # on a side of the picture
 NEAR_MOVES = 400  # before the contact, that the picture shows
-AROUND_MM = 10.0
+PICTURE_MARGIN_MM = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def contact_of(
     """
     own = np.flatnonzero(moves.line == refusal.line)
     starts, ends = moves.start_mm[own], moves.end_mm[own]
-    shares = (np.arange(STEPS + 1) / STEPS)[:, None]
+    shares = (np.arange(MOVE_STEPS + 1) / MOVE_STEPS)[:, None]
     places = np.concatenate(
         [start + shares * (end - start) for start, end in zip(starts, ends, strict=True)]
     )
@@ -85,7 +85,7 @@ def draw(
     image = base64.b64encode(_png(_shaded(as_built))).decode()
     radius = max(width_mm, depth_mm) / 60.0
     font = max(width_mm, depth_mm) / 35.0
-    margin = AROUND_MM
+    margin = PICTURE_MARGIN_MM
     text = f"X {x:.1f} Y {y:.1f} Z {z:.2f} mm, line {contact.line}: {contact.depth}"
     path.write_text(
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{-margin:g} {-margin:g} '
@@ -106,7 +106,7 @@ def draw(
 
 def _shaded(field: HeightField) -> UInt8[np.ndarray, "ny nx 4"]:
     """Heights as shades, the bed clear; what nobody saw is striped darker."""
-    step = max(1, -(-max(field.shape) // MOST_PIXELS))
+    step = max(1, -(-max(field.shape) // MOST_PICTURE_PIXELS))
     z_mm: Float[np.ndarray, "ny nx"] = field.z_mm[::step, ::step]
     seen = field.seen[::step, ::step]
     share = np.clip(z_mm / max(field.top_mm, 1e-6), 0.0, 1.0)

@@ -31,14 +31,14 @@ _OF_KLIPPER = {
     "ACCEL": ("max_acceleration_mm_s2", "acceleration", "mm/s²"),
     "SQUARE_CORNER_VELOCITY": ("max_jerk_mm_s", "jerk", "mm/s"),
 }
-COMMANDS = frozenset(_BY_AXIS) | {"M204"}
+LIMIT_COMMANDS = frozenset(_BY_AXIS) | {"M204"}
 _MAY_BE_ZERO = "max_jerk_mm_s"  # an axis without speed or acceleration never arrives
 
 
 def raised_by(
     name: str, words: dict[str, float | None], printer: PrinterProfile, dialect: str
 ) -> Iterator[Finding]:
-    """What a command of `COMMANDS` raises too far, or sets to what no axis ever arrives with."""
+    """What a command of `LIMIT_COMMANDS` raises too far, or sets to what stops an axis."""
     if name == "M204":
         for letter, axis in _OF_M204.items():
             limit = getattr(printer.max_acceleration_mm_s2, axis)

@@ -16,6 +16,7 @@ from gcode.check.findings import Moves, Policy, Refusal, Text, Warnings
 from gcode.check.words import G91_MOVES_E, LINE_LIMIT
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
+from gcode.reader.text_kernels import INCH_MM
 
 # Plastic is told in five digits: what is shorter than this is judged with its neighbours.
 SHORT_MM = 0.05
@@ -23,14 +24,13 @@ SHORT_MM = 0.05
 SECTION_SLACK = 1.05
 FLOW_SLACK = 1.05
 PLACE_SLACK_MM = 0.011
-FASTEST_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
+UNIT_SLIP_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
 # Firmwares clamp a feed to their own limit, and slicers ask for more (300 mm/s in Voron's own
 # printer.cfg, 350 to 500 in OrcaSlicer's profiles): far beyond it a file is another machine's.
 # Along Z and E slicers write the travel speed, whatever the axis does.
 FEED_SLACK = 2.0
 # Wipes pull back on the move; relative values that are read as absolute do half of the way.
 BACKWARDS_RATIO, BACKWARDS_MOVES = 0.25, 10
-INCH_MM = 25.4
 # Klipper's `[idle_timeout]` gives a hot machine that stands still ten minutes.
 STILL_S = 600.0
 # What stands molten in a hotend (the melt zone of a V6 is 10 mm long) is pushed out at any speed: a
@@ -96,7 +96,7 @@ class Motion:
         low = (x0 - PLACE_SLACK_MM, y0 - PLACE_SLACK_MM, -PLACE_SLACK_MM)
         high = (x1 + PLACE_SLACK_MM, y1 + PLACE_SLACK_MM, printer.max_z_mm + PLACE_SLACK_MM)
         self._limits_of_moves = (
-            *low, *high, FASTEST_MM_S, SHORT_MM, SECTION_SLACK * printer.max_bead_section_mm2,
+            *low, *high, UNIT_SLIP_MM_S, SHORT_MM, SECTION_SLACK * printer.max_bead_section_mm2,
             printer.max_extrude_only_mm, LINE_LIMIT[program.dialect], LEAST_BEAD_Z_MM, MOLTEN_MM,
         )  # fmt: skip
 
@@ -222,8 +222,8 @@ class Motion:
                 self._refuse("feed without a number", "F", "mm/min")
             return
         feed_mm_s = value * self._unit / 60.0
-        if not 0 < feed_mm_s <= FASTEST_MM_S:
-            self._refuse("feed", f"{feed_mm_s:g} mm/s", f"0 to {FASTEST_MM_S:g} mm/s")
+        if not 0 < feed_mm_s <= UNIT_SLIP_MM_S:
+            self._refuse("feed", f"{feed_mm_s:g} mm/s", f"0 to {UNIT_SLIP_MM_S:g} mm/s")
         self._feed_mm_s = max(feed_mm_s, 1e-3)
 
     def _move(self, words: dict[str, float | None]) -> None:

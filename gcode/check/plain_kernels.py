@@ -15,7 +15,7 @@ X, Y, Z, E, FEED, PULLED, SHORT_MM3, ABSOLUTE, ABSOLUTE_E, UNIT = range(10)
 ) = range(19)  # fmt: skip
 EXACT = 2**53  # digits up to this, and as many decimals as a double divides by exactly
 MOST_DECIMALS = 22
-WORDS = 5  # X, Y, Z, E, F
+MOVE_WORDS = 5  # X, Y, Z, E, F
 
 
 @njit(cache=True, nogil=True)
@@ -89,7 +89,7 @@ def follow(data, starts, first, last, limits, state, rows, counts):
     below 0 where it is pulled back; `counts` (2,) of commands and of rows. The last three are
     changed. Returns the first line that was not followed.
     """
-    words = np.empty(WORDS)
+    words = np.empty(MOVE_WORDS)
     for line in range(first, last):
         kind = words_of(data, starts[line], starts[line + 1] - 1, limits[LINE], words)
         if kind == 0:

@@ -10,7 +10,7 @@ from gcode.check.findings import Policy, Warned
 from gcode.errors import LocalProtocolError
 from gcode.moves import Program
 
-_TOKEN = object()
+_PROOF = object()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class CheckedProgram:
     def __init__(
         self, program: Program, printer_id: str, report: CheckReport, *, token: object = None
     ) -> None:
-        if token is not _TOKEN:
+        if token is not _PROOF:
             raise LocalProtocolError(
                 "Only gcode.check.check() makes a CheckedProgram; run it on the program."
             )
@@ -102,4 +102,4 @@ class CheckedProgram:
 
 def _prove(program: Program, printer_id: str, report: CheckReport) -> CheckedProgram:
     """For `checker` alone."""
-    return CheckedProgram(program, printer_id, report, token=_TOKEN)
+    return CheckedProgram(program, printer_id, report, token=_PROOF)

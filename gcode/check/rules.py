@@ -7,10 +7,10 @@ import re
 
 from gcode.check import limits, touches, waits
 from gcode.check.findings import Policy, Text, Touch
-from gcode.check.motion import INCH_MM, PLACE_SLACK_MM, STILL_S, Motion
+from gcode.check.motion import PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
-    COMMANDS,
     G90_SETS_E,
+    KNOWN_COMMANDS,
     LENIENT_OF_TOOLS,
     LINE_LIMIT,
     NO_INCHES,
@@ -21,6 +21,8 @@ from gcode.check.words import (
 )
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
+from gcode.profiles.own_settings import SAME_NOZZLE_MM
+from gcode.reader.text_kernels import INCH_MM
 
 HEATER_COMMANDS = {
     **dict.fromkeys(("M104", "M109"), "hotend"),
@@ -29,8 +31,8 @@ HEATER_COMMANDS = {
 }
 # Marlin's AUTOTEMP (B, F) and presets (I) set what no number here says.
 UNSAID_HEATS = frozenset("BFI")
-_HEAD = re.compile(r"([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
-_NUMBERED = re.compile(r"N\s*\d")
+_COMMAND_HEAD = re.compile(r"([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+_NUMBERED_LINE = re.compile(r"N\s*\d")
 # M486 A tells an object's name
 FREE_TEXT = frozenset({"M117", "M118", "M486", "M862.3", "M115"})
 _TOOL = re.compile(r"T\d+")
@@ -38,7 +40,7 @@ _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
 KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
 # Factors on flow (M221) and speed (M220), per cent.
-FACTORS = {"M221": ("flow factor", 50.0, 150.0), "M220": ("speed factor", 10.0, 200.0)}
+FACTOR_LIMITS = {"M221": ("flow factor", 50.0, 150.0), "M220": ("speed factor", 10.0, 200.0)}
 MOTORS_OFF = frozenset({"M18", "M84"})
 # Axes that no profile has, of idlers, turntables and second carriages.
 OTHER_AXES = frozenset("ABCUVW")
@@ -47,7 +49,6 @@ DWELLS = {"S": 1.0, "P": 1e-3}
 # Klipper's Pressure_Advance.md has 0.05 to 1 s, the most with bowden extruders.
 MOST_ADVANCE_S = 2.0
 FULL_FAN = 255.0
-SAME_NOZZLE_MM = 0.01
 HOMING_SLACK_MM = 0.2  # as much as the tip may press into what it prints on
 
 
@@ -72,8 +73,8 @@ class Judge(Motion):
         self._macros = macros | STARTS - {self._begins.name.upper() if self._begins else ""}
         self._heats_unsaid = False  # whether a macro ran that may have heated something
         self._waited_s, self._waited_at = 0.0, -1
-        self._known = COMMANDS[program.dialect] | macros | {name.upper() for name in own}
-        self._feels = touches.COMMANDS.get(program.dialect, "") if planned else ""
+        self._known = KNOWN_COMMANDS[program.dialect] | macros | {name.upper() for name in own}
+        self._feels = touches.TOUCH_COMMANDS.get(program.dialect, "") if planned else ""
         if self._feels:
             self._known |= {self._feels}
         self._tool: str | None = None
@@ -92,10 +93,10 @@ class Judge(Motion):
             limit = LINE_LIMIT[self._dialect]
             self._refuse("line too long", f"{len(command)} characters", f"{limit}")
         upper = command.upper()
-        if _NUMBERED.match(upper):
+        if _NUMBERED_LINE.match(upper):
             self._numbered("line number of its own", upper)
             return
-        head = _HEAD.match(upper)
+        head = _COMMAND_HEAD.match(upper)
         if head is None:
             self._named(upper)
             return
@@ -259,10 +260,10 @@ class Judge(Motion):
             self._tool_settings(name, words)
         elif name in {"G10", "G11"}:
             self._refuse("firmware retraction", name, "its length is not in the program")
-        elif name in limits.COMMANDS:
+        elif name in limits.LIMIT_COMMANDS:
             for raised in limits.raised_by(name, words, self._setup.printer, self._dialect):
                 self._raised(*raised)
-        elif name in FACTORS and words.get("S") is not None:
+        elif name in FACTOR_LIMITS and words.get("S") is not None:
             self._scale(name, words["S"] or 0.0)
         elif name in MOTORS_OFF and "S" not in words:
             off = [k for k, letter in enumerate("XYZ") if letter in words]
@@ -341,7 +342,7 @@ class Judge(Motion):
 
     def _scale(self, name: str, percent: float) -> None:
         """A factor on all flow or speed from here on."""
-        what, low, high = FACTORS[name]
+        what, low, high = FACTOR_LIMITS[name]
         if low <= percent <= high:
             self._factor[name] = percent / 100.0
         else:

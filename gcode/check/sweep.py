@@ -23,12 +23,12 @@ from gcode.surfaces.heightfield import footprint_rows
 TIP_SLACK_MM = 0.2
 # The head's body must clear what stands there, up to the noise of the height field.
 BODY_SLACK_MM = 0.1
-MAX_CELLS = (
+MAX_SWEPT_CELLS = (
     4_000_000  # of a field: 100 MB with what is needed over it; beyond that cells are joined
 )
 # What is laid is looked at in cells of this size by slices that reach farther than this.
-WIDE_MM, WIDE_CELL_MM = 2.6, 0.2
-EDGE_MM = 0.5  # of a window around moves
+WIDE_SLICE_MM, WIDE_CELL_MM = 2.6, 0.2
+WINDOW_EDGE_MM = 0.5  # of a window around moves
 MOST_SAID = 20
 
 
@@ -51,8 +51,8 @@ def sweep(
     worst = np.full(len(start), -np.inf)
     which = np.zeros(len(start), dtype=np.int64)
     swept = _Swept(start, end, pushed, width)
-    near = [k for k, part in enumerate(slices) if part.reach_mm <= WIDE_MM]
-    far = [k for k, part in enumerate(slices) if part.reach_mm > WIDE_MM]
+    near = [k for k, part in enumerate(slices) if part.reach_mm <= WIDE_SLICE_MM]
+    far = [k for k, part in enumerate(slices) if part.reach_mm > WIDE_SLICE_MM]
     for own, found in (
         (near, swept.over(as_built, [slices[k] for k in near], grows=True)),
         (far, swept.over(as_built, [slices[k] for k in far], grows=False)),
@@ -124,7 +124,7 @@ class _Swept:
             return None
         rows, columns = field.window(box_mm)
         cells = (rows.stop - rows.start) * (columns.stop - columns.start)
-        factor = math.ceil(math.sqrt(cells / MAX_CELLS))
+        factor = math.ceil(math.sqrt(cells / MAX_SWEPT_CELLS))
         field = field.coarsened(factor)
         window, near = field.window(box_mm), field.crop(box_mm)
         if not near.z_mm.size:
@@ -156,7 +156,7 @@ class _Swept:
         if not slices or box_mm is None:
             return None
         size_mm = np.array(box_mm[2:]) - np.array(box_mm[:2])
-        cell_mm = max(WIDE_CELL_MM, math.sqrt(float(np.prod(size_mm)) / MAX_CELLS))
+        cell_mm = max(WIDE_CELL_MM, math.sqrt(float(np.prod(size_mm)) / MAX_SWEPT_CELLS))
         nx, ny = (int(v) for v in np.ceil(size_mm / cell_mm) + 1)
         nothing = np.full((ny, nx), -np.inf)
         bare = HeightField(np.array(box_mm[:2]), cell_mm, nothing.copy(), np.ones((ny, nx), bool))
@@ -169,7 +169,7 @@ class _Swept:
             return None
         both = np.concatenate([self.start_mm[low, :2], self.end_mm[low, :2]])
         (x0, y0), (x1, y1) = both.min(axis=0).tolist(), both.max(axis=0).tolist()
-        return x0 - EDGE_MM, y0 - EDGE_MM, x1 + EDGE_MM, y1 + EDGE_MM
+        return x0 - WINDOW_EDGE_MM, y0 - WINDOW_EDGE_MM, x1 + WINDOW_EDGE_MM, y1 + WINDOW_EDGE_MM
 
     def _run(
         self,

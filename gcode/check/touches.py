@@ -9,7 +9,7 @@ from gcode.check.findings import Touch
 from gcode.check.motion import PLACE_SLACK_MM
 from gcode.profiles import ProbeProfile
 
-COMMANDS = {"marlin": "G38.2", "reprap": "G38.2", "klipper": "AMREPAIR_TOUCH"}
+TOUCH_COMMANDS = {"marlin": "G38.2", "reprap": "G38.2", "klipper": "AMREPAIR_TOUCH"}
 """By dialect: touches whose depth the program tells.
 
 G38.2 is a straight move until something is felt (Marlin's G38.cpp; RepRapFirmware has it too).
@@ -18,7 +18,7 @@ AMREPAIR_TOUCH is a macro of ours around Klipper's PROBE, which alone goes down 
 to forty places some millimetres around, and lowers the nozzle to 2 mm above the bed afterwards
 (Z_PROBE_LOW_POINT, offset_for_probe_try, Z_AFTER_PROBING), wherever the part's top is.
 """
-FASTEST_MM_S = 4.0  # Z_PROBE_FEEDRATE_FAST of Marlin's Configuration.h
+FASTEST_TOUCH_MM_S = 4.0  # Z_PROBE_FEEDRATE_FAST of Marlin's Configuration.h
 
 
 def planned_at(touches: Sequence[Touch], place: Sequence[float | None]) -> Touch | None:
@@ -71,6 +71,6 @@ def refusal_of(
         return "touch from below what it is to feel", text, f"Z {planned.surface_mm:g} mm or more"
     if hotend_c > 0 and (probe is None or probe.kind == "nozzle"):
         return "touch with a hot nozzle", f"{hotend_c:g} °C", "heater off"
-    if not 0 < feed <= 60.0 * FASTEST_MM_S:
-        return "touch too fast", f"{feed / 60.0:g} mm/s", f"{FASTEST_MM_S:g} mm/s"
+    if not 0 < feed <= 60.0 * FASTEST_TOUCH_MM_S:
+        return "touch too fast", f"{feed / 60.0:g} mm/s", f"{FASTEST_TOUCH_MM_S:g} mm/s"
     return None

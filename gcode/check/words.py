@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 
-_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
+_OPTIONAL_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
 _MOTION = "G0 G1 G2 G3 G4 G10 G11 G17 G20 G21 G28 G90 G91 G92"
 _COMMON = (
     "M17 M18 M73 M82 M83 M84 M104 M105 M106 M107 M109 M114 M115 M117 M118 M140 M141 M190 "
@@ -18,7 +18,7 @@ _COMMON = (
 )
 _PROBING = "G29 G32 G34 G80 G81"
 
-COMMANDS: dict[str, frozenset[str]] = {
+KNOWN_COMMANDS: dict[str, frozenset[str]] = {
     "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M0 M1 M31 M85 M113 M145 M420 M569 M593 "
                         "M862.1 M862.3 M413 M142".split()),
     "prusa": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M0 M1 M31 M85 M862.1 M862.2 M862.3 M862.4 "
@@ -69,7 +69,7 @@ def words_of(rest: str) -> tuple[dict[str, float | None], tuple[str, str, str] |
         if rest[at] in " \t":
             at += 1
             continue
-        match = _WORD.match(rest, at)
+        match = _OPTIONAL_WORD.match(rest, at)
         if match is None or (match.end() < len(rest) and rest[match.end()] in ".0123456789"):
             return words, ("word that is no number", rest.strip(), "a letter and one number")
         letter, text = match.groups()

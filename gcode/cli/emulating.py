@@ -48,11 +48,11 @@ def emulate(
     """Emulate a printer: prints the pseudo-terminal's path and serves until interrupted."""
     from gcode.firmware import serve_forever
     from gcode.firmware.faults import parse_faults
-    from gcode.firmware.variants import VARIANTS
+    from gcode.firmware.variants import FIRMWARES
     from gcode.profiles import load_printer
 
-    if firmware not in VARIANTS:
-        raise InputError(f"--firmware is {firmware!r}; it is one of {', '.join(VARIANTS)}.")
+    if firmware not in FIRMWARES:
+        raise InputError(f"--firmware is {firmware!r}; it is one of {', '.join(FIRMWARES)}.")
     script = parse_faults(plain_text(faults)) if faults is not None else None
     machine = load_printer(printer)
     with tempfile.TemporaryDirectory(prefix="gcode-emulate-") as folder:

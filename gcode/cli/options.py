@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 AS_BUILT_CELL_MM = 0.2
 PIXELS_IN_CELL = 1.5  # of a depth map, across: no cell is empty for want of pixels
-AROUND_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
+BESIDE_MESH_MM = 30.0  # how far around a standing mesh the field goes: the head's own width
 
 AsBuiltOption = Annotated[
     Path | None,
@@ -139,7 +139,7 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
     InputError
         If it cannot be read.
     """
-    from gcode.solids import SUFFIXES, NotClosedError, read_solid, read_triangles
+    from gcode.solids import SOLID_SUFFIXES, NotClosedError, read_solid, read_triangles
     from gcode.surfaces import HeightField, clouds, depth_maps, scanned
 
     suffix = path.suffix.lower()
@@ -148,9 +148,9 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
         console.errors.print(seen.told, markup=False)
         cell_mm = max(AS_BUILT_CELL_MM, PIXELS_IN_CELL * seen.spacing_mm)
         return scanned.from_points(seen.points_mm, cell_mm, what=str(path))
-    if suffix in clouds.SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
+    if suffix in clouds.CLOUD_SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
         return scanned.from_points(clouds.read_points(path), AS_BUILT_CELL_MM, what=str(path))
-    if suffix not in SUFFIXES:
+    if suffix not in SOLID_SUFFIXES:
         if not path.is_file():
             raise InputError(f"{path}: there is no such file.")
         return HeightField.read(path)
@@ -159,7 +159,7 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
     except NotClosedError:  # as scanners' meshes are
         vertices, faces = read_triangles(path)
         return scanned.from_open_mesh(vertices, faces, AS_BUILT_CELL_MM, what=str(path))
-    return HeightField.from_manifold(solid, AS_BUILT_CELL_MM, margin_mm=AROUND_MM)
+    return HeightField.from_manifold(solid, AS_BUILT_CELL_MM, margin_mm=BESIDE_MESH_MM)
 
 
 def _has_faces(path: Path) -> bool:

@@ -16,7 +16,7 @@ from gcode.firmware.damage import Wire
 from gcode.firmware.faults import Fault, FaultScript
 from gcode.firmware.framing import RENUMBERED, unframed
 from gcode.firmware.machine import Machine
-from gcode.firmware.variants import VARIANTS, Variant
+from gcode.firmware.variants import FIRMWARES, Variant
 from gcode.profiles import PrinterProfile
 
 MAX_CMD_SIZE = 96
@@ -46,7 +46,7 @@ class FirmwareCore:
         seed: int = 0,
         record: Callable[[bytes], None] | None = None,
     ) -> None:
-        self.variant = VARIANTS[variant] if isinstance(variant, str) else variant
+        self.variant = FIRMWARES[variant] if isinstance(variant, str) else variant
         self.machine = Machine(profile, self.variant)
         self.accelerated = accelerated
         self.record = record

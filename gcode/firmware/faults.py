@@ -17,7 +17,7 @@ from typing import Literal
 
 from gcode.errors import InputError
 
-KINDS: dict[str, str] = {
+FAULT_KINDS: dict[str, str] = {
     "lose_ok": "the ok of this line is not sent",
     "garble_ok": "the ok of this line is garbled",
     "double_ok": "the ok of this line is sent twice",
@@ -117,8 +117,8 @@ def _parse_fault(words: list[str]) -> Fault:
         count = int(rest.pop(0))
     elif when != "always":
         raise ValueError("begins with none of line, every, always")
-    if not rest or rest[0] not in KINDS:
-        raise ValueError(f"names no fault of {', '.join(KINDS)}")
+    if not rest or rest[0] not in FAULT_KINDS:
+        raise ValueError(f"names no fault of {', '.join(FAULT_KINDS)}")
     kind = rest.pop(0)
     value = None
     if rest:

@@ -7,7 +7,7 @@ from functools import reduce
 from operator import xor
 from typing import Literal, NamedTuple
 
-NUMBERED = re.compile(rb"N\s*(-?\d{1,10})\s*")
+LINE_NUMBER = re.compile(rb"N\s*(-?\d{1,10})\s*")
 RENUMBERED = re.compile(rb"N(-?\d{1,10})")
 
 Numbers = Literal["verify", "checksum", "ignore"]
@@ -33,7 +33,7 @@ class Unframed(NamedTuple):
 
 def unframed(command: bytes, numbers: Numbers, last_number: int) -> Unframed:
     """Read the frame of a line, `last_number` having come last."""
-    match = NUMBERED.match(command)
+    match = LINE_NUMBER.match(command)
     if match is None:
         return Unframed(command)
     if numbers == "verify":

@@ -14,21 +14,21 @@ from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField, raster_kernels
 from gcode.units import filament_area_mm2
 
-CELL_MM = 0.25
-LEAST_MM = 0.05  # thinner and shorter is none
+LAID_CELL_MM = 0.25
+LEAST_STRAND_MM = 0.05  # thinner and shorter is none
 
 
 class Laid:
     """Heights of all beads laid so far."""
 
     def __init__(self, profile: PrinterProfile) -> None:
-        self.surface = HeightField.flat(profile.bed_size_mm, CELL_MM)
+        self.surface = HeightField.flat(profile.bed_size_mm, LAID_CELL_MM)
         self._area_mm2 = filament_area_mm2(profile.filament_diameter_mm)
 
     def add(self, motion: MotionBatch) -> None:
         """Lay what the nozzle pushed out, in order; all of one height at a time."""
         length_mm = np.linalg.norm(motion.end_mm - motion.start_mm, axis=1)
-        pick = (motion.filament_mm > 0) & (length_mm > LEAST_MM)
+        pick = (motion.filament_mm > 0) & (length_mm > LEAST_STRAND_MM)
         start, end = motion.start_mm[pick], motion.end_mm[pick]
         section = motion.filament_mm[pick] * self._area_mm2 / length_mm[pick]
         for high in np.unique(end[:, 2]):
@@ -43,7 +43,7 @@ class Laid:
     ) -> None:
         surface = self.surface
         under_mm = surface.sample(0.5 * (start_mm + end_mm)[:, :2])
-        height_mm = np.maximum(end_mm[:, 2] - under_mm, LEAST_MM)
+        height_mm = np.maximum(end_mm[:, 2] - under_mm, LEAST_STRAND_MM)
         rows, columns = surface.shape
         top_mm = raster_kernels.beside_lines(
             np.ascontiguousarray(start_mm[:, :2]), np.ascontiguousarray(end_mm[:, :2]),

@@ -15,7 +15,7 @@ from gcode.firmware.contact import Contact
 from gcode.firmware.laid import Laid
 from gcode.firmware.motion import MotionBatch
 from gcode.firmware.planner import Planner
-from gcode.firmware.thermal import BED, HOTEND, Heater
+from gcode.firmware.thermal import BED_HEATER, HOTEND, Heater
 from gcode.firmware.variants import Variant
 from gcode.profiles import AxisLimits, PrinterProfile
 from gcode.surfaces import HeightField
@@ -31,7 +31,7 @@ MOST_CHORDS = 10_000
 SOFT_MARGIN_MM = 10.0
 """How far over the bed's edge the head reaches (purge lines beside the bed)."""
 HOMING_MM_S = 50.0
-_WORD = re.compile(rb"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+)?)")
+_RAW_WORD = re.compile(rb"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+)?)")
 
 
 @dataclass(slots=True)
@@ -107,7 +107,7 @@ class Mechanics:
         executed = self.planner.executed
         self.planner = self._new_planner()
         self.planner.executed = executed
-        self.hotend, self.bed = Heater(HOTEND), Heater(BED)
+        self.hotend, self.bed = Heater(HOTEND), Heater(BED_HEATER)
         for heater in (self.hotend, self.bed):
             heater.set_target(0.0, self.clock_s)
         self.x = self.y = self.z = 0.0
@@ -323,7 +323,7 @@ def _axes(limits: AxisLimits) -> tuple[float, float, float, float]:
 def words_of(rest: bytes) -> dict[str, float]:
     """Parameters by letter; a letter without a number counts as 0."""
     words: dict[str, float] = {}
-    for letter, number in _WORD.findall(rest.upper()):
+    for letter, number in _RAW_WORD.findall(rest.upper()):
         value = float(number) if number.strip(b"+-.") else 0.0
         words[letter.decode()] = min(max(value, -LARGEST), LARGEST)
     return words

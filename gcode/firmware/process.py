@@ -26,7 +26,7 @@ from gcode.firmware.serve import FRAME
 from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
 
-ANSWER_S = 60.0
+EMULATOR_ANSWERS_S = 60.0
 
 
 class EmulatedPrinterProcess:
@@ -172,10 +172,10 @@ class EmulatedPrinterProcess:
 
     def _answer(self) -> dict[str, object]:
         try:
-            answer = self._answers.get(timeout=ANSWER_S)
+            answer = self._answers.get(timeout=EMULATOR_ANSWERS_S)
         except queue.Empty:
             raise LinkError(
-                f"The emulated printer has not answered for {ANSWER_S:g} s; it may hang."
+                f"The emulated printer has not answered for {EMULATOR_ANSWERS_S:g} s; it may hang."
             ) from None
         if answer is None:
             raise LinkError("The emulated printer's process ended; see its standard error.")

@@ -27,7 +27,7 @@ class HeaterModel:
 
 HOTEND = HeaterModel(full_c=440.0, heat_tau_s=150.0, cool_tau_s=240.0)
 """A 40 W cartridge in an aluminium block: about 100 s to 215 °C."""
-BED = HeaterModel(full_c=145.0, heat_tau_s=300.0, cool_tau_s=700.0)
+BED_HEATER = HeaterModel(full_c=145.0, heat_tau_s=300.0, cool_tau_s=700.0)
 """A 200 W bed: about two minutes to 60 °C."""
 
 

@@ -60,7 +60,7 @@ _MARLIN_CAPABILITIES = (
     ("ARCS", True),
 )
 
-VARIANTS: dict[str, Variant] = {
+FIRMWARES: dict[str, Variant] = {
     "marlin": Variant(
         name="marlin",
         family="marlin",

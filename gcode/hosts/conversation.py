@@ -27,7 +27,7 @@ from gcode.protocol import events as ev
 from gcode.protocol.lines import numbered
 
 Answer = TypeVar("Answer")
-QUERY_TRIES = 10
+REPORT_TRIES = 10
 """At one damaged byte in 200 a report is damaged every fourth time: ten in a row, one in 10^6."""
 MOST_WAIT_S = 0.5
 PROOF_QUIET_S = 0.2
@@ -153,7 +153,7 @@ class SerialConversation:
             ("line numbers", numbered(number + 7, b"M105")),
         ):
             refused = False
-            for _ in range(QUERY_TRIES):
+            for _ in range(REPORT_TRIES):
                 self._refused_numbers.clear()
                 self._write(line)
                 until_s = self._clock() + max(self._link.timing.doubt_s, 0.3)
@@ -225,7 +225,7 @@ class SerialConversation:
     def _where(self) -> ev.PositionReport:
         """The position that two reports in a row agree on: a report has no checksum."""
         before = None
-        for _ in range(QUERY_TRIES):
+        for _ in range(REPORT_TRIES):
             report = self._answer("M114", lambda: self._position, "position")
             if report == before:
                 return report
@@ -233,7 +233,7 @@ class SerialConversation:
         raise LinkError("The printer reports another position each time; let it come to rest.")
 
     def _answer(self, command: str, read: Callable[[], Answer | None], what: str) -> Answer:
-        for _ in range(QUERY_TRIES):
+        for _ in range(REPORT_TRIES):
             self._temperatures = self._position = None
             self._ask(command)
             value = read()
@@ -279,7 +279,7 @@ class SerialConversation:
 
     def _prove_place(self) -> None:
         """Have the printer say which line it took last, until that is the last there is."""
-        for _ in range(QUERY_TRIES):
+        for _ in range(REPORT_TRIES):
             with self._mutex:
                 self._write(self._link.ask_place(self._clock()))
                 heard: list[ev.Event] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 
-LOOKS = (b"AMREPAIR_SCAN", b"@amrepair scan")
+LOOK_COMMANDS = (b"AMREPAIR_SCAN", b"@amrepair scan")
 
 
 class JobText:
@@ -31,4 +31,6 @@ class JobText:
 
     def is_look(self, line: int) -> bool:
         """Whether the line before this one asks for a look."""
-        return 0 < line < len(self._lines) and self._lines[line - 1].strip().startswith(LOOKS)
+        return 0 < line < len(self._lines) and self._lines[line - 1].strip().startswith(
+            LOOK_COMMANDS
+        )

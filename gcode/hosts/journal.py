@@ -28,14 +28,14 @@ from pathlib import Path
 
 from gcode.errors import JournalError
 
-VERSION = 2
+JOURNAL_VERSION = 2
 """Of the tables below; a journal of another version is not read."""
 FIRST_BASES = (10_000, 20_000)
 """Range of a new journal's first number: no firmware is there by itself after a reset."""
 FOREIGN_LINES = 50_000
 """Most commands of the host's own after a step: a question a second for half a day of pause."""
 
-_SCHEMA = """
+_JOURNAL_SCHEMA = """
 CREATE TABLE IF NOT EXISTS session (
     id INTEGER PRIMARY KEY,
     base INTEGER NOT NULL,        -- M110 sets the printer's number to this
@@ -161,14 +161,15 @@ class Journal:
     def _prepare(self) -> None:
         tables = self._db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        if tables and version != VERSION:
+        if tables and version != JOURNAL_VERSION:
             raise JournalError(
                 f"The journal {self.path} is of version {version}, this program writes version "
-                f"{VERSION}; name another file."
+                f"{JOURNAL_VERSION}; name another file."
             )
         if not tables:  # in one transaction: a kill leaves all of it or nothing
             self._db.executescript(
-                f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;"
+                f"BEGIN IMMEDIATE; {_JOURNAL_SCHEMA} "
+                f"PRAGMA user_version = {JOURNAL_VERSION}; COMMIT;"
             )
 
     def open_session(self) -> int:

@@ -18,7 +18,7 @@ from gcode.protocol.replies import parse_reply
 
 QUESTION = b"\nN2147483646 M105*0\n"
 """The newline ends the half line that a dead sender may have left. Its true checksum is 28."""
-TRIES = 6
+QUERY_TRIES = 6
 
 
 def last_number(
@@ -39,7 +39,7 @@ def last_number(
     """
     _listen(fd, timing, clock, note, for_answer=False)  # what a dead sender's lines still cause
     before: int | None = None
-    for _ in range(TRIES):
+    for _ in range(QUERY_TRIES):
         note(b">", QUESTION)
         os.write(fd, QUESTION)
         asked_for = _listen(fd, timing, clock, note, for_answer=True)

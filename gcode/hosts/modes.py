@@ -9,12 +9,11 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from gcode.dialects import dialect_of
+from gcode.dialects import WORD, dialect_of
 from gcode.hosts.port import PrintableProgram
 from gcode.protocol import command_in
 
-_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
-_NAME = re.compile(r"([GM])\s*0*(\d+)")
+_CODE_NAME = re.compile(r"([GM])\s*0*(\d+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +85,11 @@ def modes_after(
 def follow(modes: Modes, text: str, dialect: str) -> Modes:
     """Return the modes after one more line."""
     command = text.partition(";")[0].strip().upper()
-    match = _NAME.match(command)
+    match = _CODE_NAME.match(command)
     if match is None:
         return modes
     name = match.group(1) + match.group(2)
-    words = {letter: float(value) for letter, value in _WORD.findall(command[match.end() :])}
+    words = {letter: float(value) for letter, value in WORD.findall(command[match.end() :])}
     if name in ("G0", "G1", "G2", "G3"):
         return _move(modes, words, g91_moves_e=dialect_of(dialect).g91_moves_e)
     if name in ("G90", "G91"):

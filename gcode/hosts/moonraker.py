@@ -13,7 +13,7 @@ from collections.abc import Callable
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker_session import MoonrakerSession
-from gcode.hosts.moonraker_state import ENDS
+from gcode.hosts.moonraker_state import MOONRAKER_ENDS
 from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
 from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter
 from gcode.hosts.upload import JobFile
@@ -47,7 +47,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         session.look()
         if state.print_file == name and state.busy:
             return Left(name, "printing")
-        if state.print_file == name and state.print_state in ENDS:
+        if state.print_file == name and state.print_state in MOONRAKER_ENDS:
             return Left(name, "done" if state.print_state == "complete" else "failed")
         (about,) = session.listed("/server/files/metadata", filename=name)
         if about.get("print_start_time") is None:

@@ -19,7 +19,7 @@ from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
 from gcode.progress import Progress
 
 METHOD = "amrepair_call"
-STEP = "_AMREPAIR_STEP"
+STEP_MACRO = "_AMREPAIR_STEP"
 STEP_LINES = 40
 """Lines a script: some seconds of moves, which Klipper has queued long before they are made."""
 WRITTEN_S = 3.0
@@ -76,8 +76,8 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
 
     def forget_steps(self) -> None:
         """What an earlier run had counted is none of this one's."""
-        self.command("\n".join(f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE={v} VALUE=0" for v in
-                               ("program", "begun", "done", "hotend", "bed")))  # fmt: skip
+        names = ("program", "begun", "done", "hotend", "bed")
+        self.command("\n".join(_set_step(name, 0) for name in names))
 
     def leave_out(self, name: str) -> None:
         """By Klipper's own [exclude_object]; told twice, it is left out once."""
@@ -144,9 +144,9 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
                     self._session.news.wait(self._timing.poll_s)
             after = min(first + STEP_LINES, lines.stop)
             start = " START=1" if first == 0 else ""
-            script = [f"{STEP} PROGRAM={program} FROM={first} TO={after}{start}"]
+            script = [f"{STEP_MACRO} PROGRAM={program} FROM={first} TO={after}{start}"]
             script += [command for _, command in commands_of(checked, first, after)]
-            script.append(f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE=done VALUE={after}")
+            script.append(_set_step("done", after))
             self._carry_out("\n".join(script), program, first, after)
             progress("printing", float(after - lines.start), float(len(lines)))
             first = after
@@ -188,12 +188,12 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
 
     def _steps(self) -> dict[str, int]:
         """What the printer's macro has counted."""
-        key = f"gcode_macro {STEP}"
+        key = f"gcode_macro {STEP_MACRO}"
         told = self._session.query({key: None}).get(key)
         if told is None:
             raise LinkError(
-                f"the printer behind {self.address.name} has no macro {STEP}; include amrepair.cfg "
-                "('amrepair agent --macros') in printer.cfg and restart Klipper."
+                f"the printer behind {self.address.name} has no macro {STEP_MACRO}; include "
+                "amrepair.cfg ('amrepair agent --macros') in printer.cfg and restart Klipper."
             )
         return {name: int(told.get(name) or 0) for name in ("program", "begun", "done", "hotend",
                                                             "bed")}  # fmt: skip
@@ -242,8 +242,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
             now = self.temperatures()
             for name, value in (("hotend", now.hotend_target_c), ("bed", now.bed_target_c or 0)):
                 if value:
-                    text = f"SET_GCODE_VARIABLE MACRO={STEP} VARIABLE={name} VALUE={round(value)}"
-                    self.command(text)
+                    self.command(_set_step(name, round(value)))
         super().heaters_off()
 
     # ------------------------------------------------------------------ macros
@@ -256,3 +255,8 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
             found = [params for _, params in session.state.called]
             session.state.called.clear()
         return found
+
+
+def _set_step(name: str, value: int) -> str:
+    """The command that keeps a number with the printer."""
+    return f"SET_GCODE_VARIABLE MACRO={STEP_MACRO} VARIABLE={name} VALUE={value}"

@@ -10,7 +10,7 @@ from typing import Any
 
 import gcode
 from gcode.errors import LinkError, PortBusyError, PrinterError
-from gcode.hosts.moonraker_state import SUBSCRIPTION, KlippyState
+from gcode.hosts.moonraker_state import MOONRAKER_SUBSCRIPTION, KlippyState
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.server import ServerSession
 from gcode.hosts.web import Address, WebLog, WebTiming, json_object, refused_key, sentence
@@ -157,7 +157,7 @@ class MoonrakerSession(ServerSession[KlippyState]):
                 f"Klipper behind {self.address.name} is not ready (it is {klippy or 'silent'}); "
                 f"start it, or see its log."
             )
-        found = self.call("printer.objects.subscribe", {"objects": SUBSCRIPTION})
+        found = self.call("printer.objects.subscribe", {"objects": MOONRAKER_SUBSCRIPTION})
         with self.news:
             if isinstance(found, dict) and isinstance(found.get("status"), dict):
                 self.state.take_status(found["status"])

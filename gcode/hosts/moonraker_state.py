@@ -6,9 +6,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-ENDS = ("complete", "cancelled", "error")
+MOONRAKER_ENDS = ("complete", "cancelled", "error")
 STOPPED = ("shutdown", "error")
-SUBSCRIPTION: dict[str, list[str] | None] = {
+MOONRAKER_SUBSCRIPTION: dict[str, list[str] | None] = {
     "webhooks": ["state", "state_message"],
     "print_stats": ["state", "filename", "message"],
     "virtual_sdcard": ["file_position"],
@@ -31,7 +31,7 @@ class KlippyState:
     stale
         Klipper came back: what we knew of its objects is void until asked anew.
     outcome
-        How the followed print ended: one of `ENDS`.
+        How the followed print ended: one of `MOONRAKER_ENDS`.
     file_position
         Bytes of the followed file that Klipper has taken into its queue.
     methods, called
@@ -99,7 +99,7 @@ class KlippyState:
         self.message = str(stats.get("message", self.message))
         if not self.file or self.print_file != self.file:
             return
-        if self.print_state in ENDS and not self.outcome:
+        if self.print_state in MOONRAKER_ENDS and not self.outcome:
             self.outcome = self.print_state
         position = _object(status, "virtual_sdcard").get("file_position")
         if isinstance(position, int) and position > self.file_position:  # 0 again once it ended

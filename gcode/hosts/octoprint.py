@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.octoprint_session import OctoPrintSession
-from gcode.hosts.octoprint_state import BUSY, part_of
+from gcode.hosts.octoprint_state import BUSY_STATES, part_of
 from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
 from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter
@@ -55,7 +55,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         newest = max(mine, key=lambda row: row.get("date") or 0)
         name = str(newest["path"])
         flags = self._session.status()["state"]["flags"]
-        if self._session.printing()[0] == name and any(flags.get(f) for f in BUSY):
+        if self._session.printing()[0] == name and any(flags.get(f) for f in BUSY_STATES):
             return Left(name, "printing")
         prints = part_of(newest, "prints")
         last = part_of(prints, "last")

@@ -29,7 +29,7 @@ from gcode.hosts.web import json_object, sentence
 from gcode.progress import Progress
 
 PLUGIN = f"/plugin/{AGENT}"
-AGENT_GONE_S = 8.0
+OTHER_AGENT_GOES_S = 8.0
 """An agent that was killed is missed by then, and another may come."""
 HERE_EVERY_S = 2.0
 BOM = b"\xef\xbb\xbf"
@@ -93,9 +93,9 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
         Raises
         ------
         PortBusyError
-            If that agent does not go within `AGENT_GONE_S`.
+            If that agent does not go within `OTHER_AGENT_GOES_S`.
         """
-        until_s = self._clock() + AGENT_GONE_S
+        until_s = self._clock() + OTHER_AGENT_GOES_S
         while True:
             try:
                 calls = self._state()["calls"]

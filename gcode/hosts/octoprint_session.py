@@ -22,8 +22,8 @@ from gcode.hosts.web import Address, WebLog, WebTiming, json_object, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
-_SENT = re.compile(r"Send: (?:N\d+ )?(.*?)(?:\*\d+)?")
-SUBSCRIPTION = {"state": {"logs": True, "messages": False}, "events": True}
+_SENT_LINE = re.compile(r"Send: (?:N\d+ )?(.*?)(?:\*\d+)?")
+OCTOPRINT_SUBSCRIPTION = {"state": {"logs": True, "messages": False}, "events": True}
 
 
 class OctoPrintSession(ServerSession[ServerState]):
@@ -66,7 +66,7 @@ class OctoPrintSession(ServerSession[ServerState]):
         socket = self._open_socket("/sockjs/websocket", {})
         socket.send({"auth": f"{user.get('name')}:{user['session']}"})
         plugins = [self.state.plugin] if self.state.plugin else False
-        socket.send({"subscribe": {**SUBSCRIPTION, "plugins": plugins}})
+        socket.send({"subscribe": {**OCTOPRINT_SUBSCRIPTION, "plugins": plugins}})
         with self.news:
             if not self.news.wait_for(lambda: self.state.connected, self._timing.request_s):
                 raise LinkError(
@@ -183,7 +183,7 @@ class OctoPrintSession(ServerSession[ServerState]):
 
 def _sent_at(terminal: deque[str], command: str) -> int | None:
     for index, line in enumerate(terminal):
-        match = _SENT.fullmatch(line)
+        match = _SENT_LINE.fullmatch(line)
         if match is not None and match.group(1) == command:
             return index
     return None

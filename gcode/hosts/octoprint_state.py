@@ -6,8 +6,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-ENDS = ("PrintDone", "PrintFailed", "PrintCancelled")
-BUSY = ("printing", "paused", "pausing", "resuming", "cancelling", "finishing")
+OCTOPRINT_ENDS = ("PrintDone", "PrintFailed", "PrintCancelled")
+BUSY_STATES = ("printing", "paused", "pausing", "resuming", "cancelling", "finishing")
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class ServerState:
     @property
     def at_rest(self) -> bool:
         """Whether the server does nothing with a file."""
-        return not any(self.flags.get(name) for name in BUSY)
+        return not any(self.flags.get(name) for name in BUSY_STATES)
 
     @property
     def ended(self) -> bool:
@@ -107,7 +107,7 @@ class ServerState:
             self.error = str(payload.get("error") or self.error)
         if not isinstance(payload, dict) or payload.get("path") != self.file:
             return
-        if kind in ENDS and not self.outcome:
+        if kind in OCTOPRINT_ENDS and not self.outcome:
             cancelled = payload.get("reason") == "cancelled"
             self.outcome = "PrintCancelled" if cancelled else kind
             # The flags lag behind by up to half a second; rest is what the next ones say.

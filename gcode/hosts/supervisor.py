@@ -23,7 +23,7 @@ LIFT = (
 )
 QUESTIONS = 3
 _TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
-ANSWER_S = 0.5
+PORT_ANSWERS_S = 0.5
 SILENT_S = 0.1
 """The same for who has not answered so far: its receive buffer holds all that is said."""
 
@@ -54,7 +54,7 @@ def make_safe(port_fd: int, *, lift: bool = True) -> str:
     for said, command in enumerate(commands):
         if not write(port_fd, command + b"\n"):
             return "THE PORT IS GONE, HEATERS COULD NOT BE REACHED"
-        answered += wait(port_fd, ANSWER_S if answered or said < 2 else SILENT_S)[0]
+        answered += wait(port_fd, PORT_ANSWERS_S if answered or said < 2 else SILENT_S)[0]
     if not answered:
         return "heaters told to switch off, NO ANSWER"
     if confirmed_off(port_fd):
@@ -70,7 +70,7 @@ def confirmed_off(port_fd: int) -> bool:
     for _ in range(QUESTIONS):
         if not write(port_fd, b"M105\n"):
             return False
-        targets = dict(_TARGET.findall(wait(port_fd, ANSWER_S)[1]))
+        targets = dict(_TARGET.findall(wait(port_fd, PORT_ANSWERS_S)[1]))
         if b"T" in targets:
             return all(float(value) == 0.0 for value in targets.values())
     return False
@@ -80,7 +80,7 @@ def write(port_fd: int, data: bytes) -> bool:
     """Write all of `data`; False if the port is gone."""
     try:
         while data:
-            if not select.select([], [port_fd], [], ANSWER_S)[1]:
+            if not select.select([], [port_fd], [], PORT_ANSWERS_S)[1]:
                 return True
             data = data[os.write(port_fd, data) :]
     except OSError:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gcode.check import CheckedProgram
-from gcode.check.touches import COMMANDS
+from gcode.check.touches import TOUCH_COMMANDS
 from gcode.dialects import number
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
 from gcode.hosts.serial import SerialPrinter
@@ -128,7 +128,7 @@ def felt(
         If nothing is felt down to where a touch was to end, or the firmware does not know touches;
         heaters are off then, and the nozzle is lifted.
     """
-    command = COMMANDS[checked.program.dialect]
+    command = TOUCH_COMMANDS[checked.program.dialect]
     lines = checked.program.text.split("\n")
     felt_mm: list[float] = []
     first = 0
@@ -155,7 +155,7 @@ def felt(
 
 def _forget_z(printer: SerialPrinter, command: str) -> None:
     """Klipper's Z is still the one that the macro lowered: it must be homed before it moves."""
-    if command == COMMANDS["klipper"]:
+    if command == TOUCH_COMMANDS["klipper"]:
         with contextlib.suppress(LinkError, LocalProtocolError):
             printer.command("SET_KINEMATIC_POSITION CLEAR_HOMED=Z")
 
@@ -166,14 +166,14 @@ def _met_mm(printer: SerialPrinter, warnings: tuple[str, ...], command: str) -> 
         printer.make_safe()
         how = (
             "write its macro by 'gcode touch --klipper-macro FILE' and include it in printer.cfg"
-            if command == COMMANDS["klipper"]
+            if command == TOUCH_COMMANDS["klipper"]
             else "build it with G38_PROBE_TARGET, or set Z by hand, with paper below the nozzle"
         )
         raise PrinterError(
             f"The printer's firmware does not know {command}, so nothing was touched; the nozzle "
             f"was lifted and the heaters are off: {how}."
         )
-    if command != COMMANDS["klipper"]:
+    if command != TOUCH_COMMANDS["klipper"]:
         return printer.place().z_mm
     said = [match for text in printer.said if (match := _TOUCHED.fullmatch(text.strip()))]
     if not said:

@@ -27,9 +27,9 @@ from gcode.hosts.port import Temperatures
 from gcode.hosts.secret import VARIABLES, ApiKey
 from gcode.hosts.wirelog import WireLog
 
-MAX_MESSAGE_BYTES = 16_000_000  # OctoPrint's history holds half an hour of temperatures
+MAX_SERVER_MESSAGE_BYTES = 16_000_000  # OctoPrint's history holds half an hour of temperatures
 LIFT_COMMANDS = ("G91", "G1 Z5 F600", "G90")
-_NAMES = {"octoprint": "OctoPrint", "moonraker": "Moonraker"}
+_SERVER_NAMES = {"octoprint": "OctoPrint", "moonraker": "Moonraker"}
 # websockets logs frames and headers when somebody asks for DEBUG, and with them keys and sessions.
 _MUTE = logging.Logger("gcode.hosts.web.frames", logging.CRITICAL + 1)
 
@@ -74,7 +74,7 @@ class Address:
     @property
     def name(self) -> str:
         """What messages call it."""
-        return f"{_NAMES[self.kind]} at {self.base}"
+        return f"{_SERVER_NAMES[self.kind]} at {self.base}"
 
     def socket_url(self, path: str) -> str:
         """Return the address of a websocket."""
@@ -193,7 +193,7 @@ class WebClient:
         if answer.status_code != 200 or body is None:
             raise LinkError(
                 f"{self.address.name} answers {path} with status {answer.status_code} "
-                f"({sentence(answer)}); is it {_NAMES[self.address.kind]}?"
+                f"({sentence(answer)}); is it {_SERVER_NAMES[self.address.kind]}?"
             )
         return body
 
@@ -235,7 +235,7 @@ class PushSocket:
                     additional_headers=dict(headers),
                     open_timeout=timing.request_s,
                     close_timeout=1.0,
-                    max_size=MAX_MESSAGE_BYTES,
+                    max_size=MAX_SERVER_MESSAGE_BYTES,
                     proxy=None,
                     logger=_MUTE,
                 )

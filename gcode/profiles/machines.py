@@ -14,12 +14,12 @@ from gcode.profiles.names import id_of, profile_dir
 
 # "(0.4 mm nozzle)", "0.4 nozzle", and what slicers add of the project a preset was saved in
 _ASIDE = re.compile(r"\([^)]*\)|@.*$|\b0\.\d+ ?(?:MM)? ?NOZZLE\b|-? ?COPY\b")
-_BETWEEN = re.compile(r"[\s_-]")
+_NAME_GAP = re.compile(r"[\s_-]")
 
 
 def plain(name: str) -> str:
     """A machine's name in capitals, without spaces, dashes, nozzle."""
-    return _BETWEEN.sub("", _ASIDE.sub("", name.upper().strip('"')))
+    return _NAME_GAP.sub("", _ASIDE.sub("", name.upper().strip('"')))
 
 
 @lru_cache(maxsize=1)

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from gcode.dialects import dialect_of
 from gcode.profiles.schema import PrinterProfile
 
-_WORD = re.compile(r"([A-Z])([-+]?(?:\d+\.?\d*|\.\d+))")
+_CLOSE_WORD = re.compile(r"([A-Z])([-+]?(?:\d+\.?\d*|\.\d+))")
 _HEATS = {"M104": "hotend", "M109": "hotend", "M140": "bed", "M190": "bed"}
 _AXES = "XYZ"
 ROUNDED = 1.05  # what a script's digits may add
-STILL_MM = 0.05  # a shorter move leaves a blob, no bead
+UNMOVED_MM = 0.05  # a shorter move leaves a blob, no bead
 
 
 def own_fault(printer: PrinterProfile) -> str | None:
@@ -61,7 +61,7 @@ class _Start:
         """The limits that the next line breaks, as phrases."""
         command = line.partition(";")[0].strip().upper()
         name, _, rest = command.partition(" ")
-        words = {letter: float(value) for letter, value in _WORD.findall(rest)}
+        words = {letter: float(value) for letter, value in _CLOSE_WORD.findall(rest)}
         if "{" in rest:  # what a material fills in is judged with that material
             return
         if name in _HEATS:
@@ -101,7 +101,7 @@ class _Start:
         if pushed_mm <= 0 or not known:
             return
         area_mm2 = math.pi / 4 * printer.filament_diameter_mm**2
-        if length_mm <= STILL_MM:
+        if length_mm <= UNMOVED_MM:
             most_mm = printer.max_extrude_only_mm
             if pushed_mm > most_mm:
                 yield f"{pushed_mm:g} mm of filament standing still, 'max_extrude_only_mm' is " + (

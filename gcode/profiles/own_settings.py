@@ -20,10 +20,10 @@ from gcode.profiles.schema import PrinterProfile
 from gcode.profiles.setup import PrintSetup, load_setup
 
 SAME_BED_RATIO = 0.05  # slicers and makers give one bed a few millimetres more or less
-SAME_NOZZLE_MM = 0.01
+SAME_NOZZLE_MM = 0.01  # nozzles are sold in steps of a tenth
 _POINT = re.compile(r"(-?\d+(?:\.\d+)?)x(-?\d+(?:\.\d+)?)")
 # What one would ask first, and what no slicer tells.
-_WORDS = {
+_ASKED_FIRST = {
     "bed_size_mm": "bed",
     "max_z_mm": "height",
     "nozzle_diameter_mm": "nozzle",
@@ -90,7 +90,7 @@ class OwnSettings:
     def in_words(self, setup: PrintSetup) -> str:
         """One sentence: what was taken from where."""
         printer, made = setup.printer, self.found.profiles[0]
-        untold = [words for key, words in _WORDS.items() if key not in made.values]
+        untold = [words for key, words in _ASKED_FIRST.items() if key not in made.values]
         return (
             f"{self.job}: no --printer is given, so its own settings"
             f"{f' ({self.slicer})' if self.slicer else ''} are taken: {_described(printer)}; "

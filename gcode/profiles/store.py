@@ -26,7 +26,7 @@ _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less tha
 _P = TypeVar("_P", PrinterProfile, MaterialProfile, ProcessProfile)
 
 
-_MODELS: dict[Kind, type[BaseModel]] = {
+MODELS: dict[Kind, type[BaseModel]] = {
     "printers": PrinterProfile,
     "materials": MaterialProfile,
     "processes": ProcessProfile,
@@ -62,7 +62,7 @@ def kind_of(id_or_path: str | Path) -> Kind:
         Where it is none, or an ID that several kinds have.
     """
     text = str(id_or_path)
-    named: list[Kind] = [kind for kind in _MODELS if text in list_profiles(kind)]
+    named: list[Kind] = [kind for kind in MODELS if text in list_profiles(kind)]
     if len(named) == 1:
         return named[0]
     if not (text.endswith(".toml") or "/" in text):
@@ -75,7 +75,7 @@ def kind_of(id_or_path: str | Path) -> Kind:
     parent = Path(str(own.get("inherits", ""))).name.removesuffix(".toml")
     points = {
         kind: sum(key in model.model_fields for key in own) + (parent in list_profiles(kind))
-        for kind, model in _MODELS.items()
+        for kind, model in MODELS.items()
     }
     best = max(points.values())
     fits = [kind for kind, value in points.items() if value == best]

@@ -27,10 +27,10 @@ SLOW_COMMANDS = frozenset(
 )
 """Commands that may take minutes without an answer (OctoPrint's longRunningCommands and more)."""
 
-_MACRO = re.compile(r"[A-Za-z_]{2}")
+_MACRO_NAME = re.compile(r"[A-Za-z_]{2}")
 """A command by name (Klipper) may be a whole script, and takes as long as its moves."""
 
-_QUICK = frozenset(("G0 ", "G1 "))
+_QUICK_MOVES = frozenset(("G0 ", "G1 "))
 _NEWLINE = 10
 _CHECKSUMS = tuple(f"*{value}\n" for value in range(256))
 _FRAME_BYTES = 18
@@ -92,7 +92,7 @@ class WireLines(Sequence[str | WireLine]):
         self._commands = commands
         self._dialect = dialect
         self._data = _numbered_at_once(first, commands, dialect)
-        self._breaks = [i for i, line in enumerate(commands) if line[:3] not in _QUICK]
+        self._breaks = [i for i, line in enumerate(commands) if line[:3] not in _QUICK_MOVES]
 
     def __len__(self) -> int:
         return len(self._commands)
@@ -152,7 +152,7 @@ def _numbered_at_once(
 
 def _takes_long(text: str) -> bool:
     name = text.partition(" ")[0]
-    return name in SLOW_COMMANDS or _MACRO.match(name) is not None
+    return name in SLOW_COMMANDS or _MACRO_NAME.match(name) is not None
 
 
 def checksum(data: bytes) -> int:

@@ -54,9 +54,9 @@ _OK_NUMBER = re.compile(rb"N(\d+)")
 _MOVES = frozenset(("G0 ", "G1 ", "G2 ", "G3 "))
 
 # Looked up once: Python 3.11 takes 0.1 µs to find a member of an enumeration, ten times a line.
-_GREETING, _IDLE, _WAITING = State.GREETING, State.IDLE, State.WAITING
-_REWINDING, _PROBING, _ASKING = State.REWINDING, State.PROBING, State.ASKING
-_SENT = Signal.SENT
+_GREETING, _IDLE_STATE, _WAITING = State.GREETING, State.IDLE, State.WAITING
+_REWINDING, _PROBING_STATE, _ASKING = State.REWINDING, State.PROBING, State.ASKING
+_SENT_SIGNAL = Signal.SENT
 
 
 class Link(Recovery):
@@ -85,7 +85,7 @@ class Link(Recovery):
     @property
     def ready(self) -> bool:
         """Whether `send` may be called now."""
-        if self.state is _IDLE:
+        if self.state is _IDLE_STATE:
             return True
         if self.window == 1 or self.state is not _WAITING:
             return False
@@ -131,7 +131,7 @@ class Link(Recovery):
         must have its turn: lines under way, something in doubt, a command that is no plain move.
         """
         if (
-            self.state is not _IDLE
+            self.state is not _IDLE_STATE
             or lines.first + index != self._ledger.last + 1
             or self._swallow_until_s >= 0
             or not self._inbox.empty
@@ -168,8 +168,8 @@ class Link(Recovery):
         if answered:
             self._belief.progress()
             self._probing_since_s = None
-        if answered < len(written) and self.state is _IDLE:
-            self.state = TRANSITIONS[_IDLE][_SENT]
+        if answered < len(written) and self.state is _IDLE_STATE:
+            self.state = TRANSITIONS[_IDLE_STATE][_SENT_SIGNAL]
             self._listen_anew(now_s)
 
     def send(self, command: str | WireLine, now_s: float) -> bytes:
@@ -181,7 +181,7 @@ class Link(Recovery):
             If the link is not `ready`, or the command cannot be carried by this dialect.
         """
         ledger = self._ledger
-        if self.state is not _IDLE and not self.ready:
+        if self.state is not _IDLE_STATE and not self.ready:
             raise LocalProtocolError(
                 f"The link is {self.state.value} with {ledger.last - ledger.acked} lines under way "
                 f"of {self.window}; wait until it is ready."
@@ -195,7 +195,7 @@ class Link(Recovery):
             line = wire_line(number, command.command, self.dialect)
         ledger.add(line)
         self._moved = self._moved or line.command[:3] in _MOVES
-        self.state = TRANSITIONS[self.state][_SENT]
+        self.state = TRANSITIONS[self.state][_SENT_SIGNAL]
         self._listen_anew(now_s)
         return line[2]
 
@@ -210,7 +210,7 @@ class Link(Recovery):
     def next_deadline_s(self) -> float:
         """When `tick` has something to do; infinity if never."""
         state = self.state
-        if state is _WAITING or state is _PROBING:
+        if state is _WAITING or state is _PROBING_STATE:
             return min(self._deadline_s, self._half_line_s)
         if state is _GREETING or state is _ASKING:
             return self._deadline_s
@@ -274,7 +274,7 @@ class Link(Recovery):
             self._greet_again(now_s)
         elif self.state is _ASKING:
             self._ask_place(now_s)
-        elif self.state in (_WAITING, _PROBING):
+        elif self.state in (_WAITING, _PROBING_STATE):
             self._silence(now_s)
         events, self._events = self._events, []
         return events
@@ -312,7 +312,7 @@ class Link(Recovery):
             # A numbered line whose N was lost: taken for a command without number, checksum
             # and all, and answered with ok. It must be sent again.
             self._events.append(reply)
-            if self.state in (_WAITING, _PROBING):
+            if self.state in (_WAITING, _PROBING_STATE):
                 self._on_resend(self._ledger.acked + 1, now_s)
         elif isinstance(reply, Unrecognised):
             self._events.append(reply)
@@ -343,7 +343,7 @@ class Link(Recovery):
                 self._rewind_at_once = True
             self._spare("belongs to a resend request")
             return
-        if self.state not in (_WAITING, _PROBING):
+        if self.state not in (_WAITING, _PROBING_STATE):
             self._spare("nothing was under way")
             return
         if self._asked_question:

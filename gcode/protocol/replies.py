@@ -45,20 +45,22 @@ Reply = (
     | Unrecognised
 )
 
-_NUMBER = r"[-+]?\d{1,9}(?:\.\d{0,9})?"
+_REPLIED_NUMBER = r"[-+]?\d{1,9}(?:\.\d{0,9})?"
 _RESEND = re.compile(r"(?:resend|rs)\s*[: ]\s*N?(\d{1,9})\s*", re.IGNORECASE)
-_OK = re.compile(r"ok(?:\s+(.*))?", re.DOTALL)
+_OK_REPLY = re.compile(r"ok(?:\s+(.*))?", re.DOTALL)
 _ADVANCED = re.compile(r"(?:N(\d{1,9})\s*)?(?:P(\d{1,4})\s+)?(?:B(\d{1,4}))?\s*")
-_BUSY = re.compile(r"(?:echo:\s*)?busy:\s*(.+)", re.IGNORECASE)
-_HEATER = re.compile(rf"\b([TBCPA]\d?):\s?({_NUMBER})(?:\s*/\s*({_NUMBER}))?")
-_TEMPERATURES = re.compile(rf"[TBCPA]\d?:\s?{_NUMBER}(?:\s*/\s*{_NUMBER})?(?:\s.*)?")
+_BUSY_REPLY = re.compile(r"(?:echo:\s*)?busy:\s*(.+)", re.IGNORECASE)
+_HEATER = re.compile(rf"\b([TBCPA]\d?):\s?({_REPLIED_NUMBER})(?:\s*/\s*({_REPLIED_NUMBER}))?")
+_TEMPERATURES = re.compile(
+    rf"[TBCPA]\d?:\s?{_REPLIED_NUMBER}(?:\s*/\s*{_REPLIED_NUMBER})?(?:\s.*)?"
+)
 _POSITION = re.compile(
-    rf"X:\s?({_NUMBER})\s+Y:\s?({_NUMBER})\s+Z:\s?({_NUMBER})\s+E:\s?({_NUMBER})\b.*"
+    rf"X:\s?({_REPLIED_NUMBER})\s+Y:\s?({_REPLIED_NUMBER})\s+Z:\s?({_REPLIED_NUMBER})\s+E:\s?({_REPLIED_NUMBER})\b.*"
 )
 _CAPABILITY = re.compile(r"Cap:([A-Z0-9_]{1,40}):([01])")
 _FIRMWARE_NAME = re.compile(r"FIRMWARE_NAME:\s*(\S[^:]*?)(?:\s+[A-Z_]+:.*)?$")
 _ACTION = re.compile(r"//\s?action:\s*(\S.*)")
-_UNKNOWN = re.compile(r"(?:echo:\s*|//\s*)?unknown command:.*", re.IGNORECASE | re.DOTALL)
+_UNKNOWN_COMMAND = re.compile(r"(?:echo:\s*|//\s*)?unknown command:.*", re.IGNORECASE | re.DOTALL)
 
 # What firmwares print as they boot: Marlin `start`, reset causes (`setup()` of MarlinCore),
 # Repetier the same; Klipper tells of its restart with `// Klipper state:`; RepRap.cpp of
@@ -100,16 +102,16 @@ def parse_reply(raw: bytes) -> Reply:
         return Ok()
     if _PRINTABLE.fullmatch(raw) is None:
         text = raw.decode("latin-1").strip()
-        return UnknownCommand(text) if _UNKNOWN.fullmatch(text) else Unrecognised(raw)
+        return UnknownCommand(text) if _UNKNOWN_COMMAND.fullmatch(text) else Unrecognised(raw)
     text = raw.decode("latin-1").strip()
     if not text:
         return Echo("")
     head = text[0]
-    if head == "o" and (match := _OK.fullmatch(text)):
+    if head == "o" and (match := _OK_REPLY.fullmatch(text)):
         return _parse_ok(match.group(1) or "", raw)
     if head in "Rr" and (match := _RESEND.fullmatch(text)):
         return Resend(int(match.group(1)))
-    if match := _BUSY.fullmatch(text):
+    if match := _BUSY_REPLY.fullmatch(text):
         return Busy(match.group(1).strip())
     if head in "TBCPA" and _TEMPERATURES.fullmatch(text):
         return _temperatures(text)
@@ -125,7 +127,7 @@ def parse_reply(raw: bytes) -> Reply:
         return _error(text[6:].strip())
     if match := _ACTION.fullmatch(text):
         return HostAction(match.group(1).strip())
-    if _UNKNOWN.fullmatch(text):
+    if _UNKNOWN_COMMAND.fullmatch(text):
         return UnknownCommand(text)
     if match := _CAPABILITY.fullmatch(text):
         return Capability(match.group(1), match.group(2) == "1")

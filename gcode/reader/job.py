@@ -22,9 +22,9 @@ from gcode.units import filament_area_mm2
 
 _LAYER_MARKS = ("LAYER_CHANGE", "CHANGE_LAYER", "BEFORE_LAYER_CHANGE")
 _CURA_LAYER = re.compile(r"LAYER:\s*(-?\d+)")
-_NUMBER = r"([-+]?\d*\.?\d+)"
-_HEIGHT = re.compile(r"(?:HEIGHT|LAYER_HEIGHT):\s*" + _NUMBER)
-_WIDTH = re.compile(r"(?:WIDTH|LINE_WIDTH):\s*" + _NUMBER)
+_JOB_NUMBER = r"([-+]?\d*\.?\d+)"
+_HEIGHT = re.compile(r"(?:HEIGHT|LAYER_HEIGHT):\s*" + _JOB_NUMBER)
+_WIDTH = re.compile(r"(?:WIDTH|LINE_WIDTH):\s*" + _JOB_NUMBER)
 _ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$")
 _LEAST_LAYER_MM = 0.015
 _SQUARE_LOSS = 1.0 - math.pi / 4.0

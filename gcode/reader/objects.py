@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 
 from gcode.reader.job import Job
 
-_KLIPPER = re.compile(r"^\s*EXCLUDE_OBJECT_(START|END)(?:\s+NAME=(\S+))?", re.IGNORECASE)
+_KLIPPER_OBJECT = re.compile(r"^\s*EXCLUDE_OBJECT_(START|END)(?:\s+NAME=(\S+))?", re.IGNORECASE)
 _DEFINE = re.compile(r"^\s*EXCLUDE_OBJECT_DEFINE\b.*?\bNAME=(\S+)", re.IGNORECASE)
 _M486 = re.compile(r"^\s*M486\s+S(-?\d+)", re.IGNORECASE)
 _M486_NAME = re.compile(r"^\s*M486\b.*?\bA\"?([^\";]+)", re.IGNORECASE)
@@ -91,7 +91,7 @@ def _klipper(lines: list[str]) -> tuple[list[str], Changes]:
             continue
         if (defined := _DEFINE.match(line)) is not None:
             _index(names, defined.group(1))
-        elif (match := _KLIPPER.match(line)) is not None:
+        elif (match := _KLIPPER_OBJECT.match(line)) is not None:
             begins = match.group(1).upper() == "START" and match.group(2) is not None
             changes.append((number, _index(names, match.group(2)) if begins else NONE))
     return names, changes

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.check import CheckedProgram, check, policy_of
-from gcode.dialects import number
+from gcode.dialects import WORD, number
 from gcode.errors import InputError
 from gcode.meshes import mesh_of
 from gcode.moves import ModalState, Program
@@ -27,13 +27,12 @@ from gcode.reader import Job
 from gcode.surfaces import raster_kernels
 from gcode.units import filament_area_mm2
 
-LEAST_FACTOR, MOST_FACTOR = 0.3, 1.8
+LEAST_FACTOR, MOST_FLOW_FACTOR = 0.3, 1.8
 """Flow of a bead, of what the job plans: below, it tears; above, the nozzle ploughs."""
-STEP_MM = 0.5
+FLOW_STEP_MM = 0.5
 SAME_FACTOR = 0.03
 HEADROOM = 0.98
 """Of the printer's limits, so that rounding does not exceed them."""
-_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,12 +193,12 @@ class _Pen:
         for row in rows:
             start, end = beads.start_mm[row], beads.end_mm[row]
             length_mm = float(np.linalg.norm(end - start))
-            count = max(1, math.ceil(length_mm / STEP_MM))
+            count = max(1, math.ceil(length_mm / FLOW_STEP_MM))
             ends = start + (end - start) * (np.arange(1, count + 1) / count)[:, None]
             middles = ends - (end - start) * (0.5 / count)
             section = float(beads.section_mm2[row])
             most = min(
-                MOST_FACTOR,
+                MOST_FLOW_FACTOR,
                 self._most_mm2 / section,
                 self._most_mm3_s / max(section * feed_mm_s, 1e-9),
             )
@@ -222,7 +221,7 @@ class _Pen:
         pieces: Sequence[tuple[Float[np.ndarray, " 3"] | None, float, float]],
     ) -> None:
         """One move a piece; feed with the first."""
-        words = dict(_WORD.findall(command))
+        words = dict(WORD.findall(command))
         name = command.split(maxsplit=1)[0]
         e_mm = self._job.state_after(line).e_mm + self._offset_mm
         for k, (end, filament_mm, factor) in enumerate(pieces):
@@ -249,7 +248,7 @@ class _Pen:
             self._absolute_e and self._offset_mm and command.startswith(("G0", "G1", "G2", "G3"))
         ):
             return raw
-        words = dict(_WORD.findall(command))
+        words = dict(WORD.findall(command))
         if "E" not in words:
             return raw
         return re.sub(

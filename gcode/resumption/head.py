@@ -19,7 +19,7 @@ from gcode.slicing.room import bare_place, room_for_line
 from gcode.surfaces import HeightField
 from gcode.units import filament_area_mm2, mm_min_from_mm_s
 
-LIFT_MM = 10.0
+RESUME_LIFT_MM = 10.0
 LEAST_LIFT_MM = 2.0
 PRIME_MM3_S = 4.0
 
@@ -50,7 +50,7 @@ def temperatures(settings: Settings, setup: PrintSetup) -> tuple[float, float]:
 def height_over(top_mm: float, state: ModalState, printer: PrinterProfile) -> float:
     """Height at which the nozzle passes over everything."""
     top_mm = max(top_mm, state.position_mm[2])
-    clear_mm = min(top_mm + LIFT_MM, printer.max_z_mm)
+    clear_mm = min(top_mm + RESUME_LIFT_MM, printer.max_z_mm)
     if clear_mm < top_mm + LEAST_LIFT_MM:
         raise InputError(
             f"The part stands {top_mm:g} mm high and the nozzle goes up to {printer.max_z_mm:g} "

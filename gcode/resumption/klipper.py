@@ -4,4 +4,4 @@ from __future__ import annotations
 
 from importlib.resources import files
 
-MACRO = files("gcode.resumption").joinpath("klipper_touch.cfg").read_text(encoding="utf-8")
+TOUCH_MACRO = files("gcode.resumption").joinpath("klipper_touch.cfg").read_text(encoding="utf-8")

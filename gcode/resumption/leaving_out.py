@@ -19,8 +19,8 @@ from gcode.profiles import PrinterProfile
 from gcode.reader import Job, JobObjects, objects_of
 from gcode.resumption.head import feed, filament_back_mm
 
-MOVE = re.compile(r"^\s*[Gg]0*[0123](?!\d)")
-LEAST_MM = 5e-4
+MOVE_OR_ARC = re.compile(r"^\s*[Gg]0*[0123](?!\d)")
+LEAST_MOVE_MM = 5e-4
 
 
 def object_named(job: Job, name: str) -> tuple[JobObjects, int]:
@@ -59,7 +59,7 @@ def lines_without(job: Job, first: int, name: str, printer: PrinterProfile) -> t
     at = first
     for start, stop in _gaps(job, objects, index, first):
         out += lines[at:start]
-        out += [line for line in lines[start:stop] if not MOVE.match(line)]
+        out += [line for line in lines[start:stop] if not MOVE_OR_ARC.match(line)]
         out += _across(job, start, stop, printer)
         at = stop
     return (*out, *lines[at:])
@@ -92,7 +92,7 @@ def _filament(job: Job, start: int, stop: int, printer: PrinterProfile) -> list[
     """What is to be pulled back before the way over the gap, as the job has it behind it."""
     back_mm = filament_back_mm(job)
     more_mm = float(back_mm[stop] - back_mm[start])
-    if abs(more_mm) < LEAST_MM:
+    if abs(more_mm) < LEAST_MOVE_MM:
         return []
     return [f"G1 E{number(-more_mm, 5)} F{feed(printer.retraction_speed_mm_s)}"]
 

@@ -23,11 +23,11 @@ from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import over_reach
 from gcode.surfaces import HeightField
 
-STEP_MM = 0.5  # along the first layer's beads
-FLAT_RATIO = 0.5  # of a layer: what the first one bridges or is pressed into
+ONTO_STEP_MM = 0.5  # along the first layer's beads
+UNEVEN_RATIO = 0.5  # of a layer: what the first one bridges or is pressed into
 HELD_RATIO = 0.98  # of the first layer that must lie on something
 TOP_PERCENT = 95.0  # what is higher are single points of a scan's noise
-_MOVE = re.compile(r"^\s*[Gg][0123](?!\d)")
+_MOVED_COMMAND = re.compile(r"^\s*[Gg][0123](?!\d)")
 _Z = re.compile(r"([Zz])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 _RELATIVE = re.compile(r"^\s*G9([01])\b", re.IGNORECASE)
 
@@ -109,7 +109,7 @@ def _height_under(job: Job, standing: HeightField) -> tuple[float, float]:
     own = beads.layer == 0
     start, end = beads.start_mm[own], beads.end_mm[own]
     lengths = np.linalg.norm(end - start, axis=1)
-    count = np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
+    count = np.maximum(1, np.ceil(lengths / ONTO_STEP_MM).astype(np.int64))
     owner = np.repeat(np.arange(len(count)), count)
     step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     places = start[owner] + (end - start)[owner] * ((step + 0.5) / count[owner])[:, None]
@@ -121,15 +121,15 @@ def _height_under(job: Job, standing: HeightField) -> tuple[float, float]:
             f"Nothing stands under the job's first layer (the highest is {top_mm:.2f} mm); place "
             "the job in X and Y where the part stands, in the slicer."
         )
-    low_mm = top_mm - FLAT_RATIO * layer_mm
+    low_mm = top_mm - UNEVEN_RATIO * layer_mm
     held = under_mm >= low_mm
     share = float(held.mean())
     if share < HELD_RATIO:
         raise InputError(
             f"{1 - share:.0%} of the job's first layer would hang in the air: what stands under it "
             f"is {under_mm.min():.2f} to {top_mm:.2f} mm high, half a layer "
-            f"({FLAT_RATIO * layer_mm:.2f} mm) may be uneven; slice it without skirt and brim, or "
-            "move it onto a flat."
+            f"({UNEVEN_RATIO * layer_mm:.2f} mm) may be uneven; slice it without skirt and brim, "
+            "or move it onto a flat."
         )
     return round(top_mm, 3), round(top_mm - float(under_mm[held].min()), 3)
 
@@ -148,7 +148,7 @@ def _raised(lines: list[str], by_mm: float, *, absolute: bool, first: int) -> li
                 f"Line {number_} ({code.strip()!r}) changes what a height means, and cannot be "
                 "raised; slice the job without it."
             )
-        if absolute and _MOVE.match(code):
+        if absolute and _MOVED_COMMAND.match(code):
             code = _Z.sub(lambda m: f"{m.group(1)}{number(float(m.group(2)) + by_mm, 5)}", code)
         out.append(f"{code}{mark}{comment}")
     return out

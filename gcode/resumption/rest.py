@@ -24,12 +24,12 @@ from gcode.profiles import PrintSetup
 from gcode.reader import Job, JobObjects, objects_of, read_job
 from gcode.reader.objects import box_of_beads_mm
 from gcode.resumption.head import feed, filament_back_mm
-from gcode.resumption.leaving_out import LEAST_MM, MOVE, modes_as
+from gcode.resumption.leaving_out import LEAST_MOVE_MM, MOVE_OR_ARC, modes_as
 from gcode.surfaces import HeightField
 
-CLEAR_MM = 2.0
+OVER_PART_MM = 2.0
 """Over all that stands there: what has come loose once may stand up a little more."""
-BESIDE_MM = 5.0
+OFF_OBJECT_MM = 5.0
 """Around what stands of an object: half a nozzle's tip and a strand."""
 _FIRMWARE_RETRACTION = re.compile(r"^\s*[Gg]1[01](?!\d)", re.MULTILINE)
 
@@ -124,7 +124,7 @@ def given_up_box_mm(
     if not given_up.any():
         return None
     x0, y0, x1, y1 = box_of_beads_mm(job, given_up)
-    return x0 - BESIDE_MM, y0 - BESIDE_MM, x1 + BESIDE_MM, y1 + BESIDE_MM
+    return x0 - OFF_OBJECT_MM, y0 - OFF_OBJECT_MM, x1 + OFF_OBJECT_MM, y1 + OFF_OBJECT_MM
 
 
 def _pieces(
@@ -184,12 +184,12 @@ class _Pen:
         """Lay nothing, and go, lifted, to where the job is after it."""
         for line in range(start, stop):
             self._note(line)
-            if not MOVE.match(self._lines[line]):
+            if not MOVE_OR_ARC.match(self._lines[line]):
                 self.text.append(self._lines[line])
         after, machine = self.job.state_after(stop), self.setup.printer
         more_mm = machine.retraction_mm - self.pulled_mm
         self.text += ["G90", "M83"]
-        if more_mm > LEAST_MM:
+        if more_mm > LEAST_MOVE_MM:
             self._push(-more_mm)
         up, *there = self._way_to(after.position_mm)
         self.text.append(up)
@@ -223,14 +223,14 @@ class _Pen:
         return float(self._back_mm[line])
 
     def _push(self, filament_mm: float) -> None:
-        if abs(filament_mm) >= LEAST_MM:
+        if abs(filament_mm) >= LEAST_MOVE_MM:
             speed = feed(self.setup.printer.retraction_speed_mm_s)
             self.text.append(f"G1 E{number(filament_mm, 5)} F{speed}")
             self.pulled_mm -= filament_mm
 
     def _over(self, z_mm: float) -> float:
         """A height over all that stands there and is laid meanwhile."""
-        return min(max(self.standing.top_mm, z_mm) + CLEAR_MM, self.setup.printer.max_z_mm)
+        return min(max(self.standing.top_mm, z_mm) + OVER_PART_MM, self.setup.printer.max_z_mm)
 
     def _crosses(self, line: int) -> bool:
         """Whether a travel passes what stands of a given up object, not above it."""
@@ -238,7 +238,7 @@ class _Pen:
         before, after = self.job.state_after(line), self.job.state_after(line + 1)
         if box is None or not before.absolute_xyz or not after.units_mm:
             return False
-        if min(before.position_mm[2], after.position_mm[2]) > self.standing.top_mm + CLEAR_MM:
+        if min(before.position_mm[2], after.position_mm[2]) > self.standing.top_mm + OVER_PART_MM:
             return False
         start, end = np.array(before.position_mm[:2]), np.array(after.position_mm[:2])
         share = np.linspace(0.0, 1.0, max(2, int(np.hypot(*(end - start))) + 1))[:, None]

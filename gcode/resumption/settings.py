@@ -9,12 +9,12 @@ from gcode.errors import ReadError
 from gcode.reader import Job
 
 _LIMITS = ("M201", "M203", "M204", "M205", "M566", "M593", "SET_VELOCITY_LIMIT")
-_FACTORS = ("M220", "M221", "M572", "M900", "SET_PRESSURE_ADVANCE")
-_OTHERS = ("M141", "M486", "EXCLUDE_OBJECT_DEFINE", "G17", "G18", "G19")
-REPLAYED = frozenset((*_LIMITS, *_FACTORS, *_OTHERS))
+_FACTOR_COMMANDS = ("M220", "M221", "M572", "M900", "SET_PRESSURE_ADVANCE")
+_OTHER_COMMANDS = ("M141", "M486", "EXCLUDE_OBJECT_DEFINE", "G17", "G18", "G19")
+REPLAYED = frozenset((*_LIMITS, *_FACTOR_COMMANDS, *_OTHER_COMMANDS))
 """Limits, factors, pressure advance, planes, chamber, names of objects: the last word counts."""
 _PLANES = frozenset({"G17", "G18", "G19"})
-_NAME = re.compile(r"([GMT]\d+(?:\.\d+)?|[A-Z_]{3,}\w*)\s*(.*)")
+_SETTING_NAME = re.compile(r"([GMT]\d+(?:\.\d+)?|[A-Z_]{3,}\w*)\s*(.*)")
 _KEY = re.compile(r"([A-Z_]+)=?")
 _MACRO_HEAT = re.compile(
     r"\b(BED|EXTRUDER|HOTEND|NOZZLE|TOOL)\w*?(?:_?TEMP\w*)?\s*=\s*(\d+(?:\.\d+)?)"
@@ -55,7 +55,7 @@ def settings_before(job: Job, line: int) -> Settings:
     says_bed = levelled = False
     for number, raw in enumerate(job.program.text.split("\n")[:line], start=1):
         command = raw.partition(";")[0].strip()
-        match = _NAME.match(command)
+        match = _SETTING_NAME.match(command)
         if match is None:
             continue
         name, rest = match.groups()

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from gcode.check import CheckedProgram, Touch, check
-from gcode.check.touches import COMMANDS
+from gcode.check.touches import TOUCH_COMMANDS
 from gcode.dialects import number
 from gcode.errors import InputError
 from gcode.moves import Program
@@ -23,13 +23,13 @@ from gcode.profiles import PrinterProfile, PrintSetup, ProbeProfile
 from gcode.progress import Progress, silent
 from gcode.reader import read_job
 from gcode.reader.job import Beads, JobLayer
-from gcode.resumption.head import LIFT_MM, feed, height_over
+from gcode.resumption.head import RESUME_LIFT_MM, feed, height_over
 from gcode.resumption.resume_at import first_layer
 from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import standing_field
 from gcode.surfaces import HeightField
 
-CELL_MM = 0.2
+FLAT_CELL_MM = 0.2
 FLAT_SLACK_MM = 0.01
 """Beads of one layer lie at one height, within the digits of the text; a spiral's do not."""
 
@@ -155,7 +155,7 @@ def plan_touch(
 
 def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchOptions) -> None:
     """Raise where no nozzle feels by such a touch, or it stands too low or too high."""
-    if printer.dialect not in COMMANDS:
+    if printer.dialect not in TOUCH_COMMANDS:
         raise InputError(
             f"{printer.id} speaks {printer.dialect}, whose probing goes as deep as its own "
             f"configuration says: nothing could stop it above the part; set Z by hand, with paper "
@@ -168,10 +168,10 @@ def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchO
             f"height that does not tell to a few hundredths of a millimetre; set Z by hand, with "
             f"paper below the nozzle."
         )
-    if not 2 * options.doubt_mm <= above_mm <= LIFT_MM:
+    if not 2 * options.doubt_mm <= above_mm <= RESUME_LIFT_MM:
         raise InputError(
             f"--above-mm is {above_mm:g}; turn Z by hand until the nozzle stands "
-            f"{2 * options.doubt_mm:g} to {LIFT_MM:g} mm above the part's top."
+            f"{2 * options.doubt_mm:g} to {RESUME_LIFT_MM:g} mm above the part's top."
         )
 
 
@@ -194,7 +194,7 @@ def _text(touches: tuple[Touch, ...], setup: PrintSetup, high_mm: float, *, mesh
 def touch_line(printer: PrinterProfile, *, from_mm: float, lowest_mm: float) -> str:
     """The line that feels straight down from one height, to another at the deepest."""
     probe = printer.feeler
-    if COMMANDS[printer.dialect] == "AMREPAIR_TOUCH":
+    if TOUCH_COMMANDS[printer.dialect] == "AMREPAIR_TOUCH":
         depth = number(from_mm - lowest_mm, 3)
         return f"AMREPAIR_TOUCH DEPTH={depth} SPEED={number(probe.speed_mm_s, 3)}"
     return f"G38.2 Z{number(lowest_mm, 3)} F{feed(probe.speed_mm_s)}"
@@ -205,7 +205,9 @@ def _flat(
 ) -> tuple[Float[np.ndarray, "2 2"], float]:
     """Two places on the largest flat of a layer, and how wide it is there, mm."""
     origin, solid = _solid(beads, layer)
-    inside_mm = CELL_MM * ndimage.distance_transform_edt(solid) if solid.size else np.zeros((1, 1))
+    inside_mm = (
+        FLAT_CELL_MM * ndimage.distance_transform_edt(solid) if solid.size else np.zeros((1, 1))
+    )
     row, column = np.unravel_index(int(inside_mm.argmax()), inside_mm.shape)
     across_mm = 2.0 * float(inside_mm[row, column])
     if across_mm < options.flat_mm:
@@ -219,7 +221,7 @@ def _flat(
     away = np.hypot(rows - row, columns - column)
     other = int(away.argmax())
     cells = np.array([[column, row], [columns[other], rows[other]]], dtype=float)
-    return origin + (cells + 0.5) * CELL_MM, across_mm
+    return origin + (cells + 0.5) * FLAT_CELL_MM, across_mm
 
 
 def _solid(
@@ -231,14 +233,14 @@ def _solid(
     if not len(start):
         return np.zeros(2), np.zeros((0, 0), dtype=bool)
     half_mm = 0.5 * float(np.median(beads.width_mm[pick]))
-    steps = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / (0.5 * CELL_MM)), 1.0)
+    steps = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / (0.5 * FLAT_CELL_MM)), 1.0)
     count = (steps + 1).astype(np.int64)
     owner = np.repeat(np.arange(len(count)), count)
     share = (np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)) / steps[owner]
     points = start[owner] + share[:, None] * (end - start)[owner]
-    rim = 2 * math.ceil(half_mm / CELL_MM) + 1
-    origin = np.floor(points.min(axis=0) / CELL_MM) * CELL_MM - rim * CELL_MM
-    cells = ((points - origin) / CELL_MM).astype(np.int64)
+    rim = 2 * math.ceil(half_mm / FLAT_CELL_MM) + 1
+    origin = np.floor(points.min(axis=0) / FLAT_CELL_MM) * FLAT_CELL_MM - rim * FLAT_CELL_MM
+    cells = ((points - origin) / FLAT_CELL_MM).astype(np.int64)
     free = np.ones(cells.max(axis=0)[::-1] + 1 + rim, dtype=bool)
     free[cells[:, 1], cells[:, 0]] = False
-    return origin, CELL_MM * ndimage.distance_transform_edt(free) <= half_mm
+    return origin, FLAT_CELL_MM * ndimage.distance_transform_edt(free) <= half_mm

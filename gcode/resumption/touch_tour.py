@@ -19,7 +19,7 @@ from gcode.resumption.head import feed
 from gcode.resumption.touch import touch_line
 from gcode.surfaces import HeightField
 
-CLEAR_MM = 2.0
+OVER_FLAT_MM = 2.0
 """Between touches, over all that stands there: what stands out of a layer is mostly lower."""
 ABOVE_BED_C = 10.0
 """Beside a hot bed a nozzle gets no colder."""
@@ -50,12 +50,12 @@ def tour(
     printer, probe = setup.printer, setup.printer.feeler
     tip_mm = np.asarray(places_mm) - probe.offset_mm  # the nozzle's, where the probe's meets
     touches = tuple(Touch(x, y, z, z - probe.depth_mm) for x, y, z in tip_mm.tolist())
-    high_mm = standing.top_mm + CLEAR_MM - probe.offset_mm[2]
+    high_mm = standing.top_mm + OVER_FLAT_MM - probe.offset_mm[2]
     travel, down = (f" F{feed(v)}" for v in (printer.travel_speed_mm_s, printer.z_speed_mm_s))
     x, y, z = (number(float(v), 3) for v in rest.position_mm)
     lines = ["; touches", "G21", "G90"]
     for touch in touches:
-        near_mm = touch.surface_mm + CLEAR_MM
+        near_mm = touch.surface_mm + OVER_FLAT_MM
         lines += [
             f"G1 X{number(touch.x_mm, 3)} Y{number(touch.y_mm, 3)}{travel}",
             f"G1 Z{number(near_mm, 3)}{down}",

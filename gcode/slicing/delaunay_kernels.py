@@ -20,8 +20,8 @@ from gcode.compiled import njit
 
 # The triangle around all points reaches out so many of their extents: triangles within with a
 # circle smaller than that are the points' own.
-FAR = 1e3
-MOST_STEPS = 10_000
+FAR_CIRCLE = 1e3
+MOST_WALK_STEPS = 10_000
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -48,7 +48,7 @@ def in_circle(xy: Any, a: int, b: int, c: int, d: int) -> bool:
 def found_at(xy: Any, corners: Any, across: Any, p: int, begin: int, count: int) -> int:
     """The triangle that holds a point, by a walk from another one."""
     t = begin
-    for step in range(MOST_STEPS):
+    for step in range(MOST_WALK_STEPS):
         moved = False
         for k in range(3):
             side = (k + step) % 3  # another side first each time: no walk goes round for ever
@@ -98,7 +98,7 @@ def put_in(xy: Any, corners: Any, across: Any, at: Any, p: int, t: int, count: i
     stack = np.empty(64, np.int64)
     stack[0], stack[1], stack[2] = t, one, two
     n = 3
-    for _ in range(MOST_STEPS):
+    for _ in range(MOST_WALK_STEPS):
         if n == 0:
             break
         n -= 1
@@ -150,7 +150,10 @@ def triangles(points: Any) -> tuple[Any, Any]:
         xy[i, 0], xy[i, 1] = points[i, 0] - middle[0], points[i, 1] - middle[1]
     for k in range(3):
         angle = 2.0 * np.pi * k / 3.0 + 0.1
-        xy[m + k, 0], xy[m + k, 1] = FAR * extent * np.cos(angle), FAR * extent * np.sin(angle)
+        xy[m + k, 0], xy[m + k, 1] = (
+            FAR_CIRCLE * extent * np.cos(angle),
+            FAR_CIRCLE * extent * np.sin(angle),
+        )
     corners, across = np.empty((2 * m + 4, 3), np.int64), np.full((2 * m + 4, 3), -1, np.int64)
     at = np.zeros(m + 3, np.int64)
     corners[0, 0], corners[0, 1], corners[0, 2] = m, m + 1, m + 2

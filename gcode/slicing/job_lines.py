@@ -18,7 +18,7 @@ from gcode.moves import Role
 from gcode.slicing.beads import Bead
 from gcode.surfaces import raster_kernels as kernels
 
-LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
+SAME_LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
 # Beside the deficit's columns: its rim is as uncertain as the scan's noise and spacing make it.
 RIM_MM = 0.3
 ON_MM = 0.05  # of a line's middle
@@ -69,18 +69,18 @@ class JobLines:
         """Level lines that pass through a box."""
         low, high = np.minimum(self.start_mm, self.end_mm), np.maximum(self.start_mm, self.end_mm)
         through = ((high >= low_mm) & (low <= high_mm)).all(axis=1)
-        return self.some(through & (high[:, 2] - low[:, 2] < LEVEL_MM))
+        return self.some(through & (high[:, 2] - low[:, 2] < SAME_LEVEL_MM))
 
     def at(self, z_mm: float) -> JobLines:
         """Those at one height."""
-        return self.some(np.abs(self.end_mm[:, 2] - z_mm) < LEVEL_MM)
+        return self.some(np.abs(self.end_mm[:, 2] - z_mm) < SAME_LEVEL_MM)
 
     def chains(self) -> list[tuple[Bead, Float[np.ndarray, " _m"]]]:
         """Lines that go on from one another as one bead, and the sections of its pieces."""
         n = len(self.rim)
         if n == 0:
             return []
-        off = np.abs(self.start_mm[1:, :2] - self.end_mm[:-1, :2]).max(axis=1) > LEVEL_MM
+        off = np.abs(self.start_mm[1:, :2] - self.end_mm[:-1, :2]).max(axis=1) > SAME_LEVEL_MM
         begins = np.flatnonzero(np.concatenate([[True], off | (self.rim[1:] != self.rim[:-1])]))
         found = []
         for a, b in zip(begins, [*begins[1:], n], strict=True):
@@ -123,8 +123,8 @@ class JobColumns:
         wide_mm = float((lines.section_mm2 / np.maximum(lines.height_mm, 1e-6)).max(initial=0.0))
         self._cell_mm = cell_mm
         self._lines = lines.near(
-            np.array([*(low - wide_mm), low_mm - LEVEL_MM]),
-            np.array([*(high + wide_mm), high_mm + LEVEL_MM]),
+            np.array([*(low - wide_mm), low_mm - SAME_LEVEL_MM]),
+            np.array([*(high + wide_mm), high_mm + SAME_LEVEL_MM]),
         )
         self._masks: dict[float, Bool[np.ndarray, "ny nx"] | None] = {}
 
@@ -263,7 +263,7 @@ def runs_of(
     gone = np.zeros(len(section_mm2), dtype=bool)
     if runs and len(lines.gone_mm):
         high_mm = float(lines.end_mm[0, 2])
-        for a, b in lines.gone_mm[np.abs(lines.gone_mm[:, 0, 2] - high_mm) < LEVEL_MM]:
+        for a, b in lines.gone_mm[np.abs(lines.gone_mm[:, 0, 2] - high_mm) < SAME_LEVEL_MM]:
             gone |= _on(middles, a[:2], b[:2])
     height_mm = float(np.median(lines.height_mm)) if runs else 0.0
     half_mm = 0.5 * float(np.median(section_mm2)) / height_mm if runs else 0.0

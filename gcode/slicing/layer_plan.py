@@ -27,7 +27,7 @@ LEAST_NOZZLES = 0.5
 MOST_NOZZLES = 2.0
 INFILL_OVERLAP = 0.25  # of a spacing: PrusaSlicer's default overlap of infill and perimeters
 FLOW_CORRECTION = (0.85, 1.6)  # slab volume over section × height, outside of which flow is wrong
-NOT_LISTED_MM3 = 1e-3
+LEAST_LEFT_MM3 = 1e-3
 DENSE_RATIO = 0.999  # from here on infill is solid
 
 
@@ -197,6 +197,6 @@ def _listed(layer: _Layer, slab: Slab) -> list[Unprintable]:
         volume = part.area() * slab.height_mm
         x0, y0, x1, y1 = part.bounds()
         box = (x0, y0, slab.bottom_mm, x1, y1, slab.top_mm)
-        if volume > NOT_LISTED_MM3:
+        if volume > LEAST_LEFT_MM3:
             out.append(Unprintable(volume, box, "thinner than half a nozzle"))
     return out

@@ -22,7 +22,7 @@ from gcode.slicing import volume_kernels as kernels
 MAX_LAYERS = 20_000
 HIGHEST_LAYER_OF_NOZZLE = 0.8  # layers above 0.8 nozzle diameters no longer press onto the last
 SNAP_SHARE = 0.01  # horizontal faces above this share of the largest section bend the grid
-_SAME_MM = 1e-4
+_SAME_LAYER_MM = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class LayerGrid:
         """Tops from the bed up, the last one at or above `z_mm`."""
         explicit = np.array(self.explicit_tops_mm)
         last_mm = float(explicit[-1]) if len(explicit) else self.first_layer_height_mm
-        count = max(0, math.ceil((z_mm - last_mm - _SAME_MM) / self.layer_height_mm))
+        count = max(0, math.ceil((z_mm - last_mm - _SAME_LAYER_MM) / self.layer_height_mm))
         if count > MAX_LAYERS:
             raise SliceError(
                 f"{count} layers of {self.layer_height_mm:g} mm up to {z_mm:g} mm are over the "
@@ -77,7 +77,7 @@ class LayerGrid:
         start = explicit if len(explicit) else np.array([last_mm])
         tops = np.concatenate([start, last_mm + self.layer_height_mm * np.arange(1, count + 1)])
         # Heights are rounded to decimals, so that 0.2 × 3 reads 0.6.
-        return np.round(tops[: int(np.searchsorted(tops, z_mm - _SAME_MM)) + 1], 9)
+        return np.round(tops[: int(np.searchsorted(tops, z_mm - _SAME_LAYER_MM)) + 1], 9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,14 +119,14 @@ def plan_slabs(solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float) -> tup
     """
     box = solid.bounding_box()
     bottom_mm, end_mm = max(0.0, float(box[2])), float(box[5])
-    if end_mm - bottom_mm <= _SAME_MM:
+    if end_mm - bottom_mm <= _SAME_LAYER_MM:
         return ()
     h_mm = grid.layer_height_mm
     highest_mm = max(1.05 * h_mm, HIGHEST_LAYER_OF_NOZZLE * nozzle_diameter_mm)
     tops = list(grid.tops_to(end_mm))
     faces = sorted({*_horizontal_faces(solid), end_mm, bottom_mm})
-    cuts = _snapped([bottom_mm, *[z for z in tops if z > bottom_mm + _SAME_MM]], faces, h_mm)
-    cuts = [z for z in cuts if bottom_mm - _SAME_MM <= z <= end_mm + _SAME_MM]
+    cuts = _snapped([bottom_mm, *[z for z in tops if z > bottom_mm + _SAME_LAYER_MM]], faces, h_mm)
+    cuts = [z for z in cuts if bottom_mm - _SAME_LAYER_MM <= z <= end_mm + _SAME_LAYER_MM]
     cuts = _split_thick(cuts, highest_mm, max(h_mm, grid.first_layer_height_mm))
     volumes = slab_volumes(solid, np.array(cuts))
     return tuple(
@@ -137,7 +137,7 @@ def plan_slabs(solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float) -> tup
 
 def _horizontal_faces(solid: Any) -> list[float]:
     """Heights of level faces that are large enough to matter."""
-    z, areas = level_faces(*mesh_of(solid), _SAME_MM)
+    z, areas = level_faces(*mesh_of(solid), _SAME_LAYER_MM)
     if not len(z):
         return []
     heights, group = np.unique(np.round(z, 3), return_inverse=True)
@@ -154,8 +154,8 @@ def _snapped(cuts: list[float], faces: list[float], h_mm: float) -> list[float]:
     fixed: set[int] = {0}
     for face in faces:
         i = int(np.argmin(np.abs(np.array(out) - face)))
-        if abs(out[i] - face) <= _SAME_MM or (
-            i not in fixed and abs(out[i] - face) <= 0.5 * h_mm + _SAME_MM
+        if abs(out[i] - face) <= _SAME_LAYER_MM or (
+            i not in fixed and abs(out[i] - face) <= 0.5 * h_mm + _SAME_LAYER_MM
         ):
             out[i] = face
             fixed.add(i)
@@ -181,7 +181,7 @@ def _snapped(cuts: list[float], faces: list[float], h_mm: float) -> list[float]:
 
 def _split_thick(cuts: list[float], highest_mm: float, usual_mm: float) -> list[float]:
     """Halve what is thicker than the nozzle can press, and than the grid itself asks for."""
-    limit_mm = max(highest_mm, usual_mm) + _SAME_MM
+    limit_mm = max(highest_mm, usual_mm) + _SAME_LAYER_MM
     out = cuts[:1]
     for z in cuts[1:]:
         pieces = max(1, math.ceil((z - out[-1]) / limit_mm))

@@ -25,7 +25,7 @@ from gcode.slicing.regions import flattened
 
 FACING_RATIO = 1.5  # feet further apart than 1.5 r: walls meeting at less than 97° face each other
 END_INSET_RATIO = 0.5  # of r: an open bead ends r/2 short of the wall, its round cap fills the rest
-ASIDE_MM = 1e-5
+ON_AXIS_MM = 1e-5
 APART_MM = 0.15  # points of a bead
 Chain = tuple[Float[np.ndarray, "_k 2"], Float[np.ndarray, " _k"]]  # points, distances to walls
 
@@ -98,7 +98,7 @@ def _axis(region: Any, sample_mm: float) -> list[Chain]:
     if len(points) < 3:
         return []
     nodes, radius, runs, starts_at = kernels.axis_of(
-        points, starts, sample_mm, ASIDE_MM, FACING_RATIO
+        points, starts, sample_mm, ON_AXIS_MM, FACING_RATIO
     )
     paths = [run.tolist() for run in np.split(runs, starts_at[1:-1]) if len(run)]
     return [(nodes[path], radius[path]) for path in _joined(paths, nodes) if len(path) > 1]

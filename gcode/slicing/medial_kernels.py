@@ -14,7 +14,7 @@ from gcode.slicing.delaunay_kernels import triangles
 from gcode.slicing.infill_kernels import inside
 
 LEAF_RATIO = 1.2  # of a junction's radius: a shorter branch to a wall is its corner, not an axis
-FAR_MM = 1e9  # where a triangle without area has its centre
+NO_CENTRE_MM = 1e9  # where a triangle without area has its centre
 
 
 @njit(cache=True, nogil=True)
@@ -152,11 +152,11 @@ def _centres(samples_mm: Any, corners: Any) -> tuple[Any, Any]:
         vx, vy = samples_mm[corners[t, 2], 0] - ax, samples_mm[corners[t, 2], 1] - ay
         twice = 2.0 * (ux * vy - uy * vx)
         uu, vv = ux * ux + uy * uy, vx * vx + vy * vy
-        x, y = FAR_MM, FAR_MM
+        x, y = NO_CENTRE_MM, NO_CENTRE_MM
         if twice != 0.0:
             x, y = (vy * uu - uy * vv) / twice, (ux * vv - vx * uu) / twice
-        if not (abs(x) < FAR_MM and abs(y) < FAR_MM):
-            x, y = FAR_MM, FAR_MM
+        if not (abs(x) < NO_CENTRE_MM and abs(y) < NO_CENTRE_MM):
+            x, y = NO_CENTRE_MM, NO_CENTRE_MM
         nodes[t, 0], nodes[t, 1] = ax + x, ay + y
         radius[t] = np.hypot(x, y)
     return nodes, radius

@@ -37,7 +37,7 @@ TO_WALL_MM = 0.2
 # cells, by about so much.
 DRAWN_MM = 0.035
 ON_LINE_MM = 0.02
-ROUNDED_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
+CORNER_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,8 +297,8 @@ def _free_over(wanted: Any, free: Bool[np.ndarray, "ry rx"], reach: Reach) -> An
         return wanted
     box = np.array(wanted.bounds()).reshape(2, 2)
     low, high = (box - reach.field.origin_mm) / reach.cell_mm
-    first = np.floor(low).astype(np.int64) - ROUNDED_CELLS
-    last = np.ceil(high).astype(np.int64) + ROUNDED_CELLS
+    first = np.floor(low).astype(np.int64) - CORNER_CELLS
+    last = np.ceil(high).astype(np.int64) + CORNER_CELLS
     a, b = np.maximum(first, 0), np.minimum(last, free.shape[::-1])
     near = np.ones((last - first)[::-1], dtype=bool)  # outside the field nothing stands
     if (a < b).all():
@@ -315,9 +315,9 @@ def _outline(
     if not mask.any():
         return CrossSection()
     (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in mask.nonzero())
-    around = np.pad(mask[y0:y1, x0:x1].astype(np.float64), ROUNDED_CELLS)
+    around = np.pad(mask[y0:y1, x0:x1].astype(np.float64), CORNER_CELLS)
     smooth = ndimage.gaussian_filter(around, 0.8)
-    corner = np.array([x0, y0]) + 0.5 - ROUNDED_CELLS
+    corner = np.array([x0, y0]) + 0.5 - CORNER_CELLS
     polygons = []
     for line in measure.find_contours(smooth, 0.5):  # type: ignore[no-untyped-call]
         if len(line) < 4:

@@ -12,13 +12,15 @@ from gcode.slicing import reach_kernels
 from gcode.slicing.beads import Bead, divided
 from gcode.slicing.reach import Reach
 
-STEP_MM = 0.4  # along a bead, between two samples of the gap
+GAP_STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4
 # A point that is not free is moved by no more than this; stretches between points that are free,
 # and are not so themselves, are halved so often.
 ASIDE_MM, HALVINGS = 0.15, 2
 ROUNDING_MM = 2e-3  # more than the text's last digit
-ROUNDED_MM = ROUNDING_MM * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # whichever way it goes
+ROUNDED_CORNERS_MM = ROUNDING_MM * np.array(
+    [[-1, -1], [-1, 1], [1, -1], [1, 1]]
+)  # whichever way it goes
 
 
 def eased(beads: list[Bead], free: Bool[np.ndarray, "ry rx"], reach: Reach) -> list[Bead]:
@@ -122,7 +124,7 @@ def free_runs(
 def steps_of(bead: Bead) -> Int[np.ndarray, " m"]:
     """How many steps each of a bead's pieces takes."""
     lengths = np.hypot(*np.diff(bead.xy_mm, axis=0).T)
-    return np.maximum(1, np.ceil(lengths / STEP_MM).astype(np.int64))
+    return np.maximum(1, np.ceil(lengths / GAP_STEP_MM).astype(np.int64))
 
 
 def free_between(
@@ -154,7 +156,7 @@ def _free_along(
 
 def shares_of_step(reach: Reach) -> Float[np.ndarray, " k"]:
     """Where between two samples to look: closer than the checker's own steps of half a cell."""
-    return np.linspace(0.0, 1.0, 2 + int(np.ceil(3 * STEP_MM / reach.field.cell_mm)))
+    return np.linspace(0.0, 1.0, 2 + int(np.ceil(3 * GAP_STEP_MM / reach.field.cell_mm)))
 
 
 def surely_free(

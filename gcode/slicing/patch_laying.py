@@ -21,7 +21,7 @@ from gcode.profiles import PrintSetup
 from gcode.slicing.beads import width_of
 from gcode.slicing.patch_beads import Chain
 from gcode.slicing.patch_free import surely_free
-from gcode.slicing.patch_model import NEAR_MM, PatchModel
+from gcode.slicing.patch_model import NO_LIFT_MM, PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.pen import Pen
 from gcode.slicing.reach import Reach
@@ -29,8 +29,8 @@ from gcode.slicing.room import bare_place, over_bed, room_for_line
 from gcode.surfaces import HeightField
 from gcode.units import filament_area_mm2
 
-LEVEL_MM = 1e-6
-CLEAR_MM = 0.5  # of the tip over everything on a travel
+NOT_LOWER_MM = 1e-6
+TIP_CLEAR_MM = 0.5  # of the tip over everything on a travel
 STANDALONE_LIFT_MM = 5.0
 WIPE_MM = 4.0  # more than a drop is wide
 PRIME_MM_S = 3.0  # of filament: 7 mm³/s
@@ -184,14 +184,14 @@ def _go_to(
     far = float(np.hypot(*across))
     samples = 2 + int(np.ceil(3 * far / min(reach.field.cell_mm, model.cell_mm)))
     way = pen.position_mm[:2] + np.linspace(0.0, 1.0, samples)[:, None] * across
-    near = abs(rise) < LEVEL_MM and far < NEAR_MM
+    near = abs(rise) < NOT_LOWER_MM and far < NO_LIFT_MM
     # what oozes there, beads cover; what was laid before stands no higher than this pass
-    combed = isinstance(one.tip_mm, float) and rise > -LEVEL_MM and model.is_over(way).all()
+    combed = isinstance(one.tip_mm, float) and rise > -NOT_LOWER_MM and model.is_over(way).all()
     if (near or combed) and surely_free(way, one.reach, reach).all():
         pen.move_to(np.array([*pen.position_mm[:2], target_mm[2]]))
         pen.move_to(target_mm)
     else:
-        over_mm = max(reach.least_over(way), one.z_mm) + CLEAR_MM
+        over_mm = max(reach.least_over(way), one.z_mm) + TIP_CLEAR_MM
         pen.hop_to(target_mm, over_mm=min(over_mm, setup.printer.max_z_mm))
 
 

@@ -12,13 +12,13 @@ from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_beads import LEAST_THICK_MM
 from gcode.slicing.patch_due import AGREE_MM
 from gcode.slicing.patch_model import PatchModel
-from gcode.slicing.patch_passes import NOT_LISTED_MM3
+from gcode.slicing.patch_passes import LEAST_LISTED_MM3
 from gcode.slicing.patch_state import PatchState
 
 COVERED = "covered by what stands above it"
 # Less of a hollow than this share, so little, and over less of its opening: it closes nothing.
-LEAST_SHARE, LEAST_WORTH_MM3, LEAST_COVER = 0.1, 30.0, 0.5
-STEP_MM = 0.15  # of a job's staircase: half a layer, and what the scan gets wrong
+LEAST_SHARE, LEAST_WORTH_MM3, LEAST_CLOSED = 0.1, 30.0, 0.5
+STAIRCASE_MM = 0.15  # of a job's staircase: half a layer, and what the scan gets wrong
 NOT_CLOSED = "; the little in reach would not close it"
 TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
 # Of what is left of a piece: a cause of less is told with the greatest.
@@ -61,7 +61,7 @@ def not_worth_it(state: PatchState, model: PatchModel) -> Bool[np.ndarray, "ny n
         np.bincount(label.ravel(), each.ravel(), minlength=count + 1) * model.cell_mm**2
         for each in (state.laid_mm, model.wanted_below(np.inf), state.laid_mm > 0, wanted)
     )
-    few = (laid < LEAST_SHARE * due) & (laid < LEAST_WORTH_MM3) & (cover < LEAST_COVER * opening)
+    few = (laid < LEAST_SHARE * due) & (laid < LEAST_WORTH_MM3) & (cover < LEAST_CLOSED * opening)
     few[0] = False
     if not few.any():
         return np.zeros(model.shape, dtype=bool)
@@ -79,7 +79,9 @@ def left_over(
     # a film below the thinnest bead is the tolerance, not out of reach
     left = np.where(left > LEAST_THICK_MM + AGREE_MM, left, 0.0)
     # nor is what lies under a step of the job's staircase, or over it
-    done = (state.surface_mm >= state.done_mm - AGREE_MM) & (state.done_mm > model.top_mm - STEP_MM)
+    done = (state.surface_mm >= state.done_mm - AGREE_MM) & (
+        state.done_mm > model.top_mm - STAIRCASE_MM
+    )
     left = np.where(done, 0.0, left)
     unreachable: list[Unreachable] = []
     lost = list(state.lost)
@@ -94,7 +96,7 @@ def left_over(
         share = min(max(share, 0.0), 1.0)
         volume_mm3 = float(piece.volume())
         regions.append(PatchRegion(volume_mm3, box, share))
-        if stuck_mm3 <= NOT_LISTED_MM3:
+        if stuck_mm3 <= LEAST_LISTED_MM3:
             continue
         ended = NOT_CLOSED if given_up[cells].any() else ""
         for reason, part in _causes(state, model, cells, left[cells], apart=not ended):

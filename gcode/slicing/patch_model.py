@@ -17,7 +17,7 @@ from gcode.surfaces import raster_kernels as kernels
 
 FINE_MM, COARSE_MM = 0.1, 0.2
 FINE_CELLS = 250_000
-MARGIN_MM = 3.0
+PATCH_MARGIN_MM = 3.0
 # A bead thicker than this share of the bore no longer presses onto its floor.
 MOST_THICK_NOZZLES = 0.8
 # In bores: a strand that nothing holds falls as far as this onto a floor, as one purged in the air
@@ -29,7 +29,7 @@ SPREAD_NOZZLES = 1.125
 SEAM_MM = 1.0  # around a loop's seam, as far as old material hides it
 TIP_CELLS = 2  # in one of the field, each way
 JOB_LAYER_MM = 0.5  # a job's layer may end so far above the deficit that it belongs to
-NEAR_MM = 1.0  # a travel as short as this needs no lift
+NO_LIFT_MM = 1.0  # a travel as short as this needs no lift
 
 
 class PatchModel:
@@ -46,10 +46,10 @@ class PatchModel:
         self.as_built = as_built
         self.box = deficit.bounding_box()
         x0, y0, x1, y1 = (
-            self.box[0] - MARGIN_MM,
-            self.box[1] - MARGIN_MM,
-            self.box[3] + MARGIN_MM,
-            self.box[4] + MARGIN_MM,
+            self.box[0] - PATCH_MARGIN_MM,
+            self.box[1] - PATCH_MARGIN_MM,
+            self.box[3] + PATCH_MARGIN_MM,
+            self.box[4] + PATCH_MARGIN_MM,
         )
         fine = (x1 - x0) * (y1 - y0) / FINE_MM**2 <= FINE_CELLS
         self.cell_mm = FINE_MM if fine else COARSE_MM
@@ -72,7 +72,7 @@ class PatchModel:
         self.floor_mm = floor_mm
         # where a tip may lay what is missing: over it, or in the air beside a rim
         away_mm = ndimage.distance_transform_edt(~np.isfinite(self.top_mm)) * self.cell_mm
-        self.near = np.asarray(away_mm <= NEAR_MM)
+        self.near = np.asarray(away_mm <= NO_LIFT_MM)
         self.beside_mm = ndimage.uniform_filter(floor_mm, round(2 * SEAM_MM / self.cell_mm) + 1)
         self.job: JobColumns | None = None
         # along the surface itself it is not as the job had it
@@ -86,7 +86,7 @@ class PatchModel:
         self.drop_mm = DROP_NOZZLES * setup.printer.nozzle_diameter_mm
         self.spread_mm = SPREAD_NOZZLES * setup.printer.nozzle_diameter_mm
         self._printer = setup.printer
-        self._window_mm = (x0 - NEAR_MM, y0 - NEAR_MM, x1 + NEAR_MM, y1 + NEAR_MM)
+        self._window_mm = (x0 - NO_LIFT_MM, y0 - NO_LIFT_MM, x1 + NO_LIFT_MM, y1 + NO_LIFT_MM)
         self.reach = self.reach_of(as_built)
         self._tip_cells = self.reach.cells_of(self.points_mm)
 

@@ -17,7 +17,7 @@ from gcode.slicing.beads import divided
 from gcode.slicing.layer_plan import MOST_NOZZLES
 from gcode.slicing.patch_beads import Chain
 from gcode.slicing.patch_free import surely_free
-from gcode.slicing.patch_model import NEAR_MM, PatchModel
+from gcode.slicing.patch_model import NO_LIFT_MM, PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.patch_state import PatchState
 from gcode.slicing.reach import Reach
@@ -88,7 +88,7 @@ def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reac
 
 def _regions(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
     """Which connected region columns belong to, from 1; those close together are one."""
-    near = ndimage.distance_transform_edt(state.laid_mm <= 0) * model.cell_mm <= 0.5 * NEAR_MM
+    near = ndimage.distance_transform_edt(state.laid_mm <= 0) * model.cell_mm <= 0.5 * NO_LIFT_MM
     return np.asarray(ndimage.label(near)[0], dtype=np.int64)
 
 

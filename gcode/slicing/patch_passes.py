@@ -29,9 +29,9 @@ from gcode.slicing.patch_skin import Skin
 from gcode.slicing.patch_state import PatchState
 
 SKIN_MM = 0.2  # about as thick as it gets
-NOT_LISTED_MM3 = 0.02
+LEAST_LISTED_MM3 = 0.02
 LEAST_OF_GAP = 0.9  # where the gap is more than the deficit: both are right to about as much
-FAR_MM = 0.3  # from a line: more than half of it
+OFF_LINE_MM = 0.3  # from a line: more than half of it
 SERVED = 0.95  # share of what is due; where the job's own lines serve less, others may serve more
 
 
@@ -145,7 +145,7 @@ def _along_own(
     chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
     lost_mm3 = drawn.lost_mm2 * drawn.height_mm
     lost = []
-    if lost_mm3 > NOT_LISTED_MM3:
+    if lost_mm3 > LEAST_LISTED_MM3:
         lost.append(_thin(drawn.region, at.z_mm, drawn.height_mm, lost_mm3))
     return _Laying(chains, laid, _served(chains, thick, model), drawn.height_mm, lost)
 
@@ -177,7 +177,7 @@ def _along_job(
     wanted = state.left_below(model, at.z_mm)
     share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), LEAST_OF_GAP, 1.0))
     chains, laid = weighed(runs, tips_mm, share * thick, strips, model, setup, job=job)
-    served = float(thick[beside_runs(runs, FAR_MM, model)].sum()) / float(thick.sum())
+    served = float(thick[beside_runs(runs, OFF_LINE_MM, model)].sum()) / float(thick.sum())
     return _Laying(chains, laid, served, height_mm, [])
 
 

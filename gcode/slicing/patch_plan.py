@@ -18,7 +18,7 @@ from gcode.slicing.patch_state import PatchState
 # Of the plastic, what may be laid in the air beside rims; about twice as much lies outside then.
 MOST_HEM = 0.025
 # Of what the head allows: a way that fills as much leaves little for others to find.
-ENOUGH = 0.95
+FILLED_ENOUGH = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ def best_plan(
         if found.hem_mm3(model) > MOST_HEM * found.beads_mm3:
             found = plan(model, heights, setup, progress, hems=False)
         tried.append(found)
-        if found.filled_mm3(model) >= ENOUGH * open_mm3:
+        if found.filled_mm3(model) >= FILLED_ENOUGH * open_mm3:
             break
     return max(tried, key=lambda found: found.worth_mm3(model, setup))
 

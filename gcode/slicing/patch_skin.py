@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from gcode.slicing.patch_free import ROUNDED_MM, ROUNDING_MM, STEP_MM, shares_of_step
+from gcode.slicing.patch_free import GAP_STEP_MM, ROUNDED_CORNERS_MM, ROUNDING_MM, shares_of_step
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
@@ -76,7 +76,7 @@ class Skin:
         low, high = (self.tip.sample(at, smooth=True) for at in (start_mm, end_mm))
         tip_mm = (low + (high - low) * share[:, :, 0]).reshape(-1)
         free = np.ones(len(way), dtype=bool)
-        for little in ROUNDED_MM:
+        for little in ROUNDED_CORNERS_MM:
             cells, inside = self.reach.cells_of(way + little)
             free &= ~inside | (self.reach.need_mm[cells[:, 0], cells[:, 1]] <= tip_mm + GIVE_MM)
         return np.asarray(free.reshape(share.shape[0], -1).all(axis=0))
@@ -99,7 +99,7 @@ def skin_of(model: PatchModel, planar: Bool[np.ndarray, "ny nx"]) -> Skin | None
     surface_mm = surface.sample(cells, smooth=True).reshape(reach.shape)
     rise_mm = np.clip(reach.need_mm - surface_mm, 0.0, None)
     # between the points of a bead the tip goes straight
-    rise_mm = ndimage.maximum_filter(rise_mm, round(STEP_MM / reach.cell_mm) + 1)
+    rise_mm = ndimage.maximum_filter(rise_mm, round(GAP_STEP_MM / reach.cell_mm) + 1)
     slope = np.hypot(*np.gradient(np.asarray(surface.z_mm, np.float64), model.cell_mm))
     columns = wanted & planar & (slope >= LEAST_SLOPE) & model.free_at(rise_mm <= MOST_RISE_MM)
     least = np.ones((round(SKIN_WIDE_MM / model.cell_mm),) * 2)

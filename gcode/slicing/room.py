@@ -10,7 +10,7 @@ from gcode.profiles import PrinterProfile
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 
-CELL_MM = 1.0
+ROOM_CELL_MM = 1.0
 INSET_MM = 5.0  # from the bed's edge
 EVERY_MM = 10.0
 BARE_RADIUS_MM = 6.0  # a strand that hangs from the nozzle falls into this circle
@@ -19,17 +19,19 @@ BARE_RADIUS_MM = 6.0  # a strand that hangs from the nozzle falls into this circ
 def over_bed(field: HeightField, printer: PrinterProfile) -> HeightField:
     """A field as high or higher on coarse cells all over the nozzle's reach; bare beside it."""
     x0, y0, x1, y1 = printer.reach_box_mm
-    shape = (int(np.ceil((y1 - y0) / CELL_MM)), int(np.ceil((x1 - x0) / CELL_MM)))
-    coarse = field.coarsened(max(1, int(CELL_MM / field.cell_mm)))
+    shape = (int(np.ceil((y1 - y0) / ROOM_CELL_MM)), int(np.ceil((x1 - x0) / ROOM_CELL_MM)))
+    coarse = field.coarsened(max(1, int(ROOM_CELL_MM / field.cell_mm)))
     xs, ys = coarse.centres_mm()
-    iy, ix = (np.floor((at - low) / CELL_MM).astype(np.int64) for at, low in ((ys, y0), (xs, x0)))
+    iy, ix = (
+        np.floor((at - low) / ROOM_CELL_MM).astype(np.int64) for at, low in ((ys, y0), (xs, x0))
+    )
     rows, columns = (iy >= 0) & (iy < shape[0]), (ix >= 0) & (ix < shape[1])
     z_mm = np.zeros(shape)
     cells = np.ix_(iy[rows], ix[columns])
     np.maximum.at(z_mm, cells, np.asarray(coarse.z_mm, np.float64)[np.ix_(rows, columns)])
     # A cell reaches into the cells beside the one that holds its middle.
-    z_mm = ndimage.maximum_filter(z_mm, 2 * int(np.ceil(0.5 * coarse.cell_mm / CELL_MM)) + 1)
-    return HeightField(np.array([x0, y0]), CELL_MM, z_mm, np.ones(shape, dtype=bool))
+    z_mm = ndimage.maximum_filter(z_mm, 2 * int(np.ceil(0.5 * coarse.cell_mm / ROOM_CELL_MM)) + 1)
+    return HeightField(np.array([x0, y0]), ROOM_CELL_MM, z_mm, np.ones(shape, dtype=bool))
 
 
 def room_for_line(
@@ -37,7 +39,12 @@ def room_for_line(
 ) -> tuple[float, float, float, float] | None:
     """Where a line can be drawn on the bed, the whole head fitting: (x, y) and its direction."""
     x, y = printer.prime_mm[:2]
-    around = (x - CELL_MM, y - CELL_MM, x + length_mm + CELL_MM, y + length_mm + CELL_MM)
+    around = (
+        x - ROOM_CELL_MM,
+        y - ROOM_CELL_MM,
+        x + length_mm + ROOM_CELL_MM,
+        y + length_mm + ROOM_CELL_MM,
+    )
     own = Reach(field, printer, window_mm=around)  # soon answered, and mostly it is enough
     place = _room_at([(x, y)], own, field, printer, length_mm)
     return place or _room_at(_starts(printer), Reach(field, printer), field, printer, length_mm)

@@ -14,10 +14,10 @@ from jaxtyping import Float
 
 from gcode.errors import InputError
 
-SUFFIXES = frozenset({".ply", ".pcd", ".xyz", ".txt", ".csv", ".asc"})
+CLOUD_SUFFIXES = frozenset({".ply", ".pcd", ".xyz", ".txt", ".csv", ".asc"})
 MOST_BYTES = 2 * 2**30
 MOST_HEADER_BYTES = 64 * 1024
-LEAST_POINTS = 100
+LEAST_CLOUD_POINTS = 100
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
     "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
@@ -64,9 +64,10 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
             f"{path} cannot be read as a point cloud ({what}); export it anew."
         ) from error
     points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < LEAST_POINTS:
+    if len(points) < LEAST_CLOUD_POINTS:
         raise InputError(
-            f"{path} has {len(points)} points; {LEAST_POINTS} are the least that shows a surface."
+            f"{path} has {len(points)} points; {LEAST_CLOUD_POINTS} are the least that shows a "
+            "surface."
         )
     return points
 

@@ -22,22 +22,24 @@ import tifffile
 from jaxtyping import Bool, Float, Num
 
 from gcode.errors import InputError
-from gcode.surfaces.heightfield import READ_ERRORS
+from gcode.surfaces.heightfield import IMAGE_READ_ERRORS
 
-SUFFIXES = frozenset({".png", ".tif", ".tiff"})
+DEPTH_SUFFIXES = frozenset({".png", ".tif", ".tiff"})
 MOST_JSON_BYTES = 1_000_000
-MOST_PIXELS = 50_000_000
+MOST_DEPTH_PIXELS = 50_000_000
 MOST_PACKED = 100
 """Real depths pack to a third; deflate itself goes no further than a thousandth."""
 COUNT_MM = 1.0  # of depth cameras (RealSense, Azure Kinect) where nothing is said
-RIGID = 1e-3  # digits of a rotation in a file
+CAMERA_RIGID = 1e-3  # digits of a rotation in a file
 BAND_MM, TILT_RAD = 10.0, math.radians(3.0)
 """How far off a camera's pose may be for the bed to put it right."""
-NEAR_MM = 0.7
+ON_BED_MM = 0.7
 """Of one plane: what depth cameras of this class are off by at half a metre."""
 UNDER_MM, UNDER_RATIO = 2.0, 0.01
 LEAST_BED_RATIO = 0.05
-TRIES = 400  # of three points: where a tenth is bed, one in three such runs in a hundred misses it
+PLANE_TRIES = (
+    400  # of three points: where a tenth is bed, one in three such runs in a hundred misses it
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,7 @@ def camera_of(said: dict[str, Any]) -> Camera:
     if said.get("pose") is not None:
         pose = np.array(said["pose"], dtype=np.float64).reshape(4, 4)
         turn = pose[:3, :3]
-        if not (np.abs(turn @ turn.T - np.eye(3)).max() < RIGID and np.linalg.det(turn) > 0):
+        if not (np.abs(turn @ turn.T - np.eye(3)).max() < CAMERA_RIGID and np.linalg.det(turn) > 0):
             raise ValueError("the pose is no rigid motion: its rotation stretches or mirrors")
     return Camera(focal, centre, shape, _count_mm(said), pose)
 
@@ -125,7 +127,7 @@ def is_depth_map(path: Path) -> bool:
     if suffix == ".png":
         return True
     beside = path.with_suffix(".json")
-    if suffix not in SUFFIXES or not beside.is_file():
+    if suffix not in DEPTH_SUFFIXES or not beside.is_file():
         return False
     said = _said(beside)
     return isinstance(said, dict) and bool({"fx", "intrinsic_matrix"} & said.keys())
@@ -210,11 +212,11 @@ def levelled(
     some = points_mm[near[:: max(1, len(near) // 20_000)]]
     every = points_mm[:: max(1, len(points_mm) // 20_000)]
     rng, best, plane = np.random.default_rng(0), 0, None
-    for _ in range(TRIES if len(some) > 2 else 0):
+    for _ in range(PLANE_TRIES if len(some) > 2 else 0):
         fitted = _plane(some[rng.choice(len(some), 3, replace=False)])
         if fitted is None:
             continue
-        count = int((np.abs(_above(some, fitted)) < NEAR_MM).sum())
+        count = int((np.abs(_above(some, fitted)) < ON_BED_MM).sum())
         if count > best and (_above(every, fitted) < -UNDER_MM).mean() < UNDER_RATIO:
             best, plane = count, fitted
     if plane is None or best < LEAST_BED_RATIO * len(some):
@@ -223,7 +225,7 @@ def levelled(
             "photograph more of the bed, or calibrate the camera's pose."
         )
     for _ in range(3):
-        plane = _plane(some[np.abs(_above(some, plane)) < NEAR_MM]) or plane
+        plane = _plane(some[np.abs(_above(some, plane)) < ON_BED_MM]) or plane
     a, b, c = plane
     up = np.array([-a, -b, 1.0]) / math.sqrt(a * a + b * b + 1.0)
     axis = np.array([up[1], -up[0], 0.0])  # up × Z
@@ -286,8 +288,8 @@ def _camera_beside(path: Path) -> Camera:
 def _image(path: Path, camera: Camera) -> Num[np.ndarray, "rows columns"]:
     from PIL import Image
 
-    if math.prod(camera.shape) > MOST_PIXELS:
-        raise InputError(f"{path}: over {MOST_PIXELS:,} pixels are no depth map.")
+    if math.prod(camera.shape) > MOST_DEPTH_PIXELS:
+        raise InputError(f"{path}: over {MOST_DEPTH_PIXELS:,} pixels are no depth map.")
     try:
         size = path.stat().st_size
         if path.suffix.lower() == ".png":
@@ -307,7 +309,7 @@ def _image(path: Path, camera: Camera) -> Num[np.ndarray, "rows columns"]:
             return np.asarray(page.asarray())
     except InputError:
         raise
-    except (*READ_ERRORS, Image.DecompressionBombError) as error:
+    except (*IMAGE_READ_ERRORS, Image.DecompressionBombError) as error:
         what = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: the depth map cannot be read ({what}).") from error
 

@@ -25,13 +25,13 @@ from gcode.errors import InputError
 from gcode.surfaces import raster_kernels as kernels
 
 # What NumPy's, zip's and TIFF's readers raise on damaged files.
-READ_ERRORS = (
+IMAGE_READ_ERRORS = (
     ValueError, ArithmeticError, LookupError, TypeError, AttributeError, OSError, EOFError,
     NotImplementedError, RuntimeError, MemoryError, SyntaxError, AssertionError,
     struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError,
 )  # fmt: skip
 MOST_READ_CELLS = 20_000_000  # of a file: a bed of 400 mm in cells of 0.1 mm, and then some
-MAX_CELLS = 60_000_000  # half a gigabyte of heights: beyond that a cell size is a mistake
+MAX_FIELD_CELLS = 60_000_000  # half a gigabyte of heights: beyond that a cell size is a mistake
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,9 +346,9 @@ class HeightField:
             box_mm = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
         nx = max(1, math.ceil((box_mm[2] - box_mm[0]) / cell_mm - 1e-9))
         ny = max(1, math.ceil((box_mm[3] - box_mm[1]) / cell_mm - 1e-9))
-        if nx * ny > MAX_CELLS:
+        if nx * ny > MAX_FIELD_CELLS:
             raise InputError(
-                f"A height field of {nx}×{ny} cells is over the limit of {MAX_CELLS}; "
+                f"A height field of {nx}×{ny} cells is over the limit of {MAX_FIELD_CELLS}; "
                 f"use cells larger than {cell_mm:g} mm."
             )
         offset, z, _ = kernels.column_crossings(
@@ -455,7 +455,7 @@ def _read_heights(
         raise InputError(f"{path}: a height map is a .npz, .tif or .npy file, not '{suffix}'.")
     try:
         return readers[suffix](path)
-    except READ_ERRORS as e:
+    except IMAGE_READ_ERRORS as e:
         what = " ".join(str(e).split())[:120] or type(e).__name__
         raise InputError(f"{path}: the height map cannot be read ({what}).") from e
 

@@ -15,8 +15,10 @@ from gcode.surfaces.heightfield import HeightField
 
 OUTLINE_CELLS = 3  # gaps this wide in what was seen are within the scan's outline
 WIDEST_MM = 1000.0  # of a bed, and what stands around it
-MOST_CELLS = 8_000_000  # some seconds to close the holes of: a bed of 560 mm in cells of 0.2 mm
-LEAST_MM = 5.0  # less is no bed with something on it, but a scan in metres or inches
+MOST_SCANNED_CELLS = (
+    8_000_000  # some seconds to close the holes of: a bed of 560 mm in cells of 0.2 mm
+)
+LEAST_SCAN_MM = 5.0  # less is no bed with something on it, but a scan in metres or inches
 UNDER_MM = 2.0  # points so far below the bed are of another frame
 
 
@@ -74,16 +76,16 @@ def _refuse_below(points_mm: Float[np.ndarray, "n 3"], what: str) -> None:
 def _refuse_wide(points_mm: Float[np.ndarray, "n 3"], cell_mm: float, what: str) -> None:
     low, high = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
     x_mm, y_mm = (float(v) for v in high - low)
-    if max(x_mm, y_mm) < LEAST_MM:
+    if max(x_mm, y_mm) < LEAST_SCAN_MM:
         raise InputError(
-            f"{what} spreads over {x_mm:.3g} × {y_mm:.3g} mm, {LEAST_MM:g} mm are the least that "
-            "shows a bed; is it in metres? Scale it to millimetres."
+            f"{what} spreads over {x_mm:.3g} × {y_mm:.3g} mm, {LEAST_SCAN_MM:g} mm are the least "
+            "that shows a bed; is it in metres? Scale it to millimetres."
         )
-    if max(x_mm, y_mm) > WIDEST_MM or x_mm * y_mm > MOST_CELLS * cell_mm**2:
+    if max(x_mm, y_mm) > WIDEST_MM or x_mm * y_mm > MOST_SCANNED_CELLS * cell_mm**2:
         raise InputError(
             f"{what} spreads over {x_mm:.3g} × {y_mm:.3g} mm, the limit is {WIDEST_MM:g} mm, or "
-            f"{MOST_CELLS / 1e6:g} million cells of {cell_mm:g} mm; is it in millimetres, and of "
-            "the bed alone?"
+            f"{MOST_SCANNED_CELLS / 1e6:g} million cells of {cell_mm:g} mm; is it in millimetres, "
+            "and of the bed alone?"
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from amrepair.align.pam import CODE, PAPER
+from amrepair.align.pam import PUBLISHED_PAM, RELEASED_PAM
 from amrepair.bench.house import repair_distance
 from amrepair.bench.method import ClassInput
 from amrepair.bench.paper import BENCH_PAPER, make_pam_aligner, pam_options
@@ -42,7 +42,7 @@ def test_pasdf_finds_defects_on_a_synthetic_set(tmp_path: Path) -> None:
 def test_the_published_system_runs_by_name_and_says_what_was_shortened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quick = replace(PAPER, ransac_iterations=20_000, threshold=1.0)
+    quick = replace(PUBLISHED_PAM, ransac_iterations=20_000, threshold=1.0)
     monkeypatch.setattr("amrepair.bench.paper.TARGET_POINTS", 5_000)
     monkeypatch.setattr("amrepair.bench.paper.pam_options", lambda format: quick)
     monkeypatch.setattr("amrepair.bench.house.SURFACE_SPACING_MM", 2.0)
@@ -106,6 +106,6 @@ def test_pam_brings_a_cloud_onto_its_class() -> None:
     assert placed.shape == points.shape
     assert np.median(residual) < 1.0
     # single views have nothing near most of the template: only the directed loss can end there
-    assert pam_options(Format.SHAPENET) == PAPER
+    assert pam_options(Format.SHAPENET) == PUBLISHED_PAM
     # the released configuration of that set (config_files/test_Real3D_AD.yaml: cd_threshold)
-    assert pam_options(Format.REAL3D) == replace(CODE, threshold=1.8)
+    assert pam_options(Format.REAL3D) == replace(RELEASED_PAM, threshold=1.8)

@@ -247,7 +247,7 @@ def test_a_lost_link_never_claims_that_the_heaters_are_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # regression: the log said "heaters off" although nobody had confirmed it
-    monkeypatch.setattr(supervisor, "ANSWER_S", 0.05)
+    monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.05)
     wire = tmp_path / "wire.log"
     job = program([*HEAT, *moves(200)])
     with (

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from gcode.hosts.touching import _TOUCHED
-from gcode.resumption.klipper import MACRO
+from gcode.resumption.klipper import TOUCH_MACRO
 
 KLIPPER = os.environ.get("AMREPAIR_KLIPPER", "")
 PYTHON = os.environ.get("AMREPAIR_KLIPPER_PYTHON", sys.executable)
@@ -88,7 +88,7 @@ def klippy(folder: Path, lines: list[str], *, share: float) -> str:
         for k, (axis, turn, low) in enumerate([("x", 40, 0), ("y", 40, 0), ("z", 8, LOWEST_MM)])
     ]
     (folder / "printer.cfg").write_text(CONFIG + "".join(axes))
-    (folder / "klipper_touch.cfg").write_text(MACRO)
+    (folder / "klipper_touch.cfg").write_text(TOUCH_MACRO)
     (folder / "touch.gcode").write_text("\n".join(["G28", "G90", *lines]) + "\n")
     done = subprocess.run(
         [PYTHON, "-c", RUN, str(share), str(folder)],

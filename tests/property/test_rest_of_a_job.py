@@ -21,7 +21,7 @@ from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, objects_of, read_job
-from gcode.resumption.rest import CLEAR_MM, rest_without
+from gcode.resumption.rest import OVER_PART_MM, rest_without
 from gcode.resumption.standing import standing_field
 
 WORD = re.compile(r"([GMXYZEFS])(-?[\d.]+)")
@@ -150,7 +150,7 @@ def test_the_others_are_laid_as_they_were_and_nothing_of_what_was_given_up(
         if blocks[index].holds((start + share * (end - start))[:2], 0.0)
         and np.hypot(*(end - start)[:2]) > 0
     ]
-    assert min(inside, default=np.inf) > standing.top_mm + 0.9 * CLEAR_MM, "lifted over it"
+    assert min(inside, default=np.inf) > standing.top_mm + 0.9 * OVER_PART_MM, "lifted over it"
     # where the job is looked at again, the machine is where the rest's own job says
     for one in job.layers[layer + 1 :]:
         place = int(rest.line_of[one.end_line])

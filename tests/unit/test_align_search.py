@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align import Registration, align
-from amrepair.align.search import PIECE, QUICK, CoarseField, search, spread_rotations
+from amrepair.align.search import PIECE, QUICK_EFFORT, CoarseField, search, spread_rotations
 from amrepair.align.thinning import Thinned, in_order, thin_out
 from amrepair.bench.bodies import pieces_of
 from amrepair.errors import AlignmentError
@@ -173,7 +173,7 @@ def test_clutter_does_not_mislead() -> None:
 
 
 def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK)
+    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK_EFFORT)
     monkeypatch.setattr("amrepair.align.anywhere.by_features", lambda *_: iter(()))
     template = notched()
     points = 10.0 * sample_surface(template.body, 3.0, seed=4)[0]  # centimetres taken for mm
@@ -230,6 +230,28 @@ def test_a_wide_bend_is_one_in_every_draw(seed: int, monkeypatch: pytest.MonkeyP
     points += np.random.default_rng(3).normal(0, SIGMA_MM, points.shape)
     pose = pieces_of(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(seed)).pose
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.05
+
+
+@pytest.mark.parametrize(("turned_deg", "smaller"), [(1.0, True), (1.0, False), (0.0, True)])
+def test_a_little_bend_tells_how_far_the_smaller_piece_was_moved(
+    turned_deg: float, smaller: bool
+) -> None:
+    """By 0.35 mm at most, mostly along its sides; a sound part has one piece."""
+    plate = difference(box((0, 0, 0), (60, 20, 4)), box((50, 12, -1), (61, 21, 5)))
+    points = sample_surface(plate.body, 0.6, seed=5)[0]
+    beyond = points[:, 0] > 40.0 if smaller else points[:, 0] < 20.0
+    hinge = np.array([40.0 if smaller else 20.0, 0.0, 0.0])
+    turn = rotation_from_vector(np.array([0.0, -np.deg2rad(turned_deg), 0.0]))
+    home = points.copy()
+    points[beyond] = (points[beyond] - hinge) @ turn.T + hinge
+    truth_mm = np.linalg.norm(points - home, axis=1)
+    points += np.random.default_rng(5).normal(0, SIGMA_MM, points.shape)
+    pieces = pieces_of(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(0))
+    assert np.abs(pieces.pose - np.eye(4))[:3, :3].max() < 0.002
+    assert (pieces.other is None) == (turned_deg == 0.0)
+    off_mm = np.abs(pieces.moved_mm(points) - truth_mm)
+    assert float(np.median(off_mm[beyond])) < 0.05
+    assert float(np.quantile(off_mm, 0.95)) < 0.1
 
 
 @pytest.mark.slow
@@ -299,7 +321,7 @@ def test_a_view_of_a_bent_thin_plate_lies_on_its_larger_piece(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # regression: it was laid 0.7 mm off between its pieces, some of it on either side of the plate
-    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK)
+    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK_EFFORT)
     monkeypatch.setattr("amrepair.align.anywhere._turns", lambda *_: [])
     plate = box((0, 0, 0), (100, 60, 1.2))
     for hole in (

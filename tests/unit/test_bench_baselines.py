@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amrepair.bench import METHODS, shapenet
+from amrepair.bench import BENCH_METHODS, shapenet
 from amrepair.bench.baselines import BankMethod, fpfh_features, raw_features, reweighted
 from amrepair.bench.cells import Cell, _judge
 from amrepair.bench.features import coreset, fill_in, fpfh, nearest
@@ -127,7 +127,7 @@ def test_noise_is_estimated_within_a_fifth(rng: np.random.Generator) -> None:
 
 
 def test_names_are_those_of_the_contract() -> None:
-    assert set(METHODS) == {
+    assert set(BENCH_METHODS) == {
         "pasdf",
         "pasdf-paper",
         *(f"{name}{pam}" for name in BASELINES for pam in ("", "+pam")),

@@ -14,7 +14,7 @@ from amrepair.bench import run_bench
 from amrepair.bench.adam3d import read_part
 from amrepair.bench.cells import Cell, _judge
 from amrepair.bench.dataset import LAYOUTS, open_dataset
-from amrepair.bench.samples import UNKNOWN, BenchClass, Format
+from amrepair.bench.samples import UNLABELLED, BenchClass, Format
 from amrepair.errors import InputError
 
 ROWS, COLUMNS = 60, 80
@@ -126,7 +126,7 @@ def test_a_folder_of_ones_own(tmp_path: Path) -> None:
         "good_s1": "good", "crack_s2": "crack", "crack_s3": "crack", "s4": "defect", "s5": "good",
     }  # fmt: skip
     assert clouds["crack_s2"].tolist() == clouds["s4"].tolist() == labels.tolist()
-    assert set(clouds["crack_s3"]) == {UNKNOWN}
+    assert set(clouds["crack_s3"]) == {UNLABELLED}
     assert set(clouds["s5"]) == {0}
     assert pickle.loads(pickle.dumps(one)).test[0].load().labels.tolist() == labels.tolist()
 

@@ -9,17 +9,17 @@ import pytest
 import torch
 from torch import nn
 
-from amrepair.bench.pointmae import DEPTH, HEADS, WIDTH, _shapes, load_checkpoint
+from amrepair.bench.pointmae import DEPTH, HEADS, TOKEN_WIDTH, _shapes, load_checkpoint
 from amrepair.bench.registry import make_method
 from amrepair.errors import InputError
 
 
 def random_weights(kind: str) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
-    shapes = _shapes(256 if kind == "pointbert" else WIDTH)
+    shapes = _shapes(256 if kind == "pointbert" else TOKEN_WIDTH)
     if kind == "pointbert":
-        shapes |= {"cls_token": (1, 1, WIDTH), "cls_pos": (1, 1, WIDTH)}
-        shapes |= {"reduce_dim.weight": (WIDTH, 256), "reduce_dim.bias": (WIDTH,)}
+        shapes |= {"cls_token": (1, 1, TOKEN_WIDTH), "cls_pos": (1, 1, TOKEN_WIDTH)}
+        shapes |= {"reduce_dim.weight": (TOKEN_WIDTH, 256), "reduce_dim.bias": (TOKEN_WIDTH,)}
     weights = {n: 0.05 * torch.randn(s, generator=generator) for n, s in shapes.items()}
     return {n: v.abs() + 0.5 if n.endswith("running_var") else v for n, v in weights.items()}
 
@@ -39,7 +39,7 @@ class Reference(nn.Module):
     def __init__(self, kind: str, weights: dict[str, torch.Tensor]) -> None:
         super().__init__()
         self.kind, self.w = kind, weights
-        channels = 256 if kind == "pointbert" else WIDTH
+        channels = 256 if kind == "pointbert" else TOKEN_WIDTH
         self.first = self.pair(3, 128, 256, "encoder.first_conv.")
         self.second = self.pair(512, 512, channels, "encoder.second_conv.")
         self.blocks = [self.block(i) for i in range(DEPTH)]
@@ -53,13 +53,13 @@ class Reference(nn.Module):
 
     def block(self, i: int) -> nn.TransformerEncoderLayer:
         layer = nn.TransformerEncoderLayer(
-            WIDTH, HEADS, 4 * WIDTH, 0.0, "gelu", batch_first=True, norm_first=True
+            TOKEN_WIDTH, HEADS, 4 * TOKEN_WIDTH, 0.0, "gelu", batch_first=True, norm_first=True
         )
         name = f"blocks.blocks.{i}."
         layer.load_state_dict(
             {
                 "self_attn.in_proj_weight": self.w[name + "attn.qkv.weight"],
-                "self_attn.in_proj_bias": torch.zeros(3 * WIDTH),
+                "self_attn.in_proj_bias": torch.zeros(3 * TOKEN_WIDTH),
                 "self_attn.out_proj.weight": self.w[name + "attn.proj.weight"],
                 "self_attn.out_proj.bias": self.w[name + "attn.proj.bias"],
                 "linear1.weight": self.w[name + "mlp.fc1.weight"],
@@ -88,7 +88,7 @@ class Reference(nn.Module):
             x = layer((x + position)[None])[0]
             if i in (3, 7, 11):
                 taken.append(
-                    nn.functional.layer_norm(x, (WIDTH,), w["norm.weight"], w["norm.bias"])
+                    nn.functional.layer_norm(x, (TOKEN_WIDTH,), w["norm.weight"], w["norm.bias"])
                 )
         out = torch.cat(taken, dim=1)
         return out[1:] if self.kind == "pointbert" else out
@@ -102,7 +102,7 @@ def test_forward_pass_is_the_published_architecture(tmp_path: Path, kind: str) -
     with torch.no_grad():
         expected = Reference(kind, weights)(groups, centres)
         found = model.forward(groups, centres)
-    assert found.shape == (20, 3 * WIDTH)
+    assert found.shape == (20, 3 * TOKEN_WIDTH)
     assert torch.allclose(found, expected, atol=2e-5)
 
 

@@ -71,7 +71,7 @@ def test_a_kernel_is_compiled_anew_when_another_has_changed(tmp_path: Path) -> N
 
 def test_every_kernel_is_kept_safely() -> None:
     kept = infill_kernels.inside._cache._cache_file
-    assert compiled._TOKEN in kept._data_name(1)
+    assert compiled._PROCESS_TOKEN in kept._data_name(1)
     assert kept._source_stamp[-1] == compiled.kernels_stamp()
     names = {name for name, _, _ in compiled.kernels_stamp()}
     assert {"infill_kernels.py", "nearest_kernels.py"} <= names

@@ -9,7 +9,7 @@ import trimesh
 
 from amrepair.deficit import Deficit, compute_deficit
 from amrepair.frames import Transform
-from amrepair.policy import POLICY
+from amrepair.policy import USUAL_POLICY
 from amrepair.policy.worth import worth_mending
 from amrepair.regions import detect
 from amrepair.scans import ScanRequest
@@ -123,7 +123,7 @@ def test_pieces_side_by_side_are_one_defect_and_crumbs_join_nothing() -> None:
     def box(x_mm: float) -> np.ndarray:
         return np.array([[x_mm, 0.0, 0.0], [x_mm + 1.0, 1.0, 0.2]])
 
-    share = 0.4 * POLICY.least_mm3
+    share = 0.4 * USUAL_POLICY.least_mm3
     kept = worth_mending([box(0.0), box(1.5), box(3.0), box(20.0)], [share] * 4, [False] * 4)
     assert kept.tolist() == [True, True, True, False]
     assert not worth_mending([box(0.1 * k) for k in range(100)], [0.03] * 100, [False] * 100).any()

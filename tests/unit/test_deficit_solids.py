@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from amrepair.deficit import Deficit, compute_deficit, measured_regions
-from amrepair.deficit.voxels import MAX_VOXELS, VoxelBox, solid_from_field
+from amrepair.deficit.voxels import MAX_DEFICIT_VOXELS, VoxelBox, solid_from_field
 from amrepair.errors import InputError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.regions import Label, detect
-from amrepair.regions.calibration import NORMAL
+from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from tests import analytic
@@ -135,7 +135,7 @@ def test_a_film_beside_a_deep_cut_is_found_with_it() -> None:
     # regression: the box was sampled as coarsely as the cut is deep, and 0.96 of the film was lost
     deep, film = cube((10, 28, 8), (2, 1, 3)), cube((27, 28, 1), (11.9, 1, 9.74))
     # over most of a face it is what errors of the whole would look like: these are known
-    found = deficit_of(cloud(BLOCK.body - deep - film), BLOCK, calibration=NORMAL)
+    found = deficit_of(cloud(BLOCK.body - deep - film), BLOCK, calibration=NORMAL_NOISE)
     over_mm3 = (BLOCK.body ^ film).volume()
     assert over_mm3 == pytest.approx(27 * 28 * 0.26)
     assert (found.missing ^ film).volume() == pytest.approx(over_mm3, rel=0.05)
@@ -386,14 +386,14 @@ def test_a_film_beside_a_deep_cut_is_sampled_finely_and_so_are_the_walls(
     box = VoxelBox.around(np.zeros(3), np.array(extent_mm), thickness_mm=0.36, across=2)
     assert box.step_mm[2] <= 0.24 / 1.5
     assert (box.step_mm[:2] <= 0.3).all()
-    assert np.prod(box.shape) <= 1.1 * MAX_VOXELS
+    assert np.prod(box.shape) <= 1.1 * MAX_DEFICIT_VOXELS
     assert (box.step_mm * (np.array(box.shape) - 1) >= np.array(extent_mm) - 1e-9).all()
 
 
 def test_a_wide_thin_defect_keeps_its_samples_across() -> None:
     box = VoxelBox.around(np.zeros(3), np.array([80.0, 50.0, 2.2]), thickness_mm=0.2, across=2)
     assert box.step_mm[2] <= 0.1
-    assert np.prod(box.shape) <= 1.1 * MAX_VOXELS
+    assert np.prod(box.shape) <= 1.1 * MAX_DEFICIT_VOXELS
 
 
 def test_a_field_that_touches_zero_by_less_than_a_nanometre_is_no_solid() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from amrepair.regions import Label, detect
-from amrepair.regions.calibration import NORMAL
+from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import observed
 from amrepair.scans import Scan
@@ -93,8 +93,8 @@ def strand(noise_mm: float, high_mm: float, seed: int) -> Scan:
 def test_a_strand_is_told_at_twice_the_noise(seed: int) -> None:
     # regression: averaged over a window wider than itself it was lost in every fourth scan
     plate = box((0, 0, 0), (24, 20, 3))
-    assert detect(strand(0.2, 0.0, seed), plate, calibration=NORMAL).regions == ()
-    found = detect(strand(0.2, 0.5, seed), plate, calibration=NORMAL).regions
+    assert detect(strand(0.2, 0.0, seed), plate, calibration=NORMAL_NOISE).regions == ()
+    found = detect(strand(0.2, 0.5, seed), plate, calibration=NORMAL_NOISE).regions
     assert {region.label for region in found} == {Label.EXCESS}
     boxes = np.array([region.box_mm for region in found])
     middle = 0.5 * (boxes[:, 0].min(axis=0) + boxes[:, 1].max(axis=0))

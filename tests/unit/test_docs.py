@@ -22,12 +22,12 @@ from amrepair.cli.app import app as amrepair_app
 from amrepair.cli.scanners import Bed, open_scanner
 from amrepair.frames import Transform
 from amrepair.scans import ScanRequest
-from amrepair.simulate.defects import KINDS as DEFECTS
-from gcode.check.words import COMMANDS, LINE_LIMIT
+from amrepair.simulate.defects import DEFECT_KINDS as DEFECTS
+from gcode.check.words import KNOWN_COMMANDS, LINE_LIMIT
 from gcode.cli.app import app as gcode_app
 from gcode.dialects import DIALECTS
-from gcode.firmware.faults import KINDS
-from gcode.firmware.variants import VARIANTS
+from gcode.firmware.faults import FAULT_KINDS
+from gcode.firmware.variants import FIRMWARES
 from gcode.profiles import load_setup
 from gcode.protocol.dialects import LINK_DIALECTS
 
@@ -69,7 +69,7 @@ WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
 def own_tables() -> Iterator[None]:
     """What a page adds to our tables is gone after it."""
     tables: list[dict[str, Any]] = [
-        DIALECTS, LINK_DIALECTS, COMMANDS, LINE_LIMIT, VARIANTS, DEFECTS, LAYOUTS,
+        DIALECTS, LINK_DIALECTS, KNOWN_COMMANDS, LINE_LIMIT, FIRMWARES, DEFECTS, LAYOUTS,
     ]  # fmt: skip
     before = [dict(table) for table in tables]
     yield
@@ -112,7 +112,7 @@ def test_the_new_scanner_s_file_is_taken_by_the_command_line(tmp_path: Path) -> 
 
 def test_every_fault_of_the_emulated_printer_is_on_its_page() -> None:
     said = (DOCS / "how-to" / "rehearse-faults.md").read_text(encoding="utf-8")
-    assert dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", said, re.M)) == KINDS
+    assert dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", said, re.M)) == FAULT_KINDS
 
 
 def test_every_example_is_on_its_page() -> None:

@@ -22,7 +22,7 @@ from amrepair.errors import InputError
 from amrepair.fleet.chart import ChartOptions, alarm_ratio, chart, false_alarm_ratio, limit_of
 from amrepair.fleet.config import FleetConfig, FleetOptions, PrinterSpec, read_config
 from amrepair.fleet.desk import JUDGES, STATUS, Desk, answer, read_note
-from amrepair.fleet.history import BAND_MM, History
+from amrepair.fleet.history import SAME_HEIGHT_MM, History
 from amrepair.fleet.page import Page, metrics
 from amrepair.fleet.supervisor import DESK, Command, Fleet, State, loop_command
 
@@ -404,7 +404,7 @@ def write_tape(folder: Path, began_s: float, missing_mm3: list[float], *, over: 
     for number, value in enumerate(missing_mm3):
         events.append(
             {"event": "look", "time_s": began_s + number, "look": number, "stop": f"layer-{number}",
-             "z_mm": 2.0 + BAND_MM * number, "missing_mm3": value, "excess_mm3": 0.5,
+             "z_mm": 2.0 + SAME_HEIGHT_MM * number, "missing_mm3": value, "excess_mm3": 0.5,
              "printed": value > 1.0}
         )  # fmt: skip
     if over:

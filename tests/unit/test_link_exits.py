@@ -95,7 +95,7 @@ def test_an_interrupt_while_it_heats_waits_for_no_heater(
     firmware: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In real time; a firmware without emergency parser reads nothing before M190 has ended."""
-    monkeypatch.setattr(supervisor, "ANSWER_S", 0.2)
+    monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.2)
     with bench(tmp_path, firmware=firmware, accelerated=False) as it:
         printer = SerialPrinter(it.emulator.port, supervise=False, dialect=firmware)
         thread = it.once("M190 S60", interrupt)
@@ -164,7 +164,7 @@ def test_an_emergency_stop_of_a_printer_that_says_nothing_ends_the_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # regression: who waited for an answer waited for ever
-    monkeypatch.setattr(supervisor, "ANSWER_S", 0.01)
+    monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.01)
     lines = [*HEAD, *moves(60)]
     with (
         bench(tmp_path, faults="line 40 dead") as it,
@@ -225,7 +225,7 @@ def test_a_restart_is_noticed_where_lines_are_not_verified(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """By what they say as they start; where that is lost, by the refusal to move unhomed."""
-    monkeypatch.setattr(supervisor, "ANSWER_S", 0.05)
+    monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.05)
     with bench(tmp_path, firmware=firmware, faults="line 30 reset") as it:
         printer = SerialPrinter(it.emulator.port, dialect=firmware, supervise=False)
         printer.connect()

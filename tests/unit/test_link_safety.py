@@ -75,7 +75,7 @@ def test_targets_of_zero_are_called_off(report: bytes) -> None:
 
 
 def test_no_answer_at_all_is_said_to_be_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "ANSWER_S", 0.01)
+    monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.01)
     said, _ = answering(None)
     assert "NO ANSWER" in said
 

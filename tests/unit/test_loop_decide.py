@@ -12,7 +12,7 @@ import pytest
 from amrepair.loop.findings import _whole_defects
 from amrepair.policy.table import (
     FINDINGS,
-    STOPS,
+    STOP_ROWS,
     Action,
     Cover,
     Finding,
@@ -79,7 +79,7 @@ def test_every_row_for_a_finding_can_be_reached(row) -> None:  # type: ignore[no
     assert (verdict.row, verdict.action, verdict.reason) == (row.id, row.action, row.reason)
 
 
-@pytest.mark.parametrize("row", STOPS, ids=lambda row: row.id)
+@pytest.mark.parametrize("row", STOP_ROWS, ids=lambda row: row.id)
 def test_every_row_for_a_stop_can_be_reached(row) -> None:  # type: ignore[no-untyped-def]
     decision = decide((), SITUATIONS[row.id])
     assert (decision.row, decision.action) == (row.id, row.action)

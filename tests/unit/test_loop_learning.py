@@ -15,11 +15,11 @@ from loop_bench import Small, scan_of
 
 from amrepair.frames import Transform
 from amrepair.loop import LoopReport, Stop, Tape, plan_stops
-from amrepair.loop.learning import FIRST_LOOKS, OWN, told
+from amrepair.loop.learning import FIRST_LOOKS, OWN_CALIBRATION, told
 from amrepair.loop.replay import replay
 from amrepair.loop.setting import Setting, keep, open_run
 from amrepair.loop.sites import sites
-from amrepair.regions.calibration import NORMAL, Calibration
+from amrepair.regions.calibration import NORMAL_NOISE, Calibration
 from amrepair.repair import Site
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan, ScanRequest
@@ -88,10 +88,10 @@ def test_errors_that_hang_together_are_learned_told_and_used(small: Small, tmp_p
     assert [str(look.decision.action) for look in report.looks] == ["go on"] * len(LAYERS)
     learned = report.calibration
     assert learned is not None
-    assert (learned.name, learned.scans) == (OWN, FIRST_LOOKS)
+    assert (learned.name, learned.scans) == (OWN_CALIBRATION, FIRST_LOOKS)
     assert 0.2 * HIGH_MM < learned.wander_mm[0][0] < 1.5 * HIGH_MM
     by = [look.plan.anomaly.calibration for look in report.looks]
-    assert by == [NORMAL] * FIRST_LOOKS + [learned] * (len(LAYERS) - FIRST_LOOKS)
+    assert by == [NORMAL_NOISE] * FIRST_LOOKS + [learned] * (len(LAYERS) - FIRST_LOOKS)
     (event,) = [e for e in _events(tmp_path) if e["event"] == "learned"]
     assert event["calibration"]["told"] == told(learned)  # type: ignore[index]
     assert any(told(learned) in stage for stage in said)
@@ -101,9 +101,9 @@ def test_errors_that_hang_together_are_learned_told_and_used(small: Small, tmp_p
 
 def test_normal_noise_is_told_and_changes_nothing(small: Small, tmp_path: Path) -> None:
     report, _, _ = _run(small, tmp_path, 0.0)
-    assert report.calibration is NORMAL
-    assert {look.plan.anomaly.calibration for look in report.looks} == {NORMAL}
-    assert "normal noise" in told(NORMAL)
+    assert report.calibration is NORMAL_NOISE
+    assert {look.plan.anomaly.calibration for look in report.looks} == {NORMAL_NOISE}
+    assert "normal noise" in told(NORMAL_NOISE)
     assert sum(e["event"] == "learned" for e in _events(tmp_path)) == 1
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amrepair.agent.octoprint.held import AGENT_GONE_S, AHEAD_LINES, PATIENCE_S, Held, Refusal
+from amrepair.agent.octoprint.held import AGENT_GONE_S, AHEAD_LINES, HOLD_PATIENCE_S, Held, Refusal
 
 JOB = ["G28", "G1 X1", "G1 X2", "@amrepair scan layer=3 z=0.8", "G1 X3", "G1 X4", "G1 X5"]
 LOOK = 4  # the line behind it
@@ -169,7 +169,7 @@ def test_a_print_that_is_cancelled_in_a_repair_sends_no_more_and_is_safe() -> No
 
 def test_nobody_comes_and_the_heaters_go_off_and_on_again() -> None:
     wire = Wire().begin()
-    wire.now_s = PATIENCE_S + 1
+    wire.now_s = HOLD_PATIENCE_S + 1
     wire.held.tick()
     wire.settle()
     assert wire.targets == [0.0, 0.0]
@@ -182,7 +182,7 @@ def test_nobody_comes_and_the_heaters_go_off_and_on_again() -> None:
 
 def test_an_agent_that_asks_keeps_the_bed_and_not_the_nozzle() -> None:
     wire = Wire().begin()
-    wire.now_s = PATIENCE_S + 1
+    wire.now_s = HOLD_PATIENCE_S + 1
     wire.held.here("one")
     wire.held.tick()
     wire.settle()

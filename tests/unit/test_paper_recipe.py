@@ -33,8 +33,8 @@ def same(said: str, value: object) -> bool:
 @pytest.mark.parametrize(
     ("module", "options", "variants"),
     [
-        ("amrepair.align.pam", pam.PamOptions, pam.VARIANTS),
-        ("amrepair.template.paper", paper.PaperOptions, paper.VARIANTS),
+        ("amrepair.align.pam", pam.PamOptions, pam.PAM_VARIANTS),
+        ("amrepair.template.paper", paper.PaperOptions, paper.NETWORK_VARIANTS),
     ],
 )
 def test_every_number_of_the_recipe_stands_on_the_page(

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from amrepair.cli.inspect import _refuse_too_noisy
 from amrepair.errors import InputError
-from amrepair.field.scales import FACING_COSINE, RANK, scales_of
+from amrepair.field.scales import RANK, WINDOW_FACING, scales_of
 from amrepair.regions import Label, detect
 from amrepair.regions.calibrating import calibrated
-from amrepair.regions.calibration import NORMAL, Calibration, Tail
+from amrepair.regions.calibration import NORMAL_NOISE, Calibration, Tail
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
@@ -52,7 +52,7 @@ def test_errors_that_hang_together_raise_no_alarm(ball: AnalyticTemplate, seed: 
     """Judged by normal noise of 0.04 mm, as the file says, such a scan has tens of regions."""
     scan = rough(ball, seed)
     assert detect(scan, ball).regions == ()
-    assert len(detect(scan, ball, calibration=NORMAL).regions) > 5
+    assert len(detect(scan, ball, calibration=NORMAL_NOISE).regions) > 5
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -131,7 +131,7 @@ def test_windows_are_what_a_plain_loop_makes_of_them() -> None:
     for k in range(0, len(first), 37):
         beside = (np.abs(index - index[k]) <= 1).all(axis=1)
         off = first.value_mm * np.sign(first.value_mm[k]) > 0.5 * 0.8
-        alike = (first.normal @ first.normal[k] > FACING_COSINE) | (off & off[k])
+        alike = (first.normal @ first.normal[k] > WINDOW_FACING) | (off & off[k])
         beside &= alike | (np.arange(len(first)) == k)
         ranked = np.sort(first.value_mm[beside])
         assert first.count[k] == len(ranked)

@@ -34,7 +34,7 @@ from amrepair.report.assemble import report_of_plan
 from amrepair.report.collect import look_of, of_the_part, plan_result, together_mm3
 from amrepair.report.data import Rule
 from amrepair.report.document import render_report
-from amrepair.report.live import STOPS
+from amrepair.report.live import COLOUR_STOPS
 from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
 
@@ -209,7 +209,7 @@ def test_missing_and_too_much_are_told_apart_by_every_eye(eye: str) -> None:
     found = re.search(r"const STOPS = (\[\[.*?\]\]);", script)
     assert found
     stops = np.array(json.loads(found.group(1)), dtype=np.float64)
-    assert np.array_equal(stops, STOPS)  # one scale, in the report and in the live view
+    assert np.array_equal(stops, COLOUR_STOPS)  # one scale, in the report and in the live view
     linear = np.where(stops <= 10.31, stops / 3294.6, ((stops / 255 + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ np.array(SEEN_BY[eye]).T, 0.0, 1.0)
     xyz = seen @ np.array(

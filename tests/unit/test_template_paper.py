@@ -13,10 +13,17 @@ from amrepair.errors import TemplateError
 from amrepair.template import GridSdf, MeshSdf, PaperSdf, extract_mesh, load_template
 from amrepair.template.fitting import fit_template
 from amrepair.template.network import Architecture
-from amrepair.template.paper import CODE, PAPER, VARIANTS, _from_cloud, _queries, fit_paper
+from amrepair.template.paper import (
+    NETWORK_VARIANTS,
+    PUBLISHED_NETWORK,
+    RELEASED_NETWORK,
+    _from_cloud,
+    _queries,
+    fit_paper,
+)
 
 # Seconds instead of hours, the same arithmetic.
-QUICK = replace(PAPER, batch=512, rate=2e-3, epochs=10, dropout=0.0, width=96)
+QUICK = replace(PUBLISHED_NETWORK, batch=512, rate=2e-3, epochs=10, dropout=0.0, width=96)
 RADIUS_MM = 10.0
 
 
@@ -31,14 +38,23 @@ def fitted(ball: MeshSdf) -> PaperSdf:
 
 
 def test_defaults_are_those_of_the_paper() -> None:
-    assert (PAPER.surface, PAPER.box, PAPER.volume) == (10_000, 10_000, 3_000)
-    assert (PAPER.epochs, PAPER.rate, PAPER.batch, PAPER.clamp) == (2_000, 1e-5, 16, 0.1)
-    assert (PAPER.dropout, CODE.dropout) == (0.2, 0.0)
-    assert PAPER.architecture.inputs == 63
-    assert replace(PAPER, encoding=False).architecture.inputs == 3
-    assert len(PAPER.architecture.sizes) == 8
-    assert PAPER.architecture.sizes[3] == (256, 256 - 63)
-    assert set(VARIANTS) == {"paper", "code"}
+    assert (PUBLISHED_NETWORK.surface, PUBLISHED_NETWORK.box, PUBLISHED_NETWORK.volume) == (
+        10_000,
+        10_000,
+        3_000,
+    )
+    assert (
+        PUBLISHED_NETWORK.epochs,
+        PUBLISHED_NETWORK.rate,
+        PUBLISHED_NETWORK.batch,
+        PUBLISHED_NETWORK.clamp,
+    ) == (2_000, 1e-5, 16, 0.1)
+    assert (PUBLISHED_NETWORK.dropout, RELEASED_NETWORK.dropout) == (0.2, 0.0)
+    assert PUBLISHED_NETWORK.architecture.inputs == 63
+    assert replace(PUBLISHED_NETWORK, encoding=False).architecture.inputs == 3
+    assert len(PUBLISHED_NETWORK.architecture.sizes) == 8
+    assert PUBLISHED_NETWORK.architecture.sizes[3] == (256, 256 - 63)
+    assert set(NETWORK_VARIANTS) == {"paper", "code"}
 
 
 def test_encoding_is_input_then_waves() -> None:
@@ -55,7 +71,7 @@ def test_encoding_is_input_then_waves() -> None:
 
 
 def test_queries_lie_where_the_paper_says(ball: MeshSdf) -> None:
-    points = _queries(ball, np.zeros(3), RADIUS_MM, PAPER, np.random.default_rng(0))
+    points = _queries(ball, np.zeros(3), RADIUS_MM, PUBLISHED_NETWORK, np.random.default_rng(0))
     assert points.shape == (23_000, 3)
     assert np.abs(ball.distance(points[:10_000])).max() < 0.01
     box = np.abs(points[10_000:20_000]).max(axis=0)
@@ -163,9 +179,9 @@ def test_fit_template_takes_the_recipe_by_name() -> None:
 )
 def test_settings_out_of_range_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(TemplateError):
-        replace(PAPER, **change)
+        replace(PUBLISHED_NETWORK, **change)
 
 
 def test_a_network_too_narrow_for_its_skip_is_refused() -> None:
     with pytest.raises(TemplateError, match="width above 63"):
-        _ = replace(PAPER, width=60).architecture
+        _ = replace(PUBLISHED_NETWORK, width=60).architecture

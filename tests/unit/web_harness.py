@@ -141,11 +141,14 @@ class FakeServer:
 
     @staticmethod
     def _flush(connection: socket.socket, protocol: ServerProtocol) -> None:
-        for data in protocol.data_to_send():
-            if data:
-                connection.sendall(data)
-            else:
-                connection.shutdown(socket.SHUT_WR)
+        try:
+            for data in protocol.data_to_send():
+                if data:
+                    connection.sendall(data)
+                else:
+                    connection.shutdown(socket.SHUT_WR)
+        except OSError:  # the peer has hung up already
+            return
 
     def push(self, message: object) -> None:
         """Send a JSON value over every websocket."""

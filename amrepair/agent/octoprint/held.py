@@ -20,7 +20,7 @@ AHEAD_LINES = 8
 """Lines that OctoPrint has before it has sent them: a cancelled print stops within so many."""
 AGENT_GONE_S = 6.0
 """Three times what an agent is silent."""
-PATIENCE_S = 600.0
+HOLD_PATIENCE_S = 600.0
 SAFE_COMMANDS = ("M104 S0", "M140 S0", "M107")
 KEPT = 20  # messages and calls
 _SCAN = re.compile(r"scan\s+layer=(\d+)\s+z=([\d.]+)\s*$")
@@ -114,7 +114,7 @@ class Held:
         later: Callable[[Callable[[], None]], None],
         clock: Callable[[], float],
         *,
-        patience_s: Callable[[], float] = lambda: PATIENCE_S,
+        patience_s: Callable[[], float] = lambda: HOLD_PATIENCE_S,
     ) -> None:
         self._server, self._later, self._clock, self._patience_s = server, later, clock, patience_s
         self._lock = threading.RLock()

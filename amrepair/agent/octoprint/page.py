@@ -12,8 +12,8 @@ import tornado.httpclient
 import tornado.web
 import tornado.websocket
 
-MAX_MESSAGE_BYTES = 256 * 1024 * 1024  # a scan's points come in one
-PATIENCE_S = 10.0
+MAX_SCAN_MESSAGE_BYTES = 256 * 1024 * 1024  # a scan's points come in one
+PAGE_PATIENCE_S = 10.0
 PASSED_ON = ("Content-Type", "Content-Encoding")
 
 
@@ -41,10 +41,10 @@ class LivePage(tornado.websocket.WebSocketHandler):
             wanted = self.request.headers.get("Sec-WebSocket-Protocol", "")
             self._behind = await tornado.websocket.websocket_connect(
                 tornado.httpclient.HTTPRequest(
-                    f"ws://{host}/", headers=cookie, connect_timeout=PATIENCE_S
+                    f"ws://{host}/", headers=cookie, connect_timeout=PAGE_PATIENCE_S
                 ),
                 subprotocols=[word.strip() for word in wanted.split(",") if word.strip()],
-                max_message_size=MAX_MESSAGE_BYTES,
+                max_message_size=MAX_SCAN_MESSAGE_BYTES,
             )
             await super().get(*args, **kwargs)
             return
@@ -52,7 +52,7 @@ class LivePage(tornado.websocket.WebSocketHandler):
         try:
             answer = await tornado.httpclient.AsyncHTTPClient().fetch(
                 f"http://{host}/", headers={**cookie, **accepted}, decompress_response=False,
-                request_timeout=PATIENCE_S,
+                request_timeout=PAGE_PATIENCE_S,
             )  # fmt: skip
         except (tornado.httpclient.HTTPError, OSError) as error:
             raise tornado.web.HTTPError(502, reason="the live page does not answer") from error

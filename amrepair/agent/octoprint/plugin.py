@@ -16,7 +16,7 @@ from octoprint.access.permissions import Permissions
 from octoprint.util import RepeatedTimer
 
 import amrepair
-from amrepair.agent.octoprint.held import PATIENCE_S, Held, Refusal
+from amrepair.agent.octoprint.held import HOLD_PATIENCE_S, Held, Refusal
 
 TAG = "amrepair:"
 TRIES, TRY_S = 50, 0.01
@@ -40,7 +40,7 @@ class AmrepairPlugin(
         self._deeds: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._held = Held(
             self, self._deeds.put, time.monotonic,
-            patience_s=lambda: float(self._settings.get_float(["patience_s"]) or PATIENCE_S),
+            patience_s=lambda: float(self._settings.get_float(["patience_s"]) or HOLD_PATIENCE_S),
         )  # fmt: skip
         self._address = ("", "")
         self._note = Path(self.get_plugin_data_folder()) / "rests"
@@ -218,7 +218,7 @@ class AmrepairPlugin(
 
     def get_settings_defaults(self) -> dict[str, Any]:
         """What may be set."""
-        return {"patience_s": PATIENCE_S}
+        return {"patience_s": HOLD_PATIENCE_S}
 
     def get_template_configs(self) -> list[dict[str, Any]]:
         """A tab, and a page of the settings."""

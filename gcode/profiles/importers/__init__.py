@@ -17,15 +17,15 @@ from typing import Any
 from pydantic import ValidationError
 
 from gcode.errors import InputError, ProfileError
-from gcode.profiles.importers.jobs import SUFFIXES, read_settings
-from gcode.profiles.importers.klipper import KLIPPER, bed_note, finish, read_klipper
+from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
+from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
 from gcode.profiles.importers.rules import Imported, Left, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
 from gcode.profiles.names import Kind, list_profiles
 from gcode.profiles.own_limits import own_fault
-from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
-from gcode.profiles.store import content_of
+from gcode.profiles.schema import PrinterProfile
+from gcode.profiles.store import MODELS, content_of
 
 __all__ = [
     "Imported",
@@ -38,11 +38,6 @@ __all__ = [
     "write_profiles",
 ]
 
-_MODELS: dict[Kind, type[PrinterProfile | MaterialProfile | ProcessProfile]] = {
-    "printers": PrinterProfile,
-    "materials": MaterialProfile,
-    "processes": ProcessProfile,
-}
 _GENERIC = {
     "marlin": "generic_marlin",
     "klipper": "generic_klipper",
@@ -62,7 +57,7 @@ ASK_FOR = (
     "end_gcode",
 )
 """Keys of a printer that are another machine's until somebody measures or writes them."""
-EDGE_MM = 5.0
+BED_EDGE_MM = 5.0
 """How far from the bed's edge an inherited place is kept."""
 
 
@@ -105,11 +100,11 @@ def import_profiles(
         If a value is outside what our profiles allow.
     """
     try:
-        kind = "replace" if path.suffix.lower() in SUFFIXES else "strict"
+        kind = "replace" if path.suffix.lower() in JOB_SUFFIXES else "strict"
         text = path.read_text(encoding="utf-8-sig", errors=kind)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read as text ({error}).") from error
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in JOB_SUFFIXES:
         found = import_job(str(path), text, inherits=inherits)
         if found is None:
             raise InputError(
@@ -125,7 +120,7 @@ def import_profiles(
     parents = {kind: inherits or _parent(kind, source, rules) for kind in source.kinds}
     made, left = apply(source, rules, parents)
     notes: list[str] = []
-    if rules is KLIPPER:
+    if rules is KLIPPER_RULES:
         left = finish(made[0], left, source)
         notes += filter(None, [bed_note(made[0])])
     for profile in made:
@@ -170,7 +165,7 @@ def _read(path: Path, text: str, preset: str | None) -> tuple[dict[str, Rule], S
     if suffix == ".json":
         return ORCA, read_orca(path, text)
     if suffix == ".cfg":
-        return KLIPPER, read_klipper(path, text)
+        return KLIPPER_RULES, read_klipper(path, text)
     if suffix == ".ini":
         return PRUSA, read_prusa(path, text, preset)
     raise InputError(
@@ -185,7 +180,7 @@ def _parent(kind: Kind, source: Source, rules: dict[str, Rule]) -> str:
     if kind == "materials":
         named = source.values.get("filament_type", "").split(",")[0].split(";")[0].strip().lower()
         return named if named in list_profiles("materials") else "pla"
-    if rules is KLIPPER:
+    if rules is KLIPPER_RULES:
         return _GENERIC["klipper"]
     known = machine_named(
         source.values.get("printer_model", ""),
@@ -218,7 +213,11 @@ def _settle(made: Imported) -> list[str]:
     size_mm, top_mm = merged["bed_size_mm"], merged["max_z_mm"]
     for key in ("park_mm", "prime_mm"):
         x_mm, y_mm, z_mm = merged[key]
-        kept = [min(x_mm, size_mm[0] - EDGE_MM), min(y_mm, size_mm[1] - EDGE_MM), min(z_mm, top_mm)]
+        kept = [
+            min(x_mm, size_mm[0] - BED_EDGE_MM),
+            min(y_mm, size_mm[1] - BED_EDGE_MM),
+            min(z_mm, top_mm),
+        ]
         if kept != list(merged[key]):
             made.values[key] = kept
             notes.append(f"{key} of {made.inherits} was moved onto this bed: {kept}")
@@ -233,7 +232,7 @@ def _settle(made: Imported) -> list[str]:
 def _validate(path: Path, made: Imported) -> None:
     content = {**content_of(made.kind, made.inherits), **made.values, "id": "x", "name": made.name}
     try:
-        _MODELS[made.kind].model_validate(content)
+        MODELS[made.kind].model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -263,7 +262,7 @@ def _fault(made: Imported) -> tuple[str, str] | None:
     """The first key of a profile's own that is not allowed, and why."""
     content = {**content_of(made.kind, made.inherits), **made.values, "id": "x", "name": made.name}
     try:
-        profile = _MODELS[made.kind].model_validate(content)
+        profile = MODELS[made.kind].model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         return str(first["loc"][0]), f"{first['input']!r} is out of range ({first['msg']})"

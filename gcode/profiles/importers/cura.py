@@ -26,7 +26,7 @@ from gcode.profiles.importers.rules import (
 )
 from gcode.profiles.names import Kind
 
-MARK = ";SETTING_3 "
+SETTING_MARK = ";SETTING_3 "
 HEADER = re.compile(
     r"^;(FLAVOR|TARGET_MACHINE\.NAME|Layer height|GENERATOR\.NAME|GENERATOR\.VERSION"
     r"|EXTRUDER_TRAIN\.0\.(?:NOZZLE\.DIAMETER|INITIAL_TEMPERATURE|MATERIAL\.GUID)"
@@ -70,7 +70,7 @@ def _steady(rule: Rule) -> Rule:
     return Rule(rule.kind, rule.key, convert)
 
 
-_RULES: dict[str, Rule] = {
+_CURA_RULES: dict[str, Rule] = {
     "FLAVOR": Rule("printers", "dialect", _dialect),
     "EXTRUDER_TRAIN.0.NOZZLE.DIAMETER": Rule("printers", "nozzle_diameter_mm", number),
     "machine_width": Rule("printers", "bed_size_mm", _bed),
@@ -123,7 +123,7 @@ _RULES: dict[str, Rule] = {
     "acceleration_print": Rule("processes", "acceleration_mm_s2", limit),
     "infill_overlap": Rule("processes", "infill_overlap_ratio", percent),
 }
-CURA = {key: _steady(rule) for key, rule in _RULES.items()}
+CURA = {key: _steady(rule) for key, rule in _CURA_RULES.items()}
 _NO_MACHINE = frozenset({"fdmprinter", "custom"})  # definitions of anybody's printer
 
 
@@ -152,7 +152,9 @@ def read_cura(name: str, text: str) -> Source | None:
 
 def _changed(name: str, text: str) -> dict[str, str]:
     """Settings that the user changed; the first extruder's count over the machine's."""
-    lines = [line[len(MARK) :] for line in text.splitlines() if line.startswith(MARK)]
+    lines = [
+        line[len(SETTING_MARK) :] for line in text.splitlines() if line.startswith(SETTING_MARK)
+    ]
     if not lines:
         return {}
     try:
@@ -168,7 +170,7 @@ def _changed(name: str, text: str) -> dict[str, str]:
                 values.setdefault("definition", parser.get("general", "definition"))
     except (ValueError, AttributeError, TypeError, configparser.Error) as error:
         raise InputError(
-            f"{name}: the settings that Cura wrote behind the job ('{MARK.strip()}') cannot be "
-            f"read ({str(error).splitlines()[0]}); slice the part again."
+            f"{name}: the settings that Cura wrote behind the job ('{SETTING_MARK.strip()}') "
+            f"cannot be read ({str(error).splitlines()[0]}); slice the part again."
         ) from error
     return values

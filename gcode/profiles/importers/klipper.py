@@ -20,7 +20,7 @@ from gcode.profiles.importers.rules import (
     number,
 )
 
-_MACRO = "gcode_macro "
+_MACRO_SECTION = "gcode_macro "
 _INCLUDE = "include "
 _SAVED = "#*# <"
 """Where what SAVE_CONFIG appends begins: it is no limit of the machine."""
@@ -38,7 +38,7 @@ def _size(axis: str) -> Rule:
     return Rule("printers", f"bed_size_mm.{axis}", convert)
 
 
-KLIPPER: dict[str, Rule] = {
+KLIPPER_RULES: dict[str, Rule] = {
     "stepper_x.position_max": _size("x"),
     "stepper_y.position_max": _size("y"),
     "stepper_z.position_max": Rule("printers", "max_z_mm", number),
@@ -124,7 +124,7 @@ def _add_sections(values: dict[str, str], path: Path, text: str) -> None:
         what = str(error).splitlines()[0]
         raise InputError(f"{path} cannot be read as a Klipper printer.cfg ({what}).") from error
     for section in parser.sections():
-        if section.startswith(_MACRO):
+        if section.startswith(_MACRO_SECTION):
             values[section] = ""
             continue
         for key, value in parser[section].items():
@@ -167,9 +167,13 @@ def finish(made: Imported, left: tuple[Left, ...], source: Source) -> tuple[Left
             halves += [
                 Left(m.source_key, m.source_value, "the other axis is missing") for m in lost
             ]
-    names = [key for key in source.values if key.startswith(_MACRO)]
+    names = [key for key in source.values if key.startswith(_MACRO_SECTION)]
     if names:
-        values["macros"] = sorted(name.removeprefix(_MACRO).strip().upper() for name in names)
+        values["macros"] = sorted(
+            name.removeprefix(_MACRO_SECTION).strip().upper() for name in names
+        )
         for name in names:
-            made.mapped.append(Mapped(name, "", "macros", name.removeprefix(_MACRO).upper()))
+            made.mapped.append(
+                Mapped(name, "", "macros", name.removeprefix(_MACRO_SECTION).upper())
+            )
     return (*(row for row in left if row.source_key not in names), *halves)

@@ -1,0 +1,97 @@
+"""What a newcomer may rely on: a name has one value, a function fits a page, a call a line."""
+
+from __future__ import annotations
+
+import ast
+import functools
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LINES, PARAMETERS, KERNEL_PARAMETERS = 60, 10, 14
+# Commands have a parameter an option. Every package that loads late has one table of that name.
+COMMANDS, LOADED_LATE = ("amrepair/cli/", "gcode/cli/"), "HOMES"
+# A table in the form of a function: a line each.
+TABLES = {"amrepair/bench/tables.py": {"as_markdown"}}
+
+
+@functools.cache
+def modules() -> list[tuple[str, ast.Module]]:
+    paths = [path for name in ("amrepair", "gcode") for path in sorted((ROOT / name).rglob("*.py"))]
+    return [
+        (str(path.relative_to(ROOT)), ast.parse(path.read_text(encoding="utf-8"))) for path in paths
+    ]
+
+
+def constants(module: ast.Module) -> Iterator[tuple[str, ast.expr]]:
+    """Names in capitals that a module sets, and those of a tuple."""
+    for node in module.body:
+        if isinstance(node, ast.AnnAssign) and node.value is not None:
+            targets, value = [node.target], node.value
+        elif isinstance(node, ast.Assign):
+            targets, value = node.targets, node.value
+        else:
+            continue
+        for target in targets:
+            several = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
+            pairs = zip(target.elts, value.elts, strict=True) if several else [(target, value)]
+            for name, what in pairs:
+                if isinstance(name, ast.Name) and name.id.lstrip("_").isupper():
+                    yield name.id.lstrip("_"), what
+
+
+def functions(module: ast.Module) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in ast.walk(module):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function without its docstring."""
+    count = (function.end_lineno or 0) - function.lineno + 1
+    if ast.get_docstring(function) is not None:
+        text = function.body[0]
+        count -= (text.end_lineno or 0) - text.lineno + 1
+    return count
+
+
+def test_a_constant_s_name_has_one_value() -> None:
+    found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    for path, module in modules():
+        for name, value in constants(module):
+            text = ast.unparse(value)
+            if name != LOADED_LATE and "TypeVar" not in text and not text.endswith(f".{name}"):
+                found[name][text].append(path)
+    assert len(found) > 500
+    assert {name: dict(values) for name, values in found.items() if len(values) > 1} == {}
+
+
+def test_a_function_fits_a_page() -> None:
+    too_long = [
+        (path, function.name, code_lines(function))
+        for path, module in modules()
+        if not path.startswith(COMMANDS) and not path.endswith("_kernels.py")
+        for function in functions(module)
+        if code_lines(function) > LINES and function.name not in TABLES.get(path, ())
+    ]
+    assert too_long == []
+
+
+@pytest.mark.parametrize(
+    ("kernels", "most"), [(False, PARAMETERS), (True, KERNEL_PARAMETERS)], ids=["", "kernels"]
+)
+def test_a_call_fits_a_line(kernels: bool, most: int) -> None:
+    too_many = []
+    for path, module in modules():
+        if path.startswith(COMMANDS) or path.endswith("_kernels.py") != kernels:
+            continue
+        for function in functions(module):
+            given = function.args
+            names = [a.arg for a in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+            count = len(names) - (names[:1] in (["self"], ["cls"]))
+            if count > most:
+                too_many.append((path, function.name, count))
+    assert too_many == []
