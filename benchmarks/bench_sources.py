@@ -1,7 +1,7 @@
 """Detection on what was left out, source by source: small, partly smooth defects of six kinds.
 
 Run: python benchmarks/bench_sources.py [--source NAME FILE…] [--method pasdf] [--normal 12]
-[--defects 3] [--points 12000] [--clouds-alone] [--out DIR] [--page].
+[--defects 3] [--points 12000] [--clouds-alone] [--out DIR].
 
 A source is a house that draws its parts its own way: parts of one are alike, so that a share of
 them held back says little. Without --source it takes those of AMREPAIR_DATA/parts. Each part
@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from measured_page import add_page_option, table, write_rows
+from measured_page import table
 
 from amrepair.bench import BENCH_METHODS, SynthOptions, run_bench, synthesize
 from amrepair.bench.cells import Row
@@ -82,7 +82,6 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=SynthOptions().points)
     parser.add_argument("--clouds-alone", action="store_true")
     parser.add_argument("--out", type=Path)
-    add_page_option(parser)
     said = parser.parse_args()
     options = SynthOptions(
         normal=said.normal,
@@ -101,8 +100,6 @@ def main() -> None:
                 row = (f"{row[0]}, clouds alone", *row[1:])
             rows.append(row)
             print(table(HEADER, rows), "\n", flush=True)
-    if said.page:
-        write_rows("bench_sources", HEADER, rows)
 
 
 if __name__ == "__main__":

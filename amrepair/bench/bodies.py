@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from amrepair.align.refine import refine_all
+from amrepair.align.refine import Prior, refine_all
 from amrepair.align.search import THOROUGH, CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.bench.bends import best_cuts
@@ -63,9 +63,9 @@ SURFACE_RATIO = 1.0 / 60.0  # spacing of the template's points, of the diagonal
 BENT_GAIN = float(chi2.isf(1e-6, 6))
 BENT_SCALE_RATIO = 0.01  # of the diagonal: scale of the loss, where pieces begin
 CUT_RANGE = (0.1, 0.9)  # of the points: shares below a cut
-# Of what is off in one pose, within the limit, two explain so much more; of sound views whose one
-# pose was not yet at its end up to 0.04.
-LEAST_EXPLAINED = 0.06
+# Of what is off in one pose, within the limit, two explain so much more: of bends of 0.6° 0.15, of
+# sound views, whose pieces slide along what the template is off by, up to 0.07.
+LEAST_EXPLAINED = 0.1
 
 Pose = Float[np.ndarray, "4 4"]
 
@@ -164,6 +164,8 @@ def _little_bent(pose: Pose, scene: _Scene) -> Pieces:
     best: tuple[float, Pieces] | None = None
     for cut in cuts[:2]:
         explained, pieces = _parted(whole, cut.normal, cut.height_mm, scene)
+        if pieces.other is None or _hinge(pieces.other @ np.linalg.inv(pieces.pose), scene) is None:
+            continue  # what slid along a flat or round face is no bend
         if best is None or explained < best[0]:
             best = explained, pieces
     if best is None or best[0] > (1.0 - LEAST_EXPLAINED) * alone:
@@ -184,7 +186,7 @@ def _parted(
         for k, own in enumerate((height < at, height >= at)):
             scale = BENT_SCALE_RATIO if round_ == 0 else 0.0
             some = np.ascontiguousarray(cloud[own])
-            poses[k] = scene.refined(some, [poses[k]], scale)[0]
+            poses[k] = scene.refined(some, [poses[k]], scale, held=True)[0]
             off[k] = scene.off(poses[k])
         below = np.cumsum(off[0][order])
         beyond = np.cumsum(off[1][order][::-1])[::-1]
@@ -295,6 +297,12 @@ class _Scene:
         placed = moved(self.cloud if points is None else points, pose)
         return np.abs(self.template.distance(placed)) <= self.limit_mm
 
+    @property
+    def prior(self) -> Prior:
+        """A piece lies near where the whole does: a flat one must not slide."""
+        shift_mm = SECOND_PIECE_RATIO * self.diagonal_mm
+        return Prior(np.full(3, PIECE_TURN_RAD), np.full(3, shift_mm))
+
     def off(self, pose: Pose) -> Float[np.ndarray, " n"]:
         """(n,) how far off the template the points lie, in limits; 1 beyond it."""
         distance = np.abs(self.template.distance(moved(self.cloud, pose)))
@@ -313,10 +321,12 @@ class _Scene:
         first_ratio: float = FIRST_PIECE_RATIO,
         *,
         outside: bool = True,
+        held: bool = False,
     ) -> list[Pose]:
         """Poses moved so that as many of the points as may be lie on the template.
 
-        Unless `outside`, those beyond it are drawn in from anywhere.
+        Unless `outside`, those beyond it are drawn in from anywhere. If `held`, what the points do
+        not tell of a pose stays.
         """
         end_mm = SHARP * self.limit_mm
         found = refine_all(
@@ -329,6 +339,7 @@ class _Scene:
             max_iterations=ITERATIONS,
             enough_mm=ENOUGH_SIGMAS * self.sigma_mm,
             outside_mm=0.0 if outside else end_mm,
+            prior=self.prior if held else None,
         )
         return [one.matrix for one in found]
 

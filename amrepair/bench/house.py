@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import align
 from amrepair.align.thinning import order_of
-from amrepair.bench.bodies import Pieces, pieces_of
+from amrepair.bench.bodies import pieces_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.errors import AlignmentError
@@ -57,6 +57,9 @@ MAX_OFFSET_RATIO = 0.15
 REPAIR_POINTS = 16_384
 SURFACE_SPACING_MM = 0.3  # of the extracted surface; at 0.5 thin walls are off by 2.5 times as much
 RETRIES = 3
+# So near to the template, of the diagonal, sound clouds lie, or a pose is not told by it; where
+# less of a sample lies so, it is laid wrong, and all of it is asked.
+FOLLOWED_RATIO, LEAST_FOLLOWED = 0.002, 0.5
 # Where the surface fused from clouds lies far off, the second look is from nearer by.
 LEARNING_ROUNDS = 2
 
@@ -106,17 +109,14 @@ def _from_clouds(data: ClassInput, seed: int) -> GridSdf:
     return template
 
 
-def _pieces(
+def _laid(
     points_mm: Float[np.ndarray, "n 3"],
     template: Template,
     *,
     sigma_mm: float,
     rng: np.random.Generator,
-) -> Pieces:
-    """Where the points lie in the template's frame, and a piece that was bent out of it.
-
-    A failed alignment is tried again with other draws.
-    """
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Poses of points in the template, the best first; a failed alignment is tried again."""
     scan = Scan(points_mm, sigma_mm, "scanner", source="sample")
     for attempt in range(RETRIES):
         try:
@@ -127,8 +127,7 @@ def _pieces(
             _log.info("alignment failed (%s); trying again", error)
         else:
             poses = (found.template_from_scan, *found.symmetric_alternatives)
-            known = [pose.matrix for pose in poses]
-            return pieces_of(points_mm, template, known, sigma_mm, rng)
+            return [pose.matrix for pose in poses]
     raise AlignmentError("no alignment was tried")  # RETRIES is at least one
 
 
@@ -204,9 +203,12 @@ class FieldModel:
     def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
         """Align, test, score; what cannot be aligned is not this part."""
         try:
-            pieces = _pieces(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)
+            known = _laid(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)
         except AlignmentError:
             return Scores(np.zeros(len(points_mm)), np.inf, None, aligned=False)
+        followed = self.sound.followed_at(moved(points_mm, known[0]), FOLLOWED_RATIO * DIAGONAL_MM)
+        some = points_mm[followed] if followed.mean() > LEAST_FOLLOWED else points_mm
+        pieces = pieces_of(some, self.template, known, self.sigma_mm, rng)
         placed = moved(points_mm, pieces.pose)
         judged = self.sound.judge(placed)
         # Published clouds may have no noise at all; the unit does not matter then.
@@ -234,11 +236,11 @@ class FieldMethod:
         laid, refused = [], None
         for cloud in data.clouds_mm:
             try:
-                pieces = _pieces(cloud, template, sigma_mm=data.sigma_mm, rng=rng)
+                pose = _laid(cloud, template, sigma_mm=data.sigma_mm, rng=rng)[0]
             except AlignmentError as error:
                 refused = error
             else:
-                laid.append(moved(cloud, pieces.pose))
+                laid.append(moved(cloud, pose))
         if refused is not None and not laid:
             raise refused
         model = FieldModel(template, data.sigma_mm, SoundTest.of(template, laid), distance)
