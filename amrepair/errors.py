@@ -5,6 +5,11 @@ A message is one sentence: what happened, the value, the limit and what to try.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import gcode.errors
+
 
 class AmrepairError(Exception):
     """Root of every error that `amrepair` raises on purpose.
@@ -57,3 +62,18 @@ class LoopError(AmrepairError):
 
 class MissingDependencyError(AmrepairError):
     """A library that this command needs cannot be loaded."""
+
+
+@contextmanager
+def refused_as_ours() -> Iterator[None]:
+    """What `gcode`'s readers refuse within this is an `InputError` of ours: converted here alone.
+
+    Raises
+    ------
+    InputError
+        In place of `gcode.errors.InputError`, with its sentence.
+    """
+    try:
+        yield
+    except gcode.errors.InputError as error:
+        raise InputError(str(error).removesuffix(".")) from error

@@ -42,6 +42,11 @@ class ClosedMesh:
         """Enclosed, mm³."""
         return float(bodies_of(self.vertices_mm, self.faces, self.across)[0].sum())
 
+    def bodies_mm(self) -> list[tuple[float, ...]]:
+        """Boxes (as `bounding_box`) of what edges hold together; cavities have none."""
+        volumes, boxes = bodies_of(self.vertices_mm, self.faces, self.across)
+        return [tuple(box) for box in boxes[volumes > 0].tolist()]
+
     def bounding_box(self) -> tuple[float, ...]:
         """(x_min, y_min, z_min, x_max, y_max, z_max)."""
         low, high = self.vertices_mm.min(axis=0), self.vertices_mm.max(axis=0)

@@ -230,6 +230,8 @@ class ModalState:
         Of printing moves; None where the program never set it.
     units_mm
         False after G20.
+    pulled_mm
+        Filament that is pulled back, mm: so much of the next push melts nothing.
     """
 
     position_mm: tuple[float, float, float]
@@ -243,3 +245,4 @@ class ModalState:
     acceleration_mm_s2: float | None = None
     units_mm: bool = True
     tool: int = 0
+    pulled_mm: float = 0.0

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from gcode.errors import InputError
 from gcode.meshes import ClosedMesh, bodies_apart, closed_mesh
-from gcode.meshes_kernels import index_of_corners, put_in_table
+from gcode.meshes_kernels import index_of_corners, paired, put_in_table
 from gcode.solids_kernels import first_of_each
 from gcode.threemf import read_3mf
 
@@ -227,13 +227,20 @@ def _binary_stl(path: Path) -> Float[np.ndarray, "v 3"] | None:
             f"its header promises {count} triangles, which are {expected} bytes; it has {len(data)}"
         )
     triangles = np.frombuffer(data, STL_TRIANGLE, offset=STL_HEAD)
-    return np.ascontiguousarray(triangles["corners"].reshape(-1, 3), dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN, which is refused as every other is
+        return np.ascontiguousarray(triangles["corners"].reshape(-1, 3), dtype=np.float64)
 
 
 def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
-    """A `manifold3d.Manifold` of these triangles; its status tells whether it is one."""
+    """A `manifold3d.Manifold` of these triangles; `is_valid` tells whether it is one.
+
+    An empty one where they close no surface, which manifold3d 3.5.4 is not asked: of such meshes it
+    refuses most, and ends the process on others.
+    """
     import manifold3d
 
+    if not are_closed(faces):
+        return manifold3d.Manifold()
     # Arrays are copied: the binding takes no read-only ones, and trimesh's are read-only.
     return manifold3d.Manifold(
         manifold3d.Mesh64(
@@ -241,6 +248,17 @@ def as_manifold(vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
             np.array(faces, dtype=np.uint64, order="C"),
         )
     )
+
+
+def are_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Whether every edge of the faces is run as often one way as the other.
+
+    Faces that have a corner twice do not count.
+    """
+    a, b, c = faces.T
+    whole = (a != b) & (b != c) & (c != a)
+    some = faces if whole.all() else faces[whole]
+    return bool(paired(np.ascontiguousarray(some, np.int32))[1] >= 0)
 
 
 def is_valid(solid: Any) -> bool:

@@ -14,15 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from jaxtyping import Bool, Float
 from PIL import Image
 
 from amrepair.bench.samples import GOOD, BenchClass, Cloud, Points, Sample
-from amrepair.errors import InputError
+from amrepair.errors import InputError, refused_as_ours
 from amrepair.observe.robust import MAD_TO_SIGMA
-from amrepair.scans.depth_map import refuse_swollen_page
-from amrepair.scans.sizes import PARSER_ERRORS, UnpackLimit, in_words
+from gcode.surfaces.sizes import (
+    PARSER_ERRORS,
+    UnpackLimit,
+    in_words,
+    quiet_tiff,
+    refuse_swollen_page,
+)
 
 BORDER_RATIO = 0.03  # of the image's shorter side: the part does not reach so far out
 # A table is flat to this share of the width that the border shows, as one standard deviation (a
@@ -96,7 +100,7 @@ def read_grid(path: Path) -> Float[np.ndarray, "rows columns 3"]:
         If it is damaged, or holds something else.
     """
     try:
-        with tifffile.TiffFile(path) as tiff:
+        with refused_as_ours(), quiet_tiff(path) as tiff:
             page: Any = tiff.pages[0]
             refuse_swollen_page(path, page, UnpackLimit())
             grid = np.asarray(page.asarray(), dtype=np.float64)

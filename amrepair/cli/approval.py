@@ -43,6 +43,8 @@ class Terminal:
                         f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}.",
                         markup=False,
                     )
+            for way in decision.ways:
+                console.errors.print(f"  {way.told}", markup=False)
             return confirmed("Go on all the same (no ends the run)?")
 
 
@@ -82,6 +84,7 @@ class AtDesk(console.Bars):
         """Tell why the run rests, and wait for a word."""
         own = [v for v in decision.verdicts if v.action is decision.action]
         lines = [f"{v.finding.type}: {v.reason}" for v in own] or [decision.reason]
+        lines += [way.told for way in decision.ways]
         return self._desk.ask("Go on all the same (no ends the run)?", lines)
 
 

@@ -104,7 +104,13 @@ def simulate(
 ) -> None:
     """Print a part on an emulated printer, break it, find what is missing and print only that."""
     refuse_traps([] if part is None else [part])
-    with console.starting():
+    from amrepair.simulate.defects import parse_defect
+    from gcode.profiles import load_setup
+
+    defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
+    defects = [d for d in defects if d.kind != "none"]
+    setup = load_setup(printer, material, process)
+    with console.starting():  # a second: what was typed wrong is refused before
         import numpy as np
 
         from amrepair.loop import Approval
@@ -113,17 +119,12 @@ def simulate(
         from amrepair.report import write_report
         from amrepair.report.folder import RunFolder
         from amrepair.scans import PROBE
-        from amrepair.simulate.defects import parse_defect
         from amrepair.simulate.parameters import load_world
         from amrepair.simulate.part_files import bracket_path
         from amrepair.simulate.run import place_on_bed, prepare_run, simulate_run
-        from gcode.profiles import load_setup
 
     watch, bars = Stopwatch(), console.Bars()
     policy = PolicyOptions(most_passes=max_iterations)
-    defects = [parse_defect(text) for text in defect or DEFAULT_DEFECTS]
-    defects = [d for d in defects if d.kind != "none"]
-    setup = load_setup(printer, material, process)
     told = load_world(world)
     _ = setup.printer.feeler if scanner == PROBE else told.scanner(scanner)  # before any work
     path = part or bracket_path()

@@ -81,6 +81,9 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
     else:
         for line in summary_of_result(result, within_tolerance=within):
             console.out.print(line)
+        for look in report.looks:
+            for way in look.decision.ways:
+                console.out.print(f"{look.stop.label}, found late: {way.told}.", markup=False)
         for felt in begun.felt:
             console.out.print(f"{felt.stop}: {felt.told()}.")
         if report.calibration is not None:

@@ -27,7 +27,8 @@ from amrepair.loop.objects import Course, Objects
 from amrepair.loop.options import Approval, LoopOptions, Records
 from amrepair.loop.sites import Expected
 from amrepair.loop.situation import decide_look
-from amrepair.loop.tape import Sent, TapeEndsError, report_from_json, report_to_json
+from amrepair.loop.tape import ANEW, LOOK_EVENTS, TapeEndsError
+from amrepair.loop.wire import Mover, Wire
 from amrepair.policy import Action, Decision
 from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import PROBE, Scan, Scanner, ScanRequest
@@ -35,13 +36,13 @@ from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
 from gcode.hosts.port import LeavesOut, Printer, PrintReport
 from gcode.moves import ModalState
-from gcode.progress import Progress, silent
+from gcode.progress import Progress
 from gcode.reader import Job
 from gcode.resumption.head import pulled_back_mm
 from gcode.resumption.rest import rest_without
 from gcode.resumption.standing import with_solid
 
-ENDED_BY_NO = (Action.PAUSE, Action.GIVE_UP)
+ENDED_BY_NO = (Action.PAUSE, Action.GIVE_UP, Action.OFFER)
 
 
 class Run:
@@ -66,10 +67,13 @@ class Run:
         self._objects, self._course, self._stops = Objects.of(job), Course(job), tuple(stops)
         self._site_at, self._options, self._approval = site_at, options, approval
         self._keep_scan, self._record = records.scan, records.look
-        self._tape, self._pick_up, self._watch = records.tape, records.pick_up, records.watch
+        self._tape, self._watch = records.tape, records.watch
+        self._wire = Wire(printer, records.tape, records.pick_up)
+        self._moves = isinstance(scanner, Mover) and not records.tape.only_read
+        if isinstance(scanner, Mover):
+            scanner.send_by(self._wire)
         self._progress = progress
         self._learning = Learning(options.calibration)
-        self._sent: list[Sent] = []
         self._next_line = 0
         self._looks: list[Look] = []
         self._unsettled: list[Callable[[], Look]] = []  # the last ones, as they are to be kept
@@ -114,7 +118,7 @@ class Run:
                 self._coming = coming, beside.submit(self._site_at, now)
             settling = beside.submit(self.settle)
             kind, base = ("rest" if self._base else "job"), self._base
-            report = self._send(kind, self._checked, first - base, end - base, whole_job)
+            report = self._wire.send(kind, self._checked, first - base, end - base, whole_job)
         settling.result()
         if report is not None:
             self._job_prints.append(report)
@@ -129,7 +133,7 @@ class Run:
         """The last word on the tape."""
         if not self._tape.only_read and not (self._tape.peek() and self._tape.next("end")):
             if self._stopped:
-                self._go_live()
+                self._wire.go_live()
                 with contextlib.suppress(GcodeError, OSError):
                     self._printer.heaters_off()
             self._tape.write("end", stopped=self._stopped)
@@ -147,7 +151,7 @@ class Run:
         site = self._expected(stop, now)
         with self._watch("print"):
             program, parked = travel.park(site.setup, state)
-            self._send("park", program)
+            self._wire.send("park", program)
         while True:
             look = self._try_to_look(stop, site, parked)
             if look is None:
@@ -157,7 +161,7 @@ class Run:
             action = look.decision.action
             if look.printed and look.plan.checked is not None:
                 with self._watch("repair"):
-                    report = self._send("repair", look.plan.checked)
+                    report = self._wire.send("repair", look.plan.checked)
                     if report is not None:
                         self._repair_prints.append(report)
             elif action is Action.STOP or (look.declined and action in ENDED_BY_NO):
@@ -173,7 +177,7 @@ class Run:
             return True  # what is left of the job begins where the nozzle rests
         with self._watch("print"):
             for program in travel.way_back(site.setup, state, parked):
-                self._send("back", program)
+                self._wire.send("back", program)
             if look is not None:
                 self._change_next(stop, site, look)
         return True
@@ -189,7 +193,7 @@ class Run:
         try:
             if isinstance(self._printer, LeavesOut):
                 if self._tape.next("given_up") is None:
-                    self._go_live()
+                    self._wire.go_live()
                     for name in names:
                         self._printer.leave_out(name)
                     self._tape.write("given_up", objects=names)
@@ -251,7 +255,7 @@ class Run:
         )
         if changed is None:
             return
-        report = self._send("next layer", changed.checked)
+        report = self._wire.send("next layer", changed.checked)
         if report is not None:
             self._job_prints.append(report)
         self._next_line = changed.end_line
@@ -259,22 +263,11 @@ class Run:
     def _try_to_look(self, stop: Stop, site: Site, parked: ModalState) -> Look | None:
         """A look; None where the scanner is silent, or (with `_stopped`) nothing fits the part."""
         for attempt in (1, 2):
-            if self._tape.peek() == "no_look":
-                taped = self._tape.next("no_look") or {}
-                outcome, why = str(taped["outcome"]), str(taped["why"])
-            else:
-                try:
-                    look = self._look(stop, site, parked)
-                except ScannerError as error:
-                    if self._silent >= self._options.silent_stops:
-                        raise
-                    outcome, why = "pass by", str(error)
-                except AlignmentError as error:
-                    outcome, why = ("again" if attempt == 1 else "stop"), str(error)
-                else:
-                    self._silent = 0
-                    return look
-                self._tape.write("no_look", stop=stop.label, outcome=outcome, why=why)
+            found = self._one_try(stop, site, parked, last=attempt == 2)
+            if isinstance(found, Look):
+                self._silent = 0
+                return found
+            outcome, why = found
             if outcome == "pass by":
                 self._silent += 1
                 self._passed.append(stop)
@@ -282,22 +275,53 @@ class Run:
         self._stopped = f"stop: twice the scan did not fit the part: {why}"
         return None
 
-    def _look(self, stop: Stop, site: Site, parked: ModalState) -> Look:
+    def _one_try(
+        self, stop: Stop, site: Site, parked: ModalState, *, last: bool
+    ) -> Look | tuple[str, str]:
+        """A look; or, where there is none, what follows and why, which is on the tape then."""
+        try:
+            scan = self._moved_scan(stop)
+            if self._tape.peek() != "no_look":
+                return self._look(stop, site, parked, scan)
+        except ScannerError as error:
+            if self._silent >= self._options.silent_stops:
+                raise
+            outcome, why = "pass by", str(error)
+        except AlignmentError as error:
+            outcome, why = ("stop" if last else "again"), str(error)
+        else:
+            taped = self._tape.next("no_look") or {}
+            return str(taped["outcome"]), str(taped["why"])
+        self._tape.write("no_look", stop=stop.label, outcome=outcome, why=why)
+        return outcome, why
+
+    def _moved_scan(self, stop: Stop) -> Scan | None:
+        """What a scanner sees that has the printer move: on the tape its moves precede the look."""
+        if not self._moves or self._tape.peek() in LOOK_EVENTS:
+            return None
+        scan = self._scan(stop)
+        return scan if self._tape.next_if(ANEW) is None else self._scan(stop)
+
+    def _scan(self, stop: Stop) -> Scan:
+        """What the scanner sees, as a file keeps it."""
+        with self._watch("scan"):
+            self._progress(f"scan {stop.label}", 0.0, 1.0)
+            request = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
+            scan = as_recorded(self._scanner.scan(request))
+            self._progress(f"scan {stop.label}", 1.0, 1.0)
+        return scan
+
+    def _look(self, stop: Stop, site: Site, parked: ModalState, scan: Scan | None) -> Look:
         """Scan, plan, decide; what is to be printed is on the tape when this returns."""
         number, here = len(self._looks) + 1, [k for k in self._looks if k.stop == stop]
         site = replace(self._learning.judged_by(site), policy=self._options.policy)
         taped = self._tape.next("look")
-        if taped is None:
-            self._go_live()
-        with self._watch("scan"):
-            self._progress(f"scan {stop.label}", 0.0, 1.0)
-            request = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
-            scan = (
-                as_recorded(self._scanner.scan(request))
-                if taped is None
-                else self._tape.scan(number, str(taped["frame"]))
-            )
-            self._progress(f"scan {stop.label}", 1.0, 1.0)
+        if taped is not None:
+            with self._watch("scan"):
+                scan = self._tape.scan(number, str(taped["frame"]))
+        else:
+            self._wire.go_live()
+            scan = scan or self._scan(stop)
         with ThreadPoolExecutor(1) as beside:  # the disk need not wait for the plan, nor it for it
             kept = beside.submit(self._keep_scan, number, scan) if taped is None else None
             now = self._course.stop(stop) or stop
@@ -393,7 +417,7 @@ class Run:
         if action is Action.FILL_NOW:
             granted = self._approval.approve(look.plan)
             return replace(look, printed=granted, declined=not granted)
-        if action is Action.GIVE_UP and self._approval.ask is not None:
+        if action in (Action.GIVE_UP, Action.OFFER) and self._approval.ask is not None:
             return replace(look, declined=not self._approval.ask(look.decision))
         if action is Action.PAUSE:
             if self._approval.ask is None or not self._approval.ask(look.decision):
@@ -404,67 +428,13 @@ class Run:
                 return replace(look, printed=self._approval.approve(look.plan))
         return look
 
-    # ------------------------------------------------------------------ the wire
-
-    def _send(
-        self,
-        kind: str,
-        checked: CheckedProgram,
-        first: int = 0,
-        end: int | None = None,
-        progress: Progress = silent,
-    ) -> PrintReport | None:
-        """Send a program, or find on the tape that it was sent."""
-        if self._tape.only_read:
-            return None
-        end = checked.program.text.count("\n") if end is None else end
-        began = self._tape.next("send")
-        if began is not None:
-            self._require_same(began, kind, checked, first, end)
-            if not self._tape.live:
-                done = self._tape.next("sent")
-                self._sent.append(Sent(kind, checked, first, end, done=True))
-                return report_from_json(done["report"]) if done else None
-            self._sent.append(Sent(kind, checked, first, end, done=False))
-            report = self._go_live()
-        else:
-            self._go_live()
-            self._tape.write("send", kind=kind, sha256=checked.program.sha256, first=first, end=end)
-            self._sent.append(Sent(kind, checked, first, end, done=False))
-            report = None
-        if report is None:
-            report = self._printer.print(checked, lines=range(first, end), progress=progress)
-        if report.ok:
-            self._printer.finish_moves()
-            self._sent[-1] = replace(self._sent[-1], done=True)
-            self._tape.write("sent", report=report_to_json(report))
-        return report
-
-    def _require_same(
-        self, began: dict[str, object], kind: str, checked: CheckedProgram, first: int, end: int
-    ) -> None:
-        """A resumed run must come to the very lines that were sent."""
-        said = (began["kind"], began["sha256"], began["first"], began["end"])
-        if said != (kind, checked.program.sha256, first, end):
-            raise LoopError(
-                f"the record says that '{said[0]}' was sent there, lines {said[2]} to {said[3]} of "
-                f"{str(said[1])[:12]}, this run comes to '{kind}', lines {first} to {end} of "
-                f"{checked.program.sha256[:12]}; the job, the profiles or the program have changed"
-            )
-
-    def _go_live(self) -> PrintReport | None:
-        """Before the first thing that the tape lacks: where is the printer?"""
-        if self._pick_up is None:
-            return None
-        pick_up, self._pick_up = self._pick_up, None
-        return pick_up(tuple(self._sent))
-
 
 def _why(decision: Decision) -> str:
     """One line on why a run was ended."""
     own = [v for v in decision.verdicts if v.action is decision.action]
     kinds = ", ".join(sorted({str(v.finding.type) for v in own}))
     reason = own[0].reason if own else decision.situation.beyond or decision.reason
+    reason = "; ".join([reason, *(way.told for way in decision.ways if way.layer is not None)])
     return f"{decision.action}: {kinds + ': ' if kinds else ''}{reason}"
 
 

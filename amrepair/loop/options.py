@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from amrepair.loop.looks import Look
 from amrepair.loop.pace import Pace
-from amrepair.loop.tape import Sent, Tape
+from amrepair.loop.tape import Tape
+from amrepair.loop.wire import PickUp
 from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions
 from amrepair.policy.unasked import Limits
 from amrepair.regions.calibration import Calibration
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.scans import Scan
-from gcode.hosts.port import PrintReport
-
-PickUp = Callable[[Sequence[Sent]], PrintReport | None]
-"""Finds out where the printer is, and has it finish what it was sent last."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,9 @@
 
 The tape says what was sent last; the journal of the port, which program the wire last carried;
 the printer, which of its lines came last (`gcode.hosts.resume`). What was begun is finished from
-that line on. A print server has printed on by itself, and knows what became of its last file
-(`gcode.hosts.rejoin`). Whatever does not add up is refused, and nothing is printed twice.
+that line on; touches, which lay nothing, are begun anew. A print server has printed on by itself,
+and knows what became of its last file (`gcode.hosts.rejoin`). Whatever does not add up is refused,
+and nothing is printed twice.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from dataclasses import replace
 from typing import Any
 
 from amrepair.errors import InputError, LoopError
-from amrepair.loop.tape import Sent
+from amrepair.loop.tape import TOUCH, Sent
 from gcode.hosts.file import FilePrinter
 from gcode.hosts.port import Printer, PrintReport
-from gcode.hosts.resume import resume
+from gcode.hosts.resume import back_to_start, resume
 from gcode.hosts.serial import SerialPrinter
 
 
@@ -119,13 +120,20 @@ def pick_up_serial(
             one = sent[k] if k >= 0 else None
             if latest is None or one is None or one.checked.program.sha256 != latest.program_sha256:
                 continue
+            before = [(s.checked, s.first, s.end) for s in _before(sent, k)]
+            if one.kind == TOUCH and not one.done:
+                back_to_start(
+                    serial, one.checked, release_c=release_c, pose_confirmed=pose_confirmed,
+                    before=before,
+                )  # fmt: skip
+                return None
             report = resume(
                 serial,
                 one.checked,
                 release_c=release_c,
                 pose_confirmed=pose_confirmed,
                 end=one.end,
-                before=[(s.checked, s.first, s.end) for s in _before(sent, k)],
+                before=before,
             )
             return report if k == len(sent) - 1 and not one.done else None
         if latest is None and len(sent) == 1:

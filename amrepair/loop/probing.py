@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -19,13 +19,14 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import travel
 from amrepair.loop.looks import Stop
+from amrepair.loop.tape import FELT
 from amrepair.loop.touch_design import Flats, TouchOptions, first_places, flats_of, next_places
 from amrepair.loop.touched import Touches, measured_sigma_mm, scan_of
+from amrepair.loop.wire import Wire
 from amrepair.scans import PROBE, Scan, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.hosts.port import Printer
 from gcode.hosts.serial import SerialPrinter
-from gcode.hosts.touching import felt
 from gcode.moves import ModalState
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
@@ -65,6 +66,9 @@ class Felt:
 class Feeler(Protocol):
     """Whoever touches, for a job that rests."""
 
+    def send_by(self, wire: Wire) -> None:
+        """Send by this wire from now on."""
+
     def get_ready(self, rest: ModalState) -> None:
         """Be cold, where what feels must be."""
 
@@ -98,11 +102,15 @@ class PortFeeler:
                 "--scanner probe needs the printer's own port (--port /dev/ttyACM0, or Klipper's "
                 "/tmp/printer): a server or a file does not answer where a touch ended"
             )
-        self._printer, self._setup, self._probe = printer, setup, setup.printer.feeler
+        self._wire, self._setup, self._probe = Wire(printer), setup, setup.printer.feeler
+
+    def send_by(self, wire: Wire) -> None:
+        """Send by this wire from now on."""
+        self._wire = wire
 
     def get_ready(self, rest: ModalState) -> None:
         """Wait until the nozzle is cold, where it feels itself."""
-        self._send(cooled(self._setup, rest))
+        self._send("cool", cooled(self._setup, rest))
 
     def feel(
         self,
@@ -113,17 +121,16 @@ class PortFeeler:
     ) -> Float[np.ndarray, " k"]:
         """Touch, and go back to where the job rests."""
         program = tour(places_mm, self._setup, rest, standing)
-        met_mm = felt(self._printer, program, at_contact=told)
+        met_mm = self._wire.touch(program, told)
         return np.array(met_mm) + self._probe.offset_mm[2]
 
     def get_back(self, rest: ModalState) -> None:
         """Heat the nozzle again."""
-        self._send(heated(self._setup, rest))
+        self._send("heat", heated(self._setup, rest))
 
-    def _send(self, program: CheckedProgram | None) -> None:
+    def _send(self, kind: str, program: CheckedProgram | None) -> None:
         if program is not None:
-            self._printer.print(program)
-            self._printer.finish_moves()
+            self._wire.send(kind, program)
 
 
 class ProbeScanner:
@@ -159,7 +166,13 @@ class ProbeScanner:
         self._job, self._setup, self._options = job, setup, options or TouchOptions()
         self._clock, self._progress = clock, progress
         self._before: list[tuple[Stop, Touches]] = []
+        self._wire: Wire | None = None
         self.felt: list[Felt] = []
+
+    def send_by(self, wire: Wire) -> None:
+        """Have the printer move by this wire from now on."""
+        self._wire = wire
+        self._feeler.send_by(wire)
 
     @property
     def build_from_scanner(self) -> Transform:
@@ -189,6 +202,8 @@ class ProbeScanner:
         self._before.append((stop, touches))
         off = int(touches.is_off.sum())
         cost = Felt(stop.label, count, off, touches.sigma_mm, self._clock() - began_s)
+        if self._wire is not None:  # a resumed run tells what it cost then
+            cost = Felt(**self._wire.note(FELT, **asdict(cost)))
         self.felt.append(cost)
         self._progress(f"{stop.label}: {cost.told()}", 1.0, 1.0)
         return scan_of(

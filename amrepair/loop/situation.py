@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+from amrepair.loop.buried import buried, buried_mm3, pieces_of, ways
 from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions, decide, gravest, judge
 from amrepair.policy.passes import is_little, is_stuck
-from amrepair.policy.table import Situation
+from amrepair.policy.table import Action, Situation
 from amrepair.policy.unasked import Limits
 from amrepair.policy.worth import volume_mm3
 from amrepair.repair import RepairPlan, Site
@@ -51,6 +53,7 @@ def decide_look(
             objects=objects,
         )
     )
+    left = buried(pieces_of(plan, here), stop, plan.layer_height_mm, policy)
     situation = Situation(
         gravest=gravest(verdicts),
         seen_twice=seen_twice,
@@ -59,8 +62,12 @@ def decide_look(
         stuck=_stuck(here, plan, policy),
         little_left=_done(here, plan, policy),
         beyond="" if limits is None else _beyond(plan, limits),
+        buried_mm3=buried_mm3(left),
     )
-    return decide(verdicts, situation)
+    decision = decide(verdicts, situation, policy)
+    if decision.action is not Action.OFFER:
+        return decision
+    return replace(decision, ways=ways(left, job, stop, site.setup))
 
 
 def _stuck(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:

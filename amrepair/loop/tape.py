@@ -22,6 +22,12 @@ from gcode.hosts.port import PrintReport
 
 TAPE = "run.jsonl"
 LOOK_EVENTS = ("look", "no_look")
+TOUCH = "touch"
+"""Kind of what is sent to feel; the tape has where each touch met something."""
+FELT = "felt"
+"""A scanner that has the printer move has done so: its scan follows from what is on the tape."""
+ANEW = "anew"
+"""In place of a look that ended a run, where its moves are on the tape: they are made anew."""
 
 
 class TapeEndsError(LoopError):
@@ -101,6 +107,10 @@ class Tape:
         self._at += 1
         return found
 
+    def next_if(self, event: str) -> dict[str, Any] | None:
+        """The next thing recorded if it is of this kind."""
+        return self.next(event) if self.peek() == event else None
+
     def scan(self, number: int, frame: str) -> Scan:
         """The scan of a recorded look."""
         assert self.path is not None
@@ -136,7 +146,7 @@ class Tape:
                 f"the run in {self.path} was printed to its end; there is nothing left"
             )
         self.write("reopened")
-        self._events = self._events[:-2]
+        self._events = _before_the_end(self._events)
 
     def write(self, event: str, **said: Any) -> None:
         """Put an event on the disk."""
@@ -187,7 +197,7 @@ def read_events(folder: Path) -> list[dict[str, Any]]:
         for line in lines:
             event = dict(json.loads(line))
             if event.get("event") == "reopened":  # it was ended by a question: look anew
-                events = events[:-2]
+                events = _before_the_end(events)
             else:
                 events.append(event)
     except (ValueError, TypeError) as error:
@@ -195,6 +205,12 @@ def read_events(folder: Path) -> list[dict[str, Any]]:
             f"{path} is no record of a run ({error}); name the run's folder"
         ) from error
     return events
+
+
+def _before_the_end(events: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What a run was before the look that ended it."""
+    before = events[:-2]
+    return [*before, {"event": ANEW}] if before and before[-1].get("event") == FELT else before
 
 
 def report_to_json(report: PrintReport) -> dict[str, Any]:

@@ -34,8 +34,9 @@ def park(setup: PrintSetup, state: ModalState) -> tuple[CheckedProgram, ModalSta
     ]
     program = _program(setup, moves, state, "park for a scan", restore=False)
     after = replace(
-        state, position_mm=place, e_mm=0.0, absolute_xyz=True, absolute_e=False, units_mm=True
-    )
+        state, position_mm=place, e_mm=0.0, absolute_xyz=True, absolute_e=False, units_mm=True,
+        pulled_mm=state.pulled_mm + machine.retraction_mm,
+    )  # fmt: skip
     return program, after
 
 
@@ -54,7 +55,7 @@ def way_back(
         moves.append(Retract(-machine.retraction_mm, machine.retraction_speed_mm_s))
     # the way back starts from the park; the modes are put back once the nozzle has arrived
     back = _program(setup, moves, parked, "back to the job", restore=False)
-    arrived = replace(parked, position_mm=state.position_mm)
+    arrived = replace(parked, position_mm=state.position_mm, pulled_mm=state.pulled_mm)
     modes = _program(setup, [], state, "go on with the job", restore=True, initial=arrived)
     return back, modes
 

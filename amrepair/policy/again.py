@@ -36,7 +36,7 @@ def decided_again(recorded: Mapping[str, Any], options: PolicyOptions = USUAL_PO
             f"a recorded decision cannot be made again ({error}); it was written by another version"
         ) from error
     verdicts = tuple(judge(finding, options) for finding in findings)
-    return decide(verdicts, replace(situation, gravest=gravest_of(verdicts)))
+    return decide(verdicts, replace(situation, gravest=gravest_of(verdicts)), options)
 
 
 def changed(options: PolicyOptions, rules: Sequence[str]) -> PolicyOptions:

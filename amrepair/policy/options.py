@@ -51,6 +51,8 @@ class PolicyOptions:
         A repair that leaves more than this share of what it found has met something else.
     little_ratio
         Less than this share of what was found at a stop is not worth another pass.
+    buried_mm3
+        What stays open inside and is less, 5 × 5 × 0.4 mm, is spanned by the layers over it.
     left_ratio
         Of what was found in the job: so much may be left, or stand out, within tolerance.
     """
@@ -73,6 +75,7 @@ class PolicyOptions:
     most_passes: int = 3
     stuck_ratio: float = 0.8
     little_ratio: float = 0.03
+    buried_mm3: float = 10.0
     left_ratio: float = 0.08
 
 

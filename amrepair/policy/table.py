@@ -8,11 +8,12 @@ Both tables are data: rows with conditions and a reason, the first that fits cou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
 
 from amrepair.policy.options import USUAL_POLICY, PolicyOptions
+from amrepair.policy.ways import Way
 from amrepair.regions.anomaly import DefectType
 
 
@@ -26,6 +27,7 @@ class Action(StrEnum):
     FILL_NOW = "fill now"
     FILL_WITH_NEXT = "fill with the next layer"
     LOWER_NEXT = "lower the next layer's flow"
+    OFFER = "offer to print again"
     GO_ON = "go on"
 
 
@@ -106,6 +108,8 @@ class Situation:
         Why another pass would not help.
     beyond
         A limit of the profile that the repair would exceed, where nobody is asked; else empty.
+    buried_mm3
+        What stays open under layers that were printed since, however the stop is left.
     """
 
     gravest: Action
@@ -115,6 +119,7 @@ class Situation:
     stuck: bool = False
     little_left: bool = False
     beyond: str = ""
+    buried_mm3: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,12 +188,14 @@ _QUANTITY_NAMES = {
     "refused": "nothing of the patch may be printed",
     "gravest": "gravest",
     "beyond": "beyond a limit for printing unasked",
+    "buried_mm3": "left open under later layers",
 }
 _QUANTITY_UNITS = {
     "thickness_layers": " layers",
     "height_layers": " layers",
     "volume_mm3": " mm³",
     "defect_mm3": " mm³",
+    "buried_mm3": " mm³",
     "hit_mm": " mm",
 }
 
@@ -316,6 +323,8 @@ STOP_ROWS: tuple[Row, ...] = (
         "the job's next layer is rewritten, bead by bead"),
     Row("S11", Action.LOWER_NEXT, (_is("gravest", Action.LOWER_NEXT),),
         "the job's next layer is rewritten, bead by bead"),
+    Row("S12a", Action.OFFER, (_is("gravest", Action.GO_ON), _from("buried_mm3", "buried_mm3")),
+        "the nozzle cannot get to it any more: cut down and printed again it could; else it stays"),
     Row("S12", Action.GO_ON, (),
         "nothing is left to decide"),
 )  # fmt: skip
@@ -343,6 +352,7 @@ class Decision:
     reason: str
     situation: Situation
     verdicts: tuple[Verdict, ...]
+    ways: tuple[Way, ...] = ()
 
     @property
     def changes_next(self) -> tuple[Verdict, ...]:
@@ -362,6 +372,7 @@ class Decision:
                  "action": str(verdict.action), "row": verdict.row, "reason": verdict.reason}
                 for verdict in self.verdicts
             ],
+            "ways": [way.to_json() for way in self.ways],
         }  # fmt: skip
 
 
@@ -376,17 +387,20 @@ def gravest(verdicts: Sequence[Verdict]) -> Action:
     return min((v.action for v in verdicts), key=_GRAVITY.index, default=Action.GO_ON)
 
 
-def decide(verdicts: Sequence[Verdict], situation: Situation) -> Decision:
+def decide(
+    verdicts: Sequence[Verdict], situation: Situation, options: PolicyOptions = USUAL_POLICY
+) -> Decision:
     """What happens at the stop.
 
     A patch that is not to be printed does not hide what else was found: then the next gravest
     counts.
     """
-    row = next(row for row in STOP_ROWS if row.fits(situation))
+    row = next(row for row in STOP_ROWS if row.fits(situation, options))
     if situation.gravest is Action.FILL_NOW and row.action is Action.GO_ON:
         rest = gravest([v for v in verdicts if v.action is not Action.FILL_NOW])
-        if rest is not Action.GO_ON:
-            also = next(other for other in STOP_ROWS if other.when == (_is("gravest", rest),))
+        rest_of = replace(situation, gravest=rest)
+        also = next(other for other in STOP_ROWS if other.fits(rest_of, options))
+        if also.action is not Action.GO_ON:
             return Decision(
                 also.action, f"{row.id}, {also.id}", f"{row.reason}; {also.reason}",
                 situation, tuple(verdicts),

@@ -6,7 +6,7 @@ tells that it is gone; along the line, looks at its own middle do. What follows 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,11 @@ from amrepair.template.port import Template
 
 LOOK_STEP_MM = 0.25
 LOOKS_TOGETHER = 5  # along a line that are judged together: a millimetre and a quarter
-LEAST_STRETCH_MM = 1.5  # shorter stretches are seams, corners and curves
+LEAST_STRETCH_MM = 1.5  # shorter stretches are seams and corners
+# A line goes on in the next that begins where it ends, unless it turns there by more than 45°: that
+# is a corner, and plastic cuts it.
+JOINED_MM, STRAIGHT_ON = 1e-3, 0.7
+LEVEL = 1e-9
 # How far the middle of a bead lies in the open where it is gone, as a share of half its height.
 # Half of its plastic would put it at the surface, and noise is averaged over a stretch.
 GONE_SHARE = 0.4
@@ -109,19 +113,12 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     evidence
         Of a scan whose sensors are known; without rays nothing is said.
     """
-    length_mm = np.linalg.norm(beads.end_mm - beads.start_mm, axis=1)
-    lines, length_mm = (
-        beads.some(length_mm >= LEAST_STRETCH_MM),
-        length_mm[length_mm >= LEAST_STRETCH_MM],
-    )
-    if not evidence.has_rays or not len(length_mm):
-        return lines.some(np.zeros(len(length_mm), dtype=bool))
-    count = np.ceil(length_mm / LOOK_STEP_MM).astype(np.int64)
-    line = np.repeat(np.arange(len(count)), count)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    share = (np.arange(len(line)) - first[line] + 0.5) / count[line]
+    paths = _Paths.of(beads)
+    lines, line = paths.lines, paths.line
+    if not evidence.has_rays or not len(line):
+        return lines.some(np.zeros(len(lines.width_mm), dtype=bool))
     half_mm = 0.5 * lines.height_mm[line]
-    middle = lines.start_mm[line] + share[:, None] * (lines.end_mm - lines.start_mm)[line]
+    middle = lines.start_mm[line] + paths.share[:, None] * (lines.end_mm - lines.start_mm)[line]
     middle[:, 2] -= half_mm
     # rays alone cost little; only where they say "open" walls and surfaces are asked, too
     rays_mm = evidence.rays_say(middle)
@@ -140,15 +137,12 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
         by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
         by_both[known[_topped(middle[known], half_mm[known], lines.width_mm[line[known]],
                               evidence)]] = -1.0  # fmt: skip
-    surface_says = _together(by_surface, line)
+    surface_says = _together(by_surface, paths.path)
     sure = surface_says >= GONE_SHARE
-    both = _together(by_both, line)
+    both = _together(by_both, paths.path)
     gone = sure | (both >= GONE_BY_BOTH)
     sure |= both >= SURE_BY_BOTH
-    step_mm = length_mm / count
-    found = _stretches(
-        lines, line, share, gone, sure, step_mm, np.full(len(step_mm), LEAST_STRETCH_MM)
-    )
+    found = paths.stretches(gone, sure, np.full(len(line), LEAST_STRETCH_MM))
     if not len(found.width_mm):
         return found
     # where the extruder has slipped in a layer it is likelier to have slipped there again
@@ -156,8 +150,89 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     again = (np.abs(high_mm[:, None] - slipped_mm) < SAME_LINE_LAYER_MM).any(axis=1)
     likely = again[line] & (both >= GONE_AGAIN)
     sure |= likely & (surface_says > 0)
-    least_mm = np.where(again, LEAST_AGAIN_MM, LEAST_STRETCH_MM)
-    return _stretches(lines, line, share, gone | likely, sure, step_mm, least_mm)
+    least_mm = np.where(again[line], LEAST_AGAIN_MM, LEAST_STRETCH_MM)
+    return paths.stretches(gone | likely, sure, least_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class _Paths:
+    """Lines that go on from one another without a corner, as one: curves are many short lines.
+
+    Attributes
+    ----------
+    lines
+        Those of paths that are long enough.
+    ends_mm
+        (n + 1,) length of all lines before each, and of all.
+    path, at_mm, step_mm, line, share
+        (m,) looks along the paths: the path, how far along all lines, the distance between two, the
+        line, and where on it from 0 to 1.
+    """
+
+    lines: PlannedBeads
+    ends_mm: Float[np.ndarray, " _k"]
+    path: Int[np.ndarray, " m"]
+    at_mm: Float[np.ndarray, " m"]
+    step_mm: Float[np.ndarray, " m"]
+    line: Int[np.ndarray, " m"]
+    share: Float[np.ndarray, " m"]
+
+    @classmethod
+    def of(cls, beads: PlannedBeads) -> _Paths:
+        """Paths of beads in the order in which they are laid, looked at every `LOOK_STEP_MM`."""
+        over = beads.end_mm - beads.start_mm
+        length_mm = np.linalg.norm(over, axis=1)
+        begins = np.ones(len(length_mm), dtype=bool)
+        joined = np.abs(beads.start_mm[1:] - beads.end_mm[:-1]).max(axis=1) < JOINED_MM
+        along = np.einsum("ij,ij->i", over[1:], over[:-1])
+        begins[1:] = ~joined | (along < STRAIGHT_ON * length_mm[1:] * length_mm[:-1])
+        path = np.cumsum(begins) - 1
+        keep = np.bincount(path, length_mm)[path] >= LEAST_STRETCH_MM if len(path) else begins
+        lines, length_mm = beads.some(keep), length_mm[keep]
+        path = np.unique(path[keep], return_inverse=True)[1]
+        ends_mm = np.concatenate([[0.0], np.cumsum(length_mm)])
+        first = np.searchsorted(path, np.arange(path.max(initial=-1) + 1))
+        path_mm = np.bincount(path, length_mm)
+        count = np.ceil(path_mm / LOOK_STEP_MM).astype(np.int64)
+        of = np.repeat(np.arange(len(count)), count)
+        number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        step_mm = (path_mm / np.maximum(count, 1))[of]
+        at_mm = ends_mm[first[of]] + (number + 0.5) * step_mm
+        line = np.searchsorted(ends_mm[1:], at_mm)
+        share = (at_mm - ends_mm[line]) / length_mm[line]
+        return cls(lines, ends_mm, of, at_mm, step_mm, line, share)
+
+    def stretches(
+        self,
+        gone: Bool[np.ndarray, " m"],
+        sure: Bool[np.ndarray, " m"],
+        least_mm: Float[np.ndarray, " m"],
+    ) -> PlannedBeads:
+        """Neighbouring looks that say so, as one bead for each line of theirs; one is sure."""
+        at = np.flatnonzero(gone)
+        begins = np.ones(len(at), dtype=bool)
+        begins[1:] = (np.diff(at) > 1) | (np.diff(self.path[at]) != 0)
+        a, b = at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
+        surely = np.concatenate([[0], np.cumsum(sure)])
+        kept = ((b - a + 1) * self.step_mm[a] >= least_mm[a]) & (surely[b + 1] > surely[a])
+        a, b = a[kept], b[kept]
+        from_mm, to_mm = (
+            self.at_mm[k] + sign * self.step_mm[k] for k, sign in ((a, -0.5), (b, 0.5))
+        )
+        inner = self.ends_mm[1:-1]
+        first, last = np.searchsorted(inner, from_mm + LEVEL), np.searchsorted(inner, to_mm - LEVEL)
+        count = last - first + 1
+        which = np.repeat(first - np.cumsum(count) + count, count) + np.arange(count.sum())
+        length_mm = np.diff(self.ends_mm)[which]
+        low, high = (
+            np.clip((np.repeat(mm, count) - self.ends_mm[which]) / length_mm, 0.0, 1.0)[:, None]
+            for mm in (from_mm, to_mm)
+        )
+        lines = self.lines.some(which)
+        over = lines.end_mm - lines.start_mm
+        return replace(
+            lines, start_mm=lines.start_mm + low * over, end_mm=lines.start_mm + high * over
+        )
 
 
 def _wall_shift(
@@ -215,44 +290,16 @@ def _topped(
 
 
 def _together(
-    value: Float[np.ndarray, " m"], line: Int[np.ndarray, " m"]
+    value: Float[np.ndarray, " m"], path: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, " m"]:
-    """(m,) the best mean of `LOOKS_TOGETHER` neighbours on one line that each belongs to."""
+    """(m,) the best mean of `LOOKS_TOGETHER` neighbours on one path that each belongs to."""
     m = len(value)
     whole = np.full(m, -np.inf)
     if m < LOOKS_TOGETHER:
         return whole
     total = np.concatenate([[0.0], np.cumsum(value)])
     mean = (total[LOOKS_TOGETHER:] - total[:-LOOKS_TOGETHER]) / LOOKS_TOGETHER
-    mean[line[LOOKS_TOGETHER - 1 :] != line[: m - LOOKS_TOGETHER + 1]] = -np.inf
+    mean[path[LOOKS_TOGETHER - 1 :] != path[: m - LOOKS_TOGETHER + 1]] = -np.inf
     for k in range(LOOKS_TOGETHER):
         np.maximum(whole[k : k + len(mean)], mean, out=whole[k : k + len(mean)])
     return np.where(value > 0, whole, -np.inf)  # an end that is there does not belong to it
-
-
-def _stretches(
-    lines: PlannedBeads,
-    line: Int[np.ndarray, " m"],
-    share: Float[np.ndarray, " m"],
-    gone: Bool[np.ndarray, " m"],
-    sure: Bool[np.ndarray, " m"],
-    step_mm: Float[np.ndarray, " n"],
-    least_mm: Float[np.ndarray, " n"],
-) -> PlannedBeads:
-    """Neighbouring looks that say so, as one bead each; one of them is sure."""
-    at = np.flatnonzero(gone)
-    begins = np.ones(len(at), dtype=bool)
-    begins[1:] = (np.diff(at) > 1) | (np.diff(line[at]) != 0)
-    a, b = at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
-    surely = np.concatenate([[0], np.cumsum(sure)])
-    kept = ((b - a + 1) * step_mm[line[a]] >= least_mm[line[a]]) & (surely[b + 1] > surely[a])
-    a, b = a[kept], b[kept]
-    which = line[a]
-    over = lines.end_mm[which] - lines.start_mm[which]
-    half = 0.5 * step_mm[which] / np.maximum(np.linalg.norm(over, axis=1), 1e-9)
-    return PlannedBeads(
-        lines.start_mm[which] + (share[a] - half)[:, None] * over,
-        lines.start_mm[which] + (share[b] + half)[:, None] * over,
-        lines.width_mm[which],
-        lines.height_mm[which],
-    )

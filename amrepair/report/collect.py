@@ -173,6 +173,15 @@ def loop_result(
         "learned": None if report.calibration is None else to_json(report.calibration),
         "passed_by": [stop.label for stop in report.passed],
         "given_up": list(report.given_up),
+        "found_late": [
+            {
+                "stop": look.stop.label,
+                "buried_mm3": look.decision.situation.buried_mm3,
+                "ways": [way.to_json() for way in look.decision.ways],
+            }
+            for look in report.looks
+            if look.decision.ways
+        ],
         "stops": [_stop_row(look) for look in report.looks],
     }
     return dict(rounded(result))
@@ -324,6 +333,7 @@ def decision_of(look: LoopLook) -> Decision:
         reasons.append(_sentence(plan.refused))
     if decided.situation.beyond:
         reasons.append(_sentence(decided.situation.beyond))
+    reasons += [_sentence(way.told) for way in decided.ways]
     if plan.unreachable_mm3 > NEGLIGIBLE_MM3:
         reasons.append(f"The nozzle cannot reach {quantity(plan.unreachable_mm3, 'mm³')}.")
     where = f"{look_label(look)}, z = {look.stop.z_mm:.2f} mm"

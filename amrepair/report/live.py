@@ -304,6 +304,7 @@ class LiveView:
             return False
         own = [v for v in decision.verdicts if v.action is decision.action]
         why = [f"- {v.finding.type}: {v.reason}" for v in own] or [f"- {decision.reason}"]
+        why += [f"- {way.told}" for way in decision.ways]
         self._found.content = "\n".join(["**Go on all the same?** (Skip ends the run)", *why])
         return self._operator.ask() is Verdict.APPROVE
 

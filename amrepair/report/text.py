@@ -178,11 +178,15 @@ def summary_of_result(
     result: Mapping[str, object], *, within_tolerance: bool
 ) -> tuple[str, str, str]:
     """The three lines for the terminal, from a `--json` result."""
-    return summary(
+    found, done, left = summary(
         outcome_of(result, within_tolerance=within_tolerance),
         Figures.from_result(result),
         regions_from_result(result),
     )
+    names = result.get("given_up")
+    if isinstance(names, list) and names:
+        left += f" Given up, so that the other objects could go on: {', '.join(map(str, names))}."
+    return found, done, left
 
 
 def _found(figures: Figures, regions: Sequence[RegionRow]) -> str:

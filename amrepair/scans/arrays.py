@@ -10,15 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from jaxtyping import Float, Shaped
 
-from amrepair.errors import InputError
-from amrepair.scans.depth_map import refuse_swollen_page
+from amrepair.errors import InputError, refused_as_ours
 from amrepair.scans.range_grid import RangeGrid
 from amrepair.scans.scan import DEFAULT_SIGMA_MM, Scan
-from amrepair.scans.sizes import PARSER_ERRORS, UnpackLimit, in_words, length_of, refuse_short
 from amrepair.scans.viewpoint import straight_from
+from gcode.surfaces.sizes import (
+    PARSER_ERRORS,
+    UnpackLimit,
+    in_words,
+    length_of,
+    quiet_tiff,
+    refuse_short,
+    refuse_swollen_page,
+)
 
 ARRAY_ERRORS = (*PARSER_ERRORS, tokenize.TokenError)
 STRAIGHT_DOWN = np.array([0.0, 0.0, 1.0])
@@ -149,18 +155,16 @@ def read_height_map(
     InputError
         If it cannot be read or does not say how large its cells are.
     """
-    from gcode.errors import InputError as GcodeInputError
     from gcode.surfaces import HeightField
 
-    _refuse_swollen(path)
     try:
-        heights = HeightField.read(path, cell_mm=cell_mm, origin_mm=origin_mm)
+        with refused_as_ours():
+            _refuse_swollen(path)
+            heights = HeightField.read(path, cell_mm=cell_mm, origin_mm=origin_mm)
         if not np.isfinite(heights.origin_mm).all() or not np.isfinite(heights.cell_mm):
             raise InputError(f"{path}: the height map's cell or origin is no finite number")
         x, y = heights.centres_mm()
-    except GcodeInputError as e:
-        raise InputError(str(e)) from e
-    except (*ARRAY_ERRORS, tifffile.TiffFileError) as e:
+    except ARRAY_ERRORS as e:
         raise InputError(f"{path}: the height map cannot be read ({in_words(e)})") from e
     grid_x, grid_y = np.meshgrid(x, y)
     seen = heights.seen
@@ -191,7 +195,7 @@ def _refuse_swollen(path: Path) -> None:
         _members(path)
     else:
         try:
-            with tifffile.TiffFile(path) as tiff:
+            with quiet_tiff(path) as tiff:
                 refuse_swollen_page(path, tiff.pages[0], UnpackLimit())
-        except (*PARSER_ERRORS, tifffile.TiffFileError) as e:
+        except PARSER_ERRORS as e:
             raise InputError(f"{path}: the height map cannot be read ({in_words(e)})") from e

@@ -9,7 +9,7 @@ import numpy as np
 
 from amrepair.errors import InputError
 from amrepair.scans.scan import Scan
-from amrepair.scans.sizes import PARSER_ERRORS, UnpackLimit, in_words, length_of
+from gcode.surfaces.sizes import PARSER_ERRORS, UnpackLimit, in_words, length_of
 
 MESH_SPACING_MM = 0.2
 MAX_MESH_SAMPLES = 2_000_000

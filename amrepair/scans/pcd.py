@@ -18,8 +18,8 @@ from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.scans.lzf_kernels import lzf_decompress
-from amrepair.scans.sizes import UnpackLimit, refuse_short
 from amrepair.scans.text import filled, read_table
+from gcode.surfaces.sizes import UnpackLimit, refuse_short
 
 NUMBER_KINDS = {"F": "f", "I": "i", "U": "u"}
 HEADER_BYTES = 65536

@@ -13,8 +13,8 @@ from amrepair.errors import InputError
 from amrepair.scans.range_grid import NO_POINT, RangeGrid
 from amrepair.scans.range_grid_kernels import lists_of_bytes, lists_of_numbers
 from amrepair.scans.scan import Scan
-from amrepair.scans.sizes import refuse_short
 from amrepair.scans.text import filled, read_table
+from gcode.surfaces.sizes import refuse_short
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -237,6 +237,10 @@ def read_grid(rest: memoryview, header: PlyHeader, path: Path) -> RangeGrid | No
         raise InputError(
             f"{path}: a pixel of the PLY file's range_grid is neither a gap nor one of its "
             f"{header.elements[0].count} vertices; it is damaged"
+        )
+    if int(np.bincount(entries[entries >= 0], minlength=1).max()) > 1:
+        raise InputError(
+            f"{path}: two pixels of the PLY file's range_grid name one vertex; it is damaged"
         )
     return RangeGrid(entries.astype(np.int32).reshape(rows, columns))
 

@@ -20,8 +20,8 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans.range_grid import RangeGrid
 from amrepair.scans.scan import Scan
-from amrepair.scans.sizes import refuse_short
 from amrepair.scans.text import filled, read_table
+from gcode.surfaces.sizes import refuse_short
 
 MM_PER_M = 1000.0
 HEADER_LINES = 10

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from amrepair.errors import InputError
+from amrepair.errors import InputError, refused_as_ours
 from amrepair.scans.arrays import is_map, load_npy, read_height_map, read_npz
-from amrepair.scans.depth_map import camera_beside, read_depth_map
+from amrepair.scans.depth_map import read_depth_map
 from amrepair.scans.mesh import read_mesh
 from amrepair.scans.pcd import PcdHeader, read_pcd
 from amrepair.scans.ply import (
@@ -33,6 +33,7 @@ from amrepair.scans.range_grid import NO_POINT, RangeGrid, edge_flags
 from amrepair.scans.scan import DEFAULT_SIGMA_MM, Scan
 from amrepair.scans.text import read_table
 from amrepair.scans.viewpoint import viewpoint_of
+from gcode.surfaces.depth_maps import is_depth_map
 
 POINT_SUFFIXES = frozenset(
     {".ply", ".pcd", ".ptx", ".xyz", ".txt", ".csv", ".asc", ".npy", ".npz", ".png"}
@@ -89,7 +90,8 @@ def read_scan(
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
         raise InputError(f"{path}: {what}")
-    with np.errstate(all="ignore"):  # what overflows is refused as not finite
+    # what overflows is refused as not finite
+    with np.errstate(all="ignore"), refused_as_ours():
         scan = _read(path, frame, cell_mm, origin_mm)
         scan = _with_word(scan, sigma_mm, sensor_at)
         return _with_edges(scan)
@@ -100,16 +102,8 @@ def _read(
 ) -> Scan:
     """By the ending of its name, as the file has it."""
     suffix = path.suffix.lower()
-    if suffix == ".png" or suffix in HEIGHT_SUFFIXES:
-        camera = camera_beside(path)
-        if camera is not None:
-            return read_depth_map(path, camera, frame=frame, sigma_mm=DEFAULT_SIGMA_MM)
-        if suffix == ".png":
-            raise InputError(
-                f"{path}: a PNG is read as a depth map, and needs the camera in "
-                f"{path.with_suffix('.json').name} beside it: fx, fy, cx, cy, width, height, "
-                "depth_scale_mm"
-            )
+    if is_depth_map(path):
+        return read_depth_map(path, frame=frame, sigma_mm=DEFAULT_SIGMA_MM)
     if suffix in HEIGHT_SUFFIXES or (suffix == ".npy" and is_map(path)):
         return read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
     if suffix == ".npz":

@@ -295,11 +295,12 @@ def _along_the_way(
     pixel = float(seen.spacing[0]) if seen is not None else length / max(grid.index.shape)
     # half a stretch over the distance is a ray's error in angle: over the depth at most a pixel
     stretch = 2 * pixel * distance / max(float(np.ptp(points[:, 2])), pixel)
-    count = max(1, int(np.ceil(length / stretch)))
+    # finer than a number tells, there is nothing to tell apart
+    count = max(1, int(np.ceil(length / max(stretch, length * np.finfo(float).eps))))
     index = np.minimum(((way - low) / length * count).astype(np.int64), count - 1)
-    sensors = np.empty((count, 3))
-    sensors[:, fit.along] = low + (np.arange(count) + 0.5) * length / count
+    used, index = np.unique(index, return_inverse=True)
+    sensors = np.empty((len(used), 3))
+    sensors[:, fit.along] = low + (used + 0.5) * length / count
     sensors[:, 1 - fit.along] = fit.centre[0]
     sensors[:, 2] = fit.centre[1]
-    used, index = np.unique(index, return_inverse=True)
-    return Viewpoint("pushbroom", sensors[used], index.reshape(-1).astype(np.int64))
+    return Viewpoint("pushbroom", sensors, index.reshape(-1).astype(np.int64))

@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from amrepair.frames import Transform
 from amrepair.loop.probing import ProbeScanner
+from amrepair.loop.wire import Wire
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.defects import PlacedDefect
@@ -98,6 +99,10 @@ class FeltStage:
     def build_from_scanner(self) -> Transform:
         """The printer's own axes."""
         return self._probe.build_from_scanner
+
+    def send_by(self, wire: Wire) -> None:
+        """Have the printer move by this wire from now on."""
+        self._probe.send_by(wire)
 
     def scan(self, request: ScanRequest) -> Scan:
         """Lay what was printed since the last look, then touch it."""

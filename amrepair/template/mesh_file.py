@@ -20,6 +20,7 @@ from amrepair.errors import InputError, TemplateError
 from gcode.solids import (
     MESH_READ_ERRORS,
     SOLID_SUFFIXES,
+    are_closed,
     as_manifold,
     first_closed,
     is_valid,
@@ -275,7 +276,9 @@ def _sewn(mesh: trimesh.Trimesh) -> Any:
         tolerance=SEW_RATIO * extent_mm,
     )
     sewn.merge()
-    return m3.Manifold(sewn)
+    same = np.arange(len(mesh.vertices))
+    same[np.asarray(sewn.merge_from_vert, np.int64)] = np.asarray(sewn.merge_to_vert, np.int64)
+    return m3.Manifold(sewn) if are_closed(same[np.asarray(mesh.faces)]) else m3.Manifold()
 
 
 def _orient(solid: Any, notes: list[str]) -> Any:

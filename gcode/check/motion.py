@@ -88,7 +88,7 @@ class Motion:
         self._ready_c = self._hotend_c  # what the hotend was waited for
         self._bed_c = state.bed_c if state else 0.0
         self._chamber_c = 0.0
-        self._pulled_mm = 0.0
+        self._pulled_mm = 0.0 if state is None else state.pulled_mm
         self._short_mm3 = 0.0
         self._line, self._text = 0, ""
         printer = setup.printer

@@ -14,6 +14,7 @@ from gcode.hosts.port import PrintableProgram
 from gcode.protocol import command_in
 
 _CODE_NAME = re.compile(r"([GM])\s*0*(\d+)")
+_TOUCH_LINE = re.compile(r"G38\.2\s+Z(?P<to>[-+.\d]+)|AMREPAIR_TOUCH\s+DEPTH=(?P<by>[.\d]+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +86,9 @@ def modes_after(
 def follow(modes: Modes, text: str, dialect: str) -> Modes:
     """Return the modes after one more line."""
     command = text.partition(";")[0].strip().upper()
+    touch = _TOUCH_LINE.match(command)
+    if touch is not None:
+        return _touched(modes, touch)
     match = _CODE_NAME.match(command)
     if match is None:
         return modes
@@ -111,6 +115,16 @@ def follow(modes: Modes, text: str, dialect: str) -> Modes:
             position_mm={k: v for k, v in modes.position_mm.items() if k not in gone},
         )
     return _heat(modes, name, words)
+
+
+def _touched(modes: Modes, touch: re.Match[str]) -> Modes:
+    """After a touch the nozzle is at the lowest where it may be, or straight above that."""
+    place = dict(modes.position_mm)
+    if touch["to"] is not None:
+        place["Z"] = float(touch["to"]) * modes.unit_mm
+    elif "Z" in place:
+        place["Z"] -= float(touch["by"])
+    return replace(modes, position_mm=place)
 
 
 def _heat(modes: Modes, name: str, words: dict[str, float]) -> Modes:

@@ -71,6 +71,37 @@ def resume(
     ).run(progress)
 
 
+def back_to_start(
+    printer: SerialPrinter,
+    checked: PrintableProgram,
+    *,
+    release_c: float,
+    pose_confirmed: bool = False,
+    before: Sequence[tuple[PrintableProgram, int, int]],
+    wall_clock: Callable[[], float] = time.time,
+) -> None:
+    """Have the machine where the journal's last job began, which can begin anew; or refuse.
+
+    For a program that lays nothing and begins above all that stands there: the nozzle is lifted
+    straight up to that height before it goes anywhere else.
+
+    Parameters
+    ----------
+    printer, checked, release_c, pose_confirmed
+        As for `resume`; the printer is connected afterwards.
+    before
+        What was printed before it, as for `resume`.
+
+    Raises
+    ------
+    ResumeRefusedError
+        Naming the interval; the heaters have been told to switch off.
+    """
+    _Resumption(
+        printer, checked, release_c, pose_confirmed, wall_clock, end=None, before=before, anew=True
+    ).prepared()
+
+
 class _Resumption:
     def __init__(
         self,
@@ -82,8 +113,10 @@ class _Resumption:
         *,
         end: int | None,
         before: Sequence[tuple[PrintableProgram, int, int]],
+        anew: bool = False,
     ) -> None:
         self._printer, self._checked, self._before = printer, checked, before
+        self._anew = anew
         self._release_c, self._pose_confirmed = release_c, pose_confirmed
         self._now_s = wall_clock()
         self._total = checked.program.text.count("\n") + 1 if end is None else end
@@ -92,16 +125,21 @@ class _Resumption:
         self._left_alone = False
 
     def run(self, progress: Progress) -> PrintReport:
+        """Go on."""
+        lines = range(self.prepared(), self._total)
+        return self._printer.print(self._checked, lines=lines, progress=progress)
+
+    def prepared(self) -> int:
+        """The line to send next, with the machine there; a refusal says how it was left."""
         printer = self._printer
         try:
-            line = self._prepare()
+            return self._prepare()
         except ResumeRefusedError as error:
             safe = printer.notes[-1] if printer.notes else "nothing was sent to the printer"
             message = f"{error} Now: {safe}."
             raise ResumeRefusedError(
                 message, error.last_executed_line, error.last_sent_line
             ) from error
-        return printer.print(self._checked, lines=range(line, self._total), progress=progress)
 
     def _prepare(self) -> int:
         """Connect, find the line, judge, and bring the machine back to it."""
@@ -112,6 +150,8 @@ class _Resumption:
             line = self._job.acked if printer.dialect.verifies else self._line_by_place(place)
             modes = self._modes_after(line)
             self._require_place(place, modes, line)
+            if self._anew:
+                line, modes = 0, self._modes_after(0)
             if not self._pose_confirmed:
                 self._require_motors()
                 self._require_warm(modes)
@@ -208,7 +248,7 @@ class _Resumption:
             if _fits(place, modes):
                 fitting.append(index + 1)
         at_origin = max(abs(place.x_mm), abs(place.y_mm)) < SAME_PLACE_MM  # as after a reset
-        if len(fitting) != 1 or at_origin:
+        if at_origin or not (fitting if self._anew else len(fitting) == 1):
             self._refuse(
                 f"the firmware counts no lines, and the nozzle's place fits {len(fitting)} of the "
                 f"{len(doubtful) + 1} places where it may have been"
@@ -303,7 +343,8 @@ class _Resumption:
         known = modes.position_mm
         tell("G21")
         if place.z_mm < known["Z"] + PAUSE_LIFT_MM / 2:
-            for command in ("G91", f"G1 Z{PAUSE_LIFT_MM:g} F600", "G90"):
+            lift_mm = max(PAUSE_LIFT_MM, known["Z"] - place.z_mm)
+            for command in ("G91", f"G1 Z{lift_mm:.3f} F600", "G90"):
                 tell(command)
         for heat, wait, target_c in (
             ("M140", "M190", modes.bed_c),

@@ -145,10 +145,16 @@ def felt(
                 f"touch was to end ({error}); the nozzle was lifted and the heaters are off: the "
                 f"probe does not trigger, or what it was to feel is farther below."
             ) from error
+        if not report.ok:
+            raise PrinterError(
+                f"The touches were stopped after {len(felt_mm)}; the nozzle was lifted and the "
+                f"heaters are off."
+            )
         felt_mm.append(_met_mm(printer, report.warnings, command))
         at_contact()
         first = index + 1
-    printer.print(checked, lines=range(first, len(lines)), progress=progress)
+    # not to its very end: that is for whoever sends the last of a job, and lets go of the motors
+    printer.print(checked, lines=range(first, len(lines) - 1), progress=progress)
     printer.finish_moves()
     return felt_mm
 

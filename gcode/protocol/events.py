@@ -200,15 +200,8 @@ class Resend:
     number: int
 
 
-Event = (
-    Greeted
-    | Acknowledged
-    | SpareOk
-    | ResendRequested
-    | ResendRefused
-    | Probed
-    | Proved
-    | Busy
+Said = (
+    Busy
     | Waiting
     | Echo
     | UnknownCommand
@@ -220,6 +213,18 @@ Event = (
     | Capability
     | HostAction
     | PrinterReset
-    | LinkLost
     | Unrecognised
+)
+"""What a line of the printer may mean by itself, whatever it was asked."""
+
+Event = (
+    Greeted
+    | Acknowledged
+    | SpareOk
+    | ResendRequested
+    | ResendRefused
+    | Probed
+    | Proved
+    | LinkLost
+    | Said
 )

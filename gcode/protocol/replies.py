@@ -21,29 +21,14 @@ from gcode.protocol.events import (
     PositionReport,
     PrinterReset,
     Resend,
+    Said,
     TemperatureReport,
     UnknownCommand,
     Unrecognised,
     Waiting,
 )
 
-Reply = (
-    Ok
-    | Resend
-    | Busy
-    | Waiting
-    | Echo
-    | UnknownCommand
-    | LineError
-    | CommandFailed
-    | TemperatureReport
-    | PositionReport
-    | FirmwareInfo
-    | Capability
-    | HostAction
-    | PrinterReset
-    | Unrecognised
-)
+Reply = Ok | Resend | Said
 
 _REPLIED_NUMBER = r"[-+]?\d{1,9}(?:\.\d{0,9})?"
 _RESEND = re.compile(r"(?:resend|rs)\s*[: ]\s*N?(\d{1,9})\s*", re.IGNORECASE)

@@ -11,7 +11,6 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from gcode.moves import Role
 from gcode.slicing import infill_kernels as kernels
@@ -184,9 +183,3 @@ def _thin(region: Any, *, least_mm: float, most_mm: float) -> tuple[list[Bead], 
         lost_mm2 += thin.lost_mm2
         found_mm2 += part.area()
     return beads, lost_mm2 + max(0.0, region.area() - found_mm2)
-
-
-def bounds_of(beads: list[Bead]) -> Float[np.ndarray, " 4"]:
-    """(x_min, y_min, x_max, y_max) of centre lines."""
-    points = np.concatenate([bead.xy_mm for bead in beads])
-    return np.concatenate([points.min(axis=0), points.max(axis=0)])

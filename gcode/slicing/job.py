@@ -24,6 +24,7 @@ from gcode.slicing import infill_kernels as kernels
 from gcode.slicing.beads import Bead, loop_bead, spacing_of
 from gcode.slicing.layer_plan import LayerPlan, PartLayers, Unprintable
 from gcode.slicing.layers import LayerGrid, Slab, plan_slabs
+from gcode.slicing.objects import Labels, boxes_apart_mm
 from gcode.slicing.order import nearest_first, seam_index
 from gcode.slicing.pen import MERGE_MM, Pen
 from gcode.slicing.regions import flattened, union
@@ -91,13 +92,14 @@ def plan_part(
     lost: list[Unprintable] = []
     _begin(pen, setup, float(solid.bounding_box()[5]))
     seam_mm = np.array([-1e3, 1e3])
+    labels = Labels(boxes_apart_mm(solid, setup.process.line_width_mm))
     plans = in_order(layers.plan, len(slabs), workers=workers)
     for slab, plan in zip(slabs, plans, strict=True):
         lost += plan.lost
         _change_layer(pen, slab, setup)
         if slab.index == 0:
             _skirt(pen, layers.section(0), slab, setup)
-        seam_mm = _emit(pen, plan, slab, seam_mm, setup)
+        seam_mm = _emit(pen, plan, slab, seam_mm, setup, labels)
         progress("slice", float(slab.index + 1), float(len(slabs)))
     pen.retract()
     pen.move_to(np.array([*pen.position_mm[:2], slabs[-1].top_mm + setup.printer.z_hop_mm + 1.0]))
@@ -168,7 +170,12 @@ def _change_layer(pen: Pen, slab: Slab, setup: PrintSetup) -> None:
 
 
 def _emit(
-    pen: Pen, plan: LayerPlan, slab: Slab, seam_mm: Float[np.ndarray, " 2"], setup: PrintSetup
+    pen: Pen,
+    plan: LayerPlan,
+    slab: Slab,
+    seam_mm: Float[np.ndarray, " 2"],
+    setup: PrintSetup,
+    labels: Labels,
 ) -> Float[np.ndarray, " 2"]:
     """Moves of one layer, nearest island next; returns where its last seam was."""
     left = list(plan.islands)
@@ -176,12 +183,14 @@ def _emit(
     while left:
         here = pen.position_mm[:2]
         island = left.pop(int(np.argmin([_box_distance(one.box_mm, here) for one in left])))
+        labels.of_box(pen, island.box_mm)
         for group in island.groups:
             beads = [_seamed(bead, seam) for bead in group]
             if beads and beads[0].role is Role.EXTERNAL_PERIMETER:
                 seam = beads[0].xy_mm[0]
             for bead in nearest_first(beads, pen.position_mm[:2]):
                 _lay(pen, bead, slab, (island.outline_mm, island.starts), setup)
+    labels.of_none(pen)
     return seam
 
 

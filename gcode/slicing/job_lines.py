@@ -127,6 +127,16 @@ class JobColumns:
             np.array([*(high + wide_mm), high_mm + SAME_LEVEL_MM]),
         )
         self._masks: dict[float, Bool[np.ndarray, "ny nx"] | None] = {}
+        order = np.argsort(self._lines.end_mm[:, 2])
+        steps = np.flatnonzero(np.diff(self._lines.end_mm[order, 2]) > SAME_LEVEL_MM) + 1
+        self._layers = [
+            (
+                float(np.median(self._lines.end_mm[of, 2])),
+                float(np.median(self._lines.height_mm[of])),
+            )
+            for of in np.split(order, steps)
+            if len(of)
+        ]
 
     def lines_at(self, z_mm: float) -> JobLines:
         """The job's lines near the patch at one height."""
@@ -138,6 +148,18 @@ class JobColumns:
         if key not in self._masks:
             self._masks[key] = self._over(self.lines_at(z_mm))
         return self._masks[key]
+
+    def laid_mm(
+        self, from_mm: Float[np.ndarray, "ny nx"], to_mm: float
+    ) -> Float[np.ndarray, "ny nx"]:
+        """How much of each column, from a height of its own to one of all, the job filled."""
+        laid = np.zeros(self.near.shape)
+        for top_mm, height_mm in self._layers:
+            over = self.at(top_mm) if top_mm < to_mm + SAME_LEVEL_MM else None
+            if over is not None:
+                under_mm = np.maximum(from_mm, top_mm - height_mm)
+                laid += np.where(over, np.clip(min(top_mm, to_mm) - under_mm, 0.0, None), 0.0)
+        return laid
 
     def _over(self, lines: JobLines) -> Bool[np.ndarray, "ny nx"] | None:
         if len(lines.rim) == 0:

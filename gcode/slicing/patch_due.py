@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from gcode.slicing.job_lines import RIM_MM
 from gcode.slicing.patch_beads import LEAST_THICK_MM, TO_WALL_MM
 from gcode.slicing.patch_free import ROUNDING_MM
 from gcode.slicing.patch_heights import DEEP_RATIO, Height
@@ -24,11 +25,15 @@ HEM_MM, RIM_MM2 = 0.35, 1.0
 
 @dataclass(frozen=True, slots=True)
 class Due:
-    """Thickness to lay by column, what is given up below where it is laid, and where in the air."""
+    """Thickness to lay by column, what is given up below where it is laid, and where in the air.
+
+    What `hangs` is as high as the nozzle once it is laid, whatever lies open below.
+    """
 
     thick_mm: Float[np.ndarray, "ny nx"]
     sunk_mm: Float[np.ndarray, "ny nx"]
     hem: Bool[np.ndarray, "ny nx"]
+    hangs: Bool[np.ndarray, "ny nx"]
 
 
 def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
@@ -58,10 +63,11 @@ def due_of_job(
 ) -> Due:
     """Thickness to lay now where the job laid something at this height: up to it, as the job did.
 
-    On a slope the job's steps are what was there, not the smooth surface that the deficit has.
+    On a slope the job's steps are what was there, not the smooth surface that the deficit has. What
+    the job left open, as the cells of sparse infill, stays so: a line over it hangs, as it did.
     """
     assert model.job is not None
-    gap = at.z_mm - state.surface_mm
+    gap = model.job.laid_mm(state.surface_mm, at.z_mm)
     wanted = state.left_below(model, at.z_mm)
     deep = gap > at.deep_mm
     thick = np.where(deep, np.minimum(gap, np.maximum(wanted + AGREE_MM, at.layer_mm)), gap)
@@ -73,9 +79,23 @@ def due_of_job(
     # the shallow rim of what a scan rounded off counts: line by line it makes up a bead; beside
     # it noise would
     least_mm = np.where(wanted > ROUNDING_MM, ROUNDED_OFF_MM, LEAST_THICK_MM)
-    active = planned & due & (thick >= least_mm)
+    active = planned & due & (thick >= least_mm) & _gone_at(model, at)
     active &= ~deep | (wanted > LEAST_THICK_MM / 2)  # beside the part all is deep
-    return _lidded(model, at, thick, active, deep & active, gap)
+    due = _lidded(model, at, thick, active, deep & active, gap)
+    return replace(due, hangs=due.hangs | (at.z_mm - state.surface_mm > gap + AGREE_MM))
+
+
+def _gone_at(model: PatchModel, at: Height) -> Bool[np.ndarray, "ny nx"]:
+    """Columns where something of the layer that ends at a height is missing, and beside them.
+
+    A deficit that goes on above, and begins no deeper below than a bead of the next layer gets, is
+    that layer's: a scanner's spot rounds off ridges one line wide, and their flanks lie lower.
+    """
+    assert model.job is not None
+    own = model.wanted_below(at.z_mm) - model.wanted_below(at.z_mm - at.layer_mm)
+    goes_on = model.top_mm > at.z_mm + AGREE_MM
+    gone = np.where(goes_on, own > at.most_mm - at.layer_mm, own > 0)
+    return beside(gone, model.job.near, RIM_MM, model.cell_mm)
 
 
 def hemmed(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
@@ -133,7 +153,8 @@ def _lidded(
         sunk = np.where(deep & held, thick - lidded, 0.0)
         thick = np.where(deep & held, lidded, thick)
         active = active & (~deep | held)
-    return Due(np.where(active, thick, 0.0), sunk, np.zeros(model.shape, dtype=bool))
+    nowhere = np.zeros(model.shape, dtype=bool)
+    return Due(np.where(active, thick, 0.0), sunk, nowhere, hangs=gap > at.deep_mm)
 
 
 def beside(

@@ -80,8 +80,9 @@ class PatchModel:
             wanted = np.isfinite(self.top_mm)
             low_mm, high_mm = float(self.box[2]), float(self.box[5])
             self.job = JobColumns(
-                lines, wanted, self.points_mm, self.cell_mm, low_mm, high_mm + JOB_LAYER_MM
-            )
+                lines, wanted, self.points_mm, self.cell_mm,
+                low_mm - JOB_LAYER_MM, high_mm + JOB_LAYER_MM,
+            )  # fmt: skip
         self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
         self.drop_mm = DROP_NOZZLES * setup.printer.nozzle_diameter_mm
         self.spread_mm = SPREAD_NOZZLES * setup.printer.nozzle_diameter_mm
@@ -133,9 +134,9 @@ class PatchModel:
         y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * self.cell_mm
         disc = np.hypot(x, y) <= self.spread_mm
         from_mm = ndimage.minimum_filter(self.need_mm, footprint=disc, mode="nearest") - layer_mm
-        thick_mm = np.minimum(self.top_mm - from_mm, self.wanted_below(np.inf))
-        thick_mm = np.where(np.isfinite(self.top_mm), np.clip(thick_mm, 0.0, None), 0.0)
-        return float(thick_mm.sum()) * self.cell_mm**2 * self.weight
+        over = np.isfinite(self.top_mm)
+        thick_mm = np.minimum(self.top_mm[over] - from_mm[over], self.wanted_below(np.inf)[over])
+        return float(np.clip(thick_mm, 0.0, None).sum()) * self.cell_mm**2 * self.weight
 
     def cell_at(self, point_mm: Float[np.ndarray, " 2"]) -> tuple[int, int]:
         """Row and column of the column that a point lies over."""

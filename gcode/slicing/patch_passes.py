@@ -106,8 +106,7 @@ def _after(
 ) -> PatchState:
     """Columns with these beads on them."""
     laid = laying.laid_mm
-    # over a bridge the surface is the nozzle's height, whatever lies open below
-    bridged = (laid > 0) & (at.z_mm - state.surface_mm > at.deep_mm)
+    bridged = (laid > 0) & due.hangs
     done = state.done_mm
     if planned is not None:
         done = np.where((laid > 0) & planned, at.z_mm, done)

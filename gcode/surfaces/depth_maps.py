@@ -18,17 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from jaxtyping import Bool, Float, Num
 
 from gcode.errors import InputError
-from gcode.surfaces.heightfield import IMAGE_READ_ERRORS
+from gcode.surfaces.sizes import (
+    PARSER_ERRORS,
+    UnpackLimit,
+    in_words,
+    length_of,
+    quiet_tiff,
+    refuse_swollen_page,
+)
 
 DEPTH_SUFFIXES = frozenset({".png", ".tif", ".tiff"})
 MOST_JSON_BYTES = 1_000_000
-MOST_DEPTH_PIXELS = 50_000_000
-MOST_PACKED = 100
-"""Real depths pack to a third; deflate itself goes no further than a thousandth."""
 COUNT_MM = 1.0  # of depth cameras (RealSense, Azure Kinect) where nothing is said
 CAMERA_RIGID = 1e-3  # digits of a rotation in a file
 BAND_MM, TILT_RAD = 10.0, math.radians(3.0)
@@ -167,20 +170,8 @@ def read_on_bed(path: Path, box_mm: tuple[float, float, float, float] | None = N
     InputError
         If something cannot be read, nobody says where the camera stands, or it sees no bed.
     """
-    camera = _camera_beside(path)
-    image = _image(path, camera)
-    count_mm = camera.count_mm
-    if count_mm is None:
-        if image.dtype.kind == "f":
-            raise InputError(
-                f"{path}: the JSON file beside it does not say depth_scale_mm, and depths in "
-                "fractions may be metres or millimetres; add it."
-            )
-        count_mm = COUNT_MM
-    points_mm, _ = camera.points_mm(image, count_mm)
-    if not len(points_mm) or points_mm[:, 2].min() < 0:
-        raise InputError(f"{path}: the depth map has no seen pixel, or depths below 0.")
-    pose = camera.pose
+    depth = read_depth(path)
+    points_mm, pose = depth.points_mm, depth.camera.pose
     if pose is None:
         raise InputError(
             f"{path}: the JSON file beside it does not say where the camera stands: add 'pose', a "
@@ -192,7 +183,7 @@ def read_on_bed(path: Path, box_mm: tuple[float, float, float, float] | None = N
         inside = ((placed_mm[:, :2] >= low) & (placed_mm[:, :2] <= high)).all(axis=1)
         points_mm, placed_mm = points_mm[inside], placed_mm[inside]
     moved_mm, told = levelled(placed_mm, what=str(path))
-    spacing_mm = float(np.median(points_mm[:, 2])) / min(camera.focal)
+    spacing_mm = float(np.median(points_mm[:, 2])) / min(depth.camera.focal)
     return Seen(moved_mm, spacing_mm, told)
 
 
@@ -260,66 +251,119 @@ def _above(points_mm: Float[np.ndarray, "n 3"], plane: Plane) -> Float[np.ndarra
     return np.asarray(points_mm[:, 2] - points_mm[:, :2] @ plane[:2] - plane[2])
 
 
+@dataclass(frozen=True, slots=True)
+class Depth:
+    """A depth map as it was read.
+
+    Attributes
+    ----------
+    points_mm
+        (n, 3) the seen pixels in the camera's frame, row after row.
+    seen
+        (rows, columns) which they are.
+    """
+
+    camera: Camera
+    points_mm: Float[np.ndarray, "n 3"]
+    seen: Bool[np.ndarray, "rows columns"]
+
+
+def read_depth(path: Path) -> Depth:
+    """Read a depth map, and the camera beside it.
+
+    Raises
+    ------
+    InputError
+        If either cannot be read, they do not belong together, or nothing was seen.
+    """
+    camera = _camera_beside(path)
+    image = _image(path, camera)
+    count_mm = camera.count_mm
+    if count_mm is None:
+        if image.dtype.kind == "f":
+            raise InputError(
+                f"{path}: the JSON file beside it does not say depth_scale_mm, and depths in "
+                "fractions may be metres or millimetres; add it."
+            )
+        count_mm = COUNT_MM
+    points_mm, seen = camera.points_mm(image, count_mm)
+    if not len(points_mm):
+        raise InputError(f"{path}: the depth map has no seen pixel.")
+    if points_mm[:, 2].min() < 0:
+        raise InputError(f"{path}: the depth map has depths below 0; it is damaged.")
+    return Depth(camera, points_mm, seen)
+
+
 def _said(beside: Path) -> Any:
     try:
-        if beside.stat().st_size > MOST_JSON_BYTES:
+        if length_of(beside) > MOST_JSON_BYTES:
             raise InputError(f"{beside}: over {MOST_JSON_BYTES} bytes are no camera's intrinsics.")
         return json.loads(beside.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{beside}: the camera of the depth map cannot be read ({error}); it is a JSON file of "
-            "the image's name, with fx, fy, cx, cy, width, height and pose."
+            f"{beside}: the camera of the depth map cannot be read ({in_words(error)}); it is a "
+            "JSON file of the image's name, with fx, fy, cx, cy, width, height and pose."
         ) from error
 
 
 def _camera_beside(path: Path) -> Camera:
     beside = path.with_suffix(".json")
+    if not beside.is_file():
+        raise InputError(
+            f"{path}: a PNG is read as a depth map, and needs the camera in {beside.name} beside "
+            "it: fx, fy, cx, cy, width, height, depth_scale_mm and pose."
+        )
     said = _said(beside)
     try:
         return camera_of(said)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        what = " ".join(str(error).split())[:120]
         raise InputError(
-            f"{beside}: the camera cannot be understood ({type(error).__name__}: {what}); it needs "
-            "fx, fy, cx, cy or intrinsic_matrix, and width and height."
+            f"{beside}: the camera cannot be understood ({type(error).__name__}: "
+            f"{in_words(error)}); it needs fx, fy, cx, cy or intrinsic_matrix, and width and "
+            "height."
         ) from error
 
 
 def _image(path: Path, camera: Camera) -> Num[np.ndarray, "rows columns"]:
     from PIL import Image
 
-    if math.prod(camera.shape) > MOST_DEPTH_PIXELS:
-        raise InputError(f"{path}: over {MOST_DEPTH_PIXELS:,} pixels are no depth map.")
+    read = _png if path.suffix.lower() == ".png" else _tiff
     try:
-        size = path.stat().st_size
-        if path.suffix.lower() == ".png":
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of bombs: the limit here is held below
-                with Image.open(path, formats=["PNG"]) as image:
-                    mode, shape = image.mode, (image.height, image.width)
-                    _refuse_shape(path, shape, size, camera)
-                    if mode not in {"I;16", "I;16B", "I"}:
-                        raise InputError(
-                            f"{path}: a depth map is grey of 16 bits a pixel, this is '{mode}'."
-                        )
-                    return np.asarray(image)
-        with tifffile.TiffFile(path) as tiff:
-            page = tiff.pages[0]
-            _refuse_shape(path, tuple(page.shape), size, camera)
-            return np.asarray(page.asarray())
-    except InputError:
-        raise
-    except (*IMAGE_READ_ERRORS, Image.DecompressionBombError) as error:
-        what = " ".join(str(error).split())[:120] or type(error).__name__
-        raise InputError(f"{path}: the depth map cannot be read ({what}).") from error
+        return read(path, camera)
+    except (*PARSER_ERRORS, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: the depth map cannot be read ({in_words(error)}).") from error
 
 
-def _refuse_shape(path: Path, shape: tuple[int, ...], size: int, camera: Camera) -> None:
-    if shape != camera.shape:
-        told = " × ".join(str(n) for n in reversed(shape))
+def _png(path: Path, camera: Camera) -> Num[np.ndarray, "rows columns"]:
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of bombs: the limit here is held below
+        with Image.open(path, formats=["PNG"]) as image:
+            _refuse_shape(path, (image.height, image.width), camera)
+            if image.mode not in {"I;16", "I;16B", "I"}:
+                raise InputError(
+                    f"{path}: a depth map is grey of 16 bits a pixel, this one is '{image.mode}'."
+                )
+            UnpackLimit().refuse(path, 2 * image.height * image.width, length_of(path))
+            return np.asarray(image)
+
+
+def _tiff(path: Path, camera: Camera) -> Num[np.ndarray, "rows columns"]:
+    with quiet_tiff(path) as tiff:
+        page: Any = tiff.pages[0]
+        refuse_swollen_page(path, page, UnpackLimit())
+        if len(page.shape) != 2 or page.dtype is None or page.dtype.kind not in "uif":
+            raise InputError(
+                f"{path}: a depth map is one number a pixel, this one has shape {page.shape}."
+            )
+        _refuse_shape(path, page.shape, camera)
+        return np.asarray(page.asarray())
+
+
+def _refuse_shape(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
+    if tuple(shape) != camera.shape:
         raise InputError(
-            f"{path}: the depth map has {told} pixels, the JSON file beside it says "
-            f"{camera.shape[1]} × {camera.shape[0]}; they do not belong together."
+            f"{path}: the depth map has {shape[1]} × {shape[0]} pixels, the JSON file beside it "
+            f"says {camera.shape[1]} × {camera.shape[0]}; they do not belong together."
         )
-    if 2 * math.prod(shape) > max(MOST_PACKED * size, 16 * 2**20):
-        raise InputError(f"{path}: {size} bytes would unpack to {2 * math.prod(shape)}; a trap?")

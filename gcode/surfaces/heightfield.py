@@ -7,11 +7,8 @@ description) and `.npy` (heights alone). It holds one height per column: undercu
 from __future__ import annotations
 
 import json
-import logging
 import math
-import struct
 import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,13 +20,14 @@ from jaxtyping import Bool, Float, Int
 
 from gcode.errors import InputError
 from gcode.surfaces import raster_kernels as kernels
+from gcode.surfaces.sizes import (
+    PARSER_ERRORS,
+    UnpackLimit,
+    in_words,
+    quiet_tiff,
+    refuse_swollen_page,
+)
 
-# What NumPy's, zip's and TIFF's readers raise on damaged files.
-IMAGE_READ_ERRORS = (
-    ValueError, ArithmeticError, LookupError, TypeError, AttributeError, OSError, EOFError,
-    NotImplementedError, RuntimeError, MemoryError, SyntaxError, AssertionError,
-    struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError,
-)  # fmt: skip
 MOST_READ_CELLS = 20_000_000  # of a file: a bed of 400 mm in cells of 0.1 mm, and then some
 MAX_FIELD_CELLS = 60_000_000  # half a gigabyte of heights: beyond that a cell size is a mistake
 
@@ -455,9 +453,8 @@ def _read_heights(
         raise InputError(f"{path}: a height map is a .npz, .tif or .npy file, not '{suffix}'.")
     try:
         return readers[suffix](path)
-    except IMAGE_READ_ERRORS as e:
-        what = " ".join(str(e).split())[:120] or type(e).__name__
-        raise InputError(f"{path}: the height map cannot be read ({what}).") from e
+    except PARSER_ERRORS as e:
+        raise InputError(f"{path}: the height map cannot be read ({in_words(e)}).") from e
 
 
 def _read_npz(
@@ -499,18 +496,13 @@ def _refuse_too_many(cells: int) -> None:
 
 
 def _read_tiff(path: Path) -> tuple[Float[np.ndarray, ...], dict[str, Any], None]:
-    said = logging.getLogger("tifffile")
-    level = said.level
-    said.setLevel(logging.CRITICAL)  # what it finds odd is told once, by us
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            page = tiff.pages[0]
-            _refuse_too_many(math.prod(page.shape))
-            heights = page.asarray().astype(np.float64, copy=False)
-            try:
-                placement = json.loads(getattr(page, "description", "") or "{}")
-            except json.JSONDecodeError:
-                placement = {}
-    finally:
-        said.setLevel(level)
+    with quiet_tiff(path) as tiff:
+        page = tiff.pages[0]
+        _refuse_too_many(math.prod(page.shape))
+        refuse_swollen_page(path, page, UnpackLimit())
+        heights = page.asarray().astype(np.float64, copy=False)
+        try:
+            placement = json.loads(getattr(page, "description", "") or "{}")
+        except json.JSONDecodeError:
+            placement = {}
     return heights, placement if isinstance(placement, dict) else {}, None

@@ -38,6 +38,7 @@ def kept(out: Path) -> dict[Path, int]:
     return {p: p.stat().st_mtime_ns for p in (out / "results").glob("*/[!.]*.json")}
 
 
+@pytest.mark.slow
 def test_killed_thrice_it_ends_with_the_same_rows(
     forks: Forks, template: Path, tmp_path: Path
 ) -> None:

@@ -164,6 +164,7 @@ def test_a_killed_run_goes_on_to_the_same_results(dataset: Path, tmp_path: Path)
     ]
 
 
+@pytest.mark.slow
 def test_jobs_change_nothing_but_time(dataset: Path, tmp_path: Path) -> None:
     one = run_bench(dataset, format=LAYOUT, methods=["btf-raw"], out=tmp_path / "1", seeds=[0, 1])
     two = run_bench(

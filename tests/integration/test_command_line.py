@@ -347,8 +347,8 @@ def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
         while not stop.wait(1.0):
             k += 1
             noisy = points + rng.normal(size=points.shape) * 0.03
-            np.savetxt(tmp_path / "partial.xyz", noisy, fmt="%.4f")
-            (tmp_path / "partial.xyz").rename(drop / f"scan{k}.xyz")
+            np.save(tmp_path / "partial.npy", noisy)
+            (tmp_path / "partial.npy").rename(drop / f"scan{k}.npy")
 
     eye = threading.Thread(target=scan)
     eye.start()

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import manifold3d as m3
 import numpy as np
-from loop_bench import PLACE_MM
+import trimesh
+from loop_bench import PLACE_MM, solid_mesh
 
+from amrepair.scans import Scan
 from gcode.moves import Program
 from gcode.profiles import PrintSetup
 from gcode.reader import read_job
@@ -64,3 +66,14 @@ def labelled(blocks: list[Block], setup: PrintSetup, marks: str = "m486") -> Pro
         before.setdefault(job.footer_start_line, []).append(ends.format(n=now))
     text = [row for k, line in enumerate(lines) for row in (*before.get(k, ()), line)]
     return Program("\n".join(text), program.dialect)
+
+
+def with_bed(solid: m3.Manifold) -> Scan:
+    """A cloud of what stands there and of the bed round it: where nothing is, the bed is seen."""
+    bed = m3.Manifold.cube((80.0, 40.0, 1.0)).translate((90.0, 80.0, -1.0))
+    mesh, rng = solid_mesh(solid + bed), np.random.default_rng(1)
+    points, faces = trimesh.sample.sample_surface(mesh, 40_000, seed=1)
+    up = points[:, 2] > -1e-6
+    normals = np.asarray(mesh.face_normals)[faces[up]].astype(np.float32).astype(np.float64)
+    noisy = np.asarray(points[up]) + rng.normal(scale=0.02, size=(int(up.sum()), 3))
+    return Scan(noisy, 0.02, "scanner", normals)

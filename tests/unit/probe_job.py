@@ -10,6 +10,7 @@ import trimesh
 from amrepair.loop import Stop
 from amrepair.loop.probing import ProbeScanner
 from amrepair.loop.travel import park
+from amrepair.loop.wire import Wire
 from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import ScanRequest
 from amrepair.simulate.run import PreparedRun, prepare_run
@@ -24,10 +25,12 @@ Hole = tuple[float, float, float, float]
 """X, Y and radius from the plate's middle, and depth, mm."""
 
 
-def plate(size_mm: tuple[float, float, float] = (30.0, 20.0, 3.0)) -> PreparedRun:
+def plate(
+    size_mm: tuple[float, float, float] = (30.0, 20.0, 3.0), *, printer: str = "generic_marlin"
+) -> PreparedRun:
     """A plate in the middle of the bed, of solid layers of 0.2 mm."""
     mesh = trimesh.creation.box(extents=size_mm)
-    setup = load_setup("generic_marlin", "pla", "repair_0.20")
+    setup = load_setup(printer, "pla", "repair_0.20")
     return prepare_run(MeshSdf.from_mesh(mesh), setup, [], title="plate")
 
 
@@ -50,6 +53,9 @@ class FieldFeeler:
     def __init__(self, run: PreparedRun, field: HeightField, *, seed: int = 0) -> None:
         self._contact = Contact.of(run.setup.printer.feeler, field, seed=seed)
         self.asked_mm: list[np.ndarray] = []
+
+    def send_by(self, wire: Wire) -> None:
+        """Nothing is sent."""
 
     def get_ready(self, rest: ModalState) -> None:
         """Nothing is hot."""

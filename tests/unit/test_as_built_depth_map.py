@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import struct
 import sys
 import time
 from pathlib import Path
@@ -18,6 +19,7 @@ from gcode.cli import main
 from gcode.cli.options import standing_on_bed
 from gcode.errors import InputError
 from gcode.profiles import load_setup
+from gcode.surfaces import HeightField
 
 SHAPE, FOCAL = (240, 320), 300.0
 BOX_MM = ((60.0, 90.0), (70.0, 100.0), 12.0)  # X, Y, height
@@ -139,8 +141,22 @@ def test_a_pose_that_is_far_off_is_refused(tmp_path: Path) -> None:
         standing_on_bed(written(tmp_path, told=tilted(18.0, 0.0, seed=0)))
     path = written(tmp_path)
     path.with_suffix(".json").unlink()
-    with pytest.raises(InputError, match="the camera of the depth map cannot be read"):
+    with pytest.raises(InputError, match=r"needs the camera in bed\.json"):
         standing_on_bed(path)
+
+
+def test_a_height_map_that_is_cut_off_is_not_read_as_a_bare_bed(tmp_path: Path) -> None:
+    """regression: strips that were not there were zeros, and so nothing stood there."""
+    path = tmp_path / "cut.tif"
+    tifffile.imwrite(path, np.full((64, 64), 12.0, np.float32), rowsperstrip=8)
+    data = bytearray(path.read_bytes())
+    tag = struct.pack("<HHIH", 257, 3, 1, 64)
+    at = data.find(tag if tag in data else struct.pack("<HHII", 257, 4, 1, 64))
+    data[at : at + 12] = struct.pack("<HHII", 257, 4, 1, 640)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="in 80 pieces, and the file has 8") as error:
+        HeightField.read(path, cell_mm=1.0)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("x_mm", "hits"), [(75.0, True), (170.0, False)])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import random
 import resource
+import subprocess
+import sys
 import time
 import zipfile
 from pathlib import Path
@@ -13,7 +16,7 @@ import pytest
 import trimesh
 
 from gcode.errors import InputError
-from gcode.solids import read_solid, read_triangles
+from gcode.solids import read_closed, read_solid, read_triangles
 
 CORE = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
 MESH = (
@@ -91,6 +94,41 @@ def test_an_stl_that_promises_more_than_it_holds_gets_one_sentence(tmp_path: Pat
     path.write_bytes(bytes(80) + (2**31).to_bytes(4, "little") + bytes(500))
     with pytest.raises(InputError, match=r"promises 2147483648 triangles.*it has 584"):
         read_solid(path)
+
+
+SIGNALLING_NAN = (0x7FA00000).to_bytes(4, "little")  # the cast to double precision complains
+
+
+def test_a_corner_that_is_a_signalling_nan_gets_one_sentence(tmp_path: Path) -> None:
+    """regression: a RuntimeWarning, which the fuzz of seed 3 found."""
+    path = tmp_path / "nan.stl"
+    box = trimesh.creation.box((10.0, 20.0, 30.0))
+    data = box.export(file_type="stl")
+    path.write_bytes(data[:96] + SIGNALLING_NAN + data[100:])  # x of the first corner
+    for read in (read_solid, read_closed):
+        with pytest.raises(InputError, match="not finite numbers"):
+            read(path)
+
+
+def test_edges_that_pair_with_none_get_one_sentence_and_no_crash() -> None:
+    """regression: manifold3d 3.5.4 ends the process by a segmentation fault on every other such.
+
+    The fuzz of seed 2 found it; here each soup of triangles is asked for in a process of its own.
+    """
+    rng = np.random.default_rng(0)
+    child = "import sys, json; from gcode.solids import as_manifold, is_valid; import numpy as np\n"
+    child += "for v, f in json.load(sys.stdin): print(is_valid(as_manifold(np.array(v), f)))"
+    soups = []
+    for _ in range(400):
+        count = int(rng.integers(4, 9))
+        faces = rng.integers(0, count, (int(rng.integers(2, 13)), 3))
+        soups.append((rng.normal(size=(count, 3)).tolist(), faces.tolist()))
+    done = subprocess.run(
+        [sys.executable, "-c", child.replace("(v), f)", "(v), np.array(f))")],
+        input=json.dumps(soups), capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert len(done.stdout.split()) == len(soups)
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:

@@ -135,6 +135,47 @@ def test_the_stretch_that_is_gone_is_told_where_it_is() -> None:
     assert length_mm[mine].sum() > length_mm[~mine].sum()
 
 
+def test_a_curve_that_is_gone_is_told_though_it_is_many_short_lines() -> None:
+    # regression: gyroid infill of a slicer, laid in pieces of less than a millimetre, was seen to
+    # be gone four layers later
+    scan = scan_of(without(8.0, 12.0, 1, 2 * HIGH_MM), 0)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    whole, count = lines(), 60
+    share = np.linspace(0.0, 1.0, count + 1)
+    place = whole.start_mm[:, None] + share[:, None] * (whole.end_mm - whole.start_mm)[:, None]
+    wide, high = (np.repeat(each, count) for each in (whole.width_mm, whole.height_mm))
+    pieces = PlannedBeads(place[:, :-1].reshape(-1, 3), place[:, 1:].reshape(-1, 3), wide, high)
+    gone, told = (skipped(beads, anomaly.evidence, BLOCK) for beads in (pieces, whole))
+    assert len(gone.width_mm) > len(told.width_mm) > 0
+    for row in range(3):
+        at = (row + 0.5) * WIDE_MM
+        ends = [
+            [
+                *found.start_mm[found.start_mm[:, 1] == at, 0],
+                *found.end_mm[found.end_mm[:, 1] == at, 0],
+            ]
+            for found in (gone, told)
+        ]
+        assert [min(each, default=0.0) for each in ends] == pytest.approx(
+            [min(ends[1], default=0.0)] * 2
+        )
+        assert [max(each, default=0.0) for each in ends] == pytest.approx(
+            [max(ends[1], default=0.0)] * 2
+        )
+
+
+def test_a_corner_ends_a_line() -> None:
+    """Plastic cuts corners: the short side of one is no stretch of its own."""
+    scan = scan_of(without(8.0, 9.2, 1, 2 * HIGH_MM), 0)
+    anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert anomaly.evidence is not None
+    y, z = 1.5 * WIDE_MM, TOP_MM
+    path = np.array([[8.0, y + 3.0, z], [8.0, y, z], [9.2, y, z], [9.2, y + 3.0, z]])
+    beads = PlannedBeads(path[:-1], path[1:], np.full(3, WIDE_MM), np.full(3, HIGH_MM))
+    assert len(skipped(beads, anomaly.evidence, BLOCK).width_mm) == 0
+
+
 def test_without_rays_nothing_is_said_of_lines() -> None:
     points, normals = analytic.noisy_scan_points(
         without(8.0, 12.0, 1, 2 * HIGH_MM), spacing_mm=0.2, sigma_mm=SIGMA_MM, seed=0

@@ -69,6 +69,7 @@ SITUATIONS = {
     "S9": Situation(Action.FILL_NOW),
     "S10": Situation(Action.FILL_WITH_NEXT),
     "S11": Situation(Action.LOWER_NEXT),
+    "S12a": Situation(Action.GO_ON, buried_mm3=40.0),
     "S12": Situation(Action.GO_ON),
 }
 

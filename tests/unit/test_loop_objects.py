@@ -9,13 +9,11 @@ from typing import Any
 import manifold3d as m3
 import numpy as np
 import pytest
-import trimesh
 from loop_bench import PLACE_MM, Small, Thermal, solid_mesh
-from objects_job import Block, labelled, plate
+from objects_job import Block, labelled, plate, with_bed
 
 from amrepair.frames import Transform
 from amrepair.loop import LoopReport, Stop
-from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.check import check
 from gcode.hosts.port import PrintReport
@@ -37,17 +35,6 @@ class Plate(Small):
             for k, b in enumerate(BLOCKS)
         ]
         return plate(stand).trim_by_plane((0.0, 0.0, -1.0), -self.top_mm).translate(PLACE_MM)
-
-
-def with_bed(solid: m3.Manifold) -> Scan:
-    """A cloud of what stands there and of the bed round it: where nothing is, the bed is seen."""
-    bed = m3.Manifold.cube((80.0, 40.0, 1.0)).translate((90.0, 80.0, -1.0))
-    mesh, rng = solid_mesh(solid + bed), np.random.default_rng(1)
-    points, faces = trimesh.sample.sample_surface(mesh, 40_000, seed=1)
-    up = points[:, 2] > -1e-6
-    normals = np.asarray(mesh.face_normals)[faces[up]].astype(np.float32).astype(np.float64)
-    noisy = np.asarray(points[up]) + rng.normal(scale=0.02, size=(int(up.sum()), 3))
-    return Scan(noisy, 0.02, "scanner", normals)
 
 
 @pytest.fixture(scope="module")

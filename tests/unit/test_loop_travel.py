@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import product
 
 import pytest
 
 from amrepair.loop import travel
+from gcode.check import check
+from gcode.errors import CheckRefusedError
 from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import read_job
@@ -54,3 +56,19 @@ def test_every_mode_comes_back(relative: bool, absolute_e: bool, inches: bool, t
         assert found.pop(name) == pytest.approx(wanted.pop(name), abs=2e-3), name
     assert found == wanted
     assert "M400" in sent[0]  # the scan waits for the last move
+
+
+def test_filament_that_was_pulled_back_is_pushed_without_melting() -> None:
+    """regression: 6 mm of a Bowden's retraction at 40 mm/s were 96 mm³/s to the checker.
+
+    A printer with more than 5 mm could not go on after its first look.
+    """
+    setup = load_setup("anycubic_kobra")
+    assert setup.printer.retraction_mm == 6.0
+    job = read_job(Program(HEAD, setup.printer.dialect))
+    state = job.state_after(HEAD.count("\n"))
+    _, parked = travel.park(setup, state)
+    back, _ = travel.way_back(setup, state, parked)
+    assert "G1 E6 F2400" in back.program.text
+    with pytest.raises(CheckRefusedError, match="melts more than the hotend can"):
+        check(back.program, setup, initial=replace(parked, pulled_mm=0.0))

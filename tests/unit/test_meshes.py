@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import manifold3d
@@ -88,6 +89,18 @@ def test_a_fan_of_many_faces_is_paired_at_once() -> None:
     up = np.stack([round_it, after, np.full(n, n, np.int32)], axis=1)
     down = np.stack([after, round_it, np.full(n, n + 1, np.int32)], axis=1)
     assert kernels.paired(np.concatenate([up, down]))[1] == 0
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_an_edge_of_many_faces_is_paired_at_once(apart: bool) -> None:
+    """regression: 80,000 faces round one edge, a file of 4 MB, took 10 s; now 0.02 s."""
+    n = 40_000
+    one, other = np.array([[0, 1, 2]], np.int32), np.array([[0, 2, 1]], np.int32)
+    pairs = [one.repeat(n, axis=0), other.repeat(n, axis=0)]
+    faces = np.concatenate(pairs) if apart else np.stack(pairs, axis=1).reshape(-1, 3)
+    begun = time.process_time()
+    assert kernels.paired(faces)[1] == 3 * (n - 1)
+    assert time.process_time() - begun < 2.0
 
 
 def body(size_mm: float, at_mm: float) -> trimesh.Trimesh:

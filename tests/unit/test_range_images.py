@@ -6,6 +6,7 @@ Truth is a ball on a plane, by intersection of rays (`tests/range_images.py`).
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from jaxtyping import TypeCheckError
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans import EDGE, FLYING, RangeGrid, Scan, read_scan, write_ply
+from amrepair.scans.viewpoint import _along_the_way, _Fit
 from tests.range_images import (
     CAMERA_MM,
     HOLE,
@@ -241,6 +243,27 @@ def test_a_plys_unit_is_taken_at_its_word(tmp_path: Path) -> None:
     assert np.array_equal(plain.edge, told_m.edge)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="furlong"):
         read_scan(tmp_path / "c.ply", frame="s")
+
+
+def test_a_sheet_of_rays_has_no_more_places_than_points() -> None:
+    """regression: 1.3 TB for the places of a file with one damaged depth."""
+    image = pushbroom()
+    points = image.xyz[image.seen]
+    points[3, 2] = 1e12
+    grid = RangeGrid.of_seen(image.seen)
+    fit = _Fit("pushbroom", 0.0, 0.0, along=0, centre=(0.0, 300.0))
+    found = _along_the_way(points, grid, points, fit)
+    assert len(found.sensors_mm) <= len(points)
+    assert found.sensor_index.max() < len(found.sensors_mm)
+
+
+def test_a_vertex_in_two_pixels_is_damage(tmp_path: Path) -> None:
+    """regression: another vertex was then in none, and its sensor's number was left to chance."""
+    path = tmp_path / "twice.ply"
+    write_ply_grid(path, pushbroom().xyz, "ascii")
+    path.write_text(re.sub(r"1 \d+((\n0)*\n)$", r"1 0\1", path.read_text()))
+    with pytest.raises(InputError, match=r"two pixels .* name one vertex"):
+        read_scan(path, frame="scanner")
 
 
 def test_a_depth_map_stands_where_its_pose_says(tmp_path: Path) -> None:

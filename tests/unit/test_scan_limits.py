@@ -82,6 +82,20 @@ def tiff(width: int, height: int) -> bytes:
     return bytes(data)
 
 
+def strips(rows: int) -> bytes:
+    """A TIFF of one packed strip whose directory promises many: the others were read as zeros."""
+    file = io.BytesIO()
+    image = np.ones((24, 32), np.float32)
+    tifffile.imwrite(file, image, compression="zlib", rowsperstrip=24)
+    data = bytearray(file.getvalue())
+    for kind, width in ((3, "<HHIH"), (4, "<HHII")):
+        found = data.find(struct.pack(width, 257, kind, 1, 24))
+        if found >= 0:
+            data[found : found + 12] = struct.pack("<HHII", 257, 4, 1, rows)
+            return bytes(data)
+    raise AssertionError("the tag is not where it is looked for")
+
+
 def camera(width: int, height: int) -> bytes:
     return json.dumps(
         {"fx": 100, "fy": 100, "cx": 5, "cy": 5, "width": width, "height": height,
@@ -121,6 +135,11 @@ PROMISES: dict[str, Callable[[], dict[str, bytes]]] = {
     "ply of 10^12 faces": lambda: {
         "a.ply": ply("3", "ascii", "element face 1000000000000\nproperty list uchar int v\n")
     },
+    "ply of an element without properties": lambda: {
+        "a.ply": ply(
+            "3", "binary_little_endian", "element face 1\nproperty list uchar int v\n"
+        ).replace(b"property float", b"prXperty float")
+    },
     "ply of 10^12 pixels": lambda: {
         "a.ply": ply("3", "binary_little_endian", "obj_info num_cols 1000000\nobj_info num_rows "
                      "1000000\nelement range_grid 1000000000000\nproperty list uchar int v\n")
@@ -132,6 +151,7 @@ PROMISES: dict[str, Callable[[], dict[str, bytes]]] = {
     "tiff of a terapixel": lambda: {
         "a.tif": tiff(1_000_000, 1_000_000), "a.json": camera(1_000_000, 1_000_000)
     },
+    "height map of strips that are not there": lambda: {"a.tif": strips(40_000)},
     "height map of a terapixel": lambda: {"a.tif": tiff(1_000_000, 1_000_000)},
     "3mf that swells": lambda: {"a.3mf": zipped({"3D/3dmodel.model": b" " * 200_000_000})},
     "3mf whose entities grow": lambda: {"a.3mf": zipped({"3D/3dmodel.model": ENTITIES})},

@@ -172,6 +172,42 @@ def test_on_a_slope_the_jobs_steps_come_back():
     assert by_line.max() < 1.05 * by_line.min()
 
 
+def crossing(z_mm: float) -> JobLines:
+    """Lines along Y, 3 mm apart: sparse infill under a line along X."""
+    x = X0 + np.arange(1.0, LONG_MM, 3.0)
+    start = np.column_stack([x, np.full(len(x), Y0), np.full(len(x), z_mm)])
+    same = np.full(len(x), HIGH_MM)
+    end = start + np.array([0.0, 40 * WIDE_MM, 0.0])
+    return JobLines(start, end, WIDE_MM * same, same, np.zeros(len(x), dtype=bool))
+
+
+def bars(z_mm: float, high_mm: float) -> m3.Manifold:
+    """What `crossing` is when laid, so high as is said."""
+    each = m3.Manifold.cube((WIDE_MM, 40 * WIDE_MM, HIGH_MM)).translate(
+        (-0.5 * WIDE_MM, Y0, high_mm - HIGH_MM)
+    )
+    places = crossing(z_mm).start_mm[:, 0]
+    return m3.Manifold.batch_boolean([each.translate((x, 0.0, 0.0)) for x in places], m3.OpType.Add)
+
+
+@pytest.mark.parametrize("rounded_mm", [0.0, 0.08])
+def test_over_open_cells_a_line_gets_what_the_job_laid_there(rounded_mm: float) -> None:
+    # regression: the gap down to the next line but one was filled, 1.6 times the line's plastic,
+    # and what a scanner's spot had rounded off the lines below was laid onto them
+    below_mm = TOP_MM - HIGH_MM
+    lower = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, below_mm - HIGH_MM)).translate((X0, Y0, 0.0))
+    stands = lower + bars(below_mm, below_mm - rounded_mm)
+    missing = slab((4.0, 16.0), (20, 21), TOP_MM - HIGH_MM) + (
+        bars(below_mm, below_mm) ^ slab((4.0, 16.0), (20, 21), below_mm - rounded_mm)
+    )
+    one = np.arange(40) == 20
+    field = HeightField.from_manifold(stands, 0.1, margin_mm=15.0)
+    plan = patched(missing, field, stacked(crossing(below_mm), hatch(TOP_MM).some(one)))
+    assert set(beads_of(plan)[:, 2].round(3)) == {TOP_MM}
+    laid = 12.0 * WIDE_MM * HIGH_MM
+    assert plan.beads_mm3 == pytest.approx(BOND_RATIO * laid, rel=0.12)
+
+
 def test_without_lines_there_it_draws_its_own():
     missing = slab((5.0, 15.0), (10, 16), TOP_MM - 2 * HIGH_MM)
     elsewhere = hatch(0.4)

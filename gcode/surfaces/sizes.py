@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from amrepair.errors import InputError
+import tifffile
+
+from gcode.errors import InputError
 
 # What the libraries that read meshes, images and archives are known to raise on damaged files.
 PARSER_ERRORS = (
@@ -19,6 +26,7 @@ PARSER_ERRORS = (
     ImportError,
     LookupError,
     MemoryError,
+    NameError,
     NotImplementedError,
     OSError,
     RecursionError,
@@ -28,9 +36,11 @@ PARSER_ERRORS = (
     TypeError,
     ValueError,
     struct.error,
+    tifffile.TiffFileError,
     zipfile.BadZipFile,
     zlib.error,
 )
+RAW_TIFF = 1  # TIFF's number for no compression
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +71,7 @@ class UnpackLimit:
         if unpacked_bytes > most:
             raise InputError(
                 f"{path}: {packed_bytes} compressed bytes should unpack to {unpacked_bytes}, the "
-                f"limit is {most:.0f}; the file is damaged or a trap, else export it uncompressed"
+                f"limit is {most:.0f}; the file is damaged or a trap, else export it uncompressed."
             )
 
 
@@ -76,7 +86,7 @@ def refuse_short(path: Path, what: str, need_bytes: int, have_bytes: int) -> Non
     if need_bytes > have_bytes:
         raise InputError(
             f"{path}: the file promises {what}, at least {need_bytes} bytes, and has {have_bytes}; "
-            "it is cut off or damaged"
+            "it is cut off or damaged."
         )
 
 
@@ -91,10 +101,45 @@ def length_of(path: Path) -> int:
     try:
         return path.stat().st_size
     except OSError as e:
-        raise InputError(f"{path}: the file cannot be read ({e.strerror})") from e
+        raise InputError(f"{path}: the file cannot be read ({e.strerror}).") from e
 
 
 def in_words(error: BaseException) -> str:
     """What a foreign error says, on one line; its kind where it says nothing."""
     said = " ".join(str(error).split())
     return said[:200] or type(error).__name__
+
+
+def refuse_swollen_page(path: Path, page: Any, limit: UnpackLimit) -> None:
+    """Refuse a page of a TIFF that the file cannot hold.
+
+    Raises
+    ------
+    InputError
+        If it is larger than what is stored of it, or swells beyond the limit.
+    """
+    size = length_of(path)
+    what = "an image of " + " × ".join(str(n) for n in page.shape)
+    promised, there = math.prod(page.chunked), len(page.dataoffsets)
+    if there < promised:  # what is not there would be read as zeros
+        raise InputError(
+            f"{path}: {what} is in {promised} pieces, and the file has {there}; it is cut off or "
+            "damaged."
+        )
+    if page.compression == RAW_TIFF:
+        refuse_short(path, what, page.nbytes, size)
+    else:
+        limit.refuse(path, page.nbytes, min(size, sum(page.databytecounts)))
+
+
+@contextmanager
+def quiet_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
+    """A TIFF file, opened; what its reader finds odd is told once, by whoever asked."""
+    said = logging.getLogger("tifffile")
+    level = said.level
+    said.setLevel(logging.CRITICAL)
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            yield tiff
+    finally:
+        said.setLevel(level)

@@ -1,0 +1,86 @@
+"""What a stop leaves under layers that were printed since, and the ways to get at it.
+
+Facts for the policy's table: nothing is decided, cut or printed here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from amrepair.loop.looks import Look, Stop
+from amrepair.policy import USUAL_POLICY, PolicyOptions
+from amrepair.policy.ways import Way
+from amrepair.repair import RepairPlan
+from gcode.estimate import estimate
+from gcode.moves import Program
+from gcode.profiles import PrintSetup
+from gcode.reader import Job
+from gcode.slicing.patch import PatchRegion
+
+
+def pieces_of(plan: RepairPlan, here: Sequence[Look]) -> tuple[PatchRegion, ...]:
+    """Pieces of what is missing at a stop, and how far they are, or were, filled.
+
+    A repair covers what it could not get to, so that no later look sees that: what was printed last
+    at this stop tells of it. `here` are its earlier looks.
+    """
+    printed = [look.plan for look in here if look.printed]
+    patch = printed[-1].patch if printed else plan.patch
+    return () if patch is None else patch.regions
+
+
+def buried(
+    pieces: Sequence[PatchRegion], stop: Stop, layer_mm: float, policy: PolicyOptions = USUAL_POLICY
+) -> tuple[PatchRegion, ...]:
+    """Pieces that begin a layer or more below the one just printed, and are not filled whole."""
+    deep_mm = policy.one_layer * layer_mm
+    return tuple(
+        piece
+        for piece in pieces
+        if piece.reachable_ratio < 1.0 and stop.z_mm - piece.box_mm[2] >= deep_mm
+    )
+
+
+def buried_mm3(pieces: Sequence[PatchRegion]) -> float:
+    """Volume of them that stays open."""
+    return float(sum(piece.volume_mm3 * (1.0 - piece.reachable_ratio) for piece in pieces))
+
+
+def ways(pieces: Sequence[PatchRegion], job: Job, stop: Stop, setup: PrintSetup) -> tuple[Way, ...]:
+    """Cut down to the layer under the lowest piece and print again from there; or let it be.
+
+    A piece that begins in the first layer is no part to be cut down: then nothing is left but to
+    let it be, or to print it anew.
+    """
+    open_mm3 = buried_mm3(pieces)
+    leave = Way("leave", 0.0, open_mm3)
+    first = _first_layer(job, min(piece.box_mm[2] for piece in pieces))
+    if first is None:
+        return (leave,)
+    beads, layer = job.beads, job.layers[first]
+    again = (beads.layer >= first) & (beads.line < stop.line)
+    length_mm = np.linalg.norm(beads.end_mm[again] - beads.start_mm[again], axis=1)
+    reprint = Way(
+        "reprint", open_mm3, 0.0,
+        print_time_s=_seconds(job, stop.line, setup) - _seconds(job, layer.first_line, setup),
+        filament_mm3=float(length_mm @ beads.section_mm2[again]),
+        layer=first, cut_to_mm=job.layers[first - 1].z_mm,
+    )  # fmt: skip
+    return (reprint, leave)
+
+
+def _first_layer(job: Job, low_mm: float) -> int | None:
+    """The layer in which something begins; None in the first one."""
+    tops_mm = np.array([layer.z_mm for layer in job.layers])
+    half_mm = np.array([0.5 * layer.height_mm for layer in job.layers])
+    # less of a layer than half is what solids are wrong by
+    over = np.flatnonzero(tops_mm - half_mm > low_mm)
+    return int(over[0]) if len(over) and over[0] > 0 else None
+
+
+def _seconds(job: Job, line: int, setup: PrintSetup) -> float:
+    """Time of the job's moves up to a line."""
+    text = "\n".join(job.program.text.split("\n")[:line]) + "\n"
+    return estimate(Program(text, job.program.dialect), setup.printer).print_time_s
