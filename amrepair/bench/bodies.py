@@ -4,22 +4,25 @@ An alignment of the whole lays the piece that was seen most on the template, or 
 the scan somewhere else, where more of it lies nearly right. What tells is how much lies on the
 template *within the noise*: of a bent part hardly more than one piece in any pose, all of it in
 two poses that agree along a hinge. Of the two pieces the one that makes up more of the *template*
-is taken to be in place. It judges poses; it makes no scores.
+is taken to be in place. A part that is bent by less than an alignment tells is found by what the
+motions of both sides of a cut explain (`bends`). It judges poses; it makes no scores.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
+from scipy.stats import chi2
 
-from amrepair.align.refine import refine_all
+from amrepair.align.refine import Prior, refine_all
 from amrepair.align.search import THOROUGH, CoarseField, search
 from amrepair.align.thinning import Thinned
-from amrepair.frames import moved, rotation_from_vector, ways_across
+from amrepair.bench.bends import best_cuts
+from amrepair.frames import moved, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
 LEAST_BENT_SHARE = 0.1  # of the points: with fewer off the template nothing was bent
@@ -56,18 +59,53 @@ MOST_OF_BROKEN = 0.5  # where a pose holds more, the rest is a matter of its own
 MOST_OUTSIDE = 0.01  # of the points, beyond the noise, where something broke off
 SUNK_RATIOS = (0.01, 0.003)  # the loss's scale to begin with, of the diagonal
 SURFACE_RATIO = 1.0 / 60.0  # spacing of the template's points, of the diagonal
+# A bend that is looked for: noise alone has such a gain in one of so many scans.
+BENT_GAIN = float(chi2.isf(1e-6, 6))
+BENT_SCALE_RATIO = 0.01  # of the diagonal: scale of the loss, where pieces begin
+CUT_RANGE = (0.1, 0.9)  # of the points: shares below a cut
+# Of what is off in one pose, within the limit, two explain so much more: of bends of 0.6° 0.15, of
+# sound views, whose pieces slide along what the template is off by, up to 0.07.
+LEAST_EXPLAINED = 0.1
 
 Pose = Float[np.ndarray, "4 4"]
 
 
-def standing_pose(
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """A part in one piece, or in two that stand in poses of their own.
+
+    Attributes
+    ----------
+    pose
+        (4, 4) template from scan, of the piece that stands where it was.
+    other
+        The same of the other piece; None where there is none.
+    normal, through_mm
+        Of the plane between them, template frame, away from the standing one.
+    """
+
+    pose: Pose
+    other: Pose | None = None
+    normal: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    through_mm: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
+
+    def moved_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) how far points of the scan, in its frame, were moved with the other piece."""
+        if self.other is None:
+            return np.zeros(len(points_mm))
+        here, home = moved(points_mm, self.pose), moved(points_mm, self.other)
+        beyond = (here - self.through_mm) @ self.normal > 0.0
+        return np.asarray(np.where(beyond, np.linalg.norm(here - home, axis=1), 0.0))
+
+
+def pieces_of(
     points_mm: Float[np.ndarray, "n 3"],
     template: Template,
     known: Sequence[Pose],
     sigma_mm: float,
     rng: np.random.Generator,
-) -> Pose:
-    """The pose of the larger piece, where the scan shows a part bent in two.
+) -> Pieces:
+    """The larger piece's pose, and the other's, where the scan shows a part bent in two.
 
     Else the pose in which most of it is held; the first given where that explains nearly all.
 
@@ -82,15 +120,14 @@ def standing_pose(
     """
     thinned = Thinned(points_mm, rng)
     limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * _diagonal_mm(template))
-    off_mm = np.abs(template.distance(moved(thinned.to(BODY_POINTS), known[0])))
-    if (off_mm > limit_mm).mean() < LEAST_BENT_SHARE:
-        return known[0]
     scene = _Scene.of(thinned, template, sigma_mm, limit_mm)
+    if (~scene.on(known[0])).mean() < LEAST_BENT_SHARE:
+        return _little_bent(known[0], scene)
     tried = scene.distinct(scene.refined(scene.thinned.to(START_POINTS), known))
     best = _best_pair(tried, scene)
     if best is None or not best.is_enough:
-        field = CoarseField.of(template)
-        found = [pose.matrix for pose in search(scene.thinned, field, effort=THOROUGH)]
+        coarse = CoarseField.of(template)
+        found = [pose.matrix for pose in search(scene.thinned, coarse, effort=THOROUGH)]
         more = scene.distinct([*tried, *scene.refined(scene.thinned.to(START_POINTS), found)])
         untried = [pose for pose in more if not any(pose is one for one in tried)]
         best = _best_pair(untried[:MOST_TRIED], scene, best)
@@ -98,12 +135,68 @@ def standing_pose(
     alone = scene.held(scene.on(tried[0]))
     gained = 0.0 if best is None else best.explained - alone
     if best is not None and best.beyond >= LEAST_OF_PAIR and gained >= LEAST_GAINED:
-        return scene.finished(best.standing, best.normal, best.through_mm)
+        return Pieces(
+            scene.finished(best.standing, best.normal, best.through_mm),
+            scene.finished(best.other, -best.normal, best.through_mm),
+            best.normal,
+            best.through_mm,
+        )
     if alone < MOST_OF_BROKEN:
         broken = _nothing_outside(tried, scene)
         if broken is not None:
-            return broken
-    return scene.finished(tried[0])
+            return Pieces(broken)
+    return _little_bent(scene.finished(tried[0]), scene)
+
+
+def _little_bent(pose: Pose, scene: _Scene) -> Pieces:
+    """The pose, or those of two pieces where these explain more than noise does."""
+    cuts = best_cuts(
+        moved(scene.cloud, pose),
+        scene.template,
+        scene.surface_mm,
+        scale_mm=BENT_SCALE_RATIO * scene.diagonal_mm,
+        sigma_mm=max(scene.sigma_mm, CLEAR_RATIO / CLEAR_SIGMAS * scene.diagonal_mm),
+    )
+    if cuts[0].gain < BENT_GAIN:
+        return Pieces(pose)
+    whole = scene.refined(scene.cloud, [pose], BENT_SCALE_RATIO)[0]
+    alone = float(scene.off(whole).mean())
+    best: tuple[float, Pieces] | None = None
+    for cut in cuts[:2]:
+        explained, pieces = _parted(whole, cut.normal, cut.height_mm, scene)
+        if pieces.other is None or _hinge(pieces.other @ np.linalg.inv(pieces.pose), scene) is None:
+            continue  # what slid along a flat or round face is no bend
+        if best is None or explained < best[0]:
+            best = explained, pieces
+    if best is None or best[0] > (1.0 - LEAST_EXPLAINED) * alone:
+        return Pieces(pose)
+    return best[1]
+
+
+def _parted(
+    whole: Pose, axis: Float[np.ndarray, " 3"], height_mm: float, scene: _Scene
+) -> tuple[float, Pieces]:
+    """What is off, and the pieces on either side of a cut: each moved by itself, then the cut."""
+    cloud = scene.cloud
+    height = scene.feet(whole) @ axis
+    order = np.argsort(height)
+    first, last = (int(share * len(order)) for share in CUT_RANGE)
+    poses, off, at = [whole, whole], [np.zeros(len(cloud))] * 2, height_mm
+    for round_ in range(BODY_ROUNDS // 2):
+        for k, own in enumerate((height < at, height >= at)):
+            scale = BENT_SCALE_RATIO if round_ == 0 else 0.0
+            some = np.ascontiguousarray(cloud[own])
+            poses[k] = scene.refined(some, [poses[k]], scale, held=True)[0]
+            off[k] = scene.off(poses[k])
+        below = np.cumsum(off[0][order])
+        beyond = np.cumsum(off[1][order][::-1])[::-1]
+        cut = first + int(np.argmin(below[first : last - 1] + beyond[first + 1 : last]))
+        at = float(height[order[cut + 1]])
+    off_mean = float(np.where(height < at, off[0], off[1]).mean())
+    surface = scene.surface_mm @ axis
+    stands = 0 if (surface < at).mean() > 0.5 else 1
+    normal = axis if stands == 0 else -axis
+    return off_mean, Pieces(poses[stands], poses[1 - stands], normal, at * axis)
 
 
 def _nothing_outside(poses: Sequence[Pose], scene: _Scene) -> Pose | None:
@@ -154,6 +247,7 @@ class _Pair:
     explained: float
     beyond: float
     standing: Pose
+    other: Pose
     normal: Float[np.ndarray, " 3"]
     through_mm: Float[np.ndarray, " 3"]
 
@@ -203,6 +297,23 @@ class _Scene:
         placed = moved(self.cloud if points is None else points, pose)
         return np.abs(self.template.distance(placed)) <= self.limit_mm
 
+    @property
+    def prior(self) -> Prior:
+        """A piece lies near where the whole does: a flat one must not slide."""
+        shift_mm = SECOND_PIECE_RATIO * self.diagonal_mm
+        return Prior(np.full(3, PIECE_TURN_RAD), np.full(3, shift_mm))
+
+    def off(self, pose: Pose) -> Float[np.ndarray, " n"]:
+        """(n,) how far off the template the points lie, in limits; 1 beyond it."""
+        distance = np.abs(self.template.distance(moved(self.cloud, pose)))
+        return np.asarray(np.minimum(distance / self.limit_mm, 1.0))
+
+    def feet(self, pose: Pose) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) places of the template's surface that the points lie over."""
+        placed = moved(self.cloud, pose)
+        f_mm, gradient = self.template.distance_and_gradient(placed)
+        return np.asarray(placed - f_mm[:, None] * unit_vectors(gradient))
+
     def refined(
         self,
         points: Float[np.ndarray, "k 3"],
@@ -210,10 +321,12 @@ class _Scene:
         first_ratio: float = FIRST_PIECE_RATIO,
         *,
         outside: bool = True,
+        held: bool = False,
     ) -> list[Pose]:
         """Poses moved so that as many of the points as may be lie on the template.
 
-        Unless `outside`, those beyond it are drawn in from anywhere.
+        Unless `outside`, those beyond it are drawn in from anywhere. If `held`, what the points do
+        not tell of a pose stays.
         """
         end_mm = SHARP * self.limit_mm
         found = refine_all(
@@ -226,6 +339,7 @@ class _Scene:
             max_iterations=ITERATIONS,
             enough_mm=ENOUGH_SIGMAS * self.sigma_mm,
             outside_mm=0.0 if outside else end_mm,
+            prior=self.prior if held else None,
         )
         return [one.matrix for one in found]
 
@@ -369,8 +483,10 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     share = float(held.mean())
     share_beyond = float(held[beyond].mean()) if beyond.mean() > LEAST_BEYOND else share
     in_front = float(((scene.surface_mm - through) @ normal > 0.0).mean())
-    standing, away = (second, -normal) if in_front > 0.5 else (first, normal)
-    return _Pair(share, share_beyond, standing, away, through)
+    (standing, other), away = (
+        ((second, first), -normal) if in_front > 0.5 else ((first, second), normal)
+    )
+    return _Pair(share, share_beyond, standing, other, away, through)
 
 
 def _hinge(

@@ -1,8 +1,9 @@
-"""`pasdf`, our own method: the class's template, robust alignment, a score on the field.
+"""`pasdf`, our own method: the class's template, robust alignment, a test against sound clouds.
 
-It stands on `template` and `align`. The score is in standard deviations of what sound parts leave
-there, noise and spread together, and averages the signed field over neighbours before taking its
-size: noise falls with the root of their number, a defect's offset does not.
+It stands on `template`, `align` and `regions`. A point's score is in standard errors of what sound
+clouds leave there, and averages the signed deviation over neighbours before taking its size: noise
+falls with the root of their number, a defect's offset does not. What a bend moved along the surface
+scores by how far it was moved. The object's score is the test's p-value.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import align
 from amrepair.align.thinning import order_of
-from amrepair.bench.bodies import standing_pose
+from amrepair.bench.bodies import pieces_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge import fit_from_scans
+from amrepair.regions.sound import SoundTest
 from amrepair.scans.scan import Scan
 from amrepair.template import (
     GridSdf,
@@ -50,13 +52,14 @@ NEAR_NEIGHBOURS = 12
 WIDE_PASSES = 5  # means of means: as far as 64 neighbours, found in a quarter of the time
 WIDE_WEIGHT = 0.5
 LEAST_SET_SIGMA_MM = 0.001 * DIAGONAL_MM
-TOP_RATIO = 0.004
-MIN_TOP = 12
 # Farther out than this share of the part nothing more is learned: clutter must not set the score.
 MAX_OFFSET_RATIO = 0.15
 REPAIR_POINTS = 16_384
 SURFACE_SPACING_MM = 0.3  # of the extracted surface; at 0.5 thin walls are off by 2.5 times as much
 RETRIES = 3
+# So near to the template, of the diagonal, sound clouds lie, or a pose is not told by it; where
+# less of a sample lies so, it is laid wrong, and all of it is asked.
+FOLLOWED_RATIO, LEAST_FOLLOWED = 0.002, 0.5
 # Where the surface fused from clouds lies far off, the second look is from nearer by.
 LEARNING_ROUNDS = 2
 
@@ -106,17 +109,14 @@ def _from_clouds(data: ClassInput, seed: int) -> GridSdf:
     return template
 
 
-def _place(
+def _laid(
     points_mm: Float[np.ndarray, "n 3"],
     template: Template,
     *,
     sigma_mm: float,
     rng: np.random.Generator,
-) -> Float[np.ndarray, "n 3"]:
-    """Points in the template's frame, the larger piece of a bent part in its place.
-
-    A failed alignment is tried again with other draws.
-    """
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Poses of points in the template, the best first; a failed alignment is tried again."""
     scan = Scan(points_mm, sigma_mm, "scanner", source="sample")
     for attempt in range(RETRIES):
         try:
@@ -127,9 +127,7 @@ def _place(
             _log.info("alignment failed (%s); trying again", error)
         else:
             poses = (found.template_from_scan, *found.symmetric_alternatives)
-            known = [pose.matrix for pose in poses]
-            matrix = standing_pose(points_mm, template, known, sigma_mm, rng)
-            return points_mm @ matrix[:3, :3].T + matrix[:3, 3]
+            return [pose.matrix for pose in poses]
     raise AlignmentError("no alignment was tried")  # RETRIES is at least one
 
 
@@ -193,34 +191,31 @@ def smoothed_score(
     return score
 
 
-def top_mean(score: Float[np.ndarray, " n"], count: int) -> float:
-    """Mean of the `count` highest scores."""
-    count = min(count, len(score))
-    return float(np.partition(score, len(score) - count)[len(score) - count :].mean())
-
-
 @dataclass(frozen=True, slots=True)
 class FieldModel:
-    """A template and how to score against it."""
+    """A template, and the test of what sound clouds leave in it."""
 
     template: Template
     sigma_mm: float
+    sound: SoundTest
     template_distance: CloudDistance | None
 
     def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
-        """Align, ask the field, score; what cannot be aligned is not this part."""
+        """Align, test, score; what cannot be aligned is not this part."""
         try:
-            placed = _place(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)
+            known = _laid(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)
         except AlignmentError:
             return Scores(np.zeros(len(points_mm)), np.inf, None, aligned=False)
-        offset_mm = self.template.distance(placed)
-        spread = getattr(self.template, "spread_mm", None)
-        spread_mm = np.zeros(len(placed)) if spread is None else spread(placed)
-        # Published clouds may have neither noise nor spread; the unit does not matter then.
-        sigma_mm = np.hypot(max(self.sigma_mm, LEAST_SET_SIGMA_MM), spread_mm)
-        score = smoothed_score(placed, offset_mm, sigma_mm)
-        top = max(MIN_TOP, int(TOP_RATIO * len(score)))
-        return Scores(score, top_mean(score, top), np.abs(offset_mm))
+        followed = self.sound.followed_at(moved(points_mm, known[0]), FOLLOWED_RATIO * DIAGONAL_MM)
+        some = points_mm[followed] if followed.mean() > LEAST_FOLLOWED else points_mm
+        pieces = pieces_of(some, self.template, known, self.sigma_mm, rng)
+        placed = moved(points_mm, pieces.pose)
+        judged = self.sound.judge(placed)
+        # Published clouds may have no noise at all; the unit does not matter then.
+        sigma_mm = np.maximum(judged.sigma_mm, LEAST_SET_SIGMA_MM)
+        score = smoothed_score(placed, judged.off_mm, sigma_mm)
+        aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, LEAST_SET_SIGMA_MM)
+        return Scores(score + aside, -judged.log_expected, np.abs(self.template.distance(placed)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,9 +223,26 @@ class FieldMethod:
     """The fast template with robust alignment."""
 
     def fit(self, data: ClassInput, *, seed: int, cache: Path) -> Model:
-        """Fit the template, and measure it."""
+        """Fit the template, measure it, and test the training clouds against each other.
+
+        Raises
+        ------
+        AlignmentError
+            If no training cloud can be laid in the template.
+        """
         template = class_template(data, seed, cache)
         distance = repair_distance(template, data, np.random.default_rng(seed))
-        model = FieldModel(template, data.sigma_mm, distance)
+        rng = np.random.default_rng(seed)
+        laid, refused = [], None
+        for cloud in data.clouds_mm:
+            try:
+                pose = _laid(cloud, template, sigma_mm=data.sigma_mm, rng=rng)[0]
+            except AlignmentError as error:
+                refused = error
+            else:
+                laid.append(moved(cloud, pose))
+        if refused is not None and not laid:
+            raise refused
+        model = FieldModel(template, data.sigma_mm, SoundTest.of(template, laid), distance)
         model.score(data.clouds_mm[0], np.random.default_rng(seed))  # compiled before it is timed
         return model

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.pam import PUBLISHED_PAM, RELEASED_PAM, PamError, PamOptions, pam
 from amrepair.bench.baselines import Aligner
-from amrepair.bench.house import class_template, repair_distance, top_mean
+from amrepair.bench.house import class_template, repair_distance
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
 from amrepair.bench.samples import Format
@@ -107,6 +107,12 @@ def make_pam_aligner(data: ClassInput, seed: int, cache: Path) -> Aligner:
         return placed, target.residual(placed)
 
     return place
+
+
+def top_mean(score: Float[np.ndarray, " n"], count: int) -> float:
+    """Mean of the `count` highest scores."""
+    count = min(count, len(score))
+    return float(np.partition(score, len(score) - count)[len(score) - count :].mean())
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ from gcode.whole import left_behind, write_bytes
 
 DEFAULT_SEEDS = (0, 1, 2)
 # Raised when scores of the same name would come out differently: old cells are then refused.
-SCORES_LAYOUT_VERSION = 2
+SCORES_LAYOUT_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,6 +72,8 @@ class SynthOptions:
         and other defects are as much smaller.
     smooth_ratio
         Share of bulges and concavities that run out smoothly, without an edge.
+    mesh
+        Whether Anomaly-ShapeNet's layout gets the normal shape; without, training clouds alone.
     """
 
     train: int = 4
@@ -82,6 +84,7 @@ class SynthOptions:
     single_view_ratio: float | None = None
     smallest_ratio: float | None = None
     smooth_ratio: float = 0.0
+    mesh: bool = True
 
     def __post_init__(self) -> None:
         if min(self.train, self.normal, self.per_defect) < 1 or self.points < 500:
@@ -209,7 +212,7 @@ def _write_class(
     vertices = np.array(mesh.vertices, dtype=np.float64)
     faces = np.array(mesh.faces, dtype=np.int64)
     part = make_part(vertices, faces, np.random.default_rng([*key, 0]))
-    if layout is Format.SHAPENET:
+    if layout is Format.SHAPENET and options.mesh:
         _write_obj(out / "dataset" / "obj" / name / "train" / f"{name}_template0.obj", part.shape)
     samples: dict[str, object] = {}
     for made in _make_all(part, options, layout, key):

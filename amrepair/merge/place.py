@@ -78,16 +78,16 @@ def place(
         begun = on_turntable(views, turntable_deg, size_mm, options)
     else:
         begun = _as_given(views, options)
-    begun, _ = _held(views, begun, rng, options)
+    begun, begun_rmse_mm = _held(views, begun, rng, options)
     graph = grouped(views, size_mm, options, begun=begun, progress=progress)
     progress("refine poses", 0.0, 1.0)
     found = graph.groups[0]
     left_out = {k: _why(graph, k) for k in range(len(views)) if k not in found}
-    poses, rmse_mm = _refined(views, found, rng)
-    poses, dropped = _consistent(views, poses, options)
-    left_out |= dropped
-    if dropped and len(poses) > 1:
-        poses, rmse_mm = _refined(views, poses, rng)
+    if begun_rmse_mm is not None and found.keys() == begun.keys():
+        poses, rmse_mm = found, begun_rmse_mm  # nothing came to what is refined and agrees
+    else:
+        poses, rmse_mm, dropped = _agreed(views, found, rng, options)
+        left_out |= dropped
     if 2 * len(poses) <= len(views):
         raise AlignmentError(_said_apart(graph, left_out))
     home = np.linalg.inv(poses[min(poses)])
@@ -119,13 +119,27 @@ def _as_given(views: Sequence[View], options: MergeOptions) -> Placed:
 
 def _held(
     views: Sequence[View], begun: Placed, rng: np.random.Generator, options: MergeOptions
-) -> tuple[Placed, dict[int, str]]:
-    """Poses that were told, refined; without those that the views contradict."""
+) -> tuple[Placed, float | None]:
+    """Poses that were told, refined, without those that the views contradict; and the residual.
+
+    None where some were contradicted: the others are to be refined without them.
+    """
     if len(begun) < 2:
-        return {}, {}
-    poses, _ = _refined(views, begun, rng)
+        return {}, None
+    poses, rmse_mm = _refined(views, begun, rng)
     kept, dropped = _consistent(views, poses, options)
-    return (kept if len(kept) > 1 else {}), dropped
+    return (kept if len(kept) > 1 else {}), (None if dropped else rmse_mm)
+
+
+def _agreed(
+    views: Sequence[View], found: Placed, rng: np.random.Generator, options: MergeOptions
+) -> tuple[Placed, float, dict[int, str]]:
+    """Poses refined together, the residual, and why views that contradict them were left out."""
+    poses, rmse_mm = _refined(views, found, rng)
+    poses, dropped = _consistent(views, poses, options)
+    if dropped and len(poses) > 1:
+        poses, rmse_mm = _refined(views, poses, rng)
+    return poses, rmse_mm, dropped
 
 
 def _refined(

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from amrepair.align import Registration, align
 from amrepair.align.search import PIECE, QUICK_EFFORT, CoarseField, search, spread_rotations
 from amrepair.align.thinning import Thinned, in_order, thin_out
-from amrepair.bench.bodies import standing_pose
+from amrepair.bench.bodies import pieces_of
 from amrepair.errors import AlignmentError
 from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan
@@ -198,7 +198,7 @@ def test_the_larger_piece_of_a_bent_part_stands(
     by_end[:3, :3], by_end[:3, 3] = turn.T, hinge - turn.T @ hinge
     monkeypatch.setattr("amrepair.bench.bodies.search", lambda *_, **__: [])
     for start in (np.eye(4), by_end):
-        pose = standing_pose(points, plate, [start], SIGMA_MM, np.random.default_rng(0))
+        pose = pieces_of(points, plate, [start], SIGMA_MM, np.random.default_rng(0)).pose
         assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.002
 
 
@@ -213,7 +213,7 @@ def test_the_larger_piece_stands_where_the_view_shows_more_of_the_other(
     beyond = np.maximum(points[:, 0] - 34.0, 0.0)  # 26 of 60 mm are bent up
     points[:, 2] += beyond * np.tan(np.deg2rad(7.0))
     points += np.random.default_rng(3).normal(0, SIGMA_MM, points.shape)
-    pose = standing_pose(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(0))
+    pose = pieces_of(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(0)).pose
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.005
 
 
@@ -228,8 +228,30 @@ def test_a_wide_bend_is_one_in_every_draw(seed: int, monkeypatch: pytest.MonkeyP
     beyond = np.maximum(points[:, 0] - 43.0, 0.0)
     points[:, 2] += (along**2 / 36.0 + beyond) * np.tan(np.deg2rad(9.0))
     points += np.random.default_rng(3).normal(0, SIGMA_MM, points.shape)
-    pose = standing_pose(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(seed))
+    pose = pieces_of(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(seed)).pose
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.05
+
+
+@pytest.mark.parametrize(("turned_deg", "smaller"), [(1.0, True), (1.0, False), (0.0, True)])
+def test_a_little_bend_tells_how_far_the_smaller_piece_was_moved(
+    turned_deg: float, smaller: bool
+) -> None:
+    """By 0.35 mm at most, mostly along its sides; a sound part has one piece."""
+    plate = difference(box((0, 0, 0), (60, 20, 4)), box((50, 12, -1), (61, 21, 5)))
+    points = sample_surface(plate.body, 0.6, seed=5)[0]
+    beyond = points[:, 0] > 40.0 if smaller else points[:, 0] < 20.0
+    hinge = np.array([40.0 if smaller else 20.0, 0.0, 0.0])
+    turn = rotation_from_vector(np.array([0.0, -np.deg2rad(turned_deg), 0.0]))
+    home = points.copy()
+    points[beyond] = (points[beyond] - hinge) @ turn.T + hinge
+    truth_mm = np.linalg.norm(points - home, axis=1)
+    points += np.random.default_rng(5).normal(0, SIGMA_MM, points.shape)
+    pieces = pieces_of(points, plate, [np.eye(4)], SIGMA_MM, np.random.default_rng(0))
+    assert np.abs(pieces.pose - np.eye(4))[:3, :3].max() < 0.002
+    assert (pieces.other is None) == (turned_deg == 0.0)
+    off_mm = np.abs(pieces.moved_mm(points) - truth_mm)
+    assert float(np.median(off_mm[beyond])) < 0.05
+    assert float(np.quantile(off_mm, 0.95)) < 0.1
 
 
 @pytest.mark.slow
@@ -242,7 +264,7 @@ def test_a_bent_part_that_was_laid_elsewhere_is_found() -> None:
     points += np.random.default_rng(5).normal(0, SIGMA_MM, points.shape)
     elsewhere = np.diag([1.0, -1.0, -1.0, 1.0])
     elsewhere[:3, 3] = 0.0, 20.0, 4.0
-    pose = standing_pose(points, plate, [elsewhere], SIGMA_MM, np.random.default_rng(0))
+    pose = pieces_of(points, plate, [elsewhere], SIGMA_MM, np.random.default_rng(0)).pose
     assert np.abs(pose - np.eye(4))[:3, :3].max() < 0.002
 
 
@@ -263,7 +285,7 @@ def test_a_broken_face_is_not_laid_on_the_side_that_is_gone(
     points += rng.normal(0, SIGMA_MM, points.shape)
     on_the_side = np.eye(4)
     on_the_side[0, 3] = gone_mm
-    pose = standing_pose(points, plate, [on_the_side], SIGMA_MM, np.random.default_rng(0))
+    pose = pieces_of(points, plate, [on_the_side], SIGMA_MM, np.random.default_rng(0)).pose
     off = (points @ pose[:3, :3].T + pose[:3, 3] - points)[: len(top)]
     assert float(np.sqrt((off**2).sum(axis=1).mean())) < 0.1
 

@@ -1,0 +1,283 @@
+"""The test where sound scans of the part are at hand: how surely a scan is not one of them.
+
+As in `significance`: means over windows on several scales, each in standard errors, and the number
+of false windows expected as far out, by the tail of what sound places leave. But nothing of the
+null has to be told by the scan that is judged, so no median must guard it against its own defects:
+the sound scans tell the bias by place, what they differ by there, and the tail, each judged by the
+others. Means find what fills a fraction of a window, and windows go down to single cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+
+from amrepair.errors import InputError
+from amrepair.field import scales_kernels
+from amrepair.field.fused import estimate_spacing
+from amrepair.field.scales import Scale, scales_of
+from amrepair.frames import unit_vectors
+from amrepair.regions.calibration import Tail
+from amrepair.regions.significance import LEAST_SIGMA_MM
+from amrepair.template.port import Template
+
+
+@dataclass(frozen=True, slots=True)
+class SoundTestOptions:
+    """Settings of the test against sound scans.
+
+    Attributes
+    ----------
+    neighbours
+        Points of the sound scans that tell what is normal at a place: a mean over six has a
+        standard error of 0.4 of a point's noise, and reaches hardly a spacing.
+    tail_share
+        Share of the windows of sound scans, the farthest out, that tell the tail.
+    gap_spacings
+        No sound scan looked at a place of the surface with none of their points within so many
+        spacings: chance leaves 3 in 10⁹ without one, 1 in 100 where they are four times sparser.
+    widest_mm
+        Windows reach up to this width, as in `RegionOptions`.
+    most_off_mm
+        Farther off the template a point counts as so far off: clutter must not decide alone.
+    """
+
+    neighbours: int = 6
+    tail_share: float = 0.01
+    gap_spacings: float = 2.5
+    widest_mm: float = 10.0
+    most_off_mm: float = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What the test says of a scan.
+
+    Attributes
+    ----------
+    log_expected
+        Natural logarithm of the number of false windows expected, over all that is tested, that
+        are as far out as this scan's farthest: its p-value where it is small.
+    off_mm, sigma_mm
+        (n,) deviation of each point from what is normal there, and its standard error; infinite
+        where no sound scan looked.
+    """
+
+    log_expected: float
+    off_mm: Float[np.ndarray, " n"]
+    sigma_mm: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Points of sound scans, by place, with their deviations: (n, 3) in the tree, (n,)."""
+
+    tree: cKDTree
+    f_mm: Float[np.ndarray, " n"]
+    spacing_mm: float
+
+    def looked(
+        self, feet_mm: Float[np.ndarray, "q 3"], options: SoundTestOptions
+    ) -> Bool[np.ndarray, " q"]:
+        """(q,) whether a sound scan looked at a place of the surface."""
+        within = options.gap_spacings * self.spacing_mm
+        away = self.tree.query(feet_mm, distance_upper_bound=within, workers=-1)[0]
+        return np.asarray(np.isfinite(away))
+
+    def at(
+        self, points_mm: Float[np.ndarray, "q 3"], count: int
+    ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+        """(q,) mean deviation of the nearest sound points, and their standard deviation.
+
+        Nearest in space, not over the surface: where a template closed a hollow by a guess, the
+        floor of the hollow is normal, and so is what lies above it.
+        """
+        count = min(count, len(self.f_mm))
+        index = self.tree.query(points_mm, k=[*range(1, count + 1)], workers=-1)[1]
+        near = self.f_mm[index]
+        return near.mean(axis=1), near.std(axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class SoundTest:
+    """What sound scans of a part leave, and the test of a further scan against it.
+
+    Attributes
+    ----------
+    template
+        Into whose frame scans were laid.
+    statistics
+        Of single cells and of windows, at each scale from the finest: by what factor their means
+        spread more than independent noise does, and how they fall off in units of that; `peaks` is
+        a share of the windows.
+    """
+
+    template: Template
+    known: _Known
+    statistics: tuple[tuple[float, Tail], ...]
+    options: SoundTestOptions
+
+    @classmethod
+    def of(
+        cls,
+        template: Template,
+        scans_mm: Sequence[Float[np.ndarray, "_ 3"]],
+        options: SoundTestOptions | None = None,
+    ) -> SoundTest:
+        """Learn from sound scans.
+
+        Parameters
+        ----------
+        scans_mm
+            Points of sound parts, each (n, 3), template frame; each is judged by the others, one
+            alone by the template.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        if not scans_mm:
+            raise InputError("the test needs a sound scan at least; name one")
+        options = options or SoundTestOptions()
+        f_mm = [template.distance(points) for points in scans_mm]
+        found: list[list[Float[np.ndarray, " w"]]] = []
+        for k, points in enumerate(scans_mm):
+            others = [m for m in range(len(scans_mm)) if m != k]
+            known = _joined(scans_mm, f_mm, others) if others else None
+            off_mm, sigma_mm, scales = _observed(points, template, known, options)
+            for level, z in enumerate(_standardised(off_mm, sigma_mm, scales)):
+                if level == len(found):
+                    found.append([])
+                found[level].append(z)
+        return cls(
+            template,
+            _joined(scans_mm, f_mm, range(len(scans_mm))),
+            tuple(_null(np.concatenate(each), options) for each in found),
+            options,
+        )
+
+    def followed_at(
+        self, points_mm: Float[np.ndarray, "n 3"], within_mm: float
+    ) -> Bool[np.ndarray, " n"]:
+        """(n,) whether sound scans lie on the template there, within so much.
+
+        (n, 3) template frame. Elsewhere it is a guess, or wrong, and poses should not follow it.
+        """
+        f_mm, gradient = self.template.distance_and_gradient(points_mm)
+        normals = unit_vectors(gradient)
+        looked = _looked(points_mm, f_mm, normals, self.template, self.known, self.options)
+        expected_mm, _ = self.known.at(points_mm, self.options.neighbours)
+        return np.asarray(looked & (np.abs(expected_mm) <= within_mm))
+
+    def judge(self, points_mm: Float[np.ndarray, "n 3"]) -> Judged:
+        """Test a scan, (n, 3) in the template's frame, against what sound ones leave."""
+        off_mm, sigma_mm, scales = _observed(points_mm, self.template, self.known, self.options)
+        found = list(_standardised(off_mm, sigma_mm, scales))[: len(self.statistics)]
+        least = 0.0
+        for z, (spread, tail) in zip(found, self.statistics, strict=False):
+            if len(z):
+                windows = Tail(tail.start, tail.scale, tail.peaks * len(z), tail.told_by)
+                farthest = np.array([float(z.max()) / spread])
+                least = min(least, float(windows.log_expected(farthest)[0]))
+        return Judged(least + float(np.log(max(len(found), 1))), off_mm, sigma_mm)
+
+
+def _joined(
+    scans_mm: Sequence[Float[np.ndarray, "_ 3"]],
+    f_mm: Sequence[Float[np.ndarray, " _"]],
+    which: Sequence[int],
+) -> _Known:
+    points = np.concatenate([scans_mm[k] for k in which])
+    f = np.concatenate([f_mm[k] for k in which])
+    return _Known(cKDTree(points), f, estimate_spacing(points))
+
+
+def _observed(
+    points_mm: Float[np.ndarray, "n 3"],
+    template: Template,
+    known: _Known | None,
+    options: SoundTestOptions,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], tuple[Scale, ...]]:
+    """Deviation of each point from what is normal there, its standard error, and the windows."""
+    f_mm, gradient = template.distance_and_gradient(points_mm)
+    expected_mm, spread_mm = (
+        (0.0, 0.0) if known is None else known.at(points_mm, options.neighbours)
+    )
+    normals = unit_vectors(gradient)
+    off_mm = np.clip(f_mm - expected_mm, -options.most_off_mm, options.most_off_mm)
+    scales = scales_of(
+        points_mm,
+        normals,
+        off_mm,
+        np.ones(len(off_mm)),
+        cell_mm=estimate_spacing(points_mm),
+        widest_mm=options.widest_mm,
+    )
+    noise_mm = _noise_mm(off_mm, scales[-1])
+    sigma_mm = np.hypot(noise_mm, np.sqrt(np.maximum(spread_mm**2 - noise_mm**2, 0.0)))
+    sigma_mm = np.broadcast_to(sigma_mm, off_mm.shape).copy()
+    sigma_mm[~_looked(points_mm, f_mm, normals, template, known, options)] = np.inf
+    return off_mm, sigma_mm, scales
+
+
+def _looked(
+    points_mm: Float[np.ndarray, "n 3"],
+    f_mm: Float[np.ndarray, " n"],
+    normals: Float[np.ndarray, "n 3"],
+    template: Template,
+    known: _Known | None,
+    options: SoundTestOptions,
+) -> Bool[np.ndarray, " n"]:
+    """(n,) whether what lies there was looked at: what was not is unknown, and speaks for nothing.
+
+    A hollow that the template closed by a guess has no sound point on the guess.
+    """
+    feet_mm = points_mm - f_mm[:, None] * normals
+    looked = np.ones(len(points_mm), bool) if known is None else known.looked(feet_mm, options)
+    told = getattr(template, "coverage", None)
+    if told is not None:
+        looked &= ~(told.unseen_at(points_mm) | told.unseen_at(feet_mm))
+    return looked
+
+
+def _noise_mm(off_mm: Float[np.ndarray, " n"], scale: Scale) -> float:
+    """Standard deviation of one point, by what neighbours within a cell differ by."""
+    order = np.argsort(scale.of_base, kind="stable")
+    cell, value = scale.of_base[order], off_mm[order]
+    apart = np.abs(np.diff(value))[cell[1:] == cell[:-1]]
+    if not len(apart):
+        return LEAST_SIGMA_MM
+    return max(float(np.median(apart)) / scales_kernels.PAIR_MEDIAN, LEAST_SIGMA_MM)
+
+
+def _standardised(
+    off_mm: Float[np.ndarray, " n"], sigma_mm: Float[np.ndarray, " n"], scales: tuple[Scale, ...]
+) -> Iterator[Float[np.ndarray, " w"]]:
+    """|Mean| over cells and windows of each scale, the finest first, in its standard errors."""
+    counted = np.isfinite(sigma_mm).astype(np.float64)
+    value = off_mm / sigma_mm
+    for scale in scales:
+        total = np.bincount(scale.of_base, value, len(scale))
+        points = np.bincount(scale.of_base, counted, len(scale))
+        around = [
+            scales_kernels.window_means(scale.table, scale.count, each) * scale.count
+            for each in (total, points)
+        ]
+        for sums, weight in ((total, points), around):
+            seen = weight > 0
+            yield np.abs(sums[seen]) / np.sqrt(weight[seen])
+
+
+def _null(z: Float[np.ndarray, " w"], options: SoundTestOptions) -> tuple[float, Tail]:
+    """By what factor means of sound places spread, and their tail in units of that."""
+    spread = max(float(np.median(z)) / float(norm.ppf(0.75)), 1e-9)
+    start = float(np.quantile(z / spread, 1.0 - options.tail_share))
+    beyond = z[z > start * spread] / spread - start
+    scale = float(beyond.mean()) if len(beyond) else 0.0
+    return spread, Tail(start, max(scale, 1e-9), len(beyond) / len(z), float(max(len(beyond), 1)))

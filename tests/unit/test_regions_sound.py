@@ -1,0 +1,104 @@
+"""The test against sound scans: sound ones pass, small defects do not, nor what nobody saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from amrepair.errors import InputError
+from amrepair.regions.sound import SoundTest
+from amrepair.template import GridSdf, MeshSdf
+from amrepair.template.fit import fit_fast
+from amrepair.template.grid import Coverage
+from tests.analytic import box, difference, sample_surface
+
+SIGMA_MM = 0.05
+PART = difference(box((0, 0, 0), (40, 30, 12)), box((28, 18, 6), (36, 26, 13)))
+STATED = np.log(0.05)  # false windows a sound scan, as `detect` states them
+
+
+@pytest.fixture(scope="module")
+def template() -> GridSdf:
+    import trimesh
+
+    solid = trimesh.creation.box(bounds=[(0, 0, 0), (40, 30, 12)])
+    pocket = trimesh.creation.box(bounds=[(28, 18, 6), (36, 26, 13)])
+    return fit_fast(MeshSdf.from_mesh(trimesh.boolean.difference([solid, pocket])))
+
+
+def scanned(seed: int) -> Float[np.ndarray, "n 3"]:
+    points = sample_surface(PART.body, 0.8, seed=seed)[0]
+    return points + np.random.default_rng(seed).normal(0, SIGMA_MM, points.shape)
+
+
+@pytest.fixture(scope="module")
+def sound(template: GridSdf) -> SoundTest:
+    return SoundTest.of(template, [scanned(seed) for seed in range(4)])
+
+
+def dented(points: Float[np.ndarray, "n 3"], radius_mm: float, depth_mm: float) -> np.ndarray:
+    """A dent without an edge in the top, about (10, 10)."""
+    points = points.copy()
+    share = 1.0 - ((points[:, :2] - 10.0) ** 2).sum(axis=1) / radius_mm**2
+    top = (points[:, 2] > 11.0) & (share > 0)
+    points[top, 2] -= depth_mm * share[top] ** 2
+    return points
+
+
+def test_sound_scans_are_as_likely_as_stated(sound: SoundTest) -> None:
+    found = [sound.judge(scanned(seed)).log_expected for seed in range(10, 30)]
+    assert sum(value < STATED for value in found) <= 4  # 1 expected, over 4 in one of 270
+
+
+@pytest.mark.parametrize(("radius_mm", "depth_mm"), [(1.5, 0.6), (5.0, 0.15), (10.0, 0.1)])
+def test_a_dent_is_surer_than_any_sound_scan(
+    sound: SoundTest, radius_mm: float, depth_mm: float
+) -> None:
+    """Narrow and three times as deep as a wide one, whose means over windows say it."""
+    least = min(sound.judge(scanned(seed)).log_expected for seed in range(10, 20))
+    assert sound.judge(dented(scanned(50), radius_mm, depth_mm)).log_expected < least - 2.0
+
+
+def test_a_bias_that_all_sound_parts_have_is_normal(template: GridSdf) -> None:
+    """Nothing of a foot of 0.3 mm counts, and a dent beside it does."""
+
+    def printed(seed: int) -> np.ndarray:
+        points = scanned(seed)
+        foot = (points[:, 2] < 1.5) & (points[:, 0] > 39.0)
+        points[foot, 0] += 0.3
+        return points
+
+    learned = SoundTest.of(template, [printed(seed) for seed in range(4)])
+    known = learned.judge(printed(9)).log_expected
+    unknown = SoundTest.of(template, [scanned(seed) for seed in range(4)]).judge(printed(9))
+    assert known > STATED
+    assert unknown.log_expected < -20.0
+    assert learned.judge(dented(printed(9), 2.0, 0.5)).log_expected < np.log(1e-3)
+
+
+def test_what_no_scan_saw_speaks_against_none(template: GridSdf, sound: SoundTest) -> None:
+    centre = np.array([[10.0, 10.0, 12.0]])
+    unseen = Coverage.of(centre, np.ones(1), np.asarray(template.bounds_mm), 6.0)
+    partial = SoundTest.of(replace(template, coverage=unseen), [scanned(seed) for seed in range(4)])
+    dent = dented(scanned(50), 2.0, 0.6)
+    assert sound.judge(dent).log_expected < -10.0
+    judged = partial.judge(dent)
+    assert judged.log_expected > STATED
+    assert np.isinf(judged.sigma_mm).any()
+
+
+def test_noise_is_the_scan_s_own(sound: SoundTest) -> None:
+    """A scan three times as noisy is no defective part."""
+    points = sample_surface(PART.body, 0.8, seed=60)[0]
+    points += np.random.default_rng(60).normal(0, 3 * SIGMA_MM, points.shape)
+    assert sound.judge(points).log_expected > np.log(1e-3)
+
+
+def test_one_scan_is_judged_by_the_template_and_none_is_refused(template: GridSdf) -> None:
+    alone = SoundTest.of(template, [scanned(0)])
+    assert alone.judge(dented(scanned(50), 2.0, 0.6)).log_expected < -10.0
+    with pytest.raises(InputError, match="needs a sound scan"):
+        SoundTest.of(template, [])
