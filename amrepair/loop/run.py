@@ -85,7 +85,9 @@ def run_loop(
     >>> [look.printed for look in report.looks]  # the scan did not change: it tries once
     [True, False]
     >>> [str(look.decision.action) for look in report.looks]
-    ['fill now', 'go on']
+    ['fill now', 'offer to print again']
+    >>> [way.name for way in report.looks[-1].decision.ways]  # of what the nozzle cannot get to
+    ['reprint', 'leave']
     """
     run = Run(
         job, checked, printer, scanner, site_at, stops=stops,
