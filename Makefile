@@ -4,8 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := $(VENV)/.extras
-# Tests wait for wires and for killed processes: one worker more than there are cores.
-WORKERS := $(shell $(PYTHON) -c "import os; print(1 + (os.cpu_count() or 1))")
+# Tests wait for wires, killed processes and one another's kernels: two workers more than cores.
+WORKERS := $(shell $(PYTHON) -c "import os; print(2 + (os.cpu_count() or 1))")
 
 .PHONY: demo test lint suite slow chromium batches examples docs pictures peers clean help
 

@@ -52,12 +52,17 @@ class OpenMeshOptions:
         Share of the triangles' area that the surface must follow, or they bound nothing.
     patches_per_cell
         Pieces of surface along a cell's edge, as the winding number sums them.
+    asked_first, doubt
+        Places on the triangles that are asked before the grid is filled, whether an inside lies on
+        one side of them and an outside on the other; by so much may the winding number err there.
     """
 
     cells: int = 256
     small_hole_ratio: float = 0.01
     least_followed: float = 0.9
     patches_per_cell: float = 1.5
+    asked_first: int = 4_000
+    doubt: float = 0.1
 
 
 def fit_mesh(
@@ -130,6 +135,9 @@ def _closed(
     points, normals, _ = sample_surface(vertices, faces, count=count)
     # winding numbers have no unit: in cells, the tree's leaves hold a few pieces each
     shell = Shell.of(points / edge, normals * (float(areas.sum()) / count / edge**2))
+    bounding = _bounding(shell, points, normals, edge, options)
+    if bounding < options.least_followed:
+        raise TemplateError(_no_part(name, bounding, options))
     tree = TriangleTree.of(vertices, faces)
     grid, low = _field(tree, shell, _rims(vertices, faces, edge), vertices, edge, progress)
     try:
@@ -141,11 +149,7 @@ def _closed(
     off_mm = MeshSdf.from_mesh(found).unsigned_distance(points)
     followed = float((off_mm < edge).mean())
     if followed < options.least_followed:
-        raise TemplateError(
-            f"the mesh {name} is a soup of polygons that bounds no part: of its area "
-            f"{followed:.0%} lie on the surface that it encloses, {options.least_followed:.0%} "
-            "are needed; export a closed solid"
-        )
+        raise TemplateError(_no_part(name, followed, options))
     coverage, notes = _holes(found, tree, edge, options)
     worst_mm = float(np.quantile(off_mm, 0.99))
     said = (
@@ -154,6 +158,34 @@ def _closed(
     )
     notes.insert(0, said)
     return _Made(found, worst_mm, coverage, tuple(notes))
+
+
+def _bounding(
+    shell: Shell,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    edge: float,
+    options: OpenMeshOptions,
+) -> float:
+    """Share of the triangles' area that has an inside behind it and an outside before it.
+
+    Across a triangle the winding number falls by one; it passes a half there only if what all
+    others add to it lies between 0 and 1. A soup is told so in a second, not after its grid.
+    """
+    some = slice(None, None, max(1, len(points) // options.asked_first))
+    behind, before = (
+        shell.winding(points[some] / edge + side * normals[some]) for side in (-1.0, 1.0)
+    )
+    others = 0.5 * (behind + before)
+    return float(((others > -options.doubt) & (others < 1.0 + options.doubt)).mean())
+
+
+def _no_part(name: str, followed: float, options: OpenMeshOptions) -> str:
+    return (
+        f"the mesh {name} is a soup of polygons that bounds no part: of its area {followed:.0%} "
+        f"lie on the surface that it encloses, {options.least_followed:.0%} are needed; export a "
+        "closed solid"
+    )
 
 
 def _oriented(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:

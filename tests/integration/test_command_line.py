@@ -80,9 +80,17 @@ def test_a_bad_part_is_refused_in_one_sentence(
 
 
 @pytest.mark.skipif(DATA is None, reason="AMREPAIR_DATA is not set")
-@pytest.mark.parametrize("name", ["empty.stl", "soup.stl", "busted.STL", "wallhole.obj"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "empty.stl",
+        "soup.stl",
+        pytest.param("busted.STL", marks=pytest.mark.slow),
+        pytest.param("wallhole.obj", marks=pytest.mark.slow),
+    ],
+)
 def test_broken_meshes_from_the_wild_end_in_words(name: str, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+    out = tmp_path / "out.safetensors"
     done = call("template", "fit", Path(str(DATA)) / "bad" / name, "-o", out)
     if done.returncode != 0:
         refused(done, "mesh")
