@@ -360,13 +360,16 @@ def _ask(
 
     A block whose middle lies farther off than its half diagonal holds none of the surface.
     """
-    block = np.argwhere(asked) // BLOCK_NODES
-    blocks, of_block = np.unique(block, axis=0, return_inverse=True)
+    where = np.argwhere(asked)
+    shape = tuple(-(-n // BLOCK_NODES) for n in asked.shape)
+    key = np.ravel_multi_index(tuple(where.T // BLOCK_NODES), shape)
+    used = np.zeros(int(np.prod(shape)), bool)
+    used[key] = True
+    blocks, of_block = np.argwhere(used.reshape(shape)), (np.cumsum(used) - 1)[key]
     half_mm = 0.5 * np.sqrt(3.0) * BLOCK_NODES * edge
     far = closing.distance(low + edge * (BLOCK_NODES * blocks + 0.5 * (BLOCK_NODES - 1)))
-    found = np.copysign(edge, far)[of_block.ravel()].astype(np.float32)
-    near = (np.abs(far) <= half_mm)[of_block.ravel()]
-    where = np.argwhere(asked)
+    found = np.copysign(edge, far)[of_block].astype(np.float32)
+    near = (np.abs(far) <= half_mm)[of_block]
     found[near] = closing.distance(low + edge * where[near])
     grid[asked] = found
 
@@ -380,7 +383,7 @@ def _poisson(points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_mm[::step]))
     cloud.normals = o3d.utility.Vector3dVector(normals[::step])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        cloud, depth=POISSON_DEPTH, scale=1.2, linear_fit=False
+        cloud, depth=POISSON_DEPTH, scale=1.2, linear_fit=False, n_threads=1
     )[0]
     made = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), process=False)
     made.metadata["notes"] = ()  # only its distance is asked, and its sides by ray counts

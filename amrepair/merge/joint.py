@@ -14,6 +14,7 @@ for what all points of a patch may share.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from amrepair.align.registration import bounded_inverse
 from amrepair.frames import motion_about, moved
 from amrepair.merge.views import View, loss_weight
+from gcode.crew import cores
 
 SAMPLED, LEAST_SAMPLED = 48_000, 4_000  # points of all scans together; of each
 JOINT_ROUNDS = 15
@@ -193,31 +195,38 @@ def _pairs(
     sample: Sequence[Int[np.ndarray, " _"]],
 ) -> _Pairs:
     """Sampled points of each scan with the nearest planes of every other that face their way."""
-    found: list[tuple[np.ndarray, ...]] = []
-    for k, view in enumerate(views):
-        own = moved(view.surface.points_mm[sample[k]], poses[k])
-        facing = view.surface.normals[sample[k]] @ poses[k][:3, :3].T
-        for r, other in enumerate(views):
-            if r == k:
-                continue
-            local = moved(own, np.linalg.inv(poses[r]))
-            reach, index = other.surface.tree.query(
-                local, distance_upper_bound=_reach_mm(view, other), workers=-1
-            )
-            near = np.flatnonzero(np.isfinite(reach))
-            index = index[near]
-            plane = other.surface.normals[index] @ poses[r][:3, :3].T
-            cosine = (plane * facing[near]).sum(axis=1)
-            signed = bool(view.looks.each and other.looks.each)
-            agrees = (cosine if signed else np.abs(cosine)) > PAIR_AGREES
-            near, index, plane = near[agrees], index[agrees], plane[agrees]
-            height = (
-                (local[near] - other.surface.points_mm[index]) * other.surface.normals[index]
-            ).sum(axis=1)
-            turned = facing[near] * np.sign(cosine[agrees])[:, None]
-            rough = np.maximum(view.rough_mm[sample[k]][near], other.rough_mm[index])
-            of = np.full(len(near), k)
-            found.append((of, np.full(len(near), r), own[near], plane, turned, height, rough))
+    own = [
+        moved(view.surface.points_mm[some], pose)
+        for view, some, pose in zip(views, sample, poses, strict=True)
+    ]
+    facing = [
+        view.surface.normals[some] @ pose[:3, :3].T
+        for view, some, pose in zip(views, sample, poses, strict=True)
+    ]
+
+    def pair(k: int, r: int) -> tuple[np.ndarray, ...]:
+        view, other = views[k], views[r]
+        local = moved(own[k], np.linalg.inv(poses[r]))
+        reach, index = other.surface.tree.query(local, distance_upper_bound=_reach_mm(view, other))
+        near = np.flatnonzero(np.isfinite(reach))
+        index = index[near]
+        plane = other.surface.normals[index] @ poses[r][:3, :3].T
+        cosine = (plane * facing[k][near]).sum(axis=1)
+        signed = bool(view.looks.each and other.looks.each)
+        agrees = (cosine if signed else np.abs(cosine)) > PAIR_AGREES
+        near, index, plane = near[agrees], index[agrees], plane[agrees]
+        height = (
+            (local[near] - other.surface.points_mm[index]) * other.surface.normals[index]
+        ).sum(axis=1)
+        turned = facing[k][near] * np.sign(cosine[agrees])[:, None]
+        rough = np.maximum(view.rough_mm[sample[k]][near], other.rough_mm[index])
+        of = np.full(len(near), k)
+        return of, np.full(len(near), r), own[k][near], plane, turned, height, rough
+
+    both = [(k, r) for k in range(len(views)) for r in range(len(views)) if r != k]
+    # a thread a pair of scans, not a thread a piece of each query: queries are short
+    with ThreadPoolExecutor(cores()) as pool:
+        found = list(pool.map(pair, *zip(*both, strict=True)))
     return _Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

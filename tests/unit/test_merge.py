@@ -12,7 +12,7 @@ from amrepair.errors import AlignmentError, InputError, TemplateError
 from amrepair.frames import rotation_from_vector
 from amrepair.merge import fit_from_scans
 from amrepair.merge.cloud import outward, planes, spacing_of
-from amrepair.merge.fuse import Cloud, Fused, fuse
+from amrepair.merge.fuse import Cloud, Fused, _poisson, fuse
 from amrepair.merge.place import Placement, place
 from amrepair.merge.views import View
 from amrepair.regions import Label, detect
@@ -238,3 +238,15 @@ def test_bad_scans_are_refused_in_words(part: AnalyticTemplate) -> None:
     repeated = Scan(np.repeat(good.points_mm[:50], 100, axis=0), 0.04, "scanner", source="same")
     with pytest.raises(InputError, match="only 50 different points"):
         fit_from_scans([repeated])
+
+
+@pytest.mark.slow
+def test_the_smooth_closure_is_the_same_every_time() -> None:
+    # regression: threads of the Poisson solver added up in any order, and templates differed
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(60_000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 2] > -0.6]
+    points = 20.0 * normals + 0.05 * rng.normal(size=normals.shape)
+    one, other = (_poisson(points, normals).mesh for _ in range(2))
+    assert np.array_equal(one.vertices, other.vertices)
