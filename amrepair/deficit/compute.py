@@ -154,9 +154,9 @@ def compute_deficit(
     """
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
-    if tolerance_mm is not None and not tolerance_mm >= 0:
-        raise DeficitError(f"the tolerance is {tolerance_mm} mm; it must be ≥ 0")
     tau_mm = anomaly.threshold_mm if tolerance_mm is None else tolerance_mm
+    if not tau_mm >= 0:
+        raise DeficitError(f"the tolerance is {tau_mm} mm; it must be ≥ 0")
     evidence, lines = _evidence_of(scan, template, anomaly, beads)
     look = as_built or partial(
         as_built_heights,
@@ -169,16 +169,16 @@ def compute_deficit(
         options=options.heights,
         images=evidence.images,
     )
-    gone = {Label.MISSING: lines, Label.EXCESS: None}
+    of_label = {Label.MISSING: lines, Label.EXCESS: None}
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
-        is_early = _roughly_missing(anomaly, evidence) > options.early_mm3
-        early = beside.submit(look) if is_early else None
+        many = _roughly_missing(anomaly, evidence) > options.early_mm3
+        early = beside.submit(look) if many else None
         solids = {
-            label: pieces_of(template, evidence, anomaly, label, tau_mm, of, options, progress)
-            for label, of in gone.items()
+            label: pieces_of(template, evidence, anomaly, label, tau_mm, gone, options, progress)
+            for label, gone in of_label.items()
         }
     regions = [
-        _region(piece, label, template, build_from_template, gone[label], options)
+        _region(piece, label, template, build_from_template, of_label[label], options)
         for label, pieces in solids.items()
         for piece in pieces
     ]
@@ -188,9 +188,8 @@ def compute_deficit(
         seen = look() if early is None else early.result()
         if as_built is not None:
             return without_missing(seen, missing, options.heights)
-        return _standing(
-            seen, scan, template, build_from_template, missing, excess, evidence, options
-        )
+        parts = missing, excess
+        return _standing(seen, scan, template, build_from_template, *parts, evidence, options)
 
     return Deficit(
         missing=missing,
