@@ -159,16 +159,10 @@ def compute_deficit(
         raise DeficitError(f"the tolerance is {tau_mm} mm; it must be ≥ 0")
     evidence, lines = _evidence_of(scan, template, anomaly, beads)
     look = as_built or partial(
-        as_built_heights,
-        scan,
-        template,
-        evidence.spacing_mm,
-        build_from_template=build_from_template,
-        printed_z_mm=printed_z_mm,
-        cell_mm=options.heights.cell_mm,
-        options=options.heights,
-        images=evidence.images,
-    )
+        as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
+        build_from_template=build_from_template, printed_z_mm=printed_z_mm,
+        cell_mm=options.heights.cell_mm, options=options.heights,
+    )  # fmt: skip
     of_label = {Label.MISSING: lines, Label.EXCESS: None}
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
         many = _roughly_missing(anomaly, evidence) > options.early_mm3

@@ -125,7 +125,7 @@ def observed(
             assert scan.view_index is not None
             keep &= ~np.isin(scan.view_index, without)
         _refuse_nothing_near(scan, keep)
-        surfels = make_surfels(scan.points_mm, f_mm, keep)
+        surfels = make_surfels(scan.points_mm, f_mm, keep, options.surfels)
         seen = images or () if asked is None else asked.result()
         if without and seen:
             assert scan.sensors_mm is not None
