@@ -18,7 +18,7 @@ from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
 from amrepair.loop.findings import reach_of
 from amrepair.loop.learning import to_json
-from amrepair.observe.background import BACKGROUND_BAND_MM
+from amrepair.observe.options import USUAL_BACKGROUND
 from amrepair.policy.table import FINDINGS, STOP_ROWS
 from amrepair.regions import Label
 from amrepair.repair import RepairPlan
@@ -289,7 +289,7 @@ def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
     foot_mm = (
         float(anomaly.template_points_mm[:, 2].min()) if len(anomaly.template_points_mm) else 0
     )
-    flat = plan.scan.points_mm[:, 2] < foot_mm + BACKGROUND_BAND_MM
+    flat = plan.scan.points_mm[:, 2] < foot_mm + USUAL_BACKGROUND.band_mm
     outside = anomaly.deviation_mm > anomaly.threshold_mm
     far = anomaly.deviation_mm > STRAY_LIMITS * anomaly.threshold_mm
     return ~(((flat & outside) | far) & (anomaly.label == int(Label.OK)))
