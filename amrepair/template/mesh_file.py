@@ -18,7 +18,6 @@ from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
 from gcode.solids import (
-    MESH_READ_ERRORS,
     SOLID_SUFFIXES,
     are_closed,
     as_manifold,
@@ -27,6 +26,7 @@ from gcode.solids import (
     read_triangles,
     unite_overlaps,
 )
+from gcode.surfaces.sizes import PARSER_ERRORS, in_words
 
 if TYPE_CHECKING:
     import trimesh
@@ -126,11 +126,10 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
         )
     try:
         vertices, faces = read_triangles(path)
-    except MESH_READ_ERRORS as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+    except PARSER_ERRORS as error:
         raise TemplateError(
-            f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} ({reason}); "
-            "export it again"
+            f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} "
+            f"({in_words(error)}); export it again"
         ) from error
     if len(faces) == 0:
         raise TemplateError(f"the mesh {path.name} has no triangles; export it again")
