@@ -2,7 +2,8 @@
 
 What went wrong with the whole print comes first (it came off, layers are shifted, it curls up):
 then every region is of that. Then what went wrong with the flow, told from the last layer's beads
-in the order they were printed: too little from some bead on is a clog, too little everywhere is
+in the order they were printed: too little from some bead on is a clog, where that tells more of
+them right than a region would, whichever lie beside one another; too little everywhere is
 under-extrusion. What is left has a place, and is told by its shape.
 """
 
@@ -41,10 +42,11 @@ RISEN_SHARE = 0.5
 # Of a layer's beads: too little or too much flow over at least this share is the layer's own.
 LAYER_SHARE = 0.55
 CLOG_SHARE = (0.12, 0.9)
-# Before a clog, of what it takes away after its beginning; and how deep that is at most: beads of
-# one layer, and noise. Layers below are whole, or all of this one would lack.
-BEFORE_CLOG = 0.4
+# How deep a clog is at most: beads of one layer, and noise. Layers below are whole, or all of this
+# one would lack.
 CLOG_LAYERS = 1.5
+# Places around one that tell what is there as a region, and among how many they are looked for.
+AROUND, AROUND_OF = 8, 128
 # Longer along the beads than across them by this much: beads were skipped.
 SKIPPED_ASPECT = 2.2
 STRING_ASPECT, STRING_WIDTH_MM = 4.0, 2.2
@@ -267,22 +269,45 @@ def _flow(top: _Surface, job: Job, line: int, layer_mm: float) -> Kind | None:
         return Kind(DefectType.OVER_EXTRUSION, float(np.mean(low < -SHORT)))
     if not short.any():
         return None
-    n, total = len(low), np.concatenate([[0.0], np.cumsum(low)])
-    k = np.arange(1, n)
-    before, after = total[1:-1] / k, (total[-1] - total[1:-1]) / (n - k)
-    at = int(np.argmax(k * (n - k) * (after - before) ** 2))
-    share, rest = 1.0 - (at + 1) / n, float(short[at + 1 :].mean())
+    at, wrong = _since(short)
+    share = 1.0 - at / len(short)
     if (
         CLOG_SHARE[0] < share < CLOG_SHARE[1]
-        and after[at] > SHORT
-        and before[at] < BEFORE_CLOG * after[at]
-        and np.percentile(low[at + 1 :], 75) < CLOG_LAYERS
-        and rest > LAYER_SHARE
+        and np.percentile(low[at:], 75) < CLOG_LAYERS
+        and wrong <= _apart(points[seen, :2], short, distance[seen, -1])
     ):
-        return Kind(DefectType.CLOG, min(1.0, rest))
+        return Kind(DefectType.CLOG, 1.0 - wrong)
     if short.mean() > LAYER_SHARE:
         return Kind(DefectType.UNDER_EXTRUSION, float(short.mean()))
     return None
+
+
+def _since(short: Bool[np.ndarray, " n"]) -> tuple[int, float]:
+    """From which place along the path too little came out, and the share that this tells wrong.
+
+    All that was printed before it is taken to be whole, all after it to be short.
+    """
+    wrong = np.cumsum(np.concatenate([[np.sum(~short)], np.where(short, 1, -1)]))
+    at = int(np.argmin(wrong))
+    return at, float(wrong[at]) / len(short)
+
+
+def _apart(
+    xy_mm: Float[np.ndarray, "n 2"],
+    short: Bool[np.ndarray, " n"],
+    blur_mm: Float[np.ndarray, " n"],
+) -> float:
+    """Share of places that are not as most of those around them: what a region tells wrong.
+
+    `blur_mm` is how far away the points lie that a place's height is the mean of: nearer than
+    twice as far two places share them, and their noise.
+    """
+    distance, near = cKDTree(xy_mm).query(xy_mm, k=min(AROUND_OF, len(xy_mm)))
+    other = distance > np.maximum(2.0 * blur_mm, 1e-9)[:, None]
+    other &= np.cumsum(other, axis=1) <= AROUND
+    votes = np.where(other, np.where(short[near], 1, -1), 0).sum(axis=1)
+    told = other.any(axis=1)
+    return float(np.mean((votes[told] > 0) != short[told])) if told.any() else 1.0
 
 
 def _of_region(

@@ -133,3 +133,37 @@ def test_what_broke_off_where_the_last_beads_end_is_no_clog(
     )
     found = kinds._flow(top, job, stop.line, 0.2)
     assert (found.type if found is not None else None) == kind
+
+
+def short_top(beads: np.ndarray, gone: np.ndarray) -> kinds._Surface:
+    """A top, one point on each of its beads, a layer of 0.2 mm short where it is gone."""
+    return top_of(np.where(gone, -0.2, 0.0), beads[:, :2], 0.03)
+
+
+@pytest.mark.parametrize("radius_mm", [6.0, 7.0, 8.0, 9.0])
+@pytest.mark.parametrize("off_mm", [(0.0, 0.0), (3.0, 0.0), (0.0, 2.0)])
+def test_a_void_that_takes_most_of_a_layer_is_no_clog(
+    bench: ModuleType,
+    scene,  # type: ignore[no-untyped-def]
+    radius_mm: float,
+    off_mm: tuple[float, float],
+) -> None:
+    # regression: walls come first, so that what is gone is gone from late beads; a void in a wedge
+    # ended the run, though beads after its first were there, and some before it were not
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    middle = bench.CORNER + bench.SIZE / 2 + off_mm
+    gone = np.hypot(*(beads[:, :2] - middle).T) < radius_mm
+    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2)
+    assert found is None or found.type is not DefectType.CLOG
+
+
+@pytest.mark.parametrize("begun", [0.2, 0.35, 0.5, 0.65, 0.8])
+def test_what_is_short_from_a_bead_on_is_a_clog(scene, begun: float) -> None:  # type: ignore[no-untyped-def]
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    gone = np.arange(len(beads)) >= begun * len(beads)
+    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2)
+    assert found is not None
+    assert found.type is DefectType.CLOG
+    assert found.confidence > 0.95
