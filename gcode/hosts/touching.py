@@ -13,10 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gcode.check import CheckedProgram
-from gcode.check.touches import TOUCH_COMMANDS
+from gcode.check.touches import TOUCH_COMMANDS, touch_lines
 from gcode.dialects import number
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
-from gcode.hosts.port import NothingMetError, PrintableProgram, TellsTouches
+from gcode.hosts.port import NothingMetError, TellsTouches
 from gcode.hosts.serial import SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.resumption.touch import Touching
@@ -136,7 +136,7 @@ def felt(
     lines = checked.program.text.split("\n")
     felt_mm: list[float] = []
     first = 0
-    for index in touches_of(checked):
+    for index in touch_lines(checked.program):
         try:
             if isinstance(printer, SerialPrinter):
                 met_mm = _met_mm(printer, checked, range(first, index + 1), progress)
@@ -144,9 +144,9 @@ def felt(
                 met_mm = printer.touch(checked, range(first, index + 1), progress=progress)
         except NothingMetError as error:
             raise PrinterError(
-                f"Nothing was felt down to {lines[index].split()[1].replace('DEPTH=', '')} mm, "
-                f"where the touch was to end ({error}); the nozzle was lifted and the heaters are "
-                "off: the probe does not trigger, or what it was to feel is farther below."
+                f"Nothing was felt {_how_deep(lines[index])}, where the touch was to end "
+                f"({f'{error}'.rstrip('.')}); the nozzle was lifted and the heaters are off: the "
+                "probe does not trigger, or what it was to feel is farther below."
             ) from error
         felt_mm.append(met_mm)
         at_contact()
@@ -157,13 +157,12 @@ def felt(
     return felt_mm
 
 
-def touches_of(checked: PrintableProgram) -> list[int]:
-    """The lines of a program that are touches."""
-    command = TOUCH_COMMANDS.get(checked.program.dialect)
-    if command is None:
-        return []
-    lines = checked.program.text.split("\n")
-    return [k for k, line in enumerate(lines) if line.startswith(command + " ")]
+def _how_deep(line: str) -> str:
+    """Where a touch was to end: Klipper's macro is told how far, G38.2 where to."""
+    word = line.split()[1]
+    if word.startswith("DEPTH="):
+        return f"within {word.removeprefix('DEPTH=')} mm"
+    return f"down to {word} mm"
 
 
 def _met_mm(
