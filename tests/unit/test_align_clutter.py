@@ -19,6 +19,7 @@ from amrepair.errors import AlignmentError
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from amrepair.template.fit import fit_fast
+from amrepair.template.options import FitOptions
 from amrepair.template.port import Template
 from tests.analytic import (
     AnalyticTemplate,
@@ -232,13 +233,10 @@ def test_the_unit_is_guessed_from_the_size(mm: float, hint: str) -> None:
         align(Scan(part, SIGMA_MM / mm, "scanner", source="scan.ply"), stepped())
 
 
-def test_a_flat_view_of_a_keyed_disc_is_ambiguous_and_holds_the_true_pose(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for name, value in (("SAMPLES", 20_000), ("GRID_CELLS", 48)):
-        monkeypatch.setattr(f"amrepair.template.fit.{name}", value)
+def test_a_flat_view_of_a_keyed_disc_is_ambiguous_and_holds_the_true_pose() -> None:
     shape = union(cylinder((0, 0, 0), 25.0, 8.0), box((22, -1.5, 0), (28, 1.5, 8)))
-    disc = fit_fast(MeshSdf.from_mesh(to_trimesh(shape.body)))
+    exact = MeshSdf.from_mesh(to_trimesh(shape.body))
+    disc = fit_fast(exact, options=FitOptions(cells=48, samples=20_000))
     rng = np.random.default_rng(6)
     flat = rng.uniform(-28, 28, (12_000, 2))
     key = (flat[:, 0] > 0) & (flat[:, 0] < 28) & (np.abs(flat[:, 1]) < 1.5)
