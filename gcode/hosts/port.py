@@ -10,6 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+from jaxtyping import Int
+
 from gcode.errors import LinkError, PrinterError
 from gcode.moves import Program
 from gcode.progress import Progress, silent
@@ -230,4 +233,19 @@ class TellsTouches(Printer, Protocol):
         ------
         PrinterError
             If it met nothing: the nozzle is lifted then, and the heaters are off.
+        """
+
+
+@runtime_checkable
+class GoesOnAnew(Printer, Protocol):
+    """A printer whose server prints the job, and takes what is left of it as written anew."""
+
+    def rewrite(self, rest: PrintableProgram, line_of: Int[np.ndarray, " m"]) -> None:
+        """From where the nozzle rests, have this program printed in the place of the job's rest.
+
+        Parameters
+        ----------
+        line_of
+            (m + 1,) by line of the job, and its end: the program's line that stands for it; below
+            0 before what is written anew.
         """

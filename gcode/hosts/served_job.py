@@ -26,6 +26,7 @@ from gcode.hosts.modes import Modes, commands_of, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
 from gcode.hosts.proof import require_checked
 from gcode.hosts.rejoin import require_as_left
+from gcode.hosts.rewritten import Rewritten
 from gcode.hosts.server import ServerPrinter, Session
 from gcode.progress import Progress, silent
 
@@ -56,6 +57,8 @@ class ServedJob(ServerPrinter[Session]):
     """
 
     _job_text: JobText | None = None
+    _rest_anew: Rewritten | None = None
+    """What is printed in the place of the job's last lines."""
     _name = _sha256 = ""
     _joining = False
     _heat_at_look = (0.0, 0.0)
@@ -153,7 +156,7 @@ class ServedJob(ServerPrinter[Session]):
     def follow(self, name: str, data: bytes) -> int:
         """Serve this job from now on; returns the first line that a look can still stand before."""
         self._name, self._job_text, self._sha256 = name, self._text_of(data), ""
-        self._joining = False
+        self._joining, self._rest_anew = False, None
         self._session.state.follow(name)
         self._refresh()
         rests, line = self._rest()
@@ -185,21 +188,16 @@ class ServedJob(ServerPrinter[Session]):
         with self._session.news:
             self._session.news.wait(wait_s)
 
+    def _is_the_jobs(self, checked: PrintableProgram) -> bool:
+        """Whether the server prints it from the job's file."""
+        anew = "" if self._rest_anew is None else self._rest_anew.checked.program.sha256
+        return checked.program.sha256 in {self._sha256, anew}
+
     @property
     def _text(self) -> JobText:
         if self._job_text is None:
             raise LinkError("no job is followed; call follow() first.")
         return self._job_text
-
-    def leave_out(self, name: str) -> None:
-        """Have the server print nothing more of an object.
-
-        Raises
-        ------
-        LinkError
-            If it cannot.
-        """
-        raise LinkError(f"{self.address.name} cannot leave the object {name!r} out of its print.")
 
     # ------------------------------------------------------------------ printing
 
@@ -215,9 +213,14 @@ class ServedJob(ServerPrinter[Session]):
         start_s = self._clock()
         lines = range(checked.program.text.count("\n")) if lines is None else lines
         ok, end = True, lines.stop
+        anew = self._rest_anew
         if checked.program.sha256 == self._sha256:
             ok = self._print_on(lines.start, lines.stop, progress)
             end = lines.stop if ok else self._rest()[1]
+        elif anew is not None and checked.program.sha256 == anew.checked.program.sha256:
+            end = self._text.lines if end >= anew.total else anew.theirs(end)
+            ok = self._print_on(anew.theirs(lines.start), end, progress)
+            end = lines.stop if ok else anew.ours(self._rest()[1])
         else:
             first = lines.start
             if self._joining:
@@ -274,7 +277,7 @@ class ServedJob(ServerPrinter[Session]):
             If the machine is not as it was left.
         """
         self._joining = True
-        if not sent or (sent[-1][0].program.sha256 == self._sha256 and not sent[-1][3]):
+        if not sent or (self._is_the_jobs(sent[-1][0]) and not sent[-1][3]):
             return  # the server has it in hand
         checked, first, end, done = sent[-1]
         self._asked(self._settled)
@@ -290,7 +293,7 @@ class ServedJob(ServerPrinter[Session]):
         if anew:
             self._joining = False
             self._lift_to(modes)
-        elif checked.program.sha256 == self._sha256 or end == first:
+        elif self._is_the_jobs(checked) or end == first:
             modes.position_mm.clear()  # the server's own pause has parked it somewhere
         self._heat_as_left(sent)
 
@@ -316,7 +319,7 @@ class ServedJob(ServerPrinter[Session]):
         """Heat again what was switched off since; a nozzle that was cooled on purpose stays so."""
         of_job, at_look = Modes(), Modes(hotend_c=math.nan)
         for program, first, end, _ in sent:
-            if program.program.sha256 == self._sha256:
+            if self._is_the_jobs(program):
                 of_job, at_look = _after(program, first, end, of_job), Modes(hotend_c=math.nan)
             else:
                 at_look = _after(program, first, end, at_look)

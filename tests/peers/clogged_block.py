@@ -51,15 +51,24 @@ def command(*words: str | Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def sliced(folder: Path, *, flavour: str, reads: str) -> Path:
-    """The first two of the user's commands: slice, and put looks in."""
+def sliced(
+    folder: Path,
+    *,
+    flavour: str,
+    reads: str,
+    size_mm: tuple[float, float, float] = (24.0, 20.0, 4.0),
+    at_mm: tuple[str, ...] = ("3",),
+    copies: int = 1,
+) -> Path:
+    """The first two of the user's commands: slice, and put looks in; copies are labelled."""
     part, job, settings = folder / "block.stl", folder / "block.gcode", folder / "slicer.ini"
-    trimesh.creation.box((24.0, 20.0, 4.0)).export(part)
+    trimesh.creation.box(size_mm).export(part)
     settings.write_text(SLICER.format(flavour=flavour))
+    more = ["--duplicate", str(copies), "--gcode-label-objects"] if copies > 1 else []
     command(str(PRUSA_SLICER), "--export-gcode", "--load", settings, "--center", "110,110",
-            "--output", job, part)  # fmt: skip
-    command(*AMREPAIR, "postprocess", "--for", reads, "--every", "0", "--at-z", "3",
-            "--no-final", job)  # fmt: skip
+            *more, "--output", job, part)  # fmt: skip
+    looks = [word for z in at_mm for word in ("--at-z", z)]
+    command(*AMREPAIR, "postprocess", "--for", reads, "--every", "0", *looks, "--no-final", job)
     return job
 
 
