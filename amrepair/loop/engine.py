@@ -397,6 +397,7 @@ class Run:
                 stop.line,
                 self._scanner.build_from_scanner,
                 repaired=passes > 0,
+                options=self._options.kinds,
             )
             decision = decide_look(
                 plan,

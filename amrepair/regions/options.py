@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from amrepair.errors import InputError
-from amrepair.field.occupancy import OccupancyOptions
+from amrepair.field.options import EvidenceOptions, SurfelOptions
+from amrepair.observe.options import BackgroundOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +62,9 @@ class RegionOptions:
         So many windows tell by how much means wander: enough for a few per cent.
     spacing_mm
         Template surface points are asked for so far apart.
-    occupancy
-        How space around broken surface is labelled where no rays tell.
+    background, surfels, evidence
+        What is not the part, how the scan is condensed, and how space around broken surface is
+        known.
     top_k
         How many of the highest scores make the object score (PASDF: 1000).
     """
@@ -85,7 +87,9 @@ class RegionOptions:
     least_cells: int = 30
     most_windows: int = 3000
     spacing_mm: float = 0.6
-    occupancy: OccupancyOptions = field(default_factory=OccupancyOptions)
+    background: BackgroundOptions = field(default_factory=BackgroundOptions)
+    surfels: SurfelOptions = field(default_factory=SurfelOptions)
+    evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     top_k: int = 1000
 
     def __post_init__(self) -> None:
