@@ -136,6 +136,52 @@ class _Known:
 
 
 @dataclass(frozen=True, slots=True)
+class Seen:
+    """What template and sound scans say of a scan's points.
+
+    Attributes
+    ----------
+    f_mm, normals
+        (n,) deviation from the template, (n, 3) its outward normals.
+    expected_mm, spread_mm
+        (n,) what sound points there deviate by in the mean, and their standard deviation.
+    looked
+        (n,) whether a sound scan looked at the surface that tells the deviation.
+    """
+
+    f_mm: Float[np.ndarray, " n"]
+    normals: Float[np.ndarray, "n 3"]
+    expected_mm: Float[np.ndarray, " n"]
+    spread_mm: Float[np.ndarray, " n"]
+    looked: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls,
+        points_mm: Float[np.ndarray, "n 3"],
+        template: Template,
+        known: _Known | None,
+        options: SoundTestOptions,
+    ) -> Seen:
+        """Of points, (n, 3) template frame; `known` is None where one sound scan is alone."""
+        f_mm, gradient = template.distance_and_gradient(points_mm)
+        normals = unit_vectors(gradient)
+        if known is None:
+            expected_mm, spread_mm = np.zeros(len(f_mm)), np.zeros(len(f_mm))
+        else:
+            expected_mm, spread_mm = known.at(points_mm, options.neighbours)
+        looked = _looked(points_mm, f_mm, normals, template, known)
+        return cls(f_mm, normals, expected_mm, spread_mm, looked)
+
+    def followed(self, within_mm: float) -> Bool[np.ndarray, " n"]:
+        """(n,) whether sound scans lie on the template there, within so much.
+
+        Elsewhere it is a guess, or wrong, and poses should not follow it.
+        """
+        return np.asarray(self.looked & (np.abs(self.expected_mm) <= within_mm))
+
+
+@dataclass(frozen=True, slots=True)
 class SoundTest:
     """What sound scans of a part leave, and the test of a further scan against it.
 
@@ -182,7 +228,8 @@ class SoundTest:
         for k, points in enumerate(scans_mm):
             others = [m for m in range(len(scans_mm)) if m != k]
             known = _joined(scans_mm, f_mm, others, template, options) if others else None
-            off_mm, sigma_mm, scales = _observed(points, template, known, options)
+            seen = Seen.of(points, template, known, options)
+            off_mm, sigma_mm, scales = _observed(points, seen, options)
             for level, z in enumerate(_standardised(off_mm, sigma_mm, scales)):
                 if level == len(found):
                     found.append([])
@@ -194,22 +241,17 @@ class SoundTest:
             options,
         )
 
-    def followed_at(
-        self, points_mm: Float[np.ndarray, "n 3"], within_mm: float
-    ) -> Bool[np.ndarray, " n"]:
-        """(n,) whether sound scans lie on the template there, within so much.
+    def look(self, points_mm: Float[np.ndarray, "n 3"]) -> Seen:
+        """Ask template and sound scans of a scan's points, (n, 3) in the template's frame."""
+        return Seen.of(points_mm, self.template, self.known, self.options)
 
-        (n, 3) template frame. Elsewhere it is a guess, or wrong, and poses should not follow it.
+    def judge(self, points_mm: Float[np.ndarray, "n 3"], seen: Seen | None = None) -> Judged:
+        """Test a scan, (n, 3) in the template's frame, against what sound ones leave.
+
+        `seen` is what `look` said of the same points.
         """
-        f_mm, gradient = self.template.distance_and_gradient(points_mm)
-        normals = unit_vectors(gradient)
-        looked = _looked(points_mm, f_mm, normals, self.template, self.known)
-        expected_mm, _ = self.known.at(points_mm, self.options.neighbours)
-        return np.asarray(looked & (np.abs(expected_mm) <= within_mm))
-
-    def judge(self, points_mm: Float[np.ndarray, "n 3"]) -> Judged:
-        """Test a scan, (n, 3) in the template's frame, against what sound ones leave."""
-        off_mm, sigma_mm, scales = _observed(points_mm, self.template, self.known, self.options)
+        seen = seen or self.look(points_mm)
+        off_mm, sigma_mm, scales = _observed(points_mm, seen, self.options)
         found = list(_standardised(off_mm, sigma_mm, scales))[: len(self.statistics)]
         least = 0.0
         for z, (spread, tail) in zip(found, self.statistics, strict=False):
@@ -240,30 +282,21 @@ def _joined(
 
 
 def _observed(
-    points_mm: Float[np.ndarray, "n 3"],
-    template: Template,
-    known: _Known | None,
-    options: SoundTestOptions,
+    points_mm: Float[np.ndarray, "n 3"], seen: Seen, options: SoundTestOptions
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], tuple[Scale, ...]]:
     """Deviation of each point from what is normal there, its standard error, and the windows."""
-    f_mm, gradient = template.distance_and_gradient(points_mm)
-    expected_mm, spread_mm = (
-        (0.0, 0.0) if known is None else known.at(points_mm, options.neighbours)
-    )
-    normals = unit_vectors(gradient)
-    off_mm = np.clip(f_mm - expected_mm, -options.most_off_mm, options.most_off_mm)
+    off_mm = np.clip(seen.f_mm - seen.expected_mm, -options.most_off_mm, options.most_off_mm)
     scales = scales_of(
         points_mm,
-        normals,
+        seen.normals,
         off_mm,
         np.ones(len(off_mm)),
         cell_mm=estimate_spacing(points_mm),
         widest_mm=options.widest_mm,
     )
     noise_mm = _noise_mm(off_mm, scales[-1])
-    sigma_mm = np.hypot(noise_mm, np.sqrt(np.maximum(spread_mm**2 - noise_mm**2, 0.0)))
-    sigma_mm = np.broadcast_to(sigma_mm, off_mm.shape).copy()
-    sigma_mm[~_looked(points_mm, f_mm, normals, template, known)] = np.inf
+    sigma_mm = np.maximum(noise_mm, seen.spread_mm)
+    sigma_mm[~seen.looked] = np.inf
     return off_mm, sigma_mm, scales
 
 
