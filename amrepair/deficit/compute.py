@@ -35,6 +35,7 @@ from amrepair.errors import DeficitError
 from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.frames import Transform, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
+from amrepair.regions.options import SkippedOptions
 from amrepair.regions.regions import classify
 from amrepair.regions.skipped import PlannedBeads, skipped
 from amrepair.scans import Scan
@@ -157,7 +158,7 @@ def compute_deficit(
     tau_mm = anomaly.threshold_mm if tolerance_mm is None else tolerance_mm
     if not tau_mm >= 0:
         raise DeficitError(f"the tolerance is {tau_mm} mm; it must be ≥ 0")
-    evidence, lines = _evidence_of(scan, template, anomaly, beads)
+    evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
     look = as_built or partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
@@ -198,16 +199,20 @@ def compute_deficit(
 
 
 def _evidence_of(
-    scan: Scan, template: Template, anomaly: AnomalyMap, beads: PlannedBeads | None
+    scan: Scan,
+    template: Template,
+    anomaly: AnomalyMap,
+    beads: PlannedBeads | None,
+    options: SkippedOptions,
 ) -> tuple[Evidence, PlannedBeads | None]:
     """What is known of space, also around lines of the job that are gone; and those lines."""
     evidence = anomaly.evidence
     if evidence is None:
         raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
-    lines = None if beads is None else skipped(beads, evidence, template)
+    lines = None if beads is None else skipped(beads, evidence, template, options)
     if lines is not None and len(lines.width_mm):
         labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
-        evidence = with_stubs(evidence, scan, lines.samples_mm(), labelled)
+        evidence = with_stubs(evidence, scan, lines.samples_mm(options.look_step_mm), labelled)
     return evidence, lines
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from amrepair.regions.options import SkippedOptions
+
 
 @dataclass(frozen=True, slots=True)
 class VoxelOptions:
@@ -184,12 +186,13 @@ class DeficitOptions:
         One bead of 0.45 × 0.2 mm as long as two nozzle widths: less cannot be placed.
     early_mm3
         From so much on heights will be asked for: what a clean layer's crumbs never are.
-    voxels, solids, heights, walls
+    skipped, voxels, solids, heights, walls
         Of each stage.
     """
 
     bead_mm3: float = 0.08
     early_mm3: float = 0.5
+    skipped: SkippedOptions = field(default_factory=SkippedOptions)
     voxels: VoxelOptions = field(default_factory=VoxelOptions)
     solids: SolidOptions = field(default_factory=SolidOptions)
     heights: HeightOptions = field(default_factory=HeightOptions)

@@ -113,7 +113,7 @@ def _solid_in_box(
     else:
         said = [s.place_mm[inside], anomaly.template_points_mm[anomaly.template_label == label]]
         if gone is not None:
-            said.append(gone.samples_mm())
+            said.append(gone.samples_mm(options.skipped.look_step_mm))
         core = _of_a_region(core, box, np.concatenate(said), s.cell_mm)
     return _grown_back(box, core, clip, f, label, tau_mm)
 
