@@ -147,7 +147,8 @@ def from_scans(exact: MeshSdf, points: int) -> None:
         [s.points_mm @ m[:3, :3].T + m[:3, 3] for s, m in zip(scans, made.poses, strict=True)]  # type: ignore[attr-defined]
     )
     spacing_mm = spacing_of(placed)
-    normals = outward(placed, planes(placed, spacing_mm).normals, spacing_mm)
+    plane = planes(placed, spacing_mm)
+    normals = outward(placed, plane.normals, spacing_mm, plane.sigma_mm)
     poisson, seconds = timed(lambda: _poisson(placed, normals).mesh)
     assert isinstance(poisson, trimesh.Trimesh)
     print(f"- Poisson, depth 8, of the same placed points: {seconds:.1f} s, without placing;")

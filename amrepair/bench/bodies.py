@@ -98,12 +98,18 @@ class Pieces:
         return np.asarray(np.where(beyond, np.linalg.norm(here - home, axis=1), 0.0))
 
 
+def surface_of(template: Template) -> Float[np.ndarray, "m 3"]:
+    """(m, 3) places of a template's surface, as dense as bends are judged."""
+    return template.surface_points(SURFACE_RATIO * _diagonal_mm(template))[0]
+
+
 def pieces_of(
     points_mm: Float[np.ndarray, "n 3"],
     template: Template,
     known: Sequence[Pose],
     sigma_mm: float,
     rng: np.random.Generator,
+    surface_mm: Float[np.ndarray, "m 3"] | None = None,
 ) -> Pieces:
     """The larger piece's pose, and the other's, where the scan shows a part bent in two.
 
@@ -117,10 +123,13 @@ def pieces_of(
         (4, 4) each, template from scan, best first, as aligned.
     sigma_mm
         Noise of the points.
+    surface_mm
+        What `surface_of` says of the template; None asks it.
     """
     thinned = Thinned(points_mm, rng)
     limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * _diagonal_mm(template))
-    scene = _Scene.of(thinned, template, sigma_mm, limit_mm)
+    surface = surface_of(template) if surface_mm is None else surface_mm
+    scene = _Scene.of(thinned, template, sigma_mm, limit_mm, surface)
     if (~scene.on(known[0])).mean() < LEAST_BENT_SHARE:
         return _little_bent(known[0], scene)
     tried = scene.distinct(scene.refined(scene.thinned.to(START_POINTS), known))
@@ -268,17 +277,29 @@ class _Scene:
     sigma_mm: float
     diagonal_mm: float
     limit_mm: float
-    neighbours: Int[np.ndarray, "n k"]
     surface_mm: Float[np.ndarray, "m 3"]
+    _neighbours: list[Int[np.ndarray, "n k"]] = field(default_factory=list)
 
     @classmethod
-    def of(cls, thinned: Thinned, template: Template, sigma_mm: float, limit_mm: float) -> _Scene:
+    def of(
+        cls,
+        thinned: Thinned,
+        template: Template,
+        sigma_mm: float,
+        limit_mm: float,
+        surface_mm: Float[np.ndarray, "m 3"],
+    ) -> _Scene:
         cloud, diagonal_mm = thinned.to(BODY_POINTS), _diagonal_mm(template)
-        near = [*range(1, min(NEIGHBOURS, len(cloud)) + 1)]
-        index = cKDTree(cloud).query(cloud, k=near)[1]
-        surface = template.surface_points(SURFACE_RATIO * diagonal_mm)[0]
         sigma_mm = max(sigma_mm, 1e-3)
-        return cls(thinned, cloud, template, sigma_mm, diagonal_mm, limit_mm, index, surface)
+        return cls(thinned, cloud, template, sigma_mm, diagonal_mm, limit_mm, surface_mm)
+
+    @property
+    def neighbours(self) -> Int[np.ndarray, "n k"]:
+        """(n, k) points of the cloud around each; most scans are whole, and never ask."""
+        if not self._neighbours:
+            near = [*range(1, min(NEIGHBOURS, len(self.cloud)) + 1)]
+            self._neighbours.append(cKDTree(self.cloud).query(self.cloud, k=near)[1])
+        return self._neighbours[0]
 
     def held(self, on: Bool[np.ndarray, " n"]) -> float:
         """Share of the places that are held."""

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import align
 from amrepair.align.thinning import order_of
-from amrepair.bench.bodies import pieces_of
+from amrepair.bench.bodies import pieces_of, surface_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.errors import AlignmentError
@@ -193,12 +193,13 @@ def smoothed_score(
 
 @dataclass(frozen=True, slots=True)
 class FieldModel:
-    """A template, and the test of what sound clouds leave in it."""
+    """A template, the test of what sound clouds leave in it, (m, 3) places of its surface."""
 
     template: Template
     sigma_mm: float
     sound: SoundTest
     template_distance: CloudDistance | None
+    surface_mm: Float[np.ndarray, "m 3"]
 
     def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
         """Align, test, score; what cannot be aligned is not this part."""
@@ -206,16 +207,20 @@ class FieldModel:
             known = _laid(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)
         except AlignmentError:
             return Scores(np.zeros(len(points_mm)), np.inf, None, aligned=False)
-        followed = self.sound.followed_at(moved(points_mm, known[0]), FOLLOWED_RATIO * DIAGONAL_MM)
+        placed = moved(points_mm, known[0])
+        seen = self.sound.look(placed)
+        followed = seen.followed(FOLLOWED_RATIO * DIAGONAL_MM)
         some = points_mm[followed] if followed.mean() > LEAST_FOLLOWED else points_mm
-        pieces = pieces_of(some, self.template, known, self.sigma_mm, rng)
-        placed = moved(points_mm, pieces.pose)
-        judged = self.sound.judge(placed)
+        pieces = pieces_of(some, self.template, known, self.sigma_mm, rng, self.surface_mm)
+        if not np.array_equal(pieces.pose, known[0]):
+            placed = moved(points_mm, pieces.pose)
+            seen = self.sound.look(placed)
+        judged = self.sound.judge(placed, seen)
         # Published clouds may have no noise at all; the unit does not matter then.
         sigma_mm = np.maximum(judged.sigma_mm, LEAST_SET_SIGMA_MM)
         score = smoothed_score(placed, judged.off_mm, sigma_mm)
         aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, LEAST_SET_SIGMA_MM)
-        return Scores(score + aside, -judged.log_expected, np.abs(self.template.distance(placed)))
+        return Scores(score + aside, -judged.log_expected, np.abs(seen.f_mm))
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +248,8 @@ class FieldMethod:
                 laid.append(moved(cloud, pose))
         if refused is not None and not laid:
             raise refused
-        model = FieldModel(template, data.sigma_mm, SoundTest.of(template, laid), distance)
+        model = FieldModel(
+            template, data.sigma_mm, SoundTest.of(template, laid), distance, surface_of(template)
+        )
         model.score(data.clouds_mm[0], np.random.default_rng(seed))  # compiled before it is timed
         return model

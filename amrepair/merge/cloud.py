@@ -9,22 +9,28 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from amrepair.merge import fuse_kernels as kernels
 
-CLOUD_PLANE_POINTS = 25  # that a plane is fitted to, on average
+# Points that planes are fitted to, on average: few where walls are thin, or more, by the tilt.
+CLOUD_PLANE_POINTS = (10, 25)
 # A plane's radius over the noise, at least: 4 of them tilt it by some 3°. And how often it grows.
 PLANE_NOISES, GROWTHS, GROWTH = 8.0, 3, 1.6
+NOISE_NOISES = 4.0  # radius over the noise from which on a plane tells the noise
 OPEN_DIRECTIONS = 256  # a deep hole is open in one direction of a hundred
-# Cells that look around themselves; the others are told by their neighbours.
-EVERY_CELL = 4
-# Rays start this many cells away from a surface, so that it does not hide itself.
-SKIP_CELLS = 2.2
-NOISE_QUANTILE = 0.1
-AGREE_ROUNDS = 60  # cells that a verdict travels
+# So many points look around themselves; the others are told by those beside them. And so many
+# stand for the surface that hides others, each as a disc of so many spacings, which leaves one
+# place in a hundred bare.
+LOOKING_POINTS, HIDING_POINTS, DISC_SPACINGS = 8_000, 50_000, 1.2
+MOST_CELLS = 250  # along the longest side
+# Of two places on one sheet the height over the distance is less than so much, or chance. Discs
+# nearer than so many of their radii are not in the way if they are of the looker's own sheet.
+SHEET_SLOPE, SHEET_NOISES, OWN_DISCS = 0.2, 4.0, 2.5
+TELLS_SPACINGS, TOLD_BY = 2.2, 8
+NOISE_QUANTILE, LEAST_PLANE_POINTS = 0.1, 8
+AGREE_ROUNDS = 60  # places that a verdict travels
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,41 +92,66 @@ class Planes:
         Noise across the surface.
     rough_mm
         (n,) how far the neighbours lie from the plane beyond that noise: edges and curves.
+    tilt_rad
+        (n,) standard error of the normal, by what the neighbours lie off the plane.
     """
 
     normals: Float[np.ndarray, "n 3"]
     sigma_mm: float
     rough_mm: Float[np.ndarray, " n"]
+    tilt_rad: Float[np.ndarray, " n"]
+
+    def or_better(self, other: Planes) -> Planes:
+        """At each point the plane of the two that is tilted less; the noise is this one's."""
+        better = other.tilt_rad < self.tilt_rad
+        return Planes(
+            np.where(better[:, None], other.normals, self.normals),
+            self.sigma_mm,
+            np.where(better, other.rough_mm, self.rough_mm),
+            np.where(better, other.tilt_rad, self.tilt_rad),
+        )
 
 
 def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
-    """Fit a plane at each point, over more of the surface where the noise asks for it.
+    """Fit a plane at each point, over as much of the surface as tilts it least.
 
-    On flat ground the least variance of m points is σ²/m χ² with m − 3 degrees of freedom; edges
-    and curves only add to it, so a low quantile is compared.
+    More points average more noise, and reach over edges and through thin walls. On flat ground the
+    least variance of m points is σ²/m χ² with m − 3 degrees of freedom; edges, curves and walls'
+    other sides only add to it, so the noise is a low quantile, by the narrowest planes.
     """
-    radius_mm = float(np.sqrt(CLOUD_PLANE_POINTS / np.pi)) * spacing_mm
+    narrow_mm, wide_mm = np.sqrt(np.array(CLOUD_PLANE_POINTS) / np.pi) * spacing_mm
+    found = _planes(points_mm, narrow_mm, None)
+    reached_mm, radius_mm = narrow_mm, wide_mm
     for _ in range(GROWTHS):
-        found = _planes(points_mm, radius_mm)
+        # a ball not much wider than the noise cuts it off at its ends
+        told = found.sigma_mm if reached_mm >= NOISE_NOISES * found.sigma_mm else None
+        found = _planes(points_mm, radius_mm, told).or_better(found)
         if radius_mm >= PLANE_NOISES * found.sigma_mm:
             break
+        reached_mm = radius_mm
         radius_mm = min(GROWTH * radius_mm, PLANE_NOISES * found.sigma_mm)
     return found
 
 
-def _planes(points_mm: Float[np.ndarray, "n 3"], radius_mm: float) -> Planes:
+def _planes(
+    points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sigma_mm: float | None
+) -> Planes:
     cells = Cells.of(points_mm, radius_mm)
     ordered = np.ascontiguousarray(points_mm[cells.order])
     found, least, count = kernels.local_planes(ordered, cells.grid, radius_mm)
-    normals, variance = np.empty_like(found), np.empty(len(found))
-    normals[cells.order], variance[cells.order] = found, least
-    enough = count >= 8
-    if not enough.any():
-        return Planes(normals, 0.0, np.sqrt(np.maximum(variance, 0.0)))
-    m = count[enough].astype(np.float64)
-    ratio = np.maximum(least[enough], 0.0) * m / chi2.ppf(NOISE_QUANTILE, m - 3)
-    sigma_mm = float(np.sqrt(np.quantile(ratio, NOISE_QUANTILE)))
-    return Planes(normals, sigma_mm, np.sqrt(np.maximum(variance - sigma_mm**2, 0.0)))
+    normals, variance, m = np.empty_like(found), np.empty(len(found)), np.empty(len(found))
+    normals[cells.order], variance[cells.order], m[cells.order] = found, least, count
+    variance = np.maximum(variance, 0.0)
+    if sigma_mm is None:
+        enough = m >= LEAST_PLANE_POINTS
+        freedom = m[enough] - 3
+        ratio = variance[enough] * m[enough] / chi2.ppf(NOISE_QUANTILE, freedom)
+        sigma_mm = float(np.sqrt(np.quantile(ratio, NOISE_QUANTILE))) if enough.any() else 0.0
+    # residuals over the points' lever: over a disc, each coordinate has a quarter of r² as variance
+    freedom = np.maximum(m - 3, 0.5)
+    off = np.maximum(variance * m / freedom, sigma_mm**2)
+    tilt = np.sqrt(4.0 * off / m) / radius_mm
+    return Planes(normals, sigma_mm, np.sqrt(np.maximum(variance - sigma_mm**2, 0.0)), tilt)
 
 
 def directions(count: int = OPEN_DIRECTIONS) -> Float[np.ndarray, "k 3"]:
@@ -133,63 +164,78 @@ def directions(count: int = OPEN_DIRECTIONS) -> Float[np.ndarray, "k 3"]:
 
 
 def outward(
-    points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing_mm: float
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    spacing_mm: float,
+    sigma_mm: float,
 ) -> Float[np.ndarray, "n 3"]:
     """(n, 3) the normals, turned to the side from which more of the distance is in sight.
 
-    A closed surface lets no ray out from within; one with gaps fewer than from without.
+    A closed surface lets no ray out from within; one with gaps fewer than from without. What hides
+    is a disc about each point, not a cell: a wall thinner than a cell has two sides.
     """
-    extent_mm = float(np.ptp(points_mm, axis=0).max())
-    cell_mm = max(2.0 * spacing_mm, extent_mm / 250.0)
-    low = points_mm.min(axis=0) - 2.0 * cell_mm
-    index = np.floor((points_mm - low) / cell_mm).astype(np.int64)
-    shape = index.max(axis=0) + 3
-    key = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
-    places, first, cell_of = np.unique(key, return_index=True, return_inverse=True)
-    occupied = np.zeros(tuple(shape), dtype=bool)
-    occupied.reshape(-1)[places] = True
-    # no ray slips through a cell that happens to hold no point
-    occupied |= ndimage.binary_closing(occupied, np.ones((3, 3, 3), dtype=bool))
-    count = np.bincount(cell_of)
+    step = len(points_mm) // LOOKING_POINTS + 1
+    look, facing = (np.ascontiguousarray(each[::step]) for each in (points_mm, normals))
+    votes = _seen_from(look, facing, points_mm, normals, spacing_mm, sigma_mm)
+    side = _agreed(look, facing, (facing * votes).sum(axis=1), spacing_mm * np.sqrt(step), sigma_mm)
+    near = min(TOLD_BY, len(look))
+    away, index = cKDTree(look).query(points_mm, k=[*range(1, near + 1)], workers=-1)
+    cosine = np.einsum("na,nka->nk", normals, facing[index])
+    offset = look[index] - points_mm[:, None]
+    mean = normals[:, None] + np.sign(cosine)[..., None] * facing[index]
+    height = np.einsum("nka,nka->nk", offset, mean) / 2
+    slack = np.maximum(SHEET_SLOPE * away, SHEET_NOISES * sigma_mm) + 1e-9
+    weight = np.exp(-((height / slack) ** 2)) / (away + 0.1 * spacing_mm) ** 2
+    told = (weight * cosine * np.sign(side)[index]).sum(axis=1)
+    return normals * np.where(told < 0, -1.0, 1.0)[:, None]
 
-    def total(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "s 3"]:
-        return np.stack([np.bincount(cell_of, weights=values[:, a]) for a in range(3)], axis=1)
 
-    centre = total(points_mm) / count[:, None]
-    same = np.sign((normals * normals[first][cell_of]).sum(axis=1))
-    plane = total(normals * same[:, None])
-    plane /= np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
-    votes = np.zeros_like(centre)
-    votes[::EVERY_CELL] = kernels.open_side(
-        centre[::EVERY_CELL], directions(), occupied, low, cell_mm, SKIP_CELLS
-    )
-    side = _agreed(centre, plane, (plane * votes).sum(axis=1), cell_mm)
-    along = (normals * plane[cell_of]).sum(axis=1)
-    # where a cell holds two planes, the nearest that looked around decides for the other
-    looked = votes[::EVERY_CELL][cKDTree(centre[::EVERY_CELL]).query(centre)[1]]
-    own = (normals * looked[cell_of]).sum(axis=1)
-    sign = np.where(np.abs(along) > 0.5, along * np.sign(side)[cell_of], own)
-    return normals * np.where(sign < 0, -1.0, 1.0)[:, None]
+def _seen_from(
+    look_mm: Float[np.ndarray, "s 3"],
+    facing: Float[np.ndarray, "s 3"],
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    spacing_mm: float,
+    sigma_mm: float,
+) -> Float[np.ndarray, "s 3"]:
+    """(s, 3) sums of the directions in which places see far past the points' discs."""
+    step = len(points_mm) // HIDING_POINTS + 1
+    place, plane = (np.ascontiguousarray(each[::step]) for each in (points_mm, normals))
+    disc_mm = DISC_SPACINGS * spacing_mm * float(np.sqrt(step))
+    extent_mm = float(np.ptp(place, axis=0).max())
+    cell_mm = max(disc_mm, extent_mm / MOST_CELLS)
+    low = place.min(axis=0) - 2.0 * cell_mm - disc_mm
+    shape = np.floor((place.max(axis=0) + disc_mm - low) / cell_mm).astype(np.int64) + 3
+    start, discs = kernels.discs_of_cells(place, plane, disc_mm, low, cell_mm, shape)
+    own_mm = max(OWN_DISCS * disc_mm, 2.0 * SHEET_NOISES * sigma_mm)
+    return np.asarray(
+        kernels.open_side(
+            look_mm, facing, directions(), place, plane, kernels.Grid(low, cell_mm, shape, start),
+            discs, kernels.Sheet(disc_mm, own_mm, SHEET_SLOPE, SHEET_NOISES * sigma_mm),
+        )
+    )  # fmt: skip
 
 
 def _agreed(
-    centre_mm: Float[np.ndarray, "s 3"],
+    look_mm: Float[np.ndarray, "s 3"],
     plane: Float[np.ndarray, "s 3"],
     side: Float[np.ndarray, " s"],
-    cell_mm: float,
+    spacing_mm: float,
+    sigma_mm: float,
 ) -> Float[np.ndarray, " s"]:
-    """(s,) the sides, after cells in one plane have told each other: a face turns as a whole."""
+    """(s,) the sides, after places on one sheet have told each other: a face turns as a whole."""
     from scipy.sparse import coo_matrix
 
-    pairs = cKDTree(centre_mm).query_pairs(1.9 * cell_mm, output_type="ndarray")
+    pairs = cKDTree(look_mm).query_pairs(TELLS_SPACINGS * spacing_mm, output_type="ndarray")
     i, j = pairs[:, 0], pairs[:, 1]
     cosine = (plane[i] * plane[j]).sum(axis=1)
-    offset = centre_mm[j] - centre_mm[i]
+    offset = look_mm[j] - look_mm[i]
     reach = np.linalg.norm(offset, axis=1)
     height = np.abs((offset * (plane[i] + np.sign(cosine)[:, None] * plane[j])).sum(axis=1)) / 2
-    together = (np.abs(cosine) > 0.8) & (height < 0.35 * reach)
+    together = np.abs(cosine) > 0.8
+    together &= height < np.maximum(SHEET_SLOPE * reach, SHEET_NOISES * sigma_mm)
     weight = np.where(together, cosine, 0.0)
-    count = len(centre_mm)
+    count = len(look_mm)
     graph = coo_matrix((weight, (i, j)), shape=(count, count)).tocsr()
     graph = graph + graph.T
     degree = np.maximum(np.asarray(np.abs(graph).sum(axis=1)).ravel(), 1.0)

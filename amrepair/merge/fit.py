@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 import amrepair
 from amrepair.errors import InputError
-from amrepair.merge.cloud import outward, spacing_of
+from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.fuse import Cloud, Fused, fuse
 from amrepair.merge.joint import Slack
 from amrepair.merge.options import MergeOptions
@@ -207,10 +207,29 @@ def _joined(views: Sequence[View], placed: Placement) -> Cloud:
     # where the scans overlap little, the joint cloud is no denser than one of them
     spacing_mm = max(float((spacings**-2.0).sum() ** -0.5), spacing_of(every))
     sure = np.concatenate([view.sure for view in chosen.values()])
-    if not sure.all():
-        facing = np.where(sure[:, None], facing, outward(every, facing, spacing_mm))
     sigma_mm = max(view.sigma_mm for view in chosen.values())
+    if not sure.all():
+        tilt = np.concatenate([view.tilt_rad for view in chosen.values()])
+        facing = _by_all(every, facing, sure, tilt, spacing_mm, sigma_mm)
     return Cloud(every, facing, scan, len(chosen), spacing_mm, sigma_mm, float(spacings.max()))
+
+
+def _by_all(
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    sure: Bool[np.ndarray, " n"],
+    tilt_rad: Float[np.ndarray, " n"],
+    spacing_mm: float,
+    sigma_mm: float,
+) -> Float[np.ndarray, "n 3"]:
+    """Outward normals by what all scans have about a place, where that tells them better.
+
+    Together they are denser, and reach less far across thin walls.
+    """
+    every = planes(points_mm, spacing_mm)
+    better = (every.tilt_rad < tilt_rad)[:, None]
+    found = outward(points_mm, np.where(better, every.normals, normals), spacing_mm, sigma_mm)
+    return np.where(sure[:, None], normals, found)
 
 
 def _outvoted(cloud: Cloud, fused: Fused, which: Sequence[int]) -> dict[int, float]:

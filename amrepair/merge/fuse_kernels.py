@@ -20,6 +20,7 @@ MAX_NEAR = 2048
 # The scans' own variance is taken off twice: at edges they differ by where their points fell.
 NOISE_FACTOR = 2.0
 LAST_BIT = 62
+RAY_STEP = 0.5  # of a cell
 
 
 class Grid(NamedTuple):
@@ -29,6 +30,15 @@ class Grid(NamedTuple):
     cell: float
     shape: Int[np.ndarray, " 3"]
     start: Int[np.ndarray, " cells1"]
+
+
+class Sheet(NamedTuple):
+    """Discs' radius; which are of a place's own sheet: how near, how steep, how high by chance."""
+
+    disc: float
+    own: float
+    slope: float
+    chance: float
 
 
 class Rules(NamedTuple):
@@ -84,51 +94,122 @@ def local_planes(points, grid, radius):
     return normals, least, count
 
 
+@njit(cache=True, nogil=True)
+def discs_of_cells(places, planes, radius, low, cell, shape):
+    """Discs that reach into each cell: where each cell's begin, and their numbers."""
+    start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    discs = np.empty(0, np.int64)
+    for turn in range(2):
+        if turn == 1:
+            start[1:] = np.cumsum(start[1:])
+            discs = np.empty(start[-1], np.int64)
+            used = start[:-1].copy()
+        for k in range(len(places)):
+            for a in range(3):
+                half = radius * np.sqrt(max(1.0 - planes[k, a] * planes[k, a], 0.0))
+                first[a] = int((places[k, a] - half - low[a]) / cell)
+                last[a] = int((places[k, a] + half - low[a]) / cell)
+            for x in range(first[0], last[0] + 1):
+                for y in range(first[1], last[1] + 1):
+                    for z in range(first[2], last[2] + 1):
+                        c = (x * shape[1] + y) * shape[2] + z
+                        if turn == 0:
+                            start[c + 1] += 1
+                        else:
+                            discs[used[c]] = k
+                            used[c] += 1
+    return start, discs
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _is_hit(k, d, q, looks, facing, directions, places, planes, sheet):
+    """Whether the ray d of place k meets disc q, which is not of its own sheet."""
+    x, y, z = (
+        places[q, 0] - looks[k, 0],
+        places[q, 1] - looks[k, 1],
+        places[q, 2] - looks[k, 2],
+    )
+    slant = planes[q, 0] * directions[d, 0] + planes[q, 1] * directions[d, 1]
+    slant += planes[q, 2] * directions[d, 2]
+    if abs(slant) < 1e-6:
+        return False
+    t = (planes[q, 0] * x + planes[q, 1] * y + planes[q, 2] * z) / slant
+    if t <= 0.0:
+        return False
+    u, v, w = t * directions[d, 0] - x, t * directions[d, 1] - y, t * directions[d, 2] - z
+    if u * u + v * v + w * w > sheet.disc * sheet.disc:
+        return False
+    reach = np.sqrt(x * x + y * y + z * z)
+    height = abs(x * facing[k, 0] + y * facing[k, 1] + z * facing[k, 2])
+    return reach > sheet.own or height > max(sheet.slope * reach, sheet.chance)
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def open_side(places, directions, occupied, low, cell, skip):
+def open_side(looks, facing, directions, places, planes, grid, discs, sheet):
     """(s, 3) sums of the directions in which a place sees far: toward the open side.
 
-    A ray counts by how far it gets before an occupied cell; one that leaves the box counts most.
+    A ray counts by how far it gets before a disc; one that leaves the box counts most.
     """
-    s = len(places)
+    low, cell, shape, start = grid
+    s = len(looks)
     votes = np.zeros((s, 3))
-    step = 0.7
-    longest = np.sqrt(
-        float(occupied.shape[0] ** 2 + occupied.shape[1] ** 2 + occupied.shape[2] ** 2)
-    )
+    longest = np.sqrt(float(shape[0] ** 2 + shape[1] ** 2 + shape[2] ** 2))
     for k in prange(s):
-        x0 = (places[k, 0] - low[0]) / cell
-        y0 = (places[k, 1] - low[1]) / cell
-        z0 = (places[k, 2] - low[2]) / cell
+        x0 = (looks[k, 0] - low[0]) / cell
+        y0 = (looks[k, 1] - low[1]) / cell
+        z0 = (looks[k, 2] - low[2]) / cell
         for d in range(len(directions)):
-            t = skip
-            weight = 1.0
-            while True:
+            t, weight, before = 0.0, 1.0, -1
+            while weight == 1.0:
                 ix = int(np.floor(x0 + t * directions[d, 0]))
                 iy = int(np.floor(y0 + t * directions[d, 1]))
                 iz = int(np.floor(z0 + t * directions[d, 2]))
-                if (
-                    ix < 0
-                    or iy < 0
-                    or iz < 0
-                    or ix >= occupied.shape[0]
-                    or iy >= occupied.shape[1]
-                    or iz >= occupied.shape[2]
-                ):
+                if min(ix, iy, iz) < 0 or ix >= shape[0] or iy >= shape[1] or iz >= shape[2]:
                     break
-                if occupied[ix, iy, iz]:
-                    weight = 0.02 * min(t / longest, 1.0)
-                    break
-                t += step
+                c = (ix * shape[1] + iy) * shape[2] + iz
+                if c != before:
+                    for q in range(start[c], start[c + 1]):
+                        if _is_hit(
+                            k, d, discs[q], looks, facing, directions, places, planes, sheet
+                        ):
+                            weight = 0.02 * min(t / longest, 1.0)
+                            break
+                before = c
+                t += RAY_STEP
             for a in range(3):
                 votes[k, a] += weight * directions[d, a]
     return votes
+
+
+@njit(cache=True, nogil=True)
+def _has(scan, q, places, normals, index, low, cell, near, facing):
+    """Whether a scan has surface itself where a surfel of another lies."""
+    ix = int(np.floor((places[q, 0] - low[0]) / cell))
+    iy = int(np.floor((places[q, 1] - low[1]) / cell))
+    iz = int(np.floor((places[q, 2] - low[2]) / cell))
+    for x in range(max(ix - 1, 0), min(ix + 2, index.shape[1])):
+        for y in range(max(iy - 1, 0), min(iy + 2, index.shape[2])):
+            for z in range(max(iz - 1, 0), min(iz + 2, index.shape[3])):
+                own = index[scan, x, y, z]
+                if own < 0:
+                    continue
+                cosine = height = away = 0.0
+                for a in range(3):
+                    cosine += normals[q, a] * normals[own, a]
+                    height += normals[q, a] * (places[own, a] - places[q, a])
+                    away += (places[own, a] - places[q, a]) ** 2
+                beside = away - height * height
+                if cosine > facing and abs(height) <= near and beside <= 0.25 * cell * cell:
+                    return True
+    return False
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def columns(places, normals, scan, index, low, cell, near, far, facing):
     """(s,) other scans that have surface here; that have it elsewhere along the normal; how far.
 
+    What the scan has there, too, is another wall of the part, and no contradiction.
     `index` is (scans, x, y, z): number of the surfel of a scan in a cell, or −1.
     """
     s = len(places)
@@ -141,7 +222,7 @@ def columns(places, normals, scan, index, low, cell, near, far, facing):
         for r in range(scans):
             if r == scan[k]:
                 continue
-            best = 1e30
+            best, at = 1e30, -1
             for j in range(-steps, steps + 1):
                 t = 0.5 * j * cell
                 ix = int(np.floor((places[k, 0] + t * normals[k, 0] - low[0]) / cell))
@@ -165,10 +246,12 @@ def columns(places, normals, scan, index, low, cell, near, far, facing):
                     cosine += normals[k, a] * normals[q, a]
                     height += normals[k, a] * (places[q, a] - places[k, a])
                 if cosine > facing and abs(height) < best:
-                    best = abs(height)
+                    best, at = abs(height), q
             if best <= near:
                 support[k] += 1
-            elif best <= far:
+            elif best <= far and not _has(
+                scan[k], at, places, normals, index, low, cell, near, facing
+            ):
                 conflict[k] += 1
                 apart[k] = max(apart[k], best)
     return support, conflict, apart

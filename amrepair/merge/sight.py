@@ -238,14 +238,15 @@ def guess_directions(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "
     48 views of eight parts it was the right one in all).
     """
     spacing_mm = spacing_of(points_mm)
-    normals = planes(points_mm, spacing_mm).normals
+    plane = planes(points_mm, spacing_mm)
+    normals = plane.normals
     ways = directions(PLACES)
     hidden = np.array([_hidden(points_mm, normals, way, spacing_mm) for way in ways])
     if hidden.min() > VIEW_RATIO:
         return np.empty((0, 3))
     passed = ways[hidden <= max(HIDDEN_RATIO, hidden.min() + ABOVE_LEAST)]
     best = ways[int(np.argmin(hidden))]
-    side = float(np.sign(outward(points_mm, normals, spacing_mm) @ best).mean())
+    side = float(np.sign(outward(points_mm, normals, spacing_mm, plane.sigma_mm) @ best).mean())
     mean = best if side >= 0.0 else -best
     turned = passed * np.where(passed @ mean < 0.0, -1.0, 1.0)[:, None]
     if len(turned) < FEW_GUESSES:

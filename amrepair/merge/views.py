@@ -64,6 +64,8 @@ class View:
         All its points that lie on one surface: none at an edge of a range image.
     rough_mm
         (n,) how far the points around lie from the plane, beyond the noise.
+    tilt_rad
+        (n,) standard error of the normals.
     sure
         (n,) whether it is clear which way the normals face.
     thin
@@ -77,6 +79,7 @@ class View:
     name: str
     surface: Surface
     rough_mm: Float[np.ndarray, " n"]
+    tilt_rad: Float[np.ndarray, " n"]
     sure: Bool[np.ndarray, " n"]
     thin: Surface
     spacing_mm: float
@@ -111,12 +114,14 @@ class View:
         looks = _looks(points, sensors, index, rng)
         spacing_mm = spacing_of(points)
         plane = planes(points, spacing_mm)
-        normals, sure = _facing(points, plane.normals, spacing_mm, sensors, index, looks)
+        normals, sure = _facing(
+            points, plane.normals, spacing_mm, plane.sigma_mm, sensors, index, looks
+        )
         surface = Surface.of(points, normals)
         which = surface.tree.query(thin_out(points, THIN_POINTS, rng))[1]
         thin = Surface.of(points[which], normals[which])
         return cls(
-            scan.source, surface, plane.rough_mm, sure, thin, spacing_mm,
+            scan.source, surface, plane.rough_mm, plane.tilt_rad, sure, thin, spacing_mm,
             spacing_of(thin.points_mm), plane.sigma_mm, looks,
         )  # fmt: skip
 
@@ -144,6 +149,7 @@ def _facing(
     points_mm: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     spacing_mm: float,
+    sigma_mm: float,
     sensors_mm: Float[np.ndarray, "k 3"] | None,
     sensor_index: Int[np.ndarray, " n"] | None,
     looks: sight.Looks,
@@ -154,7 +160,7 @@ def _facing(
     elif len(looks.each):
         rays = looks.sensors_mm.mean(axis=0) - points_mm
     else:
-        return outward(points_mm, normals, spacing_mm), np.zeros(len(points_mm), bool)
+        return outward(points_mm, normals, spacing_mm, sigma_mm), np.zeros(len(points_mm), bool)
     along = (normals * rays).sum(axis=1) / np.linalg.norm(rays, axis=1)
     return normals * np.where(along < 0.0, -1.0, 1.0)[:, None], np.abs(along) > CLEAR
 

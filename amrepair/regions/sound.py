@@ -26,6 +26,8 @@ from amrepair.regions.calibration import Tail
 from amrepair.regions.significance import LEAST_SIGMA_MM
 from amrepair.template.port import Template
 
+SPACING_POINTS = 2_000  # that tell how dense sound scans are
+
 
 @dataclass(frozen=True, slots=True)
 class SoundTestOptions:
@@ -75,19 +77,49 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """Points of sound scans, by place, with their deviations: (n, 3) in the tree, (n,)."""
+    """Points of sound scans, by place, with their deviations: (n, 3) in the tree, (n,).
+
+    And the places of the template's surface that none of them looked at; None where all were.
+    """
 
     tree: cKDTree
     f_mm: Float[np.ndarray, " n"]
     spacing_mm: float
+    within_mm: float
+    unseen: cKDTree | None
+
+    @classmethod
+    def of(
+        cls,
+        points_mm: Float[np.ndarray, "n 3"],
+        f_mm: Float[np.ndarray, " n"],
+        template: Template,
+        options: SoundTestOptions,
+    ) -> _Known:
+        """By points of sound scans, and their deviations."""
+        tree = cKDTree(points_mm)
+        spacing_mm = _spacing_mm(tree)
+        within_mm = options.gap_spacings * spacing_mm
+        surface = template.surface_points(spacing_mm)[0]
+        away = tree.query(surface, distance_upper_bound=within_mm, workers=-1)[0]
+        far = surface[np.isinf(away)]
+        return cls(tree, f_mm, spacing_mm, within_mm, cKDTree(far) if len(far) else None)
 
     def looked(
-        self, feet_mm: Float[np.ndarray, "q 3"], options: SoundTestOptions
+        self, feet_mm: Float[np.ndarray, "q 3"], f_mm: Float[np.ndarray, " q"]
     ) -> Bool[np.ndarray, " q"]:
-        """(q,) whether a sound scan looked at a place of the surface."""
-        within = options.gap_spacings * self.spacing_mm
-        away = self.tree.query(feet_mm, distance_upper_bound=within, workers=-1)[0]
-        return np.asarray(np.isfinite(away))
+        """(q,) whether a sound scan looked at the surface that a point's deviation is told by.
+
+        At its foot, and beside it as far as the point lies off: where the template's surface is a
+        guess nearer than that, the true one may pass through the point. A guess begins so much
+        before it is called one as a gap may be wide.
+        """
+        away = self.tree.query(feet_mm, distance_upper_bound=self.within_mm, workers=-1)[0]
+        looked = np.isfinite(away)
+        if self.unseen is not None:
+            beside = self.unseen.query(feet_mm, workers=-1)[0] - self.within_mm
+            looked &= beside > np.abs(f_mm)
+        return looked
 
     def at(
         self, points_mm: Float[np.ndarray, "q 3"], count: int
@@ -101,6 +133,52 @@ class _Known:
         index = self.tree.query(points_mm, k=[*range(1, count + 1)], workers=-1)[1]
         near = self.f_mm[index]
         return near.mean(axis=1), near.std(axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What template and sound scans say of a scan's points.
+
+    Attributes
+    ----------
+    f_mm, normals
+        (n,) deviation from the template, (n, 3) its outward normals.
+    expected_mm, spread_mm
+        (n,) what sound points there deviate by in the mean, and their standard deviation.
+    looked
+        (n,) whether a sound scan looked at the surface that tells the deviation.
+    """
+
+    f_mm: Float[np.ndarray, " n"]
+    normals: Float[np.ndarray, "n 3"]
+    expected_mm: Float[np.ndarray, " n"]
+    spread_mm: Float[np.ndarray, " n"]
+    looked: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls,
+        points_mm: Float[np.ndarray, "n 3"],
+        template: Template,
+        known: _Known | None,
+        options: SoundTestOptions,
+    ) -> Seen:
+        """Of points, (n, 3) template frame; `known` is None where one sound scan is alone."""
+        f_mm, gradient = template.distance_and_gradient(points_mm)
+        normals = unit_vectors(gradient)
+        if known is None:
+            expected_mm, spread_mm = np.zeros(len(f_mm)), np.zeros(len(f_mm))
+        else:
+            expected_mm, spread_mm = known.at(points_mm, options.neighbours)
+        looked = _looked(points_mm, f_mm, normals, template, known)
+        return cls(f_mm, normals, expected_mm, spread_mm, looked)
+
+    def followed(self, within_mm: float) -> Bool[np.ndarray, " n"]:
+        """(n,) whether sound scans lie on the template there, within so much.
+
+        Elsewhere it is a guess, or wrong, and poses should not follow it.
+        """
+        return np.asarray(self.looked & (np.abs(self.expected_mm) <= within_mm))
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,35 +227,31 @@ class SoundTest:
         found: list[list[Float[np.ndarray, " w"]]] = []
         for k, points in enumerate(scans_mm):
             others = [m for m in range(len(scans_mm)) if m != k]
-            known = _joined(scans_mm, f_mm, others) if others else None
-            off_mm, sigma_mm, scales = _observed(points, template, known, options)
+            known = _joined(scans_mm, f_mm, others, template, options) if others else None
+            seen = Seen.of(points, template, known, options)
+            off_mm, sigma_mm, scales = _observed(points, seen, options)
             for level, z in enumerate(_standardised(off_mm, sigma_mm, scales)):
                 if level == len(found):
                     found.append([])
                 found[level].append(z)
         return cls(
             template,
-            _joined(scans_mm, f_mm, range(len(scans_mm))),
+            _joined(scans_mm, f_mm, range(len(scans_mm)), template, options),
             tuple(_null(np.concatenate(each), options) for each in found),
             options,
         )
 
-    def followed_at(
-        self, points_mm: Float[np.ndarray, "n 3"], within_mm: float
-    ) -> Bool[np.ndarray, " n"]:
-        """(n,) whether sound scans lie on the template there, within so much.
+    def look(self, points_mm: Float[np.ndarray, "n 3"]) -> Seen:
+        """Ask template and sound scans of a scan's points, (n, 3) in the template's frame."""
+        return Seen.of(points_mm, self.template, self.known, self.options)
 
-        (n, 3) template frame. Elsewhere it is a guess, or wrong, and poses should not follow it.
+    def judge(self, points_mm: Float[np.ndarray, "n 3"], seen: Seen | None = None) -> Judged:
+        """Test a scan, (n, 3) in the template's frame, against what sound ones leave.
+
+        `seen` is what `look` said of the same points.
         """
-        f_mm, gradient = self.template.distance_and_gradient(points_mm)
-        normals = unit_vectors(gradient)
-        looked = _looked(points_mm, f_mm, normals, self.template, self.known, self.options)
-        expected_mm, _ = self.known.at(points_mm, self.options.neighbours)
-        return np.asarray(looked & (np.abs(expected_mm) <= within_mm))
-
-    def judge(self, points_mm: Float[np.ndarray, "n 3"]) -> Judged:
-        """Test a scan, (n, 3) in the template's frame, against what sound ones leave."""
-        off_mm, sigma_mm, scales = _observed(points_mm, self.template, self.known, self.options)
+        seen = seen or self.look(points_mm)
+        off_mm, sigma_mm, scales = _observed(points_mm, seen, self.options)
         found = list(_standardised(off_mm, sigma_mm, scales))[: len(self.statistics)]
         least = 0.0
         for z, (spread, tail) in zip(found, self.statistics, strict=False):
@@ -188,41 +262,41 @@ class SoundTest:
         return Judged(least + float(np.log(max(len(found), 1))), off_mm, sigma_mm)
 
 
+def _spacing_mm(tree: cKDTree) -> float:
+    """1/√ρ of ρ points a mm²: random ones have their 8th neighbour at √(8/πρ) on average."""
+    some = tree.data[:: max(1, tree.n // SPACING_POINTS)]
+    count = min(8, tree.n - 1)
+    reach = tree.query(some, k=[count + 1], workers=-1)[0][:, 0]
+    return float(np.median(reach) * np.sqrt(np.pi / max(count, 1)))
+
+
 def _joined(
     scans_mm: Sequence[Float[np.ndarray, "_ 3"]],
     f_mm: Sequence[Float[np.ndarray, " _"]],
     which: Sequence[int],
+    template: Template,
+    options: SoundTestOptions,
 ) -> _Known:
     points = np.concatenate([scans_mm[k] for k in which])
-    f = np.concatenate([f_mm[k] for k in which])
-    return _Known(cKDTree(points), f, estimate_spacing(points))
+    return _Known.of(points, np.concatenate([f_mm[k] for k in which]), template, options)
 
 
 def _observed(
-    points_mm: Float[np.ndarray, "n 3"],
-    template: Template,
-    known: _Known | None,
-    options: SoundTestOptions,
+    points_mm: Float[np.ndarray, "n 3"], seen: Seen, options: SoundTestOptions
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], tuple[Scale, ...]]:
     """Deviation of each point from what is normal there, its standard error, and the windows."""
-    f_mm, gradient = template.distance_and_gradient(points_mm)
-    expected_mm, spread_mm = (
-        (0.0, 0.0) if known is None else known.at(points_mm, options.neighbours)
-    )
-    normals = unit_vectors(gradient)
-    off_mm = np.clip(f_mm - expected_mm, -options.most_off_mm, options.most_off_mm)
+    off_mm = np.clip(seen.f_mm - seen.expected_mm, -options.most_off_mm, options.most_off_mm)
     scales = scales_of(
         points_mm,
-        normals,
+        seen.normals,
         off_mm,
         np.ones(len(off_mm)),
         cell_mm=estimate_spacing(points_mm),
         widest_mm=options.widest_mm,
     )
     noise_mm = _noise_mm(off_mm, scales[-1])
-    sigma_mm = np.hypot(noise_mm, np.sqrt(np.maximum(spread_mm**2 - noise_mm**2, 0.0)))
-    sigma_mm = np.broadcast_to(sigma_mm, off_mm.shape).copy()
-    sigma_mm[~_looked(points_mm, f_mm, normals, template, known, options)] = np.inf
+    sigma_mm = np.maximum(noise_mm, seen.spread_mm)
+    sigma_mm[~seen.looked] = np.inf
     return off_mm, sigma_mm, scales
 
 
@@ -232,18 +306,18 @@ def _looked(
     normals: Float[np.ndarray, "n 3"],
     template: Template,
     known: _Known | None,
-    options: SoundTestOptions,
 ) -> Bool[np.ndarray, " n"]:
     """(n,) whether what lies there was looked at: what was not is unknown, and speaks for nothing.
 
     A hollow that the template closed by a guess has no sound point on the guess.
     """
     feet_mm = points_mm - f_mm[:, None] * normals
-    looked = np.ones(len(points_mm), bool) if known is None else known.looked(feet_mm, options)
+    if known is not None:
+        return known.looked(feet_mm, f_mm)
     told = getattr(template, "coverage", None)
-    if told is not None:
-        looked &= ~(told.unseen_at(points_mm) | told.unseen_at(feet_mm))
-    return looked
+    if told is None:
+        return np.ones(len(points_mm), bool)
+    return np.asarray(~(told.unseen_at(points_mm) | told.unseen_at(feet_mm)))
 
 
 def _noise_mm(off_mm: Float[np.ndarray, " n"], scale: Scale) -> float:

@@ -66,7 +66,7 @@ def joined(clouds: list[np.ndarray]) -> Cloud:
     points = np.concatenate(clouds)
     together = spacing_of(points)
     scan = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-    facing = outward(points, normals, together)
+    facing = outward(points, normals, together, SIGMA_MM)
     return Cloud(points, facing, scan, len(clouds), together, SIGMA_MM, max(spacing))
 
 
@@ -92,13 +92,39 @@ def test_noise_and_spacing_are_measured(part: AnalyticTemplate) -> None:
 def test_normals_point_outwards_also_in_the_hole(part: AnalyticTemplate) -> None:
     points = points_of(part, 60_000, 1)
     spacing_mm = spacing_of(points)
-    normals = outward(points, planes(points, spacing_mm).normals, spacing_mm)
+    normals = outward(points, planes(points, spacing_mm).normals, spacing_mm, SIGMA_MM)
     gradient = part.distance_and_gradient(points)[1]
     agree = (normals * gradient).sum(axis=1)
     assert (agree > 0).mean() > 0.995  # planes through an edge lie across it
     hole = (np.linalg.norm(points[:, :2] - (10, 9), axis=1) < 4.2) & (points[:, 2] > 1)
     hole &= points[:, 2] < 7
     assert (agree[hole] > 0).mean() > 0.99
+
+
+def test_both_sides_of_a_thin_wall_are_told_apart() -> None:
+    """A duct with walls of 1.5 mm, points a millimetre apart: planes, sides, and the noise."""
+    duct = difference(box((0, 0, 0), (50, 26, 20)), box((-1, 1.5, 1.5), (51, 24.5, 18.5)))
+    points = sample_surface(duct.body, 1.0, seed=0)[0]
+    points += np.random.default_rng(0).normal(0.0, 0.05, points.shape)
+    spacing_mm = spacing_of(points)
+    plane = planes(points, spacing_mm)
+    assert plane.sigma_mm < 2.0 * 0.05  # edges and corners are everywhere
+    normals = outward(points, plane.normals, spacing_mm, plane.sigma_mm)
+    agree = (normals * duct.distance_and_gradient(points)[1]).sum(axis=1)
+    assert (agree < -0.3).mean() < 0.03
+
+
+def test_a_hollow_that_one_scan_alone_saw_into_is_kept() -> None:
+    """The others have a wall above it, which the scan has, too: that contradicts nothing."""
+    step = difference(box((0, 0, 0), (40, 30, 12)), box((10, 8, 4), (30, 22, 13)))
+    clouds = []
+    for seed in range(4):
+        points = sample_surface(step.body, 0.8, seed=seed)[0]
+        points += np.random.default_rng(seed).normal(0.0, 0.03, points.shape)
+        floor = (abs(points - (20, 15, 4)) < (9.9, 6.9, 0.5)).all(axis=1)
+        shelf = (points[:, 2] > 3.0) & (points[:, 2] < 11.0) & floor
+        clouds.append(points if seed == 0 else points[~shelf])
+    assert fuse(joined(clouds)).rejected < 20
 
 
 def test_scans_find_each_other(part: AnalyticTemplate) -> None:

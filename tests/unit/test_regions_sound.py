@@ -80,14 +80,49 @@ def test_a_bias_that_all_sound_parts_have_is_normal(template: GridSdf) -> None:
 
 
 def test_what_no_scan_saw_speaks_against_none(template: GridSdf, sound: SoundTest) -> None:
-    centre = np.array([[10.0, 10.0, 12.0]])
-    unseen = Coverage.of(centre, np.ones(1), np.asarray(template.bounds_mm), 6.0)
-    partial = SoundTest.of(replace(template, coverage=unseen), [scanned(seed) for seed in range(4)])
+    """Not where the sound scans have a hole; nor where a single one's template is a guess."""
     dent = dented(scanned(50), 2.0, 0.6)
     assert sound.judge(dent).log_expected < -10.0
-    judged = partial.judge(dent)
-    assert judged.log_expected > STATED
-    assert np.isinf(judged.sigma_mm).any()
+    holed = [
+        points[np.linalg.norm(points - (10.0, 10.0, 12.0), axis=1) > 4.0]
+        for points in (scanned(seed) for seed in range(4))
+    ]
+    centre = np.array([[10.0, 10.0, 12.0]])
+    unseen = Coverage.of(centre, np.ones(1), np.asarray(template.bounds_mm), 6.0)
+    for partial in (
+        SoundTest.of(template, holed),
+        SoundTest.of(replace(template, coverage=unseen), holed[:1]),
+    ):
+        judged = partial.judge(dent)
+        assert judged.log_expected > STATED
+        assert np.isinf(judged.sigma_mm).any()
+
+
+def test_a_defect_beside_what_no_scan_saw_is_found(template: GridSdf) -> None:
+    """What is unknown is so many spacings wide, not whole cells of a grid."""
+    holed = [
+        points[np.linalg.norm(points - (20.0, 10.0, 12.0), axis=1) > 4.0]
+        for points in (scanned(seed) for seed in range(4))
+    ]
+    assert SoundTest.of(template, holed).judge(dented(scanned(50), 2.0, 0.6)).log_expected < -10.0
+
+
+def test_a_hollow_deeper_than_the_template_guesses_is_unknown() -> None:
+    """The sound scans saw the pocket's rim alone, and the template closes it at half its depth."""
+    import trimesh
+
+    solid = trimesh.creation.box(bounds=[(0, 0, 0), (40, 30, 12)])
+    shallow = trimesh.creation.box(bounds=[(28, 18, 9), (36, 26, 13)])
+    guess = fit_fast(MeshSdf.from_mesh(trimesh.boolean.difference([solid, shallow])))
+
+    def down_to(z_mm: float, seed: int) -> np.ndarray:
+        points = scanned(seed)
+        x, y, z = points.T
+        inside = (x > 27.5) & (x < 36.5) & (y > 17.5) & (y < 26.5)
+        return points[~(inside & (z < z_mm) & (z > 5.5))]
+
+    test = SoundTest.of(guess, [down_to(9.5, seed) for seed in range(4)])
+    assert test.judge(down_to(5.0, 9)).log_expected > STATED
 
 
 def test_noise_is_the_scan_s_own(sound: SoundTest) -> None:
