@@ -73,11 +73,6 @@ def serve(told: Served) -> None:
     _refuse_early(told)
     machine, screens = _machine(told.address, told.key)
     touches = told.said["scanner"] == PROBE
-    if touches and not isinstance(machine, TellsTouches):
-        raise InputError(
-            f"--scanner probe: {told.address.name} does not tell where a touch ended; print over "
-            "the printer's own port ('amrepair loop --port'), or name a scanner that sees"
-        )
     machine.connect()
     talk = Talk(machine, screens, lambda text: console.errors.print(text, markup=False))
     try:
