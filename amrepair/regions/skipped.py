@@ -126,7 +126,8 @@ def skipped(
     both = _together(by_both, paths.path, options.looks_together)
     gone = sure | (both >= options.gone_by_both)
     sure |= both >= options.sure_by_both
-    found = paths.stretches(gone, sure, np.full(len(line), options.least_stretch_mm))
+    kept = paths.kept(gone, sure, np.full(len(line), options.least_stretch_mm))
+    found = paths.stretches(kept)
     if not len(found.width_mm):
         return found
     # where the extruder has slipped in a layer it is likelier to have slipped there again
@@ -135,7 +136,8 @@ def skipped(
     likely = again[line] & (both >= options.gone_again)
     sure |= likely & (surface_says > 0)
     least_mm = np.where(again[line], options.least_again_mm, options.least_stretch_mm)
-    return paths.stretches(gone | likely, sure, least_mm)
+    kept = paths.kept(gone | likely, sure, least_mm)
+    return paths.stretches(paths.grown(kept, by_both, options))
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,20 +188,53 @@ class _Paths:
         share = (at_mm - ends_mm[line]) / length_mm[line]
         return cls(lines, ends_mm, of, at_mm, step_mm, line, share)
 
-    def stretches(
+    def kept(
         self,
         gone: Bool[np.ndarray, " m"],
         sure: Bool[np.ndarray, " m"],
         least_mm: Float[np.ndarray, " m"],
-    ) -> PlannedBeads:
-        """Neighbouring looks that say so, as one bead for each line of theirs; one is sure."""
-        at = np.flatnonzero(gone)
-        begins = np.ones(len(at), dtype=bool)
-        begins[1:] = (np.diff(at) > 1) | (np.diff(self.path[at]) != 0)
-        a, b = at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
+    ) -> Bool[np.ndarray, " m"]:
+        """Neighbouring looks that say so, over a length, of which one is sure."""
+        a, b = self._runs(gone, self.path)
         surely = np.concatenate([[0], np.cumsum(sure)])
-        kept = ((b - a + 1) * self.step_mm[a] >= least_mm[a]) & (surely[b + 1] > surely[a])
-        a, b = a[kept], b[kept]
+        long = ((b - a + 1) * self.step_mm[a] >= least_mm[a]) & (surely[b + 1] > surely[a])
+        found = np.zeros(len(gone), dtype=bool)
+        for first, last in zip(a[long], b[long], strict=True):
+            found[first : last + 1] = True
+        return found
+
+    def grown(
+        self, kept: Bool[np.ndarray, " m"], gone: Float[np.ndarray, " m"], options: SkippedOptions
+    ) -> Bool[np.ndarray, " m"]:
+        """Stretches go on, round corners too, as long as the next looks on the whole say so.
+
+        `gone` is above 0 where less than half of a bead is there. Where a stretch is known to have
+        slipped that is enough; nothing begins by it.
+        """
+        apart_mm = np.abs(self.lines.start_mm[1:] - self.lines.end_mm[:-1]).max(axis=1)
+        chain = np.concatenate([[0], np.cumsum(apart_mm >= options.joined_mm)])[self.line]
+        open_on = kept | (_best_mean(gone, chain, options.looks_together) > 0)
+        found = np.zeros_like(kept)
+        for a, b in zip(*self._runs(open_on, chain), strict=True):
+            mine = np.arange(a, b + 1)
+            seen = mine[kept[a : b + 1] | (gone[a : b + 1] > 0)]  # an end that is there is none
+            if kept[a : b + 1].any():
+                found[seen[0] : seen[-1] + 1] = True
+        return found
+
+    @staticmethod
+    def _runs(
+        pick: Bool[np.ndarray, " m"], of: Int[np.ndarray, " m"]
+    ) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
+        """First and last of neighbouring looks that are picked, of one path or chain."""
+        at = np.flatnonzero(pick)
+        begins = np.ones(len(at), dtype=bool)
+        begins[1:] = (np.diff(at) > 1) | (np.diff(of[at]) != 0)
+        return at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
+
+    def stretches(self, gone: Bool[np.ndarray, " m"]) -> PlannedBeads:
+        """Neighbouring looks that say so, as one bead for each line of theirs."""
+        a, b = self._runs(gone, self.path)
         from_mm, to_mm = (
             self.at_mm[k] + sign * self.step_mm[k] for k, sign in ((a, -0.5), (b, 0.5))
         )
@@ -280,14 +315,21 @@ def _topped(
 def _together(
     value: Float[np.ndarray, " m"], path: Int[np.ndarray, " m"], together: int
 ) -> Float[np.ndarray, " m"]:
-    """(m,) the best mean of so many neighbours on one path that each belongs to."""
+    """(m,) `_best_mean` where a look says "gone" itself: an end that is there does not belong."""
+    return np.where(value > 0, _best_mean(value, path, together), -np.inf)
+
+
+def _best_mean(
+    value: Float[np.ndarray, " m"], of: Int[np.ndarray, " m"], together: int
+) -> Float[np.ndarray, " m"]:
+    """(m,) the best mean of so many neighbours of one path that each belongs to."""
     m = len(value)
     whole = np.full(m, -np.inf)
     if m < together:
         return whole
     total = np.concatenate([[0.0], np.cumsum(value)])
     mean = (total[together:] - total[:-together]) / together
-    mean[path[together - 1 :] != path[: m - together + 1]] = -np.inf
+    mean[of[together - 1 :] != of[: m - together + 1]] = -np.inf
     for k in range(together):
         np.maximum(whole[k : k + len(mean)], mean, out=whole[k : k + len(mean)])
-    return np.where(value > 0, whole, -np.inf)  # an end that is there does not belong to it
+    return whole

@@ -13,7 +13,8 @@ from amrepair.deficit import Deficit, compute_deficit
 from amrepair.field.as_built import Evidence
 from amrepair.frames import Transform
 from amrepair.regions import detect
-from amrepair.regions.skipped import PlannedBeads, skipped
+from amrepair.regions.options import USUAL_SKIPPED
+from amrepair.regions.skipped import PlannedBeads, _Paths, skipped
 from amrepair.scans import Scan
 from tests import analytic
 
@@ -241,3 +242,28 @@ def gone_of(scan: Scan) -> PlannedBeads:
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
     return skipped(lines(), anomaly.evidence, BLOCK)
+
+
+@pytest.mark.parametrize("open_again", [False, True])
+def test_a_stretch_goes_on_round_a_corner_as_long_as_looks_say_open(open_again: bool) -> None:
+    # regression: round the corner of an inner wall, where looks on neither side are enough to say
+    # so, two layers kept a hole of 3.5 mm, whatever was gone before and after it
+    start = np.array([[0.0, 0.0, 1.0], [10.0, 0.0, 1.0], [20.0, 0.0, 1.0]])
+    end = np.array([[10.0, 0.0, 1.0], [10.0, 8.0, 1.0], [30.0, 0.0, 1.0]])  # the last is apart
+    lines = PlannedBeads(start, end, np.full(3, WIDE_MM), np.full(3, HIGH_MM))
+    paths = _Paths.of(lines, USUAL_SKIPPED)
+    along_mm = paths.at_mm
+    gone = np.where((along_mm > 6.0) & (along_mm < 14.0), 0.2, -1.0)
+    gone[np.argmin(np.abs(along_mm - 10.6))] = -0.1  # one look among others
+    gone[along_mm > 18.0] = 0.2 if open_again else -1.0  # not joined: nothing was seen to begin
+    kept = (along_mm > 6.5) & (along_mm < 8.2)
+    grown = paths.grown(kept, gone, USUAL_SKIPPED)
+    assert not grown[along_mm > 18.0].any()
+    far_mm = along_mm[grown]
+    assert (far_mm.min(), far_mm.max()) == pytest.approx((6.0, 14.0), abs=0.3)
+    assert grown[(along_mm > 6.3) & (along_mm < 13.7)].all()
+    assert not paths.grown(np.zeros_like(kept), gone, USUAL_SKIPPED).any()
+    found = paths.stretches(grown)
+    assert len(found.width_mm) == 2
+    assert found.end_mm[0] == pytest.approx([10.0, 0.0, 1.0], abs=1e-6)
+    assert found.start_mm[1] == pytest.approx([10.0, 0.0, 1.0], abs=1e-6)
