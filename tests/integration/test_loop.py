@@ -231,7 +231,7 @@ def test_stops_are_after_layers_that_there_are(template: MeshSdf) -> None:
     stops = plan_stops(job, [5, 3, 5])
     assert [stop.layer_index for stop in stops] == [3, 5, None]
     assert stops[0].line == job.layers[4].first_line
-    with pytest.raises(LoopError, match="no layer 999"):
+    with pytest.raises(InputError, match="no layer 999"):
         plan_stops(job, [999])
 
 
