@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from amrepair.align import AlignOptions
 from amrepair.deficit.options import DeficitOptions
 from amrepair.regions.options import RegionOptions
+from gcode.slicing.options import PatchOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class RepairOptions:
         A part stands upright where its Z is the bed's: 1 − cos of 0.05 mm over 100 mm.
     same_repair_ratio
         Two poses whose repairs share less than this are two different repairs.
-    align, regions, deficit
+    align, regions, deficit, patch
         Of each stage. What the process may leave, and how far it wanders, is the site's.
     """
 
@@ -48,6 +49,7 @@ class RepairOptions:
     align: AlignOptions = field(default_factory=AlignOptions)
     regions: RegionOptions = field(default_factory=RegionOptions)
     deficit: DeficitOptions = field(default_factory=DeficitOptions)
+    patch: PatchOptions = field(default_factory=PatchOptions)
 
 
 USUAL_REPAIR = RepairOptions()

@@ -260,6 +260,7 @@ def _slice(
         start_mm=None if interruption is None else (x_mm, y_mm, z_mm),
         hotend_c=None if interruption is None else interruption.hotend_c,
         lines=lines,
+        options=site.options.patch,
         progress=progress,
     )
 

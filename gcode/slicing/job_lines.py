@@ -16,19 +16,12 @@ from scipy.spatial import cKDTree
 
 from gcode.moves import Role
 from gcode.slicing.beads import Bead
+from gcode.slicing.options import USUAL_PATCH, JobLineOptions
 from gcode.surfaces import raster_kernels as kernels
 
 SAME_LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
-# Beside the deficit's columns: its rim is as uncertain as the scan's noise and spacing make it.
-RIM_MM = 0.3
 ON_MM = 0.05  # of a line's middle
 EXACTLY_MM = 0.01  # how exactly it is told which columns lie in a line
-# A scanner's spot rounds off what is gone: a little beside a lot is the lot's own. Shares of what
-# the job lays in a piece of a line: from here on it lacks a lot, up to there a little, and less is
-# nothing.
-LOT, LITTLE, NOTHING = 0.4, 0.35, 0.1
-NEARLY_ALL, STANDS_OUT = 0.75, 0.1  # shares that a line which is gone reads, at least, and more
-BESIDE_WIDTHS = 1.4  # from a line to its neighbour
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +97,8 @@ class JobColumns:
         (ny · nx, 2) their middles.
     low_mm, high_mm
         Heights between which they are asked about.
+    rim_mm
+        Neighbours are so near.
     """
 
     def __init__(
@@ -114,9 +109,10 @@ class JobColumns:
         cell_mm: float,
         low_mm: float,
         high_mm: float,
+        rim_mm: float,
     ) -> None:
         away_mm = ndimage.distance_transform_edt(~asked) * cell_mm
-        self.near = np.asarray(away_mm <= RIM_MM)
+        self.near = np.asarray(away_mm <= rim_mm)
         self._corner_mm = points_mm[0] - 0.5 * cell_mm
         near_mm = points_mm[self.near.ravel()]
         low, high = near_mm.min(axis=0), near_mm.max(axis=0)
@@ -204,6 +200,7 @@ def gathered(
     length_mm: Float[np.ndarray, " n"],
     middle_mm: Float[np.ndarray, "n 2"],
     width_mm: float,
+    options: JobLineOptions = USUAL_PATCH.lines,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """What is missing, piece by piece of the job's lines, a little beside a lot given to the lot.
 
@@ -225,15 +222,15 @@ def gathered(
     own_mm3 = np.maximum(job.section_mm2 * length_mm, 1e-9)
     most_mm3 = own_mm3 * np.maximum(1.0, deep_mm / job.height_mm)
     share = volume_mm3 / own_mm3
-    gone = job.gone & (share > LITTLE)
-    gone[gone] = _rounded_off(share, gone, middle_mm, BESIDE_WIDTHS * width_mm)
+    gone = job.gone & (share > options.little)
+    gone[gone] = _rounded_off(share, gone, middle_mm, options.beside_widths * width_mm, options)
     volume = np.where(gone, np.maximum(volume_mm3, own_mm3), volume_mm3)
     share = volume / own_mm3
-    little = np.flatnonzero((share < LITTLE) & (share > 0))
-    lot = np.flatnonzero(share >= LOT)
+    little = np.flatnonzero((share < options.little) & (share > 0))
+    lot = np.flatnonzero(share >= options.lot)
     if len(little) and len(lot):
         beside = cKDTree(middle_mm[lot]).query_ball_point(
-            middle_mm[little], BESIDE_WIDTHS * width_mm
+            middle_mm[little], options.beside_widths * width_mm
         )
         for k, others in zip(little, beside, strict=True):
             near = lot[others][np.argsort(-share[lot[others]])]
@@ -243,7 +240,7 @@ def gathered(
                 volume[k] -= moved
             if gone[near].any():
                 volume[k] = 0.0  # it was the gone line's own, which has it already
-    dropped = volume < NOTHING * own_mm3
+    dropped = volume < options.nothing * own_mm3
     return np.where(dropped, 0.0, volume), volume_mm3 - np.where(dropped, volume, 0.0)
 
 
@@ -252,6 +249,7 @@ def _rounded_off(
     asked: Bool[np.ndarray, " n"],
     middle_mm: Float[np.ndarray, "n 2"],
     around_mm: float,
+    options: JobLineOptions,
 ) -> Bool[np.ndarray, " q"]:
     """Which of some pieces lack all of a line, though they read as if they lacked less.
 
@@ -261,7 +259,7 @@ def _rounded_off(
     tree = cKDTree(middle_mm)
     near = tree.query_ball_point(middle_mm[asked], around_mm)
     around = np.array([share[others].mean() for others in near])
-    return (share[asked] > NEARLY_ALL) | (share[asked] - around > STANDS_OUT)
+    return (share[asked] > options.nearly_all) | (share[asked] - around > options.stands_out)
 
 
 def runs_of(

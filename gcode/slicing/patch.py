@@ -21,6 +21,7 @@ from gcode.progress import Progress, silent
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.layers import LayerGrid
+from gcode.slicing.options import USUAL_PATCH, PatchOptions
 from gcode.slicing.patch_laying import after_first, begin, emit, end, first_pass_words
 from gcode.slicing.patch_left import (
     NOT_CLOSED,
@@ -51,6 +52,8 @@ class PatchPlan:
         The surface after the patch.
     first_pass
         How the first pass is laid onto what has long been cold, in words.
+    options
+        That it was planned with.
     """
 
     toolpath: Toolpath
@@ -61,6 +64,7 @@ class PatchPlan:
     regions: tuple[PatchRegion, ...]
     predicted: HeightField
     first_pass: str
+    options: PatchOptions = USUAL_PATCH
 
 
 def slice_patch(
@@ -73,6 +77,7 @@ def slice_patch(
     start_mm: tuple[float, float, float] | None = None,
     hotend_c: float | None = None,
     lines: JobLines | None = None,
+    options: PatchOptions = USUAL_PATCH,
     progress: Progress = silent,
 ) -> PatchPlan:
     """Slice a deficit.
@@ -96,6 +101,8 @@ def slice_patch(
     lines
         What the job laid there, where that is known: the patch follows it, step by step of its
         staircase, with as much of each line's plastic as is missing.
+    options
+        How passes and beads are planned.
 
     Raises
     ------
@@ -123,7 +130,7 @@ def slice_patch(
         raise SliceError("The deficit is empty (0 mm³); there is nothing to print.")
     if not standalone and start_mm is None:
         raise SliceError("A patch in mid-job needs the place where the nozzle is parked.")
-    model = PatchModel(deficit, setup, as_built, lines)
+    model = PatchModel(deficit, setup, as_built, lines, options)
     best = best_plan(model, grid, setup, progress)
     dropped = np.zeros(model.shape, dtype=bool)
     if model.job is None:

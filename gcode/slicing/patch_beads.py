@@ -19,24 +19,12 @@ from gcode.slicing.infill import ring_beads, solid_fill
 from gcode.slicing.job_lines import JobPieces, gathered
 from gcode.slicing.layer_plan import LEAST_NOZZLES, MOST_NOZZLES
 from gcode.slicing.medial import fill_thin
+from gcode.slicing.options import PatchOptions
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
 from gcode.surfaces import raster_kernels
 
-# A patch presses into pores and roughness that no scan resolves, and printers push a per cent
-# less than they are asked to: what is too little stays a void, what is too much is planed.
-BOND_RATIO = 1.015
-# Thinner than this no bead holds together; it is filled with the next pass, or is the tolerance.
-LEAST_THICK_MM = 0.06
-LEAST_SECTION_MM2 = 0.004
-# What is pressed out under the flat beside a wall goes on to the wall, where that is this near to
-# what it reaches: nowhere else has it to go.
-TO_WALL_MM = 0.2
-# Centre lines keep off the rim of where the tip may go: outlines round off the corners of its
-# cells, by about so much.
-DRAWN_MM = 0.035
-ON_LINE_MM = 0.02
 CORNER_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 
 
@@ -101,7 +89,7 @@ def draw(
     Within `rings` perimeters the lines go at an angle. `free` is an answer of the model's reach.
     """
     wanted = contour(thick_mm > 0, model)
-    drawn_in = offset(_free_over(wanted, free, model.reach) ^ wanted, -DRAWN_MM)
+    drawn_in = offset(_free_over(wanted, free, model.reach) ^ wanted, -model.options.beads.drawn_mm)
     if drawn_in.is_empty():
         return None
     height_mm = float(thick_mm[thick_mm > 0].mean())
@@ -153,7 +141,8 @@ class _Shares:
         filled = np.flatnonzero(thick.ravel() > 0)
         tree = cKDTree(middle)
         distance, nearest = tree.query(
-            model.points_mm[filled], distance_upper_bound=model.spread_mm + TO_WALL_MM
+            model.points_mm[filled],
+            distance_upper_bound=model.spread_mm + model.options.beads.to_wall_mm,
         )
         near = np.isfinite(distance) & ((distance < model.spread_mm) | strips.ravel()[filled])
         columns = filled[near]
@@ -187,6 +176,7 @@ def weighed(
     the chains, and the thickness that columns get: none beyond where a bead can spread (farther in
     `strips` along walls), less where a bead would be too wide.
     """
+    options = model.options
     shares = _Shares.of(runs, thick, strips, model)
     volume = shares.sums(shares.thick_mm * model.cell_mm**2 * model.weight)
     depth = shares.deep_mm
@@ -194,7 +184,13 @@ def weighed(
     if job is not None:
         told_mm3 = _by_lines(volume, runs, shares, job, thick, model)
         volume, met_mm3 = gathered(
-            told_mm3, depth, job, shares.length_mm, shares.middle_mm, setup.process.line_width_mm
+            told_mm3,
+            depth,
+            job,
+            shares.length_mm,
+            shares.middle_mm,
+            setup.process.line_width_mm,
+            options.lines,
         )
         own, met = job.section_mm2, met_mm3 / np.maximum(told_mm3, 1e-9)
     chains: list[Chain] = []
@@ -203,12 +199,14 @@ def weighed(
     for run, tip_mm in zip(runs, tips_mm, strict=True):
         mine = slice(at, at + len(run.xy_mm) - 1)
         at = mine.stop
-        section = BOND_RATIO * _smooth(volume[mine], shares.length_mm[mine], closed=run.closed)
-        deep = np.maximum(depth[mine], LEAST_THICK_MM)
-        most = _most_section(deep, BOND_RATIO * own[mine], setup)
+        section = options.beads.bond_ratio * _smooth(
+            volume[mine], shares.length_mm[mine], closed=run.closed
+        )
+        deep = np.maximum(depth[mine], options.beads.least_thick_mm)
+        most = _most_section(deep, options.beads.bond_ratio * own[mine], setup)
         given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9)) * met[mine]
         section = np.minimum(section, most)
-        chains += _split(Chain(run.xy_mm, tip_mm, section, deep, run.role))
+        chains += _split(Chain(run.xy_mm, tip_mm, section, deep, run.role), options)
     laid = np.zeros(thick.size)
     laid[shares.columns] = shares.thick_mm * given[shares.piece]
     return chains, laid.reshape(thick.shape)
@@ -236,7 +234,9 @@ def _by_lines(
     One line has four columns across it, the next one five: that is no reason to lay less of it.
     The total stays what it is. What lies beside the lines is added to the nearest as it is.
     """
-    under = np.flatnonzero(job.over & beside_runs(runs, job.half_mm + ON_LINE_MM, model))
+    under = np.flatnonzero(
+        job.over & beside_runs(runs, job.half_mm + model.options.beads.on_line_mm, model)
+    )
     of_piece = shares.tree.query(model.points_mm[under])[1]
     number = np.bincount(of_piece, minlength=shares.tree.n)
     deep = np.bincount(of_piece, thick.ravel()[under], minlength=shares.tree.n)
@@ -273,9 +273,9 @@ def _smooth(
     return np.asarray(section * volume_mm3.sum() / max(float(section @ length_mm), 1e-9))
 
 
-def _split(chain: Chain) -> list[Chain]:
+def _split(chain: Chain, options: PatchOptions) -> list[Chain]:
     """Drop the pieces where there is nothing to lay."""
-    keep = np.concatenate([[False], chain.section_mm2 > LEAST_SECTION_MM2, [False]])
+    keep = np.concatenate([[False], chain.section_mm2 > options.beads.least_section_mm2, [False]])
     edges = np.flatnonzero(np.diff(keep.astype(np.int8)))
     return [
         Chain(

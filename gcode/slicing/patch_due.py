@@ -8,19 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from gcode.slicing.job_lines import RIM_MM
-from gcode.slicing.patch_beads import LEAST_THICK_MM, TO_WALL_MM
 from gcode.slicing.patch_free import ROUNDING_MM
-from gcode.slicing.patch_heights import DEEP_RATIO, Height
+from gcode.slicing.patch_heights import Height
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_state import PatchState
-
-# The floor was measured, the deficit computed from it: they agree within this.
-AGREE_MM = 0.04
-ROUNDED_OFF_MM = 0.02  # more than the mean of a scan's noise
-HOLD_MM = 0.45  # a line's width: how far a bead may hang over a hole beside what holds it
-# From a tip in the air, as far as its bead covers a rim; less of one is not worth a line.
-HEM_MM, RIM_MM2 = 0.35, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +34,22 @@ def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
     as far as a bead holds on to what stands beside it, or falls onto the floor; what lies under it
     is lost, and said.
     """
+    options = model.options
     below = model.wanted_below(at.z_mm)
     wanted = below - state.laid_mm - state.sunk_mm
     # a hole that the nozzle could not get into ends below: nothing is laid over what is above it
     lower = model.wanted_below(at.z_mm - at.most_mm)
     wanted = np.where(below - lower > ROUNDING_MM, wanted, 0.0)
     gap = at.z_mm - state.surface_mm
-    thick = np.clip(np.minimum(gap, wanted + AGREE_MM), 0.0, None)
+    thick = np.clip(np.minimum(gap, wanted + options.due.agree_mm), 0.0, None)
     last = np.minimum(state.planar_top_mm, at.following_mm) <= at.z_mm + ROUNDING_MM
     due = (at.following_mm - state.surface_mm > at.most_mm) | last
-    active = at.here & due & (wanted > LEAST_THICK_MM / 2) & (thick >= LEAST_THICK_MM)
+    active = (
+        at.here
+        & due
+        & (wanted > options.beads.least_thick_mm / 2)
+        & (thick >= options.beads.least_thick_mm)
+    )
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
     active &= state.planar_top_mm > at.z_mm - 0.5 * at.layer_mm
     return _lidded(model, at, thick, active, active & (gap > at.deep_mm), gap)
@@ -66,11 +63,14 @@ def due_of_job(
     On a slope the job's steps are what was there, not the smooth surface that the deficit has. What
     the job left open, as the cells of sparse infill, stays so: a line over it hangs, as it did.
     """
+    options = model.options
     assert model.job is not None
     gap = model.job.laid_mm(state.surface_mm, at.z_mm)
     wanted = state.left_below(model, at.z_mm)
     deep = gap > at.deep_mm
-    thick = np.where(deep, np.minimum(gap, np.maximum(wanted + AGREE_MM, at.layer_mm)), gap)
+    thick = np.where(
+        deep, np.minimum(gap, np.maximum(wanted + options.due.agree_mm, at.layer_mm)), gap
+    )
     thick = np.clip(thick, 0.0, None)
     after = np.unique(at.following_mm[np.isfinite(at.following_mm)])
     again = model.job.at(float(after[0])) if len(after) else None
@@ -78,11 +78,13 @@ def due_of_job(
     due = last | (at.following_mm - state.surface_mm > at.most_mm)
     # the shallow rim of what a scan rounded off counts: line by line it makes up a bead; beside
     # it noise would
-    least_mm = np.where(wanted > ROUNDING_MM, ROUNDED_OFF_MM, LEAST_THICK_MM)
+    least_mm = np.where(
+        wanted > ROUNDING_MM, options.due.rounded_off_mm, options.beads.least_thick_mm
+    )
     active = planned & due & (thick >= least_mm) & _gone_at(model, at)
-    active &= ~deep | (wanted > LEAST_THICK_MM / 2)  # beside the part all is deep
+    active &= ~deep | (wanted > options.beads.least_thick_mm / 2)  # beside the part all is deep
     due = _lidded(model, at, thick, active, deep & active, gap)
-    return replace(due, hangs=due.hangs | (at.z_mm - state.surface_mm > gap + AGREE_MM))
+    return replace(due, hangs=due.hangs | (at.z_mm - state.surface_mm > gap + options.due.agree_mm))
 
 
 def _gone_at(model: PatchModel, at: Height) -> Bool[np.ndarray, "ny nx"]:
@@ -91,11 +93,12 @@ def _gone_at(model: PatchModel, at: Height) -> Bool[np.ndarray, "ny nx"]:
     A deficit that goes on above, and begins no deeper below than a bead of the next layer gets, is
     that layer's: a scanner's spot rounds off ridges one line wide, and their flanks lie lower.
     """
+    options = model.options
     assert model.job is not None
     own = model.wanted_below(at.z_mm) - model.wanted_below(at.z_mm - at.layer_mm)
-    goes_on = model.top_mm > at.z_mm + AGREE_MM
+    goes_on = model.top_mm > at.z_mm + options.due.agree_mm
     gone = np.where(goes_on, own > at.most_mm - at.layer_mm, own > 0)
-    return beside(gone, model.job.near, RIM_MM, model.cell_mm)
+    return beside(gone, model.job.near, options.lines.rim_mm, model.cell_mm)
 
 
 def hemmed(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
@@ -104,6 +107,7 @@ def hemmed(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
     A wall keeps it off a gap in another one, but not off the air in front: there a line laid half
     upon the rim begins what the next ones grow from. Without it all above would stay open.
     """
+    options = model.options.due
     wanted, outside = due.thick_mm > 0, ~np.isfinite(model.top_mm)
     air = outside & ((at.z_mm - state.surface_mm > at.deep_mm) | state.hem)
     if not wanted.any() or not air.any():
@@ -111,16 +115,16 @@ def hemmed(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
     free = model.free_at(at.reach)
     # a row of columns holds no line
     served = ndimage.binary_opening(wanted & free, np.ones((2, 2)))
-    unserved = wanted & ~beside(served, wanted, HEM_MM, model.cell_mm)
+    unserved = wanted & ~beside(served, wanted, options.hem_mm, model.cell_mm)
     if not unserved.any():
         return due
-    rim = unserved & beside(air & free, unserved, HEM_MM, model.cell_mm)
+    rim = unserved & beside(air & free, unserved, options.hem_mm, model.cell_mm)
     label, count = ndimage.label(rim, np.ones((3, 3)))
     area_mm2 = np.bincount(label.ravel(), minlength=count + 1) * model.cell_mm**2
-    rim &= area_mm2[label] >= RIM_MM2
+    rim &= area_mm2[label] >= options.rim_mm2
     if not rim.any():
         return due
-    hem = air & beside(rim, rim, HEM_MM, model.cell_mm)
+    hem = air & beside(rim, rim, options.hem_mm, model.cell_mm)
     return replace(due, thick_mm=np.where(hem, at.layer_mm, due.thick_mm), hem=hem)
 
 
@@ -139,14 +143,15 @@ def _lidded(
     near enough it lies under the nozzle all the same. Counted is only what a layer holds, wherever
     it comes to lie, so that none of it is too much.
     """
+    options = model.options
     sunk = np.zeros(model.shape)
     if deep.any():
         # from the edge of what holds it, not from the middle of its last column
-        hang_mm = HOLD_MM + 0.5 * model.cell_mm
+        hang_mm = options.due.hold_mm + 0.5 * model.cell_mm
         holds = (active & ~deep) | (gap < at.most_mm)
         held = beside(holds, deep, hang_mm, model.cell_mm)
         blocked = ~model.free_at(at.reach)
-        held |= beside(holds & blocked, deep, hang_mm + TO_WALL_MM, model.cell_mm)
+        held |= beside(holds & blocked, deep, hang_mm + options.beads.to_wall_mm, model.cell_mm)
         falls = deep & (gap <= model.drop_mm)
         held |= falls & beside(~blocked, falls, model.spread_mm, model.cell_mm)
         lidded = np.minimum(thick, at.layer_mm)
@@ -183,7 +188,8 @@ def strips_along_walls(
     state: PatchState,
 ) -> Bool[np.ndarray, "ny nx"]:
     """Columns to fill that lie along a wall: it stands up to the nozzle, or higher."""
-    walls = (state.surface_mm > z_mm - AGREE_MM) & (thick <= 0)
+    options = model.options
+    walls = (state.surface_mm > z_mm - options.due.agree_mm) & (thick <= 0)
     # what is drawn over a hollow hangs: nothing presses it aside
-    asked = (thick > 0) & (z_mm - state.surface_mm <= DEEP_RATIO * model.most_mm)
-    return beside(walls, asked, TO_WALL_MM, model.cell_mm) & asked
+    asked = (thick > 0) & (z_mm - state.surface_mm <= options.heights.deep_ratio * model.most_mm)
+    return beside(walls, asked, options.beads.to_wall_mm, model.cell_mm) & asked

@@ -11,24 +11,9 @@ from scipy import ndimage
 
 from gcode.profiles import PrintSetup
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.patch_beads import LEAST_THICK_MM
 from gcode.slicing.patch_free import ROUNDING_MM
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_state import PatchState
-
-# A gap of more than this share of the thickest bead is not filled from above: up to there a strand
-# of one line width, round (π/4 d² = width × gap), still reaches its floor. On a steep slope the
-# head keeps the tip this far off.
-DEEP_RATIO = 1.6
-# Of columns over a hollow, as many as open to the head at one height are worth a pass there.
-OPENING_MM2 = 1.0
-OPENS_BELOW_MM = 0.1  # half a layer: over less of a hollow the last pass goes anyway
-# Of a layer: what hangs spreads to both sides of its line, held there or not, and a strand that is
-# drawn just above it finds no room.
-APART_LAYERS = 0.5
-# A flat top: as much area, as wide, within so little height.
-FLAT_MM2, FLAT_WIDE_MM, FLAT_MM = 1.0, 0.6, 0.02
-ON_FLAT_MM = 1.5 * FLAT_MM  # of its height: what belongs to it
 
 
 class Openings(enum.Enum):
@@ -102,7 +87,7 @@ class Heights:
         flats = _flats(model, tops) if model.job is None else np.zeros(0)
         ends = np.full(model.shape, np.inf)  # where a flat top lies, off the job's layers
         for flat_mm in flats:
-            ends[np.abs(model.top_mm - flat_mm) <= ON_FLAT_MM] = flat_mm
+            ends[np.abs(model.top_mm - flat_mm) <= model.options.heights.on_flat_mm] = flat_mm
         others = np.sort(np.concatenate([tops, flats]))
         alone = np.zeros(model.shape, dtype=bool)
         keep = openings is Openings.ALONE
@@ -118,15 +103,16 @@ class Heights:
 
     def at(self, index: int, state: PatchState, model: PatchModel) -> Height:
         """One of them, when so much has been laid."""
+        options = model.options.heights
         z_mm = float(self.all_mm[index])
         on_grid = not (np.abs(self.flats_mm - z_mm) < ROUNDING_MM).any()
         later = self.tops_mm[self.tops_mm > z_mm + ROUNDING_MM]
         following = np.minimum(self.ends_mm, float(later[0]) if len(later) else np.inf)
         here = self.ends_mm > z_mm + ROUNDING_MM if on_grid else self.ends_mm == z_mm
-        deep_mm = DEEP_RATIO * self.most_mm
+        deep_mm = options.deep_ratio * self.most_mm
         opens = bool((np.abs(self.openings_mm - z_mm) < ROUNDING_MM).any())
-        if self.alone.any() and z_mm < self.openings_mm[-1] + APART_LAYERS * self.layer_mm:
-            apart_mm = self.openings_mm[-1] + APART_LAYERS * self.layer_mm
+        if self.alone.any() and z_mm < self.openings_mm[-1] + options.apart_layers * self.layer_mm:
+            apart_mm = self.openings_mm[-1] + options.apart_layers * self.layer_mm
             more = np.concatenate([self.openings_mm, self.tops_mm[self.tops_mm >= apart_mm]])
             more = more[more > z_mm + ROUNDING_MM]
             ends = state.planar_top_mm <= z_mm + ROUNDING_MM
@@ -144,24 +130,27 @@ def _flats(model: PatchModel, tops_mm: Float[np.ndarray, " n"]) -> Float[np.ndar
 
     They get a pass of their own there: the nozzle's flat makes the surface, at its own height.
     """
+    options = model.options
     tops = model.top_mm
-    steps = np.round(tops[np.isfinite(tops)] / FLAT_MM).astype(np.int64)
+    steps = np.round(tops[np.isfinite(tops)] / options.heights.flat_mm).astype(np.int64)
     if not len(steps):
         return np.zeros(0)
     area_mm2 = np.bincount(steps - steps.min()) * model.cell_mm**2
-    often = np.flatnonzero(ndimage.convolve1d(area_mm2, np.ones(3), mode="constant") >= FLAT_MM2)
-    least = np.ones((round(FLAT_WIDE_MM / model.cell_mm),) * 2)
+    often = np.flatnonzero(
+        ndimage.convolve1d(area_mm2, np.ones(3), mode="constant") >= options.heights.flat_mm2
+    )
+    least = np.ones((round(options.heights.flat_wide_mm / model.cell_mm),) * 2)
     found: list[float] = []
     for step in often[np.argsort(-area_mm2[often])] + steps.min():
-        z_mm = float(step * FLAT_MM)
-        if np.abs(np.array([*tops_mm, *found]) - z_mm).min() < LEAST_THICK_MM:
+        z_mm = float(step * options.heights.flat_mm)
+        if np.abs(np.array([*tops_mm, *found]) - z_mm).min() < options.beads.least_thick_mm:
             continue
         # no rim or slope that passes through this height
-        at = np.abs(tops - z_mm) <= ON_FLAT_MM
+        at = np.abs(tops - z_mm) <= options.heights.on_flat_mm
         (y0, y1), (x0, x1) = ((int(k.min()), int(k.max()) + 1) for k in at.nonzero())
         flat = np.zeros_like(at)
         flat[y0:y1, x0:x1] = ndimage.binary_opening(at[y0:y1, x0:x1], least)
-        if flat.sum() * model.cell_mm**2 >= FLAT_MM2:
+        if flat.sum() * model.cell_mm**2 >= options.heights.flat_mm2:
             found.append(float(np.median(tops[flat])))
     return np.array(found)
 
@@ -182,6 +171,7 @@ def _openings(
     little higher takes the place of one, and so does one a little lower where the head is in: its
     beads lie there already.
     """
+    options = model.options
     at_mm, area_mm2 = _opening(model, tops_mm, most_mm)
     if not len(at_mm):
         return np.zeros(0)
@@ -190,9 +180,9 @@ def _openings(
     last_mm, open_mm2 = -np.inf, 0.0
     for z_mm, more_mm2 in zip(at_mm.tolist(), area_mm2.tolist(), strict=True):
         open_mm2 += more_mm2
-        if open_mm2 < OPENING_MM2 or z_mm < last_mm + layer_mm - ROUNDING_MM:
+        if open_mm2 < options.heights.opening_mm2 or z_mm < last_mm + layer_mm - ROUNDING_MM:
             continue
-        near = others[np.abs(others - z_mm) < LEAST_THICK_MM]
+        near = others[np.abs(others - z_mm) < options.beads.least_thick_mm]
         if len(near):
             last_mm = float(near[-1])
         else:
@@ -208,7 +198,7 @@ def _hollow(
     """Columns too deep for a bead where passes at some heights first get in."""
     later = np.searchsorted(tops_mm, model.need_mm - ROUNDING_MM)
     first_mm = np.append(tops_mm, np.inf)[later]
-    deep = first_mm - model.floor_mm > DEEP_RATIO * most_mm
+    deep = first_mm - model.floor_mm > model.options.heights.deep_ratio * most_mm
     return np.asarray(deep & np.isfinite(model.top_mm))
 
 
@@ -216,10 +206,11 @@ def _opening(
     model: PatchModel, tops_mm: Float[np.ndarray, " n"], most_mm: float
 ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
     """Ascending heights, and over how much that is hollow the head first gets in at each."""
+    options = model.options.heights
     need_mm = model.need_mm
-    hollow = _hollow(model, tops_mm, most_mm) & (need_mm < model.top_mm - OPENS_BELOW_MM)
-    steps = np.ceil(need_mm[hollow] / FLAT_MM).astype(np.int64)
+    hollow = _hollow(model, tops_mm, most_mm) & (need_mm < model.top_mm - options.opens_below_mm)
+    steps = np.ceil(need_mm[hollow] / options.flat_mm).astype(np.int64)
     if not len(steps):
         return np.zeros(0), np.zeros(0)
     area_mm2 = np.bincount(steps - steps.min()) * model.cell_mm**2
-    return (np.arange(len(area_mm2)) + steps.min()) * FLAT_MM, area_mm2
+    return (np.arange(len(area_mm2)) + steps.min()) * options.flat_mm, area_mm2

@@ -24,7 +24,7 @@ from gcode.profiles import PrintSetup
 from gcode.slicing.beads import width_of
 from gcode.slicing.patch_beads import Chain
 from gcode.slicing.patch_free import surely_free
-from gcode.slicing.patch_model import NO_LIFT_MM, PatchModel
+from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.pen import Pen
 from gcode.slicing.reach import Reach
@@ -199,7 +199,7 @@ def _go_to(
     far = float(np.hypot(*across))
     samples = 2 + int(np.ceil(3 * far / min(reach.field.cell_mm, model.cell_mm)))
     way = pen.position_mm[:2] + np.linspace(0.0, 1.0, samples)[:, None] * across
-    near = abs(rise) < NOT_LOWER_MM and far < NO_LIFT_MM
+    near = abs(rise) < NOT_LOWER_MM and far < model.options.columns.no_lift_mm
     # what oozes there, beads cover; what was laid before stands no higher than this pass
     combed = isinstance(one.tip_mm, float) and rise > -NOT_LOWER_MM and model.is_over(way).all()
     if (near or combed) and surely_free(way, one.reach, reach).all():

@@ -9,20 +9,12 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from gcode.slicing.layer_plan import Unprintable
-from gcode.slicing.patch_beads import LEAST_THICK_MM
-from gcode.slicing.patch_due import AGREE_MM
 from gcode.slicing.patch_model import PatchModel
-from gcode.slicing.patch_passes import LEAST_LISTED_MM3
 from gcode.slicing.patch_state import PatchState
 
 COVERED = "covered by what stands above it"
-# Less of a hollow than this share, so little, and over less of its opening: it closes nothing.
-LEAST_SHARE, LEAST_WORTH_MM3, LEAST_CLOSED = 0.1, 30.0, 0.5
-STAIRCASE_MM = 0.15  # of a job's staircase: half a layer, and what the scan gets wrong
 NOT_CLOSED = "; the little in reach would not close it"
 TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
-# Of what is left of a piece: a cause of less is told with the greatest.
-LEAST_CAUSE = 0.05
 Box = tuple[float, float, float, float, float, float]
 
 
@@ -55,13 +47,18 @@ class LeftOver:
 
 def not_worth_it(state: PatchState, model: PatchModel) -> Bool[np.ndarray, "ny nx"]:
     """Columns of hollows that would stay open: no repair, but strands along a rim."""
+    options = model.options.left
     wanted = np.isfinite(model.top_mm)
     label, count = ndimage.label(wanted, np.ones((3, 3)))
     laid, due, cover, opening = (
         np.bincount(label.ravel(), each.ravel(), minlength=count + 1) * model.cell_mm**2
         for each in (state.laid_mm, model.wanted_below(np.inf), state.laid_mm > 0, wanted)
     )
-    few = (laid < LEAST_SHARE * due) & (laid < LEAST_WORTH_MM3) & (cover < LEAST_CLOSED * opening)
+    few = (
+        (laid < options.least_share * due)
+        & (laid < options.least_worth_mm3)
+        & (cover < options.least_closed * opening)
+    )
     few[0] = False
     if not few.any():
         return np.zeros(model.shape, dtype=bool)
@@ -73,15 +70,16 @@ def left_over(
     state: PatchState, model: PatchModel, given_up: Bool[np.ndarray, "ny nx"]
 ) -> LeftOver:
     """By connected piece: what was filled, and why the rest was not."""
+    options = model.options
     cell_mm2 = model.cell_mm**2 * model.weight
     wanted = model.wanted_below(np.inf)
     left = np.clip(wanted - state.laid_mm, 0.0, None)
     # a film below the thinnest bead is the tolerance, not out of reach
-    left = np.where(left > LEAST_THICK_MM + AGREE_MM, left, 0.0)
+    left = np.where(left > options.beads.least_thick_mm + options.due.agree_mm, left, 0.0)
     # nor is what lies under a step of the job's staircase, or over it; what was given up under a
     # line that hangs is
-    done = (state.surface_mm >= state.done_mm - AGREE_MM) & (
-        state.done_mm > model.top_mm - STAIRCASE_MM
+    done = (state.surface_mm >= state.done_mm - options.due.agree_mm) & (
+        state.done_mm > model.top_mm - options.left.staircase_mm
     )
     left = np.where(done, np.minimum(left, state.sunk_mm), left)
     unreachable: list[Unreachable] = []
@@ -97,7 +95,7 @@ def left_over(
         share = min(max(share, 0.0), 1.0)
         volume_mm3 = float(piece.volume())
         regions.append(PatchRegion(volume_mm3, box, share))
-        if stuck_mm3 <= LEAST_LISTED_MM3:
+        if stuck_mm3 <= options.left.least_listed_mm3:
             continue
         ended = NOT_CLOSED if given_up[cells].any() else ""
         for reason, part in _causes(state, model, cells, left[cells], apart=not ended):
@@ -128,16 +126,17 @@ def _causes(
     Of each cause the column with most left says how far the head would go in. Unless `apart`, the
     column with most left speaks for all.
     """
+    options = model.options
     floor, top = model.floor_mm[cells], model.top_mm[cells]
     # the tip over the first bead that is lacking: the lowest, where a bridge was laid over it
     lies = floor + np.where(state.sunk_mm[cells] > 0, 0.0, state.laid_mm[cells])
     tip = np.minimum(lies + model.most_mm, top)
     kind = np.where(model.need_mm[cells] > tip, 1, 0)
-    kind = np.where(floor > top + LEAST_THICK_MM, 2, kind)
+    kind = np.where(floor > top + options.beads.least_thick_mm, 2, kind)
     total = float(stuck.sum())
     shares = np.bincount(kind.ravel(), stuck.ravel(), minlength=3) / total
     worst = int(kind.flat[int(np.argmax(stuck))])
-    told = [k for k in range(3) if apart and shares[k] >= LEAST_CAUSE] or [worst]
+    told = [k for k in range(3) if apart and shares[k] >= options.left.least_cause] or [worst]
     found = []
     for k in told:
         at = int(np.argmax(np.where(kind == k, stuck, -1.0)))

@@ -11,25 +11,10 @@ from scipy import ndimage
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
 from gcode.slicing.job_lines import JobColumns, JobLines
+from gcode.slicing.options import USUAL_PATCH, PatchOptions
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 from gcode.surfaces import raster_kernels as kernels
-
-FINE_MM, COARSE_MM = 0.1, 0.2
-FINE_CELLS = 250_000
-PATCH_MARGIN_MM = 3.0
-# A bead thicker than this share of the bore no longer presses onto its floor.
-MOST_THICK_NOZZLES = 0.8
-# In bores: a strand that nothing holds falls as far as this onto a floor, as one purged in the air
-# does, and lies where it was laid. Deeper down it is anybody's guess.
-DROP_NOZZLES = 6.0
-# From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which is
-# 2.5 bores across (E3D V6): not to its very rim.
-SPREAD_NOZZLES = 1.125
-SEAM_MM = 1.0  # around a loop's seam, as far as old material hides it
-TIP_CELLS = 2  # in one of the field, each way
-JOB_LAYER_MM = 0.5  # a job's layer may end so far above the deficit that it belongs to
-NO_LIFT_MM = 1.0  # a travel as short as this needs no lift
 
 
 class PatchModel:
@@ -41,18 +26,17 @@ class PatchModel:
         setup: PrintSetup,
         as_built: HeightField,
         lines: JobLines | None = None,
+        options: PatchOptions = USUAL_PATCH,
     ) -> None:
+        self.options = options
         self.deficit = deficit
         self.as_built = as_built
         self.box = deficit.bounding_box()
-        x0, y0, x1, y1 = (
-            self.box[0] - PATCH_MARGIN_MM,
-            self.box[1] - PATCH_MARGIN_MM,
-            self.box[3] + PATCH_MARGIN_MM,
-            self.box[4] + PATCH_MARGIN_MM,
-        )
-        fine = (x1 - x0) * (y1 - y0) / FINE_MM**2 <= FINE_CELLS
-        self.cell_mm = FINE_MM if fine else COARSE_MM
+        margin_mm = options.columns.margin_mm
+        x0, y0 = self.box[0] - margin_mm, self.box[1] - margin_mm
+        x1, y1 = self.box[3] + margin_mm, self.box[4] + margin_mm
+        fine = (x1 - x0) * (y1 - y0) / options.columns.fine_mm**2 <= options.columns.fine_cells
+        self.cell_mm = options.columns.fine_mm if fine else options.columns.coarse_mm
         nx = int(np.ceil((x1 - x0) / self.cell_mm))
         ny = int(np.ceil((y1 - y0) / self.cell_mm))
         self.shape = (ny, nx)
@@ -72,8 +56,10 @@ class PatchModel:
         self.floor_mm = floor_mm
         # where a tip may lay what is missing: over it, or in the air beside a rim
         away_mm = ndimage.distance_transform_edt(~np.isfinite(self.top_mm)) * self.cell_mm
-        self.near = np.asarray(away_mm <= NO_LIFT_MM)
-        self.beside_mm = ndimage.uniform_filter(floor_mm, round(2 * SEAM_MM / self.cell_mm) + 1)
+        self.near = np.asarray(away_mm <= options.columns.no_lift_mm)
+        self.beside_mm = ndimage.uniform_filter(
+            floor_mm, round(2 * options.columns.seam_mm / self.cell_mm) + 1
+        )
         self.job: JobColumns | None = None
         # along the surface itself it is not as the job had it
         if lines is not None and len(lines.rim) and not setup.process.nonplanar_top:
@@ -81,13 +67,15 @@ class PatchModel:
             low_mm, high_mm = float(self.box[2]), float(self.box[5])
             self.job = JobColumns(
                 lines, wanted, self.points_mm, self.cell_mm,
-                low_mm - JOB_LAYER_MM, high_mm + JOB_LAYER_MM,
+                low_mm - options.columns.job_layer_mm, high_mm + options.columns.job_layer_mm,
+                options.lines.rim_mm,
             )  # fmt: skip
-        self.most_mm = MOST_THICK_NOZZLES * setup.printer.nozzle_diameter_mm
-        self.drop_mm = DROP_NOZZLES * setup.printer.nozzle_diameter_mm
-        self.spread_mm = SPREAD_NOZZLES * setup.printer.nozzle_diameter_mm
+        self.most_mm = options.columns.most_thick_nozzles * setup.printer.nozzle_diameter_mm
+        self.drop_mm = options.columns.drop_nozzles * setup.printer.nozzle_diameter_mm
+        self.spread_mm = options.columns.spread_nozzles * setup.printer.nozzle_diameter_mm
         self._printer = setup.printer
-        self._window_mm = (x0 - NO_LIFT_MM, y0 - NO_LIFT_MM, x1 + NO_LIFT_MM, y1 + NO_LIFT_MM)
+        far_mm = options.columns.no_lift_mm
+        self._window_mm = (x0 - far_mm, y0 - far_mm, x1 + far_mm, y1 + far_mm)
         self.reach = self.reach_of(as_built)
         self._tip_cells = self.reach.cells_of(self.points_mm)
 
@@ -100,7 +88,7 @@ class PatchModel:
             self._printer,
             lowest_tip_mm=lowest_mm,
             window_mm=self._window_mm,
-            finer=TIP_CELLS,
+            finer=self.options.columns.tip_cells,
         )
 
     def _centres(self) -> Float[np.ndarray, "n 2"]:

@@ -17,13 +17,11 @@ from gcode.slicing.beads import divided
 from gcode.slicing.layer_plan import MOST_NOZZLES
 from gcode.slicing.patch_beads import Chain
 from gcode.slicing.patch_free import surely_free
-from gcode.slicing.patch_model import NO_LIFT_MM, PatchModel
+from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.patch_state import PatchState
 from gcode.slicing.reach import Reach
 from gcode.surfaces import raster_kernels
-
-LEAST_HIGH_MM = 0.2  # a bead's plastic spreads as if it lay no higher
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +70,9 @@ def stages_of(
 def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reach:
     """Where the nozzle may be once beads are laid, each as wide and as high as it may get."""
     field = model.as_built
-    wide_mm = np.concatenate([chain.section_mm2 for chain in laid]) / LEAST_HIGH_MM
+    wide_mm = (
+        np.concatenate([chain.section_mm2 for chain in laid]) / model.options.columns.least_high_mm
+    )
     wide_mm = np.minimum(wide_mm, MOST_NOZZLES * setup.printer.nozzle_diameter_mm)
     stands_mm = raster_kernels.beside_lines(
         np.concatenate([chain.xy_mm[:-1] for chain in laid]),
@@ -88,7 +88,10 @@ def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reac
 
 def _regions(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
     """Which connected region columns belong to, from 1; those close together are one."""
-    near = ndimage.distance_transform_edt(state.laid_mm <= 0) * model.cell_mm <= 0.5 * NO_LIFT_MM
+    near = (
+        ndimage.distance_transform_edt(state.laid_mm <= 0) * model.cell_mm
+        <= 0.5 * model.options.columns.no_lift_mm
+    )
     return np.asarray(ndimage.label(near)[0], dtype=np.int64)
 
 

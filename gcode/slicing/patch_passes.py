@@ -12,27 +12,13 @@ from gcode.profiles import PrintSetup
 from gcode.slicing.infill import SOLID_ANGLES_RAD
 from gcode.slicing.job_lines import runs_of
 from gcode.slicing.layer_plan import Unprintable
-from gcode.slicing.patch_beads import (
-    BOND_RATIO,
-    LEAST_THICK_MM,
-    Chain,
-    begun_inside,
-    beside_runs,
-    draw,
-    weighed,
-)
-from gcode.slicing.patch_due import AGREE_MM, Due, due_at, due_of_job, hemmed, strips_along_walls
+from gcode.slicing.patch_beads import Chain, begun_inside, beside_runs, draw, weighed
+from gcode.slicing.patch_due import Due, due_at, due_of_job, hemmed, strips_along_walls
 from gcode.slicing.patch_free import eased, free_between, free_runs
-from gcode.slicing.patch_heights import DEEP_RATIO, Height
+from gcode.slicing.patch_heights import Height
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_skin import Skin
 from gcode.slicing.patch_state import PatchState
-
-SKIN_MM = 0.2  # about as thick as it gets
-LEAST_LISTED_MM3 = 0.02
-LEAST_OF_GAP = 0.9  # where the gap is more than the deficit: both are right to about as much
-OFF_LINE_MM = 0.3  # from a line: more than half of it
-SERVED = 0.95  # share of what is due; where the job's own lines serve less, others may serve more
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +62,7 @@ def plan_pass(
     laying = None
     if planned is not None:
         laying = _along_job(model, state, at, planned, due.thick_mm, setup)
-    if laying is None or laying.served < SERVED:
+    if laying is None or laying.served < model.options.lines.served:
         own = _along_own(model, state, at, due.thick_mm, setup)
         if laying is None or (own is not None and own.served > laying.served):
             laying = own
@@ -153,7 +139,7 @@ def _along_own(
     chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
     lost_mm3 = drawn.lost_mm2 * drawn.height_mm
     lost = []
-    if lost_mm3 > LEAST_LISTED_MM3:
+    if lost_mm3 > model.options.left.least_listed_mm3:
         lost.append(_thin(drawn.region, at.z_mm, drawn.height_mm, lost_mm3))
     return _Laying(chains, laid, _served(chains, thick, model), drawn.height_mm, lost)
 
@@ -171,6 +157,7 @@ def _along_job(
     Where walls keep the head off, so that lines end before them, none of them goes along the wall:
     less is served.
     """
+    options = model.options.lines
     assert model.job is not None
     runs, job = runs_of(
         model.job.lines_at(at.z_mm),
@@ -183,9 +170,9 @@ def _along_job(
     strips = strips_along_walls(thick, at.z_mm, model, state)
     height_mm = float(thick[thick > 0].mean())
     wanted = state.left_below(model, at.z_mm)
-    share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), LEAST_OF_GAP, 1.0))
+    share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), options.least_of_gap, 1.0))
     chains, laid = weighed(runs, tips_mm, share * thick, strips, model, setup, job=job)
-    served = float(thick[beside_runs(runs, OFF_LINE_MM, model)].sum()) / float(thick.sum())
+    served = float(thick[beside_runs(runs, options.off_line_mm, model)].sum()) / float(thick.sum())
     return _Laying(chains, laid, served, height_mm, [])
 
 
@@ -193,7 +180,7 @@ def _served(chains: list[Chain], thick: Float[np.ndarray, "ny nx"], model: Patch
     """Share of what is due that beads lay."""
     beads_mm3 = sum(chain.volume_mm3 for chain in chains)
     due_mm3 = float(thick.sum()) * model.cell_mm**2 * model.weight
-    return beads_mm3 / (BOND_RATIO * due_mm3)
+    return beads_mm3 / (model.options.beads.bond_ratio * due_mm3)
 
 
 def plan_skin(
@@ -205,9 +192,14 @@ def plan_skin(
     setup: PrintSetup,
 ) -> tuple[Pass | None, PatchState]:
     """The last pass, along the surface, where the planar ones left room for it."""
+    options = model.options
     wanted = state.left_below(model, np.inf)
-    thick = np.minimum(model.top_mm - state.surface_mm, wanted + AGREE_MM)
-    due = skin.columns & (thick >= LEAST_THICK_MM) & (thick <= DEEP_RATIO * most_mm)
+    thick = np.minimum(model.top_mm - state.surface_mm, wanted + options.due.agree_mm)
+    due = (
+        skin.columns
+        & (thick >= options.beads.least_thick_mm)
+        & (thick <= options.heights.deep_ratio * most_mm)
+    )
     thick = np.where(due, thick, 0.0)
     chains, laid = _along_skin(model, state, skin, thick, setup)
     if not chains:
@@ -225,7 +217,7 @@ def skin_served(
     """A skin of the columns that its beads would get to."""
     if skin is None:
         return None
-    thick = np.where(skin.columns, SKIN_MM, 0.0)
+    thick = np.where(skin.columns, model.options.skin.thick_mm, 0.0)
     _, laid = _along_skin(model, state, skin, thick, setup)
     return replace(skin, columns=laid > 0) if laid.any() else None
 

@@ -15,11 +15,6 @@ from gcode.slicing.patch_passes import Pass, plan_pass, plan_skin, skin_served
 from gcode.slicing.patch_skin import skin_of
 from gcode.slicing.patch_state import PatchState
 
-# Of the plastic, what may be laid in the air beside rims; about twice as much lies outside then.
-MOST_HEM = 0.025
-# Of what the head allows: a way that fills as much leaves little for others to find.
-FILLED_ENOUGH = 0.95
-
 
 @dataclass(frozen=True, slots=True)
 class PatchPasses:
@@ -68,6 +63,7 @@ def best_plan(
 
     Another way is tried where one leaves open what the head allows.
     """
+    options = model.options.due
     open_mm3 = model.open_mm3(grid.layer_height_mm)
     tried: list[PatchPasses] = []
     for openings in Openings:
@@ -75,10 +71,10 @@ def best_plan(
         if tried and not heights.alone.any():
             continue  # the same again
         found = plan(model, heights, setup, progress, hems=True)
-        if found.hem_mm3(model) > MOST_HEM * found.beads_mm3:
+        if found.hem_mm3(model) > options.most_hem * found.beads_mm3:
             found = plan(model, heights, setup, progress, hems=False)
         tried.append(found)
-        if found.filled_mm3(model) >= FILLED_ENOUGH * open_mm3:
+        if found.filled_mm3(model) >= options.filled_enough * open_mm3:
             break
     return max(tried, key=lambda found: found.worth_mm3(model, setup))
 

@@ -18,14 +18,7 @@ from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 
-LEAST_SKIN_MM = 0.1  # left to it everywhere
-# The tip may stay this far over the surface for the sake of what is uphill: farther, and it no
-# longer presses the bead down. With a flat of 1 mm that is a slope of 14 degrees.
-MOST_RISE_MM = 0.05
-LEAST_SLOPE = 0.02  # rise over run: flatter is flat
-SKIN_MM2, SKIN_WIDE_MM = 4.0, 1.2  # as large, and as wide
 GIVE_MM = 0.015  # closer than this the checker's limits and the planner's are not
-LEAST_CLIMB_MM = 0.1  # from its lowest to its highest: flatter is flat, whatever its noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +57,9 @@ class Skin:
     ) -> Float[np.ndarray, "ny nx"]:
         """How high planar passes fill each column: under the skin, as high as a layer's top."""
         below = np.concatenate([[-np.inf], tops_mm])
-        under = below[np.searchsorted(tops_mm, model.top_mm - LEAST_SKIN_MM + ROUNDING_MM)]
+        under = below[
+            np.searchsorted(tops_mm, model.top_mm - model.options.skin.least_mm + ROUNDING_MM)
+        ]
         return np.where(self.columns, under, model.top_mm)
 
     def free_between(
@@ -87,6 +82,7 @@ def skin_of(model: PatchModel, planar: Bool[np.ndarray, "ny nx"]) -> Skin | None
 
     None: nowhere enough of it.
     """
+    options = model.options.skin
     wanted = np.isfinite(model.top_mm)
     if not (wanted & planar).any():
         return None
@@ -101,17 +97,22 @@ def skin_of(model: PatchModel, planar: Bool[np.ndarray, "ny nx"]) -> Skin | None
     # between the points of a bead the tip goes straight
     rise_mm = ndimage.maximum_filter(rise_mm, round(GAP_STEP_MM / reach.cell_mm) + 1)
     slope = np.hypot(*np.gradient(np.asarray(surface.z_mm, np.float64), model.cell_mm))
-    columns = wanted & planar & (slope >= LEAST_SLOPE) & model.free_at(rise_mm <= MOST_RISE_MM)
-    least = np.ones((round(SKIN_WIDE_MM / model.cell_mm),) * 2)
+    columns = (
+        wanted
+        & planar
+        & (slope >= options.least_slope)
+        & model.free_at(rise_mm <= options.most_rise_mm)
+    )
+    least = np.ones((round(options.wide_mm / model.cell_mm),) * 2)
     columns = ndimage.binary_opening(columns, least)
     label, count = ndimage.label(columns)
     for k in range(1, count + 1):
         one = label == k
         climb_mm = np.ptp(model.top_mm[one])
-        if one.sum() * model.cell_mm**2 < SKIN_MM2 or climb_mm < LEAST_CLIMB_MM:
+        if one.sum() * model.cell_mm**2 < options.mm2 or climb_mm < options.least_climb_mm:
             columns &= ~one
     if not columns.any():
         return None
-    tip_mm = surface_mm + np.minimum(rise_mm, MOST_RISE_MM)
+    tip_mm = surface_mm + np.minimum(rise_mm, options.most_rise_mm)
     tip = HeightField(reach.field.origin_mm, reach.cell_mm, tip_mm, np.ones(reach.shape, bool))
     return Skin(columns, np.asarray(surface.z_mm, np.float64), tip, reach)

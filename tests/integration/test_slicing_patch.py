@@ -18,8 +18,8 @@ from gcode.firmware.motion import MotionBatch
 from gcode.moves import Extrude, LayerChange, ModalState, Role, Toolpath
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
+from gcode.slicing.options import USUAL_PATCH
 from gcode.slicing.patch import NOT_CLOSED, PatchPlan, slice_patch
-from gcode.slicing.patch_beads import BOND_RATIO
 from gcode.surfaces import HeightField
 from gcode.writer import write
 
@@ -524,4 +524,6 @@ def test_no_more_plastic_is_laid_than_the_columns_ask_for() -> None:
     ).trim_by_plane((0.0, 0.0, -1.0), -TOP_MM)
     plan, _ = plan_of(bores)
     # columns may be laid as far over as floor and deficit disagree, a hundredth here
-    assert plan.beads_mm3 == pytest.approx(BOND_RATIO * plan.reachable_mm3, rel=0.02)
+    assert plan.beads_mm3 == pytest.approx(
+        USUAL_PATCH.beads.bond_ratio * plan.reachable_mm3, rel=0.02
+    )

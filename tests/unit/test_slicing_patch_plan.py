@@ -11,10 +11,11 @@ import pytest
 from gcode.profiles import PrintSetup, load_setup
 from gcode.progress import silent
 from gcode.slicing.layers import LayerGrid
+from gcode.slicing.options import USUAL_PATCH
 from gcode.slicing.patch_heights import Heights, Openings
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_passes import plan_pass
-from gcode.slicing.patch_plan import FILLED_ENOUGH, best_plan, plan
+from gcode.slicing.patch_plan import best_plan, plan
 from gcode.slicing.patch_state import PatchState
 from gcode.surfaces import HeightField
 
@@ -97,7 +98,9 @@ def test_a_way_that_fills_what_the_head_allows_is_enough(model: PatchModel) -> N
     """Others are not even tried: they take as long again."""
     heights = Heights.of(model, GRID, SETUP, openings=Openings.EACH)
     first = plan(model, heights, SETUP, silent, hems=True)
-    assert first.filled_mm3(model) >= FILLED_ENOUGH * model.open_mm3(GRID.layer_height_mm)
+    assert first.filled_mm3(model) >= USUAL_PATCH.due.filled_enough * model.open_mm3(
+        GRID.layer_height_mm
+    )
     asked: list[float] = []
     best_plan(model, GRID, SETUP, lambda _, done, total: asked.append(done))
     assert len(asked) == len(heights.all_mm)
