@@ -23,6 +23,9 @@ import numpy as np
 
 from gcode.check import find_refusals
 from gcode.profiles import PrintSetup, load_setup
+from gcode.reader import job_for
+from gcode.slicing.job import plan_part
+from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import slice_patch
 from gcode.surfaces import HeightField
@@ -89,16 +92,28 @@ def case_of(name: str) -> Case | None:
     return Case(block, block - tool, block ^ tool)
 
 
-def run(name: str, setup: PrintSetup, cell_mm: float) -> dict[str, Any] | None:
-    """A case's figures."""
+def lines_of(part: Any, setup: PrintSetup) -> JobLines:
+    """What our own slicer lays for a part."""
+    program = write(plan_part(part, setup).toolpath, setup, title="bench")
+    beads = job_for(program, setup.printer).beads
+    rim = np.array([role.lower().endswith("perimeter") for role in beads.roles])
+    mine = beads.layer >= 0
+    ends = beads.start_mm[mine], beads.end_mm[mine]
+    return JobLines(*ends, beads.section_mm2[mine], beads.height_mm[mine], rim[beads.role[mine]])
+
+
+def run(name: str, setup: PrintSetup, cell_mm: float, *, along_job: bool) -> dict[str, Any] | None:
+    """A case's figures; `along_job`, the patch may follow the lines that the job laid there."""
     case = case_of(name)
     if case is None:
         return None
     as_built = HeightField.from_manifold(case.rest, cell_mm, margin_mm=BESIDE_MM)
+    lines = lines_of(case.whole, setup) if along_job else None
     start_s = time.process_time()
     plan = slice_patch(
-        case.piece, setup, as_built=as_built, grid=LayerGrid.from_setup(setup), standalone=True
-    )
+        case.piece, setup, as_built=as_built, grid=LayerGrid.from_setup(setup), standalone=True,
+        lines=lines,
+    )  # fmt: skip
     spent_s = time.process_time() - start_s
     program = write(plan.toolpath, setup, title="bench", resume=None, restore=False)
     refused = find_refusals(program, setup, as_built=as_built)
@@ -170,6 +185,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", default=every)
     parser.add_argument("--printers", nargs="+", default=PRINTERS, choices=PRINTERS)
     parser.add_argument("--cell-mm", type=float, default=CELL_MM)
+    parser.add_argument("--along-job", action="store_true", help="on lines of the part's own job")
     parser.add_argument("--results", type=Path, help="a line of JSON each, besides the table")
     parser.add_argument("--page", action="store_true", help="of the first printer's blocks")
     args = parser.parse_args()
@@ -177,7 +193,7 @@ def main() -> None:
     told: list[tuple[object, ...]] = []
     for name in args.cases:
         for printer in args.printers:
-            row = run(name, load_setup(printer=printer), args.cell_mm)
+            row = run(name, load_setup(printer=printer), args.cell_mm, along_job=args.along_job)
             if row is None:
                 continue
             print(line_of(row), flush=True)

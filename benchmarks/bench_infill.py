@@ -10,7 +10,9 @@ the wall and the cells beside it, from cells up into the top's skin, or from the
 into cells. The loop looks after each layer of it, or with `--late` once after the last of them.
 Truth is the world against one printed by the same motion without the void. *Again* is what the same
 world says of the job's own lines laid once more inside the circle, by a nozzle that nothing is in
-the way of: two clean prints of a wall one bead wide do not lie in the same columns, either.
+the way of: two clean prints of a wall one bead wide do not lie in the same columns, either. Of what
+is found late the outside judge's head (`tests/judge`) says how much it reaches at all, and how much
+of that is filled.
 
 Blocks are what was looked at while the planner was written; the other parts were held back.
 """
@@ -19,9 +21,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -40,9 +44,12 @@ from bench_clean import FILAMENT_MM2, motion_of
 from bench_clean_jobs import COMMON, PARTS, mesh_of
 from bench_closed_loop import CorePrinter, figures
 
+from amrepair.frames import Transform
 from amrepair.loop import LoopOptions, LoopReport, locate_part, plan_stops, run_loop
 from amrepair.loop.sites import sites
 from amrepair.policy import PolicyOptions
+from amrepair.scans import Scan, ScanRequest
+from amrepair.simulate.columns import IntervalMap
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import load_world
 from amrepair.simulate.placed import PlacedDefect
@@ -55,12 +62,17 @@ from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, job_for
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tests.judge.head import HEADS, Reaching, least_tip, reachable
+
 LAYER_MM, SKINS, LAYERS = 0.2, 3, 4
 AROUND_MM = 3.0
 LEAST_MM3 = 2.0  # less of a void holds no line across it
 WAYS = ("grid", "gyroid", "line")  # as PrusaSlicer calls its patterns
 POLICY = PolicyOptions(most_passes=2)
 HELD_BACK = ("bracket", "button", "clip")
+VOXEL_MM = 0.05  # in Z; across, the world's own columns
+REACHED = ("reachable_ratio", "filled_of_reachable")
 
 
 @dataclass(frozen=True)
@@ -148,20 +160,22 @@ def void(cut: Cut, part: m3.Manifold, job: Job) -> PlacedDefect:
 def run(name: str, way: str, cut: str, *, late: bool, seed: int) -> dict[str, Any] | None:
     """Print, break and mend; what became of it. None where the job lays nothing in the circle."""
     began = time.perf_counter()
-    printed, report, stage = mended(name, way, cut, late=late, seed=seed)
+    printed, report, looked = mended(name, way, cut, late=late, seed=seed)
+    stage = looked.stage
     if stage.truth[0].missing_mm3 < LEAST_MM3:
         return None
     return (
         {"part": name, "way": way, "cut": cut, "late": late, "seed": seed}
         | figures(report, stage.truth[0], printed.defects[0].layers)
         | {"again_ratio": round(again(printed, late=late), 4)}
+        | (dict(zip(REACHED, of_reachable(looked, printed), strict=True)) if late else {})
         | {"seconds": round(time.perf_counter() - began, 1)}
     )
 
 
 def mended(
     name: str, way: str, cut: str, *, late: bool, seed: int
-) -> tuple[Printed, LoopReport, Stage]:
+) -> tuple[Printed, LoopReport, Looked]:
     """The job up to where its void is repaired."""
     setup = load_setup()
     whole = block() if name == "block" else PARTS[name]()
@@ -175,11 +189,66 @@ def mended(
     stops = plan_stops(job, defect.layers[-1:] if late else defect.layers, final=False)
     printer = CorePrinter(printed, stops[-1])  # type: ignore[arg-type]
     stage = set_stage(printed, printer.take_motion)  # type: ignore[arg-type]
+    looked = Looked(stage)
     report = run_loop(
-        job, checked, printer, stage, sites(job, template, placed, setup),
+        job, checked, printer, looked, sites(job, template, placed, setup),
         stops=stops, options=LoopOptions(policy=POLICY, seed=seed),
     )  # fmt: skip
-    return printed, report, stage
+    return printed, report, looked
+
+
+class Looked:
+    """A stage that remembers what stood there at its first look, before any repair."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage = stage
+        self.before: IntervalMap | None = None
+
+    @property
+    def build_from_scanner(self) -> Transform:
+        """The stage's."""
+        return self.stage.build_from_scanner
+
+    def scan(self, request: ScanRequest) -> Scan:
+        """As the stage has it."""
+        scan = self.stage.scan(request)
+        if self.before is None:
+            self.before = self.stage.world.snapshot()
+        return scan
+
+
+def of_reachable(looked: Looked, printed: Printed) -> tuple[float, float]:
+    """Of what one stop found missing: the share that the head reaches, and of that what is filled.
+
+    By the outside judge's own head and its own rule (`tests/judge`), on the world's columns.
+    """
+    standing, world, box_mm = looked.before, looked.stage.world, printed.defects[0].box_mm
+    assert standing is not None
+    sound = looked.stage.reference.snapshot(standing.window)
+    missing, after = sound.minus(standing).clipped(box_mm), world.snapshot(standing.window)
+    low_mm = float(box_mm[0, 2])
+    heights = np.arange(low_mm + 0.5 * VOXEL_MM, float(box_mm[1, 2]), VOXEL_MM)
+    tops_mm = np.ascontiguousarray(standing.top_mm().T)
+    window = (slice(0, tops_mm.shape[0]), slice(0, tops_mm.shape[1]))
+    head = HEADS[printed.setup.printer.id]
+    least_mm = least_tip(tops_mm, window, world.cell_mm, head)
+    by = Reaching(
+        least_mm, world.cell_mm, low_mm, VOXEL_MM, bead_mm=0.45, layer_mm=LAYER_MM,
+        allowed_mm=0.1,
+    )  # fmt: skip
+    gone, stands, laid = (solid_at(each, heights) for each in (missing, standing, after))
+    reach = reachable(gone, stands, by, tip_layers=1.0, held=False)
+    return float(reach.sum() / gone.sum()), float((laid & reach).sum() / reach.sum())
+
+
+def solid_at(columns: IntervalMap, heights_mm: np.ndarray) -> np.ndarray:
+    """(nx, ny, nz) whether columns are solid at heights."""
+    found = np.zeros((len(columns.offsets) - 1, len(heights_mm)), dtype=bool)
+    column = np.repeat(np.arange(len(found)), np.diff(columns.offsets))
+    for (a, b), k in zip(columns.spans_mm, column, strict=True):
+        found[k, np.searchsorted(heights_mm, a) : np.searchsorted(heights_mm, b)] = True
+    ny, nx = columns.window.shape
+    return np.ascontiguousarray(found.reshape(ny, nx, -1).transpose(1, 0, 2))
 
 
 def empty_stage(printed: Printed) -> Stage:
@@ -234,7 +303,10 @@ def inside(job: Job, layer: int, circle: np.ndarray) -> MotionBatch:
     )  # fmt: skip
 
 
-PAGE_HEADER = ("infill", "cases", "filled, mean", "least", "again, mean", "added, most")
+PAGE_HEADER = (
+    "infill", "cases", "filled, mean", "least", "of what the head reaches", "least", "again, mean",
+    "added, most",
+)  # fmt: skip
 
 
 def page_rows(rows: list[dict[str, Any]]) -> list[tuple[object, ...]]:
@@ -251,9 +323,11 @@ def page_rows(rows: list[dict[str, Any]]) -> list[tuple[object, ...]]:
         if not group:
             continue
         filled, again = ([row[key] for row in group] for key in ("filled_ratio", "again_ratio"))
-        figures = (statistics.fmean(filled), min(filled), statistics.fmean(again),
-                   max(row["added_ratio"] for row in group))  # fmt: skip
-        told.append((name, len(group), *(f"{value:.3f}" for value in figures)))
+        reached = [row[REACHED[1]] for row in group if REACHED[1] in row]
+        figures = [statistics.fmean(filled), min(filled)]
+        figures += [statistics.fmean(reached), min(reached)] if reached else [math.nan, math.nan]
+        figures += [statistics.fmean(again), max(row["added_ratio"] for row in group)]
+        told.append((name, len(group), *(f"{v:.3f}".replace("nan", "–") for v in figures)))
     return told
 
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import fcntl
 import functools
+import importlib
 import os
 import secrets
 import time
@@ -30,6 +31,7 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when the first of its threads starts
 
 import numba
+import numba.np.linalg
 from numba import get_num_threads, prange, set_num_threads
 
 __all__ = ["get_num_threads", "njit", "prange", "set_num_threads"]
@@ -42,6 +44,28 @@ COMPILE_POLL_S = 0.02
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
+
+
+def without_scipy() -> None:
+    """Load what numba adds to numpy's functions, but not scipy for it.
+
+    With its first kernel numba loads `scipy.linalg`, to ask whether there is a BLAS that
+    `np.correlate` might use: 0.15 s and 15 MB at the start of every command. Who multiplies
+    matrices in a kernel has numba ask anew, and scipy loaded.
+    """
+    asked = numba.np.linalg.ensure_blas
+
+    def not_asked() -> None:
+        raise ImportError
+
+    numba.np.linalg.ensure_blas = not_asked
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        numba.np.linalg.ensure_blas = asked
+
+
+without_scipy()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

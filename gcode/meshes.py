@@ -6,6 +6,7 @@ A `manifold3d.Manifold` can do more, and holds half a gigabyte for what is read 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +17,7 @@ from manifold3d import CrossSection, FillRule
 from gcode.meshes_kernels import bodies_of, contours_at, crossing, paired
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ClosedMesh:
     """Triangles that close a surface, outside to their left.
 
@@ -38,13 +39,19 @@ class ClosedMesh:
         """Whether it has no faces."""
         return len(self.faces) == 0
 
+    @cached_property
+    def _bodies(self) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b 6"]]:
+        """Volumes and boxes of what edges hold together: asked for again and again."""
+        volumes, boxes = bodies_of(self.vertices_mm, self.faces, self.across)
+        return volumes, boxes
+
     def volume(self) -> float:
         """Enclosed, mm³."""
-        return float(bodies_of(self.vertices_mm, self.faces, self.across)[0].sum())
+        return float(self._bodies[0].sum())
 
     def bodies_mm(self) -> list[tuple[float, ...]]:
         """Boxes (as `bounding_box`) of what edges hold together; cavities have none."""
-        volumes, boxes = bodies_of(self.vertices_mm, self.faces, self.across)
+        volumes, boxes = self._bodies
         return [tuple(box) for box in boxes[volumes > 0].tolist()]
 
     def bounding_box(self) -> tuple[float, ...]:
@@ -119,7 +126,7 @@ def bodies_apart(
     if shared != 0:
         return None
     mesh = ClosedMesh(np.ascontiguousarray(vertices_mm, np.float64), faces, across)
-    volumes, boxes = bodies_of(mesh.vertices_mm, faces, across)
+    volumes, boxes = mesh._bodies
     wholes = int((volumes > 0).sum())
     if wholes < 2 or wholes < len(volumes):  # which cavity belongs to which body is not told
         return mesh

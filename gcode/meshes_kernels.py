@@ -96,13 +96,8 @@ def _first_of(faces: Any, a: int, b: int, first: Any, after: Any, take: bool) ->
 
 
 @njit(cache=True, nogil=True)
-def paired(faces: Any) -> tuple[Any, int]:
-    """(3m,) the half-edge across from each, and at how many pairs an edge had more faces.
-
-    -1 edges where the faces close no oriented surface: a half-edge without another that runs the
-    other way, or a face with a corner twice. Edges of several faces are paired in their order. The
-    time grows as the faces do, however many share an edge.
-    """
+def _paired_in_order(faces: Any) -> tuple[Any, int]:
+    """As `paired`, where an edge may have several faces: through chains of half-edges."""
     halves = 3 * faces.shape[0]
     slots = 8
     while slots < halves:
@@ -133,6 +128,43 @@ def paired(faces: Any) -> tuple[Any, int]:
         ):
             shared += 1
     return across, shared
+
+
+@njit(cache=True, nogil=True)
+def paired(faces: Any) -> tuple[Any, int]:
+    """(3m,) the half-edge across from each, and at how many pairs an edge had more faces.
+
+    -1 edges where the faces close no oriented surface: a half-edge without another that runs the
+    other way, or a face with a corner twice. Edges of several faces are paired in their order. The
+    time grows as the faces do, however many share an edge.
+    """
+    slots = 8
+    while slots < 3 * faces.shape[0]:
+        slots *= 2
+    across = np.full(3 * faces.shape[0], -1, np.int32)
+    first = np.full(slots, -1, np.int32)  # the first half-edge of each edge, open addressing
+    open_halves = 0
+    for face in range(faces.shape[0]):
+        for k in range(3):
+            a, b = faces[face, k], faces[face, (k + 1) % 3]
+            if a == b:
+                return across, -1
+            slot = _slot_of(min(a, b), max(a, b), 0, slots)
+            while True:
+                other = first[slot]
+                if other < 0:
+                    first[slot] = 3 * face + k
+                    open_halves += 1
+                    break
+                c, d = faces[other // 3, other % 3], faces[other // 3, (other % 3 + 1) % 3]
+                if c == b and d == a and across[other] < 0:
+                    across[3 * face + k], across[other] = other, 3 * face + k
+                    open_halves -= 1
+                    break
+                if min(c, d) == min(a, b) and max(c, d) == max(a, b):
+                    return _paired_in_order(faces)
+                slot = (slot + 1) & (slots - 1)
+    return across, -1 if open_halves else 0
 
 
 @njit(cache=True, nogil=True)

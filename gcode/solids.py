@@ -19,6 +19,7 @@ from gcode.errors import InputError
 from gcode.meshes import ClosedMesh, bodies_apart, closed_mesh
 from gcode.meshes_kernels import index_of_corners, paired, put_in_table
 from gcode.solids_kernels import first_of_each
+from gcode.surfaces.sizes import PARSER_ERRORS, in_words
 from gcode.threemf import read_3mf
 
 _log = logging.getLogger(__name__)
@@ -30,11 +31,6 @@ STL_HEAD = 84
 STL_PIECE = 1 << 15  # triangles that are read at a time
 STL_TEXT_BYTES = 256  # spaces before a text file's first word
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("of_colour", "<u2")])
-# trimesh's readers raise whatever their parsing hits; these are the kinds seen in malformed files
-MESH_READ_ERRORS = (
-    ValueError, ArithmeticError, LookupError, TypeError, AttributeError, NameError, OSError,
-    EOFError, NotImplementedError, RuntimeError, MemoryError,
-)  # fmt: skip
 LARGEST_MM = 1e6  # a kilometre: what is welded is counted in hundred-millionths of a millimetre
 
 
@@ -64,14 +60,12 @@ def read_solid(path: Path) -> Any:
         raise InputError(f"{path}: a solid is one of {', '.join(SOLID_SUFFIXES)}.")
     try:
         vertices, faces = read_triangles(path)
-    except MESH_READ_ERRORS as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: the mesh cannot be read ({reason}); export it again.") from error
+    except PARSER_ERRORS as error:
+        raise InputError(
+            f"{path}: the mesh cannot be read ({in_words(error)}); export it again."
+        ) from error
     if len(faces) == 0:
         raise InputError(f"{path}: the mesh has no triangles; export it again.")
-    bad = int((~np.isfinite(vertices)).any(axis=1).sum())
-    if bad:
-        raise InputError(f"{path}: {bad} of {len(vertices)} vertices are not finite numbers (NaN).")
     extent = float(np.ptp(vertices, axis=0).max())
     if extent <= 0:
         raise InputError(f"{path}: the mesh has no extent; export it again.")
@@ -105,7 +99,7 @@ def read_closed(path: Path) -> ClosedMesh:
     """
     mesh = None
     if path.is_file():
-        with contextlib.suppress(*MESH_READ_ERRORS):  # told by `read_solid`, in one sentence
+        with contextlib.suppress(*PARSER_ERRORS):  # told by `read_solid`, in one sentence
             mesh = _as_it_is(path)
     return closed_mesh(read_solid(path)) if mesh is None else mesh
 
@@ -173,8 +167,8 @@ def read_triangles(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray
     Raises
     ------
     ValueError
-        Where a face has a corner that is no vertex, or a vertex lies beyond all measure; and what
-        else is in `MESH_READ_ERRORS`, where the file is damaged.
+        Where a face has a corner that is no vertex, or a vertex is no place: not a number, or
+        beyond all measure; and what else is in `PARSER_ERRORS`, where the file is damaged.
     """
     vertices, faces = _triangles_in(path)
     if len(faces):
@@ -184,7 +178,12 @@ def read_triangles(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray
         if not 0 <= low <= high < len(vertices):
             wrong = low if low < 0 else high
             raise ValueError(f"a face has corner {wrong}, and there are {len(vertices)} vertices")
-    largest = float(np.abs(vertices[np.isfinite(vertices)]).max(initial=0.0))
+    bad = int((~np.isfinite(vertices)).any(axis=1).sum())
+    if bad:  # the faces at them would be gaps that nobody is told of
+        raise ValueError(
+            f"{bad} of {len(vertices)} vertices are not finite numbers (NaN or infinity)"
+        )
+    largest = float(np.abs(vertices).max(initial=0.0))
     if largest > LARGEST_MM:
         raise ValueError(f"a vertex lies at {largest:.3g} mm, the limit is {LARGEST_MM:g} mm")
     return vertices, faces

@@ -137,7 +137,8 @@ class _Model:
                 raise ValueError(
                     f"a triangle has corner {int(corners.max())} of {len(vertices)} vertices"
                 )
-            points.append(vertices @ pose[:, :3].T + pose[:, 3])
+            with np.errstate(all="ignore"):  # what is no place is refused by whoever asked
+                points.append(vertices @ pose[:, :3].T + pose[:, 3])
             faces.append(corners + count)
             count += len(vertices)
         return np.concatenate(points), np.concatenate(faces)

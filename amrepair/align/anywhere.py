@@ -17,13 +17,9 @@ from jaxtyping import Float
 
 from amrepair.align.clutter import noise_across, without_clutter
 from amrepair.align.coarse import by_features, cube_rotations
-from amrepair.align.families import CLEAR_MM, CLEAR_SIGMAS, best_turns, slides
+from amrepair.align.families import best_turns, slides
+from amrepair.align.options import AlignOptions, Effort
 from amrepair.align.poses import (
-    APART_RATIO,
-    DENSE_ITERATIONS,
-    DENSE_POINTS,
-    PLAUSIBLE,
-    SAME_FIT_MM,
     Clouds,
     Scored,
     by_score,
@@ -33,48 +29,13 @@ from amrepair.align.poses import (
     refined,
 )
 from amrepair.align.refine import Refined
-from amrepair.align.search import (
-    PIECE,
-    PIECE_AGAIN,
-    QUICK_EFFORT,
-    THOROUGH,
-    TWINS,
-    CoarseField,
-    Effort,
-    search,
-)
+from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
-FEATURE_POINTS = 30_000  # of the template's surface
-# The coarse field rounds edges: a right pose may look worse than a wrong one by this factor.
-COARSE_FACTOR, MOST_REFINED, MOST_DOUBTFUL, MOST_TWINS = 1.8, 40, 5, 10
-GOOD_CELLS = 0.2  # what the coarse field is off by, at most, on a scan that fits
-# Another pose fits as well if its score is of the best one's size, and no more than a few points
-# lie on the part in the best pose and clearly off it in the other. Clearly: beyond the noise, and
-# beyond what prints of one part differ by.
-AS_GOOD_FIT = 1.5
-CONTRADICTED_RATIO, CONTRADICTED_SIGMAS = 0.003, 4.0
-NOISE_FLOOR_MM = 0.02  # process and columns: points agree no better than this
-INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
-INLIER_SIGMAS = 3.0
-# Fewer explained, and the noise is measured (taken where it is more than was said, up to what a
-# thin wall's two sides could pretend, or of the diagonal: sensors for large parts see them from
-# afar), and the mirror image tried.
-DOUBTFUL, NOISIER, MOST_NOISE_MM, MOST_NOISE_RATIO = 0.93, 1.5, 0.25, 0.001
-BIAS_SIGMAS = 2.6  # a template's bias is the 99th percentile of its error
-# With fewer points on the part the search goes on, and is made thorough; with more than the last
-# the pose is worth turning.
-WELL_EXPLAINED, MOSTLY_EXPLAINED, EXPLAINED = 0.97, 0.95, 0.7
 HALF_GAP = rotation_from_vector(np.array([0.15, -0.1, 0.08]))  # half the gap between rotations
-FEW_TRIED = 3  # poses refined of what is left without clutter, and of the mirror image
-CLEARED = 0.85  # with fewer on the part clutter is looked for, until so many are
-# A pose lays so much more of all on the part than one found without clutter: that was none.
-CLEARER_BY = 0.1
-PIECE_RATIO = 0.6  # of the part's diagonal: a smaller scan is a piece, that may lie anywhere in it
-HALVED_POINTS, LEAST_HALF = 2_000, 100  # of fewer points a half says nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,16 +68,6 @@ class Found:
     field: CoarseField | None = None
 
 
-def limits_mm(noise_mm: float, bias_mm: float = 0.0) -> tuple[float, float]:
-    """How well points can agree with the template, and how near explained ones lie.
-
-    A good guess needs no `bias_mm` of the template: hardly more than half of the points must fit.
-    """
-    floor_mm = np.hypot(NOISE_FLOOR_MM, bias_mm / BIAS_SIGMAS)
-    sigma_mm = float(np.hypot(max(noise_mm, 1e-3), floor_mm))
-    return sigma_mm, max(INLIER_MM, INLIER_SIGMAS * sigma_mm)
-
-
 @dataclass(slots=True)
 class _Hunt:
     """What is known so far of one scan's poses.
@@ -129,6 +80,7 @@ class _Hunt:
         Poses whose twins have been asked for.
     """
 
+    options: AlignOptions
     template: Template
     field: CoarseField
     clouds: Clouds
@@ -171,8 +123,9 @@ def pose_from_anywhere(
     template: Template,
     *,
     sigma_mm: float,
+    options: AlignOptions,
     rng: np.random.Generator,
-    least_ratio: float = EXPLAINED,
+    least_ratio: float,
     noise_is_measured: bool = False,
     progress: Progress = silent,
 ) -> Found:
@@ -187,53 +140,67 @@ def pose_from_anywhere(
     least_ratio
         Of the points that must lie on the part: where fewer do, features are asked as well.
     """
-    sigma_mm, inlier_mm = limits_mm(sigma_mm, template.bias_mm)
-    clouds, field = Clouds.of(points_mm, template, sigma_mm, rng), CoarseField.of(template)
-    hunt = _Hunt(template, field, clouds, points_mm, sigma_mm, inlier_mm)
+    told, coarse = options.explained, options.coarse
+    sigma_mm, inlier_mm = told.limits_mm(sigma_mm, template.bias_mm)
+    clouds = Clouds.of(points_mm, template, sigma_mm, options.poses, rng)
+    field = CoarseField.of(template, coarse)
+    hunt = _Hunt(options, template, field, clouds, points_mm, sigma_mm, inlier_mm)
     progress("align", 0.1, 1.0)
-    hunt.take(_worth_refining(clouds, field, QUICK_EFFORT))
-    if hunt.share < DOUBTFUL and not noise_is_measured:
-        most_mm = max(MOST_NOISE_MM, MOST_NOISE_RATIO * clouds.diagonal_mm)
-        measured_mm = min(noise_across(points_mm, rng), most_mm)
-        if measured_mm > NOISIER * sigma_mm:
+    hunt.take(_worth_refining(clouds, field, coarse.quick))
+    if hunt.share < told.doubtful and not noise_is_measured:
+        measured_mm = _measured_mm(points_mm, clouds, options, rng)
+        if measured_mm > told.noisier * sigma_mm:
             return pose_from_anywhere(
                 points_mm,
                 template,
                 sigma_mm=measured_mm,
+                options=options,
                 rng=rng,
                 least_ratio=least_ratio,
                 noise_is_measured=True,
                 progress=progress,
             )
-    was_thorough = hunt.share < CLEARED
+    was_thorough = hunt.share < told.cleared
     if was_thorough:
         progress("align", 0.2, 1.0)
         # A part that was laid wrong may look like clutter: more rotations of it are tried first.
-        hunt.take(_worth_refining(clouds, field, THOROUGH))
+        hunt.take(_worth_refining(clouds, field, coarse.thorough))
     of_all = hunt.found
-    if hunt.share < CLEARED:
+    if hunt.share < told.cleared:
         progress("align", 0.3, 1.0)
         _leave_clutter(hunt, points_mm, rng)
-    if hunt.share < WELL_EXPLAINED:
+    if hunt.share < told.well:
         progress("align", 0.4, 1.0)
         _search_on(hunt, thorough=not (was_thorough and hunt.clouds is clouds))
-    if clouds.size_mm < PIECE_RATIO * clouds.diagonal_mm:
+    if clouds.size_mm < coarse.piece_ratio * clouds.diagonal_mm:
         progress("align", 0.5, 1.0)
-        hunt.take(_worth_refining(hunt.clouds, field, PIECE))
-        if hunt.share < WELL_EXPLAINED:
-            hunt.take(_worth_refining(hunt.clouds, field, PIECE_AGAIN, turn=HALF_GAP))
+        hunt.take(_worth_refining(hunt.clouds, field, coarse.piece))
+        if hunt.share < told.well:
+            hunt.take(_worth_refining(hunt.clouds, field, coarse.piece_again, turn=HALF_GAP))
     if hunt.share < least_ratio:
         progress("align", 0.6, 1.0)
         _ask_features(hunt)
     if hunt.left_out_ratio > 0.0:
         _ask_the_whole(hunt, clouds, of_all, points_mm, least_ratio)
     progress("align", 0.8, 1.0)
-    if hunt.share > EXPLAINED:
+    if hunt.share > told.explained:
         hunt.take(hunt.twins())
-        hunt.take(_turns(hunt.found, hunt.clouds, field, template, rng))
+        hunt.take(_turns(hunt, rng))
         hunt.take(hunt.twins())
     progress("align", 0.9, 1.0)
     return _answer(hunt, rng)
+
+
+def _measured_mm(
+    points_mm: Float[np.ndarray, "n 3"],
+    clouds: Clouds,
+    options: AlignOptions,
+    rng: np.random.Generator,
+) -> float:
+    """Noise across the surface, up to what can be believed."""
+    told = options.explained
+    most_mm = max(told.most_noise_mm, told.most_noise_ratio * clouds.diagonal_mm)
+    return min(noise_across(points_mm, rng, options.clutter), most_mm)
 
 
 def _ask_the_whole(
@@ -244,13 +211,14 @@ def _ask_the_whole(
     least_ratio: float,
 ) -> None:
     """Take all points back in where what was left out fits the part as well: it was no clutter."""
-    starts = [pose.matrix for _, pose in hunt.found[:FEW_TRIED]]
+    told = hunt.options.explained
+    starts = [pose.matrix for _, pose in hunt.found[: told.few_tried]]
     whole = sorted(refined(starts, clouds, hunt.template) + of_all, key=by_score)
     share = explained(whole[0][1], hunt.inlier_mm)
     without = hunt.best.matrix
     off_mm = hunt.template.distance(clouds.dense_mm @ without[:3, :3].T + without[:3, 3])
-    clearer = float((np.abs(off_mm) <= hunt.inlier_mm).mean()) + CLEARER_BY
-    if share > CLEARED or share > max(least_ratio, clearer):
+    clearer = float((np.abs(off_mm) <= hunt.inlier_mm).mean()) + told.clearer_by
+    if share > told.cleared or share > max(least_ratio, clearer):
         hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = clouds, whole, 0.0, points_mm
 
 
@@ -258,7 +226,7 @@ def _answer(hunt: _Hunt, rng: np.random.Generator) -> Found:
     """What was found, with the share of the points that it explains."""
     best, others = _best_and_others(hunt)
     # The thinned cloud will not do: few scattered points fill as many voxels as many on a surface.
-    sample = hunt.part_mm[rng.permutation(len(hunt.part_mm))[:DENSE_POINTS]]
+    sample = hunt.part_mm[rng.permutation(len(hunt.part_mm))[: hunt.options.poses.dense_points]]
     residual = hunt.template.distance(sample @ best.matrix[:3, :3].T + best.matrix[:3, 3])
     ratio = float((np.abs(residual) <= hunt.inlier_mm).mean())
     return Found(
@@ -271,32 +239,35 @@ def _leave_clutter(
     hunt: _Hunt, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator
 ) -> None:
     """Search again without what may be clutter; kept where more of the rest lies on the part."""
-    for kept in without_clutter(points_mm, rng):
-        fewer = Clouds.of(kept.points_mm, hunt.template, hunt.sigma_mm, rng)
-        starts = _worth_refining(fewer, hunt.field, QUICK_EFFORT)[:FEW_TRIED]
+    options = hunt.options
+    for kept in without_clutter(points_mm, rng, options.clutter):
+        fewer = Clouds.of(kept.points_mm, hunt.template, hunt.sigma_mm, options.poses, rng)
+        starts = _worth_refining(fewer, hunt.field, options.coarse.quick)
+        starts = starts[: options.explained.few_tried]
         again = refined(starts, fewer, hunt.template)
         if explained(again[0][1], hunt.inlier_mm) > hunt.share:
             hunt.clouds, hunt.found, hunt.part_mm = fewer, again, kept.points_mm
             hunt.left_out_ratio = kept.left_out_ratio
-        if hunt.share > CLEARED:
+        if hunt.share > options.explained.cleared:
             break
 
 
 def _search_on(hunt: _Hunt, *, thorough: bool) -> None:
     """Search between the rotations that were tried, or among more of them unless that was done."""
-    starts = hunt.twins()
-    if hunt.share < MOSTLY_EXPLAINED:
-        starts += _by_halves(hunt.best, hunt.clouds, hunt.field)
+    starts, coarse = hunt.twins(), hunt.options.coarse
+    if hunt.share < hunt.options.explained.mostly:
+        starts += _by_halves(hunt)
         if thorough:
-            starts += _worth_refining(hunt.clouds, hunt.field, THOROUGH)
+            starts += _worth_refining(hunt.clouds, hunt.field, coarse.thorough)
     else:
-        starts += _worth_refining(hunt.clouds, hunt.field, QUICK_EFFORT, turn=HALF_GAP)
+        starts += _worth_refining(hunt.clouds, hunt.field, coarse.quick, turn=HALF_GAP)
     hunt.take(starts)
 
 
 def _ask_features(hunt: _Hunt) -> None:
     clouds = hunt.clouds
-    surface = hunt.template.surface_points(np.sqrt(clouds.diagonal_mm**2 / FEATURE_POINTS))[0]
+    count = hunt.options.explained.feature_points
+    surface = hunt.template.surface_points(np.sqrt(clouds.diagonal_mm**2 / count))[0]
     extra = tuple(by_features(clouds.dense_mm, surface, clouds.diagonal_mm))
     if extra:
         hunt.take([pose.matrix for pose in search(clouds.thinned, hunt.field, only=extra)])
@@ -304,29 +275,34 @@ def _ask_features(hunt: _Hunt) -> None:
 
 def _best_and_others(hunt: _Hunt) -> tuple[Refined, tuple[Float[np.ndarray, "4 4"], ...]]:
     """The best pose at its end, and those apart from it that fit as well."""
-    clouds, template = hunt.clouds, hunt.template
+    clouds, template, options = hunt.clouds, hunt.template, hunt.options.poses
     best_score, best = hunt.found[0]
-    if not best.converged and best_score < PLAUSIBLE * clouds.cap_mm:
-        best = finished(best, clouds, template, DENSE_ITERATIONS)
-    beside = slides(best, clouds.dense_mm, 1.5 * APART_RATIO * clouds.diagonal_mm)
+    if not best.converged and best_score < options.plausible * clouds.cap_mm:
+        best = finished(best, clouds, template, options.dense_iterations)
+    beside = slides(best, clouds.dense_mm, 1.5 * options.apart_ratio * clouds.diagonal_mm)
     slid = [pose for _, pose in refined(beside, clouds, template, finish=False)]
     others: list[Float[np.ndarray, "4 4"]] = []
     for score, other in sorted(hunt.found[1:] + on_all(slid, clouds, template), key=by_score):
-        if score > AS_GOOD_FIT * best_score + SAME_FIT_MM:
+        if score > hunt.options.explained.as_good * best_score + options.same_fit_mm:
             break
         new = all(clouds.apart(other.matrix, known) for known in (best.matrix, *others))
-        if new and not _contradicted(other, best, hunt.sigma_mm):
+        if new and not _contradicted(other, best, hunt):
             others.append(other.matrix)
     return best, tuple(others)
 
 
 def explained_if_mirrored(
-    points_mm: Float[np.ndarray, "n 3"], found: Found, template: Template, rng: np.random.Generator
+    points_mm: Float[np.ndarray, "n 3"],
+    found: Found,
+    template: Template,
+    options: AlignOptions,
+    rng: np.random.Generator,
 ) -> float:
     """Share of the points that lie on the part where they are mirrored first."""
-    clouds = Clouds.of(points_mm * np.array([-1.0, 1.0, 1.0]), template, found.sigma_mm, rng)
-    field = found.field if found.field is not None else CoarseField.of(template)
-    starts = _worth_refining(clouds, field, QUICK_EFFORT)[:FEW_TRIED]
+    mirrored_mm = points_mm * np.array([-1.0, 1.0, 1.0])
+    clouds = Clouds.of(mirrored_mm, template, found.sigma_mm, options.poses, rng)
+    field = found.field if found.field is not None else CoarseField.of(template, options.coarse)
+    starts = _worth_refining(clouds, field, options.coarse.quick)[: options.explained.few_tried]
     return explained(refined(starts, clouds, template)[0][1], found.inlier_mm)
 
 
@@ -338,9 +314,10 @@ def _worth_refining(
     turn: Float[np.ndarray, "3 3"] | None = None,
 ) -> list[Float[np.ndarray, "4 4"]]:
     poses = search(clouds.thinned, field, effort=effort, turn=turn)
-    limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
-    fits = poses[0].score_mm <= 3.0 * clouds.sigma_mm + GOOD_CELLS * field.cell_mm
-    most = MOST_REFINED if fits else MOST_DOUBTFUL
+    options = field.options
+    limit_mm = options.worse * poses[0].score_mm + options.off_cells * field.cell_mm
+    fits = poses[0].score_mm <= 3.0 * clouds.sigma_mm + options.fits_cells * field.cell_mm
+    most = options.most_refined if fits else options.most_doubtful
     return [pose.matrix for pose in poses[:most] if pose.score_mm <= limit_mm]
 
 
@@ -349,6 +326,7 @@ def _twins(best: Refined, clouds: Clouds, field: CoarseField) -> list[Float[np.n
 
     A nearly symmetric part's other poses; a view of one side fits the other one from within, too.
     """
+    options = field.options
     middle = field.box_mm.mean(axis=0)
     centre = clouds.dense_mm.mean(axis=0)
     place = best.matrix[:3, :3] @ centre + best.matrix[:3, 3] - middle
@@ -359,53 +337,52 @@ def _twins(best: Refined, clouds: Clouds, field: CoarseField) -> list[Float[np.n
             matrix[:3, :3] = turn @ best.matrix[:3, :3]
             matrix[:3, 3] = middle + np.array(sides) * (turn @ place) - matrix[:3, :3] @ centre
             turned.append(matrix)
-    poses = search(clouds.thinned, field, effort=TWINS, only=tuple(turned))
-    limit_mm = COARSE_FACTOR * poses[0].score_mm + 0.05 * field.cell_mm
-    return [pose.matrix for pose in poses[:MOST_TWINS] if pose.score_mm <= limit_mm]
+    poses = search(clouds.thinned, field, effort=options.twins, only=tuple(turned))
+    limit_mm = options.worse * poses[0].score_mm + options.off_cells * field.cell_mm
+    return [pose.matrix for pose in poses[: options.most_twins] if pose.score_mm <= limit_mm]
 
 
-def _by_halves(best: Refined, clouds: Clouds, field: CoarseField) -> list[Float[np.ndarray, "4 4"]]:
+def _by_halves(hunt: _Hunt) -> list[Float[np.ndarray, "4 4"]]:
     """The pose as each half of the scan alone would have it.
 
     A bent part may be laid between its pieces, where neither lies well; one half is of one piece.
     On the coarse field, since between the two sides of a thin wall the exact one has a trap.
     """
-    points = clouds.thinned.to(HALVED_POINTS)
+    options, thinned = hunt.options.explained, hunt.clouds.thinned
+    points = thinned.to(options.half_points)
     local = points - points.mean(axis=0)
     axes = np.linalg.eigh(local.T @ local)[1]
     halves = [points[way * (local @ axes[:, k]) > 0] for k in (2, 1) for way in (1, -1)]
     return [
-        search(Thinned(half, clouds.thinned.rng), field, only=(best.matrix,))[0].matrix
+        search(Thinned(half, thinned.rng), hunt.field, only=(hunt.best.matrix,))[0].matrix
         for half in halves
-        if len(half) >= LEAST_HALF
+        if len(half) >= options.least_half
     ]
 
 
-def _turns(
-    found: list[Scored],
-    clouds: Clouds,
-    field: CoarseField,
-    template: Template,
-    rng: np.random.Generator,
-) -> list[Float[np.ndarray, "4 4"]]:
+def _turns(hunt: _Hunt, rng: np.random.Generator) -> list[Float[np.ndarray, "4 4"]]:
     """Starts where poses like the best can turn freely, or nearly."""
-    limit = AS_GOOD_FIT * found[0][0] + SAME_FIT_MM
+    options, clouds = hunt.options, hunt.clouds
+    limit = options.explained.as_good * hunt.found[0][0] + options.poses.same_fit_mm
     return best_turns(
-        [pose for score, pose in found if score <= limit],
+        [pose for score, pose in hunt.found if score <= limit],
         clouds.dense_mm,
-        template,
-        field,
+        hunt.template,
+        hunt.field,
         diagonal_mm=clouds.diagonal_mm,
         sigma_mm=clouds.sigma_mm,
         cap_mm=clouds.cap_mm,
+        off_mm=options.explained.clearly_off_mm(clouds.sigma_mm),
+        options=options.families,
         rng=rng,
     )
 
 
-def _contradicted(other: Refined, best: Refined, sigma_mm: float) -> bool:
+def _contradicted(other: Refined, best: Refined, hunt: _Hunt) -> bool:
     """Whether points that the best pose explains speak against the other, and few the other way."""
-    limit_mm = max(CLEAR_MM, CLEAR_SIGMAS * sigma_mm)
+    options = hunt.options.explained
+    limit_mm = options.clearly_off_mm(hunt.sigma_mm)
     off, off_best = np.abs(other.residual_mm) > limit_mm, np.abs(best.residual_mm) > limit_mm
     against, for_it = int((off & ~off_best).sum()), int((off_best & ~off).sum())
-    chance = CONTRADICTED_SIGMAS * float(np.sqrt(against + for_it))
-    return against - for_it > max(CONTRADICTED_RATIO * len(off), chance)
+    chance = options.against_sigmas * float(np.sqrt(against + for_it))
+    return against - for_it > max(options.against_ratio * len(off), chance)

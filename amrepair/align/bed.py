@@ -8,22 +8,17 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align.options import USUAL_ALIGN, BedOptions
 from amrepair.align.refine import Prior
 from amrepair.frames import moved, rotation_from_vector
 from amrepair.template.port import Template
 
-MOST_BED_POINTS, MOST_FITTED = 80_000, 10_000  # points: the bed is a plane
-BED_BAND_MM = 1.0  # how far off the guess may have the bed
-SKIRT_MM = 2.0  # bed points this near to the part may be its skirt or its foot
-LEAST_BED_POINTS = 300
-LEAST_SPREAD_MM = 3.0  # root mean square, across the bed that is seen
-# What the bed leaves open: a few micrometres of height, and tilt over a part's length.
-HEIGHT_SIGMA_MM = 0.01
-TILT_SIGMA_RAD = 2e-4
-
 
 def level_on_bed(
-    points_mm: Float[np.ndarray, "n 3"], template: Template, matrix: Float[np.ndarray, "4 4"]
+    points_mm: Float[np.ndarray, "n 3"],
+    template: Template,
+    matrix: Float[np.ndarray, "4 4"],
+    options: BedOptions = USUAL_ALIGN.bed,
 ) -> tuple[Float[np.ndarray, "4 4"], bool]:
     """Correct a guess so that the bed that the scan shows lies at the template's lowest height.
 
@@ -39,29 +34,29 @@ def level_on_bed(
     The corrected guess, and whether enough bed was seen to correct it.
     """
     low = template.bounds_mm[0]
-    placed = moved(points_mm[:: max(1, len(points_mm) // MOST_BED_POINTS)], matrix)
-    near = np.flatnonzero(np.abs(placed[:, 2] - low[2]) < BED_BAND_MM)
-    if len(near) < LEAST_BED_POINTS:
+    placed = moved(points_mm[:: max(1, len(points_mm) // options.most_points)], matrix)
+    near = np.flatnonzero(np.abs(placed[:, 2] - low[2]) < options.band_mm)
+    if len(near) < options.least_points:
         return matrix, False
-    near = near[:: -(-len(near) // MOST_FITTED)]
+    near = near[:: -(-len(near) // options.most_fitted)]
     apart = template.distance(placed[near])
-    bed = placed[near[apart > SKIRT_MM]]
-    if len(bed) < LEAST_BED_POINTS:
+    bed = placed[near[apart > options.skirt_mm]]
+    if len(bed) < options.least_points:
         return matrix, False
     centre = bed.mean(axis=0)
     local = bed - centre
     spread_mm2 = np.linalg.eigvalsh(local[:, :2].T @ local[:, :2] / len(local))
-    if spread_mm2[0] < LEAST_SPREAD_MM**2:  # a strip of bed does not tell its tilt
+    if spread_mm2[0] < options.least_spread_mm**2:  # a strip of bed does not tell its tilt
         return matrix, False
     design = np.column_stack([local[:, :2], np.ones(len(local))])
     target = bed[:, 2] - low[2]
-    fit, scale = np.zeros(3), BED_BAND_MM
-    for _ in range(12):
+    fit, scale = np.zeros(3), options.band_mm
+    for _ in range(options.rounds):
         residual = target - design @ fit
         weight = (scale**2 / (residual**2 + scale**2)) ** 2
         weighted = design.T * weight**2
         fit = np.linalg.solve(weighted @ design, weighted @ target)
-        scale = max(0.1, scale * 0.6)
+        scale = max(options.last_scale_mm, scale * options.shrink)
     normal = np.array([-fit[0], -fit[1], 1.0])
     normal /= np.linalg.norm(normal)
     axis = np.cross(normal, [0.0, 0.0, 1.0])
@@ -75,9 +70,13 @@ def level_on_bed(
     return level @ matrix, True
 
 
-def bed_prior(rotation_sigma_rad: float, translation_sigma_mm: float) -> Prior:
+def bed_prior(
+    rotation_sigma_rad: float,
+    translation_sigma_mm: float,
+    options: BedOptions = USUAL_ALIGN.bed,
+) -> Prior:
     """The guess's own spread, but for height and tilt, which the bed has fixed."""
     return Prior(
-        np.array([TILT_SIGMA_RAD, TILT_SIGMA_RAD, rotation_sigma_rad]),
-        np.array([translation_sigma_mm, translation_sigma_mm, HEIGHT_SIGMA_MM]),
+        np.array([options.tilt_sigma_rad, options.tilt_sigma_rad, rotation_sigma_rad]),
+        np.array([translation_sigma_mm, translation_sigma_mm, options.height_sigma_mm]),
     )

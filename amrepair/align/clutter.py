@@ -14,22 +14,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-CLUTTER_POINTS = 60_000
-CLUTTER_NEIGHBOURS = 9
-# A surface's points lie in planes and near each other; scattered ones fill space.
-FAR_FACTOR, USUAL_QUANTILE = 3.0, 0.3
-THICK_RATIO = 0.1  # of the neighbours' variance, across their plane; an edge of 90° has about this
-LEAST_KEPT = 0.3  # less left over: the scan is too noisy or sparse to tell
-# The bed: a plane with much of the scan in it and nearly all the rest on one side.
-HYPOTHESES, BED_PLANE_ROUNDS = 40, 6
-LEAST_PLANE, ONE_SIDE = 0.12, 0.97
-FIRST_TOLERANCE, LAST_TOLERANCE = 0.02, 0.004  # of the scan's diagonal
-PLANE_SIGMAS = 4.0
-GAP_FACTOR = 2.5  # pieces farther apart than so many usual distances are separate
-LEAST_PIECE, MOST_PIECES, MOST_CLUTTER_CELLS = 0.1, 3, 4_000_000
-LEAST_LEFT = 500
-NOISE_PLACES, NOISE_NEIGHBOURS, PLACE_NOISE_QUANTILE = 2_000, 24, 0.2
-WORTH = 0.02  # leaving out less than this changes nothing
+from amrepair.align.options import USUAL_ALIGN, ClutterOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +33,11 @@ class Kept:
     left_out_ratio: float
 
 
-def without_clutter(points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> list[Kept]:
+def without_clutter(
+    points_mm: Float[np.ndarray, "n 3"],
+    rng: np.random.Generator,
+    options: ClutterOptions = USUAL_ALIGN.clutter,
+) -> list[Kept]:
     """What may be the part, least left out first; empty where there is no clutter to tell.
 
     Parameters
@@ -57,54 +46,59 @@ def without_clutter(points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generato
         (n, 3) in any frame.
     """
     cloud = points_mm
-    if len(cloud) > CLUTTER_POINTS:
-        cloud = cloud[rng.permutation(len(cloud))[:CLUTTER_POINTS]]
-    if len(cloud) < LEAST_LEFT:
+    if len(cloud) > options.points:
+        cloud = cloud[rng.permutation(len(cloud))[: options.points]]
+    if len(cloud) < options.least_left:
         return []
-    reach, normals, across, thick = _neighbourhoods(cloud)
-    usual_mm = float(np.quantile(reach, USUAL_QUANTILE))
-    surface = (reach <= FAR_FACTOR * usual_mm) & (thick <= THICK_RATIO)
-    if surface.mean() < LEAST_KEPT:
+    reach, normals, across, thick = _neighbourhoods(cloud, options.neighbours)
+    usual_mm = float(np.quantile(reach, options.usual_quantile))
+    surface = (reach <= options.far_factor * usual_mm) & (thick <= options.thick_ratio)
+    if surface.mean() < options.least_kept:
         surface = np.ones(len(cloud), dtype=bool)
     masks = [surface]
     sigma_mm = float(np.median(across[surface]))
-    bed = _bed(cloud, normals, surface, sigma_mm, rng)
-    if bed is not None and (surface & ~bed).sum() >= LEAST_LEFT:
+    bed = _bed(cloud, normals, surface, sigma_mm, options, rng)
+    if bed is not None and (surface & ~bed).sum() >= options.least_left:
         # What is left of the bed's rim and noise is scattered by now.
         masks.append(surface & ~bed)
-    masks += _pieces(cloud, masks[-1], GAP_FACTOR * usual_mm)
+    masks += _pieces(cloud, masks[-1], options.gap_factor * usual_mm, options)
     found: list[Kept] = []
     last = len(cloud)
     for mask in masks:
         count = int(mask.sum())
-        if count >= LEAST_LEFT and abs(last - count) > WORTH * len(cloud):
+        if count >= options.least_left and abs(last - count) > options.worth * len(cloud):
             found.append(Kept(cloud[mask], 1.0 - count / len(cloud)))
             last = count
     return found
 
 
-def noise_across(points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> float:
+def noise_across(
+    points_mm: Float[np.ndarray, "n 3"],
+    rng: np.random.Generator,
+    options: ClutterOptions = USUAL_ALIGN.clutter,
+) -> float:
     """Noise across the surface, mm: what quadrics through nearby points leave.
 
     The squares that k points leave about six coefficients are σ² χ² with k − 6 degrees of freedom;
     edges only add to them, so a low quantile is compared.
     """
-    count = min(NOISE_NEIGHBOURS, len(points_mm))
+    count = min(options.noise_neighbours, len(points_mm))
     if count <= 6:
         return 0.0
-    places = points_mm[rng.permutation(len(points_mm))[:NOISE_PLACES]]
+    places = points_mm[rng.permutation(len(points_mm))[: options.noise_places]]
     index = cKDTree(points_mm).query(places, k=[*range(1, count + 1)], workers=2)[1]
     near = points_mm[index] - points_mm[index].mean(axis=1, keepdims=True)
     axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1]
     z, y, x = np.moveaxis(np.einsum("nki,nij->nkj", near, axes), 2, 0)
     basis = np.linalg.qr(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2))[0]
     left = (z**2).sum(axis=1) - (np.einsum("nkc,nk->nc", basis, z) ** 2).sum(axis=1)
-    low = float(np.quantile(np.maximum(left, 0.0), PLACE_NOISE_QUANTILE))
-    return float(np.sqrt(low / chi2.ppf(PLACE_NOISE_QUANTILE, count - 6)))
+    low = float(np.quantile(np.maximum(left, 0.0), options.noise_quantile))
+    return float(np.sqrt(low / chi2.ppf(options.noise_quantile, count - 6)))
 
 
 def _neighbourhoods(
     cloud: Float[np.ndarray, "n 3"],
+    neighbours: int,
 ) -> tuple[
     Float[np.ndarray, " n"],
     Float[np.ndarray, "n 3"],
@@ -112,9 +106,9 @@ def _neighbourhoods(
     Float[np.ndarray, " n"],
 ]:
     """Reach of the neighbours, their plane's normal, the noise across it, its share of variance."""
-    reach, index = cKDTree(cloud).query(cloud, k=[*range(1, CLUTTER_NEIGHBOURS + 1)], workers=2)
+    reach, index = cKDTree(cloud).query(cloud, k=[*range(1, neighbours + 1)], workers=2)
     near = cloud[index] - cloud[index].mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / CLUTTER_NEIGHBOURS)
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / neighbours)
     values = np.maximum(values, 0.0)
     return (
         reach[:, -1],
@@ -129,52 +123,57 @@ def _bed(
     normals: Float[np.ndarray, "n 3"],
     surface: Bool[np.ndarray, " n"],
     sigma_mm: float,
+    options: ClutterOptions,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, " n"] | None:
     """(n,) points of the plane that holds most of the surface, if all the rest is on one side."""
     here = np.flatnonzero(surface)
     kept = cloud[here]
     diagonal_mm = float(np.linalg.norm(np.ptp(kept, axis=0)))
-    last_mm = max(PLANE_SIGMAS * sigma_mm, LAST_TOLERANCE * diagonal_mm)
-    few = kept[rng.permutation(len(kept))[:4_000]]
+    last_mm = max(options.plane_sigmas * sigma_mm, options.last_tolerance_ratio * diagonal_mm)
+    first_mm = options.first_tolerance_ratio * diagonal_mm
+    few = kept[rng.permutation(len(kept))[: options.plane_points]]
     best, best_count = None, 0
-    for k in rng.permutation(here)[:HYPOTHESES]:
+    for k in rng.permutation(here)[: options.hypotheses]:
         point, normal = cloud[k], normals[k]
-        for tolerance_mm in np.geomspace(FIRST_TOLERANCE * diagonal_mm, last_mm, BED_PLANE_ROUNDS):
+        for tolerance_mm in np.geomspace(first_mm, last_mm, options.plane_rounds):
             inside = np.abs((few - point) @ normal) <= tolerance_mm
-            if inside.sum() < 10:
+            if inside.sum() < options.least_in_plane:
                 break
             point = few[inside].mean(axis=0)
             normal = np.linalg.eigh(np.cov((few[inside] - point).T))[1][:, 0]
         count = int((np.abs((few - point) @ normal) <= last_mm).sum())
         if count > best_count:
             best, best_count = (point, normal), count
-    if best is None or best_count < LEAST_PLANE * len(few):
+    if best is None or best_count < options.least_plane * len(few):
         return None
     height = (cloud - best[0]) @ best[1]
     plane = np.abs(height) <= last_mm
     rest = height[surface & ~plane]
     above = float((rest > 0).mean()) if len(rest) else 0.5
-    return plane if max(above, 1.0 - above) >= ONE_SIDE else None
+    return plane if max(above, 1.0 - above) >= options.one_side else None
 
 
 def _pieces(
-    cloud: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], gap_mm: float
+    cloud: Float[np.ndarray, "n 3"],
+    mask: Bool[np.ndarray, " n"],
+    gap_mm: float,
+    options: ClutterOptions,
 ) -> list[Bool[np.ndarray, " n"]]:
     """(n,) each, the largest pieces that do not touch, largest first; none if there is but one."""
     here: Int[np.ndarray, " k"] = np.flatnonzero(mask)
     low = cloud[here].min(axis=0)
     size = np.ptp(cloud[here], axis=0)
-    edge_mm = max(gap_mm, float(np.cbrt(np.prod(size + gap_mm) / MOST_CLUTTER_CELLS)), 1e-9)
+    edge_mm = max(gap_mm, float(np.cbrt(np.prod(size + gap_mm) / options.most_cells)), 1e-9)
     index = np.floor((cloud[here] - low) / edge_mm).astype(np.int64)
     grid = np.zeros(index.max(axis=0) + 1, dtype=bool)
     grid[tuple(index.T)] = True
     labels = ndimage.label(grid, structure=np.ones((3, 3, 3), dtype=bool))[0]
     piece = labels[tuple(index.T)]
     counts = np.bincount(piece)
-    order = np.argsort(-counts, kind="stable")[:MOST_PIECES]
-    large = [int(k) for k in order if counts[k] >= LEAST_PIECE * len(here)]
-    if len(large) == 1 and counts[large[0]] > (1.0 - WORTH) * len(here):
+    order = np.argsort(-counts, kind="stable")[: options.most_pieces]
+    large = [int(k) for k in order if counts[k] >= options.least_piece * len(here)]
+    if len(large) == 1 and counts[large[0]] > (1.0 - options.worth) * len(here):
         return []
     found = []
     for k in large:

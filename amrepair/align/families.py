@@ -12,22 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align.options import FamilyOptions
 from amrepair.align.refine import Refined
 from amrepair.align.search import CoarseField, misfits_mm
 from amrepair.align.thinning import in_order, thin_out
 from amrepair.frames import rotation_from_vector
 from amrepair.template.port import Template
-
-STEP_RATIO = 0.01  # of the diagonal: what the farthest point moves from one pose to the next
-SWEPT_POINTS, COARSE_POINTS, RADIUS_POINTS = 4_000, 1_500, 1_500
-LEAST_JUDGES = 10  # fewer that are off are outliers
-CLEAR_SIGMAS, CLEAR_MM = 4.0, 0.1  # off: beyond the noise, and what prints of one part differ by
-MOST_FAMILIES = 6
-BEST_OF_EACH = 3
-MOST_ASKED = 12  # dips of the coarse field, that the exact one puts in order
-SAME_STEPS = 4.0  # from the nearest pose of a family: the axis is known no better
-MOST_RESISTING = 0.02  # share of the points that a motion may press against the surface
-LEAST_RADIUS = 0.02  # of the diagonal, about the axis: less turns nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +79,8 @@ def best_turns(
     diagonal_mm: float,
     sigma_mm: float,
     cap_mm: float,
+    off_mm: float,
+    options: FamilyOptions,
     rng: np.random.Generator,
 ) -> list[Float[np.ndarray, "4 4"]]:
     """The best poses of each family: those that turn freely, turned once around.
@@ -107,27 +99,30 @@ def best_turns(
         That the poses' information was made with.
     cap_mm
         Farther off is as bad.
+    off_mm
+        Points farther off lie off the part for certain.
     """
-    step_mm = STEP_RATIO * diagonal_mm
-    cloud = in_order(thin_out(judged_mm, SWEPT_POINTS, rng))
+    step_mm = options.step_ratio * diagonal_mm
+    cloud = in_order(thin_out(judged_mm, options.swept_points, rng))
     known: list[Float[np.ndarray, "k 4 4"]] = []
     found: list[Float[np.ndarray, "4 4"]] = []
     for pose in poses:
-        if len(known) == MOST_FAMILIES:
+        if len(known) == options.most_families:
             break
-        if any(_among(pose.matrix, family, cloud, step_mm) for family in known):
+        within_mm = options.same_steps * step_mm
+        if any(_among(pose.matrix, family, cloud, within_mm) for family in known):
             continue
         for value, motion in zip(*motions(pose, judged_mm), strict=True):
             share = value * sigma_mm**2 / len(judged_mm)
-            family = _turned(pose.matrix, motion, judged_mm, share, diagonal_mm)
+            family = _turned(pose.matrix, motion, judged_mm, share, diagonal_mm, options)
             if family is None:
                 continue
             known.append(family)
             # A feature that decides is small: where it is seen, its points lie off this pose.
-            off = judged_mm[np.abs(pose.residual_mm) > max(CLEAR_MM, CLEAR_SIGMAS * sigma_mm)]
-            for judges in (cloud, off[:: len(off) // SWEPT_POINTS + 1]):
-                if len(judges) >= LEAST_JUDGES:
-                    found += _best_of(family, judges, template, field, cap_mm)
+            off = judged_mm[np.abs(pose.residual_mm) > off_mm]
+            for judges in (cloud, off[:: len(off) // options.swept_points + 1]):
+                if len(judges) >= options.least_judges:
+                    found += _best_of(family, judges, template, field, cap_mm, options)
     return found
 
 
@@ -137,13 +132,14 @@ def _best_of(
     template: Template,
     field: CoarseField,
     cap_mm: float,
+    options: FamilyOptions,
 ) -> list[Float[np.ndarray, "4 4"]]:
     """The best poses of a family but for its first, which is known."""
-    few = judges_mm[:: len(judges_mm) // COARSE_POINTS + 1]
+    few = judges_mm[:: len(judges_mm) // options.coarse_points + 1]
     dips = _lowest(misfits_mm(few, family, field, cap_mm))
-    asked = [family[k] for k in dips[:MOST_ASKED] if k > 0]
+    asked = [family[k] for k in dips[: options.most_asked] if k > 0]
     scores = np.array([_score(judges_mm, one, template, cap_mm) for one in asked])
-    return [asked[k] for k in np.argsort(scores, kind="stable")[:BEST_OF_EACH]]
+    return [asked[k] for k in np.argsort(scores, kind="stable")[: options.best_of_each]]
 
 
 def _turned(
@@ -152,6 +148,7 @@ def _turned(
     cloud_mm: Float[np.ndarray, "n 3"],
     share: float,
     diagonal_mm: float,
+    options: FamilyOptions,
 ) -> Float[np.ndarray, "k 4 4"] | None:
     """(k, 4, 4) the pose turned around the motion's axis; None where that is hindered.
 
@@ -159,18 +156,18 @@ def _turned(
     """
     rate = float(np.linalg.norm(motion.turn))
     # The radius is at most the diagonal.
-    if rate < 1e-9 or share > MOST_RESISTING * (rate * diagonal_mm) ** 2:
+    if rate < 1e-9 or share > options.most_resisting * (rate * diagonal_mm) ** 2:
         return None
     axis = motion.turn / rate
     centre = matrix[:3, :3] @ cloud_mm.mean(axis=0) + matrix[:3, 3]
     through = centre + np.cross(axis, motion.shift) / rate
-    few = cloud_mm[:: len(cloud_mm) // RADIUS_POINTS + 1]  # a radius needs no more
+    few = cloud_mm[:: len(cloud_mm) // options.radius_points + 1]  # a radius needs no more
     away = few @ matrix[:3, :3].T + matrix[:3, 3] - through
     radius_mm = float(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1).max())
-    in_part = LEAST_RADIUS * diagonal_mm < radius_mm < diagonal_mm
-    if not in_part or share > MOST_RESISTING * (rate * radius_mm) ** 2:
+    in_part = options.least_radius_ratio * diagonal_mm < radius_mm < diagonal_mm
+    if not in_part or share > options.most_resisting * (rate * radius_mm) ** 2:
         return None
-    count = int(np.ceil(2.0 * np.pi * radius_mm / (STEP_RATIO * diagonal_mm)))
+    count = int(np.ceil(2.0 * np.pi * radius_mm / (options.step_ratio * diagonal_mm)))
     angles = 2.0 * np.pi * np.arange(count)[:, None, None] / count
     along, across = np.outer(axis, axis), np.cross(axis, np.eye(3)).T
     turns = np.cos(angles) * (np.eye(3) - along) + np.sin(angles) * across + along  # Rodrigues
@@ -184,12 +181,12 @@ def _among(
     matrix: Float[np.ndarray, "4 4"],
     family: Float[np.ndarray, "k 4 4"],
     cloud_mm: Float[np.ndarray, "n 3"],
-    step_mm: float,
+    within_mm: float,
 ) -> bool:
     few = cloud_mm[:: max(1, len(cloud_mm) // 50)]
     placed = few @ matrix[:3, :3].T + matrix[:3, 3]
     others = few @ np.swapaxes(family[:, :3, :3], 1, 2) + family[:, None, :3, 3]
-    return bool(np.linalg.norm(others - placed, axis=2).max(axis=1).min() < SAME_STEPS * step_mm)
+    return bool(np.linalg.norm(others - placed, axis=2).max(axis=1).min() < within_mm)
 
 
 def _score(

@@ -15,93 +15,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from amrepair.align.options import PUBLISHED_PAM, PamOptions
 from amrepair.align.registration import Registration
 from amrepair.device import open3d
-from amrepair.errors import AlignmentError, InputError
+from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
-LOSSES = ("chamfer", "directed")
-LEAST_INLIERS = 0.5
-PAM_INLIER_MM = 0.3  # a real print lies this near to its template nearly everywhere
 # What the directed loss of the released code is multiplied by.
 DIRECTED_FACTOR = 100.0
-
-
-@dataclass(frozen=True, slots=True)
-class PamOptions:
-    """Algorithm 1 of the paper; the defaults are the paper's.
-
-    Attributes
-    ----------
-    voxel
-        v, edge of the down-sampling voxel, in template radii.
-    threshold, threshold_step, iterations
-        τ, Δτ by which it grows after each iteration, and K.
-    loss
-        `chamfer`: mean squared nearest distance, both directions (eq. 7); `directed`: mean nearest
-        distance from source to target × 100 (the released code).
-    loss_points, loss_on_voxels
-        Points drawn for the loss (0: all), and whether of the down-sampled clouds.
-    normal_voxels, normal_neighbours, feature_voxels, feature_neighbours
-        Radii in voxels, and how many neighbours at most, of normals and of FPFH.
-    mutual, ransac_voxels, edge_ratio, ransac_iterations, confidence
-        RANSAC: mutual filter, distance check in voxels, edge-length check, and when it ends.
-    icp_voxels, icp_iterations
-        Point-to-point ICP on the full clouds.
-    target_points
-        Points that stand for the template.
-    ransac, icp, iterate
-        Off for the ablations of the paper's Table 4.
-    """
-
-    voxel: float = 0.03
-    threshold: float = 0.016
-    threshold_step: float = 0.001
-    iterations: int = 10
-    loss: str = "chamfer"
-    loss_points: int = 0
-    loss_on_voxels: bool = False
-    normal_voxels: float = 2.0
-    normal_neighbours: int = 30
-    feature_voxels: float = 5.0
-    feature_neighbours: int = 100
-    mutual: bool = True
-    ransac_voxels: float = 1.5
-    edge_ratio: float = 0.9
-    ransac_iterations: int = 100_000
-    confidence: float = 0.999
-    icp_voxels: float = 0.4
-    icp_iterations: int = 100
-    target_points: int = 50_000
-    ransac: bool = True
-    icp: bool = True
-    iterate: bool = True
-
-    def __post_init__(self) -> None:
-        if not 1e-3 <= self.voxel <= 0.5:
-            raise InputError(f"PAM's voxel is {self.voxel} radii; choose 0.001 to 0.5")
-        if self.loss not in LOSSES:
-            raise InputError(f"PAM's loss '{self.loss}' is unknown; choose {', '.join(LOSSES)}")
-        if self.iterations < 1 or self.target_points < 100:
-            raise InputError(
-                f"PAM needs at least 1 iteration and 100 points of the template, got "
-                f"{self.iterations} and {self.target_points}"
-            )
-
-
-PUBLISHED_PAM = PamOptions()
-# The released code: its loss is directed, on 5,000 points of the down-sampled clouds.
-RELEASED_PAM = PamOptions(
-    threshold=1.6,
-    threshold_step=0.1,
-    loss="directed",
-    loss_points=5_000,
-    loss_on_voxels=True,
-)
-PAM_VARIANTS = {"paper": PUBLISHED_PAM, "code": RELEASED_PAM}
 
 
 class PamError(AlignmentError):
@@ -327,15 +251,15 @@ def align_paper(
     residual_mm, gradient = template.distance_and_gradient(placed)
     # The method cannot place a scan better than its own last search radius.
     reach = options.icp_voxels if options.icp else options.ransac_voxels
-    limit_mm = max(PAM_INLIER_MM, reach * options.voxel * found.radius_mm)
+    limit_mm = max(options.inlier_mm, reach * options.voxel * found.radius_mm)
     inlier = np.abs(residual_mm) <= limit_mm
     ratio = float(inlier.mean())
-    if ratio < LEAST_INLIERS:
+    if ratio < options.least_explained:
         raise AlignmentError(
             f"the scan {scan.source} does not fit its template: PAM converged at a loss of "
             f"{found.loss:.4g} (limit {found.threshold:.4g}), but only {ratio:.0%} of the points "
-            f"lie within {limit_mm:.2g} mm (at least {LEAST_INLIERS:.0%} are needed); use the "
-            "method robust"
+            f"lie within {limit_mm:.2g} mm (at least {options.least_explained:.0%} are needed); "
+            "use the method robust"
         )
     arm = placed - placed.mean(axis=0)
     jacobian = np.concatenate([np.cross(arm, gradient), gradient], axis=1)[inlier]

@@ -11,20 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align.options import PoseOptions
 from amrepair.align.refine import Refined, refine_all
 from amrepair.align.thinning import Thinned
 from amrepair.frames import box_corners
 from amrepair.template.port import Template
-
-DENSE_POINTS, FEW_POINTS, FIRST_POINTS = 15_000, 2_000, 700
-FEW_FACTOR, FEW_ITERATIONS, DENSE_ITERATIONS, MOST_FINISHED = 1.5, 30, 120, 3
-# After so many iterations scores change little: a pose worse than the best by this factor is left
-# as it is. On few points nothing is gained by steps below this share of the noise.
-FIRST_ITERATIONS, LEFT_FACTOR, ENOUGH_SIGMAS = 10, 1.6, 0.05
-FIRST_RATIO = 0.005  # scale of the loss to begin with, of the diagonal
-SAME_FIT_MM = 0.005  # scores that differ by less are alike
-APART_RATIO = 0.02  # poses that move the part less than this share of its size are the same
-PLAUSIBLE = 0.6  # a mean distance above this share of the cap is no fit, with more points either
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +27,7 @@ class Clouds:
     corners_mm: Float[np.ndarray, "8 3"]
     diagonal_mm: float
     sigma_mm: float
+    options: PoseOptions
 
     @classmethod
     def of(
@@ -43,13 +35,14 @@ class Clouds:
         points_mm: Float[np.ndarray, "n 3"],
         template: Template,
         sigma_mm: float,
+        options: PoseOptions,
         rng: np.random.Generator,
     ) -> Clouds:
         """Of a scan's points; the diagonal is the template's."""
-        dense = Thinned(points_mm, rng).to(DENSE_POINTS)
+        dense = Thinned(points_mm, rng).to(options.dense_points)
         box = np.stack([dense.min(axis=0), dense.max(axis=0)])
         diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-        return cls(dense, Thinned(dense, rng), box_corners(box), diagonal_mm, sigma_mm)
+        return cls(dense, Thinned(dense, rng), box_corners(box), diagonal_mm, sigma_mm, options)
 
     @property
     def size_mm(self) -> float:
@@ -62,13 +55,13 @@ class Clouds:
 
     @property
     def cap_mm(self) -> float:
-        """Farther off is as bad: ten times the noise, or a millimetre."""
-        return max(1.0, 10.0 * self.sigma_mm)
+        """Farther off is as bad."""
+        return max(self.options.least_cap_mm, self.options.cap_sigmas * self.sigma_mm)
 
     @property
     def scale_mm(self) -> float:
         """The loss's, where a pose is at its end."""
-        return max(0.1, 3.0 * self.sigma_mm)
+        return self.options.scale_mm(self.sigma_mm)
 
     def scored(self, pose: Refined) -> Scored:
         """With the mean of |f|, each up to the cap."""
@@ -76,7 +69,7 @@ class Clouds:
 
     def apart(self, one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
         """Whether two poses move the scan's box to different places."""
-        return self._between_mm(one, other) > APART_RATIO * self.diagonal_mm
+        return self._between_mm(one, other) > self.options.apart_ratio * self.diagonal_mm
 
     def same(self, one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
         """Whether two poses are one minimum: no point of either is beyond the noise of the other's.
@@ -120,27 +113,34 @@ def refined(
     known
         Poses that they are held against, and that are not given again; best first.
     """
-    first_mm = max(FIRST_RATIO * clouds.diagonal_mm, 3.0 * clouds.sigma_mm)
-    found = _moved(starts, clouds, template, FIRST_POINTS, first_mm, FIRST_ITERATIONS)
+    options = clouds.options
+    first_mm = max(options.first_ratio * clouds.diagonal_mm, options.scale_sigmas * clouds.sigma_mm)
+    found = _moved(
+        starts, clouds, template, options.first_points, first_mm, options.first_iterations
+    )
     if not found:
         return []
     best_score = min(score for score, _ in (*known[:1], *found[:1]))
-    limit = LEFT_FACTOR * best_score + SAME_FIT_MM
+    limit = options.left_factor * best_score + options.same_fit_mm
     begun = [pose.matrix for score, pose in found if score <= limit]
-    found = _moved(begun, clouds, template, FEW_POINTS, clouds.scale_mm, FEW_ITERATIONS)
+    found = _moved(
+        begun, clouds, template, options.few_points, clouds.scale_mm, options.few_iterations
+    )
     if not finish or not found:
         return found
-    limit = FEW_FACTOR * min(found[0][0], best_score) + SAME_FIT_MM
+    limit = options.few_factor * min(found[0][0], best_score) + options.same_fit_mm
     kept: list[Scored] = []
     for score, pose in found:
         if score > limit:
             break
         if not any(clouds.same(pose.matrix, other.matrix) for _, other in (*known, *kept)):
             kept.append((score, pose))
-    hopeful = [pose for score, pose in kept if score < PLAUSIBLE * clouds.cap_mm][:MOST_FINISHED]
+    limit = options.plausible * clouds.cap_mm
+    hopeful = [pose for score, pose in kept if score < limit][: options.most_finished]
     judged = [pose for _, pose in kept if not any(pose is one for one in hopeful)]
+    most = options.few_iterations
     ended = [
-        clouds.scored(finished(pose, clouds, template, FEW_ITERATIONS if k else DENSE_ITERATIONS))
+        clouds.scored(finished(pose, clouds, template, most if k else options.dense_iterations))
         for k, pose in enumerate(hopeful)
     ]
     return sorted(ended + on_all(judged, clouds, template), key=by_score)
@@ -195,6 +195,6 @@ def _moved(
         end_scale_mm=clouds.scale_mm,
         sigma_mm=clouds.sigma_mm,
         max_iterations=max_iterations,
-        enough_mm=ENOUGH_SIGMAS * clouds.sigma_mm,
+        enough_mm=clouds.options.enough_sigmas * clouds.sigma_mm,
     )
     return sorted((clouds.scored(pose) for pose in moved), key=by_score)

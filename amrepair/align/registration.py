@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align.options import AlignOptions
 from amrepair.frames import Transform
 
 KNOWN_INFORMATION = 1e12  # of a pose that is known: a micrometre, a millionth of a turn
@@ -34,8 +35,8 @@ class Registration:
         rad, translation x y z in mm), along the template's axes.
     symmetric_alternatives
         Other poses (template_from_scan) that fit as well, within noise.
-    method, iterations
-        How it was found.
+    method, iterations, options
+        How it was found; None where nothing was searched.
     """
 
     template_from_scan: Transform
@@ -46,6 +47,7 @@ class Registration:
     method: str
     iterations: int
     clutter_ratio: float = 0.0
+    options: AlignOptions | None = None
 
     @classmethod
     def known(cls, template_from_scan: Transform) -> Registration:

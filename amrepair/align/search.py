@@ -11,101 +11,18 @@ M. Alexa, Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3), CVPR
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from amrepair.align import search_kernels as kernels
+from amrepair.align.options import USUAL_ALIGN, CoarseOptions, Effort
 from amrepair.align.thinning import Thinned
 from amrepair.template.port import Template
 
-COARSE_CELLS = 56  # of the coarse field, along the longest side of the part
-SEARCH_MARGIN_RATIO = 0.15  # of the diagonal, around the part
 # Roots of x⁴ = x + 4 and 2 (Alexa, eq. 5).
 _PSI, _PHI = 1.533751168755204288118041, np.sqrt(2.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """A round of the search: points, Gauss–Newton steps, scales, poses kept.
-
-    Attributes
-    ----------
-    first_scale, last_scale
-        Of the loss, in diagonals.
-    """
-
-    points: int
-    steps: int
-    first_scale: float
-    last_scale: float
-    keep: int
-
-    def scales(self, diagonal: float) -> Float[np.ndarray, " s"]:
-        """(s,) from the first to the last, in equal ratios, in the diagonal's unit."""
-        return diagonal * np.geomspace(self.first_scale, self.last_scale, self.steps)
-
-
-@dataclass(frozen=True, slots=True)
-class Effort:
-    """How many rotations are tried (spread evenly over SO(3)), and the rounds that follow.
-
-    Attributes
-    ----------
-    places
-        Where each rotation is tried.
-    gap_ratio
-        Of the diagonal, between the places among which those are chosen.
-    """
-
-    rotations: int
-    stages: tuple[Stage, ...]
-    places: int = 1
-    gap_ratio: float = np.inf
-
-
-# About 23° apart; of 120 scans of our own parts, whole and single views, none was lost.
-QUICK_EFFORT = Effort(
-    1_200,
-    (
-        Stage(120, 6, 0.10, 0.03, 160),
-        Stage(300, 8, 0.03, 0.01, 40),
-        Stage(1_000, 6, 0.01, 0.005, 40),
-    ),
-)
-THOROUGH = Effort(
-    3_600,
-    (
-        Stage(160, 7, 0.10, 0.03, 480),
-        Stage(400, 10, 0.03, 0.01, 80),
-        Stage(1_500, 8, 0.01, 0.005, 40),
-    ),
-)
-# Of a scan that shows a piece of the part, which may lie anywhere in it. Of 40 searches for pieces
-# of a bracket 8 failed with 4 places, 2 with 12, none with 24.
-PIECE = Effort(
-    2_400,
-    (
-        Stage(160, 7, 0.07, 0.02, 600),
-        Stage(400, 10, 0.02, 0.01, 120),
-        Stage(1_500, 8, 0.01, 0.005, 40),
-    ),
-    places=12,
-    gap_ratio=0.1,
-)
-PIECE_AGAIN = replace(PIECE, places=24)
-# Of poses that are nearly known.
-TWINS = Effort(
-    192,
-    (
-        Stage(120, 6, 0.10, 0.03, 48),
-        Stage(300, 8, 0.03, 0.01, 16),
-        Stage(1_000, 6, 0.01, 0.005, 16),
-    ),
-)
-DISTANCE_CAP_RATIO = 0.03  # of the diagonal: farther off is as bad
-SAME_POSE_RATIO = 0.007  # of the diagonal: poses that move the points by less are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,35 +35,38 @@ class CoarseField:
         (x, y, z) float32.
     box_mm
         (2, 3) of the part.
+    options
+        That it was made with, and is searched by.
     """
 
     origin_mm: Float[np.ndarray, " 3"]
     cell_mm: float
     values: Float[np.ndarray, "x y z"]
     box_mm: Float[np.ndarray, "2 3"]
+    options: CoarseOptions
 
     @classmethod
-    def of(cls, template: Template) -> CoarseField:
+    def of(cls, template: Template, options: CoarseOptions = USUAL_ALIGN.coarse) -> CoarseField:
         """Ask the template at every node; the last one's answers are kept for its next scan."""
         for known, field in _latest:
-            if known is template:
+            if known is template and field.options == options:
                 return field
-        field = cls._asked(template)
+        field = cls._asked(template, options)
         _latest[:] = [(template, field)]
         return field
 
     @classmethod
-    def _asked(cls, template: Template) -> CoarseField:
+    def _asked(cls, template: Template, options: CoarseOptions) -> CoarseField:
         box = template.bounds_mm
         size = box[1] - box[0]
-        cell_mm = float(size.max()) / COARSE_CELLS
-        margin_mm = SEARCH_MARGIN_RATIO * float(np.linalg.norm(size))
+        cell_mm = float(size.max()) / options.cells
+        margin_mm = options.margin_ratio * float(np.linalg.norm(size))
         origin = box[0] - margin_mm
         shape = np.ceil((size + 2 * margin_mm) / cell_mm).astype(int) + 1
         axes = [origin[a] + cell_mm * np.arange(shape[a]) for a in range(3)]
         nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         values = template.distance(nodes).reshape(tuple(shape)).astype(np.float32)
-        return cls(origin, cell_mm, values, box)
+        return cls(origin, cell_mm, values, box, options)
 
     @property
     def diagonal_mm(self) -> float:
@@ -177,7 +97,7 @@ def search(
     cloud: Thinned,
     field: CoarseField,
     *,
-    effort: Effort = QUICK_EFFORT,
+    effort: Effort | None = None,
     turn: Float[np.ndarray, "3 3"] | None = None,
     only: tuple[Float[np.ndarray, "4 4"], ...] | None = None,
 ) -> list[Pose]:
@@ -187,12 +107,15 @@ def search(
     ----------
     cloud
         Evenly spread over what was scanned, scan's frame.
+    effort
+        The field's quick one where none is given.
     turn
         A rotation of all that are tried: between those of another search.
     only
         Poses to start from instead of all rotations.
     """
-    cell_mm = field.cell_mm
+    cell_mm, options = field.cell_mm, field.options
+    effort = effort if effort is not None else options.quick
     # The densest cloud comes first, since thinner ones are made from it.
     clouds = [cloud.to(stage.points) / cell_mm for stage in effort.stages[::-1]][::-1]
     centre = clouds[0].mean(axis=0)
@@ -222,11 +145,11 @@ def search(
         rotations, places = np.ascontiguousarray(rotations), np.ascontiguousarray(places)
         scales = stage.scales(diagonal)
         scores = kernels.descend(
-            _rows(local), rotations, places, *grid, scales, DISTANCE_CAP_RATIO * diagonal
+            _rows(local), rotations, places, *grid, scales, options.cap_ratio * diagonal
         )
         radius = float(np.sqrt((local**2).sum(axis=1).mean()))
         order = np.argsort(scores, kind="stable")
-        apart = SAME_POSE_RATIO * diagonal
+        apart = options.same_pose_ratio * diagonal
         chosen = kernels.peaks(order, rotations, places, radius, apart, stage.keep)
         rotations, places, scores = rotations[chosen], places[chosen], scores[chosen]
     return [

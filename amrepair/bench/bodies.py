@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from amrepair.align.refine import Prior, refine_all
-from amrepair.align.search import THOROUGH, CoarseField, search
+from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.bench.bends import best_cuts
 from amrepair.frames import moved, rotation_from_vector, unit_vectors, ways_across
@@ -136,7 +136,8 @@ def pieces_of(
     best = _best_pair(tried, scene)
     if best is None or not best.is_enough:
         coarse = CoarseField.of(template)
-        found = [pose.matrix for pose in search(scene.thinned, coarse, effort=THOROUGH)]
+        poses = search(scene.thinned, coarse, effort=coarse.options.thorough)
+        found = [pose.matrix for pose in poses]
         more = scene.distinct([*tried, *scene.refined(scene.thinned.to(START_POINTS), found)])
         untried = [pose for pose in more if not any(pose is one for one in tried)]
         best = _best_pair(untried[:MOST_TRIED], scene, best)

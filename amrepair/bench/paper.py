@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from amrepair.align.pam import PUBLISHED_PAM, RELEASED_PAM, PamError, PamOptions, pam
+from amrepair.align.options import PUBLISHED_PAM, RELEASED_PAM, PamOptions
+from amrepair.align.pam import PamError, pam
 from amrepair.bench.baselines import Aligner
 from amrepair.bench.house import class_template, repair_distance
 from amrepair.bench.method import ClassInput, Model, Scores

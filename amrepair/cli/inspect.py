@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -97,7 +98,7 @@ def align(
         import numpy as np
 
         from amrepair.align import align as align_scan
-        from amrepair.align.pam import PAM_VARIANTS
+        from amrepair.align.options import PAM_VARIANTS, USUAL_ALIGN
         from amrepair.repair import Stopwatch
         from amrepair.scans import write_ply
         from amrepair.template import open_template
@@ -116,7 +117,7 @@ def align(
                     field,
                     method=method,
                     part_is_known=part_is_known,
-                    pam_options=settings,
+                    options=replace(USUAL_ALIGN, paper=settings),
                     rng=np.random.default_rng(seed),
                     progress=bars,
                 )

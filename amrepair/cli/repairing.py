@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -24,7 +25,7 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import AmrepairError, InputError
 from gcode.cli import console
-from gcode.cli.options import grid_of, program_text
+from gcode.cli.options import grid_of, job_of, program_text
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption, job_setup
 from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_PROCESS
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from amrepair.template.port import Template
     from amrepair.turning import Turn
     from gcode.profiles import PrintSetup
+    from gcode.reader import Job
 
 # A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
@@ -134,6 +136,7 @@ def repair(
     with console.starting():
         import numpy as np
 
+        from amrepair.loop.afterwards import afterwards
         from amrepair.repair import Site, Stopwatch, plan_repair
         from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
         from amrepair.report.collect import plan_result
@@ -152,12 +155,13 @@ def repair(
     watch = Stopwatch()
     with bars.shown():
         with bars.stage("read"):
-            grid = grid_of(job, setup)
+            read_job = job_of(job, setup) if job is not None else None
+            grid = grid_of(read_job, setup)
         with watch("template"):
             field = open_template(template, progress=bars)
-        if pose == OF_JOB and job is not None:
+        if pose == OF_JOB and read_job is not None:
             with watch("locate"):
-                field, placed = where_the_job_prints_it(job, field, setup)
+                field, placed = where_the_job_prints_it(read_job, f"{job}", field, setup)
         guess = placed.inverse() if placed is not None and frame == "build" else None
         site = Site(
             field,
@@ -180,6 +184,11 @@ def repair(
         if turns and plan.unreachable_mm3 > WORTH_TURNING_RATIO * plan.deficit.missing_mm3:
             with watch("turns"):
                 ranked = turns_of(plan, site, turns, progress=bars)
+        late = None
+        if read_job is not None:
+            with watch("ways"):
+                command = _that_goes_on(f"{job}", output, printer, material)
+                late = afterwards(plan, read_job, field, setup, command=command)
     program = plan.checked.program if plan.checked is not None else None
     if program is not None:
         text = program.text
@@ -196,6 +205,7 @@ def repair(
         seed=seed,
         seconds=seconds,
         setup=setup,
+        late=late,
     )
     result |= {
         "clutter_ratio": plan.registration.clutter_ratio,
@@ -213,6 +223,7 @@ def repair(
                 setup=setup,
                 template=field,
                 scan_name=scan.name,
+                late=late,
             )
             console.write_whole(report, lambda path: write_report(data, path))
     if as_json:
@@ -234,6 +245,8 @@ def repair(
             console.out.print(said, markup=False)
         for line in _suggestion(plan, ranked):
             console.out.print(line)
+        for line in late.told if late is not None else ():
+            console.out.print(f"Left open inside: {line}.", markup=False)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
 
@@ -276,7 +289,7 @@ def pose_of_job(job: Path | None, template: Path, setup: PrintSetup) -> str:
     bars = console.Bars()
     try:
         with bars.shown():
-            copies = _copies(job, open_template(template, progress=bars), setup)
+            copies = _copies(job_of(job, setup), open_template(template, progress=bars), setup)
     except (AmrepairError, GcodeError) as error:
         return f"{job} does not tell, either: {error}"
     if not is_upright(copies[0]):
@@ -291,7 +304,7 @@ def pose_of_job(job: Path | None, template: Path, setup: PrintSetup) -> str:
 
 
 def where_the_job_prints_it(
-    job: Path, template: Template, setup: PrintSetup
+    job: Job, name: str, template: Template, setup: PrintSetup
 ) -> tuple[Template, Transform]:
     """The template as a job lays it on the bed, and where; the place is told for next time.
 
@@ -308,22 +321,29 @@ def where_the_job_prints_it(
     if len(copies) > 1:
         places = " or ".join(map(_typed, copies))
         raise InputError(
-            f"{job} prints {len(copies)} of the part; say which by --part-pose {places}"
+            f"{name} prints {len(copies)} of the part; say which by --part-pose {places}"
         )
     if is_upright(copies[0]):
         said = f"it stands at --part-pose {_typed(copies[0])}"
     else:
         said = "it lies in another way than its own file has it"
-    console.errors.print(f"{job} prints the part: {said}.", markup=False)
+    console.errors.print(f"{name} prints the part: {said}.", markup=False)
     return stood(template, copies)
 
 
-def _copies(job: Path, template: Template, setup: PrintSetup) -> tuple[Transform, ...]:
+def _copies(job: Job, template: Template, setup: PrintSetup) -> tuple[Transform, ...]:
     """Where a job prints the part."""
     from amrepair.loop.locate import locate_parts
-    from gcode.cli.options import job_of
 
-    return locate_parts(job_of(job, setup), template, layer_height_mm=setup.process.layer_height_mm)
+    return locate_parts(job, template, layer_height_mm=setup.process.layer_height_mm)
+
+
+def _that_goes_on(job: str, repair: Path, printer: str | None, material: str | None) -> str:
+    """The command that makes the job that is left, as it is typed; its layer follows."""
+    named = [("--printer", printer), ("--material", material)]
+    words = ["gcode", "resume-at", job, "-o", f"{repair.with_name('rest.gcode')}"]
+    words += [word for option, name in named if name is not None for word in (option, name)]
+    return shlex.join(words)
 
 
 def _typed(placed: Transform) -> str:

@@ -17,6 +17,7 @@ from amrepair.cli.running import (
     new_run,
     print_run,
 )
+from amrepair.cli.scanners import known_scanner
 from amrepair.cli.telling import Begun, written
 from amrepair.errors import AmrepairError, InputError
 from amrepair.loop.looks import LoopReport
@@ -25,10 +26,12 @@ from amrepair.loop.travel import park, way_back
 from amrepair.policy import Decision
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.report.text import summary_of_result
+from amrepair.scans import PROBE
 from gcode.cli import console
 from gcode.errors import GcodeError, LinkError
 from gcode.hosts.moonraker_job import KlipperJob
 from gcode.hosts.octoprint_job import OctoPrintJob
+from gcode.hosts.port import TellsTouches
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.served_job import ServedJob, UnderWay
 from gcode.hosts.web import Address
@@ -65,12 +68,21 @@ def serve(told: Served) -> None:
     """
     if not told.template.exists():
         raise InputError(f"--template {told.template}: there is no such file or folder")
+    known_scanner(told.said["scanner"])
     machine, screens = _machine(told.address, told.key)
+    touches = told.said["scanner"] == PROBE
+    if touches and not isinstance(machine, TellsTouches):
+        raise InputError(
+            f"--scanner probe: {told.address.name} does not tell where a touch ended; print over "
+            "the printer's own port ('amrepair loop --port'), or name a scanner that sees"
+        )
     machine.connect()
     talk = Talk(machine, screens, lambda text: console.errors.print(text, markup=False))
     try:
         with console.signals_end_it():
             machine.require_partner()
+            if touches and isinstance(machine, TellsTouches):
+                machine.require_touches()
             talk.listen()
             talk.say("the agent is here.")
             _Service(told, machine, talk).run()

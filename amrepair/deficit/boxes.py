@@ -8,16 +8,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from amrepair.deficit.options import VoxelOptions
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.regions import AnomalyMap, Label
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.template.port import Template
-
-BOX_MARGIN_MM = 1.0
-# Beside what is deep, a film on an even surface is sampled as finely as if it were alone.
-SAMPLED_FILM_MM, EVEN_MM, LEAST_FILM_MM2, FACES_OUT = 0.5, 0.05, 5.0, 0.5
-PATH_STEP_MM = 1.0
 
 
 def boxes_of(
@@ -26,6 +22,7 @@ def boxes_of(
     template: Template,
     label: Label,
     lines: PlannedBeads | None,
+    options: VoxelOptions,
 ) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
     """Low corner, high corner and depth of each group of labelled cells and template points."""
     s = evidence.surfels
@@ -33,9 +30,9 @@ def boxes_of(
     points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
     film = np.zeros(len(which), dtype=bool)
     if label is Label.MISSING:
-        film = _films(template, evidence, which)
+        film = _films(template, evidence, which, options)
         gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
-        gone = np.concatenate([gone, _paths_out(template, evidence, which)])
+        gone = np.concatenate([gone, _paths_out(template, evidence, which, options)])
         points = np.concatenate([points, gone])
         depth = np.concatenate([depth, np.full(len(gone), np.nan)])
     else:
@@ -53,18 +50,19 @@ def boxes_of(
             continue  # nor is where something would stand what stands
         thick = float(np.percentile(known, 90)) if len(known) else 2.0
         thin = deep[film[group == g]]
-        if len(thin) * s.cell_mm**2 > LEAST_FILM_MM2:
+        if len(thin) * s.cell_mm**2 > options.least_film_mm2:
             thick = min(thick, float(np.median(thin)))  # so that samples lie in its lower half
-        found.append((mine.min(axis=0) - BOX_MARGIN_MM, mine.max(axis=0) + BOX_MARGIN_MM, thick))
+        low, high = mine.min(axis=0), mine.max(axis=0)
+        found.append((low - options.margin_mm, high + options.margin_mm, thick))
     if lines is not None:
-        for a, b, high in zip(lines.start_mm, lines.end_mm, lines.height_mm, strict=True):
-            low, top = np.minimum(a, b) - BOX_MARGIN_MM, np.maximum(a, b) + BOX_MARGIN_MM
-            found.append((low, top, float(high)))
+        for a, b, thick in zip(lines.start_mm, lines.end_mm, lines.height_mm, strict=True):
+            low, top = np.minimum(a, b) - options.margin_mm, np.maximum(a, b) + options.margin_mm
+            found.append((low, top, float(thick)))
     return _merge(found)
 
 
 def _films(
-    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"]
+    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"], options: VoxelOptions
 ) -> Bool[np.ndarray, " q"]:
     """Cells of an even surface over which a film is missing: no deeper, and it faces out of it.
 
@@ -72,31 +70,31 @@ def _films(
     """
     s = evidence.surfels
     depth_mm, wide_mm = np.abs(s.deviation_mm[which]), np.abs(s.wide_deviation_mm[which])
-    film = (depth_mm < SAMPLED_FILM_MM) & (np.abs(depth_mm - wide_mm) < EVEN_MM)
+    film = (depth_mm < options.film_mm) & (np.abs(depth_mm - wide_mm) < options.even_mm)
     some = which[film]
     outward = template.distance_and_gradient(s.place_mm[some])[1]
-    film[film] = (outward * evidence.normal[some]).sum(axis=1) > FACES_OUT
+    film[film] = (outward * evidence.normal[some]).sum(axis=1) > options.facing
     return film
 
 
 def _paths_out(
-    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"]
+    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"], options: VoxelOptions
 ) -> Float[np.ndarray, "p 3"]:
     """Points through the empty space from a void's floor to where it leaves the template.
 
     They tie the floor to the mouth where nobody sampled the walls between.
     """
-    s = evidence.surfels
+    s, step_mm = evidence.surfels, options.path_step_mm
     if len(which) == 0:
         return np.zeros((0, 3))
     _, first = np.unique(
-        np.floor(s.place_mm[which] / PATH_STEP_MM).astype(np.int64), axis=0, return_index=True
+        np.floor(s.place_mm[which] / step_mm).astype(np.int64), axis=0, return_index=True
     )
     front, along = s.place_mm[which[first]], evidence.normal[which[first]]
     found = []
     reach_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
-    for _ in range(int(reach_mm / PATH_STEP_MM) + 1):
-        front = front + PATH_STEP_MM * along
+    for _ in range(int(reach_mm / step_mm) + 1):
+        front = front + step_mm * along
         f = template.distance(front)
         go_on = (f < 0) & (evidence.clearance(front, f)[0] > 0)
         if not go_on.any():

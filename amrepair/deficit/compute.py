@@ -23,6 +23,7 @@ from amrepair.deficit.heights import (
     with_what_stands_out,
     without_missing,
 )
+from amrepair.deficit.options import USUAL_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import (
     with_even_crests,
@@ -34,17 +35,13 @@ from amrepair.errors import DeficitError
 from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.frames import Transform, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
+from amrepair.regions.options import SkippedOptions
 from amrepair.regions.regions import classify
 from amrepair.regions.skipped import PlannedBeads, skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 from gcode.surfaces import HeightField
-
-# One bead of 0.45 × 0.2 mm as long as two nozzle widths: less cannot be placed.
-BEAD_MM3 = 0.08
-# From so much on heights will be asked for: what a clean layer's crumbs never are.
-EARLY_MM3 = 0.5
 
 
 class Standing:
@@ -87,6 +84,8 @@ class Deficit:
         Makes `as_built`, when that is first asked for.
     gone
         Stretches of planned lines that are not there, template frame.
+    options
+        That it was made with.
     """
 
     missing: manifold3d.Manifold
@@ -96,6 +95,7 @@ class Deficit:
     unseen_area_mm2: float
     stands: Standing
     gone: PlannedBeads | None = None
+    options: DeficitOptions = USUAL_DEFICIT
 
     @property
     def as_built(self) -> HeightField:
@@ -121,9 +121,9 @@ def compute_deficit(
     build_from_template: Transform,
     tolerance_mm: float | None = None,
     printed_z_mm: float | None = None,
-    cell_mm: float = 0.25,
     as_built: Callable[[], HeightField] | None = None,
     beads: PlannedBeads | None = None,
+    options: DeficitOptions = USUAL_DEFICIT,
     progress: Progress = silent,
 ) -> Deficit:
     """Solids of what is missing and in excess.
@@ -140,10 +140,10 @@ def compute_deficit(
         τ; None takes the detection's threshold.
     printed_z_mm
         Height printed so far, build frame; None is the template's own top.
-    cell_mm
-        Cell of what the scan alone says of heights.
     as_built
         Makes what stands on the bed, where the caller knows; None has it made of scan and solids.
+    options
+        How solids and heights are made.
     beads
         What the job has laid there, template frame: lines of it that rays went through are missing,
         however near to the template's surface they lie.
@@ -155,62 +155,64 @@ def compute_deficit(
     """
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
-    if tolerance_mm is not None and not tolerance_mm >= 0:
-        raise DeficitError(f"the tolerance is {tolerance_mm} mm; it must be ≥ 0")
     tau_mm = anomaly.threshold_mm if tolerance_mm is None else tolerance_mm
-    evidence, lines = _evidence_of(scan, template, anomaly, beads)
+    if not tau_mm >= 0:
+        raise DeficitError(f"the tolerance is {tau_mm} mm; it must be ≥ 0")
+    evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
     look = as_built or partial(
-        as_built_heights,
-        scan,
-        template,
-        evidence.spacing_mm,
-        build_from_template=build_from_template,
-        printed_z_mm=printed_z_mm,
-        cell_mm=cell_mm,
-        images=evidence.images,
-    )
-    solids: dict[Label, list[manifold3d.Manifold]] = {}
-    regions: list[Region] = []
+        as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
+        build_from_template=build_from_template, printed_z_mm=printed_z_mm,
+        cell_mm=options.heights.cell_mm, options=options.heights,
+    )  # fmt: skip
+    of_label = {Label.MISSING: lines, Label.EXCESS: None}
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
-        early = beside.submit(look) if _roughly_missing(anomaly, evidence) > EARLY_MM3 else None
-        for label in (Label.MISSING, Label.EXCESS):
-            gone = lines if label is Label.MISSING else None
-            solids[label] = pieces_of(template, evidence, anomaly, label, tau_mm, gone, progress)
-            regions += [
-                _region(piece, label, template, build_from_template, gone)
-                for piece in solids[label]
-            ]
+        many = _roughly_missing(anomaly, evidence) > options.early_mm3
+        early = beside.submit(look) if many else None
+        solids = {
+            label: pieces_of(template, evidence, anomaly, label, tau_mm, gone, options, progress)
+            for label, gone in of_label.items()
+        }
+    regions = [
+        _region(piece, label, template, build_from_template, of_label[label], options)
+        for label, pieces in solids.items()
+        for piece in pieces
+    ]
     missing, excess = (_in_build_frame(found, build_from_template) for found in solids.values())
 
     def stands() -> HeightField:
         seen = look() if early is None else early.result()
         if as_built is not None:
-            return without_missing(seen, missing)
-        return _standing(seen, scan, template, build_from_template, missing, excess, evidence)
+            return without_missing(seen, missing, options.heights)
+        parts = missing, excess
+        return _standing(seen, scan, template, build_from_template, *parts, evidence, options)
 
-    unseen = anomaly.template_label == int(Label.UNSEEN)
     return Deficit(
         missing=missing,
         excess=excess,
         regions=tuple(sorted(regions, key=lambda r: (int(r.label), -r.volume_mm3))),
         tolerance_mm=tau_mm,
-        unseen_area_mm2=_unseen_area(anomaly, int(unseen.sum())),
+        unseen_area_mm2=_unseen_area(anomaly),
         stands=Standing(stands),
         gone=lines,
+        options=options,
     )
 
 
 def _evidence_of(
-    scan: Scan, template: Template, anomaly: AnomalyMap, beads: PlannedBeads | None
+    scan: Scan,
+    template: Template,
+    anomaly: AnomalyMap,
+    beads: PlannedBeads | None,
+    options: SkippedOptions,
 ) -> tuple[Evidence, PlannedBeads | None]:
     """What is known of space, also around lines of the job that are gone; and those lines."""
     evidence = anomaly.evidence
     if evidence is None:
         raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
-    lines = None if beads is None else skipped(beads, evidence, template)
+    lines = None if beads is None else skipped(beads, evidence, template, options)
     if lines is not None and len(lines.width_mm):
         labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
-        evidence = with_stubs(evidence, scan, lines.samples_mm(), labelled)
+        evidence = with_stubs(evidence, scan, lines.samples_mm(options.look_step_mm), labelled)
     return evidence, lines
 
 
@@ -230,17 +232,20 @@ def _standing(
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
     evidence: Evidence,
+    options: DeficitOptions,
 ) -> HeightField:
     """What stands on the bed: the scan's heights, with the solids' walls and the points' own."""
     designed: Any = template.solid()
     expected = designed.transform(build_from_template.matrix[:3])
-    solid, lost_mm, designed_mm = standing_heights(seen, expected, missing, excess)
+    solid, lost_mm, designed_mm = standing_heights(seen, expected, missing, excess, options.heights)
     points_mm = build_from_template.apply(scan.points_mm)
-    sharp = with_sharp_walls(solid, lost_mm > 0, points_mm, scan.sigma_mm)
-    known = with_what_stands_out(sharp, points_mm, scan.sigma_mm, evidence.spacing_mm)
-    even = with_even_crests(known, lost_mm, designed_mm)
-    rising = with_rising_rims(even, lost_mm, designed_mm, evidence.spacing_mm)
-    return with_whole_rims(rising, lost_mm, designed_mm)
+    sharp = with_sharp_walls(solid, lost_mm > 0, points_mm, scan.sigma_mm, options.walls)
+    known = with_what_stands_out(
+        sharp, points_mm, scan.sigma_mm, evidence.spacing_mm, options.heights
+    )
+    even = with_even_crests(known, lost_mm, designed_mm, options.walls)
+    rising = with_rising_rims(even, lost_mm, designed_mm, evidence.spacing_mm, options.walls)
+    return with_whole_rims(rising, lost_mm, designed_mm, options.walls)
 
 
 def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...]:
@@ -298,6 +303,7 @@ def _region(
     template: Template,
     build_from_template: Transform,
     gone: PlannedBeads | None,
+    options: DeficitOptions,
 ) -> Region:
     """Measures of one piece; its box in the build frame."""
     bounds = np.asarray(piece.bounding_box()).reshape(2, 3)
@@ -313,7 +319,7 @@ def _region(
         area_mm2=area,
         depth_mm=depth,
         box_mm=np.asarray(moved.bounding_box()).reshape(2, 3),
-        below_bead=volume < BEAD_MM3,
+        below_bead=volume < options.bead_mm3,
         skipped=_is_skipped(piece, gone),
     )
 
@@ -328,8 +334,9 @@ def _is_skipped(piece: manifold3d.Manifold, gone: PlannedBeads | None) -> bool:
     return bool(in_box(middle, box[0], box[1]).any())
 
 
-def _unseen_area(anomaly: AnomalyMap, count: int) -> float:
+def _unseen_area(anomaly: AnomalyMap) -> float:
     """Area of the unseen template points, from their mean spacing."""
     from amrepair.field.groups import area_per_point
 
+    count = int((anomaly.template_label == int(Label.UNSEEN)).sum())
     return count * area_per_point(anomaly.template_points_mm)

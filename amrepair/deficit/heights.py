@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.deficit import heights_kernels as kernels
+from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
 from amrepair.field.near import has_near
 from amrepair.frames import Transform, box_corners
@@ -25,35 +26,7 @@ from amrepair.template.port import Template
 from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
-UNSEEN_MARGIN_MM = 1.0
-# Around the part: more than a nozzle's cone, so that what stands beside it is in the field.
-BESIDE_PART_MM = 8.0
-# Points within this of a cell's top are one surface with its noise.
-TOP_BAND_MM = 0.3
 AROUND_CELL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
-# An unseen patch smaller than this between seen ones is a gap of sampling, not a place to hide.
-GAP_MM2 = 1.0
-FINE_CELL_MM, MOST_FINE_CELLS = 0.1, 2_000_000
-# In cells of the scan: one that a wall's noise touches, and a gap beside it that took its height.
-BY_WALL_CELLS = 2.5
-# The scan may stand out this much before it overrules the solids: their tolerance, and noise.
-TRUST_MM = 0.3
-NOISE_MM = 0.1
-# What a cell with a single point may be off: of some thousand under the head one is so far.
-CHANCE_MM = 0.2
-# Two layers: thinner material over a void is the solids' own rounding at its rim.
-FILM_MM = 0.4
-LEAST_FILM_MM = 0.1  # that the scan can tell from nothing
-# In fine cells: thinner than a bead, and than two, of which points would have been seen.
-FIN_CELLS, UNSEEN_FIN_CELLS = 2, 8
-# Around what is missing: where fins are looked for, and as far again as they are told from there.
-FIN_WINDOW_CELLS = 3 * UNSEEN_FIN_CELLS
-CHANCE_CELLS = 5
-MOST_STEPS_DOWN = 64  # by which what nobody saw is followed down
-# In the scan's noise: how far a point is off upwards or aside, and tells of nothing.
-OFF_SIGMA = 2.0
-# On any surface so many others lie within so many spacings: 4 π are expected on a flat one.
-OTHERS_NEAR, BESIDE_SPACINGS = 2, 2.0
 
 
 def as_built_heights(
@@ -64,8 +37,9 @@ def as_built_heights(
     build_from_template: Transform,
     printed_z_mm: float | None,
     cell_mm: float,
-    unseen_margin_mm: float = UNSEEN_MARGIN_MM,
+    unseen_margin_mm: float = USUAL_DEFICIT.heights.unseen_margin_mm,
     images: tuple[RangeImage, ...] = (),
+    options: HeightOptions = USUAL_DEFICIT.heights,
 ) -> HeightField:
     """Height field of the scan, build frame.
 
@@ -83,13 +57,13 @@ def as_built_heights(
     points = build_from_template.apply(scan.points_mm)
     corners = box_corners(template.bounds_mm)
     box = build_from_template.apply(corners)
-    low, high = box.min(axis=0) - BESIDE_PART_MM, box.max(axis=0) + BESIDE_PART_MM
+    low, high = box.min(axis=0) - options.beside_part_mm, box.max(axis=0) + options.beside_part_mm
     cell_mm = max(cell_mm, 1.2 * spacing_mm)
     nx, ny = (math.ceil(v) for v in (high[:2] - low[:2]) / cell_mm)
     shape = (ny, nx)
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
     solid_z = np.full(shape, top_z + unseen_margin_mm)
-    z, seen = _tops(points, low[:2], cell_mm, shape)
+    z, seen = _tops(points, low[:2], cell_mm, shape, options)
     known = seen
     if scan.sensors_mm is None:
         designed_z = _designed(template, build_from_template, low[:2], cell_mm, shape)
@@ -97,11 +71,13 @@ def as_built_heights(
         z = np.where(bare, 0.0, z)
         known = seen | bare
         solid_z = np.minimum(solid_z, designed_z + unseen_margin_mm)
-    z, closed = _close_gaps(z, known, cell_mm)
+    z, closed = _close_gaps(z, known, cell_mm, options)
     seen = seen | (closed & ~known)
     known = closed
     if images:
-        solid_z = _crossed(solid_z, ~known, low, cell_mm, build_from_template.inverse(), images)
+        solid_z = _crossed(
+            solid_z, ~known, low, cell_mm, build_from_template.inverse(), images, options
+        )
     return HeightField(
         origin_mm=low[:2].copy(),
         cell_mm=cell_mm,
@@ -117,16 +93,18 @@ def _crossed(
     cell_mm: float,
     template_from_build: Transform,
     images: tuple[RangeImage, ...],
+    options: HeightOptions,
 ) -> Float[np.ndarray, "ny nx"]:
     """Heights lowered, column by column from above, as far as rays went through them."""
     iy, ix = unseen.nonzero()
     z_mm = solid_z_mm.copy()
-    step_mm = max(cell_mm, (float(z_mm.max()) - max(float(low_mm[2]), 0.0)) / MOST_STEPS_DOWN)
+    high_mm = float(z_mm.max()) - max(float(low_mm[2]), 0.0)
+    step_mm = max(cell_mm, high_mm / options.most_steps_down)
     while len(iy):
         down_mm = np.maximum(z_mm[iy, ix] - step_mm, 0.0)
         xy_mm = low_mm[:2] + (np.stack([ix, iy], axis=1) + 0.5) * cell_mm
         points = template_from_build.apply(np.column_stack([xy_mm, down_mm]))
-        empty = clearances(images, points, -np.inf)[1] > NOISE_MM
+        empty = clearances(images, points, -np.inf)[1] > options.noise_mm
         iy, ix = iy[empty], ix[empty]
         z_mm[iy, ix] = down_mm[empty]
         further = down_mm[empty] > 0
@@ -139,6 +117,7 @@ def standing_heights(
     expected: manifold3d.Manifold,
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
+    options: HeightOptions = USUAL_DEFICIT.heights,
 ) -> tuple[HeightField, Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"]]:
     """The as-built field with sharp walls; what is missing from each column; what was wanted.
 
@@ -158,37 +137,40 @@ def standing_heights(
     """
     box = seen.box_mm
     area_mm2 = (box[2] - box[0]) * (box[3] - box[1])
-    cell_mm = max(FINE_CELL_MM, float(np.sqrt(area_mm2 / MOST_FINE_CELLS)))
+    cell_mm = max(options.fine_cell_mm, float(np.sqrt(area_mm2 / options.most_fine_cells)))
     ny, nx = (math.ceil((box[k + 2] - box[k]) / cell_mm - 1e-9) for k in (1, 0))
     fine = HeightField(
         np.array(box[:2]), cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool)
     )
     whole, lost = (columns_of(solid, fine) for solid in (expected, missing))
-    z_mm = raster_kernels.column_rest(*whole, *lost, FILM_MM, 0.0).reshape(ny, nx)
+    z_mm = raster_kernels.column_rest(*whole, *lost, options.film_mm, 0.0).reshape(ny, nx)
     at = _cells_over(seen, fine)
     # a film that the scan sees, around there too, is what is left of the part
-    films = raster_kernels.column_rest(*whole, *lost, LEAST_FILM_MM, 0.0).reshape(ny, nx)
+    films = raster_kernels.column_rest(*whole, *lost, options.least_film_mm, 0.0).reshape(ny, nx)
     # a few cells without a point on it among others are chance
-    sampled = ndimage.grey_closing(np.where(seen.seen, seen.z_mm, 0.0), CHANCE_CELLS)
-    z_mm = np.where(ndimage.minimum_filter(sampled, 3)[at] > films - TRUST_MM, films, z_mm)
+    sampled = ndimage.grey_closing(np.where(seen.seen, seen.z_mm, 0.0), options.chance_cells)
+    z_mm = np.where(ndimage.minimum_filter(sampled, 3)[at] > films - options.trust_mm, films, z_mm)
     gone = (lost[0][1:] != lost[0][:-1]).reshape(ny, nx)
     if gone.any():
-        rows, columns = window_around(gone, FIN_WINDOW_CELLS)
+        # where fins are looked for, and as far again as they are told from there
+        rows, columns = window_around(gone, 3 * options.unseen_fin_cells)
         seen_mm = ndimage.maximum_filter(np.where(seen.seen, seen.z_mm, -np.inf), 3)
         seen_mm = seen_mm[at[0][rows], at[1][:, columns]]
-        z_mm[rows, columns] = _without_rims_fins(z_mm[rows, columns], gone[rows, columns], seen_mm)
+        z_mm[rows, columns] = _without_rims_fins(
+            z_mm[rows, columns], gone[rows, columns], seen_mm, options
+        )
     if not excess.is_empty():
         z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
     # beside walls, where the solids are the sharper of the two unless something else stands there
-    around = 2 * math.ceil(BY_WALL_CELLS * seen.cell_mm / cell_mm) + 1
+    around = 2 * math.ceil(options.by_wall_cells * seen.cell_mm / cell_mm) + 1
     highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
-    by_wall = (highest - lowest > TRUST_MM) & (seen.z_mm[at] < highest + TRUST_MM)
+    by_wall = (highest - lowest > options.trust_mm) & (seen.z_mm[at] < highest + options.trust_mm)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
     off_mm = seen.z_mm[at] - z_mm
-    agrees = ~gone & ((np.abs(off_mm) < NOISE_MM) | _by_chance(off_mm, around))
+    agrees = ~gone & ((np.abs(off_mm) < options.noise_mm) | _by_chance(off_mm, around, options))
     # what is much lower was seen on another side: of this one no point fell into the cell
-    beneath = seen.z_mm[at] < z_mm - TRUST_MM
+    beneath = seen.z_mm[at] < z_mm - options.trust_mm
     known = seen.seen[at]
     # where something is missing it was seen to be; below it there is what was expected, and at
     # its rim, where columns and cells do not end alike
@@ -213,7 +195,11 @@ def _cells_over(
 
 
 def with_what_stands_out(
-    field: HeightField, points_mm: Float[np.ndarray, "n 3"], sigma_mm: float, spacing_mm: float
+    field: HeightField,
+    points_mm: Float[np.ndarray, "n 3"],
+    sigma_mm: float,
+    spacing_mm: float,
+    options: HeightOptions,
 ) -> HeightField:
     """Raised to the points that its surface does not explain by the scan's noise.
 
@@ -229,14 +215,15 @@ def with_what_stands_out(
     spacing_mm
         Mean distance between neighbouring points.
     """
-    off_mm = OFF_SIGMA * sigma_mm
+    off_mm = options.off_sigma * sigma_mm
     points_mm = np.ascontiguousarray(points_mm)
     higher = kernels.standing_out(points_mm, field.z_mm, field.origin_mm, field.cell_mm, off_mm)
     out = points_mm[higher]
     if len(out) == 0:
         return field
     # itself is one of them
-    out = out[has_near(out, points_mm, BESIDE_SPACINGS * spacing_mm, enough=OTHERS_NEAR + 1)]
+    within_mm = options.beside_spacings * spacing_mm
+    out = out[has_near(out, points_mm, within_mm, enough=options.others_near + 1)]
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)
@@ -248,15 +235,16 @@ def _without_rims_fins(
     z_mm: Float[np.ndarray, "ny nx"],
     gone: Bool[np.ndarray, "ny nx"],
     seen_mm: Float[np.ndarray, "ny nx"],
+    options: HeightOptions,
 ) -> Float[np.ndarray, "ny nx"]:
     """Lower what is too thin to be there beside what is missing; `seen_mm` is the highest seen."""
     # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
     beside = ndimage.maximum_filter(gone, 3)
-    z_mm = np.where(beside, _without_fins(z_mm, FIN_CELLS), z_mm)
+    z_mm = np.where(beside, _without_fins(z_mm, options.fin_cells), z_mm)
     # nor is one there that no wall is thin enough for, and of which no point was seen
-    near = ndimage.maximum_filter(gone, 2 * UNSEEN_FIN_CELLS - 1)
-    unseen = near & (seen_mm < z_mm - TRUST_MM)
-    return np.where(unseen, _without_fins(z_mm, UNSEEN_FIN_CELLS), z_mm)
+    near = ndimage.maximum_filter(gone, 2 * options.unseen_fin_cells - 1)
+    unseen = near & (seen_mm < z_mm - options.trust_mm)
+    return np.where(unseen, _without_fins(z_mm, options.unseen_fin_cells), z_mm)
 
 
 def _without_fins(z_mm: Float[np.ndarray, "ny nx"], cells: int) -> Float[np.ndarray, "ny nx"]:
@@ -265,14 +253,20 @@ def _without_fins(z_mm: Float[np.ndarray, "ny nx"], cells: int) -> Float[np.ndar
     return np.asarray(np.minimum(z_mm, ndimage.maximum_filter(thick_mm, 3)))
 
 
-def _by_chance(off_mm: Float[np.ndarray, "ny nx"], around: int) -> Bool[np.ndarray, "ny nx"]:
+def _by_chance(
+    off_mm: Float[np.ndarray, "ny nx"], around: int, options: HeightOptions
+) -> Bool[np.ndarray, "ny nx"]:
     """Cells of few points: off by more than noise of many, but not off with those around them."""
-    bounded = np.clip(off_mm, -CHANCE_MM, CHANCE_MM)
+    bounded = np.clip(off_mm, -options.chance_mm, options.chance_mm)
     together = ndimage.uniform_filter(bounded, around)
-    return np.asarray((np.abs(off_mm) < CHANCE_MM) & (np.abs(together) < 0.5 * NOISE_MM))
+    return np.asarray(
+        (np.abs(off_mm) < options.chance_mm) & (np.abs(together) < 0.5 * options.noise_mm)
+    )
 
 
-def without_missing(seen: HeightField, missing: manifold3d.Manifold) -> HeightField:
+def without_missing(
+    seen: HeightField, missing: manifold3d.Manifold, options: HeightOptions = USUAL_DEFICIT.heights
+) -> HeightField:
     """Heights lowered, where nobody saw any, to the bottom of what is missing there.
 
     What is missing was found to be empty: it does not stand, whatever a steep cell hides below it.
@@ -284,7 +278,7 @@ def without_missing(seen: HeightField, missing: manifold3d.Manifold) -> HeightFi
         sign * raster_kernels.column_top(offset, sign * z, -np.inf).reshape(seen.shape)
         for sign in (1.0, -1.0)
     )
-    hidden = ~seen.seen & (high_mm >= seen.z_mm - NOISE_MM) & (low_mm < seen.z_mm)
+    hidden = ~seen.seen & (high_mm >= seen.z_mm - options.noise_mm) & (low_mm < seen.z_mm)
     return HeightField(seen.origin_mm, seen.cell_mm, np.where(hidden, low_mm, seen.z_mm), seen.seen)
 
 
@@ -311,6 +305,7 @@ def _tops(
     low_mm: Float[np.ndarray, " 2"],
     cell_mm: float,
     shape: tuple[int, int],
+    options: HeightOptions,
 ) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
     """Mean height of each cell's topmost surface.
 
@@ -319,20 +314,25 @@ def _tops(
     """
     points_mm = np.ascontiguousarray(points_mm)
     at = kernels.cells_under(points_mm, low_mm, cell_mm, *shape)
-    top, mean, count, among = kernels.topmost(at, points_mm, TOP_BAND_MM, shape[0] * shape[1])
+    top, mean, count, among = kernels.topmost(
+        at, points_mm, options.top_band_mm, shape[0] * shape[1]
+    )
     around = ndimage.maximum_filter(
         top.reshape(shape), footprint=AROUND_CELL, mode="constant", cval=-np.inf
     )
-    alone = (count == 1) & (among > 1) & (around.ravel() < top - TOP_BAND_MM)
+    alone = (count == 1) & (among > 1) & (around.ravel() < top - options.top_band_mm)
     if alone.any():
         stray = (at >= 0) & alone[at] & (points_mm[:, 2] == top[at])
         at = np.where(stray, -1, at)
-        _, mean, count, _ = kernels.topmost(at, points_mm, TOP_BAND_MM, shape[0] * shape[1])
+        _, mean, count, _ = kernels.topmost(at, points_mm, options.top_band_mm, shape[0] * shape[1])
     return mean.reshape(shape), count.reshape(shape) > 0
 
 
 def _close_gaps(
-    z_mm: Float[np.ndarray, "ny nx"], seen: Bool[np.ndarray, "ny nx"], cell_mm: float
+    z_mm: Float[np.ndarray, "ny nx"],
+    seen: Bool[np.ndarray, "ny nx"],
+    cell_mm: float,
+    options: HeightOptions,
 ) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
     """A few cells that sampling left empty among seen ones take their highest seen neighbour.
 
@@ -343,7 +343,7 @@ def _close_gaps(
     if count == 0:
         return z_mm, seen
     size = np.bincount(groups.ravel(), minlength=count + 1)
-    small = (size <= max(1, int(GAP_MM2 / cell_mm**2)))[groups] & ~seen
+    small = (size <= max(1, int(options.gap_mm2 / cell_mm**2)))[groups] & ~seen
     z_mm, known = z_mm.copy(), seen.copy()
     while (small & ~known).any():  # from the rim in: a gap of a few cells has no more of them
         highest = ndimage.maximum_filter(np.where(known, z_mm, -np.inf), 3)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.deficit.boxes import boxes_of
+from amrepair.deficit.options import DeficitOptions
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.field.as_built import Evidence
 from amrepair.frames import in_box
@@ -19,10 +20,6 @@ from gcode.progress import Progress
 
 # A corner of a cube of side τ lies √3 τ from the eroded template.
 GROW_FACTOR = 3**0.5
-# Under a layer's top, of the limit: what the surfel nearest to it is labelled for is missing.
-SLIVER_RATIO = 0.25
-# Pieces below this share of a bead are what marching cubes makes of noise at a rim.
-CRUMB_MM3 = 0.02
 
 
 def pieces_of(
@@ -32,10 +29,11 @@ def pieces_of(
     label: Label,
     tau_mm: float,
     gone: PlannedBeads | None,
+    options: DeficitOptions,
     progress: Progress,
 ) -> list[manifold3d.Manifold]:
     """Solids of one label, each in one piece, template frame."""
-    boxes = boxes_of(anomaly, evidence, template, label, gone)
+    boxes = boxes_of(anomaly, evidence, template, label, gone, options.voxels)
     finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
     found: list[manifold3d.Manifold] = []
     for i, (low, high, depth) in enumerate(boxes):
@@ -50,8 +48,11 @@ def pieces_of(
             depth_mm=min(depth, finest_mm),
             tau_mm=tau_mm,
             gone=gone,
+            options=options,
         )
-        found += [piece for piece in solid.decompose() if piece.volume() >= CRUMB_MM3]
+        found += [
+            piece for piece in solid.decompose() if piece.volume() >= options.solids.crumb_mm3
+        ]
     return found
 
 
@@ -66,13 +67,16 @@ def _solid_in_box(
     depth_mm: float,
     tau_mm: float,
     gone: PlannedBeads | None,
+    options: DeficitOptions,
 ) -> manifold3d.Manifold:
     """Erode, subtract, grow back, clip: all on one grid of signed distances."""
     s = evidence.surfels
     labels = np.asarray(anomaly.surfel_label)
     inside = in_box(s.place_mm, low_mm, high_mm) & (labels == int(label))
     across = int(np.argmax(np.abs(evidence.normal[inside]).sum(axis=0))) if inside.any() else 2
-    box = VoxelBox.around(low_mm, high_mm, thickness_mm=depth_mm, across=across)
+    box = VoxelBox.around(
+        low_mm, high_mm, thickness_mm=depth_mm, across=across, options=options.voxels
+    )
     samples = box.samples_mm()
     f = template.distance(samples)
     sign = -1.0 if label is Label.MISSING else 1.0
@@ -87,7 +91,7 @@ def _solid_in_box(
     # solid = both negative: inside the template and outside the as-built part (or the reverse)
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
     beyond = -sign * cautious  # missing: how empty; excess: how solid
-    limit_mm, thin_mm = _limits(anomaly, label, samples, f, tau_mm, depth_mm)
+    limit_mm, thin_mm = _limits(anomaly, label, samples, f, tau_mm, depth_mm, options)
     away_mm = sign * f  # from the template, of which so much is no defect
     away_mm[near] -= _allowed(anomaly, label, samples[near], away_mm[near] - thin_mm[near])
     core = (away_mm > limit_mm) & (beyond > limit_mm / 2)
@@ -109,7 +113,7 @@ def _solid_in_box(
     else:
         said = [s.place_mm[inside], anomaly.template_points_mm[anomaly.template_label == label]]
         if gone is not None:
-            said.append(gone.samples_mm())
+            said.append(gone.samples_mm(options.skipped.look_step_mm))
         core = _of_a_region(core, box, np.concatenate(said), s.cell_mm)
     return _grown_back(box, core, clip, f, label, tau_mm)
 
@@ -227,6 +231,7 @@ def _limits(
     f_mm: Float[np.ndarray, " v"],
     tau_mm: float,
     depth_mm: float,
+    options: DeficitOptions,
 ) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
     """(v,) τ, and the depth from which on a label counts.
 
@@ -238,5 +243,5 @@ def _limits(
     if anomaly.top_z_mm is not None and label is Label.MISSING:
         under = np.abs(f_mm - (samples_mm[:, 2] - anomaly.top_z_mm)) < ON_PLANE_MM
         limit_mm[under] = min(tau_mm, anomaly.top_threshold_mm)
-        thin_mm[under] = np.minimum(thin_mm[under], SLIVER_RATIO * limit_mm[under])
+        thin_mm[under] = np.minimum(thin_mm[under], options.solids.sliver_ratio * limit_mm[under])
     return limit_mm, thin_mm

@@ -11,12 +11,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from skimage import measure
 
+from amrepair.deficit.options import USUAL_DEFICIT, VoxelOptions
 from amrepair.errors import DeficitError
-
-MAX_DEFICIT_VOXELS = 1_000_000
-FINEST_MM, COARSEST_MM = 0.05, 0.25
-# Samples across a defect, and what must be left of them where a box is large.
-FINE_RATIO, LEAST_RATIO = 4.0, 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,23 +41,26 @@ class VoxelBox:
         *,
         thickness_mm: float,
         across: int,
+        options: VoxelOptions = USUAL_DEFICIT.voxels,
     ) -> VoxelBox:
         """A grid over a box, fine enough for a defect `thickness_mm` thick across one axis.
 
         Where that is too many samples it is first coarser along the defect, up to what walls need,
         then across it, then along it again.
         """
-        fine = float(np.clip(thickness_mm / FINE_RATIO, FINEST_MM, COARSEST_MM))
-        step = np.full(3, max(fine, min(COARSEST_MM, 2.5 * fine)))
+        coarsest = options.coarsest_mm
+        fine = float(np.clip(thickness_mm / options.across_ratio, options.finest_mm, coarsest))
+        step = np.full(3, max(fine, min(coarsest, 2.5 * fine)))
         step[across] = fine
         along = np.arange(3) != across
         extent = np.maximum(high_mm - low_mm, 1e-6)
 
         def over() -> float:
-            return max(float(np.prod(extent / step + 1)) / MAX_DEFICIT_VOXELS, 1.0)
+            return max(float(np.prod(extent / step + 1)) / options.most, 1.0)
 
-        step[along] *= min(np.sqrt(over()), COARSEST_MM / step[along][0])
-        step[across] *= min(over(), max(min(thickness_mm / LEAST_RATIO, COARSEST_MM) / fine, 1.0))
+        step[along] *= min(np.sqrt(over()), coarsest / step[along][0])
+        least = min(thickness_mm / options.least_ratio, coarsest)
+        step[across] *= min(over(), max(least / fine, 1.0))
         step[along] *= min(np.sqrt(over()), 2.0)
         step *= over() ** (1 / 3)
         size = np.ceil(extent / step).astype(int) + 1

@@ -11,31 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from amrepair.field.faces import STRIP_COSINE, Faces, find_faces, nearest_planes
+from amrepair.field.faces import Faces, find_faces, nearest_planes
 from amrepair.field.fused import Surfels
 from amrepair.field.near import has_near
-from amrepair.field.occupancy import OccupancyOptions
+from amrepair.field.options import EvidenceOptions
 from amrepair.frames import unit_vectors
 from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
-# A plane fitted to a void's floor speaks for what lies above it, not for what lies beside it:
-# sideways by one cell plus this many times the height.
-SIDEWAYS_PER_HEIGHT = 1.0
-HEIGHT_NEIGHBOURS = 4
 # "Solid, as far as anybody knows": a clearance well below every threshold.
 SOLID_MM = -5.0
-# A pixel beside a silhouette, seen aslant, is off by no more than this many of its steps.
-SHARP_STEPS = 1.5
-SHARP_MM = 0.25  # a deficit's voxel is no larger: farther off no surface is shaped
-# Parallel to the template's surface, and turned away from the sensor that saw it by 17° and more.
-BACK_COSINE = -0.3
-# As far from template that is gone as a stub of it can be, and as deep inside as noise is not.
-STUB_CELLS = 2.5
-STUB_MM = 0.05
-# The template's surface is looked at this finely.
-PATCH_MM = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +38,8 @@ class Evidence:
         (s, 3) outward unit normals where `off`; zero elsewhere (the template's field serves).
     images
         Range images, one per sensor; empty where sensors are unknown.
+    options
+        That it was gathered with.
     faces
         What the scan says around defects where no rays tell; None where there are, or no defect.
     """
@@ -60,6 +48,7 @@ class Evidence:
     off: Bool[np.ndarray, " s"]
     normal: Float[np.ndarray, "s 3"]
     images: tuple[RangeImage, ...]
+    options: EvidenceOptions
     faces: Faces | None = None
 
     @property
@@ -124,11 +113,11 @@ class Evidence:
         on which side of it a point lies.
         """
         step_mm = max(image.step_mm for image in self.images)
-        ask = np.flatnonzero(np.abs(best_mm) < SHARP_STEPS * step_mm + SHARP_MM)
+        limit_mm = self.options.sharp_steps * step_mm
+        ask = np.flatnonzero(np.abs(best_mm) < limit_mm + self.options.sharp_mm)
         if len(ask) == 0:
             return best_mm
         surface = self.surface_clearance(points_mm[ask], f_mm[ask])
-        limit_mm = SHARP_STEPS * step_mm
         low, high = best_mm[ask] - limit_mm, best_mm[ask] + limit_mm
         known = surface > SOLID_MM
         sharp = best_mm.copy()
@@ -139,7 +128,7 @@ class Evidence:
         self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """Signed distance to the scanned surface itself (no rays), positive outside."""
-        s = self.surfels
+        s, options = self.surfels, self.options
         if len(s) == 0:
             return np.full(len(points_mm), SOLID_MM)
         near = nearest_planes(
@@ -150,13 +139,12 @@ class Evidence:
             deviation_mm=s.deviation_mm,
             off=self.off,
             normal=self.normal,
-            count=HEIGHT_NEIGHBOURS,
+            count=options.neighbours,
             blur_mm=s.cell_mm,
         )
         # beside, not above: the nearest plane does not reach there
-        beside = self.off[near.index] & (
-            near.sideways_mm > 1.5 * s.cell_mm + SIDEWAYS_PER_HEIGHT * near.height_mm
-        )
+        reach_mm = options.sideways_cells * s.cell_mm + options.sideways_per_height * near.height_mm
+        beside = self.off[near.index] & (near.sideways_mm > reach_mm)
         return np.where(beside, SOLID_MM, near.value_mm)
 
 
@@ -168,12 +156,12 @@ def gather(
     images: tuple[RangeImage, ...],
     *,
     threshold_mm: float,
-    occupancy: OccupancyOptions,
+    options: EvidenceOptions,
 ) -> Evidence:
     """Collect the evidence of a scan whose off-template surfels and range images are known."""
-    off = off | _strips(template, surfels, off)
+    off = off | _strips(template, surfels, off, options)
     if images and off.any():
-        off |= _seen_from_within(scan, template, surfels, off)
+        off |= _seen_from_within(scan, template, surfels, off, options)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
     faces = None
@@ -182,13 +170,13 @@ def gather(
         normal[which] = _toward(surfels.planes(which), facing)
         surfels = surfels.halves_joined(which, normal[which])
     elif len(which):
-        surface = template.surface_points(max(PATCH_MM, surfels.spacing_mm))
+        surface = template.surface_points(max(options.patch_mm, surfels.spacing_mm))
         faces = find_faces(
-            scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=occupancy
+            scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=options
         )
         nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
         normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
-    return Evidence(surfels, off, normal, images, faces)
+    return Evidence(surfels, off, normal, images, options, faces)
 
 
 def with_stubs(
@@ -205,9 +193,10 @@ def with_stubs(
     s = evidence.surfels
     if len(gone_mm) == 0 or not evidence.has_rays:
         return evidence
-    reach_mm = STUB_CELLS * s.cell_mm
+    options = evidence.options
+    reach_mm = options.stub_cells * s.cell_mm
     near = has_near(s.place_mm, gone_mm, reach_mm)
-    which = np.flatnonzero(near & ~labelled & ~evidence.off & (s.deviation_mm < -STUB_MM))
+    which = np.flatnonzero(near & ~labelled & ~evidence.off & (s.deviation_mm < -options.stub_mm))
     if len(which) == 0:
         return evidence
     facing = s.toward_sensors(which, scan)
@@ -228,7 +217,11 @@ def _toward(
 
 
 def _seen_from_within(
-    scan: Scan, template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"]
+    scan: Scan,
+    template: Template,
+    surfels: Surfels,
+    off: Bool[np.ndarray, " s"],
+    options: EvidenceOptions,
 ) -> Bool[np.ndarray, " s"]:
     """Surfels along the template's surface that were seen through the template.
 
@@ -240,13 +233,13 @@ def _seen_from_within(
     if facing is None or len(which) == 0:
         return found
     gradient, along = _beside_template(template, surfels, which)
-    back = (unit_vectors(facing) * gradient).sum(axis=1) < BACK_COSINE
-    found[which] = (along > STRIP_COSINE) & back
+    back = (unit_vectors(facing) * gradient).sum(axis=1) < options.back_cosine
+    found[which] = (along > options.faces.strip_cosine) & back
     return found
 
 
 def _strips(
-    template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"]
+    template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"], options: EvidenceOptions
 ) -> Bool[np.ndarray, " s"]:
     """Surfels beside off-template ones whose plane crosses the template's surface.
 
@@ -261,7 +254,7 @@ def _strips(
     strips = np.zeros_like(off)
     if len(which):
         along = _beside_template(template, surfels, which)[1]
-        strips[which] = (along < STRIP_COSINE) & (surfels.deviation_mm[which] < 0)
+        strips[which] = (along < options.faces.strip_cosine) & (surfels.deviation_mm[which] < 0)
     return strips
 
 

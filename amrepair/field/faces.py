@@ -16,25 +16,11 @@ from scipy.spatial import cKDTree
 from amrepair.field import faces_kernels as kernels
 from amrepair.field.fused import Surfels
 from amrepair.field.near import has_near
-from amrepair.field.occupancy import Broken, Occupancy, OccupancyOptions, find_occupancy
+from amrepair.field.occupancy import Broken, Occupancy, find_occupancy
+from amrepair.field.options import EvidenceOptions, FaceOptions
 from amrepair.frames import unit_vectors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
-
-# The scan is looked at point by point within this of what lies off the template.
-LOOKED_AROUND_MM = 1.5
-# Points of one plane: at the spacing s of the scan a disc of about 2 s.
-FACE_PLANE_POINTS = 16
-PLANE_ROUNDS = 4
-LONE_RATIO = 0.2  # of its neighbours must be broken, too
-FACE_NEIGHBOURS = 6
-# Planes more than 40° off the template's own slope are another surface, if they lie below it.
-STRIP_COSINE, STRIP_MM = 0.77, 0.03
-# A face answers for what lies over it: sideways within a spacing and this share of the height.
-BESIDE_SPACINGS, BESIDE_PER_HEIGHT = 2.0, 0.5
-NEAR_SPACINGS = 3.0
-# A sign vector needs this mean agreement with the template before file normals are believed.
-NORMAL_AGREEMENT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +89,8 @@ class Faces:
         Of the scan.
     occupancy
         Which space around the broken faces is solid.
+    options
+        That it was made with.
     """
 
     place_mm: Float[np.ndarray, "k 3"]
@@ -112,6 +100,7 @@ class Faces:
     spacing_mm: float
     tree: cKDTree
     occupancy: Occupancy
+    options: FaceOptions
 
     def clearance(
         self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
@@ -121,6 +110,7 @@ class Faces:
         The nearest places answer (`nearest_planes`). Where none lies over the point, the occupancy
         says the side and the nearest place how far; beyond its box it is as designed.
         """
+        options = self.options
         near = nearest_planes(
             points_mm,
             f_mm,
@@ -129,14 +119,13 @@ class Faces:
             deviation_mm=self.deviation_mm,
             off=self.off,
             normal=self.normal,
-            count=FACE_NEIGHBOURS,
+            count=options.neighbours,
             blur_mm=2 * self.spacing_mm,
         )
         best, distance = near.value_mm, near.distance_mm
         s = self.spacing_mm
-        far = (distance > NEAR_SPACINGS * s) | (
-            near.sideways_mm > BESIDE_SPACINGS * s + BESIDE_PER_HEIGHT * near.height_mm
-        )
+        beside_mm = options.beside_spacings * s + options.beside_per_height * near.height_mm
+        far = (distance > options.near_spacings * s) | (near.sideways_mm > beside_mm)
         ask = np.flatnonzero(far | (distance > self.occupancy.voxel_mm))
         told = self.occupancy.at(points_mm[ask])
         designed = -np.sign(f_mm[ask])
@@ -154,7 +143,7 @@ def find_faces(
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
     *,
     threshold_mm: float,
-    options: OccupancyOptions,
+    options: EvidenceOptions,
 ) -> Faces:
     """Look at the scan around the surfels in `off`, and at which space there is solid.
 
@@ -163,9 +152,9 @@ def find_faces(
     surface
         Places evenly spread on the template's surface, and outward unit normals.
     threshold_mm
-        Deviation from the template that is more than noise for a mean of `FACE_PLANE_POINTS`.
+        Deviation from the template that is more than noise for a mean of a plane's points.
     """
-    near_cell = has_near(surfels.place_mm, surfels.place_mm[off], LOOKED_AROUND_MM)
+    near_cell = has_near(surfels.place_mm, surfels.place_mm[off], options.faces.around_mm)
     chosen = np.zeros(len(scan.points_mm), bool)
     kept = surfels.of_point >= 0
     chosen[kept] = near_cell[surfels.of_point[kept]]
@@ -173,24 +162,25 @@ def find_faces(
         scan.points_mm[chosen],
         spacing_mm=surfels.spacing_mm,
         sigma_mm=max(scan.sigma_mm, surfels.spread_mm),
+        options=options.faces,
     )
     deviation, gradient = template.distance_and_gradient(place)
     gradient = unit_vectors(gradient)
     along = np.abs((gradient * plane).sum(axis=1))
     is_broken = np.abs(deviation) > threshold_mm
-    is_broken |= (along < STRIP_COSINE) & (deviation < -STRIP_MM)
+    is_broken |= (along < options.faces.strip_cosine) & (deviation < -options.faces.strip_mm)
     # a lone point among others is noise, as are crumbs along the rim of what nobody saw
-    is_broken &= is_broken[neighbours].mean(axis=1) > LONE_RATIO
+    is_broken &= is_broken[neighbours].mean(axis=1) > options.faces.lone_ratio
     which = np.flatnonzero(is_broken)
     broken = Broken(place[which], plane[which], deviation[which])
     spacing_mm = float(np.sqrt(np.median(area_mm2))) or surfels.spacing_mm  # 0: all in one place
     on_mm = np.concatenate([place[~is_broken], scan.points_mm[kept & ~chosen]])
     occupancy = find_occupancy(
-        template, broken, on_mm, surface, spacing_mm=spacing_mm, options=options
+        template, broken, on_mm, surface, spacing_mm=spacing_mm, options=options.occupancy
     )
     given = None
     if scan.normals is not None:
-        given = _given(scan.normals[chosen], gradient, ~is_broken)
+        given = _given(scan.normals[chosen], gradient, ~is_broken, options.faces)
     if given is not None:
         side = (plane[which] * given[which]).sum(axis=1)
     else:
@@ -207,6 +197,7 @@ def find_faces(
         spacing_mm=spacing_mm,
         tree=cKDTree(places, compact_nodes=False, balanced_tree=False),
         occupancy=occupancy,
+        options=options.faces,
     )
 
 
@@ -226,7 +217,11 @@ def _voted(
 
 
 def _planes(
-    points_mm: Float[np.ndarray, "n 3"], *, spacing_mm: float, sigma_mm: float
+    points_mm: Float[np.ndarray, "n 3"],
+    *,
+    spacing_mm: float,
+    sigma_mm: float,
+    options: FaceOptions,
 ) -> tuple[
     Float[np.ndarray, "n 3"],
     Float[np.ndarray, "n 3"],
@@ -234,10 +229,12 @@ def _planes(
     Int[np.ndarray, "n k"],
 ]:
     """Points moved onto the planes through their neighbours, those planes' normals, and areas."""
-    k = min(FACE_PLANE_POINTS, len(points_mm))
+    k = min(options.plane_points, len(points_mm))
     distance, index = cKDTree(points_mm).query(points_mm, k=k, workers=2)
     distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    place, normal = kernels.smoothed(points_mm, index, PLANE_ROUNDS, spacing_mm, 2 * sigma_mm)
+    place, normal = kernels.smoothed(
+        points_mm, index, options.plane_rounds, spacing_mm, 2 * sigma_mm
+    )
     area = np.pi * distance[:, -1] ** 2 / max(k - 1, 1)
     return place, normal, area, index
 
@@ -246,11 +243,12 @@ def _given(
     normals: Float[np.ndarray, "n 3"],
     gradient: Float[np.ndarray, "n 3"],
     on: Bool[np.ndarray, " n"],
+    options: FaceOptions,
 ) -> Float[np.ndarray, "n 3"] | None:
     """The file's normals, turned outward as a whole; None where they contradict the template."""
     if not on.any():
         return normals
     agreement = float(np.median((gradient[on] * normals[on]).sum(axis=1)))
-    if abs(agreement) < NORMAL_AGREEMENT:
+    if abs(agreement) < options.normal_agreement:
         return None
     return np.asarray(normals * np.sign(agreement))

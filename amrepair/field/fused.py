@@ -14,11 +14,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.field import fused_kernels as kernels
+from amrepair.field.options import USUAL_SURFELS, SurfelOptions
 from amrepair.scans import Scan
 
-MIN_CELL_MM, MAX_CELL_MM = 0.3, 2.0
-# Occupied unit cells hold about 1.5 cell² of surface each (a plane at a random slope).
-AREA_PER_CELL = 1.5
 # A grid of so many cells is counted in place; points of a larger one are sorted.
 MOST_COUNTED_CELLS = 16_000_000
 # Columns of a neighbour table: the cells before and behind along each axis.
@@ -136,13 +134,14 @@ def make_surfels(
     points_mm: Float[np.ndarray, "n 3"],
     deviation_mm: Float[np.ndarray, " n"],
     keep: Bool[np.ndarray, " n"],
+    options: SurfelOptions = USUAL_SURFELS,
 ) -> Surfels:
     """Condense the points in `keep`; the cell follows their spacing."""
     box, kept = kernels.kept_box(points_mm, keep)
     if kept == 0:
         box = np.zeros((2, 3))
-    spacing_mm = _spacing(points_mm, keep, box, kept)
-    cell_mm = float(np.clip(2.0 * spacing_mm, MIN_CELL_MM, MAX_CELL_MM))
+    spacing_mm = _spacing(points_mm, keep, box, kept, options)
+    cell_mm = float(np.clip(2.0 * spacing_mm, options.least_cell_mm, options.most_cell_mm))
     order, start, keys, of_point, strides = _by_cell(points_mm, keep, box, cell_mm)
     # moments about one origin near the part keep float64 far from cancellation
     origin = box.mean(axis=0)
@@ -174,11 +173,13 @@ def make_surfels(
     )
 
 
-def estimate_spacing(points_mm: Float[np.ndarray, "n 3"]) -> float:
+def estimate_spacing(
+    points_mm: Float[np.ndarray, "n 3"], options: SurfelOptions = USUAL_SURFELS
+) -> float:
     """Mean spacing of a surface cloud from how many 1 mm (or larger) cells it occupies."""
     keep = np.ones(len(points_mm), bool)
     box, kept = kernels.kept_box(points_mm, keep)
-    return _spacing(points_mm, keep, box, kept)
+    return _spacing(points_mm, keep, box, kept, options)
 
 
 def _spacing(
@@ -186,10 +187,11 @@ def _spacing(
     keep: Bool[np.ndarray, " n"],
     box_mm: Float[np.ndarray, "2 3"],
     kept: int,
+    options: SurfelOptions,
 ) -> float:
     """`estimate_spacing` of some points."""
     if kept < 2:
-        return MAX_CELL_MM / 2
+        return options.most_cell_mm / 2
     cell_mm = 1.0
     while True:
         shape = _shape(box_mm, cell_mm)
@@ -199,7 +201,7 @@ def _spacing(
             occupied = len(np.unique(_keys(points_mm[keep], box_mm, cell_mm, 0)))
         # a cell must hold several points, or the count of cells says nothing about area
         if kept >= 4 * occupied or occupied == 1 or cell_mm > 64.0:
-            return float(np.sqrt(AREA_PER_CELL * occupied * cell_mm**2 / kept))
+            return float(np.sqrt(options.area_per_cell * occupied * cell_mm**2 / kept))
         cell_mm *= 2.0
 
 

@@ -17,59 +17,17 @@ from scipy import ndimage
 from amrepair.field.cut_kernels import least_cut
 from amrepair.field.groups import group_points
 from amrepair.field.near import has_near, nearest_within
+from amrepair.field.options import OccupancyOptions
 from amrepair.frames import box_of, in_box, unit_vectors
 from amrepair.template.port import Template
 
 # Capacities are whole numbers of this share of a nat; none is larger than that many.
 UNIT_NATS, MOST_NATS = 0.01, 1e4
-# Surface faces a way if it is less than 45° askew to it.
-WAY_FACING = 0.7
 # Before and behind a plane, in voxels: there its sides are looked up.
 LOOK_VOXELS = (0.75, 1.5, 2.5)
-# So many bare places make a hole, and so many broken ones are asked what they look out of.
-HOLE_PLACES, LOOKING_PLACES = 5, 2000
-# A box holds at most so many times as many voxels as are to be labelled.
-BOX_RATIO = 30.0
 # Blocks of so many voxels a side whose middle is so many sides from the template's surface are
 # wholly in it or outside it: √3 / 2, and a little.
 TRACED_BLOCK, FAR_BLOCKS = 4, 1.1
-
-
-@dataclass(frozen=True, slots=True)
-class OccupancyOptions:
-    """What the labelling is set to.
-
-    Attributes
-    ----------
-    voxel_spacings, most_voxels
-        Edge of a voxel in spacings of the scan, and how many there may be: else they are larger.
-    seen_spacings
-        Surface is seen where at least half as many points as expected lie within this.
-    gap_spacings
-        A hole of chance between points is no wider.
-    stray
-        Probability of a point that lies on no surface.
-    largest_cover
-        Nothing is seen for certain: at most with this probability.
-    deep_mm
-        So deep is a void that is as improbable as that nobody saw the surface over its mouth.
-    hole_mm, margin_mm
-        Unseen places so near to each other are one hole; space looked at around what is broken.
-    bead_mm, least_seen
-        No broken edge is thinner than a bead, and so much of it at least is seen.
-    """
-
-    voxel_spacings: float = 1.5
-    most_voxels: int = 200_000
-    seen_spacings: float = 2.5
-    gap_spacings: float = 1.6
-    stray: float = 0.05
-    largest_cover: float = 0.999
-    deep_mm: float = 50.0
-    hole_mm: float = 1.0
-    margin_mm: float = 1.5
-    bead_mm: float = 0.4
-    least_seen: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +197,7 @@ def _box(
     """What is broken, holes in the seen surface that touch it, and where it looks out of others."""
     reach_mm = max(options.hole_mm, 3.0 * spacing_mm)
     # a bare place among covered ones is chance
-    holes_mm = bare_mm[has_near(bare_mm, bare_mm, reach_mm, enough=HOLE_PLACES)]
+    holes_mm = bare_mm[has_near(bare_mm, bare_mm, reach_mm, enough=options.hole_places)]
     marked_mm = np.concatenate([broken.place_mm, holes_mm])
     group = group_points(marked_mm, reach_mm=reach_mm)
     touching = np.isin(group, np.unique(group[: len(broken.f_mm)]))
@@ -257,7 +215,7 @@ def _ways_out(
     template: Template, broken: Broken, options: OccupancyOptions
 ) -> Float[np.ndarray, "e 3"]:
     """Where lines from broken surface along its planes' normals first leave the template."""
-    some = slice(None, None, max(1, len(broken.f_mm) // LOOKING_PLACES))
+    some = slice(None, None, max(1, len(broken.f_mm) // options.looking_places))
     front_mm = np.concatenate([broken.place_mm[some]] * 2)
     along = np.concatenate([broken.plane[some], -broken.plane[some]])
     step_mm = 0.5 * options.hole_mm
@@ -286,7 +244,8 @@ def _grid(
     """
     extent_mm = np.maximum(np.ptp(box_mm, axis=0), 1e-6)
     voxel_mm = options.voxel_spacings * spacing_mm
-    voxel_mm = max(voxel_mm, float(np.cbrt(np.prod(extent_mm) / (BOX_RATIO * options.most_voxels))))
+    most = options.box_ratio * options.most_voxels
+    voxel_mm = max(voxel_mm, float(np.cbrt(np.prod(extent_mm) / most)))
     while True:
         shape = np.ceil(extent_mm / voxel_mm).astype(np.int64)
         f_mm = _distances(template, box_mm[0], voxel_mm, shape)
@@ -350,7 +309,7 @@ def _nats_unseen(
     for axis in range(3):
         for k, way in enumerate((1.0, -1.0)):
             cosine = way * normals[:, axis]
-            weight = np.where(cosine > WAY_FACING, cosine**2, 0.0)
+            weight = np.where(cosine > options.way_cosine, cosine**2, 0.0)
             cover = float((weight * seen).sum() / weight.sum()) if weight.any() else 1.0
             chance = min(cover, options.largest_cover) * (1.0 - np.exp(-points))
             nats[axis, k] = -np.log1p(-chance)

@@ -48,11 +48,19 @@ def buried_mm3(pieces: Sequence[PatchRegion]) -> float:
     return float(sum(piece.volume_mm3 * (1.0 - piece.reachable_ratio) for piece in pieces))
 
 
-def ways(pieces: Sequence[PatchRegion], job: Job, stop: Stop, setup: PrintSetup) -> tuple[Way, ...]:
+def ways(
+    pieces: Sequence[PatchRegion],
+    job: Job,
+    stop: Stop,
+    setup: PrintSetup,
+    *,
+    command: str = "gcode resume-at JOB",
+) -> tuple[Way, ...]:
     """Cut down to the layer under the lowest piece and print again from there; or let it be.
 
-    A piece that begins in the first layer is no part to be cut down: then nothing is left but to
-    let it be, or to print it anew.
+    Told with the command that makes the job that is left, to which the layer is added. A piece that
+    begins in the first layer is no part to be cut down: then nothing is left but to let it be, or
+    to print it anew.
     """
     open_mm3 = buried_mm3(pieces)
     leave = Way("leave", 0.0, open_mm3)
@@ -67,6 +75,7 @@ def ways(pieces: Sequence[PatchRegion], job: Job, stop: Stop, setup: PrintSetup)
         print_time_s=_seconds(job, stop.line, setup) - _seconds(job, layer.first_line, setup),
         filament_mm3=float(length_mm @ beads.section_mm2[again]),
         layer=first, cut_to_mm=job.layers[first - 1].z_mm,
+        command=f"{command} --layer {first}",
     )  # fmt: skip
     return (reprint, leave)
 

@@ -34,7 +34,7 @@ from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import PROBE, Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
-from gcode.hosts.port import LeavesOut, Printer, PrintReport
+from gcode.hosts.port import GoesOnAnew, LeavesOut, Printer, PrintReport
 from gcode.moves import ModalState
 from gcode.progress import Progress
 from gcode.reader import Job
@@ -224,6 +224,8 @@ class Run:
             ),
             stops=sorted({*ends, *coming}),
         )  # fmt: skip
+        if isinstance(self._printer, GoesOnAnew):
+            self._printer.rewrite(rest.checked, self._course.own_lines(rest) - rest.first_line)
         self._course = self._course.anew(rest)
         self._job, self._checked = rest.job, rest.checked
         self._base = self._next_line = rest.first_line
@@ -395,6 +397,7 @@ class Run:
                 stop.line,
                 self._scanner.build_from_scanner,
                 repaired=passes > 0,
+                options=self._options.kinds,
             )
             decision = decide_look(
                 plan,

@@ -2,7 +2,8 @@
 
 What went wrong with the whole print comes first (it came off, layers are shifted, it curls up):
 then every region is of that. Then what went wrong with the flow, told from the last layer's beads
-in the order they were printed: too little from some bead on is a clog, too little everywhere is
+in the order they were printed: too little from some bead on is a clog, where that tells more of
+them right than a region would, whichever lie beside one another; too little everywhere is
 under-extrusion. What is left has a place, and is told by its shape.
 """
 
@@ -17,42 +18,13 @@ from scipy.spatial import cKDTree
 
 from amrepair.frames import Transform
 from amrepair.loop.findings import matching
+from amrepair.loop.kind_options import USUAL_KINDS, KindOptions
 from amrepair.loop.shapes import bead_way, last_beads, spread, tall_mm
 from amrepair.loop.shapes import chain as chain_of
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import RepairPlan, Site
 from gcode.reader import Job
-
-# A calibration is good to a tenth or two; a part that moved farther has come off.
-MOVED_MM, MOVED_RAD = 0.8, float(np.deg2rad(1.5))
-# Between two groups of layers: as a share of the layer height, and of what the walls tell.
-SHIFT_LAYERS, SHIFT_SHARE = 1.0, 0.35
-LEAST_POINTS, MOST_POINTS = 120, 6_000
-# Walls are looked at off the bed and off the top's rim; the bed, off the part.
-LOW_WALL_MM, HIGH_WALL_MM, BESIDE_LAYER_MM, TOP_RIM_MM = 0.8, 0.5, 1.5, 1.2
-BELOW_LAYER_MM, LAYER_RIM_MM = 0.7, 0.5
-# Of a layer's height: less than this is what a layer's beads differ by themselves.
-SHORT = 0.3
-# A surface that bends: range of its parabola, in layers; share of the deviation it explains.
-WARP_LAYERS, LIFTED_LAYERS, WARP_SHARE = 1.0, 0.6, 0.45
-# Where its parabola is highest a curled surface itself is as high, by this much.
-RISEN_SHARE = 0.5
-# Of a layer's beads: too little or too much flow over at least this share is the layer's own.
-LAYER_SHARE = 0.55
-CLOG_SHARE = (0.12, 0.9)
-# Before a clog, of what it takes away after its beginning; and how deep that is at most: beads of
-# one layer, and noise. Layers below are whole, or all of this one would lack.
-BEFORE_CLOG = 0.4
-CLOG_LAYERS = 1.5
-# Longer along the beads than across them by this much: beads were skipped.
-SKIPPED_ASPECT = 2.2
-STRING_ASPECT, STRING_WIDTH_MM = 4.0, 2.2
-STRING_TALL = 0.25
-ALONG_COSINE = 0.9
-# Mean depth, in layers: less than whole beads are missing where it is shallower.
-WHOLE_LAYERS = 0.7
-TOP_COSINE, WALL_COSINE = 0.8, 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +39,10 @@ class _Surface:
     outward: Float[np.ndarray, "s 3"]
     noise_mm: float
 
-    def part(self, pick: Bool[np.ndarray, " s"]) -> _Surface:
+    def part(self, pick: Bool[np.ndarray, " s"], most: int) -> _Surface:
         """Some of the points, evenly thinned where they are many."""
         which = np.flatnonzero(pick)
-        which = which[:: max(1, -(-len(which) // MOST_POINTS))]
+        which = which[:: max(1, -(-len(which) // most))]
         return _Surface(
             self.place_mm[which], self.deviation_mm[which], self.outward[which], self.noise_mm
         )
@@ -95,6 +67,7 @@ def typed(
     build_from_scanner: Transform,
     *,
     repaired: bool = False,
+    options: KindOptions = USUAL_KINDS,
 ) -> RepairPlan:
     """The plan with every region typed.
 
@@ -109,13 +82,13 @@ def typed(
         laid them, how much came out.
     """
     layer_mm = plan.layer_height_mm
-    seen = _surfaces(plan, site)
-    whole, flow = _came_off(plan, build_from_scanner), None
+    seen = _surfaces(plan, site, options)
+    whole, flow = _came_off(plan, build_from_scanner, options), None
     if whole is None and seen is not None:
-        found = (_shifted(seen[1], layer_mm), _warped(seen[0], layer_mm))
+        found = (_shifted(seen[1], layer_mm, options), _warped(seen[0], layer_mm, options))
         whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
     if whole is None and seen is not None and plan.deficit.regions and not repaired:
-        flow = _flow(seen[0], job, line, layer_mm)
+        flow = _flow(seen[0], job, line, layer_mm, options)
     pieces = {
         Label.MISSING: _pieces(plan.deficit.missing),
         Label.EXCESS: _pieces(plan.deficit.excess),
@@ -124,9 +97,16 @@ def typed(
     for region in plan.deficit.regions:
         # of a line that is gone many looks have told, not its depth
         there = 1.0 if region.skipped else _there(region.depth_mm, plan.deficit.tolerance_mm)
-        rim = _at_rim(plan, site, np.asarray(region.box_mm))
+        rim = _at_rim(plan, site, np.asarray(region.box_mm), options)
         kind = whole or _of_region(
-            region, pieces[region.label], flow, job, line, at_rim=rim, layer_mm=layer_mm
+            region,
+            pieces[region.label],
+            flow,
+            job,
+            line,
+            at_rim=rim,
+            layer_mm=layer_mm,
+            options=options,
         )
         regions.append(
             replace(region, type=kind.type, confidence=min(kind.confidence, there)
@@ -151,19 +131,21 @@ def _pieces(solid: manifold3d.Manifold) -> list[manifold3d.Manifold]:
     return [] if solid.is_empty() else solid.decompose()
 
 
-def _surfaces(plan: RepairPlan, site: Site) -> tuple[_Surface, _Surface] | None:
+def _surfaces(
+    plan: RepairPlan, site: Site, options: KindOptions
+) -> tuple[_Surface, _Surface] | None:
     """What was seen of the top, and of the walls; None where no evidence says how noisy it is."""
     evidence = plan.anomaly.evidence
     if evidence is None or len(evidence.surfels) == 0:
         return None
-    every = max(1, len(plan.anomaly.points_mm) // (12 * MOST_POINTS))
+    every = max(1, len(plan.anomaly.points_mm) // (12 * options.most_points))
     points, deviation = plan.anomaly.points_mm[::every], plan.anomaly.deviation_mm[::every]
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     height = placed.apply(points)[:, 2]
-    beside = np.flatnonzero((deviation > BESIDE_LAYER_MM) & (np.abs(height) < 0.5))
-    bed_mm = float(np.median(height[beside])) if len(beside) >= LEAST_POINTS else 0.0
-    near = np.flatnonzero((np.abs(deviation) < 3.0) & (height > LOW_WALL_MM))
-    near = near[:: max(1, -(-len(near) // (4 * MOST_POINTS)))]
+    beside = np.flatnonzero((deviation > options.beside_layer_mm) & (np.abs(height) < 0.5))
+    bed_mm = float(np.median(height[beside])) if len(beside) >= options.least_points else 0.0
+    near = np.flatnonzero((np.abs(deviation) < 3.0) & (height > options.low_wall_mm))
+    near = near[:: max(1, -(-len(near) // (4 * options.most_points)))]
     expected = site.planned or site.template
     gradient = expected.distance_and_gradient(points[near])[1]
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
@@ -173,29 +155,31 @@ def _surfaces(plan: RepairPlan, site: Site) -> tuple[_Surface, _Surface] | None:
     noise_mm = max(float(evidence.surfels.spread_mm), plan.scan.sigma_mm)
     seen = _Surface(place, corrected, outward, noise_mm)
     level_mm = float(placed.apply(expected.bounds_mm)[:, 2].max())
-    top = seen.part((outward[:, 2] > TOP_COSINE) & (place[:, 2] > level_mm - TOP_RIM_MM))
-    walls = (np.abs(outward[:, 2]) < WALL_COSINE) & (place[:, 2] < level_mm - HIGH_WALL_MM)
-    return top, seen.part(walls)
+    high = place[:, 2] > level_mm - options.top_rim_mm
+    low = place[:, 2] < level_mm - options.high_wall_mm
+    top = seen.part((outward[:, 2] > options.top_cosine) & high, options.most_points)
+    walls = (np.abs(outward[:, 2]) < options.wall_cosine) & low
+    return top, seen.part(walls, options.most_points)
 
 
-def _came_off(plan: RepairPlan, build_from_scanner: Transform) -> Kind | None:
+def _came_off(plan: RepairPlan, build_from_scanner: Transform, options: KindOptions) -> Kind | None:
     """Whether the part lies somewhere else than where the calibration and the job have it."""
     moved = plan.build_from_scan @ build_from_scanner.inverse()
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     points = plan.scan.points_mm
-    some = points[:: max(1, len(points) // MOST_POINTS)]
+    some = points[:: max(1, len(points) // options.most_points)]
     centre = placed.apply(some).mean(axis=0, keepdims=True)
     off_mm = float(np.linalg.norm(moved.apply(centre) - centre))
     cosine = float(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0))
     turned_rad = float(np.arccos(cosine))
-    share = max(off_mm / MOVED_MM, turned_rad / MOVED_RAD)
+    share = max(off_mm / options.moved_mm, turned_rad / np.deg2rad(options.moved_deg))
     return Kind(DefectType.DETACHED, _sure(share, 1.0)) if share > 1.0 else None
 
 
-def _shifted(walls: _Surface, layer_mm: float) -> Kind | None:
+def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | None:
     """Walls above some height stand beside those below: two shifts tell them better than one."""
     z, dev, out = walls.place_mm[:, 2], walls.deviation_mm, walls.outward[:, :2]
-    if len(walls) < 2 * LEAST_POINTS:
+    if len(walls) < 2 * options.least_points:
         return None
     total = float(((dev - dev.mean()) ** 2).sum())
     # normal equations of the walls below each cut, from the foot up; those above are the rest
@@ -211,9 +195,9 @@ def _shifted(walls: _Surface, layer_mm: float) -> Kind | None:
         best = max(best, (total - left, jump))
     gained, jump_mm = best
     share = gained / max(total - len(walls) * walls.noise_mm**2, 0.3 * total, 1e-12)
-    if jump_mm > SHIFT_LAYERS * layer_mm and share > SHIFT_SHARE:
-        sure = _sure(jump_mm, SHIFT_LAYERS * layer_mm) * min(1.0, share / (1.5 * SHIFT_SHARE))
-        return Kind(DefectType.LAYER_SHIFT, sure)
+    if jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
+        sure = _sure(jump_mm, options.shift_layers * layer_mm)
+        return Kind(DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share)))
     return None
 
 
@@ -223,9 +207,9 @@ def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"],
     return found, float(moments[3, 3] - found @ moments[:3, 3])
 
 
-def _warped(top: _Surface, layer_mm: float) -> Kind | None:
+def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> Kind | None:
     """The top bends up at its rim: a parabola explains what flow and place do not."""
-    if len(top) < LEAST_POINTS:
+    if len(top) < options.least_points:
         return None
     xy, dev = top.place_mm[:, :2], top.deviation_mm
     centre, half = 0.5 * (xy.min(axis=0) + xy.max(axis=0)), 0.5 * np.ptp(xy, axis=0)
@@ -244,17 +228,17 @@ def _warped(top: _Surface, layer_mm: float) -> Kind | None:
     lifted_mm = high_mm - float(fitted[middle].mean())
     # what sinks in the middle is no curl; nor is a chip, whose parabola rises where nothing does
     risen_mm = float(np.median(dev[rim & (fitted >= high_mm)]))
-    up = high_mm > LIFTED_LAYERS * layer_mm and risen_mm > RISEN_SHARE * high_mm
-    if up and lifted_mm > WARP_LAYERS * layer_mm and share > WARP_SHARE:
-        sure = _sure(lifted_mm, WARP_LAYERS * layer_mm) * min(1.0, share / (1.5 * WARP_SHARE))
-        return Kind(DefectType.WARP, sure)
+    up = high_mm > options.lifted_layers * layer_mm and risen_mm > options.risen_share * high_mm
+    if up and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
+        sure = _sure(lifted_mm, options.warp_layers * layer_mm)
+        return Kind(DefectType.WARP, sure * min(1.0, share / (1.5 * options.warp_share)))
     return None
 
 
-def _flow(top: _Surface, job: Job, line: int, layer_mm: float) -> Kind | None:
+def _flow(top: _Surface, job: Job, line: int, layer_mm: float, options: KindOptions) -> Kind | None:
     """What the last layer's beads carry, in the order they were printed."""
     points = last_beads(job, line)
-    if len(points) < 30 or len(top) < LEAST_POINTS:
+    if len(points) < 30 or len(top) < options.least_points:
         return None
     window = max(4, round(6 * (top.noise_mm / layer_mm) ** 2 / 0.3**2))  # noise well below a third
     distance, nearest = cKDTree(top.place_mm[:, :2]).query(points[:, :2], k=min(window, 60))
@@ -262,27 +246,51 @@ def _flow(top: _Surface, job: Job, line: int, layer_mm: float) -> Kind | None:
     if seen.sum() < 30:
         return None
     low = -top.deviation_mm[nearest[seen]].mean(axis=1) / layer_mm
-    short = low > SHORT
-    if np.mean(low < -SHORT) > LAYER_SHARE:
-        return Kind(DefectType.OVER_EXTRUSION, float(np.mean(low < -SHORT)))
+    short = low > options.short_layers
+    if np.mean(low < -options.short_layers) > options.layer_share:
+        return Kind(DefectType.OVER_EXTRUSION, float(np.mean(low < -options.short_layers)))
     if not short.any():
         return None
-    n, total = len(low), np.concatenate([[0.0], np.cumsum(low)])
-    k = np.arange(1, n)
-    before, after = total[1:-1] / k, (total[-1] - total[1:-1]) / (n - k)
-    at = int(np.argmax(k * (n - k) * (after - before) ** 2))
-    share, rest = 1.0 - (at + 1) / n, float(short[at + 1 :].mean())
+    at, wrong = _since(short)
+    share = 1.0 - at / len(short)
     if (
-        CLOG_SHARE[0] < share < CLOG_SHARE[1]
-        and after[at] > SHORT
-        and before[at] < BEFORE_CLOG * after[at]
-        and np.percentile(low[at + 1 :], 75) < CLOG_LAYERS
-        and rest > LAYER_SHARE
+        options.clog_least < share < options.clog_most
+        and np.percentile(low[at:], 75) < options.clog_layers
+        and wrong <= _apart(points[seen, :2], short, distance[seen, -1], options)
     ):
-        return Kind(DefectType.CLOG, min(1.0, rest))
-    if short.mean() > LAYER_SHARE:
+        return Kind(DefectType.CLOG, 1.0 - wrong)
+    if short.mean() > options.layer_share:
         return Kind(DefectType.UNDER_EXTRUSION, float(short.mean()))
     return None
+
+
+def _since(short: Bool[np.ndarray, " n"]) -> tuple[int, float]:
+    """From which place along the path too little came out, and the share that this tells wrong.
+
+    All that was printed before it is taken to be whole, all after it to be short.
+    """
+    wrong = np.cumsum(np.concatenate([[np.sum(~short)], np.where(short, 1, -1)]))
+    at = int(np.argmin(wrong))
+    return at, float(wrong[at]) / len(short)
+
+
+def _apart(
+    xy_mm: Float[np.ndarray, "n 2"],
+    short: Bool[np.ndarray, " n"],
+    blur_mm: Float[np.ndarray, " n"],
+    options: KindOptions,
+) -> float:
+    """Share of places that are not as most of those around them: what a region tells wrong.
+
+    `blur_mm` is how far away the points lie that a place's height is the mean of: nearer than
+    twice as far two places share them, and their noise.
+    """
+    distance, near = cKDTree(xy_mm).query(xy_mm, k=min(options.around_of, len(xy_mm)))
+    other = distance > np.maximum(2.0 * blur_mm, 1e-9)[:, None]
+    other &= np.cumsum(other, axis=1) <= options.around
+    votes = np.where(other, np.where(short[near], 1, -1), 0).sum(axis=1)
+    told = other.any(axis=1)
+    return float(np.mean((votes[told] > 0) != short[told])) if told.any() else 1.0
 
 
 def _of_region(
@@ -294,6 +302,7 @@ def _of_region(
     *,
     at_rim: bool,
     layer_mm: float,
+    options: KindOptions,
 ) -> Kind:
     """The type of one region, its place and shape considered."""
     piece = matching(pieces, np.asarray(region.box_mm))
@@ -302,34 +311,36 @@ def _of_region(
             return flow
         chain = chain_of(piece, pieces)
         long_mm, wide_mm, _ = spread(chain)
-        lies = tall_mm(chain) < STRING_TALL * long_mm  # what climbs a wall is its seam
-        if lies and long_mm > STRING_ASPECT * wide_mm and wide_mm < STRING_WIDTH_MM:
-            return Kind(DefectType.STRING, _sure(long_mm / wide_mm, STRING_ASPECT))
+        lies = tall_mm(chain) < options.string_tall * long_mm  # what climbs a wall is its seam
+        if lies and long_mm > options.string_aspect * wide_mm and wide_mm < options.string_width_mm:
+            return Kind(DefectType.STRING, _sure(long_mm / wide_mm, options.string_aspect))
         return Kind(DefectType.BLOB, 0.95)
     if flow is not None and flow.type is not DefectType.OVER_EXTRUSION:
         return flow
     long_mm, wide_mm, along = spread([piece] if piece is not None else [])
-    if long_mm > SKIPPED_ASPECT * wide_mm and not at_rim:
+    if long_mm > options.skipped_aspect * wide_mm and not at_rim:
         way = bead_way(job, line, np.asarray(region.box_mm))
-        if way is not None and abs(float(way @ along)) > ALONG_COSINE:
-            return Kind(DefectType.MISSING_BEADS, _sure(long_mm / wide_mm, SKIPPED_ASPECT))
+        if way is not None and abs(float(way @ along)) > options.along_cosine:
+            return Kind(DefectType.MISSING_BEADS, _sure(long_mm / wide_mm, options.skipped_aspect))
     whole_layers = piece is not None and (
-        piece.volume() > WHOLE_LAYERS * layer_mm * float(piece.project().area())
+        piece.volume() > options.whole_layers * layer_mm * float(piece.project().area())
     )
     if whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
         return Kind(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
     return Kind(region.type, 0.95)
 
 
-def _at_rim(plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"]) -> bool:
+def _at_rim(
+    plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"], options: KindOptions
+) -> bool:
     """Whether a region reaches the part's outline seen from above, a little below its floor."""
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
-    z = max(float(box_mm[0, 2]) - BELOW_LAYER_MM, 0.5 * float(box_mm[0, 2]))
+    z = max(float(box_mm[0, 2]) - options.below_layer_mm, 0.5 * float(box_mm[0, 2]))
     around = np.array([[box_mm[i, 0], box_mm[j, 1], z] for i in (0, 1) for j in (0, 1)])
     inside = site.template.distance(placed.inverse().apply(around))
     foot_mm = float(placed.apply(site.template.bounds_mm)[:, 2].min())
     # near the bed the foot is nearer than any rim
-    return bool((inside > -min(LAYER_RIM_MM, 0.8 * (z - foot_mm))).any())
+    return bool((inside > -min(options.layer_rim_mm, 0.8 * (z - foot_mm))).any())
 
 
 def _everywhere(plan: RepairPlan, site: Site, whole: Kind) -> Region:

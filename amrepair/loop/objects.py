@@ -116,5 +116,8 @@ class Course:
 
     def anew(self, rest: Rest) -> Course:
         """After the job was written anew."""
-        before = self.line_of
-        return Course(rest.job, rest.line_of if before is None else rest.line_of[before])
+        return Course(rest.job, self.own_lines(rest))
+
+    def own_lines(self, rest: Rest) -> Int[np.ndarray, " m"]:
+        """(m,) by line of the job that the run was begun with: its line in what is written anew."""
+        return rest.line_of if self.line_of is None else rest.line_of[self.line_of]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from amrepair.loop.kind_options import USUAL_KINDS, KindOptions
 from amrepair.loop.looks import Look
 from amrepair.loop.pace import Pace
 from amrepair.loop.tape import Tape
@@ -24,6 +25,8 @@ class LoopOptions:
     ----------
     policy
         What is worth a repair, and how many passes a stop may have.
+    kinds
+        What tells one type of defect from another.
     pace
         Looks besides the stops: more often after trouble, fewer while all is clean.
     limits
@@ -39,6 +42,7 @@ class LoopOptions:
     """
 
     policy: PolicyOptions = USUAL_POLICY
+    kinds: KindOptions = USUAL_KINDS
     pace: Pace | None = None
     limits: Limits | None = None
     silent_stops: int = 0

@@ -25,7 +25,7 @@ from amrepair.loop.touched import Touches, measured_sigma_mm, scan_of
 from amrepair.loop.wire import Wire
 from amrepair.scans import PROBE, Scan, ScanRequest
 from gcode.check import CheckedProgram
-from gcode.hosts.port import Printer
+from gcode.hosts.port import Printer, TellsTouches
 from gcode.hosts.serial import SerialPrinter
 from gcode.moves import ModalState
 from gcode.profiles import PrintSetup
@@ -91,16 +91,17 @@ class PortFeeler:
     Raises
     ------
     InputError
-        If the printer is not on a port of its own.
+        If the printer does not tell where a touch ended.
     gcode.errors.ProfileError
         If it has no probe that feels plastic.
     """
 
     def __init__(self, printer: Printer, setup: PrintSetup) -> None:
-        if not isinstance(printer, SerialPrinter):
+        if not isinstance(printer, (SerialPrinter, TellsTouches)):
             raise InputError(
                 "--scanner probe needs the printer's own port (--port /dev/ttyACM0, or Klipper's "
-                "/tmp/printer): a server or a file does not answer where a touch ended"
+                "/tmp/printer), or 'amrepair agent' beside its server: this server or file does "
+                "not tell where a touch ended"
             )
         self._wire, self._setup, self._probe = Wire(printer), setup, setup.printer.feeler
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 from amrepair.errors import InputError, LoopError
 from amrepair.loop.tape import TOUCH, Sent, Tape, report_from_json, report_to_json
 from gcode.check import CheckedProgram
-from gcode.hosts.port import Printer, PrintReport
+from gcode.hosts.port import Printer, PrintReport, TellsTouches
 from gcode.hosts.serial import SerialPrinter
 from gcode.hosts.touching import felt
 from gcode.progress import Progress, silent
@@ -82,12 +82,12 @@ class Wire:
         Raises
         ------
         InputError
-            If the printer is not on a port of its own.
+            If the printer does not tell where a touch ended.
         gcode.errors.PrinterError
             If nothing is felt; the heaters are off then.
         """
-        if not isinstance(self._printer, SerialPrinter):
-            raise InputError("a server or a file does not answer where a touch ended")
+        if not isinstance(self._printer, (SerialPrinter, TellsTouches)):
+            raise InputError("this server or file does not tell where a touch ended")
         end = checked.program.text.count("\n")
         done, _ = self._begin(Sent(TOUCH, checked, 0, end, done=False))
         if done is not None:

@@ -22,31 +22,11 @@ from jaxtyping import Bool, Float, Int
 
 from amrepair.align.registration import bounded_inverse
 from amrepair.frames import motion_about, moved
+from amrepair.merge.options import USUAL_MERGE, JointOptions
 from amrepair.merge.views import View, loss_weight
 from gcode.crew import cores
 
-SAMPLED, LEAST_SAMPLED = 48_000, 4_000  # points of all scans together; of each
-JOINT_ROUNDS = 15
-JOINT_SHRINK = 0.6
-WITHIN_SPACINGS = 4.0  # of the other scan: farther apart are no pair
-PAIR_AGREES = 0.9  # cosine of the normals of a pair: edges are blends of two faces
-LEAST_SHARED_PAIRS = 100  # of two scans, or they say nothing of each other
-STILL_SPACINGS = 1e-3  # a smaller step ends it
-# Scale of the Geman–McClure loss: of the noise; at first, of the residuals' median and the spacing,
-# so that poses find together which the groups left a millimetre apart. And the least, of a spacing:
-# scans without noise differ by rounding.
-SCALE_NOISES, FIRST_MEDIANS, FIRST_SPACINGS, LEAST_SPACINGS = 4.0, 4.0, 0.5, 5e-3
 JOINT_DAMPING = 1e-7
-# Residuals of one facing within this share of the part err alike.
-PATCH_RATIO = 0.04
-# What all points of a patch may share: what of the spacing a fit cannot tell (`fuse.reach_mm` asks
-# no more), and how far points lie from their plane beyond the noise, at edges and curves.
-SHARED_SPACINGS = 0.05
-WORST_HELD_POINTS = 20_000  # points of a scan, for where its surface is held worst
-# A motion with less information than this share of the best known one's is free.
-JOINT_FREE_RATIO = 1e-6
-# Slips of more than so many spacings are contradicted by what the sensors saw through.
-HELD_SPACINGS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,20 +88,25 @@ class _Pairs:
 
 
 def together(
-    views: Sequence[View], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
+    views: Sequence[View],
+    poses: Sequence[Float[np.ndarray, "4 4"]],
+    rng: np.random.Generator,
+    options: JointOptions = USUAL_MERGE.joint,
 ) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
     """All poses but the first, refined jointly; and the residual's root mean square, mm."""
     found = [np.array(pose) for pose in poses]
-    sample = _samples(views, rng)
-    last_mm, spacing_mm = _scale_mm(views), max(view.spacing_mm for view in views)
+    sample = _samples(views, options, rng)
+    last_mm, spacing_mm = _scale_mm(views, options), max(view.spacing_mm for view in views)
     scale_mm = rmse_mm = 0.0
-    for _ in range(JOINT_ROUNDS):
-        pairs = _pairs(views, found, sample)
-        if len(pairs.of) < LEAST_SHARED_PAIRS:
+    for _ in range(options.rounds):
+        pairs = _pairs(views, found, sample, options)
+        if len(pairs.of) < options.least_pairs:
             break
         if scale_mm == 0.0:
             median_mm = float(np.median(np.abs(pairs.height_mm)))
-            scale_mm = max(last_mm, FIRST_MEDIANS * median_mm, FIRST_SPACINGS * spacing_mm)
+            scale_mm = max(
+                last_mm, options.first_medians * median_mm, options.first_spacings * spacing_mm
+            )
         weight = loss_weight(pairs.height_mm, scale_mm)
         rmse_mm = float(np.sqrt((weight * pairs.height_mm**2).sum() / weight.sum()))
         centre, size_mm = _frame(pairs)
@@ -133,45 +118,52 @@ def together(
         step = -np.linalg.solve(free, push[6:]).reshape(-1, 6)
         for k, own in enumerate(step, 1):
             found[k] = motion_about(centre, own[:3] / size_mm, own[3:]) @ found[k]
-        if float(np.abs(step).max()) < STILL_SPACINGS * spacing_mm and scale_mm <= last_mm:
+        if float(np.abs(step).max()) < options.still_spacings * spacing_mm and scale_mm <= last_mm:
             break
-        scale_mm = max(last_mm, JOINT_SHRINK * scale_mm)
+        scale_mm = max(last_mm, options.shrink * scale_mm)
     return found, rmse_mm
 
 
 def slacks(
-    views: Sequence[View], poses: Sequence[Float[np.ndarray, "4 4"]], rng: np.random.Generator
+    views: Sequence[View],
+    poses: Sequence[Float[np.ndarray, "4 4"]],
+    rng: np.random.Generator,
+    options: JointOptions = USUAL_MERGE.joint,
 ) -> list[Slack]:
     """How surely each refined pose is held, against the scan against which most are held best."""
     count = len(views)
-    pairs = _pairs(views, poses, _samples(views, rng))
-    weight = loss_weight(pairs.height_mm, _scale_mm(views))
+    pairs = _pairs(views, poses, _samples(views, options, rng), options)
+    weight = loss_weight(pairs.height_mm, _scale_mm(views, options))
     centre, size_mm = _frame(pairs)
     along = _jacobian(pairs.points_mm, pairs.planes, centre, size_mm)
     instrument = _jacobian(pairs.points_mm, pairs.own, centre, size_mm)
     information, _ = _equations(pairs, along, instrument, weight, count)
-    scatter = _scatter(views, pairs, instrument, weight)
-    open_ = [_open(information, scatter, home) for home in range(count)]
+    scatter = _scatter(views, pairs, instrument, weight, options)
+    open_ = [_open(information, scatter, home, options) for home in range(count)]
     best = min(open_, key=lambda blocks: float(np.median([np.trace(b) for b in blocks])))
     return [
-        _slack(view, pose, block, centre, size_mm)
+        _slack(view, pose, block, centre, size_mm, options)
         for view, pose, block in zip(views, poses, best, strict=True)
     ]
 
 
-def _reach_mm(view: View, other: View) -> float:
+def _reach_mm(view: View, other: View, options: JointOptions) -> float:
     """How far apart a point and the nearest one of its own surface may lie."""
     noise_mm = float(np.hypot(view.sigma_mm, other.sigma_mm))
-    return WITHIN_SPACINGS * other.spacing_mm + SCALE_NOISES * noise_mm
+    return options.within_spacings * other.spacing_mm + options.scale_noises * noise_mm
 
 
-def _samples(views: Sequence[View], rng: np.random.Generator) -> list[Int[np.ndarray, " _"]]:
-    each = max(LEAST_SAMPLED, SAMPLED // len(views))
+def _samples(
+    views: Sequence[View], options: JointOptions, rng: np.random.Generator
+) -> list[Int[np.ndarray, " _"]]:
+    each = max(options.least_sampled, options.sampled // len(views))
     return [rng.permutation(len(p.surface.points_mm))[:each] for p in views]
 
 
-def _scale_mm(views: Sequence[View]) -> float:
-    return max(max(SCALE_NOISES * v.sigma_mm, LEAST_SPACINGS * v.spacing_mm) for v in views)
+def _scale_mm(views: Sequence[View], options: JointOptions) -> float:
+    return max(
+        max(options.scale_noises * v.sigma_mm, options.least_spacings * v.spacing_mm) for v in views
+    )
 
 
 def _frame(pairs: _Pairs) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -193,6 +185,7 @@ def _pairs(
     views: Sequence[View],
     poses: Sequence[Float[np.ndarray, "4 4"]],
     sample: Sequence[Int[np.ndarray, " _"]],
+    options: JointOptions,
 ) -> _Pairs:
     """Sampled points of each scan with the nearest planes of every other that face their way."""
     own = [
@@ -207,13 +200,15 @@ def _pairs(
     def pair(k: int, r: int) -> tuple[np.ndarray, ...]:
         view, other = views[k], views[r]
         local = moved(own[k], np.linalg.inv(poses[r]))
-        reach, index = other.surface.tree.query(local, distance_upper_bound=_reach_mm(view, other))
+        reach, index = other.surface.tree.query(
+            local, distance_upper_bound=_reach_mm(view, other, options)
+        )
         near = np.flatnonzero(np.isfinite(reach))
         index = index[near]
         plane = other.surface.normals[index] @ poses[r][:3, :3].T
         cosine = (plane * facing[k][near]).sum(axis=1)
         signed = bool(view.looks.each and other.looks.each)
-        agrees = (cosine if signed else np.abs(cosine)) > PAIR_AGREES
+        agrees = (cosine if signed else np.abs(cosine)) > options.agrees
         near, index, plane = near[agrees], index[agrees], plane[agrees]
         height = (
             (local[near] - other.surface.points_mm[index]) * other.surface.normals[index]
@@ -273,6 +268,7 @@ def _scatter(
     pairs: _Pairs,
     instrument: Float[np.ndarray, "q 6"],
     weight: Float[np.ndarray, " q"],
+    options: JointOptions,
 ) -> Float[np.ndarray, "n n"]:
     """Covariance of what the residuals push at: by patches, with what a patch may share."""
     count = len(views)
@@ -280,14 +276,15 @@ def _scatter(
     sigma = np.array([p.sigma_mm for p in views])
     first, second = np.minimum(pairs.of, pairs.other), np.maximum(pairs.of, pairs.other)
     low = pairs.points_mm.min(axis=0)
-    edge_mm = PATCH_RATIO * float(np.linalg.norm(np.ptp(pairs.points_mm, axis=0)))
+    edge_mm = options.patch_ratio * float(np.linalg.norm(np.ptp(pairs.points_mm, axis=0)))
     axis = np.argmax(np.abs(pairs.planes), axis=1)
     side = np.take_along_axis(pairs.planes, axis[:, None], axis=1)[:, 0] > 0.0
     cell = np.floor((pairs.points_mm - low) / edge_mm).astype(np.int64)
     key = np.column_stack([first, second, cell, 2 * axis + side])
     _, start, patch = np.unique(key, axis=0, return_index=True, return_inverse=True)
     shared_mm = np.hypot(
-        pairs.rough_mm, SHARED_SPACINGS * np.maximum(spacing[pairs.of], spacing[pairs.other])
+        pairs.rough_mm,
+        options.shared_spacings * np.maximum(spacing[pairs.of], spacing[pairs.other]),
     )
     weighted = instrument * weight[:, None]
     pushed = _sums(
@@ -310,12 +307,15 @@ def _sums(
 
 
 def _open(
-    information: Float[np.ndarray, "n n"], scatter: Float[np.ndarray, "n n"], home: int
+    information: Float[np.ndarray, "n n"],
+    scatter: Float[np.ndarray, "n n"],
+    home: int,
+    options: JointOptions,
 ) -> list[Float[np.ndarray, "6 6"]]:
     """Each scan's covariance, with one of them held still."""
     count = len(information) // 6
     moving: Bool[np.ndarray, " n"] = np.arange(6 * count) // 6 != home
-    inverse = bounded_inverse(information[np.ix_(moving, moving)], JOINT_FREE_RATIO)
+    inverse = bounded_inverse(information[np.ix_(moving, moving)], options.free_ratio)
     whole = np.zeros_like(information)
     whole[np.ix_(moving, moving)] = inverse @ scatter[np.ix_(moving, moving)] @ inverse
     return [whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)]
@@ -327,11 +327,12 @@ def _slack(
     covariance: Float[np.ndarray, "6 6"],
     centre_mm: Float[np.ndarray, " 3"],
     size_mm: float,
+    options: JointOptions,
 ) -> Slack:
-    some = slice(None, None, len(view.surface.points_mm) // WORST_HELD_POINTS + 1)
+    some = slice(None, None, len(view.surface.points_mm) // options.worst_held_points + 1)
     points = moved(view.surface.points_mm[some], pose)
     normals = view.surface.normals[some] @ pose[:3, :3].T
-    most_mm = HELD_SPACINGS * view.spacing_mm
+    most_mm = options.held_spacings * view.spacing_mm
     made = Slack(covariance, centre_mm, size_mm, most_mm, 0.0, np.array([0.0, 0.0, 1.0]))
     sigma = made.across(points, normals)
     worst = int(np.argmax(sigma))

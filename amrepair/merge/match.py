@@ -19,20 +19,12 @@ from amrepair.align.search import spread_rotations
 from amrepair.align.search_kernels import peaks
 from amrepair.frames import moved
 from amrepair.merge import search_kernels as kernels
-from amrepair.merge.options import MergeOptions
+from amrepair.merge.options import MatchOptions, MergeOptions
 from amrepair.merge.views import Fit, Surface, View, judged, settled
 
 # The grid of free space: nodes along each side, and its side in sizes. A view in a wrong place
 # does not leave it.
 CELLS, SIDE = 72, 2.4
-ROTATIONS = 3_600  # about 16° apart
-CAP = 0.1  # sizes: as bad as farther in free space
-# Times what agrees. More, and views that hide behind each other and share nothing come first.
-FREE_COUNTS, FREE_COUNTS_GUESSED = 1.5, 0.75
-# Pairs of points within so many sizes, at first (features, search) and at last.
-FEATURES_WITHIN, SEARCH_WITHIN, LAST_WITHIN = 0.05, 0.03, 0.012
-ROUGH_POINTS, MATCHED_POINTS, MOST_POSES = 800, 3_000, 6
-SURE_OVERLAP = 0.3  # of a pair that features lay on each other without contradiction
 APART_POINTS = 60  # of a view, that tell two poses apart
 
 
@@ -83,11 +75,11 @@ def featured(
     source, target = views[j].surface.points_mm, views[i].surface.points_mm
     if not views[i].looks.each and not views[j].looks.each:
         guesses = list(poses_between(source, target, size_mm))
-        return _fitted(views, i, j, guesses, FEATURES_WITHIN, size_mm, options)
+        return _fitted(views, i, j, guesses, options.match.features_within, size_mm, options)
     found: list[Fit] = []
     for guess in by_features(source, target, size_mm):
-        found += _fitted(views, i, j, [guess], FEATURES_WITHIN, size_mm, options)
-        if any(f.overlap >= SURE_OVERLAP and not f.why_not(options) for f in found):
+        found += _fitted(views, i, j, [guess], options.match.features_within, size_mm, options)
+        if any(f.overlap >= options.match.sure_overlap and not f.why_not(options) for f in found):
             break  # finer features said so: coarser ones say no more
     return distinct(found, views[j].thin, options.same_size * size_mm)
 
@@ -106,8 +98,8 @@ def searched(
     for k in (i, j):
         if k not in spaces:
             spaces[k] = FreeSpace.of(views[k], size_mm)
-    guesses = _search(views[i], views[j], spaces[i], spaces[j], size_mm)
-    return _fitted(views, i, j, guesses, SEARCH_WITHIN, size_mm, options)
+    guesses = _search(views[i], views[j], spaces[i], spaces[j], size_mm, options.match)
+    return _fitted(views, i, j, guesses, options.match.search_within, size_mm, options)
 
 
 def _fitted(
@@ -121,20 +113,21 @@ def _fitted(
 ) -> list[Fit]:
     """Guesses settled on few points, and of those that end apart the best on many; judged."""
     fixed, moving = views[i].thin, views[j].thin
-    within = np.geomspace(first, LAST_WITHIN, 6) * size_mm
+    match = options.match
+    within = np.geomspace(first, match.last_within, 6) * size_mm
     rough: list[tuple[float, np.ndarray]] = []
     for guess in guesses:
-        pose = settled(fixed, moving, guess, within, ROUGH_POINTS)
-        some = moving.some(ROUGH_POINTS)
+        pose = settled(fixed, moving, guess, within, match.rough_points)
+        some = moving.some(match.rough_points)
         near = fixed.tree.query(moved(moving.points_mm[some], pose))[0]
-        rough.append((float((near < LAST_WITHIN * size_mm).mean()), pose))
+        rough.append((float((near < match.last_within * size_mm).mean()), pose))
     last_mm = options.reach_spacings * max(views[i].thin_spacing_mm, views[j].thin_spacing_mm)
-    within = np.geomspace(max(LAST_WITHIN * size_mm, last_mm), last_mm, 12)
+    within = np.geomspace(max(match.last_within * size_mm, last_mm), last_mm, 12)
     poses = apart([p for _, p in sorted(rough, key=lambda r: -r[0])], moving,
-                  options.same_size * size_mm)[:MOST_POSES]  # fmt: skip
+                  options.same_size * size_mm)[:match.most_poses]  # fmt: skip
     fits = [
         judged(views, {i: np.eye(4)}, {j: np.eye(4)},
-               settled(fixed, moving, pose, within, MATCHED_POINTS), options)
+               settled(fixed, moving, pose, within, match.points), options)
         for pose in poses
     ]  # fmt: skip
     return distinct(fits, moving, options.same_size * size_mm)
@@ -161,21 +154,27 @@ def distinct(fits: Sequence[Fit], surface: Surface, apart_mm: float) -> list[Fit
 
 
 def _search(
-    first: View, second: View, space: FreeSpace, other: FreeSpace, size_mm: float
+    first: View,
+    second: View,
+    space: FreeSpace,
+    other: FreeSpace,
+    size_mm: float,
+    options: MatchOptions,
 ) -> list[Float[np.ndarray, "4 4"]]:
     """Every rotation, moved out of free space; best first."""
     rng = np.random.default_rng(0)
     cell_mm = space.cell_mm
-    rotations, places = spread_rotations(ROTATIONS), np.zeros((ROTATIONS, 3))
+    rotations = spread_rotations(options.rotations)
+    places = np.zeros((len(rotations), 3))
     guessed = first.looks.guessed or second.looks.guessed
-    free_counts = FREE_COUNTS_GUESSED if guessed else FREE_COUNTS
+    free_counts = options.free_counts_guessed if guessed else options.free_counts
     size = size_mm / cell_mm
     for step in MATCH_ROUNDS:
         own = _sample(first, space, step.points, rng)
         others = _sample(second, other, step.points, rng)
         scores = kernels.reconcile(
             kernels.Pair(*own, *others, space.field, other.field, CELLS), rotations, places,
-            np.geomspace(step.first, step.last, step.steps) * size, CAP * size, 0.5 * size,
+            np.geomspace(step.first, step.last, step.steps) * size, options.cap * size, 0.5 * size,
         )  # fmt: skip
         order = np.argsort(free_counts * scores[:, 0] - scores[:, 1], kind="stable")
         chosen = peaks(order, rotations, places, 0.4 * size, 0.01 * size, step.keep)

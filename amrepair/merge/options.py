@@ -2,7 +2,93 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class MatchOptions:
+    """How two views are laid on each other from nothing known; lengths in sizes of the part.
+
+    Attributes
+    ----------
+    rotations
+        About 16° apart.
+    cap
+        Points farther in free space are as bad as this.
+    free_counts, free_counts_guessed
+        What lies in free space counts so many times what agrees. More, and views that hide behind
+        each other and share nothing come first.
+    features_within, search_within, last_within
+        Pairs of points lie within these, at first (of features, of the search) and at last.
+    rough_points, points, most_poses
+        That poses are settled on, at first and at last, and how many are at last.
+    sure_overlap
+        Of a pair that features lay on each other without contradiction.
+    """
+
+    rotations: int = 3_600
+    cap: float = 0.1
+    free_counts: float = 1.5
+    free_counts_guessed: float = 0.75
+    features_within: float = 0.05
+    search_within: float = 0.03
+    last_within: float = 0.012
+    rough_points: int = 800
+    points: int = 3_000
+    most_poses: int = 6
+    sure_overlap: float = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class JointOptions:
+    """The joint refinement of all poses, and how surely each is held.
+
+    Attributes
+    ----------
+    sampled, least_sampled
+        Points of all scans together; of each.
+    rounds, still_spacings
+        At most; a smaller step ends it.
+    within_spacings
+        Of the other scan: farther apart are no pair.
+    agrees
+        Cosine of the normals of a pair: edges are blends of two faces.
+    least_pairs
+        Of two scans, or they say nothing of each other.
+    scale_noises, first_medians, first_spacings, least_spacings, shrink
+        Scale of the Geman-McClure loss: of the noise; at first, of the residuals' median and the
+        spacing, so that poses find together which the groups left a millimetre apart. The least, of
+        a spacing: scans without noise differ by rounding. And from round to round.
+    patch_ratio
+        Residuals of one facing within this share of the part err alike.
+    shared_spacings
+        What all points of a patch may share: what of the spacing a fit cannot tell, beside how far
+        points lie from their plane beyond the noise, at edges and curves.
+    worst_held_points
+        Of a scan, for where its surface is held worst.
+    free_ratio
+        A motion with less information than this share of the best known one's is free.
+    held_spacings
+        Slips of more than so many are contradicted by what the sensors saw through.
+    """
+
+    sampled: int = 48_000
+    least_sampled: int = 4_000
+    rounds: int = 15
+    still_spacings: float = 1e-3
+    within_spacings: float = 4.0
+    agrees: float = 0.9
+    least_pairs: int = 100
+    scale_noises: float = 4.0
+    first_medians: float = 4.0
+    first_spacings: float = 0.5
+    least_spacings: float = 5e-3
+    shrink: float = 0.6
+    patch_ratio: float = 0.04
+    shared_spacings: float = 0.05
+    worst_held_points: int = 20_000
+    free_ratio: float = 1e-6
+    held_spacings: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +117,8 @@ class MergeOptions:
         it (spacings), and noise.
     same_size
         Of the size: poses that differ by less are one.
-    scale_noises
-        Of the joint refinement's loss: residuals beyond are not believed.
+    match, joint
+        Of each stage.
     """
 
     least_overlap: float = 0.1
@@ -47,7 +133,8 @@ class MergeOptions:
     off_spacings: float = 0.25
     off_noises: float = 6.0
     same_size: float = 0.02
-    scale_noises: float = 4.0
+    match: MatchOptions = field(default_factory=MatchOptions)
+    joint: JointOptions = field(default_factory=JointOptions)
 
     def overlap(self, *, guessed: bool) -> float:
         """Of one group on another, at least."""
@@ -56,3 +143,7 @@ class MergeOptions:
     def against(self, *, guessed: bool) -> float:
         """Of a view, at most."""
         return self.most_against_guessed if guessed else self.most_against
+
+
+USUAL_MERGE = MergeOptions()
+"""What the command line goes by."""

@@ -93,7 +93,7 @@ def place(
     home = np.linalg.inv(poses[min(poses)])
     poses = {k: home @ poses[k] for k in sorted(poses)}
     chosen = list(poses)
-    open_ = slacks([views[k] for k in chosen], list(poses.values()), rng)
+    open_ = slacks([views[k] for k in chosen], list(poses.values()), rng, options.joint)
     progress("refine poses", 1.0, 1.0)
     return Placement(poses, rmse_mm, left_out, dict(zip(chosen, open_, strict=True)))
 
@@ -126,7 +126,7 @@ def _held(
     """
     if len(begun) < 2:
         return {}, None
-    poses, rmse_mm = _refined(views, begun, rng)
+    poses, rmse_mm = _refined(views, begun, options, rng)
     kept, dropped = _consistent(views, poses, options)
     return (kept if len(kept) > 1 else {}), (None if dropped else rmse_mm)
 
@@ -135,20 +135,21 @@ def _agreed(
     views: Sequence[View], found: Placed, rng: np.random.Generator, options: MergeOptions
 ) -> tuple[Placed, float, dict[int, str]]:
     """Poses refined together, the residual, and why views that contradict them were left out."""
-    poses, rmse_mm = _refined(views, found, rng)
+    poses, rmse_mm = _refined(views, found, options, rng)
     poses, dropped = _consistent(views, poses, options)
     if dropped and len(poses) > 1:
-        poses, rmse_mm = _refined(views, poses, rng)
+        poses, rmse_mm = _refined(views, poses, options, rng)
     return poses, rmse_mm, dropped
 
 
 def _refined(
-    views: Sequence[View], poses: Placed, rng: np.random.Generator
+    views: Sequence[View], poses: Placed, options: MergeOptions, rng: np.random.Generator
 ) -> tuple[Placed, float]:
     which = sorted(poses)
     if len(which) < 2:
         return dict(poses), 0.0
-    refined, rmse_mm = together([views[k] for k in which], [poses[k] for k in which], rng)
+    own, begun = [views[k] for k in which], [poses[k] for k in which]
+    refined, rmse_mm = together(own, begun, rng, options.joint)
     return dict(zip(which, refined, strict=True)), rmse_mm
 
 

@@ -6,19 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from amrepair.errors import InputError
+from amrepair.observe.options import USUAL_BACKGROUND, BackgroundOptions
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
-# Excess farther out than this is not part of the print (clutter, the bed's rim).
-MAX_EXCESS_MM = 12.0
-# Bed, skirt and first-layer ooze: one thick layer above the lowest plane of the part.
-BACKGROUND_BAND_MM = 0.35
-# Of a plane's points one in 30,000 lies farther from it, by noise of so many sigmas.
-NOISE_SIGMAS = 4.0
 # The template's distance is the height under a plane: to rounding.
 ON_PLANE_MM = 1e-4
-# So much of the underside seen, so far from its rim: nothing lies under the part, there is no bed.
-SEEN_UNDERSIDE, UNDERSIDE_RIM_MM, FOOT_CELL_MM, MOST_FOOT = 0.3, 0.15, 1.0, 20_000
 # So many points tell a scan's size, to the factor between two units.
 SIZE_POINTS = 20_000
 
@@ -45,25 +38,26 @@ def background(
     template: Template,
     f_mm: Float[np.ndarray, " n"],
     surface_mm: Float[np.ndarray, "m 3"],
+    options: BackgroundOptions = USUAL_BACKGROUND,
 ) -> Bool[np.ndarray, " n"]:
     """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
     low_z = float(template.bounds_mm[0, 2])
-    if _shows_underside(scan, template, f_mm, surface_mm):
+    if _shows_underside(scan, template, f_mm, surface_mm, options):
         # what lies beside the part in its lowest plane is where it stood when seen from above
-        rim_mm = _rim_mm(scan)
+        rim_mm = _rim_mm(scan, options)
         in_plane = np.abs(scan.points_mm[:, 2] - low_z) < rim_mm
-        beside = in_plane & (f_mm > max(rim_mm, BACKGROUND_BAND_MM / 2))
-        return np.asarray((f_mm > MAX_EXCESS_MM) | beside)
-    band_mm = max(BACKGROUND_BAND_MM, NOISE_SIGMAS * scan.sigma_mm)
+        beside = in_plane & (f_mm > max(rim_mm, options.band_mm / 2))
+        return np.asarray((f_mm > options.most_excess_mm) | beside)
+    band_mm = max(options.band_mm, options.noise_sigmas * scan.sigma_mm)
     bed = (scan.points_mm[:, 2] < low_z + band_mm) & (f_mm > band_mm / 2)
     inside_band = scan.points_mm[:, 2] > low_z - band_mm
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
-    return bed | (f_mm > MAX_EXCESS_MM) | (~inside_band & (f_mm > 1.0))
+    return bed | (f_mm > options.most_excess_mm) | (~inside_band & (f_mm > options.below_mm))
 
 
-def _rim_mm(scan: Scan) -> float:
+def _rim_mm(scan: Scan, options: BackgroundOptions) -> float:
     """How far from the lowest plane a point may lie that is on it."""
-    return max(UNDERSIDE_RIM_MM, NOISE_SIGMAS * scan.sigma_mm)
+    return max(options.underside_rim_mm, options.noise_sigmas * scan.sigma_mm)
 
 
 def _shows_underside(
@@ -71,21 +65,22 @@ def _shows_underside(
     template: Template,
     f_mm: Float[np.ndarray, " n"],
     surface_mm: Float[np.ndarray, "m 3"],
+    options: BackgroundOptions,
 ) -> bool:
     """Whether the part was seen from below: then what bulges there is no bed."""
     low_z = float(template.bounds_mm[0, 2])
-    rim_mm = _rim_mm(scan)
+    rim_mm = _rim_mm(scan, options)
     near = np.flatnonzero((np.abs(f_mm) < rim_mm) & (scan.points_mm[:, 2] < low_z + rim_mm))
 
     def cells_within(points_mm: Float[np.ndarray, "k 3"]) -> set[tuple[int, int]]:
         above = points_mm.copy()
-        above[:, 2] = low_z + rim_mm + UNDERSIDE_RIM_MM
+        above[:, 2] = low_z + rim_mm + options.underside_rim_mm
         under = above[template.distance(above) < -rim_mm, :2] if len(above) else above[:, :2]
-        index = np.unique(np.floor(under / FOOT_CELL_MM).astype(np.int64), axis=0)
+        index = np.unique(np.floor(under / options.foot_cell_mm).astype(np.int64), axis=0)
         return {(int(x), int(y)) for x, y in index}
 
-    seen = cells_within(scan.points_mm[near[:: len(near) // MOST_FOOT + 1]])
+    seen = cells_within(scan.points_mm[near[:: len(near) // options.most_foot + 1]])
     if not seen:
         return False
     foot = cells_within(surface_mm[surface_mm[:, 2] < low_z + ON_PLANE_MM])
-    return len(seen & foot) > SEEN_UNDERSIDE * max(len(foot), 1)
+    return len(seen & foot) > options.seen_underside * max(len(foot), 1)

@@ -22,6 +22,8 @@ class Way:
         First layer of the job that is printed again; None where none is.
     cut_to_mm
         Height to which the part is cut down, build frame; None where nothing is cut.
+    command
+        What makes the program that prints it again; empty where none does.
     """
 
     name: str
@@ -31,6 +33,7 @@ class Way:
     filament_mm3: float = 0.0
     layer: int | None = None
     cut_to_mm: float | None = None
+    command: str = ""
 
     @property
     def told(self) -> str:
@@ -39,7 +42,7 @@ class Way:
             return f"let it be: {self.left_mm3:.1f} mm³ stay open inside"
         return (
             f"stop, cut the part down to {self.cut_to_mm:.2f} mm and print from there on "
-            f"('gcode resume-at JOB --layer {self.layer}'): {self.filled_mm3:.1f} mm³ come back, "
+            f"('{self.command}'): {self.filled_mm3:.1f} mm³ come back, "
             f"{self.print_time_s / 60.0:.1f} min and {self.filament_mm3:.0f} mm³ of plastic are "
             "printed again"
         )

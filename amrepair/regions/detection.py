@@ -209,7 +209,7 @@ def _bounded(
         labelled,
         seen.images,
         threshold_mm=min(_stray_limit_mm(test.levels[0], options, calibration), test.limit_mm),
-        occupancy=options.occupancy,
+        options=options.evidence,
     )
     surface_label = _label_surface(seen, template, evidence, test)
     return with_stubs(evidence, scan, seen.surface_mm[test.gone], labelled), surface_label

@@ -5,7 +5,70 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from amrepair.errors import InputError
-from amrepair.field.occupancy import OccupancyOptions
+from amrepair.field.options import EvidenceOptions, SurfelOptions
+from amrepair.observe.options import BackgroundOptions
+
+
+@dataclass(frozen=True, slots=True)
+class SkippedOptions:
+    """Lines of the job that rays went through.
+
+    Attributes
+    ----------
+    look_step_mm, looks_together
+        Looks along a line, and so many of them are judged together.
+    least_stretch_mm
+        Shorter stretches are seams and corners.
+    joined_mm, straight_on
+        A line goes on in the next that begins where it ends, unless it turns there by more than
+        45° (cosine): that is a corner, and plastic cuts it.
+    gone_share
+        How far the middle of a bead lies in the open where it is gone, as a share of half its
+        height. Half of its plastic would put it at the surface, and noise is averaged over a
+        stretch.
+    gone_by_both, sure_by_both, most_share
+        Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel
+        beside a silhouette lets rays run past a wall: by both together, rays bounded, and surer
+        somewhere.
+    gone_again, least_again_mm, same_layer_mm
+        In a layer of which a stretch is gone others need less, and may be shorter; but rays alone
+        do not do: between thin walls of infill they say "open" of many.
+    below_line_mm, wall_mm, most_shift_mm, upright_wall
+        The walls that tell how far in a line stands: so far below the last lines' middles and so
+        deep, as far off as a part shrinks and no farther, and upright (cosine).
+    wall_cells, least_wall_cells, beside_wall_mm, same_wall
+        Of so many cells near a line those of the nearest wall (cosine), a few at least.
+    about, top_share
+        Cells about a look that are asked for its line's top; how near to it, as a share of half a
+        line.
+    """
+
+    look_step_mm: float = 0.25
+    looks_together: int = 5
+    least_stretch_mm: float = 1.5
+    joined_mm: float = 1e-3
+    straight_on: float = 0.7
+    gone_share: float = 0.4
+    gone_by_both: float = 0.5
+    sure_by_both: float = 0.65
+    most_share: float = 1.5
+    gone_again: float = 0.35
+    least_again_mm: float = 1.0
+    same_layer_mm: float = 0.05
+    below_line_mm: float = 0.1
+    wall_mm: float = 2.0
+    most_shift_mm: float = 0.35
+    upright_wall: float = 0.4
+    wall_cells: int = 12
+    least_wall_cells: int = 4
+    beside_wall_mm: float = 1.5
+    same_wall: float = 0.7
+    about: int = 6
+    top_share: float = 1.0
+
+
+USUAL_SKIPPED = SkippedOptions()
+"""What the deficit goes by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +124,9 @@ class RegionOptions:
         So many windows tell by how much means wander: enough for a few per cent.
     spacing_mm
         Template surface points are asked for so far apart.
-    occupancy
-        How space around broken surface is labelled where no rays tell.
+    background, surfels, evidence
+        What is not the part, how the scan is condensed, and how space around broken surface is
+        known.
     top_k
         How many of the highest scores make the object score (PASDF: 1000).
     """
@@ -85,7 +149,9 @@ class RegionOptions:
     least_cells: int = 30
     most_windows: int = 3000
     spacing_mm: float = 0.6
-    occupancy: OccupancyOptions = field(default_factory=OccupancyOptions)
+    background: BackgroundOptions = field(default_factory=BackgroundOptions)
+    surfels: SurfelOptions = field(default_factory=SurfelOptions)
+    evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     top_k: int = 1000
 
     def __post_init__(self) -> None:

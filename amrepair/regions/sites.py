@@ -14,7 +14,6 @@ from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.near import nearest_within
 from amrepair.frames import unit_vectors
 from amrepair.observe.background import (
-    MAX_EXCESS_MM,
     ON_PLANE_MM,
     background,
     refuse_wrong_scale,
@@ -118,14 +117,14 @@ def observed(
         asked = None if images is not None else beside.submit(range_images, scan)
         f_mm = template.distance(scan.points_mm)
         surface_mm, normals = surface or template.surface_points(options.spacing_mm)
-        keep = ~background(scan, template, f_mm, surface_mm)
+        keep = ~background(scan, template, f_mm, surface_mm, options.background)
         if scan.edge is not None:  # pixels that hang between two surfaces lie on neither
             keep &= scan.edge & FLYING == 0
         if without:
             assert scan.view_index is not None
             keep &= ~np.isin(scan.view_index, without)
-        _refuse_nothing_near(scan, keep)
-        surfels = make_surfels(scan.points_mm, f_mm, keep)
+        _refuse_nothing_near(scan, keep, options.background.most_excess_mm)
+        surfels = make_surfels(scan.points_mm, f_mm, keep, options.surfels)
         seen = images or () if asked is None else asked.result()
         if without and seen:
             assert scan.sensors_mm is not None
@@ -145,10 +144,10 @@ def _refuse_other_frame(scan: Scan) -> None:
         )
 
 
-def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"]) -> None:
+def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"], within_mm: float) -> None:
     if not keep.any():
         raise InputError(
-            f"no point of the scan {scan.source} lies within {MAX_EXCESS_MM:g} mm of the "
+            f"no point of the scan {scan.source} lies within {within_mm:g} mm of the "
             "template; check its frame, its unit and that it shows this part"
         )
 

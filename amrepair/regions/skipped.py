@@ -14,31 +14,10 @@ from scipy.spatial import cKDTree
 
 from amrepair.field.as_built import SOLID_MM, Evidence
 from amrepair.regions import skipped_kernels as kernels
+from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
 from amrepair.template.port import Template
 
-LOOK_STEP_MM = 0.25
-LOOKS_TOGETHER = 5  # along a line that are judged together: a millimetre and a quarter
-LEAST_STRETCH_MM = 1.5  # shorter stretches are seams and corners
-# A line goes on in the next that begins where it ends, unless it turns there by more than 45°: that
-# is a corner, and plastic cuts it.
-JOINED_MM, STRAIGHT_ON = 1e-3, 0.7
 LEVEL = 1e-9
-# How far the middle of a bead lies in the open where it is gone, as a share of half its height.
-# Half of its plastic would put it at the surface, and noise is averaged over a stretch.
-GONE_SHARE = 0.4
-# Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel beside
-# a silhouette lets rays run past a wall: by both together, rays bounded, and surer somewhere.
-GONE_BY_BOTH, SURE_BY_BOTH, MOST_SHARE = 0.5, 0.65, 1.5
-# In a layer of which a stretch is gone others need less, and may be shorter; but rays alone do not
-# do: between thin walls of infill they say "open" of many.
-GONE_AGAIN, LEAST_AGAIN_MM, SAME_LINE_LAYER_MM = 0.35, 1.0, 0.05
-# The walls that tell how far in a line stands: so far below the last lines' middles and so deep,
-# upright, as far off as a part shrinks and no farther; of so many cells near a line those of the
-# nearest wall, a few at least.
-BELOW_LINE_MM, WALL_MM, MOST_SHIFT_MM, UPRIGHT_WALL = 0.1, 2.0, 0.35, 0.4
-WALL_CELLS, LEAST_WALL_CELLS, BESIDE_WALL_MM, SAME_WALL = 12, 4, 1.5, 0.7
-# Cells about a look that are asked for its line's top; how near to it, as a share of half a line.
-ABOUT, TOP_SHARE = 6, 1.0
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
 
 
@@ -79,10 +58,10 @@ class PlannedBeads:
             self.start_mm[which], self.end_mm[which], self.width_mm[which], self.height_mm[which]
         )
 
-    def samples_mm(self) -> Float[np.ndarray, "p 3"]:
-        """(p, 3) places along the middles of their tops, `LOOK_STEP_MM` apart."""
+    def samples_mm(self, step_mm: float) -> Float[np.ndarray, "p 3"]:
+        """(p, 3) places along the middles of their tops, at most so far apart."""
         length_mm = np.linalg.norm(self.end_mm - self.start_mm, axis=1)
-        count = np.ceil(length_mm / LOOK_STEP_MM).astype(np.int64) + 1
+        count = np.ceil(length_mm / step_mm).astype(np.int64) + 1
         line = np.repeat(np.arange(len(count)), count)
         step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
         share = step / np.maximum(count[line] - 1, 1)
@@ -103,7 +82,12 @@ class PlannedBeads:
         )
 
 
-def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> PlannedBeads:
+def skipped(
+    beads: PlannedBeads,
+    evidence: Evidence,
+    template: Template,
+    options: SkippedOptions = USUAL_SKIPPED,
+) -> PlannedBeads:
     """Stretches of beads that are not there.
 
     Parameters
@@ -113,7 +97,7 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     evidence
         Of a scan whose sensors are known; without rays nothing is said.
     """
-    paths = _Paths.of(beads)
+    paths = _Paths.of(beads, options)
     lines, line = paths.lines, paths.line
     if not evidence.has_rays or not len(line):
         return lines.some(np.zeros(len(lines.width_mm), dtype=bool))
@@ -123,7 +107,7 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
     # rays alone cost little; only where they say "open" walls and surfaces are asked, too
     rays_mm = evidence.rays_say(middle)
     ask = np.flatnonzero(rays_mm > 0)
-    middle[ask] += _wall_shift(middle[ask], evidence, template)
+    middle[ask] += _wall_shift(middle[ask], evidence, template, options)
     rays_mm[ask] = evidence.rays_say(middle[ask])
     ask = ask[rays_mm[ask] > 0]
     by_surface = np.full(len(middle), -1.0)  # what nobody looked into is there
@@ -133,24 +117,24 @@ def skipped(beads: PlannedBeads, evidence: Evidence, template: Template) -> Plan
         looked_into = told_mm > SOLID_MM + 1e-6
         known = ask[looked_into]
         surface = np.clip(told_mm[looked_into] / half_mm[known], -1.0, 1.0)
-        rays = np.clip(rays_mm[known] / half_mm[known], -1.0, MOST_SHARE)
+        rays = np.clip(rays_mm[known] / half_mm[known], -1.0, options.most_share)
         by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
         by_both[known[_topped(middle[known], half_mm[known], lines.width_mm[line[known]],
-                              evidence)]] = -1.0  # fmt: skip
-    surface_says = _together(by_surface, paths.path)
-    sure = surface_says >= GONE_SHARE
-    both = _together(by_both, paths.path)
-    gone = sure | (both >= GONE_BY_BOTH)
-    sure |= both >= SURE_BY_BOTH
-    found = paths.stretches(gone, sure, np.full(len(line), LEAST_STRETCH_MM))
+                              evidence, options)]] = -1.0  # fmt: skip
+    surface_says = _together(by_surface, paths.path, options.looks_together)
+    sure = surface_says >= options.gone_share
+    both = _together(by_both, paths.path, options.looks_together)
+    gone = sure | (both >= options.gone_by_both)
+    sure |= both >= options.sure_by_both
+    found = paths.stretches(gone, sure, np.full(len(line), options.least_stretch_mm))
     if not len(found.width_mm):
         return found
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
-    again = (np.abs(high_mm[:, None] - slipped_mm) < SAME_LINE_LAYER_MM).any(axis=1)
-    likely = again[line] & (both >= GONE_AGAIN)
+    again = (np.abs(high_mm[:, None] - slipped_mm) < options.same_layer_mm).any(axis=1)
+    likely = again[line] & (both >= options.gone_again)
     sure |= likely & (surface_says > 0)
-    least_mm = np.where(again[line], LEAST_AGAIN_MM, LEAST_STRETCH_MM)
+    least_mm = np.where(again[line], options.least_again_mm, options.least_stretch_mm)
     return paths.stretches(gone | likely, sure, least_mm)
 
 
@@ -178,22 +162,22 @@ class _Paths:
     share: Float[np.ndarray, " m"]
 
     @classmethod
-    def of(cls, beads: PlannedBeads) -> _Paths:
-        """Paths of beads in the order in which they are laid, looked at every `LOOK_STEP_MM`."""
+    def of(cls, beads: PlannedBeads, options: SkippedOptions) -> _Paths:
+        """Paths of beads in the order in which they are laid, looked at step by step."""
         over = beads.end_mm - beads.start_mm
         length_mm = np.linalg.norm(over, axis=1)
         begins = np.ones(len(length_mm), dtype=bool)
-        joined = np.abs(beads.start_mm[1:] - beads.end_mm[:-1]).max(axis=1) < JOINED_MM
+        joined = np.abs(beads.start_mm[1:] - beads.end_mm[:-1]).max(axis=1) < options.joined_mm
         along = np.einsum("ij,ij->i", over[1:], over[:-1])
-        begins[1:] = ~joined | (along < STRAIGHT_ON * length_mm[1:] * length_mm[:-1])
+        begins[1:] = ~joined | (along < options.straight_on * length_mm[1:] * length_mm[:-1])
         path = np.cumsum(begins) - 1
-        keep = np.bincount(path, length_mm)[path] >= LEAST_STRETCH_MM if len(path) else begins
+        keep = np.bincount(path, length_mm)[path] >= options.least_stretch_mm
         lines, length_mm = beads.some(keep), length_mm[keep]
         path = np.unique(path[keep], return_inverse=True)[1]
         ends_mm = np.concatenate([[0.0], np.cumsum(length_mm)])
         first = np.searchsorted(path, np.arange(path.max(initial=-1) + 1))
         path_mm = np.bincount(path, length_mm)
-        count = np.ceil(path_mm / LOOK_STEP_MM).astype(np.int64)
+        count = np.ceil(path_mm / options.look_step_mm).astype(np.int64)
         of = np.repeat(np.arange(len(count)), count)
         number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
         step_mm = (path_mm / np.maximum(count, 1))[of]
@@ -236,7 +220,10 @@ class _Paths:
 
 
 def _wall_shift(
-    middle_mm: Float[np.ndarray, "m 3"], evidence: Evidence, template: Template
+    middle_mm: Float[np.ndarray, "m 3"],
+    evidence: Evidence,
+    template: Template,
+    options: SkippedOptions,
 ) -> Float[np.ndarray, "m 3"]:
     """How much farther in than planned the walls below and beside each look stand.
 
@@ -248,26 +235,26 @@ def _wall_shift(
     shift = np.zeros_like(middle_mm)
     if not len(middle_mm):
         return shift
-    low_mm = float(middle_mm[:, 2].max()) - BELOW_LINE_MM
+    low_mm = float(middle_mm[:, 2].max()) - options.below_line_mm
     which = np.flatnonzero(
         (s.place_mm[:, 2] < low_mm)
-        & (s.place_mm[:, 2] > low_mm - WALL_MM)
-        & (np.abs(s.deviation_mm) < MOST_SHIFT_MM)
+        & (s.place_mm[:, 2] > low_mm - options.wall_mm)
+        & (np.abs(s.deviation_mm) < options.most_shift_mm)
     )
     if not len(which):
         return shift
     outward = template.distance_and_gradient(s.place_mm[which])[1]
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    wall = np.abs(outward[:, 2]) < UPRIGHT_WALL
+    wall = np.abs(outward[:, 2]) < options.upright_wall
     which, outward = which[wall], outward[wall, :2]
     if not len(which):
         return shift
     near = cKDTree(s.place_mm[which, :2]).query(
-        middle_mm[:, :2], k=WALL_CELLS, distance_upper_bound=BESIDE_WALL_MM
+        middle_mm[:, :2], k=options.wall_cells, distance_upper_bound=options.beside_wall_mm
     )[1]
     outward = np.vstack([outward, np.zeros(2)])[near]  # no neighbour is of no wall
-    same = np.einsum("akx,ax->ak", outward, outward[:, 0]) > SAME_WALL
-    ask = np.flatnonzero(same.sum(axis=1) >= LEAST_WALL_CELLS)
+    same = np.einsum("akx,ax->ak", outward, outward[:, 0]) > options.same_wall
+    ask = np.flatnonzero(same.sum(axis=1) >= options.least_wall_cells)
     deviation_mm = np.append(s.deviation_mm[which], 0.0)[near[ask]]
     farther_mm = np.nanmedian(np.where(same[ask], deviation_mm, np.nan), axis=1)
     shift[ask, :2] = np.minimum(farther_mm, 0.0)[:, None] * outward[ask, 0]
@@ -279,27 +266,28 @@ def _topped(
     half_mm: Float[np.ndarray, " m"],
     width_mm: Float[np.ndarray, " m"],
     evidence: Evidence,
+    options: SkippedOptions,
 ) -> Bool[np.ndarray, " m"]:
     """Looks at which something was seen at the line's own top: there it is, however rounded."""
     top_mm = middle_mm + half_mm[:, None] * np.array([0.0, 0.0, 1.0])
-    distance, near = evidence.surfels.tree.query(top_mm, k=ABOUT)
+    distance, near = evidence.surfels.tree.query(top_mm, k=options.about)
     height_mm = np.append(evidence.surfels.place_mm[:, 2], np.inf)[near]  # inf: no such neighbour
     low_mm = np.abs(top_mm[:, 2:] - height_mm)
-    at_top = (distance < 0.5 * width_mm[:, None]) & (low_mm < TOP_SHARE * half_mm[:, None])
+    at_top = (distance < 0.5 * width_mm[:, None]) & (low_mm < options.top_share * half_mm[:, None])
     return np.asarray(at_top.any(axis=1))
 
 
 def _together(
-    value: Float[np.ndarray, " m"], path: Int[np.ndarray, " m"]
+    value: Float[np.ndarray, " m"], path: Int[np.ndarray, " m"], together: int
 ) -> Float[np.ndarray, " m"]:
-    """(m,) the best mean of `LOOKS_TOGETHER` neighbours on one path that each belongs to."""
+    """(m,) the best mean of so many neighbours on one path that each belongs to."""
     m = len(value)
     whole = np.full(m, -np.inf)
-    if m < LOOKS_TOGETHER:
+    if m < together:
         return whole
     total = np.concatenate([[0.0], np.cumsum(value)])
-    mean = (total[LOOKS_TOGETHER:] - total[:-LOOKS_TOGETHER]) / LOOKS_TOGETHER
-    mean[path[LOOKS_TOGETHER - 1 :] != path[: m - LOOKS_TOGETHER + 1]] = -np.inf
-    for k in range(LOOKS_TOGETHER):
+    mean = (total[together:] - total[:-together]) / together
+    mean[path[together - 1 :] != path[: m - together + 1]] = -np.inf
+    for k in range(together):
         np.maximum(whole[k : k + len(mean)], mean, out=whole[k : k + len(mean)])
     return np.where(value > 0, whole, -np.inf)  # an end that is there does not belong to it

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from amrepair.align import AlignOptions
+from amrepair.deficit.options import DeficitOptions
+from amrepair.regions.options import RegionOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +32,8 @@ class RepairOptions:
         A part stands upright where its Z is the bed's: 1 − cos of 0.05 mm over 100 mm.
     same_repair_ratio
         Two poses whose repairs share less than this are two different repairs.
+    align, regions, deficit
+        Of each stage. What the process may leave, and how far it wanders, is the site's.
     """
 
     planned_edge_mm: float = 1.0
@@ -39,6 +45,9 @@ class RepairOptions:
     open_cell_margin_mm: float = 0.0
     upright: float = 1e-7
     same_repair_ratio: float = 0.8
+    align: AlignOptions = field(default_factory=AlignOptions)
+    regions: RegionOptions = field(default_factory=RegionOptions)
+    deficit: DeficitOptions = field(default_factory=DeficitOptions)
 
 
 USUAL_REPAIR = RepairOptions()

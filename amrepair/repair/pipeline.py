@@ -18,7 +18,6 @@ from amrepair.frames import Transform
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.calibration import of_touches
-from amrepair.regions.options import RegionOptions
 from amrepair.repair import in_view
 from amrepair.repair.filling import fillable, lines_of, refuse_ambiguity
 from amrepair.repair.plan import RepairPlan
@@ -163,7 +162,14 @@ def _align(
             registration = Registration.known(known)
         else:
             outer = in_view.outside_open_infill(scan, site, guess)
-            registration = align(outer, site.template, guess=guess, rng=rng, progress=progress)
+            registration = align(
+                outer,
+                site.template,
+                guess=guess,
+                options=site.options.align,
+                rng=rng,
+                progress=progress,
+            )
     placed = site.stands_at(scan, registration)
     if site.printed_z_mm is None:
         said = site.build_from_template is not None or guess is not None
@@ -186,8 +192,10 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
     return site.detector(
         laid.judged,
         site.expected,
-        options=RegionOptions(
-            allowance_mm=site.allowance_mm, process_sigma_mm=site.process_sigma_mm
+        options=replace(
+            site.options.regions,
+            allowance_mm=site.allowance_mm,
+            process_sigma_mm=site.process_sigma_mm,
         ),
         calibration=site.calibration,
         top_z_mm=in_view.top_of_layer(site),
@@ -208,6 +216,7 @@ def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -
         build_from_template=laid.placed,
         printed_z_mm=site.printed_z_mm,
         as_built=None if site.planned is None else partial(_stands, laid, anomaly, site),
+        options=site.options.deficit,
         beads=site.beads,
         progress=progress,
     )
@@ -225,6 +234,7 @@ def _stands(laid: _Laid, anomaly: AnomalyMap, site: Site) -> HeightField:
         printed_z_mm=site.printed_z_mm,
         cell_mm=site.options.as_built_cell_mm,
         unseen_margin_mm=site.options.open_cell_margin_mm,
+        options=site.options.deficit.heights,
         images=evidence.images,
     )
 

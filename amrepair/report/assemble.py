@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from amrepair.loop import LoopReport
+from amrepair.loop.afterwards import Afterwards
 from amrepair.repair import RepairPlan
 from amrepair.report.collect import (
     decision_of,
@@ -48,6 +49,7 @@ def report_of_plan(
     setup: PrintSetup,
     template: Template,
     scan_name: str = "",
+    late: Afterwards | None = None,
 ) -> ReportData:
     """The page of one planned repair.
 
@@ -55,6 +57,8 @@ def report_of_plan(
     ----------
     result
         Of `plan_result`.
+    late
+        What stays open inside, where the part's job is at hand.
     """
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     enough = plan_is_enough(plan)
@@ -67,7 +71,7 @@ def report_of_plan(
         setup={"scan": scan_name or Path(plan.scan.source).name, **_profiles(setup)},
         expected=solid_mesh(solid.transform(placed.matrix[:3])),
         regions=region_rows(plan),
-        decisions=(decision_of_plan(plan, enough=enough),),
+        decisions=(decision_of_plan(plan, enough=enough, late=late),),
         seconds=result["seconds"],
         provenance=versions(setup),
     )

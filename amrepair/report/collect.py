@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float
 
 from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
+from amrepair.loop.afterwards import Afterwards
 from amrepair.loop.findings import reach_of
 from amrepair.loop.learning import to_json
-from amrepair.observe.background import BACKGROUND_BAND_MM
+from amrepair.observe.options import USUAL_BACKGROUND
 from amrepair.policy.table import FINDINGS, STOP_ROWS
 from amrepair.regions import Label
 from amrepair.repair import RepairPlan
@@ -212,8 +213,9 @@ def plan_result(
     seed: int | None,
     seconds: Mapping[str, float],
     setup: PrintSetup,
+    late: Afterwards | None = None,
 ) -> dict[str, Any]:
-    """The keys of a result of `repair`: planned, not printed."""
+    """The keys of a result of `repair`: planned, not printed; `late` where its job is at hand."""
     result = {
         **plan_figures([plan], None),
         "repaired_ratio": None,
@@ -227,6 +229,10 @@ def plan_result(
         "rmse_mm": plan.registration.rmse_mm,
         "inlier_ratio": plan.registration.inlier_ratio,
     }
+    if late is not None:
+        result["buried_mm3"] = late.buried_mm3
+        result["ways"] = [way.to_json() for way in late.ways]
+        result["not_again"] = late.not_again or None
     return dict(rounded(result))
 
 
@@ -289,7 +295,7 @@ def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
     foot_mm = (
         float(anomaly.template_points_mm[:, 2].min()) if len(anomaly.template_points_mm) else 0
     )
-    flat = plan.scan.points_mm[:, 2] < foot_mm + BACKGROUND_BAND_MM
+    flat = plan.scan.points_mm[:, 2] < foot_mm + USUAL_BACKGROUND.band_mm
     outside = anomaly.deviation_mm > anomaly.threshold_mm
     far = anomaly.deviation_mm > STRAY_LIMITS * anomaly.threshold_mm
     return ~(((flat & outside) | far) & (anomaly.label == int(Label.OK)))
@@ -360,7 +366,7 @@ _REPORTED_RULES = tuple(
 )
 
 
-def decision_of_plan(plan: RepairPlan, *, enough: bool) -> Decision:
+def decision_of_plan(plan: RepairPlan, *, enough: bool, late: Afterwards | None = None) -> Decision:
     """What a single planned repair comes to, and why."""
     if plan.checked is None:
         choice = "nothing to print" if enough else "no repair"
@@ -373,6 +379,7 @@ def decision_of_plan(plan: RepairPlan, *, enough: bool) -> Decision:
         reasons.append(f"{small} smaller than is worth a repair, left as it is.")
     if plan.checked is not None:
         reasons.append("The program has passed the checker, against what stands there.")
+    reasons += [_sentence(line) for line in (late.told if late is not None else ())]
     return Decision("as scanned", choice, tuple(reasons))
 
 

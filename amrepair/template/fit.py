@@ -18,24 +18,13 @@ from scipy import ndimage
 from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.grid_kernels import NOBODY, carry, near_triangles
 from amrepair.template.mesh_sdf import MeshSdf
+from amrepair.template.options import USUAL_FIT, FitOptions
 from amrepair.template.signs import signed_grid, signs_in_blocks
 from amrepair.template.surface import sample_surface
 from gcode.progress import Progress, silent
 
 FIT_VERSION = 3  # raised where the same mesh gives another template: cached ones are fitted again
-GRID_CELLS = 128  # along the longest side, at least
-# Long and flat parts have flat boxes: as many nodes as a stocky part's, in smaller cells.
-STOCKY_RATIO = 0.5  # of the cube over the longest side
-MOST_DIVIDED = 4.0  # times as many cells along it
-TEMPLATE_MARGIN_RATIO = 6.0 / 128.0  # of the longest side, around the part
-EXACT_CELLS = 2.0  # nearer nodes are measured against every triangle
-FINE = 4  # a cell that bends is divided into so many along each edge
-SAMPLES = 300_000
 AT_ONCE = 100_000  # distances: a second of a large mesh
-HELD_OUT_POINTS = 40_000
-BAND_CELLS = 1.0  # the field is looked at this far around the surface
-LEAST_RESIDUAL_MM = 0.008  # cells where the grid is better than this are left as they are
-MAX_BLOCKS = 120_000  # 60 MB; the worst cells go first
 
 
 def fit_fast(
@@ -44,6 +33,7 @@ def fit_fast(
     seed: int = 0,
     least_residual_mm: float = 0.0,
     metadata: dict[str, str] | None = None,
+    options: FitOptions = USUAL_FIT,
     progress: Progress = silent,
 ) -> GridSdf:
     """Fit a template to an exact field.
@@ -55,34 +45,35 @@ def fit_fast(
     seed
         Of the points where the grid is compared with it.
     least_residual_mm
-        Cells where the grid is better than this, or than `LEAST_RESIDUAL_MM`, are not divided: for
+        Cells where the grid is better than this, or than the options', are not divided: for
         meshes that are no truer than that themselves.
     """
     rng = np.random.default_rng(seed)
     low, high = exact.bounds_mm
-    margin = TEMPLATE_MARGIN_RATIO * float((high - low).max())
-    cell = _cell_mm(high - low, margin)
+    margin = options.margin_ratio * float((high - low).max())
+    cell = _cell_mm(high - low, margin, options)
     origin = low - margin
     shape = np.ceil((high - low + 2 * margin) / cell).astype(int) + 1
-    base = _base(exact, origin, cell, shape, progress)
+    base = _base(exact, origin, cell, shape, options, progress)
     bare = Grid.bare(origin, cell, base)
-    points = _samples(exact, SAMPLES, BAND_CELLS * cell, rng)
+    points = _samples(exact, options.samples, options.band_cells * cell, rng)
     residual = np.abs(
         _in_parts(exact.distance, points, "fit: compare", progress) - bare.distance(points)
     )
-    cells = _bent(bare, points, residual, max(LEAST_RESIDUAL_MM, least_residual_mm))
-    grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, progress))
-    held = _on_surface(exact, HELD_OUT_POINTS, rng)
+    least_mm = max(options.least_residual_mm, least_residual_mm)
+    cells = _bent(bare, points, residual, least_mm, options)
+    grid = Grid.refined(origin, cell, base, cells, _blocks(exact, bare, cells, options, progress))
+    held = _on_surface(exact, options.held_out, rng)
     bias_mm = float(np.quantile(np.abs(grid.distance(held)), 0.99))
     return GridSdf(grid=grid, mesh=exact.mesh, bias_mm=bias_mm, metadata=metadata or {})
 
 
-def _cell_mm(size_mm: Float[np.ndarray, " 3"], margin_mm: float) -> float:
+def _cell_mm(size_mm: Float[np.ndarray, " 3"], margin_mm: float, options: FitOptions) -> float:
     """Edge of a cell: the longest side over its cells, or smaller where nodes are left."""
-    largest = float(size_mm.max()) / GRID_CELLS
-    nodes = STOCKY_RATIO * GRID_CELLS**3
+    largest = float(size_mm.max()) / options.cells
+    nodes = options.stocky_ratio * options.cells**3
     as_stocky = float(np.cbrt(np.prod(size_mm + 2 * margin_mm) / nodes))
-    return min(largest, max(as_stocky, largest / MOST_DIVIDED))
+    return min(largest, max(as_stocky, largest / options.most_divided))
 
 
 def _base(
@@ -90,6 +81,7 @@ def _base(
     origin: Float[np.ndarray, " 3"],
     cell: float,
     shape: np.ndarray,
+    options: FitOptions,
     progress: Progress,
 ) -> Float[np.ndarray, "x y z"]:
     """(x, y, z) distances at the nodes, float32: exact near the surface.
@@ -104,7 +96,7 @@ def _base(
     ac = np.ascontiguousarray(corners[:, 2] - a)
     dots = np.stack([(u * v).sum(axis=1) for u, v in ((ab, ab), (ab, ac), (ac, ac))], axis=1)
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
-    squared, which = near_triangles(a, ab, ac, dots, origin, cell, size, EXACT_CELLS * cell)
+    squared, which = near_triangles(a, ab, ac, dots, origin, cell, size, options.exact_cells * cell)
     near = which != NOBODY
     sweeps = list(itertools.product((1, -1), repeat=3))
     for done, way in enumerate(sweeps, 1):
@@ -149,34 +141,40 @@ def _bent(
     points: Float[np.ndarray, "n 3"],
     residual: Float[np.ndarray, " n"],
     least_mm: float,
+    options: FitOptions,
 ) -> Int[np.ndarray, "b 3"]:
     """(b, 3) cells where the coarse grid is not good enough, and their neighbours."""
     worst = np.zeros(bare.block_of.shape)
     np.maximum.at(worst, tuple(bare.cell_of(points).T), residual)
     wrong = ndimage.binary_dilation(worst > least_mm)
     cells = np.argwhere(wrong)
-    if len(cells) > MAX_BLOCKS:
+    if len(cells) > options.most_blocks:
         around = ndimage.maximum_filter(worst, 3)[tuple(cells.T)]
-        cells = cells[np.sort(np.argsort(-around, kind="stable")[:MAX_BLOCKS])]
+        cells = cells[np.sort(np.argsort(-around, kind="stable")[: options.most_blocks])]
     return cells
 
 
 def _blocks(
-    exact: MeshSdf, bare: Grid, cells: Int[np.ndarray, "b 3"], progress: Progress
+    exact: MeshSdf,
+    bare: Grid,
+    cells: Int[np.ndarray, "b 3"],
+    options: FitOptions,
+    progress: Progress,
 ) -> Float[np.ndarray, "b r r r"]:
     """(b, r+1, r+1, r+1) exact distances; nodes that blocks share are asked once."""
-    inner = np.stack(np.meshgrid(*[np.arange(FINE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    nodes = (cells[:, None, :] * FINE + inner).reshape(-1, 3)
-    extent = np.array(bare.base.shape) * FINE
+    fine = options.fine
+    inner = np.stack(np.meshgrid(*[np.arange(fine + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    nodes = (cells[:, None, :] * fine + inner).reshape(-1, 3)
+    extent = np.array(bare.base.shape) * fine
     key = (nodes[:, 0] * extent[1] + nodes[:, 1]) * extent[2] + nodes[:, 2]
     first, back = np.unique(key, return_index=True, return_inverse=True)[1:]
-    where = bare.origin_mm + nodes[first] * (bare.cell_mm / FINE)
+    where = bare.origin_mm + nodes[first] * (bare.cell_mm / fine)
     size = _in_parts(exact.unsigned_distance, where, "fit: details", progress).astype(np.float32)
-    blocks = size[back].reshape(len(cells), *[FINE + 1] * 3)
+    blocks = size[back].reshape(len(cells), *[fine + 1] * 3)
     ends = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1)
     corners = np.moveaxis(cells[:, None, None, None, :] + ends, -1, 0)
     corner_sign = np.sign(bare.base[tuple(corners)]).astype(np.int8)
-    sign = signs_in_blocks(blocks, corner_sign, bare.cell_mm / FINE)
+    sign = signs_in_blocks(blocks, corner_sign, bare.cell_mm / fine)
     asked = np.unique(back[sign.ravel() == 0])
     side = np.zeros(len(first), dtype=np.int8)
     side[asked] = np.where(exact.inside(where[asked]), -1, 1)

@@ -22,6 +22,7 @@ from amrepair.template.mesh_file import load_mesh, require_mesh
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.network import NETWORK_KIND as NETWORK
 from amrepair.template.network import PaperSdf
+from amrepair.template.options import USUAL_FIT, FitOptions
 from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions, fit_paper
 from gcode.progress import Progress, silent
 
@@ -35,6 +36,7 @@ def fit_template(
     source: Path | str | trimesh.Trimesh | Sequence[Path],
     *,
     recipe: str = "fast",
+    fast: FitOptions = USUAL_FIT,
     paper: PaperOptions = PUBLISHED_NETWORK,
     device: str = "auto",
     seed: int = 0,
@@ -46,8 +48,8 @@ def fit_template(
     ----------
     source
         A mesh or its file, mm; made watertight where that leaves the shape in no doubt.
-    paper
-        Settings of the recipe `paper`.
+    fast, paper
+        Settings of the recipes.
     device
         Where the recipe `paper` trains; the fast one needs no torch.
 
@@ -83,7 +85,7 @@ def fit_template(
         return fit_paper(
             exact, options=paper, device=device, seed=seed, metadata=metadata, progress=progress
         )
-    return fit_fast(exact, seed=seed, metadata=metadata, progress=progress)
+    return fit_fast(exact, seed=seed, metadata=metadata, options=fast, progress=progress)
 
 
 def made_from(closed: trimesh.Trimesh, recipe: str, seed: int) -> dict[str, str]:

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
+from amrepair.template.options import USUAL_MESH, MeshOptions
 from gcode.solids import (
-    MESH_READ_ERRORS,
     SOLID_SUFFIXES,
     are_closed,
     as_manifold,
@@ -27,6 +27,7 @@ from gcode.solids import (
     read_triangles,
     unite_overlaps,
 )
+from gcode.surfaces.sizes import PARSER_ERRORS, in_words
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,13 +38,6 @@ class OpenMeshError(TemplateError):
 
 
 _log = logging.getLogger(__name__)
-
-# Cracks narrower than this share of the extent are closed: 0.01 mm on a part of 100 mm.
-SEW_RATIO = 1e-4
-LEAST_PART_MM = 1.0  # a printer that prints smaller ones lays no beads
-MAX_LID_EDGES = 32  # a larger hole has a shape that we do not know
-# More open edges than this share of all edges is a bag of polygons, not a surface with a hole.
-MAX_OPEN_EDGE_RATIO = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +65,7 @@ def file_sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def load_mesh(path: Path | str) -> trimesh.Trimesh:
+def load_mesh(path: Path | str, options: MeshOptions = USUAL_MESH) -> trimesh.Trimesh:
     """Read a mesh and make it watertight where that leaves its shape in no doubt.
 
     Parameters
@@ -93,13 +87,13 @@ def load_mesh(path: Path | str) -> trimesh.Trimesh:
     """
     path = Path(path)
     mesh = read_mesh(path)
-    if (across_mm := float(np.linalg.norm(mesh.extents))) < LEAST_PART_MM:
+    if (across_mm := float(np.linalg.norm(mesh.extents))) < options.least_part_mm:
         raise TemplateError(
             f"the mesh {path.name} is {across_mm:.3g} mm across, and no part is smaller than "
-            f"{LEAST_PART_MM:g} mm; coordinates are millimetres: was it exported in metres? Scale "
-            "it by 1000"
+            f"{options.least_part_mm:g} mm; coordinates are millimetres: was it exported in "
+            "metres? Scale it by 1000"
         )
-    closed, notes = close_mesh(mesh, source=path.name)
+    closed, notes = close_mesh(mesh, source=path.name, options=options)
     for note in notes:
         _log.warning("%s: %s", path.name, note)
     closed.metadata["notes"] = notes
@@ -126,11 +120,10 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
         )
     try:
         vertices, faces = read_triangles(path)
-    except MESH_READ_ERRORS as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+    except PARSER_ERRORS as error:
         raise TemplateError(
-            f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} ({reason}); "
-            "export it again"
+            f"the mesh {path.name} cannot be read as {path.suffix[1:].upper()} "
+            f"({in_words(error)}); export it again"
         ) from error
     if len(faces) == 0:
         raise TemplateError(f"the mesh {path.name} has no triangles; export it again")
@@ -154,7 +147,9 @@ def manifold_arrays(solid: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarra
     return np.ascontiguousarray(vertices), np.asarray(mesh.tri_verts).astype(np.int64)
 
 
-def close_mesh(mesh: trimesh.Trimesh, *, source: str) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
+def close_mesh(
+    mesh: trimesh.Trimesh, *, source: str, options: MeshOptions = USUAL_MESH
+) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
     """Weld, orient and close a mesh; returns it with the sentences that say what was mended.
 
     Raises
@@ -173,7 +168,7 @@ def close_mesh(mesh: trimesh.Trimesh, *, source: str) -> tuple[trimesh.Trimesh, 
         if len(faces) == 0:
             what = "only triangles without area"
             raise TemplateError(f"the mesh {source} has {what}; export it again")
-        solid = _mend(trimesh.Trimesh(vertices, faces, process=False), source, notes)
+        solid = _mend(trimesh.Trimesh(vertices, faces, process=False), source, notes, options)
     solid = _orient(solid, notes)
     solid, overlap_mm3 = unite_overlaps(solid)
     if overlap_mm3 > 0:
@@ -202,15 +197,15 @@ def _refuse_flat(solid: Any, extent_mm: float, source: str) -> None:
         )
 
 
-def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str]) -> Any:
+def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str], options: MeshOptions) -> Any:
     """Drop doubled faces, fix the winding, fill small holes; refuse what is left open."""
     import trimesh
 
     before = edge_census(np.asarray(mesh.faces))
-    if before.open_ratio > MAX_OPEN_EDGE_RATIO:
+    if before.open_ratio > options.most_open_ratio:
         raise OpenMeshError(
             f"the mesh {source} is a soup of polygons: {before.open} of {before.total} edges are "
-            f"open ({before.open_ratio:.0%}, the limit is {MAX_OPEN_EDGE_RATIO:.0%}); "
+            f"open ({before.open_ratio:.0%}, the limit is {options.most_open_ratio:.0%}); "
             "export a closed solid"
         )
     mesh.update_faces(mesh.unique_faces())
@@ -219,9 +214,9 @@ def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str]) -> Any:
     trimesh.repair.fix_normals(mesh, multibody=True)  # type: ignore[no-untyped-call]
     solid = as_manifold(mesh.vertices, mesh.faces)
     if not is_valid(solid):
-        solid = _sewn(mesh)
+        solid = _sewn(mesh, options)
     if not is_valid(solid):
-        solid = as_manifold(mesh.vertices, _with_lids(np.asarray(mesh.faces)))
+        solid = as_manifold(mesh.vertices, _with_lids(np.asarray(mesh.faces), options))
     if not is_valid(solid):
         after = edge_census(np.asarray(mesh.faces))
         raise OpenMeshError(
@@ -238,7 +233,7 @@ def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str]) -> Any:
     return solid
 
 
-def _with_lids(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
+def _with_lids(faces: Int[np.ndarray, "f 3"], options: MeshOptions) -> Int[np.ndarray, "g 3"]:
     """Faces with a fan of triangles over every small loop of open edges."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     both = {(int(a), int(b)) for a, b in edges}
@@ -251,7 +246,7 @@ def _with_lids(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
     while following:
         first = next(iter(following))
         loop = [first]
-        while len(loop) <= MAX_LID_EDGES and loop[-1] in following:
+        while len(loop) <= options.most_lid_edges and loop[-1] in following:
             ends = following[loop[-1]]
             step = ends.pop()
             if not ends:
@@ -265,7 +260,7 @@ def _with_lids(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
     return np.concatenate([faces, np.array(lids, dtype=faces.dtype).reshape(-1, 3)])
 
 
-def _sewn(mesh: trimesh.Trimesh) -> Any:
+def _sewn(mesh: trimesh.Trimesh, options: MeshOptions) -> Any:
     """Open edges that lie on each other within a hair's breadth, sewn together."""
     import manifold3d as m3
 
@@ -273,7 +268,7 @@ def _sewn(mesh: trimesh.Trimesh) -> Any:
     sewn = m3.Mesh64(
         np.array(mesh.vertices, dtype=np.float64, order="C"),
         np.array(mesh.faces, dtype=np.uint64, order="C"),
-        tolerance=SEW_RATIO * extent_mm,
+        tolerance=options.sew_ratio * extent_mm,
     )
     sewn.merge()
     same = np.arange(len(mesh.vertices))

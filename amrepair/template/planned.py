@@ -17,14 +17,8 @@ from jaxtyping import Bool, Float
 from amrepair.errors import TemplateError
 from amrepair.template import planned_kernels as kernels
 from amrepair.template.cut import CutTemplate
+from amrepair.template.options import USUAL_PLANNED, PlannedOptions
 from amrepair.template.port import Template
-
-DEPTH_MM = 4.0
-MARGIN_MM = 3.0
-# Below its lowest beads nothing is planned: the bed is there, or what was looked at before.
-BELOW_BEADS_MM = 1.5
-LEAST_VOXEL_MM, MOST_VOXEL_MM = 0.1, 0.25
-MAX_PLANNED_VOXELS = 60_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +50,7 @@ class PlannedSdf:
         section_mm2: Float[np.ndarray, " n"],
         height_mm: Float[np.ndarray, " n"],
         *,
-        depth_mm: float = DEPTH_MM,
+        options: PlannedOptions = USUAL_PLANNED,
     ) -> PlannedSdf:
         """Make the field of beads.
 
@@ -75,26 +69,28 @@ class PlannedSdf:
         if len(start_mm) == 0:
             raise TemplateError("there are no beads to make a planned template of")
         top_mm = float(np.maximum(start_mm[:, 2], end_mm[:, 2]).max())
-        near = np.minimum(start_mm[:, 2], end_mm[:, 2]) > top_mm - depth_mm - 1e-6
+        near = np.minimum(start_mm[:, 2], end_mm[:, 2]) > top_mm - options.depth_mm - 1e-6
         start, end = start_mm[near], end_mm[near]
         height = np.ascontiguousarray(height_mm[near])
         width = section_mm2[near] / np.maximum(height, 1e-6)
-        voxel_mm = float(np.clip(np.median(height), LEAST_VOXEL_MM, MOST_VOXEL_MM))
+        voxel_mm = float(np.clip(np.median(height), options.least_voxel_mm, options.most_voxel_mm))
         reach = 0.5 * float(width.max())
         low = np.minimum(start, end).min(axis=0) - [reach, reach, 0.0]
         low[2] = (np.minimum(start[:, 2], end[:, 2]) - height).min()
         high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
         # The voxels are placed so that faces of theirs lie on the last layer's top.
         levels = int(np.ceil((top_mm - low[2]) / voxel_mm - 1e-6))
-        above, below = (int(np.ceil(margin / voxel_mm)) for margin in (MARGIN_MM, BELOW_BEADS_MM))
+        margin_mm = options.margin_mm
+        above = int(np.ceil(margin_mm / voxel_mm))
+        below = int(np.ceil(options.below_beads_mm / voxel_mm))
         foot_mm = top_mm - levels * voxel_mm
-        origin = np.array([low[0] - MARGIN_MM, low[1] - MARGIN_MM, foot_mm - below * voxel_mm])
-        size = np.ceil((high[:2] + MARGIN_MM - origin[:2]) / voxel_mm).astype(int)
+        origin = np.array([low[0] - margin_mm, low[1] - margin_mm, foot_mm - below * voxel_mm])
+        size = np.ceil((high[:2] + margin_mm - origin[:2]) / voxel_mm).astype(int)
         shape = (int(size[0]), int(size[1]), below + levels + above)
-        if np.prod([float(n) for n in shape]) > MAX_PLANNED_VOXELS:
+        if np.prod([float(n) for n in shape]) > options.most_voxels:
             raise TemplateError(
                 f"a planned template of {shape[0]}×{shape[1]}×{shape[2]} voxels is over the limit "
-                f"of {MAX_PLANNED_VOXELS:,}; look at fewer copies at once"
+                f"of {options.most_voxels:,}; look at fewer copies at once"
             )
         solid = np.zeros(shape, dtype=bool)
         kernels.fill(

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from gcode.check.findings import Touch
 from gcode.check.motion import PLACE_SLACK_MM
+from gcode.moves import Program
 from gcode.profiles import ProbeProfile
 
 TOUCH_COMMANDS = {"marlin": "G38.2", "reprap": "G38.2", "klipper": "AMREPAIR_TOUCH"}
@@ -19,6 +20,15 @@ to forty places some millimetres around, and lowers the nozzle to 2 mm above the
 (Z_PROBE_LOW_POINT, offset_for_probe_try, Z_AFTER_PROBING), wherever the part's top is.
 """
 FASTEST_TOUCH_MM_S = 4.0  # Z_PROBE_FEEDRATE_FAST of Marlin's Configuration.h
+
+
+def touch_lines(program: Program) -> list[int]:
+    """Which lines of a program are touches."""
+    command = TOUCH_COMMANDS.get(program.dialect)
+    if command is None or command not in program.text:
+        return []
+    lines = program.text.split("\n")
+    return [k for k, line in enumerate(lines) if line.startswith(command + " ")]
 
 
 def planned_at(touches: Sequence[Touch], place: Sequence[float | None]) -> Touch | None:

@@ -110,21 +110,14 @@ def job_of(path: Path, setup: PrintSetup) -> Job:
     return job_for(program_text(path), setup.printer)
 
 
-def grid_of(job: Path | None, setup: PrintSetup) -> LayerGrid:
-    """Layers of a job's file; without one, those of the process profile.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
+def grid_of(job: Job | None, setup: PrintSetup) -> LayerGrid:
+    """Layers of a job; without one, those of the process profile."""
     from gcode.slicing.layers import LayerGrid
 
     if job is None:
         return LayerGrid.from_setup(setup)
     return LayerGrid.from_tops(
-        [layer.z_mm for layer in job_of(job, setup).layers],
-        layer_height_mm=setup.process.layer_height_mm,
+        [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
     )
 
 

@@ -16,6 +16,7 @@ from gcode.cli.options import (
     PrinterOption,
     ProcessOption,
     grid_of,
+    job_of,
     standing_on_bed,
 )
 from gcode.errors import InputError
@@ -153,7 +154,7 @@ def _patch(
     with bars.stage("read solid"):
         shape, moved_mm = _placed(read_solid(solid), setup, place)
     field = standing_on_bed(around[0], setup.printer)
-    grid = grid_of(around[1], setup)
+    grid = grid_of(None if around[1] is None else job_of(around[1], setup), setup)
     plan = slice_patch(shape, setup, as_built=field, grid=grid, standalone=True, progress=bars)
     left = (*plan.unreachable, *plan.unprintable)
     program = _written(plan.toolpath, setup, solid, left, bars)

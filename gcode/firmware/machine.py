@@ -171,6 +171,7 @@ class Machine(Mechanics):
                 self.replies.append(f"// amrepair: touched at z={z_mm:.4f}")
             else:
                 self.replies.append("!! No trigger on probe after full movement")
+                self.replies.append("// amrepair: nothing was touched")
 
         self._feel_down_to(self.z - depth_mm, speed_mm_s, stopped)
 

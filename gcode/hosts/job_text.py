@@ -21,6 +21,11 @@ class JobText:
         """How many lines end in the file."""
         return len(self._lines) - 1
 
+    @property
+    def rows(self) -> list[str]:
+        """The lines, as text."""
+        return [line.decode("utf-8", "replace").rstrip("\r") for line in self._lines[: self.lines]]
+
     def start(self, line: int) -> int:
         """The byte that a line begins with."""
         return self._starts[line]

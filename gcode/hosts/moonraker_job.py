@@ -10,16 +10,19 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+from gcode.check.touches import TOUCH_COMMANDS
 from gcode.errors import LinkError, PrinterError
 from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.moonraker_session import MoonrakerSession
-from gcode.hosts.port import PrintableProgram
+from gcode.hosts.port import NothingMetError, PrintableProgram
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
-from gcode.progress import Progress
+from gcode.hosts.web import LIFT_COMMANDS
+from gcode.progress import Progress, silent
 
 METHOD = "amrepair_call"
 STEP_MACRO = "_AMREPAIR_STEP"
+TOUCH_KEY = f"gcode_macro {TOUCH_COMMANDS['klipper']}"
 STEP_LINES = 40
 """Lines a script: some seconds of moves, which Klipper has queued long before they are made."""
 WRITTEN_S = 3.0
@@ -212,6 +215,43 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
                 "the nozzle is, is not known, and the print cannot be gone on with."
             )
 
+    # ------------------------------------------------------------------ touches
+
+    def require_touches(self) -> None:
+        """Refuse a printer without the macro that bounds the depth of PROBE."""
+        self._touches()
+
+    def touch(
+        self, checked: PrintableProgram, lines: range, *, progress: Progress = silent
+    ) -> float:
+        """Carry out lines, the last of them a touch; where it met something, mm in G-code's Z."""
+        before, _ = self._asked(self._touches)
+        try:
+            self.print(checked, lines=lines, progress=progress)
+        except PrinterError as error:
+            if self._asked(self._rest)[0]:
+                self.heaters_off()
+                self.command("\n".join(LIFT_COMMANDS))
+            raise NothingMetError(f"{error}") from error
+        count, met_mm = self._asked(self._touches)
+        if count != before + 1:
+            raise PrinterError(
+                f"{self.address.name} tells of {count - before} touches where one was made; is its "
+                "macro AMREPAIR_TOUCH of this version?"
+            )
+        return met_mm
+
+    def _touches(self) -> tuple[int, float]:
+        """How many touches have met something since Klipper began, and where the last has."""
+        told = self._session.query({TOUCH_KEY: None}).get(TOUCH_KEY, {})
+        if "met" not in told:
+            raise LinkError(
+                f"the printer behind {self.address.name} has no macro AMREPAIR_TOUCH of this "
+                "version; write it by 'gcode touch --klipper-macro FILE', include it in "
+                "printer.cfg and restart Klipper."
+            )
+        return int(told["count"]), float(told["met"])
+
     # ------------------------------------------------------------------ pause, safety
 
     def pause(self) -> None:
@@ -239,8 +279,9 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
         if state.busy:
             if not self._rest()[0]:
                 return
-            now = self.temperatures()
-            for name, value in (("hotend", now.hotend_target_c), ("bed", now.bed_target_c or 0)):
+            now, (hotend_c, bed_c) = self.temperatures(), self._heat_at_look
+            was = {"hotend": now.hotend_target_c or hotend_c, "bed": now.bed_target_c or bed_c}
+            for name, value in was.items():
                 if value:
                     self.command(_set_step(name, round(value)))
         super().heaters_off()

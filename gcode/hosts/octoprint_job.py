@@ -17,6 +17,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+from jaxtyping import Int
+
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.job_text import JobText
 from gcode.hosts.modes import commands_of
@@ -24,6 +27,7 @@ from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.octoprint_session import OctoPrintSession
 from gcode.hosts.octoprint_state import part_of
 from gcode.hosts.port import PrintableProgram
+from gcode.hosts.rewritten import Rewritten
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
 from gcode.hosts.web import json_object, sentence
 from gcode.progress import Progress
@@ -186,7 +190,26 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
         return False
 
     def _go_on(self, line: int, first: int) -> None:
-        self._tell("go_on", behind=self._text.start(first) if first != line else 0)
+        behind = self._text.start(first) if first != line else 0
+        self._tell("go_on", behind=behind, edits=self._edits(max(line, first)))
+
+    def rewrite(self, rest: PrintableProgram, line_of: Int[np.ndarray, " m"]) -> None:
+        """From where the nozzle rests, have this program printed in the place of the job's rest."""
+        self._rest_anew = Rewritten(rest, line_of)
+        self._edits(0)  # refused before anything goes on
+
+    def _edits(self, line: int) -> list[tuple[int, int, list[str]]]:
+        """Bytes of the file, and what is sent in the place of its commands there, from a line on.
+
+        Commands are known by the byte behind their line.
+        """
+        if self._rest_anew is None:
+            return []
+        return [
+            (self._text.start(e.first), self._text.start(e.end), list(e.commands))
+            for e in self._rest_anew.edits(self._text.rows)
+            if e.first >= line
+        ]
 
     def _how_it_ended(self, end: int) -> bool | None:
         told = part_of(self._asked_about, "print")
@@ -271,7 +294,12 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
         self._tell("off")
 
     def leave(self, way_back: Sequence[PrintableProgram]) -> None:
-        """What leads back to the job, for somebody who lets it go on without us."""
+        """What leads back to the job, for somebody who lets it go on without us.
+
+        None to a job that is written anew: only we know what stands there.
+        """
+        if self._rest_anew is not None:
+            return
         lines = [
             text
             for one in way_back

@@ -10,7 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from gcode.errors import LinkError
+import numpy as np
+from jaxtyping import Int
+
+from gcode.errors import LinkError, PrinterError
 from gcode.moves import Program
 from gcode.progress import Progress, silent
 
@@ -86,6 +89,10 @@ class LeavesOut(Protocol):
 
     def leave_out(self, name: str) -> None:
         """Print nothing more of an object, whose name is the job's."""
+
+
+class NothingMetError(PrinterError):
+    """A touch ended where it was to end, and met nothing; heaters are off, the nozzle is lifted."""
 
 
 class LinkLostError(LinkError):
@@ -202,3 +209,43 @@ class Printer(Protocol):
     def heaters_off(self) -> None:
         """Switch hotend, bed and fan off."""
         ...
+
+
+@runtime_checkable
+class TellsTouches(Printer, Protocol):
+    """A printer whose server tells where a touch ended."""
+
+    def require_touches(self) -> None:
+        """Refuse a printer that knows no touches.
+
+        Raises
+        ------
+        LinkError
+            With what it lacks.
+        """
+
+    def touch(
+        self, checked: PrintableProgram, lines: range, *, progress: Progress = silent
+    ) -> float:
+        """Carry out lines, the last of them a touch; where it met something, mm in G-code's Z.
+
+        Raises
+        ------
+        PrinterError
+            If it met nothing: the nozzle is lifted then, and the heaters are off.
+        """
+
+
+@runtime_checkable
+class GoesOnAnew(Printer, Protocol):
+    """A printer whose server prints the job, and takes what is left of it as written anew."""
+
+    def rewrite(self, rest: PrintableProgram, line_of: Int[np.ndarray, " m"]) -> None:
+        """From where the nozzle rests, have this program printed in the place of the job's rest.
+
+        Parameters
+        ----------
+        line_of
+            (m + 1,) by line of the job, and its end: the program's line that stands for it; below
+            0 before what is written anew.
+        """

@@ -10,6 +10,7 @@ on and to count is in `moonraker_job` and `octoprint_job`.
 from __future__ import annotations
 
 import hashlib
+import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -18,16 +19,20 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 from urllib.parse import quote
 
+from gcode.check.touches import touch_lines
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.job_text import JobText
 from gcode.hosts.modes import Modes, commands_of, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
 from gcode.hosts.proof import require_checked
 from gcode.hosts.rejoin import require_as_left
+from gcode.hosts.rewritten import Rewritten
 from gcode.hosts.server import ServerPrinter, Session
 from gcode.progress import Progress, silent
 
 AGENT = "amrepair"
+LIFT_MM_MIN, GO_MM_MIN = 600, 6000
+"""As a pause's way back (`modes`)."""
 Answer = TypeVar("Answer")
 
 
@@ -52,8 +57,12 @@ class ServedJob(ServerPrinter[Session]):
     """
 
     _job_text: JobText | None = None
+    _rest_anew: Rewritten | None = None
+    """What is printed in the place of the job's last lines."""
     _name = _sha256 = ""
     _joining = False
+    _heat_at_look = (0.0, 0.0)
+    """What hotend and bed were set to as the job came to rest; 0 where that is not known."""
     _held_back: threading.Event
 
     # ------------------------------------------------------------------ of each server
@@ -147,7 +156,7 @@ class ServedJob(ServerPrinter[Session]):
     def follow(self, name: str, data: bytes) -> int:
         """Serve this job from now on; returns the first line that a look can still stand before."""
         self._name, self._job_text, self._sha256 = name, self._text_of(data), ""
-        self._joining = False
+        self._joining, self._rest_anew = False, None
         self._session.state.follow(name)
         self._refresh()
         rests, line = self._rest()
@@ -179,21 +188,16 @@ class ServedJob(ServerPrinter[Session]):
         with self._session.news:
             self._session.news.wait(wait_s)
 
+    def _is_the_jobs(self, checked: PrintableProgram) -> bool:
+        """Whether the server prints it from the job's file."""
+        anew = "" if self._rest_anew is None else self._rest_anew.checked.program.sha256
+        return checked.program.sha256 in {self._sha256, anew}
+
     @property
     def _text(self) -> JobText:
         if self._job_text is None:
             raise LinkError("no job is followed; call follow() first.")
         return self._job_text
-
-    def leave_out(self, name: str) -> None:
-        """Have the server print nothing more of an object.
-
-        Raises
-        ------
-        LinkError
-            If it cannot.
-        """
-        raise LinkError(f"{self.address.name} cannot leave the object {name!r} out of its print.")
 
     # ------------------------------------------------------------------ printing
 
@@ -209,9 +213,14 @@ class ServedJob(ServerPrinter[Session]):
         start_s = self._clock()
         lines = range(checked.program.text.count("\n")) if lines is None else lines
         ok, end = True, lines.stop
+        anew = self._rest_anew
         if checked.program.sha256 == self._sha256:
             ok = self._print_on(lines.start, lines.stop, progress)
             end = lines.stop if ok else self._rest()[1]
+        elif anew is not None and checked.program.sha256 == anew.checked.program.sha256:
+            end = self._text.lines if end >= anew.total else anew.theirs(end)
+            ok = self._print_on(anew.theirs(lines.start), end, progress)
+            end = lines.stop if ok else anew.ours(self._rest()[1])
         else:
             first = lines.start
             if self._joining:
@@ -239,6 +248,8 @@ class ServedJob(ServerPrinter[Session]):
             progress("printing", float(min(line, end) - first), float(end - first))
             if rests and self._text.is_look(line):
                 if line == end:
+                    now = self._asked(self.temperatures)
+                    self._heat_at_look = (now.hotend_target_c, now.bed_target_c or 0.0)
                     return True
                 if line < end:
                     self._go_on(line, max(first, line))
@@ -266,22 +277,25 @@ class ServedJob(ServerPrinter[Session]):
             If the machine is not as it was left.
         """
         self._joining = True
-        if not sent or (sent[-1][0].program.sha256 == self._sha256 and not sent[-1][3]):
+        if not sent or (self._is_the_jobs(sent[-1][0]) and not sent[-1][3]):
             return  # the server has it in hand
         checked, first, end, done = sent[-1]
         self._asked(self._settled)
-        end = end if done else self._reached_at_rest(checked, range(first, end))
+        anew = not done and bool(
+            touch_lines(checked.program)
+        )  # they lay nothing, and are made again
+        if not done:
+            end = first if anew else self._reached_at_rest(checked, range(first, end))
+        sent = [*sent[:-1], (checked, first, end, done)]
         modes = Modes()
-        for program, start, stop in (*(row[:3] for row in sent[:-1]), (checked, first, end)):
-            modes = modes_after(program, stop, program.program.dialect, first=start, modes=modes)
-        if checked.program.sha256 == self._sha256 or end == first:
+        for program, start, stop, _ in sent:
+            modes = _after(program, start, stop, modes)
+        if anew:
+            self._joining = False
+            self._lift_to(modes)
+        elif self._is_the_jobs(checked) or end == first:
             modes.position_mm.clear()  # the server's own pause has parked it somewhere
-        hotend_c, bed_c = self._heat_of_before()
-        now = self.temperatures()
-        if bed_c and not now.bed_target_c:
-            self.command(f"M140 S{bed_c:g}")
-        if hotend_c and not now.hotend_target_c:
-            self.command(f"M109 S{hotend_c:g}")
+        self._heat_as_left(sent)
 
         def refuse(why: str) -> ResumeRefusedError:
             return ResumeRefusedError(
@@ -289,6 +303,33 @@ class ServedJob(ServerPrinter[Session]):
             )
 
         require_as_left(self, modes, refuse, release_c=release_c, pose_confirmed=pose_confirmed)
+
+    def _lift_to(self, modes: Modes) -> None:
+        """Straight up from a touch to where the touches began, and there."""
+        place = modes.position_mm
+        if not set("XYZ") <= set(place) or not self._rest()[0]:
+            raise LinkError(
+                f"where the nozzle is over {self._name} on {self.address.name} is not known: it "
+                "was left in the midst of touches."
+            )
+        self.command(f"G90\nG1 Z{place['Z']:.3f} F{LIFT_MM_MIN}")
+        self.command(f"G1 X{place['X']:.3f} Y{place['Y']:.3f} F{GO_MM_MIN}\nM400")
+
+    def _heat_as_left(self, sent: Sequence[tuple[PrintableProgram, int, int, bool]]) -> None:
+        """Heat again what was switched off since; a nozzle that was cooled on purpose stays so."""
+        of_job, at_look = Modes(), Modes(hotend_c=math.nan)
+        for program, first, end, _ in sent:
+            if self._is_the_jobs(program):
+                of_job, at_look = _after(program, first, end, of_job), Modes(hotend_c=math.nan)
+            else:
+                at_look = _after(program, first, end, at_look)
+        hotend_c, bed_c = self._heat_of_before()
+        self._heat_at_look = (hotend_c or of_job.hotend_c, bed_c or of_job.bed_c)
+        now = self.temperatures()
+        if bed_c and not now.bed_target_c:
+            self.command(f"M140 S{bed_c:g}")
+        if hotend_c and not now.hotend_target_c and at_look.hotend_c != 0:
+            self.command(f"M109 S{hotend_c:g}")
 
     def _asked(self, ask: Callable[[], Answer]) -> Answer:
         """Ask; a server that went away gets time to come back."""
@@ -322,3 +363,7 @@ class ServedJob(ServerPrinter[Session]):
 def number_of(checked: PrintableProgram) -> int:
     """What the other side's count calls a program."""
     return int(hashlib.sha256(checked.program.sha256.encode()).hexdigest()[:12], 16)
+
+
+def _after(program: PrintableProgram, first: int, end: int, modes: Modes) -> Modes:
+    return modes_after(program, end, program.program.dialect, first=first, modes=modes)

@@ -13,15 +13,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gcode.check import CheckedProgram
-from gcode.check.touches import TOUCH_COMMANDS
+from gcode.check.touches import TOUCH_COMMANDS, touch_lines
 from gcode.dialects import number
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.hosts.port import NothingMetError, TellsTouches
 from gcode.hosts.serial import SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.resumption.touch import Touching
 
 _TOUCHED = re.compile(r"(?://\s*)?amrepair: touched at z=(-?\d+\.\d+)")
 """What the macro AMREPAIR_TOUCH says; Klipper's own answers differ by its version."""
+_TOUCHED_NOTHING = re.compile(r"(?://\s*)?amrepair: nothing was touched")
+"""What it says once it has put Z right after that."""
+HEARD_S = 0.1
+"""By then Klipper has carried out what was due when a touch had failed."""
 REPORTED_MM = 0.01
 """Marlin tells a position in two digits."""
 
@@ -109,7 +114,7 @@ def tell_z(printer: SerialPrinter, z_mm: float) -> None:
 
 
 def felt(
-    printer: SerialPrinter,
+    printer: SerialPrinter | TellsTouches,
     checked: CheckedProgram,
     *,
     at_contact: Callable[[], None] = lambda: None,
@@ -128,29 +133,22 @@ def felt(
         If nothing is felt down to where a touch was to end, or the firmware does not know touches;
         heaters are off then, and the nozzle is lifted.
     """
-    command = TOUCH_COMMANDS[checked.program.dialect]
     lines = checked.program.text.split("\n")
     felt_mm: list[float] = []
     first = 0
-    for index, line in enumerate(lines):
-        if not line.startswith(command + " "):
-            continue
-        printer.said.clear()
+    for index in touch_lines(checked.program):
         try:
-            report = printer.print(checked, lines=range(first, index + 1), progress=progress)
-        except PrinterError as error:
-            _forget_z(printer, command)
+            if isinstance(printer, SerialPrinter):
+                met_mm = _met_mm(printer, checked, range(first, index + 1), progress)
+            else:
+                met_mm = printer.touch(checked, range(first, index + 1), progress=progress)
+        except NothingMetError as error:
             raise PrinterError(
-                f"Nothing was felt down to {line.split()[1].replace('DEPTH=', '')} mm, where the "
-                f"touch was to end ({error}); the nozzle was lifted and the heaters are off: the "
-                f"probe does not trigger, or what it was to feel is farther below."
+                f"Nothing was felt {_how_deep(lines[index])}, where the touch was to end "
+                f"({f'{error}'.rstrip('.')}); the nozzle was lifted and the heaters are off: the "
+                "probe does not trigger, or what it was to feel is farther below."
             ) from error
-        if not report.ok:
-            raise PrinterError(
-                f"The touches were stopped after {len(felt_mm)}; the nozzle was lifted and the "
-                f"heaters are off."
-            )
-        felt_mm.append(_met_mm(printer, report.warnings, command))
+        felt_mm.append(met_mm)
         at_contact()
         first = index + 1
     # not to its very end: that is for whoever sends the last of a job, and lets go of the motors
@@ -159,16 +157,30 @@ def felt(
     return felt_mm
 
 
-def _forget_z(printer: SerialPrinter, command: str) -> None:
-    """Klipper's Z is still the one that the macro lowered: it must be homed before it moves."""
-    if command == TOUCH_COMMANDS["klipper"]:
-        with contextlib.suppress(LinkError, LocalProtocolError):
-            printer.command("SET_KINEMATIC_POSITION CLEAR_HOMED=Z")
+def _how_deep(line: str) -> str:
+    """Where a touch was to end: Klipper's macro is told how far, G38.2 where to."""
+    word = line.split()[1]
+    if word.startswith("DEPTH="):
+        return f"within {word.removeprefix('DEPTH=')} mm"
+    return f"down to {word} mm"
 
 
-def _met_mm(printer: SerialPrinter, warnings: tuple[str, ...], command: str) -> float:
-    """Where the touch that was just made ended."""
-    if any(command in text for text in warnings):
+def _met_mm(
+    printer: SerialPrinter, checked: CheckedProgram, lines: range, progress: Progress
+) -> float:
+    """Carry out lines, the last of them a touch; where that ended."""
+    command = TOUCH_COMMANDS[checked.program.dialect]
+    printer.said.clear()
+    try:
+        report = printer.print(checked, lines=lines, progress=progress)
+    except PrinterError as error:
+        _forget_z(printer, command)
+        raise NothingMetError(f"{error}") from error
+    if not report.ok:
+        raise PrinterError(
+            "The touches were stopped; the nozzle was lifted and the heaters are off."
+        )
+    if any(command in text for text in report.warnings):
         printer.make_safe()
         how = (
             "write its macro by 'gcode touch --klipper-macro FILE' and include it in printer.cfg"
@@ -189,3 +201,14 @@ def _met_mm(printer: SerialPrinter, warnings: tuple[str, ...], command: str) -> 
             "version? The nozzle was lifted and the heaters are off."
         )
     return float(said[-1].group(1))
+
+
+def _forget_z(printer: SerialPrinter, command: str) -> None:
+    """Klipper's Z may still be the one that the macro lowered: then it must be homed to move."""
+    if command != TOUCH_COMMANDS["klipper"]:
+        return
+    with contextlib.suppress(LinkError, LocalProtocolError):
+        printer.command(f"G4 P{1000 * HEARD_S:.0f}")
+        printer.command("M400")
+        if not any(_TOUCHED_NOTHING.fullmatch(text.strip()) for text in printer.said):
+            printer.command("SET_KINEMATIC_POSITION CLEAR_HOMED=Z")

@@ -78,11 +78,12 @@ def left_over(
     left = np.clip(wanted - state.laid_mm, 0.0, None)
     # a film below the thinnest bead is the tolerance, not out of reach
     left = np.where(left > LEAST_THICK_MM + AGREE_MM, left, 0.0)
-    # nor is what lies under a step of the job's staircase, or over it
+    # nor is what lies under a step of the job's staircase, or over it; what was given up under a
+    # line that hangs is
     done = (state.surface_mm >= state.done_mm - AGREE_MM) & (
         state.done_mm > model.top_mm - STAIRCASE_MM
     )
-    left = np.where(done, 0.0, left)
+    left = np.where(done, np.minimum(left, state.sunk_mm), left)
     unreachable: list[Unreachable] = []
     lost = list(state.lost)
     regions: list[PatchRegion] = []

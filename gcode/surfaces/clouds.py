@@ -6,6 +6,7 @@ before anything is made for it. Packed forms (`binary_compressed` PCD, images) a
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.errors import InputError
+
+_log = logging.getLogger(__name__)
 
 CLOUD_SUFFIXES = frozenset({".ply", ".pcd", ".xyz", ".txt", ".csv", ".asc"})
 MOST_BYTES = 2 * 2**30
@@ -34,7 +37,8 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
     Returns
     -------
-    (n, 3) places in the file's own frame, mm; those that are not finite are left out.
+    (n, 3) places in the file's own frame, mm; those that are not finite, as in
+    the gaps of a range image, are left out, which is logged.
 
     Raises
     ------
@@ -63,7 +67,13 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
         raise InputError(
             f"{path} cannot be read as a point cloud ({what}); export it anew."
         ) from error
-    points = points[np.isfinite(points).all(axis=1)]
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        _log.warning(
+            "%s: %d of %d points are not finite numbers (NaN or infinity) and count as not seen",
+            path.name, int((~finite).sum()), len(points),
+        )  # fmt: skip
+    points = points[finite]
     if len(points) < LEAST_CLOUD_POINTS:
         raise InputError(
             f"{path} has {len(points)} points; {LEAST_CLOUD_POINTS} are the least that shows a "

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from jaxtyping import Bool, Float, Int
 
 from gcode.errors import InputError
@@ -247,6 +246,8 @@ class HeightField:
                 path, origin_mm=self.origin_mm, cell_mm=self.cell_mm, z_mm=self.z_mm, seen=self.seen
             )
         elif suffix in {".tif", ".tiff"}:
+            import tifffile
+
             tifffile.imwrite(path, shown, description=json.dumps(placement))
         elif suffix == ".npy":
             np.save(path, shown)

@@ -11,13 +11,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import tifffile
+from typing import TYPE_CHECKING, Any
 
 from gcode.errors import InputError
 
-# What the libraries that read meshes, images and archives are known to raise on damaged files.
+if TYPE_CHECKING:
+    import tifffile
+
+# What the libraries that read meshes, images and archives are known to raise on damaged files;
+# tifffile's own error is a ValueError.
 PARSER_ERRORS = (
     ArithmeticError,
     AssertionError,
@@ -36,7 +38,6 @@ PARSER_ERRORS = (
     TypeError,
     ValueError,
     struct.error,
-    tifffile.TiffFileError,
     zipfile.BadZipFile,
     zlib.error,
 )
@@ -135,6 +136,8 @@ def refuse_swollen_page(path: Path, page: Any, limit: UnpackLimit) -> None:
 @contextmanager
 def quiet_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
     """A TIFF file, opened; what its reader finds odd is told once, by whoever asked."""
+    import tifffile  # a tenth of a second, which whoever reads no images need not wait
+
     said = logging.getLogger("tifffile")
     level = said.level
     said.setLevel(logging.CRITICAL)

@@ -16,6 +16,7 @@ from amrepair.bench.samples import Sample
 from amrepair.errors import InputError
 from amrepair.scans import Scan, write_ply
 from amrepair.template import MeshSdf, fit_template
+from amrepair.template.options import FitOptions
 
 PART = Path(__file__).parents[2] / "examples" / "parts" / "bracket.stl"
 
@@ -24,10 +25,7 @@ PART = Path(__file__).parents[2] / "examples" / "parts" / "bracket.stl"
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rough template: what is refused here does not depend on its details."""
     path = tmp_path_factory.mktemp("template") / "bracket.safetensors"
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("SAMPLES", 20_000), ("GRID_CELLS", 40)):
-            patch.setattr(f"amrepair.template.fit.{name}", value)
-        fit_template(PART).save(path)
+    fit_template(PART, fast=FitOptions(cells=40, samples=20_000)).save(path)
     return path
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from amrepair.align.pam import PUBLISHED_PAM, RELEASED_PAM
+from amrepair.align.options import PUBLISHED_PAM, RELEASED_PAM
 from amrepair.bench.house import repair_distance
 from amrepair.bench.method import ClassInput
 from amrepair.bench.paper import BENCH_PAPER, make_pam_aligner, pam_options

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
 from link_forks import Forks, until
 from loop_children import beads_of
+from probe_children import MENDED
 from probe_job import plate, standing
 
 from amrepair.frames import Transform
@@ -60,13 +62,13 @@ def forks() -> Iterator[Forks]:
 class Bench:
     """A printer with a probe, and one loop after another."""
 
-    def __init__(self, forks: Forks, prepared: Path, folder: Path) -> None:
+    def __init__(self, forks: Forks, prepared: Path, folder: Path, *, dead: bool = False) -> None:
         shutil.copytree(prepared, folder)
         self.forks, self.folder = forks, folder
         self.port, self.record = folder / "port", folder / "executed"
-        forks.printer(
+        self.printer = forks.printer(
             self.port, self.record, printer=(folder / "printer").read_text(),
-            standing=str(folder / "standing.npz"),
+            standing=str(folder / "standing.npz"), dead=dead,
         )  # fmt: skip
 
     def start(self, *, go_on: bool, die_after: int = 0) -> int:
@@ -123,6 +125,22 @@ def test_killed_while_it_touches_it_goes_on(forks: Forks, prepared: Path, tmp_pa
     assert planned < bench.touched() <= planned + len(tours[0])
     assert not bench.hot_touches()
     assert f"touches: {planned}" in bench.told()
+
+
+def test_a_touch_that_met_nothing_is_gone_on_with(
+    forks: Forks, prepared: Path, tmp_path: Path
+) -> None:
+    """regression: Klipper's Z was forgotten after it: "Must home axis first"."""
+    bench = Bench(forks, prepared, tmp_path / "run", dead=True)
+    assert forks.wait(bench.start(go_on=False)) == 4
+    assert "Nothing was felt " in bench.told()
+    assert bench.touched() == 1
+    after = [k for k, line in enumerate(bench.executed()) if line.startswith(TOUCHES)][-1]
+    assert {"M104 S0", "M140 S0"} <= set(bench.executed()[after:])
+    os.kill(bench.printer, MENDED)
+    tours = bench.finish()
+    assert bench.touched() == 1 + sum(len(tour) for tour in tours)
+    assert not bench.hot_touches()
 
 
 @pytest.mark.slow

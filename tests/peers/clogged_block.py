@@ -35,10 +35,11 @@ retract_length = 0.8
 start_gcode = G28\\nM190 S[first_layer_bed_temperature]\\nM109 S[first_layer_temperature]
 end_gcode = G91\\nG1 Z10 F600\\nG90\\nG1 X10 Y200 F6000\\nM104 S0\\nM140 S0\\nM107
 """
-CLOG_MM = (106.0, 107.0, 2.2, 114.0, 114.0, 3.05)
+CLOG_MM = (106.0, 107.0, 2.3, 114.0, 114.0, 3.05)
 PRUSA_SLICER = shutil.which("prusa-slicer")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 AMREPAIR = (sys.executable, "-m", "amrepair")
+GCODE = (sys.executable, "-m", "gcode")
 
 
 def command(*words: str | Path) -> None:
@@ -50,15 +51,24 @@ def command(*words: str | Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def sliced(folder: Path, *, flavour: str, reads: str) -> Path:
-    """The first two of the user's commands: slice, and put looks in."""
+def sliced(
+    folder: Path,
+    *,
+    flavour: str,
+    reads: str,
+    size_mm: tuple[float, float, float] = (24.0, 20.0, 4.0),
+    at_mm: tuple[str, ...] = ("3",),
+    copies: int = 1,
+) -> Path:
+    """The first two of the user's commands: slice, and put looks in; copies are labelled."""
     part, job, settings = folder / "block.stl", folder / "block.gcode", folder / "slicer.ini"
-    trimesh.creation.box((24.0, 20.0, 4.0)).export(part)
+    trimesh.creation.box(size_mm).export(part)
     settings.write_text(SLICER.format(flavour=flavour))
+    more = ["--duplicate", str(copies), "--gcode-label-objects"] if copies > 1 else []
     command(str(PRUSA_SLICER), "--export-gcode", "--load", settings, "--center", "110,110",
-            "--output", job, part)  # fmt: skip
-    command(*AMREPAIR, "postprocess", "--for", reads, "--every", "0", "--at-z", "3",
-            "--no-final", job)  # fmt: skip
+            *more, "--output", job, part)  # fmt: skip
+    looks = [word for z in at_mm for word in ("--at-z", z)]
+    command(*AMREPAIR, "postprocess", "--for", reads, "--every", "0", *looks, "--no-final", job)
     return job
 
 
@@ -68,8 +78,11 @@ def filament_of(lines: list[str]) -> float:
     return sum(float(found.group(1)) for found in pushed if found is not None)
 
 
-def judge(motion: Path, job: Path, look: str) -> None:
-    """What the firmware executed: the void is filled, and no line of the job came twice."""
+def judge(motion: Path, job: Path, look: str, *, within: float = 0.3) -> None:
+    """What the firmware executed: the void is filled, and no line of the job came twice.
+
+    `within` is for what straddles the void's edges, and what the scanner has not seen.
+    """
     batch = MotionFile(motion).take()
     area_mm2 = np.pi / 4 * 1.75**2
     middle = 0.5 * (batch.start_mm + batch.end_mm)
@@ -78,7 +91,9 @@ def judge(motion: Path, job: Path, look: str) -> None:
     inside = ((middle > low) & (middle < high)).all(axis=1) & level
     clogged_mm3 = float(np.prod(high[:2] - low[:2])) * 0.8  # layers at 2.4 to 3.0 mm
     filled_mm3 = float(batch.filament_mm[inside].sum()) * area_mm2
-    assert filled_mm3 == pytest.approx(clogged_mm3, rel=0.3)  # what straddles its edges
+    told = f"filled {filled_mm3:.1f} of {clogged_mm3:.1f} mm³"
+    print(told)
+    assert filled_mm3 == pytest.approx(clogged_mm3, rel=within), told
     lines = job.read_text().split("\n")
     first = next(k for k, line in enumerate(lines) if line.startswith(look))
     above = batch.end_mm[:, 2] > 3.15

@@ -11,6 +11,7 @@ being six numbers, mm: a box.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import re
 import sys
@@ -22,11 +23,13 @@ import small_klipper
 from klippy_standin import Client, StandIn, serve
 from small_klipper import SmallKlipper
 
+from gcode.errors import PrinterError
 from gcode.hosts import connect
 from gcode.hosts.serial import SerialPrinter
+from gcode.hosts.touching import _TOUCHED
 
 STEP_MM = 1.0  # a bead is cut into pieces so long, each laid or not
-BED_CFG = "gcode_macro _AMREPAIR_STEP"
+COUNTED = ("gcode_macro _AMREPAIR_STEP", "gcode_macro AMREPAIR_TOUCH")
 
 
 class MacroKlipper(StandIn):
@@ -45,8 +48,9 @@ class MacroKlipper(StandIn):
         self.remote: dict[str, dict[Client, dict[str, Any]]] = {}
         self.output: dict[Client, dict[str, Any]] = {}
         self.small = SmallKlipper(
-            gcodes, macros, carry_out=self.hand_on, respond=self.respond, call_remote=self.call_out
-        )
+            gcodes, macros, carry_out=self.hand_on, respond=self.respond,
+            call_remote=self.call_out, feel=self.feel,
+        )  # fmt: skip
 
     def objects(self) -> dict[str, dict[str, Any]]:
         card = {"virtual_sdcard": {"path": str(self.gcodes)}}
@@ -78,6 +82,16 @@ class MacroKlipper(StandIn):
                 words += f" E{float(lays.group(1)) / steps:.6f}"
             self.printer.command(words)
 
+    def feel(self, depth_mm: float, speed_mm_s: float) -> float | None:
+        """The emulated printer's own touch, of what it has laid itself."""
+        self.printer.said.clear()
+        with contextlib.suppress(PrinterError):
+            self.printer.command(f"AMREPAIR_TOUCH DEPTH={depth_mm} SPEED={speed_mm_s}")
+        met = [found for text in self.printer.said if (found := _TOUCHED.search(text))]
+        if not met:
+            return None
+        return self.small.z_mm - float(met[-1].group(1))
+
     def respond(self, text: str) -> None:
         for client, template in list(self.output.items()):
             self.tell(client, {**template, "params": {"response": text}})
@@ -103,7 +117,7 @@ def main() -> None:
     printer = connect(port, dialect="klipper", baud=250000)
     assert isinstance(printer, SerialPrinter)
     printer.connect()
-    klippy_standin.OBJECTS = (*klippy_standin.OBJECTS, BED_CFG)
+    klippy_standin.OBJECTS = (*klippy_standin.OBJECTS, *COUNTED)
 
     async def run() -> None:
         clog_mm = [float(number) for number in sys.argv[5:11]]

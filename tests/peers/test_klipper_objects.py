@@ -1,26 +1,22 @@
-"""A given up object in Klipper itself, from its source, in batch mode: its own EXCLUDE_OBJECT.
+"""A given up object in Klipper itself (`klippy_batch`): its own EXCLUDE_OBJECT.
 
-    AMREPAIR_KLIPPER=~/klipper AMREPAIR_KLIPPER_PYTHON=~/klippy-env/bin/python \\
-        pytest -m peers tests/peers/test_klipper_objects.py
-
-As for `test_klipper_touch`. What the tool head is told to do is written down and held against the
+What the tool head is told to do is written down and held against the
 job: the others as they were, of the given up one nothing more.
 """
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import klippy_batch
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
 from loop_bench import LAYER, PLACE_MM
 from objects_job import Block, labelled, plate
-from test_klipper_touch import AXIS, KLIPPER, PYTHON
 
 from amrepair.loop.objects import Objects
 from amrepair.loop.travel import park, way_back
@@ -33,42 +29,13 @@ from gcode.resumption.standing import standing_field
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 
-pytestmark = [
-    pytest.mark.peers,
-    pytest.mark.skipif(not KLIPPER, reason="AMREPAIR_KLIPPER names no Klipper source"),
-]
+pytestmark = klippy_batch.MARKS
 BLOCKS = [Block(14.0 * k, 0.0, (8.0, 8.0, 1.2)) for k in range(3)]
 FAILED = "BLOCK_1"
 SETUP = load_setup("generic_klipper", "pla", "repair_0.20")
 NOISE_MM = 1e-4  # digits of the program, and of what is printed here
 
-RUN = f"""
-import runpy, sys
-root = {KLIPPER!r} + "/klippy"
-sys.path.insert(0, root)
-import gcode, toolhead
-respond = gcode.GCodeDispatch.respond_raw
-def say(self, text):
-    print("SAID", text, flush=True)
-    respond(self, text)
-gcode.GCodeDispatch.respond_raw = say
-move = toolhead.ToolHead.move
-def told(self, place, speed):
-    print("MOVE", *(f"{{v:.5f}}" for v in place[:4]))
-    return move(self, place, speed)
-toolhead.ToolHead.move = told
-folder = sys.argv[1]
-sys.argv = [root + "/klippy.py", folder + "/printer.cfg", "-i", folder + "/job.gcode",
-            "-o", folder + "/out", "-d", {KLIPPER!r} + "/out/klipper.dict", "-l", folder + "/log"]
-runpy.run_path(root + "/klippy.py", run_name="__main__")
-"""
-CONFIG = """
-[mcu]
-serial: /tmp/none
-[printer]
-kinematics: cartesian
-max_velocity: 300
-max_accel: 3000
+CONFIG = """\
 [exclude_object]
 [extruder]
 step_pin: gpio21
@@ -116,22 +83,12 @@ class Told:
 
 def klippy(folder: Path, lines: list[str]) -> Told:
     """What Klipper makes of a program."""
-    folder.mkdir()
-    axes = [
-        AXIS.format(axis=axis, pin=4 * k + 1, dir=4 * k + 2, stop=4 * k + 3, turn=turn, low=-5)
-        for k, (axis, turn) in enumerate([("x", 40), ("y", 40), ("z", 8)])
-    ]
-    (folder / "printer.cfg").write_text(CONFIG + "".join(axes))
-    (folder / "job.gcode").write_text("\n".join(lines) + "\n")
-    done = subprocess.run(
-        [PYTHON, "-c", RUN, str(folder)], capture_output=True, text=True, timeout=250, check=False
-    )
-    rows = done.stdout.splitlines()
-    said = [row[5:] for row in rows if row.startswith("SAID ")]
+    rows = klippy_batch.klippy(folder, CONFIG, lines, lowest_mm=-5)
+    said = klippy_batch.said(rows)
     wrong = [row for row in said if row.startswith("!!") or "nknown command" in row]
     assert not wrong, wrong[:3]
     moves = np.array([row.split()[1:] for row in rows if row.startswith("MOVE ")], dtype=float)
-    assert len(moves) > 100, done.stdout[-2000:] + done.stderr[-2000:]
+    assert len(moves) > 100, rows[-20:]
     return Told(said, moves)
 
 

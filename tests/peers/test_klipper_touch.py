@@ -1,78 +1,21 @@
-"""The macro AMREPAIR_TOUCH in Klipper itself, from its source, in batch mode.
-
-    AMREPAIR_KLIPPER=~/klipper AMREPAIR_KLIPPER_PYTHON=~/klippy-env/bin/python \\
-        pytest -m peers tests/peers/test_klipper_touch.py
-
-`~/klipper` needs `out/klipper.dict` of its own (`make` for the Linux process). In batch mode no pin
-triggers: Klipper takes a probing move to have triggered at its end. So each touch is told to have
-triggered at a share of its way, and what Klipper makes of that is held against arithmetic.
-"""
+"""The macro AMREPAIR_TOUCH in Klipper itself (`klippy_batch`), held against arithmetic."""
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
+import klippy_batch
 import pytest
 
 from gcode.hosts.touching import _TOUCHED
 from gcode.resumption.klipper import TOUCH_MACRO
 
-KLIPPER = os.environ.get("AMREPAIR_KLIPPER", "")
-PYTHON = os.environ.get("AMREPAIR_KLIPPER_PYTHON", sys.executable)
 Z_OFFSET_MM, LOWEST_MM = -0.35, -3.0
-pytestmark = [
-    pytest.mark.peers,
-    pytest.mark.skipif(not KLIPPER, reason="AMREPAIR_KLIPPER names no Klipper source"),
-]
-
-RUN = f"""
-import runpy, sys
-root = {KLIPPER!r} + "/klippy"
-sys.path.insert(0, root)
-import gcode, mcu
-share, folder = float(sys.argv[1]), sys.argv[2]
-respond = gcode.GCodeDispatch.respond_raw
-def say(self, text):
-    print(text, flush=True)
-    respond(self, text)
-gcode.GCodeDispatch.respond_raw = say
-begin, wait = mcu.MCU_endstop.home_start, mcu.MCU_endstop.home_wait
-def home_start(self, print_time, *given, **named):
-    self.begun = print_time
-    return begin(self, print_time, *given, **named)
-def home_wait(self, end):
-    wait(self, end)
-    # 13 is the probe's pin; the axes' own end stops answer as they do
-    return self.begun + (end - self.begun) * share if "13" in str(self._pin) else end
-mcu.MCU_endstop.home_start, mcu.MCU_endstop.home_wait = home_start, home_wait
-sys.argv = [root + "/klippy.py", folder + "/printer.cfg", "-i", folder + "/touch.gcode",
-            "-o", folder + "/out", "-d", {KLIPPER!r} + "/out/klipper.dict", "-l", folder + "/log"]
-runpy.run_path(root + "/klippy.py", run_name="__main__")
-"""
-
-AXIS = """
-[stepper_{axis}]
-step_pin: gpio{pin}
-dir_pin: gpio{dir}
-microsteps: 16
-rotation_distance: {turn}
-endstop_pin: ^gpio{stop}
-position_endstop: 0
-position_max: 250
-position_min: {low}
-"""
-CONFIG = f"""
+STEPS_A_MM = 200 * 16 / 8
+pytestmark = klippy_batch.MARKS
+CONFIG = f"""\
 [include klipper_touch.cfg]
-[mcu]
-serial: /tmp/none
-[printer]
-kinematics: cartesian
-max_velocity: 300
-max_accel: 3000
 [probe]
 pin: ^gpio13
 z_offset: {Z_OFFSET_MM}
@@ -81,21 +24,13 @@ enable_force_move: True
 """
 
 
-def klippy(folder: Path, lines: list[str], *, share: float) -> str:
-    """What Klipper says to a program; its touches trigger at this share of their way."""
-    axes = [
-        AXIS.format(axis=axis, pin=4 * k + 1, dir=4 * k + 2, stop=4 * k + 3, turn=turn, low=low)
-        for k, (axis, turn, low) in enumerate([("x", 40, 0), ("y", 40, 0), ("z", 8, LOWEST_MM)])
-    ]
-    (folder / "printer.cfg").write_text(CONFIG + "".join(axes))
+def klippy(folder: Path, lines: list[str], *, share: float, config: str = CONFIG) -> str:
+    """What Klipper says to a program; its touches trigger at this share of their way, 0: never."""
     (folder / "klipper_touch.cfg").write_text(TOUCH_MACRO)
-    (folder / "touch.gcode").write_text("\n".join(["G28", "G90", *lines]) + "\n")
-    done = subprocess.run(
-        [PYTHON, "-c", RUN, str(share), str(folder)],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    assert "Unable to" not in done.stdout, done.stdout + done.stderr
-    return done.stdout
+    rows = klippy_batch.klippy(
+        folder, config, ["G28", "G90", *lines], lowest_mm=LOWEST_MM, share=share
+    )
+    return "\n".join(klippy_batch.said(rows)) + "\n"
 
 
 def z_told(said: str) -> list[float]:
@@ -139,3 +74,36 @@ def test_klipper_itself_would_go_on_down(tmp_path: Path) -> None:
     """Why the macro: PROBE alone goes to position_min, fifteen millimetres here."""
     said = klippy(tmp_path, ["G1 X100 Y100 Z12 F3000", "PROBE", "M114"], share=1.0)
     assert z_told(said)[-1] == pytest.approx(LOWEST_MM)
+
+
+def test_a_touch_that_meets_nothing_leaves_z_true(tmp_path: Path) -> None:
+    """regression: Z was forgotten, and a run could not be gone on with: "Must home axis first"."""
+    miss = ["AMREPAIR_TOUCH DEPTH=2.5 SPEED=2", "M400", "M114"]
+    lines = ["SET_GCODE_OFFSET Z=0.2", "G1 X100 Y100 Z12 F3000", "M400"]
+    for _ in range(3):
+        lines += [*miss, "G1 Z12 F600", "M400", "M114"]
+    said = klippy(tmp_path, lines, share=0.0)
+    assert "!! No trigger on" in said
+    assert said.count("// amrepair: nothing was touched\n") == 3
+    assert "Must home" not in said
+    assert "amrepair: touched" not in said
+    assert z_told(said) == pytest.approx([12.0 - 2.5, 12.0] * 3, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("config", "lines"),
+    [
+        (CONFIG.replace("enable_force_move: True", ""), []),
+        (CONFIG, ["SET_KINEMATIC_POSITION CLEAR_HOMED=Z"]),
+    ],
+)
+def test_nothing_moves_where_its_depth_cannot_be_bounded(
+    config: str, lines: list[str], tmp_path: Path
+) -> None:
+    """regression: Klipper passes over commands that it does not know; PROBE went to the end."""
+    before = ["GET_POSITION", "G1 X100 Y100 Z12 F3000", *lines]
+    after = ["AMREPAIR_TOUCH DEPTH=2.5 SPEED=2", "G4 P1000", "M84", "GET_POSITION"]
+    said = klippy(tmp_path, [*before, *after], share=1.0, config=config)
+    assert re.search("^!! .*amrepair: .*; nothing was touched$", said, re.MULTILINE)
+    home, end = (int(n) for n in re.findall(r"mcu: .*stepper_z:(-?\d+)$", said, re.MULTILINE))
+    assert abs(end - home - 12 * STEPS_A_MM) <= 1

@@ -15,6 +15,7 @@ from clogged_block import (
     AMREPAIR,
     CLOG_MM,
     ENVIRONMENT,
+    GCODE,
     PRUSA_SLICER,
     command,
     events,
@@ -70,11 +71,12 @@ class Stack:
         words = [str(word) for word in command]
         return self.keep.enter_context(process(*words, log=self.folder / f"{name}.log"))
 
-    def agent(self, *more: str) -> subprocess.Popen[bytes]:
+    def agent(self, *more: str, scanner: str = "") -> subprocess.Popen[bytes]:
         return self._keep(
             "agent", *AMREPAIR, "agent", "--moonraker", self.url, "--template",
-            self.folder / "block.stl", "--scanner", f"simulated:{self.motion}", "--printer",
-            "generic_klipper", "--material", "pla", "--out", self.folder / "runs", "--once", *more,
+            self.folder / "block.stl", "--scanner", scanner or f"simulated:{self.motion}",
+            "--printer", "generic_klipper", "--material", "pla", "--out", self.folder / "runs",
+            "--once", *more,
         )  # fmt: skip
 
     def upload(self, job: Path) -> None:
@@ -107,13 +109,17 @@ def stack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stack]:
         found.web.http.close()
 
 
-def begin(stack: Stack, *more: str) -> tuple[Path, subprocess.Popen[bytes]]:
+def begin(stack: Stack, *more: str, scanner: str = "") -> tuple[Path, subprocess.Popen[bytes]]:
     """The user's four commands: slice, mark, macros, agent; and the job is sent to be printed."""
     job = sliced(stack.folder, flavour="klipper", reads="klipper")
     macros = stack.folder / "amrepair.cfg"
     command(*AMREPAIR, "agent", "--macros", macros)
+    if scanner == "probe":
+        touch = stack.folder / "klipper_touch.cfg"
+        command(*GCODE, "touch", "--klipper-macro", touch)
+        macros.write_text(macros.read_text() + touch.read_text())
     stack.start(macros)
-    agent = stack.agent(*more)
+    agent = stack.agent(*more, scanner=scanner)
     log = stack.folder / "agent.log"
     wait_for("the agent", lambda: log.exists() and "the agent is here" in stack.said(), log)
     stack.upload(job)
@@ -124,9 +130,26 @@ def begin(stack: Stack, *more: str) -> tuple[Path, subprocess.Popen[bytes]]:
 def test_from_the_slicer_to_a_mended_print_in_four_commands(stack: Stack) -> None:
     job, agent = begin(stack, "--approve", "auto")
     assert agent.wait(timeout=400) == 0, stack.said()
-    assert "missing (a void). Printed" in stack.said()
+    assert re.search(r"missing \(a void.*\)\. Printed", stack.said())
     assert "Nothing is missing any more" in stack.console()
     judge(stack.motion, job, "AMREPAIR_SCAN")
+    assert stack.state() == "complete"
+
+
+@pytest.mark.skipif(PRUSA_SLICER is None, reason="PrusaSlicer is not installed here")
+def test_the_printers_own_probe_finds_it_and_is_killed_in_the_midst_of_it(stack: Stack) -> None:
+    """What the emulated nozzle feels is what it has laid itself, by Klipper's own macro."""
+    job, agent = begin(stack, "--approve", "auto", scanner="probe")
+    log = stack.folder / "agent.log"
+    touched = "amrepair: touched at z="
+    wait_for("a few touches", lambda: stack.console().count(touched) > 5, log, 100.0)
+    end(agent)
+    agent = stack.agent("--approve", "auto", scanner="probe")
+    assert agent.wait(timeout=400) == 0, stack.said()
+    assert "gone on with" in stack.said()
+    assert re.search(r"missing \(a void.*\)\. Printed", stack.said())
+    assert "Nothing is missing any more" in stack.console()
+    judge(stack.motion, job, "AMREPAIR_SCAN", within=0.7)  # a tip feels no hole's edges
     assert stack.state() == "complete"
 
 
@@ -138,7 +161,7 @@ def test_asked_and_killed_and_the_server_killed_and_nothing_is_printed_twice(sta
     wait_for("the question", lambda: question in stack.console(), log, 100.0)
     second = subprocess.run(
         [*AMREPAIR, "agent", "--moonraker", stack.url.replace("127.0.0.1", "localhost"),
-         "--template", str(stack.folder / "block.stl"), "--scanner", "watch:none"],
+         "--template", str(stack.folder / "block.stl"), "--scanner", f"watch:{stack.folder}"],
         capture_output=True, text=True, check=False, timeout=100, env=ENVIRONMENT,
     )  # fmt: skip
     assert second.returncode == 4

@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 import trimesh
 
 from amrepair.scans import Scan, write_ply
-from amrepair.template import fit, fit_template
+from amrepair.template import fit_template
+from amrepair.template.options import FitOptions
 
 PLACE_MM = (50.0, 60.0, 0.0)
 POINTS = 3_000
@@ -59,11 +59,7 @@ def write_template(path: Path, part: trimesh.Trimesh | None = None) -> Path:
     """Fitted, with a tenth of the work: the parts are flat."""
     mesh = path.with_suffix(".stl")
     (part or lug()).export(mesh)
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"GRID_CELLS": 64, "SAMPLES": 40_000, "STEPS": 30}.items():
-            if hasattr(fit, name):  # sizes of the recipe as it is now
-                patch.setattr(fit, name, value)
-        fit_template(mesh, seed=0).save(path)
+    fit_template(mesh, fast=FitOptions(cells=64, samples=40_000), seed=0).save(path)
     return path
 
 

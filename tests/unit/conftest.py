@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import manifold3d as m3
@@ -12,9 +13,11 @@ import trimesh
 import amrepair
 import gcode
 from amrepair.scans import Scan, write_ply
+from amrepair.template.fit import fit_fast
+from amrepair.template.options import FitOptions
 
 PLACE_MM = (100.0, 80.0, 0.0)
-SMALL_FIT = {"GRID_CELLS": 64, "SAMPLES": 40_000, "STEPS": 30}
+SMALL_FIT = FitOptions(cells=64, samples=40_000)
 
 
 def write_mesh(solid: m3.Manifold, path: Path) -> trimesh.Trimesh:
@@ -26,11 +29,7 @@ def write_mesh(solid: m3.Manifold, path: Path) -> trimesh.Trimesh:
 
 def shrink_fits(patch: pytest.MonkeyPatch) -> None:
     """The block is flat: a tenth of the work fits it as well."""
-    from amrepair.template import fit
-
-    for name, value in SMALL_FIT.items():
-        if hasattr(fit, name):  # sizes of the recipe as it is now
-            patch.setattr(fit, name, value)
+    patch.setattr("amrepair.template.fitting.fit_fast", partial(fit_fast, options=SMALL_FIT))
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from small_klipper import CommandError, SmallKlipper
 from web_harness import Answer, Asked, FakeServer
 
 from amrepair.agent import MACROS, shipped
+from gcode.resumption.klipper import TOUCH_MACRO
 
 WATCHED = ("print_stats", "virtual_sdcard", "webhooks")
 
@@ -29,7 +30,7 @@ class AgentsMoonraker:
 
     def __init__(self, gcodes: Path) -> None:
         self.klipper = SmallKlipper(
-            gcodes, shipped(MACROS), respond=self._responded, call_remote=self._remote
+            gcodes, shipped(MACROS) + TOUCH_MACRO, respond=self._responded, call_remote=self._remote
         )
         self.server = FakeServer(self._handle, on_message=self._message)
         self.on_said: Callable[[str], None] = lambda text: None

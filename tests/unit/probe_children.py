@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import traceback
 from pathlib import Path
 
@@ -26,8 +27,12 @@ from gcode.surfaces import HeightField
 SLOW = "always slow_reader s=0.001"
 
 
-def emulate(link: str, record: str, printer: str, standing: str) -> int:
-    """A printer whose nozzle feels what stands there."""
+MENDED = signal.SIGUSR1
+"""Tells a printer that its probe triggers from now on."""
+
+
+def emulate(link: str, record: str, printer: str, standing: str, dead: bool = False) -> int:
+    """A printer whose nozzle feels what stands there, or nothing at all until it is mended."""
     fd = os.open(record, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     profile = load_printer(printer)
     core = FirmwareCore(
@@ -38,6 +43,10 @@ def emulate(link: str, record: str, printer: str, standing: str) -> int:
         record=lambda command: os.write(fd, command + b"\n") and None,
     )
     core.machine.stand(HeightField.read(Path(standing)))
+    contact = core.machine.contact
+    assert contact is not None
+    contact.dead = dead
+    signal.signal(MENDED, lambda *_: setattr(contact, "dead", False))
     PtyServer(core, Path(link)).serve()
     return 0
 

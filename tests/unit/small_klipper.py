@@ -15,13 +15,22 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 
 from gcode.hosts.modes import Modes, follow
 
 EXTENDED = "_"
+POSITION_MIN_MM = -2.0  # of Z
+SETTINGS = {"force_move": {"enable_force_move": True}}
+
+
+class Place(NamedTuple):
+    x: float
+    y: float
+    z: float
+    e: float = 0.0
 
 
 class CommandError(Exception):
@@ -47,10 +56,12 @@ class SmallKlipper:
         carry_out: Callable[[str], None] = lambda line: None,
         respond: Callable[[str], None] = lambda text: None,
         call_remote: Callable[[str, dict[str, Any]], None] = lambda method, params: None,
+        feel: Callable[[float, float], float | None] = lambda depth_mm, speed_mm_s: None,
         pause_s: float = 0.0,
     ) -> None:
         self.gcodes, self.pause_s = gcodes, pause_s
         self.carry_out, self.respond, self.call_remote = carry_out, respond, call_remote
+        self.feel = feel  # how far down something is met, no deeper than it is told
         self._config = configparser.RawConfigParser(
             strict=False, inline_comment_prefixes=(";", "#"), delimiters=(":", "=")
         )
@@ -70,6 +81,7 @@ class SmallKlipper:
         self.print_state, self.message = "standby", ""
         self.saved: dict[str, Modes] = {}
         self.display = ""
+        self.shift_mm = self.probed_mm = 0.0  # Z in truth above the one believed in
         self.worker: threading.Thread | None = None
         self.variables: dict[str, dict[str, Any]] = {}
         for section in self._config.sections():
@@ -102,8 +114,15 @@ class SmallKlipper:
             },
             "pause_resume": {"is_paused": self.is_paused},
             "display_status": {"progress": 0.0, "message": self.display},
-            "gcode_move": {"gcode_position": place, "position": place, "speed_factor": 1.0},
-            "toolhead": {"homed_axes": self.homed, "position": place},
+            "gcode_move": {
+                "gcode_position": Place(*place), "position": Place(*place), "speed_factor": 1.0,
+            },
+            "toolhead": {
+                "homed_axes": self.homed, "position": Place(*place),
+                "axis_minimum": Place(0.0, 0.0, POSITION_MIN_MM),
+            },
+            "configfile": {"settings": SETTINGS},
+            "probe": {"last_probe_position": Place(*place[:2], self.probed_mm)},
             "extruder": {"temperature": hotend or 21.0, "target": hotend},
             "heater_bed": {"temperature": bed or 21.0, "target": bed},
             **{f"gcode_macro {name}": dict(told) for name, told in self.variables.items()},
@@ -186,9 +205,39 @@ class SmallKlipper:
                 printer=self.objects(),
                 params=self._words(command),
                 action_raise_error=raised,
+                action_respond_info=lambda text: self.tell(f"// {text}") or "",
                 action_call_remote_method=remote,
             )
         )
+
+    # ------------------------------------------------------------------ touches
+
+    @property
+    def z_mm(self) -> float:
+        return self.modes.position_mm.get("Z", 0.0)
+
+    def cmd_SET_KINEMATIC_POSITION(self, words: dict[str, str]) -> None:
+        z_mm = float(words["Z"])
+        self.shift_mm += self.z_mm - z_mm
+        self.modes.position_mm["Z"] = z_mm
+        self.carry_out(f"SET_KINEMATIC_POSITION Z={z_mm}")
+
+    def cmd_PROBE(self, words: dict[str, str]) -> None:
+        deep_mm = self.z_mm - POSITION_MIN_MM
+        way_mm = self.feel(deep_mm, float(words["PROBE_SPEED"]))
+        self.modes = replace(self.modes, position_mm={
+            **self.modes.position_mm, "Z": self.z_mm - (deep_mm if way_mm is None else way_mm)
+        })  # fmt: skip
+        if way_mm is None:
+            raise CommandError("No trigger on probe after full movement")
+        self.probed_mm = self.z_mm
+
+    def cmd_UPDATE_DELAYED_GCODE(self, words: dict[str, str]) -> None:
+        script = self._config[f"delayed_gcode {words['ID']}"]["gcode"]
+        threading.Timer(float(words["DURATION"]), self.run_script, (script,)).start()
+
+    def cmd_TEMPERATURE_WAIT(self, words: dict[str, str]) -> None:
+        self.carry_out("TEMPERATURE_WAIT " + " ".join(f"{k}={v}" for k, v in words.items()))
 
     def cmd_SET_GCODE_VARIABLE(self, words: dict[str, str]) -> None:
         told = self.variables.get(words["MACRO"])

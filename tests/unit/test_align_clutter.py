@@ -9,15 +9,17 @@ import pytest
 import trimesh
 from jaxtyping import Float
 
-from amrepair.align import Registration, align
+from amrepair.align import AlignOptions, Registration, align
 from amrepair.align.anywhere import Found
 from amrepair.align.clutter import Kept, noise_across, without_clutter
+from amrepair.align.options import THOROUGH, USUAL_ALIGN
 from amrepair.align.refine import Refined
-from amrepair.align.search import THOROUGH, spread_rotations
+from amrepair.align.search import spread_rotations
 from amrepair.errors import AlignmentError
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from amrepair.template.fit import fit_fast
+from amrepair.template.options import FitOptions
 from amrepair.template.port import Template
 from tests.analytic import (
     AnalyticTemplate,
@@ -39,14 +41,18 @@ def stepped() -> AnalyticTemplate:
 
 
 def aligned(
-    template: Template, part: Points, clutter: Points, sigma_mm: float = SIGMA_MM
+    template: Template,
+    part: Points,
+    clutter: Points,
+    sigma_mm: float = SIGMA_MM,
+    options: AlignOptions = USUAL_ALIGN,
 ) -> tuple[Registration, list[float]]:
     """The answer for both in one random pose, and how far off its poses leave the part."""
     rng = np.random.default_rng(7)
     points = np.concatenate([part, clutter])
     points = points + rng.normal(0, sigma_mm, points.shape)
     moved = points @ spread_rotations(500)[int(rng.integers(500))].T + rng.normal(0, 60, 3)
-    found = align(Scan(moved, SIGMA_MM, "scanner", source="scan.ply"), template)
+    found = align(Scan(moved, SIGMA_MM, "scanner", source="scan.ply"), template, options=options)
     poses = [found.template_from_scan, *found.symmetric_alternatives]
     off = [pose.apply(moved[: len(part)]) - points[: len(part)] for pose in poses]
     return found, [float(np.sqrt((one**2).sum(axis=1).mean())) for one in off]
@@ -153,7 +159,7 @@ def test_what_lay_wrong_is_no_clutter_before_more_rotations_were_tried(
     rims = Kept(low[low[:, 2] > 0.3], 0.5)
     asked = []
     monkeypatch.setattr(
-        "amrepair.align.anywhere.without_clutter", lambda points, rng: asked.append(rims) or [rims]
+        "amrepair.align.anywhere.without_clutter", lambda *_: asked.append(rims) or [rims]
     )
     found = align(Scan(low, SIGMA_MM, "scanner", source="scan.ply"), stepped())
     assert not asked
@@ -171,13 +177,12 @@ def test_another_part_is_not_called_a_mirror_image(monkeypatch: pytest.MonkeyPat
     # regression: so was a small part of which three quarters fitted a flat side when mirrored
     module = importlib.import_module("amrepair.align.align")
     monkeypatch.setattr(module, "explained_if_mirrored", lambda *_: 0.75)
-    monkeypatch.setattr(module, "MIRRORED_BETTER", 1.0)
     rng = np.random.default_rng(3)
     part = sample_surface(stepped().body, 0.8, seed=3)[0]
     away = scattered(rng, len(part))
-    monkeypatch.setattr("amrepair.align.anywhere.without_clutter", lambda points, rng: [])
+    monkeypatch.setattr("amrepair.align.anywhere.without_clutter", lambda *_: [])
     with pytest.raises(AlignmentError, match="does not fit its template: mirrored, 75%"):
-        aligned(stepped(), part, away)
+        aligned(stepped(), part, away, options=AlignOptions(mirrored_better=1.0))
 
 
 def test_noise_that_was_not_said_is_measured() -> None:
@@ -228,13 +233,10 @@ def test_the_unit_is_guessed_from_the_size(mm: float, hint: str) -> None:
         align(Scan(part, SIGMA_MM / mm, "scanner", source="scan.ply"), stepped())
 
 
-def test_a_flat_view_of_a_keyed_disc_is_ambiguous_and_holds_the_true_pose(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for name, value in (("SAMPLES", 20_000), ("GRID_CELLS", 48)):
-        monkeypatch.setattr(f"amrepair.template.fit.{name}", value)
+def test_a_flat_view_of_a_keyed_disc_is_ambiguous_and_holds_the_true_pose() -> None:
     shape = union(cylinder((0, 0, 0), 25.0, 8.0), box((22, -1.5, 0), (28, 1.5, 8)))
-    disc = fit_fast(MeshSdf.from_mesh(to_trimesh(shape.body)))
+    exact = MeshSdf.from_mesh(to_trimesh(shape.body))
+    disc = fit_fast(exact, options=FitOptions(cells=48, samples=20_000))
     rng = np.random.default_rng(6)
     flat = rng.uniform(-28, 28, (12_000, 2))
     key = (flat[:, 0] > 0) & (flat[:, 0] < 28) & (np.abs(flat[:, 1]) < 1.5)

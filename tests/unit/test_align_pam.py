@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from amrepair.align import PamOptions, Registration, align
-from amrepair.align.pam import PAM_VARIANTS, PUBLISHED_PAM, RELEASED_PAM, PamError, pam
+from amrepair.align import AlignOptions, PamOptions, Registration, align
+from amrepair.align.options import PAM_VARIANTS, PUBLISHED_PAM, RELEASED_PAM
+from amrepair.align.pam import PamError, pam
 from amrepair.cli.options import with_settings
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform, rotation_from_vector
@@ -51,7 +52,7 @@ def run(template: MeshSdf, points: np.ndarray, options: PamOptions) -> Registrat
         Scan(points, 0.03, "scanner"),
         template,
         method="paper",
-        pam_options=options,
+        options=AlignOptions(paper=options),
         rng=np.random.default_rng(0),
     )
 

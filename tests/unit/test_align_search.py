@@ -10,8 +10,9 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from amrepair.align import Registration, align
-from amrepair.align.search import PIECE, QUICK_EFFORT, CoarseField, search, spread_rotations
+from amrepair.align import AlignOptions, Registration, align
+from amrepair.align.options import PIECE, USUAL_ALIGN, CoarseOptions
+from amrepair.align.search import CoarseField, search, spread_rotations
 from amrepair.align.thinning import Thinned, in_order, thin_out
 from amrepair.bench.bodies import pieces_of
 from amrepair.errors import AlignmentError
@@ -38,14 +39,19 @@ def notched() -> AnalyticTemplate:
     return difference(box((0, 0, 0), (40, 24, 8)), box((37, 21, 6), (41, 25, 9)))
 
 
+QUICK_ALONE = AlignOptions(coarse=CoarseOptions(thorough=CoarseOptions().quick))
+
+
 def aligned(
-    template: AnalyticTemplate, points: Points, seed: int = 0
+    template: AnalyticTemplate, points: Points, seed: int = 0, options: AlignOptions = USUAL_ALIGN
 ) -> tuple[Registration, float]:
     """The answer for the points in a random pose, and how far it leaves them from their place."""
     rng = np.random.default_rng(seed)
     noisy = points + rng.normal(0, SIGMA_MM, points.shape)
     moved = noisy @ spread_rotations(500)[int(rng.integers(500))].T + rng.normal(0, 60, 3)
-    found = align(Scan(moved, SIGMA_MM, "scanner", source="scan.ply"), template)
+    scan = Scan(moved, SIGMA_MM, "scanner", source="scan.ply")
+    found = align(scan, template, options=options)
+    assert found.options == options
     off = found.template_from_scan.apply(moved) - noisy
     return found, float(np.sqrt((off**2).sum(axis=1).mean()))
 
@@ -173,12 +179,11 @@ def test_clutter_does_not_mislead() -> None:
 
 
 def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK_EFFORT)
     monkeypatch.setattr("amrepair.align.anywhere.by_features", lambda *_: iter(()))
     template = notched()
     points = 10.0 * sample_surface(template.body, 3.0, seed=4)[0]  # centimetres taken for mm
     with pytest.raises(AlignmentError, match=r"mm across, its template 47\.3 mm"):
-        aligned(template, points)
+        aligned(template, points, options=QUICK_ALONE)
 
 
 @pytest.mark.parametrize("share_of_base", [1.0, 0.3])
@@ -321,7 +326,6 @@ def test_a_view_of_a_bent_thin_plate_lies_on_its_larger_piece(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # regression: it was laid 0.7 mm off between its pieces, some of it on either side of the plate
-    monkeypatch.setattr("amrepair.align.anywhere.THOROUGH", QUICK_EFFORT)
     monkeypatch.setattr("amrepair.align.anywhere._turns", lambda *_: [])
     plate = box((0, 0, 0), (100, 60, 1.2))
     for hole in (
@@ -338,6 +342,7 @@ def test_a_view_of_a_bent_thin_plate_lies_on_its_larger_piece(
     noisy = points + rng.normal(0, SIGMA_MM, points.shape)
     moved = noisy @ spread_rotations(500)[123].T + 5.0
     scan = Scan(moved, SIGMA_MM, "scanner", source="scan.ply")
-    found = align(scan, MeshSdf.from_mesh(to_trimesh(plate.body)), part_is_known=True)
+    template = MeshSdf.from_mesh(to_trimesh(plate.body))
+    found = align(scan, template, part_is_known=True, options=QUICK_ALONE)
     off = (found.template_from_scan.apply(moved) - noisy)[beyond == 0.0]
     assert float(np.sqrt((off**2).sum(axis=1).mean())) < 0.05

@@ -82,6 +82,18 @@ def test_clouds_are_read_as_they_are(tmp_path: Path, name: str) -> None:
     assert clouds.read_points(path) == pytest.approx(few, abs=1e-4)
 
 
+def test_points_that_are_no_places_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They count as not seen, and whoever checks a job against them is to know."""
+    few = POINTS[::97].copy()
+    few[3:5, 2] = np.nan
+    path = tmp_path / "a.pcd"
+    path.write_bytes(FORMS["b.pcd"](few))
+    assert len(clouds.read_points(path)) == len(few) - 2
+    assert f"a.pcd: 2 of {len(few)} points are not finite numbers" in caplog.text
+
+
 @pytest.mark.parametrize("name", ["a.ply", "b.ply", "c.ply", "a.pcd", "b.pcd"])
 def test_a_cut_cloud_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / name

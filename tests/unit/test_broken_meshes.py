@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import resource
 import subprocess
 import sys
 import time
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from amrepair.errors import InputError as OurInputError
+from amrepair.scans import read_scan
+from amrepair.template import load_mesh
 from gcode.errors import InputError
 from gcode.solids import read_closed, read_solid, read_triangles
 
@@ -108,6 +113,38 @@ def test_a_corner_that_is_a_signalling_nan_gets_one_sentence(tmp_path: Path) -> 
     for read in (read_solid, read_closed):
         with pytest.raises(InputError, match="not finite numbers"):
             read(path)
+
+
+def with_a_corner(kind: str, value: str) -> bytes:
+    """A box as a file of this kind, one coordinate of one vertex another."""
+    box = trimesh.creation.box((10.0, 20.0, 30.0))
+    box.vertices[np.argmax(box.vertices[:, 0]), 0] = 7.25  # found in the file, and nowhere else
+    if kind == "stl":
+        data = box.export(file_type="stl")
+        return data.replace(np.float32(7.25).tobytes(), np.float32(value).tobytes())
+    if kind == "stl_ascii":
+        text = trimesh.exchange.stl.export_stl_ascii(box)
+    else:
+        said = box.export(file_type=kind, **({"encoding": "ascii"} if kind == "ply" else {}))
+        text = said if isinstance(said, str) else said.decode()
+    return re.sub(r"7\.250*", value, text).encode()
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii", "obj", "ply", "3mf"])
+def test_a_vertex_that_is_no_place_is_no_silent_gap(kind: str, value: str, tmp_path: Path) -> None:
+    """regression: the faces at it were dropped, and a scan had a hole that nobody was told of."""
+    path = tmp_path / f"part.{kind.partition('_')[0]}"
+    if kind == "3mf":
+        written(path, GOOD.replace('x="9"', f'x="{value}"'))
+    else:
+        path.write_bytes(with_a_corner(kind, value))
+    for read in (read_solid, read_closed):
+        with pytest.raises(InputError, match="not finite numbers"):
+            read(path)
+    for read_ours in (load_mesh, partial(read_scan, frame="scanner")):
+        with pytest.raises(OurInputError, match="not finite numbers"):
+            read_ours(path)
 
 
 def test_edges_that_pair_with_none_get_one_sentence_and_no_crash() -> None:

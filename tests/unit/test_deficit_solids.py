@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from amrepair.deficit import Deficit, compute_deficit, measured_regions
-from amrepair.deficit.voxels import MAX_DEFICIT_VOXELS, VoxelBox, solid_from_field
+from amrepair.deficit.options import VoxelOptions
+from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.errors import InputError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.regions import Label, detect
@@ -386,14 +387,14 @@ def test_a_film_beside_a_deep_cut_is_sampled_finely_and_so_are_the_walls(
     box = VoxelBox.around(np.zeros(3), np.array(extent_mm), thickness_mm=0.36, across=2)
     assert box.step_mm[2] <= 0.24 / 1.5
     assert (box.step_mm[:2] <= 0.3).all()
-    assert np.prod(box.shape) <= 1.1 * MAX_DEFICIT_VOXELS
+    assert np.prod(box.shape) <= 1.1 * VoxelOptions().most
     assert (box.step_mm * (np.array(box.shape) - 1) >= np.array(extent_mm) - 1e-9).all()
 
 
 def test_a_wide_thin_defect_keeps_its_samples_across() -> None:
     box = VoxelBox.around(np.zeros(3), np.array([80.0, 50.0, 2.2]), thickness_mm=0.2, across=2)
     assert box.step_mm[2] <= 0.1
-    assert np.prod(box.shape) <= 1.1 * MAX_DEFICIT_VOXELS
+    assert np.prod(box.shape) <= 1.1 * VoxelOptions().most
 
 
 def test_a_field_that_touches_zero_by_less_than_a_nanometre_is_no_solid() -> None:

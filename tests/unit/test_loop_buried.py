@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
 import manifold3d as m3
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from amrepair.cli.app import app as repair_app
 from amrepair.loop.buried import buried, buried_mm3, ways
 from amrepair.loop.looks import Stop
 from amrepair.policy import USUAL_POLICY, Action, decide
 from amrepair.policy.again import decided_again
 from amrepair.policy.table import Situation
 from amrepair.report.collect import loop_result
+from gcode.cli.app import app as gcode_app
 from gcode.estimate import estimate
 from gcode.profiles import load_setup
 from gcode.reader import job_for
@@ -21,7 +27,7 @@ from gcode.resumption import resume_at
 from gcode.slicing.job import plan_part
 from gcode.slicing.patch import PatchRegion
 from gcode.writer import write
-from tests.unit.loop_bench import PLACE_MM, Small, scan_of
+from tests.unit.loop_bench import PLACE_MM, Small, scan_of, solid_mesh
 
 SETUP = load_setup()
 PROGRAM = write(
@@ -126,3 +132,73 @@ def test_a_no_ends_the_run_with_the_command_to_go_on_from(
     )  # fmt: skip
     assert "gcode resume-at JOB --layer" in report.stopped
     assert lines[-1] == "heaters off"
+
+
+@pytest.fixture(scope="module")
+def job_file(
+    hollowed: tuple[Small, Stop, m3.Manifold], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    small, *_ = hollowed
+    folder = tmp_path_factory.mktemp("finished")
+    (folder / "job.gcode").write_text(small.checked.program.text)
+    solid_mesh(small.part).export(folder / "part.stl")
+    return folder / "job.gcode"
+
+
+def hollow_at(small: Small, place_mm: tuple[float, float, float], path: Path) -> Path:
+    """A scan of the finished part with a hollow under its roof, somewhere on the bed."""
+    hollow = m3.Manifold.cube((5.0, 8.0, 1.2)).translate((5.0, -1.0, 0.8))
+    scan = scan_of((small.part - hollow).translate(place_mm))
+    np.savetxt(path, np.hstack([scan.points_mm, scan.normals]), fmt="%.4f")
+    return path
+
+
+def words_for(scan: Path, job_file: Path) -> list[str]:
+    """`amrepair repair` of it, its foot on the bed."""
+    out, part = job_file.with_name("repair.gcode"), job_file.with_name("part.stl")
+    return ["repair", f"{scan}", "--template", f"{part}", "-o", f"{out}", "--job", f"{job_file}",
+            "--printer", "prusa_mk3s"]  # fmt: skip
+
+
+def test_a_finished_part_is_offered_the_ways_and_the_command_makes_the_program(
+    hollowed: tuple[Small, Stop, m3.Manifold], job_file: Path
+) -> None:
+    # regression: only the loop offered them; `repair --job` left the hollow and said no more
+    small, *_ = hollowed
+    words = words_for(hollow_at(small, PLACE_MM, job_file.with_name("scan.xyz")), job_file)
+    report = job_file.with_name("report.html")
+    done = CliRunner().invoke(repair_app, [*words, "--report", f"{report}", "--json"])
+    assert done.exit_code == 3, done.output
+    result = json.loads(done.stdout)
+    reprint, leave = result["ways"]
+    assert result["buried_mm3"] == pytest.approx(leave["left_mm3"], abs=1e-3)
+    assert USUAL_POLICY.buried_mm3 < leave["left_mm3"] < 5.0 * 7.0 * 1.2
+    assert reprint["layer"] in (2, 3, 4)  # it begins at 0.8 mm; never higher, lower as scanned
+    assert reprint["filament_mm3"] == pytest.approx(
+        16.0 * 12.0 * (2.8 - reprint["cut_to_mm"]), rel=0.06
+    )
+    assert reprint["print_time_s"] > 0
+    assert result["not_again"] is None
+    page = report.read_text()
+    assert reprint["command"] in page
+    assert "Let it be: " in page
+    name, *rest = shlex.split(reprint["command"])
+    assert name == "gcode"
+    made = CliRunner().invoke(gcode_app, rest)
+    assert made.exit_code == 0, made.output
+    assert f"from layer {reprint['layer']}" in " ".join(made.output.split())
+    assert job_file.with_name("rest.gcode").stat().st_size > 1000
+
+
+def test_a_part_that_was_moved_cannot_be_printed_again_from_a_layer_on(
+    hollowed: tuple[Small, Stop, m3.Manifold], job_file: Path
+) -> None:
+    small, *_ = hollowed
+    moved = (PLACE_MM[0] + 3.0, *PLACE_MM[1:])
+    words = words_for(hollow_at(small, moved, job_file.with_name("moved.xyz")), job_file)
+    done = CliRunner().invoke(repair_app, words)
+    told = " ".join(done.output.split())
+    assert "Left open inside: let it be" in told
+    assert "resume-at" not in told
+    assert "the part stands up to 3.0" in told
+    assert "put it back there" in told

@@ -12,6 +12,7 @@ import pytest
 
 from amrepair.frames import Transform
 from amrepair.loop import kinds
+from amrepair.loop.kind_options import USUAL_KINDS
 from amrepair.loop.kinds import typed
 from amrepair.loop.shapes import last_beads
 from amrepair.regions.anomaly import DefectType
@@ -104,13 +105,13 @@ def test_a_chip_is_no_curl(centre: tuple[float, float], radius_mm: float) -> Non
     # a chip off a dome was taken for a warped part, and the run ended
     xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
     chipped = np.where(np.hypot(*(xy - centre).T) < radius_mm, -1.2, 0.0)
-    assert kinds._warped(top_of(chipped, xy, 0.03), 0.2) is None
+    assert kinds._warped(top_of(chipped, xy, 0.03), 0.2, USUAL_KINDS) is None
 
 
 def test_a_curl_is_one() -> None:
     xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
     lifted = 0.6 * (np.hypot(*(xy / 8.0).T) / 2**0.5) ** 2
-    found = kinds._warped(top_of(lifted, xy, 0.1), 0.2)
+    found = kinds._warped(top_of(lifted, xy, 0.1), 0.2, USUAL_KINDS)
     assert found is not None
     assert found.type is DefectType.WARP
 
@@ -131,5 +132,39 @@ def test_what_broke_off_where_the_last_beads_end_is_no_clog(
         np.tile([0.0, 0.0, 1.0], (len(beads), 1)),
         0.03,
     )
-    found = kinds._flow(top, job, stop.line, 0.2)
+    found = kinds._flow(top, job, stop.line, 0.2, USUAL_KINDS)
     assert (found.type if found is not None else None) == kind
+
+
+def short_top(beads: np.ndarray, gone: np.ndarray) -> kinds._Surface:
+    """A top, one point on each of its beads, a layer of 0.2 mm short where it is gone."""
+    return top_of(np.where(gone, -0.2, 0.0), beads[:, :2], 0.03)
+
+
+@pytest.mark.parametrize("radius_mm", [6.0, 7.0, 8.0, 9.0])
+@pytest.mark.parametrize("off_mm", [(0.0, 0.0), (3.0, 0.0), (0.0, 2.0)])
+def test_a_void_that_takes_most_of_a_layer_is_no_clog(
+    bench: ModuleType,
+    scene,  # type: ignore[no-untyped-def]
+    radius_mm: float,
+    off_mm: tuple[float, float],
+) -> None:
+    # regression: walls come first, so that what is gone is gone from late beads; a void in a wedge
+    # ended the run, though beads after its first were there, and some before it were not
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    middle = bench.CORNER + bench.SIZE / 2 + off_mm
+    gone = np.hypot(*(beads[:, :2] - middle).T) < radius_mm
+    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2, USUAL_KINDS)
+    assert found is None or found.type is not DefectType.CLOG
+
+
+@pytest.mark.parametrize("begun", [0.2, 0.35, 0.5, 0.65, 0.8])
+def test_what_is_short_from_a_bead_on_is_a_clog(scene, begun: float) -> None:  # type: ignore[no-untyped-def]
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    gone = np.arange(len(beads)) >= begun * len(beads)
+    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2, USUAL_KINDS)
+    assert found is not None
+    assert found.type is DefectType.CLOG
+    assert found.confidence > 0.95

@@ -71,6 +71,16 @@ def test_half_edges_meet_their_opposites(seed: int, lost: int) -> None:
     assert (start[across] == end).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_pairs_of_two_are_those_that_chains_find(seed: int) -> None:
+    faces = mesh_of(some_solid(seed))[1].astype(np.int32)
+    faces = np.ascontiguousarray(np.random.default_rng(seed).permutation(faces))
+    across, shared = kernels.paired(faces)
+    expected, also_shared = kernels._paired_in_order(faces)
+    assert shared == also_shared
+    assert (across == expected).all()
+
+
 @pytest.mark.parametrize("turned", ["one face", "a corner twice"])
 def test_what_is_not_oriented_is_not_closed(turned: str) -> None:
     faces = mesh_of(Solid.cube((1.0, 1.0, 1.0)))[1].astype(np.int32).copy()

@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from amrepair.deficit import compute_deficit
 from amrepair.field.cut_kernels import least_cut
-from amrepair.field.occupancy import Broken, OccupancyOptions, find_occupancy
+from amrepair.field.occupancy import Broken, find_occupancy
+from amrepair.field.options import OccupancyOptions
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf

@@ -72,12 +72,12 @@ class Wire:
                 self.held.sent(tag)
         elif not self.on_hold and self.next < len(self.job):
             line, self.next = self.job[self.next], self.next + 1
-            if self.held.drops(self.byte(self.next)):
-                return
             if line.startswith("@"):
                 self.on_hold = self.held.mark(line.partition(" ")[2], self.byte(self.next))
-            else:
-                self._execute(line)
+                return
+            instead = self.held.instead(self.byte(self.next))
+            for command in (line,) if instead is None else instead:
+                self._execute(command)
 
     def _execute(self, line: str) -> None:
         self.executed.append(line)

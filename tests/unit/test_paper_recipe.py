@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from amrepair.align import pam
+from amrepair.align import PamOptions
+from amrepair.align.options import PAM_VARIANTS
 from amrepair.template import paper
 
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "paper-recipe.md"
@@ -33,7 +34,7 @@ def same(said: str, value: object) -> bool:
 @pytest.mark.parametrize(
     ("module", "options", "variants"),
     [
-        ("amrepair.align.pam", pam.PamOptions, pam.PAM_VARIANTS),
+        ("amrepair.align.pam", PamOptions, PAM_VARIANTS),
         ("amrepair.template.paper", paper.PaperOptions, paper.NETWORK_VARIANTS),
     ],
 )

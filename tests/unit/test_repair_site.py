@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from loop_bench import Small
 
-from amrepair.align import align
+from amrepair.align import AlignOptions, align
+from amrepair.deficit.options import DeficitOptions
 from amrepair.frames import Transform
 from amrepair.loop import Stop
 from amrepair.loop.sites import sites
-from amrepair.repair import Site
+from amrepair.regions.options import RegionOptions
+from amrepair.repair import Site, plan_repair
 from amrepair.repair.in_view import outside_open_infill, told_to_go_beyond
 from amrepair.scans import Scan
 
@@ -83,3 +85,23 @@ def test_a_site_tells_in_its_templates_frame_what_its_job_leaves(small: Small) -
     assert out_mm.max() > 0
     assert (beyond(wall, np.zeros(9)) == 0).all()  # what is within the allowance is not asked
     assert told_to_go_beyond(replace(site, laid=None), small.placed) is None
+
+
+def test_a_sites_options_reach_every_stage_and_its_results_record_them(small: Small) -> None:
+    site, _ = look(small, small.setup.process.bottom_layers + 1)
+    options = replace(
+        site.options,
+        align=AlignOptions(least_points=60),
+        regions=RegionOptions(false_regions=0.04),
+        deficit=DeficitOptions(early_mm3=0.6),
+    )
+    guess = Transform("template", "scanner", small.placed.inverse().matrix)
+    scan = scan_from_above(site, small.placed, 0.0)
+    plan = plan_repair(scan, replace(site, options=options), title="x", guess=guess, strict=False)
+    assert plan.registration.options == options.align
+    assert plan.deficit.options == options.deficit
+    assert plan.anomaly.options == replace(
+        options.regions,
+        allowance_mm=site.allowance_mm,
+        process_sigma_mm=site.process_sigma_mm,
+    )

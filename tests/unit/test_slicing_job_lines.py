@@ -257,3 +257,18 @@ def test_a_gone_line_gets_its_own_where_it_stands_out_and_not_in_a_thin_layer():
     assert not one[beside].any()
     thin = laid(lacks_half, line)
     assert thin == pytest.approx(lacks_half * own)
+
+
+@pytest.mark.parametrize(("lines", "low_mm"), [((10, 16), 0.4), ((10, 20), 0.6)])
+def test_what_is_given_up_under_a_line_is_not_declared_as_reached(
+    lines: tuple[int, int], low_mm: float
+) -> None:
+    # regression: a job's line laid over a slot's mouth counted as if all below it were filled
+    missing = slab((3.0, 17.0), lines, low_mm)
+    job = stacked(*(hatch(z) for z in np.arange(1, 11) * HIGH_MM))
+    plan = patched(missing, field_of(missing), job)
+    assert plan.reachable_mm3 < 0.7 * missing.volume()  # the nozzle's cone does not get down
+    # reached is what plastic is laid for, and what is left is told whole
+    assert plan.reachable_mm3 == pytest.approx(plan.beads_mm3 / BOND_RATIO, rel=0.08)
+    left_mm3 = sum(piece.volume_mm3 for piece in (*plan.unreachable, *plan.unprintable))
+    assert left_mm3 == pytest.approx(missing.volume() - plan.reachable_mm3, rel=0.02)

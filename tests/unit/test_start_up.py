@@ -69,3 +69,17 @@ def test_a_check_loads_nothing_that_scans_meshes_or_sends(tmp_path: Path) -> Non
 def test_sending_over_a_cable_loads_nothing_of_the_web(tmp_path: Path) -> None:
     loaded = loaded_by("gcode send job.gcode --port file:out.gcode", tmp_path)
     assert not loaded & {"httpx", "websockets", "trimesh", "torch", "open3d", "shapely"}
+
+
+def test_compiled_kernels_do_not_load_what_multiplies_matrices() -> None:
+    # regression: numba loaded scipy.linalg with its first kernel, 0.15 s and 15 MB for nothing
+    code = (
+        "import sys, numpy; from gcode.meshes_kernels import paired;"
+        "paired(numpy.array([[0, 1, 2], [0, 2, 1]], numpy.int32));"
+        "print('scipy.linalg' in sys.modules, 'numba.np.arraymath' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False,
+        cwd=ROOT,
+    )  # fmt: skip
+    assert done.stdout.split() == ["False", "True"], done.stderr

@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from amrepair.errors import TemplateError
 from amrepair.template import MeshSdf, load_mesh
-from amrepair.template.fit import GRID_CELLS, fit_fast
+from amrepair.template.fit import fit_fast
 from amrepair.template.nearest import TriangleTree
+from amrepair.template.options import FitOptions
 from amrepair.template.signs import signed_grid, signs_in_blocks
 
 BRACKET = Path(__file__).parents[2] / "examples" / "parts" / "bracket.stl"
@@ -126,15 +127,14 @@ def test_signs_from_few_rays_are_those_of_all(bracket: MeshSdf) -> None:
     assert np.array_equal(known[known != 0], np.sign(blocks[known != 0]))
 
 
-def test_long_parts_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amrepair.template.fit.GRID_CELLS", GRID_CELLS // 4)
-    monkeypatch.setattr("amrepair.template.fit.SAMPLES", 20_000)
+def test_long_parts_get_smaller_cells() -> None:
+    few = FitOptions(cells=32, samples=20_000)
     stocky, long = (
-        fit_fast(MeshSdf.from_mesh(trimesh.creation.box(size)))
+        fit_fast(MeshSdf.from_mesh(trimesh.creation.box(size)), options=few)
         for size in ((40.0, 30.0, 25.0), (200.0, 12.0, 12.0))
     )
-    assert stocky.grid.cell_mm == pytest.approx(40.0 / (GRID_CELLS // 4), rel=0.1)
-    assert long.grid.cell_mm < 0.5 * 200.0 / (GRID_CELLS // 4)
+    assert stocky.grid.cell_mm == pytest.approx(40.0 / few.cells, rel=0.1)
+    assert long.grid.cell_mm < 0.5 * 200.0 / few.cells
     assert long.grid.base.size < 1.5 * stocky.grid.base.size
 
 

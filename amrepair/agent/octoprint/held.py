@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import threading
 import uuid
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -57,8 +58,20 @@ class Server(Protocol):
 
 @dataclass(slots=True)
 class Print:
-    """A print of OctoPrint's; `byte` is that behind the look it rests at, `touched` once
-    something was printed there."""
+    """A print of OctoPrint's.
+
+    Attributes
+    ----------
+    byte
+        Behind the look that it rests at.
+    touched
+        Something was printed there.
+    behind
+        The file's lines that end here or before are left out.
+    edits
+        By the byte that they begin with, in order: bytes of the file, and what is sent in the place
+        of the commands there, with the last of them.
+    """
 
     path: str
     id: str
@@ -69,6 +82,7 @@ class Print:
     layer: int = 0
     z_mm: float = 0.0
     behind: int = 0
+    edits: tuple[tuple[int, int, tuple[str, ...]], ...] = ()
 
 
 @dataclass(slots=True)
@@ -270,10 +284,21 @@ class Held:
             self._shown.prompt = None
         self.say("OctoPrint is busy and did not hold the job: no look here.", wrong=True)
 
-    def drops(self, byte: int) -> bool:
-        """Whether a line of the job is left out: it was printed by us, in another way."""
+    def instead(self, byte: int) -> tuple[str, ...] | None:
+        """What is sent in the place of the job's command that ends at this byte; None: itself.
+
+        It was printed by us in another way, or what is left of the job was written anew.
+        """
         one = self._print
-        return one is not None and byte <= one.behind
+        if one is None:
+            return None
+        if byte <= one.behind:
+            return ()
+        k = bisect_left(one.edits, (byte,)) - 1  # the last that begins before it
+        if k < 0 or byte > one.edits[k][1]:
+            return None
+        _, end, commands = one.edits[k]
+        return commands if byte == end else ()
 
     # ------------------------------------------------------------------ the agent
 
@@ -403,8 +428,13 @@ class Held:
                 )
             self._program = None
 
-    def go_on(self, *, behind: int = 0) -> None:
+    def go_on(self, *, behind: int = 0, edits: Sequence[Sequence[Any]] = ()) -> None:
         """Let the job go on, without its lines up to byte `behind`.
+
+        Parameters
+        ----------
+        edits
+            What is sent from now on in the place of what: `Print.edits`.
 
         Raises
         ------
@@ -415,6 +445,9 @@ class Held:
             if self._print is None or not self._print.rests:
                 raise Refusal("the print does not rest at a look")
             self._print.behind = behind
+            self._print.edits = tuple(
+                (int(first), int(end), tuple(map(str, commands))) for first, end, commands in edits
+            )
         self._warm_then_release(())
 
     def _warm_then_release(self, lines: Sequence[str]) -> None:

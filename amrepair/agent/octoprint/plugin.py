@@ -21,6 +21,7 @@ from amrepair.agent.octoprint.held import HOLD_PATIENCE_S, Held, Refusal
 TAG = "amrepair:"
 TRIES, TRY_S = 50, 0.01
 """Of holding the job: OctoPrint's lock is taken for moments only."""
+MOST_PROGRAM_BYTES = 256 * 1024 * 1024  # every line of a day's print
 WILDCARDS = ("0.0.0.0", "::", "")
 Blueprint = octoprint.plugin.BlueprintPlugin
 
@@ -94,8 +95,13 @@ class AmrepairPlugin(
             "octoprint.comm.protocol.atcommand.sending": self._at_wire,
             "octoprint.comm.protocol.gcode.queuing": self._queuing,
             "octoprint.comm.protocol.gcode.sent": self._sent,
+            "octoprint.server.http.bodysize": self._bodysize,
             "octoprint.server.http.routes": self._routes,
         }
+
+    def _bodysize(self, *args: Any, **kwargs: Any) -> list[tuple[str, str, int]]:
+        """Programs are larger than what OctoPrint takes by itself (100 kB)."""
+        return [("POST", r"/(program|go_on)", MOST_PROGRAM_BYTES)]
 
     def _at(
         self, comm: Any, phase: str, command: str, parameters: str, tags: Any = None, **_: Any
@@ -121,7 +127,10 @@ class AmrepairPlugin(
     def _queuing(self, comm: Any, phase: str, cmd: str, *args: Any, tags: Any = None,
                  **_: Any) -> Any:  # fmt: skip
         byte = _byte(tags)
-        return (None,) if byte is not None and self._held.drops(byte) else None
+        instead = None if byte is None else self._held.instead(byte)
+        if instead is None:
+            return None
+        return [(command,) for command in instead] or (None,)
 
     def _sent(self, comm: Any, phase: str, cmd: str, *args: Any, tags: Any = None,
               **_: Any) -> None:  # fmt: skip

@@ -1,0 +1,86 @@
+"""What tells one type of defect from another: each number once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class KindOptions:
+    """Lengths in layers are in heights of the layer just printed.
+
+    Attributes
+    ----------
+    moved_mm, moved_deg
+        A calibration is good to a tenth or two; a part that moved farther has come off.
+    shift_layers, shift_share
+        Between two groups of layers: in layers, and as a share of what the walls tell.
+    least_points, most_points
+        Of a surface that tells something, and that are looked at.
+    low_wall_mm, high_wall_mm, beside_layer_mm, top_rim_mm
+        Walls are looked at off the bed and off the top's rim; the bed, off the part.
+    below_layer_mm, layer_rim_mm
+        So far under its floor, and within so much of the outline, a region lies at the rim.
+    short_layers
+        Less than this is what a layer's beads differ by themselves.
+    warp_layers, lifted_layers, warp_share
+        A surface that bends: range of its parabola, height of its rim; share of the deviation that
+        the parabola explains.
+    risen_share
+        Where its parabola is highest a curled surface itself is as high, by this much.
+    layer_share
+        Of a layer's beads: too little or too much flow over at least this share is the layer's own.
+    clog_least, clog_most, clog_layers
+        Share of the layer's beads that a clog takes, and how deep it is at most: beads of one
+        layer, and noise. Layers below are whole, or all of this one would lack.
+    around, around_of
+        Places around one that tell what is there as a region, and among how many they are looked
+        for.
+    skipped_aspect
+        Longer along the beads than across them by this much: beads were skipped.
+    string_aspect, string_width_mm, string_tall
+        A string is this much longer than wide, no wider, and no higher than this share of its
+        length.
+    along_cosine
+        Along the beads.
+    whole_layers
+        Mean depth: less than whole beads are missing where it is shallower.
+    top_cosine, wall_cosine
+        Steepness of a top, and of a wall.
+    """
+
+    moved_mm: float = 0.8
+    moved_deg: float = 1.5
+    shift_layers: float = 1.0
+    shift_share: float = 0.35
+    least_points: int = 120
+    most_points: int = 6_000
+    low_wall_mm: float = 0.8
+    high_wall_mm: float = 0.5
+    beside_layer_mm: float = 1.5
+    top_rim_mm: float = 1.2
+    below_layer_mm: float = 0.7
+    layer_rim_mm: float = 0.5
+    short_layers: float = 0.3
+    warp_layers: float = 1.0
+    lifted_layers: float = 0.6
+    warp_share: float = 0.45
+    risen_share: float = 0.5
+    layer_share: float = 0.55
+    clog_least: float = 0.12
+    clog_most: float = 0.9
+    clog_layers: float = 1.5
+    around: int = 8
+    around_of: int = 128
+    skipped_aspect: float = 2.2
+    string_aspect: float = 4.0
+    string_width_mm: float = 2.2
+    string_tall: float = 0.25
+    along_cosine: float = 0.9
+    whole_layers: float = 0.7
+    top_cosine: float = 0.8
+    wall_cosine: float = 0.4
+
+
+USUAL_KINDS = KindOptions()
+"""What the loop goes by."""
