@@ -154,6 +154,9 @@ def _server(
     given = [f"{kind}+{url}" for kind, url in named.items() if url is not None]
     if len(given) != 1:
         raise InputError("name one server, by --moonraker or --octoprint")
+    kind, _, url = given[0].partition("+")
+    if not url.startswith(("http://", "https://")):
+        raise InputError(f"--{kind} is {url!r}; write it as http://HOST:PORT")
     address = Address.parse(given[0])
     if key_file is not None:
         return address, key_in(key_file)

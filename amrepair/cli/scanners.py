@@ -129,7 +129,7 @@ def _probe(where: str, bed: Bed) -> Scanner:
 
     if bed.printer is None or bed.job is None:
         raise InputError(
-            "--scanner probe touches what a job has laid: it is for 'amrepair loop' and "
+            "--scanner probe touches what a job has laid: it is for 'amrepair loop', 'agent' and "
             "'simulate', and needs no calibration"
         )
     feeler = PortFeeler(bed.printer, bed.setup)

@@ -20,6 +20,7 @@ from amrepair.cli.running import (
 from amrepair.cli.scanners import known_scanner
 from amrepair.cli.telling import Begun, written
 from amrepair.errors import AmrepairError, InputError
+from amrepair.loop.calibrate import read_calibration
 from amrepair.loop.looks import LoopReport
 from amrepair.loop.tape import read_events
 from amrepair.loop.travel import park, way_back
@@ -35,6 +36,7 @@ from gcode.hosts.port import TellsTouches
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.served_job import ServedJob, UnderWay
 from gcode.hosts.web import Address
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, load_setup
 from gcode.solids import SOLID_SUFFIXES
 from gcode.whole import write_bytes
 
@@ -68,14 +70,9 @@ def serve(told: Served) -> None:
     """
     if not told.template.exists():
         raise InputError(f"--template {told.template}: there is no such file or folder")
-    known_scanner(told.said["scanner"])
+    _refuse_early(told)
     machine, screens = _machine(told.address, told.key)
     touches = told.said["scanner"] == PROBE
-    if touches and not isinstance(machine, TellsTouches):
-        raise InputError(
-            f"--scanner probe: {told.address.name} does not tell where a touch ended; print over "
-            "the printer's own port ('amrepair loop --port'), or name a scanner that sees"
-        )
     machine.connect()
     talk = Talk(machine, screens, lambda text: console.errors.print(text, markup=False))
     try:
@@ -96,6 +93,23 @@ def serve(told: Served) -> None:
     finally:
         talk.close()
         machine.close()
+
+
+def _refuse_early(told: Served) -> None:
+    """What no print could be served with, before one has begun."""
+    known_scanner(told.said["scanner"])
+    read_calibration(told.calibration)
+    printer, material, process = told.named
+    setup = load_setup(printer or DEFAULT_PRINTER, material or DEFAULT_MATERIAL, process)
+    if printer is not None:
+        _ = setup.printer.head
+        if told.said["scanner"] == PROBE:
+            _ = setup.printer.feeler
+    suffix = told.template.suffix.lower()
+    if told.template.is_file() and suffix not in PARTS:
+        raise InputError(
+            f"--template {told.template}: a part ends in one of {', '.join(sorted(PARTS))}"
+        )
 
 
 def _machine(address: Address, key: ApiKey) -> tuple[ServedJob[Any], Screens]:

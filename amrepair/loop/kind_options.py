@@ -30,9 +30,10 @@ class KindOptions:
         Where its parabola is highest a curled surface itself is as high, by this much.
     layer_share
         Of a layer's beads: too little or too much flow over at least this share is the layer's own.
-    clog_least, clog_most, clog_layers
-        Share of the layer's beads that a clog takes, and how deep it is at most: beads of one
-        layer, and noise. Layers below are whole, or all of this one would lack.
+    clog_least, clog_most, clog_lasts, clog_layers
+        Share of the layer's beads that a clog takes; it does not clear itself, but for noise, so
+        that it lasts through this share of what follows its beginning; and how deep it is at most:
+        beads of one layer, and noise. Layers below are whole, or all of this one would lack.
     around, around_of
         Places around one that tell what is there as a region, and among how many they are looked
         for.
@@ -69,6 +70,7 @@ class KindOptions:
     layer_share: float = 0.55
     clog_least: float = 0.12
     clog_most: float = 0.9
+    clog_lasts: float = 0.9
     clog_layers: float = 1.5
     around: int = 8
     around_of: int = 128

@@ -255,6 +255,7 @@ def _flow(top: _Surface, job: Job, line: int, layer_mm: float, options: KindOpti
     share = 1.0 - at / len(short)
     if (
         options.clog_least < share < options.clog_most
+        and _lasts(short[at:]) >= options.clog_lasts
         and np.percentile(low[at:], 75) < options.clog_layers
         and wrong <= _apart(points[seen, :2], short, distance[seen, -1], options)
     ):
@@ -272,6 +273,11 @@ def _since(short: Bool[np.ndarray, " n"]) -> tuple[int, float]:
     wrong = np.cumsum(np.concatenate([[np.sum(~short)], np.where(short, 1, -1)]))
     at = int(np.argmin(wrong))
     return at, float(wrong[at]) / len(short)
+
+
+def _lasts(short: Bool[np.ndarray, " n"]) -> float:
+    """Share of places, from the first on, up to where they are best taken to be whole again."""
+    return float(np.argmax(np.cumsum(np.where(short, 1, -1))) + 1) / len(short)
 
 
 def _apart(

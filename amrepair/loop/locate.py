@@ -207,7 +207,13 @@ def _place(walls: Scan, inset: _Inset, layer_height_mm: float, like: Transform |
             placed = align(walls, inset, guess=guess).template_from_scan.inverse()
             if _off_mm(walls, inset, placed) < 0.5 * layer_height_mm:
                 return placed
-    found = align(walls, inset)
+    try:
+        found = align(walls, inset)
+    except AlignmentError as error:
+        raise AlignmentError(
+            "the job prints another part: its walls do not lie on this one's; name the part that "
+            "the job prints, at its scale"
+        ) from error
     alike = (found.template_from_scan, *found.symmetric_alternatives)
     placed = max((pose.inverse() for pose in alike), key=lambda pose: float(np.trace(pose.matrix)))
     off_mm = _off_mm(walls, inset, placed)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amrepair.errors import LoopError
+from amrepair.errors import InputError
 from amrepair.policy import Decision
 from amrepair.policy.passes import may_be_left
 from amrepair.policy.worth import volume_mm3
@@ -160,13 +160,13 @@ def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[
 
     Raises
     ------
-    LoopError
+    InputError
         If the job has no such layer.
     """
     stops = []
     for index in sorted(set(layers)):
         if not 0 <= index < len(job.layers):
-            raise LoopError(
+            raise InputError(
                 f"there is no layer {index} to stop after; the job has layers 0 to "
                 f"{len(job.layers) - 1}"
             )

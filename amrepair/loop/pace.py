@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from amrepair.errors import LoopError
+from amrepair.errors import InputError, LoopError
 from amrepair.loop.looks import Look, Stop, plan_stops
 from amrepair.policy.table import Action
 from gcode.reader import Job
@@ -100,14 +100,14 @@ def layers_at(job: Job, heights_mm: Sequence[float]) -> list[int]:
 
     Raises
     ------
-    LoopError
+    InputError
         If a height is not above the bed, or above the job's last layer.
     """
     tops = [layer.z_mm for layer in job.layers]
     found = []
     for z_mm in heights_mm:
         if not 0.0 < z_mm <= tops[-1] + 1e-6:
-            raise LoopError(
+            raise InputError(
                 f"there is no layer at z = {z_mm:g} mm to stop after; the job is {tops[-1]:g} mm "
                 "high"
             )

@@ -68,8 +68,10 @@ def check(
         from gcode.moves import Program
 
     if picture is not None:
-        if as_built is None or picture.suffix.lower() != ".svg":
-            raise InputError("--picture draws a contact with --as-built as .svg; give both so.")
+        if as_built is None:
+            raise InputError("--picture draws a contact with what stands there: give --as-built.")
+        if picture.suffix.lower() != ".svg":
+            raise InputError(f"--picture {picture}: the drawing is an .svg; name it so.")
         console.writable(picture)
     text = program_text(file)
     setup = setup_to_judge(text, file, printer, material)
@@ -82,7 +84,8 @@ def check(
             leave_heaters=leave_heaters, progress=bars,
         )  # fmt: skip
     refusals = verdict.refusals
-    other = other_printer(text, file, setup.printer) if printer is not None else None
+    asked = printer is not None or bool(refusals)
+    other = other_printer(text, file, setup.printer) if asked else None
     contact = _contact_in_words(verdict, program, setup)
     drawn = picture is not None and verdict.contact is not None and verdict.moves is not None
     if picture is not None and field is not None and verdict.contact and verdict.moves:

@@ -140,13 +140,22 @@ def _result(found: ImportedFile, paths: list[Path]) -> dict[str, Any]:
 
 
 def _show(found: ImportedFile, paths: list[Path]) -> None:
+    from gcode.profiles.importers.rules import NO_COUNTERPART
+
     for made, path in zip(found.profiles, paths, strict=True):
         console.out.print(
             f"{path}: {len(made.mapped)} keys, the rest from {made.inherits}.", markup=False
         )
     for note in found.notes:
         console.out.print(f"note: {note}.", markup=False)
-    console.out.print(f"{len(found.left)} keys are not mapped:")
+    if not found.left:
+        console.out.print("Every key of the source is in them.")
+        return
+    console.out.print(f"{len(found.left)} keys are not mapped (--json tells their values):")
     for row in found.left:
-        value = " ".join(row.source_value.split())[:SHOWN]
-        console.out.print(f"  {row.source_key} = {value}: {row.reason}", markup=False)
+        if row.reason != NO_COUNTERPART:
+            value = " ".join(row.source_value.split())[:SHOWN]
+            console.out.print(f"  {row.source_key} = {value}: {row.reason}", markup=False)
+    unlike = [row.source_key for row in found.left if row.reason == NO_COUNTERPART]
+    if unlike:
+        console.out.print(f"  {NO_COUNTERPART}: {', '.join(unlike)}", markup=False)

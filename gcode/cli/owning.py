@@ -15,7 +15,7 @@ from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
     from gcode.profiles import PrinterProfile, PrintSetup
-    from gcode.profiles.own_settings import OwnSettings
+    from gcode.profiles.own_settings import OwnSettings, SlicedFor
 
 JobPrinterOption = Annotated[
     str | None,
@@ -41,7 +41,7 @@ def job_setup(
     printer: str | None,
     material: str | None,
     process: str | None = None,
-) -> tuple[PrintSetup, OwnSettings | None]:
+) -> tuple[PrintSetup, OwnSettings | SlicedFor | None]:
     """The profiles for a job, with its own settings where they were taken: told in one line.
 
     Parameters
@@ -65,7 +65,7 @@ def job_setup(
     return setup, own
 
 
-def _own(text: str | None, name: Path | str, printer: str | None) -> OwnSettings | None:
+def _own(text: str | None, name: Path | str, printer: str | None) -> OwnSettings | SlicedFor | None:
     """A job's own settings, where they are asked for; that there are none is told."""
     from gcode.profiles.own_settings import own_settings
 

@@ -71,16 +71,18 @@ def slice_solid(
     from gcode.check import check as check_program
     from gcode.estimate import estimate as estimate_program
     from gcode.profiles import load_setup
+    from gcode.profiles.own_settings import profiles_line
 
+    title = f"{solid.name}\n{profiles_line((printer, material, process))}"
     place = _place(place, patch=as_built is not None)
     console.writable(output)
     setup = load_setup(printer, material, process)
     bars = console.Bars()
     with bars.shown():
         if as_built is None:
-            made = _whole(solid, setup, place, workers, bars)
+            made = _whole(solid, setup, title, place, workers, bars)
         else:
-            made = _patch(solid, setup, place, (as_built, job), bars)
+            made = _patch(solid, setup, title, place, (as_built, job), bars)
         program = made.program
         gives_back(check_program)(program, setup, as_built=made.field, progress=bars)
         cost = estimate_program(program, setup.printer, progress=bars)
@@ -125,7 +127,12 @@ class _Made:
 
 @gives_back
 def _whole(
-    solid: Path, setup: PrintSetup, place: str, workers: int | None, bars: console.Bars
+    solid: Path,
+    setup: PrintSetup,
+    title: str,
+    place: str,
+    workers: int | None,
+    bars: console.Bars,
 ) -> _Made:
     """A whole job."""
     from gcode.crew import cores
@@ -136,13 +143,14 @@ def _whole(
         shape, moved_mm = _placed(read_closed(solid), setup, place)
     toolpath = slice_part(shape, setup, workers=workers or cores(), progress=bars)
     where = _where(shape, moved_mm) if place == CENTRE else None
-    program = _written(toolpath, setup, solid, (), bars)
+    program = _written(toolpath, setup, title, (), bars)
     return _Made(program, toolpath.volume_mm3, float(shape.volume()), moved_mm, where)
 
 
 def _patch(
     solid: Path,
     setup: PrintSetup,
+    title: str,
     place: str,
     around: tuple[Path, Path | None],
     bars: console.Bars,
@@ -157,20 +165,21 @@ def _patch(
     grid = grid_of(None if around[1] is None else job_of(around[1], setup), setup)
     plan = slice_patch(shape, setup, as_built=field, grid=grid, standalone=True, progress=bars)
     left = (*plan.unreachable, *plan.unprintable)
-    program = _written(plan.toolpath, setup, solid, left, bars)
+    program = _written(plan.toolpath, setup, title, left, bars)
     volumes = plan.toolpath.volume_mm3, float(shape.volume())
     return _Made(program, *volumes, moved_mm, None, field, left, plan.first_pass)
 
 
 def _written(
-    toolpath: Toolpath, setup: PrintSetup, solid: Path, left: tuple[Any, ...], bars: console.Bars
+    toolpath: Toolpath, setup: PrintSetup, title: str, left: tuple[Any, ...], bars: console.Bars
 ) -> Program:
     from gcode.writer import write
 
     if not toolpath.extrusions:
-        raise InputError(f"{solid}: nothing of it can be printed: {_reasons(left)}.")
+        name = title.partition("\n")[0]
+        raise InputError(f"{name}: nothing of it can be printed: {_reasons(left)}.")
     with bars.stage("write"):
-        return write(toolpath, setup, title=f"{solid.name}")
+        return write(toolpath, setup, title=title)
 
 
 def _placed(shape: Any, setup: PrintSetup, place: str) -> tuple[Any, tuple[float, float, float]]:

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, program_text
+from gcode.cli.options import JsonOption, MaterialOption, program_text
 from gcode.errors import InputError
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
+from gcode.profiles import DEFAULT_MATERIAL
 
 
 def add_to(app: typer.Typer) -> None:
@@ -57,7 +57,13 @@ def touch_command(
     layer: Annotated[
         int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
     ] = None,
-    printer: PrinterOption = DEFAULT_PRINTER,
+    printer: Annotated[
+        str | None,
+        typer.Option(
+            help="Printer profile: an ID or a TOML file, with the probe that feels.",
+            autocompletion=console.profile_ids("printers"),
+        ),
+    ] = None,
     material: MaterialOption = DEFAULT_MATERIAL,
     klipper_macro: Annotated[
         Path | None,
@@ -78,8 +84,9 @@ def touch_command(
     if klipper_macro is not None:
         _hand_out(klipper_macro)
         return
-    job, port, above_mm = (
-        _given(job, "JOB"), _given(port, "--port"), _given(above_mm, "--above-mm"),
+    job, printer, port, above_mm = (
+        _given(job, "JOB"), _given(printer, "--printer"), _given(port, "--port"),
+        _given(above_mm, "--above-mm"),
     )  # fmt: skip
     with console.starting():
         from gcode.hosts.serial import SerialPrinter

@@ -26,11 +26,11 @@ from gcode.hosts.modes import commands_of
 from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.octoprint_session import OctoPrintSession
 from gcode.hosts.octoprint_state import part_of
-from gcode.hosts.port import PrintableProgram
+from gcode.hosts.port import NothingMetError, PrintableProgram
 from gcode.hosts.rewritten import Rewritten
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
-from gcode.hosts.web import json_object, sentence
-from gcode.progress import Progress
+from gcode.hosts.web import LIFT_COMMANDS, json_object, sentence
+from gcode.progress import Progress, silent
 
 PLUGIN = f"/plugin/{AGENT}"
 OTHER_AGENT_GOES_S = 8.0
@@ -231,11 +231,18 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
 
     def _print_at_rest(self, checked: PrintableProgram, lines: range, progress: Progress) -> None:
         """Hand a program over, and wait until the plugin has had it printed."""
-        number, send = number_of(checked), uuid.uuid4().hex
         commands = [text for _, text in commands_of(checked, lines.start, lines.stop)]
-        if not commands:
-            return
-        self._asked(lambda: self._tell("program", number=number, send=send, lines=commands))
+        if commands:
+            self._hand_over(number_of(checked), commands, progress)
+
+    def _hand_over(
+        self, number: int, commands: Sequence[str], progress: Progress, *, touches: bool = False
+    ) -> str:
+        """Have commands printed at the look; what the firmware said against a touch."""
+        send, lines = uuid.uuid4().hex, list(commands)
+        self._asked(
+            lambda: self._tell("program", number=number, send=send, lines=lines, touches=touches)
+        )
         while True:
             told = part_of(self._asked(self._state), "program")
             if told.get("number") != number:
@@ -245,9 +252,31 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
                 )
             progress("printing", float(told["done"]), float(len(commands)))
             if told["over"]:
-                return
+                return str(told.get("wrong") or "")
             with self._session.news:
                 self._session.news.wait(self._timing.poll_s)
+
+    # ------------------------------------------------------------------ touches
+
+    def require_touches(self) -> None:
+        """Any firmware that knows its dialect's touch will do; one that does not says so."""
+
+    def touch(
+        self, checked: PrintableProgram, lines: range, *, progress: Progress = silent
+    ) -> float:
+        """Carry out lines, the last of them a touch; where it met something, mm in G-code's Z."""
+        commands = [text for _, text in commands_of(checked, lines.start, lines.stop)]
+        said = self._hand_over(number_of(checked), commands, progress, touches=True)
+        if not said:
+            return self._asked(self.position_mm)[2]
+        self._hand_over(0, LIFT_COMMANDS, silent, touches=True)
+        self.heaters_off()
+        if "nknown command" in said:
+            raise PrinterError(
+                f"The printer's firmware does not know {commands[-1].split()[0]} ({said}), so "
+                "nothing was touched; the nozzle was lifted and the heaters are off."
+            )
+        raise NothingMetError(f"the firmware says: {said}")
 
     def _reached_at_rest(self, checked: PrintableProgram, lines: range) -> int:
         told = part_of(self._asked_about, "program")
@@ -291,7 +320,8 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
         told = part_of(self._state(), "print")
         if told and not told.get("ended") and not told.get("rests"):
             return
-        self._tell("off")
+        hotend_c, bed_c = self._heat_at_look
+        self._tell("off", hotend=hotend_c, bed=bed_c)
 
     def leave(self, way_back: Sequence[PrintableProgram]) -> None:
         """What leads back to the job, for somebody who lets it go on without us.

@@ -312,8 +312,11 @@ class ServedJob(ServerPrinter[Session]):
                 f"where the nozzle is over {self._name} on {self.address.name} is not known: it "
                 "was left in the midst of touches."
             )
-        self.command(f"G90\nG1 Z{place['Z']:.3f} F{LIFT_MM_MIN}")
-        self.command(f"G1 X{place['X']:.3f} Y{place['Y']:.3f} F{GO_MM_MIN}\nM400")
+        for text in (
+            "G90", f"G1 Z{place['Z']:.3f} F{LIFT_MM_MIN}",
+            f"G1 X{place['X']:.3f} Y{place['Y']:.3f} F{GO_MM_MIN}", "M400",
+        ):  # fmt: skip
+            self.command(text)
 
     def _heat_as_left(self, sent: Sequence[tuple[PrintableProgram, int, int, bool]]) -> None:
         """Heat again what was switched off since; a nozzle that was cooled on purpose stays so."""

@@ -1,7 +1,8 @@
 """What a job says of the printer and the material that it was sliced for.
 
-It reads the settings that a slicer wrote into the job (`importers.jobs`), makes profiles of them,
-and tells whether a profile is of another machine. It judges no move.
+A program of `gcode slice` names its profiles. Of a slicer's job the settings that are written in it
+(`importers.jobs`) are made profiles of. It tells whether a profile is of another machine, and
+judges no move.
 """
 
 from __future__ import annotations
@@ -10,17 +11,24 @@ import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from gcode.dialects import dialect_of
+from gcode.errors import ProfileError
 from gcode.profiles.importers import ImportedFile, import_job, write_profiles
 from gcode.profiles.importers.jobs import generator
 from gcode.profiles.machines import machine_named
 from gcode.profiles.names import DEFAULT_PROCESS
 from gcode.profiles.schema import PrinterProfile
 from gcode.profiles.setup import PrintSetup, load_setup
+from gcode.profiles.store import load_printer
 
 SAME_BED_RATIO = 0.05  # slicers and makers give one bed a few millimetres more or less
 SAME_NOZZLE_MM = 0.01  # nozzles are sold in steps of a tenth
+NAMED_WITHIN = 4096
+NO_HOSTS = "Bambu Lab"
+"""Whose printers are driven by their maker's own programs."""
+_SLICED_FOR = "profiles: "
 _POINT = re.compile(r"(-?\d+(?:\.\d+)?)x(-?\d+(?:\.\d+)?)")
 # What one would ask first, and what no slicer tells.
 _ASKED_FIRST = {
@@ -99,6 +107,12 @@ class OwnSettings:
 
     def differs_from(self, printer: PrinterProfile) -> str | None:
         """One sentence if the job was sliced for another machine; None where it may be this one."""
+        if self.printer_name.startswith(NO_HOSTS):
+            return (
+                f"{self.job} was sliced for a {self.printer_name}, which takes no G-code from a "
+                "host, and has commands of its own (M1002, M620, …); slice it for the printer "
+                "that is to print it"
+            )
         values = self.found.profiles[0].values
         why = []
         if self.bed_size_mm is not None and any(
@@ -126,7 +140,76 @@ class OwnSettings:
         )
 
 
-def own_settings(text: str, name: str) -> OwnSettings | None:
+@dataclass(frozen=True, slots=True)
+class SlicedFor:
+    """The profiles that a program of `gcode slice` names.
+
+    Attributes
+    ----------
+    job
+        The program's name.
+    ids
+        Of printer, material and process: IDs or paths of files.
+    """
+
+    job: str
+    ids: tuple[str, str, str]
+
+    flow_is_told: ClassVar[bool] = True
+
+    @property
+    def machine(self) -> str:
+        """The printer's profile."""
+        return self.ids[0]
+
+    def setup(self, material: str | None = None, process: str | None = None) -> PrintSetup:
+        """These, but for what is named."""
+        return load_setup(self.ids[0], material or self.ids[1], process or self.ids[2])
+
+    def keep(
+        self, folder: Path, material: str | None = None, process: str | None = None
+    ) -> tuple[str, str, str]:
+        """The three paths or IDs to load; nothing is written."""
+        return self.ids[0], material or self.ids[1], process or self.ids[2]
+
+    def in_words(self, setup: PrintSetup) -> str:
+        """One sentence: what was taken from where."""
+        return (
+            f"{self.job}: no --printer is given, so {self.ids[0]} is taken, for which it was "
+            f"sliced: {_described(setup.printer)}"
+        )
+
+    def differs_from(self, printer: PrinterProfile) -> str | None:
+        """One sentence if the program was sliced for another machine."""
+        own = load_printer(self.ids[0])
+        if own.name == printer.name:
+            return None
+        return (
+            f"{self.job} was sliced for another printer than {printer.name}: for '{own.name}'; "
+            f"give --printer {self.ids[0]}, leave --printer out, or slice it for this one"
+        )
+
+
+def profiles_line(ids: tuple[str, str, str]) -> str:
+    """What a program of ours says of its profiles; paths of files are whole."""
+    whole = (str(Path(i).resolve()) if Path(i).suffix == ".toml" else i for i in ids)
+    return _SLICED_FOR + ", ".join(whole)
+
+
+def _sliced_for(text: str, name: str) -> SlicedFor | None:
+    """The profiles that a program names, where they are there to be loaded."""
+    line = re.search(f"^; {_SLICED_FOR}(.+), (.+), (.+)$", text[:NAMED_WITHIN], re.MULTILINE)
+    if line is None:
+        return None
+    found = SlicedFor(Path(name).name, (line[1], line[2], line[3]))
+    try:
+        found.setup()
+    except ProfileError:  # another machine's file, or another version's
+        return None
+    return found
+
+
+def own_settings(text: str, name: str) -> OwnSettings | SlicedFor | None:
     """What a job's slicer wrote into it; None where there is nothing.
 
     Parameters
@@ -141,6 +224,9 @@ def own_settings(text: str, name: str) -> OwnSettings | None:
     InputError
         If the settings are cut.
     """
+    ours = _sliced_for(text, name)
+    if ours is not None:
+        return ours
     found = import_job(name, text)
     if found is None:
         return None

@@ -28,6 +28,7 @@ UNEVEN_RATIO = 0.5  # of a layer: what the first one bridges or is pressed into
 HELD_RATIO = 0.98  # of the first layer that must lie on something
 TOP_PERCENT = 95.0  # what is higher are single points of a scan's noise
 _MOVED_COMMAND = re.compile(r"^\s*[Gg][0123](?!\d)")
+_HOMES_XY_ALONE = re.compile(r"G28(?!\d)(?=.*[XY])(?!.*Z)")
 _Z = re.compile(r"([Zz])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 _RELATIVE = re.compile(r"^\s*G9([01])\b", re.IGNORECASE)
 
@@ -142,8 +143,10 @@ def _raised(lines: list[str], by_mm: float, *, absolute: bool, first: int) -> li
         mode = _RELATIVE.match(code)
         if mode is not None:
             absolute = mode.group(1) == "0"
-        shifts = code.strip().upper().startswith("G92") and _Z.search(code) is not None
-        if shifts or code.strip().upper().startswith(("G20", "G28")):
+        command = code.strip().upper()
+        shifts = command.startswith("G92") and _Z.search(code) is not None
+        homes_z = command.startswith("G28") and not _HOMES_XY_ALONE.match(command)
+        if shifts or homes_z or command.startswith("G20"):
             raise InputError(
                 f"Line {number_} ({code.strip()!r}) changes what a height means, and cannot be "
                 "raised; slice the job without it."

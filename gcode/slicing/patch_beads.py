@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,8 @@ CORNER_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 class Chain:
     """A bead of a pass: (n, 2) points, (n,) heights of the tip, (n-1,) cross-sections, mm².
 
-    `deep_mm` has (n-1,) how far what lies under it is below the tip.
+    `deep_mm` has (n-1,) how far what lies under it is below the tip; `cold` (n-1,) says where it
+    lies on what has long been there, and not on beads of the patch; None where nobody asked.
     """
 
     xy_mm: Float[np.ndarray, "n 2"]
@@ -52,6 +53,7 @@ class Chain:
     section_mm2: Float[np.ndarray, " m"]
     deep_mm: Float[np.ndarray, " m"]
     role: Role
+    cold: Bool[np.ndarray, " m"] | None = None
 
     @property
     def volume_mm3(self) -> float:
@@ -65,12 +67,13 @@ class Chain:
 
     def reversed(self) -> Chain:
         """The same from its other end."""
-        return Chain(
-            np.ascontiguousarray(self.xy_mm[::-1]),
-            np.ascontiguousarray(self.z_mm[::-1]),
-            np.ascontiguousarray(self.section_mm2[::-1]),
-            np.ascontiguousarray(self.deep_mm[::-1]),
-            self.role,
+        return replace(
+            self,
+            xy_mm=np.ascontiguousarray(self.xy_mm[::-1]),
+            z_mm=np.ascontiguousarray(self.z_mm[::-1]),
+            section_mm2=np.ascontiguousarray(self.section_mm2[::-1]),
+            deep_mm=np.ascontiguousarray(self.deep_mm[::-1]),
+            cold=None if self.cold is None else np.ascontiguousarray(self.cold[::-1]),
         )
 
 

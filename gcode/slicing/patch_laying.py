@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Float
 
@@ -131,7 +134,8 @@ def first_pass_words(setup: PrintSetup, hotend_c: float) -> str:
     first_c = _first_bead_c(setup, hotend_c)
     more = f" ({first_c - hotend_c:g} C more than the rest)" if first_c > hotend_c else ""
     return (
-        f"first pass, onto cold material: {first_c:g} C{more}, at most {_first_mm_s(setup):g} mm/s"
+        f"first pass, onto cold material: {first_c:g} C{more}, at most {_first_mm_s(setup):g} mm/s "
+        "(as what else lies on cold material)"
     )
 
 
@@ -149,9 +153,8 @@ def _first_bead_c(setup: PrintSetup, hotend_c: float) -> float:
 def emit(
     pen: Pen, one: Pass, reach: Reach, model: PatchModel, setup: PrintSetup, *, first: bool
 ) -> float:
-    """Lay one pass, the first one no faster than a first layer; returns its plastic."""
+    """Lay one pass, no faster than a first layer where it lies on old material; its plastic."""
     pen.add(LayerChange(one.index, one.z_mm, one.height_mm))
-    speed_mm_s = _first_mm_s(setup) if first else setup.process.repair_speed_mm_s
     laid_mm3 = 0.0
     planar = isinstance(one.tip_mm, float)
     # along a surface they are in order: the lowest first
@@ -159,16 +162,28 @@ def emit(
     for chain in chains:
         _go_to(pen, np.array([*chain.xy_mm[0], chain.z_mm[0]]), one, reach, model, setup)
         deep_mm = float(chain.deep_mm.mean())
-        pen.extrude(
-            np.column_stack([chain.xy_mm, chain.z_mm]),
-            chain.section_mm2,
-            speed_mm_s=speed_mm_s,
-            role=chain.role,
-            width_mm=width_of(float(chain.section_mm2.mean()) / deep_mm, deep_mm),
-            height_mm=deep_mm,
-        )
+        points_mm = np.column_stack([chain.xy_mm, chain.z_mm])
+        for a, b, slow in _stretches(chain, first=first):
+            pen.extrude(
+                points_mm[a : b + 1],
+                chain.section_mm2[a:b],
+                speed_mm_s=_first_mm_s(setup) if slow else setup.process.repair_speed_mm_s,
+                role=chain.role,
+                width_mm=width_of(float(chain.section_mm2.mean()) / deep_mm, deep_mm),
+                height_mm=deep_mm,
+            )
         laid_mm3 += chain.volume_mm3
     return laid_mm3
+
+
+def _stretches(chain: Chain, *, first: bool) -> Iterator[tuple[int, int, bool]]:
+    """From which point to which a chain is laid at one speed, and whether it is the slow one."""
+    count = len(chain.section_mm2)
+    cold = chain.cold if chain.cold is not None else np.zeros(count, dtype=bool)
+    slow = cold | first
+    ends = [0, *(np.flatnonzero(np.diff(slow)) + 1).tolist(), count]
+    for a, b in pairwise(ends):
+        yield a, b, bool(slow[a])
 
 
 def _go_to(

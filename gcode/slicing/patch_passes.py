@@ -82,8 +82,17 @@ def plan_pass(
             laying = own
     if laying is None or not laying.chains:
         return None, state
-    one = Pass(at.z_mm, laying.height_mm, at.index, tuple(laying.chains), at.reach, at.z_mm)
+    chains = tuple(_told_cold(chain, model, state, at) for chain in laying.chains)
+    one = Pass(at.z_mm, laying.height_mm, at.index, chains, at.reach, at.z_mm)
     return one, _after(state, at, due, laying, planned)
+
+
+def _told_cold(chain: Chain, model: PatchModel, state: PatchState, at: Height) -> Chain:
+    """The chain, told where it lies on what has long been there; what hangs lies on nothing."""
+    middles = 0.5 * (chain.xy_mm[1:] + chain.xy_mm[:-1])
+    cells = tuple(np.array([model.cell_at(middle) for middle in middles]).T)
+    on_it = at.z_mm - state.surface_mm[cells] <= at.deep_mm
+    return replace(chain, cold=np.asarray(on_it & (state.laid_mm[cells] <= 0)))
 
 
 @dataclass(frozen=True, slots=True)

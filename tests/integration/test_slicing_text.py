@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from gcode.check import find_refusals
 from gcode.cli.app import app
 from gcode.errors import SliceError
-from gcode.moves import ModalState, Program
+from gcode.moves import Extrude, ModalState, Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.slicing.job import SHORT_TRAVEL_MM, slice_part
 from gcode.slicing.layers import LayerGrid
@@ -225,11 +225,39 @@ def test_the_first_pass_is_slower_and_hotter_and_the_rest_is_not(standalone: boo
     told = [line for line in program.text.splitlines() if "onto cold material" in line]
     assert told == [
         f"; first pass, onto cold material: {hotter_c:g} C ({hotter_c - own_c:g} C more than the "
-        f"rest), at most {setup.process.first_layer_speed_mm_s:g} mm/s"
+        f"rest), at most {setup.process.first_layer_speed_mm_s:g} mm/s (as what else lies on cold "
+        "material)"
     ]
     if not standalone:  # what the job goes on with
         heats = [line for line in program.text.splitlines() if line.startswith(("M104", "M109"))]
         assert heats == [f"M109 S{hotter_c:g}", f"M104 S{own_c:g}"]
+
+
+def test_what_lies_on_cold_material_is_slow_in_every_pass_and_what_lies_on_beads_is_not() -> None:
+    # regression: of a notch whose floor rises in steps only the lowest pass was laid slowly; on the
+    # steps above it beads lay on material as cold, as fast as on others
+    fast = SETUP.process.model_copy(update={"repair_speed_mm_s": 35.0})
+    setup = PrintSetup(SETUP.printer, SETUP.material, fast)
+    block = m3.Manifold.cube((24.0, 20.0, 6.0)).translate((100.0, 90.0, 0.0))
+    steps = [m3.Manifold.cube((6.0 * (k + 1), 20.0, 0.4)).translate((100.0, 90.0, 4.8 + 0.4 * k))
+             for k in range(3)]  # fmt: skip
+    gone = m3.Manifold.batch_boolean(steps, m3.OpType.Add)
+    field = HeightField.from_manifold(block - gone, 0.1, margin_mm=15.0)
+    plan = slice_patch(
+        gone, setup, as_built=field, grid=LayerGrid.from_setup(setup), standalone=True
+    )
+    right_mm = all_mm = 0.0
+    for move in plan.toolpath:
+        if not isinstance(move, Extrude):
+            continue
+        middles = 0.5 * (move.points_mm[1:] + move.points_mm[:-1])
+        floor_mm = 4.8 + 0.4 * np.clip((middles[:, 0] - 100.0) // 6.0, 0, 2)
+        cold = middles[:, 2] - floor_mm < 0.25
+        slow = move.speed_mm_s == setup.process.first_layer_speed_mm_s
+        lengths_mm = np.linalg.norm(np.diff(move.points_mm, axis=0), axis=1)
+        right_mm += float(lengths_mm[cold == slow].sum())
+        all_mm += float(lengths_mm.sum())
+    assert right_mm > 0.9 * all_mm  # but where a stretch runs over an edge
 
 
 def test_a_job_as_hot_as_the_hotend_gets_is_not_heated_beyond_it() -> None:

@@ -19,6 +19,7 @@ from clogged_block import (
     ENVIRONMENT,
     PRUSA_SLICER,
     events,
+    filament_of,
     judge,
     sliced,
 )
@@ -42,8 +43,16 @@ QUESTION = "Print this repair?"
 class Stack:
     """An emulated printer, OctoPrint with our plugin, an agent."""
 
-    def __init__(self, folder: Path, keep: ExitStack, clog_mm: tuple[float, ...] = CLOG_MM) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        keep: ExitStack,
+        clog_mm: tuple[float, ...] = CLOG_MM,
+        printer: str = "ender_3",
+        scanner: str = "",
+    ) -> None:
         self.folder, self.keep, self.clog_mm = folder, keep, clog_mm
+        self.printer, self.scanner = printer, scanner or f"simulated:{folder / 'motion.bin'}"
         self.motion, self.port, self.link = folder / "motion.bin", free_port(), folder / "printer"
         self.url = f"http://127.0.0.1:{self.port}"
         self.web = Web(self.url, KEY)
@@ -51,7 +60,7 @@ class Stack:
         self.key.write_text(KEY)
         self.key.chmod(0o600)
         self._keep("emulator", sys.executable, "-m", "gcode", "emulate", "--accelerated",
-                   "--firmware", "marlin", "--printer", "ender_3", "--link", self.link,
+                   "--firmware", "marlin", "--printer", self.printer, "--link", self.link,
                    "--motion", self.motion)  # fmt: skip
         wait_for("the emulated printer", self.link.exists, folder / "emulator.log")
         self.start_octoprint()
@@ -71,8 +80,8 @@ class Stack:
     def words(self, url: str) -> list[str]:
         return [
             *AMREPAIR, "agent", "--octoprint", url, "--api-key-file", str(self.key), "--template",
-            str(self.folder / "block.stl"), "--scanner", f"simulated:{self.motion}", "--printer",
-            "ender_3", "--material", "pla", "--out", str(self.folder / "runs"), "--view-port",
+            str(self.folder / "block.stl"), "--scanner", self.scanner, "--printer",
+            self.printer, "--material", "pla", "--out", str(self.folder / "runs"), "--view-port",
             "0", "--once",
         ]  # fmt: skip
 
@@ -119,7 +128,7 @@ def stack(
 ) -> Iterator[Stack]:
     monkeypatch.setenv("PYTHONPATH", ENVIRONMENT["PYTHONPATH"])
     with ExitStack() as keep:
-        found = Stack(tmp_path, keep, getattr(request, "param", CLOG_MM))
+        found = Stack(tmp_path, keep, **getattr(request, "param", {}))
         yield found
         found.web.http.close()
 
@@ -195,11 +204,63 @@ def test_approved_in_the_tab_and_killed_and_nothing_is_printed_twice(stack: Stac
     assert stack.state()["print"]["ended"] == "done"
 
 
+PROBE = {"printer": "generic_marlin", "scanner": "probe"}
+
+
+@pytest.mark.parametrize("stack", [PROBE], indirect=True)
+def test_the_printers_own_probe_finds_it_and_is_killed_in_the_midst_of_it(stack: Stack) -> None:
+    """What the emulated nozzle feels is what it has laid itself, by G38.2."""
+    job = sliced(stack.folder, flavour="marlin2", reads="octoprint")
+    agent = stack.agent("--approve", "auto")
+    stack.upload(job)
+    begun = lambda: any(e.get("kind") == "touch" for e in events(stack.folder))  # noqa: E731
+    wait_for("touches", begun, stack.log)
+    end(agent)
+    agent = stack.agent("--approve", "auto")
+    ended(agent, stack)
+    assert "is gone on with" in stack.said()
+    assert re.search(r"missing \(a void.*\)\. Printed", stack.said())
+    assert "Nothing is missing any more" in stack.tab()
+    judge(stack.motion, job, "@amrepair", within=0.7)  # a tip feels no hole's edges
+    assert stack.state()["print"]["ended"] == "done"
+
+
+@pytest.mark.parametrize(
+    "stack", [{**PROBE, "clog_mm": (*CLOG_MM[:2], 0.5, *CLOG_MM[3:])}], indirect=True
+)
+def test_a_touch_that_meets_nothing_ends_the_looks_and_not_the_print(stack: Stack) -> None:
+    """A hole deeper than a touch may go: OctoPrint does not cancel for the firmware's error."""
+    job = sliced(stack.folder, flavour="marlin2", reads="octoprint")
+    agent = stack.agent("--approve", "auto")
+    stack.upload(job)
+    told = "no more looks at this print: Nothing was felt down to Z2 mm"
+    wait_for("the sentence", lambda: told in stack.tab(), stack.log, 100.0)
+
+    def off() -> bool:
+        heat = stack.web.get("/api/printer").get("temperature", {})
+        return all(heat.get(name, {}).get("target") == 0.0 for name in ("tool0", "bed"))
+
+    wait_for("heaters are off", off, stack.log)
+    assert "Failed to reach target" in stack.said()
+    assert MotionFile(stack.motion).take().end_mm[-1, 2] > 3.0, "lifted"
+    wait_for("the question", lambda: stack.state()["prompt"], stack.log)
+    answer = stack.web.http.post("/plugin/amrepair/press", json={"what": "go on"})
+    assert answer.status_code == 200, answer.text
+    ended(agent, stack)
+    assert stack.state()["print"]["ended"] == "done"
+    lines = job.read_text().split("\n")
+    first = next(k for k, line in enumerate(lines) if line.startswith("@amrepair"))
+    batch = MotionFile(stack.motion).take()
+    above = (batch.end_mm[:, 2] > 3.15) & (np.hypot(*(batch.end_mm - batch.start_mm)[:, :2].T) > 0)
+    planned = [line for line in lines[first:] if re.match(r"G1 (X|Y).*E", line)]
+    assert float(batch.filament_mm[above].sum()) == pytest.approx(filament_of(planned), rel=1e-4)
+
+
 SECOND_MM = (104.0, 113.0, 0.5, 116.0, 123.0, 3.05)
 """The second of two blocks of 12 x 10 x 3 mm, but for its first two layers."""
 
 
-@pytest.mark.parametrize("stack", [SECOND_MM], indirect=True)
+@pytest.mark.parametrize("stack", [{"clog_mm": SECOND_MM}], indirect=True)
 def test_one_of_two_objects_is_given_up_and_the_other_goes_on(stack: Stack) -> None:
     """OctoPrint reads on in its file; what it sends is what was checked, lifted past the stump."""
     job = sliced(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from agent_bench import PRINTER, TOP_MM, Bench, Killed, Killer, Ready, made_ready
@@ -12,7 +13,7 @@ from agent_bench import PRINTER, TOP_MM, Bench, Killed, Killer, Ready, made_read
 from amrepair.cli import running
 from amrepair.cli.scanners import open_scanner
 from amrepair.errors import InputError
-from gcode.errors import LinkError
+from gcode.errors import GcodeError, LinkError
 from gcode.firmware.contact import Contact
 from gcode.profiles import load_setup
 from gcode.surfaces import HeightField
@@ -169,3 +170,21 @@ def test_what_cannot_touch_is_refused_at_once(bench: ProbeBench) -> None:
         run(bench)
     with pytest.raises(InputError, match="--scanner is 'prob'"):
         bench.agent(said={"scanner": "prob"})
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"named": ("voron", "pla", "repair_0.20")}, "Unknown printer profile"),
+        ({"named": ("voron_2_4", "pla", "repair_0.20")}, "probe"),
+        ({"named": (None, "wax", "repair_0.20")}, "Unknown material profile"),
+        ({"calibration": Path("none.json")}, r"none\.json"),
+        ({"template": Path(__file__)}, "a part ends in one of"),
+    ],
+)
+def test_what_no_print_could_be_served_with_is_refused_before_one_begins(
+    bench: ProbeBench, changed: dict[str, Any], said: str
+) -> None:
+    with pytest.raises((InputError, GcodeError), match=said):
+        bench.agent(said={"scanner": "probe"}, **changed)
+    assert not bench.told()

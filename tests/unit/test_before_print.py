@@ -242,6 +242,17 @@ def test_a_job_is_raised_onto_what_stands_there() -> None:
     assert find_refusals(made.checked.program, SETUP, as_built=field) == ()
 
 
+def test_homing_x_at_a_jobs_end_changes_no_height() -> None:
+    """regression: PrusaSlicer's own default job ends so, and could be raised onto nothing."""
+    field = scanned.from_points(POINTS, 0.2, what="scan")
+    ends = "G28 X0  ; home X axis\nM84\n"
+    made = print_onto(Program(PLAIN_JOB + ends, "prusa"), SETUP, field)
+    assert "\nG28 X0  ; home X axis\nM84\n" in made.checked.program.text
+    for homes_z in ("G28", "G28 Z", "G28 X Z0", "G28 W"):
+        with pytest.raises(InputError, match="changes what a height means"):
+            print_onto(Program(f"{PLAIN_JOB}{homes_z}\n", "prusa"), SETUP, field)
+
+
 def test_a_skirt_would_hang_in_the_air(job: Path) -> None:
     small = m3.Manifold.cube((14.0, 14.0, 6.0)).translate((108.0, 98.0, 0.0))
     field = HeightField.from_manifold(small, 0.2, margin_mm=30.0)

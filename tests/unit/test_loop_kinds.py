@@ -168,3 +168,20 @@ def test_what_is_short_from_a_bead_on_is_a_clog(scene, begun: float) -> None:  #
     assert found is not None
     assert found.type is DefectType.CLOG
     assert found.confidence > 0.95
+
+
+@pytest.mark.parametrize(("begun", "end"), [(0.86, 0.94), (0.88, 0.94), (0.88, 0.96)])
+def test_what_is_whole_again_at_the_end_is_no_clog(
+    scene,  # type: ignore[no-untyped-def]
+    begun: float,
+    end: float,
+) -> None:
+    # regression: a line that was skipped late in a layer, between lines that were not, is thinner
+    # than any region around it, and so "from it on too little" told more beads right
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    along = np.arange(len(beads)) / len(beads)
+    gone = (along >= begun) & (along < end)
+    noisy = top_of(np.where(gone, -0.2, 0.0), beads[:, :2], 0.1)
+    found = kinds._flow(noisy, job, stop.line, 0.2, USUAL_KINDS)
+    assert found is None or found.type is not DefectType.CLOG

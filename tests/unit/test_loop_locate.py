@@ -112,6 +112,16 @@ def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
 
 
 @pytest.mark.slow
+def test_a_job_of_another_part_is_told_as_that() -> None:
+    """regression: "the scan the job's walls does not fit its template", with advice for scans."""
+    template = MeshSdf.from_mesh(solid_mesh(m3.Manifold.cylinder(9.0, 8.0, 8.0, 48)))
+    job = job_of(wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0)))
+    with pytest.raises(AlignmentError, match="the job prints another part") as said:
+        locate_parts(job, template, layer_height_mm=LAYER_MM)
+    assert "scan" not in str(said.value)
+
+
+@pytest.mark.slow
 def test_another_thing_beside_the_part_is_refused_with_its_number() -> None:
     other = m3.Manifold.cylinder(5.0, 8.0, 5.0, 48).translate((110.0, 66.0, 0.0))
     plate = wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0)) + other

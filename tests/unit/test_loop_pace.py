@@ -8,7 +8,7 @@ import manifold3d as m3
 import pytest
 from loop_bench import Small, scan_of
 
-from amrepair.errors import LoopError
+from amrepair.errors import InputError, LoopError
 from amrepair.loop import Tape, plan_stops
 from amrepair.loop.pace import Pace, Stops, layers_at
 from amrepair.loop.replay import replay
@@ -62,7 +62,7 @@ def test_a_height_is_the_layer_that_reaches_it(small: Small) -> None:
     tops = [layer.z_mm for layer in small.job.layers]
     assert layers_at(small.job, [tops[0], tops[3], tops[3] + 0.01]) == [0, 3, 4]
     for wrong in (0.0, -1.0, tops[-1] + 0.1, float("nan")):
-        with pytest.raises(LoopError, match="no layer at z"):
+        with pytest.raises(InputError, match="no layer at z"):
             layers_at(small.job, [wrong])
 
 

@@ -141,6 +141,28 @@ def test_whatever_is_interleaved_each_line_is_printed_once_and_none_between(
     assert wire.executed == [*JOB[: LOOK - 1], *REPAIR, "M400", *JOB[LOOK:]]
 
 
+TOUCH = ["G1 Z5", "G38.2 Z2 F120"]
+
+
+def test_a_touch_is_cold_and_what_the_firmware_says_against_it_is_ours() -> None:
+    """OctoPrint would cancel the print for "Failed to reach target"."""
+    wire = Wire().begin()
+    wire.targets = [0.0, 60.0]  # cooled for the touches
+    wire.held.off(hotend=210.0)  # somebody ended the agent
+    wire.settle()
+    assert not wire.held.wrong("Thermal Runaway"), "no touch is under way"
+    wire.held.program(number=7, send="a", lines=TOUCH, touches=True)
+    assert wire.held.wrong("Failed to reach target")
+    wire.settle()
+    told = wire.held.state()["program"]
+    assert (told["over"], told["wrong"]) == (True, "Failed to reach target")
+    assert not wire.held.wrong("Thermal Runaway"), "it is over"
+    assert wire.executed[-5:] == ["M107", "M190 S60", *TOUCH, "M400"], "the bed alone is heated"
+    wire.held.program(number=8, send="b", lines=["G1 X1 E1"])
+    wire.settle()
+    assert wire.executed[-3:] == ["M109 S210", "G1 X1 E1", "M400"]
+
+
 def test_lines_that_were_printed_in_another_way_are_left_out() -> None:
     wire = Wire().begin()
     wire.held.go_on(behind=wire.byte(LOOK + 2))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
 from gcode.cli.app import app
@@ -250,6 +252,22 @@ def test_a_job_for_another_printer_is_told_apart(printer: str, why: str) -> None
     assert "Machine of mine" in said
 
 
+@pytest.mark.parametrize("more", [[], ["--printer", "ender_3"]])
+def test_a_job_for_a_printer_that_takes_none_from_a_host_is_one_sentence(
+    more: list[str], tmp_path: Path
+) -> None:
+    """regression: a list of every command that only Bambu Lab's printers know."""
+    job = tmp_path / "job.gcode"
+    own = re.sub(r"(; printer_(?:settings_id|model) =).*", r"\1 Bambu Lab P1S 0.4 nozzle", BAMBU)
+    job.write_text(own + "M1002 gcode_claim_action : 2\n")
+    run = CliRunner().invoke(app, ["check", str(job), *more])
+    assert run.exit_code == 2
+    said = run.stderr.strip().splitlines()[-1]
+    assert said.startswith("job.gcode was sliced for a Bambu Lab P1S")
+    assert "takes no G-code from a host" in said
+    assert "M1002 gcode_claim" not in run.output
+
+
 def test_check_takes_the_jobs_own_printer_and_tells_it(tmp_path: Path) -> None:
     job = tmp_path / "job.gcode"
     job.write_text(NEW_PRUSA.replace("X90", "X170"))
@@ -257,6 +275,25 @@ def test_check_takes_the_jobs_own_printer_and_tells_it(tmp_path: Path) -> None:
     assert run.exit_code == 0, run.output
     assert run.stderr.count("no --printer is given") == 1
     assert "Machine of mine, bed 180 × 180 mm" in run.stderr
+
+
+def test_a_program_of_our_own_names_its_profiles(tmp_path: Path) -> None:
+    """regression: what was sliced for a Voron was checked, and refused, for a Prusa."""
+    job, part = tmp_path / "part.gcode", tmp_path / "part.stl"
+    trimesh.creation.box((12.0, 10.0, 0.6)).export(part)
+    words = ["slice", str(part), "-o", str(job), "--printer", "voron_2_4", "--material", "tpu"]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    done = CliRunner().invoke(app, ["check", str(job)])
+    assert done.exit_code == 0, done.output
+    assert "voron_2_4 is taken, for which it was sliced" in " ".join(done.output.split())
+    own = own_settings(job.read_text(), str(job))
+    assert own is not None
+    assert own.keep(tmp_path)[:2] == ("voron_2_4", "tpu")
+    other = CliRunner().invoke(app, ["check", str(job), "--printer", "prusa_mini"])
+    assert other.exit_code == 2
+    assert "part.gcode was sliced for another printer than" in " ".join(other.output.split())
+    gone = job.read_text().replace("voron_2_4", str(tmp_path / "gone.toml"))
+    assert own_settings(gone, "part.gcode") is None
 
 
 def test_violations_on_another_printer_are_one_sentence(tmp_path: Path) -> None:

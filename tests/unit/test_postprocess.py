@@ -18,7 +18,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from amrepair.cli.app import app
-from amrepair.errors import InputError, LoopError
+from amrepair.errors import InputError
 from amrepair.postprocess import Asked, mark, target_of
 from amrepair.postprocess.mark import decoded
 from gcode.check import Policy, find_refusals
@@ -135,7 +135,7 @@ def test_adaptive_looks_come_before_what_closes_the_infill() -> None:
 def test_a_height_is_looked_at_when_it_is_reached() -> None:
     marked = mark(JOB, "job.gcode", "reprap", Asked(at_z_mm=(1.05,), final=False))
     assert [place.z_mm for place in marked.places] == [pytest.approx(1.2)]
-    with pytest.raises(LoopError, match="no layer at z = 9 mm"):
+    with pytest.raises(InputError, match="no layer at z = 9 mm"):
         mark(JOB, "job.gcode", "reprap", Asked(at_z_mm=(9.0,)))
 
 

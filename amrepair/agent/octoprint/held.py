@@ -87,7 +87,15 @@ class Print:
 
 @dataclass(slots=True)
 class Program:
-    """Lines that are printed at a look."""
+    """Lines that are printed at a look.
+
+    Attributes
+    ----------
+    touches
+        The last of them is a touch, which a cold nozzle makes: it is not heated for it.
+    wrong
+        What the firmware said against a touch.
+    """
 
     number: int
     send: str
@@ -96,6 +104,8 @@ class Program:
     fed: int = 0
     done: int = 0
     over: bool = False
+    touches: bool = False
+    wrong: str = ""
 
 
 @dataclass(slots=True)
@@ -158,7 +168,7 @@ class Held:
                 },
                 "program": None if program is None else {
                     "number": program.number, "done": program.done, "over": program.over,
-                    "total": len(program.lines), "paused": self._paused,
+                    "total": len(program.lines), "paused": self._paused, "wrong": program.wrong,
                 },
                 "heat": {"hotend": self._heat[0], "bed": self._heat[1]},
                 "doing": self._shown.doing,
@@ -318,7 +328,9 @@ class Held:
         if new:
             self._push()
 
-    def program(self, *, number: int, send: str, lines: Sequence[str]) -> None:
+    def program(
+        self, *, number: int, send: str, lines: Sequence[str], touches: bool = False
+    ) -> None:
         """Print lines at the look; told twice, they are printed once.
 
         Raises
@@ -335,7 +347,8 @@ class Held:
             if under_way is not None and not under_way.over:
                 raise Refusal("something else is being printed at this look")
             one.touched = True
-        self._print_lines(Program(number, send, (*self._heating(), *lines)))
+        warm = self._heating(hotend=not touches)
+        self._print_lines(Program(number, send, (*warm, *lines), touches=touches))
 
     def _print_lines(self, program: Program) -> None:
         with self._lock:
@@ -343,10 +356,12 @@ class Held:
         self._later(self._feed)
         self._push()
 
-    def _heating(self) -> tuple[str, ...]:
-        """What heats again what was switched off here."""
+    def _heating(self, *, hotend: bool = True) -> tuple[str, ...]:
+        """What heats again what was switched off here; a hotend that is not is kept in mind."""
         with self._lock:
-            (hotend_c, bed_c), self._heat = self._heat, (0.0, 0.0)
+            hotend_c, bed_c = self._heat
+            self._heat = (0.0 if hotend else hotend_c, 0.0)
+        hotend_c = hotend_c if hotend else 0.0
         now = self._server.heat()
         bed = (f"M190 S{bed_c:g}",) if bed_c and not now[1] else ()
         return (*bed, *((f"M109 S{hotend_c:g}",) if hotend_c and not now[0] else ()))
@@ -387,6 +402,18 @@ class Held:
             self._later(then)
         self._push()
 
+    def wrong(self, text: str) -> bool:
+        """The firmware says that something is wrong; whether that is a touch's, and ours to tell.
+
+        It met nothing, or is not known: OctoPrint would cancel the print for it.
+        """
+        with self._lock:
+            one = self._program
+            if one is None or not one.touches or one.over:
+                return False
+            one.wrong = one.wrong or text
+        return True
+
     def pause(self, *, value: bool) -> None:
         """Hold back what is printed at the look, or go on with it."""
         with self._lock:
@@ -394,8 +421,16 @@ class Held:
         self._later(self._feed)
         self._push()
 
-    def off(self) -> None:
-        """Switch heaters off; what they were set to is kept for whoever goes on."""
+    def off(self, *, hotend: float = 0.0, bed: float = 0.0) -> None:
+        """Switch heaters off; what they were set to is kept for whoever goes on.
+
+        Parameters
+        ----------
+        hotend, bed
+            What they were set to as the job came to rest, °C, where they are off now.
+        """
+        with self._lock:
+            self._heat = (self._heat[0] or hotend, self._heat[1] or bed)
         self._switch_off(bed=True)
 
     def _switch_off(self, *, bed: bool) -> None:

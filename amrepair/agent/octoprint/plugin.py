@@ -95,6 +95,8 @@ class AmrepairPlugin(
             "octoprint.comm.protocol.atcommand.sending": self._at_wire,
             "octoprint.comm.protocol.gcode.queuing": self._queuing,
             "octoprint.comm.protocol.gcode.sent": self._sent,
+            "octoprint.comm.protocol.gcode.error": self._error,
+            "octoprint.comm.protocol.gcode.received": self._received,
             "octoprint.server.http.bodysize": self._bodysize,
             "octoprint.server.http.routes": self._routes,
         }
@@ -137,6 +139,15 @@ class AmrepairPlugin(
         for tag in tags or ():
             if tag.startswith(TAG):
                 self._held.sent(tag[len(TAG) :])
+
+    def _error(self, comm: Any, text: str, *args: Any, **_: Any) -> bool:
+        """Whether OctoPrint is to pass over what its firmware calls an error."""
+        return self._held.wrong(text)
+
+    def _received(self, comm: Any, line: str, *args: Any, **_: Any) -> str:
+        if "nknown command" in line:
+            self._held.wrong(line.strip())
+        return line
 
     def _routes(self, *args: Any, **kwargs: Any) -> list[Any]:
         from octoprint.server import app
