@@ -20,7 +20,7 @@ from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import find_regions
-from amrepair.regions.significance import Level, tested
+from amrepair.regions.significance import Level, as_student, tested
 from amrepair.regions.sites import (
     PRESENT_CELLS,
     Observed,
@@ -184,7 +184,8 @@ def _tested(
     gone[seen.crossed] = labels[0, len(surfels) :]
     gone_p_value = np.ones(len(seen.surface_mm))
     gone_p_value[seen.crossed] = np.exp(log_p[0, len(surfels) :])
-    noise_mm = float(np.median(levels[1].quantile * levels[1].error_mm))
+    errors = as_student(levels[1].quantile, levels[1].freedom)
+    noise_mm = float(np.median(errors * levels[1].error_mm))
     limit_mm, top_mm = (t + noise_mm for t in tolerances_mm)
     noise = noise_of(levels, surfels, scan, options)
     return _Tested(

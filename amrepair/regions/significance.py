@@ -4,7 +4,9 @@ The null is a minimum-effect one, |mean deviation| ≤ δ (Murphy and Myors 1999
 part may depart by, so that noise alone hardly matters. Means over several scales are tested; the
 stated number of false regions is shared out over scales, signs and windows. The standard error of
 a mean comes from the scan itself: what neighbouring cells differ by, and by how much windows that
-were seen as well depart as a whole, less what the process is known to leave. Where more places
+were seen as well depart as a whole, less what the process is known to leave. As few places as lie
+farther apart than errors hang together tell the latter: what is standardised by it is distributed
+as Student's t, not as a normal value. Where more places
 exceed the tolerance than can be real, their peaks tell the tail of the null (Efron 2004, by peaks
 over a threshold), but for those that stand out of it.
 """
@@ -12,6 +14,7 @@ over a threshold), but for those that stand out of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -34,6 +37,9 @@ LEAST_SIGMA_MM = 1e-3
 OUTLIER_SIGMAS = 3.0
 # More standard errors than that are certain.
 MOST_ERRORS = 1e3
+# The first quartile of the differences of all pairs, as an estimate of a normal standard deviation,
+# is worth this share of the places (Rousseeuw and Croux 1993, section 4).
+PAIRS_EFFICIENCY = 0.82
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +56,11 @@ class Level:
         (s,) the part of it that averaging over a window does not lessen.
     usual_mm
         (s,) median standard error of the windows that were seen as well.
+    freedom
+        (s,) degrees of freedom of the standard error.
     z
-        (2, s) standard errors beyond the tolerance: missing, excess.
+        (2, s) how far beyond the tolerance, missing, excess: the normal value as rare as so many
+        standard errors are with so few degrees of freedom.
     critical
         (2,) from which on they are significant.
     quantile
@@ -69,6 +78,7 @@ class Level:
     error_mm: Float[np.ndarray, " s"]
     common_mm: Float[np.ndarray, " s"]
     usual_mm: Float[np.ndarray, " s"]
+    freedom: Float[np.ndarray, " s"]
     z: Float[np.ndarray, "2 s"]
     critical: Float[np.ndarray, " 2"]
     quantile: float
@@ -85,7 +95,31 @@ class Level:
     @property
     def smallest_mm(self) -> float:
         """The deviation that half of the places would show as significant."""
-        return float(np.median(self.tolerance_mm[0] + self.critical[0] * self.error_mm))
+        errors = as_student(self.critical[0], self.freedom)
+        return float(np.median(self.tolerance_mm[0] + errors * self.error_mm))
+
+
+def as_normal(t: Float[np.ndarray, "*n"], freedom: Float[np.ndarray, " s"]) -> Any:
+    """(*n,) the normal values as rare as Student's t of so many degrees of freedom, the last axis.
+
+    References
+    ----------
+    Wallace, "Bounds on normal approximations to Student's and the chi-square distributions", 1959.
+    """
+    some = np.isfinite(freedom)
+    few = np.where(some, freedom, 1.0)
+    length = np.sqrt(few * np.log1p(np.square(np.where(np.isfinite(t), t, 0.0)) / few))
+    found = np.sign(t) * (8.0 * few + 1.0) / (8.0 * few + 3.0) * length
+    return np.where(some & np.isfinite(t), found, t)
+
+
+def as_student(z: float, freedom: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+    """(s,) the inverse of `as_normal`; as far as a float goes."""
+    some = np.isfinite(freedom) & np.isfinite(z)
+    few = np.where(some, freedom, 1.0)
+    length = (8.0 * few + 3.0) / (8.0 * few + 1.0) * (z if np.isfinite(z) else 0.0)
+    found = np.sign(length) * np.sqrt(few * np.expm1(np.minimum(length**2 / few, 700.0)))
+    return np.where(some, np.minimum(found, MOST_ERRORS), z)
 
 
 def tested(
@@ -148,6 +182,8 @@ class Errors:
         (s,) what a window's cells have in common.
     wander_mm
         (c,) standard deviation of window means, by how well they were seen.
+    freedom
+        (c,) its degrees of freedom.
     group
         (s,) class of how well each window was seen.
     """
@@ -156,6 +192,7 @@ class Errors:
     window_mm: Float[np.ndarray, " s"]
     common_mm: Float[np.ndarray, " s"]
     wander_mm: Float[np.ndarray, " c"]
+    freedom: Float[np.ndarray, " c"]
     group: Int[np.ndarray, " s"]
 
     @property
@@ -168,6 +205,17 @@ class Errors:
         whole = np.hypot(self.window_mm, self.common_mm)
         ratio = float(np.median(self.window_mm)) / float(np.median(whole))
         return 1.0 + (RANK - 1) * ratio**2
+
+    def freedom_of(self, error_mm: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+        """(s,) degrees of freedom of a standard error that holds what windows have in common.
+
+        Of its variances that of the wander alone is uncertain (Satterthwaite 1946); where it adds
+        nothing to what neighbours differ by, none is.
+        """
+        wander = np.where(self.common_mm > 0.0, self.wander_mm[self.group], 0.0)
+        share = np.minimum(wander / error_mm, 1.0) ** 4
+        known = np.full(len(share), np.inf)
+        return np.divide(self.freedom[self.group], share, out=known, where=share > 0.0)
 
 
 def point_sigma_mm(first: Scale) -> float:
@@ -190,12 +238,13 @@ def _errors(
     cell = np.maximum(np.maximum(scale.noise_mm, usual), LEAST_SIGMA_MM)
     window = MEDIAN_LOSS * cell / np.sqrt(scale.count)
     if calibration is None:
-        wander = _wander(scale, group, classes, options, most_mm)
+        wander, freedom = _wander(scale, group, classes, options, most_mm)
     else:
         wander = calibration.wander(3.0 * scale.cell_mm, classes)
+        freedom = np.full(classes, np.inf)  # of many scans
     explained = options.process_sigma_mm**2 + window**2
     common = np.sqrt(np.maximum(wander[group] ** 2 - explained, 0.0) + pose_mm**2)
-    return Errors(cell, window, common, wander, group)
+    return Errors(cell, window, common, wander, freedom, group)
 
 
 def seen_class(scale: Scale, facing: Float[np.ndarray, " s"], step: float) -> Int[np.ndarray, " s"]:
@@ -238,11 +287,12 @@ def _wander(
     classes: int,
     options: RegionOptions,
     most_mm: float,
-) -> Float[np.ndarray, " c"]:
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """(c,) standard deviation of window means about what is normal some way off, by class.
 
-    From the differences of windows that face the same way, farther apart than errors hang
-    together: a layer that lacks as a whole is no error. By how well the worse one was seen.
+    And (c,) its degrees of freedom. From the differences of windows that face the same way, farther
+    apart than errors hang together: a layer that lacks as a whole is no error. By how well the
+    worse one was seen.
     """
     pick = np.arange(0, len(scale), max(len(scale) // options.most_windows, 1))
     pairs = cKDTree(scale.place_mm[pick]).query_pairs(options.far_mm, output_type="ndarray")
@@ -255,7 +305,37 @@ def _wander(
     # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
     found = _by_class(np.maximum(group[one], group[other]), off_mm, classes, options, 0.25)
     # a bent part wanders too, but no scanner does so smoothly and so far
-    return found * min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
+    found *= min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
+    return found, _freedom(
+        scale, np.maximum(group[one], group[other]), (one, other), found, options
+    )
+
+
+def _freedom(
+    scale: Scale,
+    of_pair: Int[np.ndarray, " q"],
+    pairs: tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q"]],
+    wander_mm: Float[np.ndarray, " c"],
+    options: RegionOptions,
+) -> Float[np.ndarray, " c"]:
+    """(c,) degrees of freedom of each class's wander: by places farther apart than errors reach.
+
+    A class too small to be told has those of the one whose value it took.
+    """
+    edge_mm = 0.5 * options.far_mm
+    axis = np.abs(scale.normal).argmax(axis=1)
+    side = 2 * axis + (scale.normal[np.arange(len(axis)), axis] > 0)
+    patch = np.column_stack([np.floor(scale.place_mm / edge_mm).astype(np.int64), side])
+    _, patch_of = np.unique(patch, axis=0, return_inverse=True)
+    freedom = np.full(len(wander_mm), np.inf)
+    last = 1.0
+    for k in range(len(wander_mm)):
+        here = of_pair == k
+        if here.sum() >= options.least_cells:
+            places = len(np.unique(patch_of[np.concatenate([each[here] for each in pairs])]))
+            last = max(PAIRS_EFFICIENCY * (places - 1), 1.0)
+        freedom[k] = last
+    return freedom
 
 
 def _level(
@@ -273,7 +353,8 @@ def _level(
         (errors.cell_mm, errors.independent) if statistic == 0 else (errors.window_mm, 1.0)
     )
     error_mm = np.hypot(own_mm, errors.common_mm)
-    z = (sides - tolerance_mm) / error_mm
+    freedom = errors.freedom_of(error_mm)
+    z = as_normal((sides - tolerance_mm) / error_mm, freedom)
     alone = scale.count < RANK  # fewer cells than that are no surface
     z[:, alone] = -np.inf
     n = max(int((~alone).sum()), 1)
@@ -304,7 +385,8 @@ def _level(
             critical[side] = max(quantile, tail.exceeded_by(share))
     usual_mm = _by_class(errors.group, error_mm, int(errors.group.max()) + 1, options)
     return Level(
-        scale, tolerance_mm, error_mm, errors.common_mm, usual_mm[errors.group], z, critical,
+        scale, tolerance_mm, error_mm, errors.common_mm, usual_mm[errors.group],
+        freedom, z, critical,
         quantile, log_p, errors.wander_mm, (tails[0], tails[1]), (peaks[0], peaks[1]),
     )  # fmt: skip
 

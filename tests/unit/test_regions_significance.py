@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from amrepair.cli.inspect import _refuse_too_noisy
 from amrepair.errors import InputError
@@ -17,6 +19,7 @@ from amrepair.regions.calibrating import calibrated
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration, Tail
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.options import RegionOptions
+from amrepair.regions.significance import as_normal, as_student
 from amrepair.scans import Scan
 from tests.analytic import AnalyticTemplate, cylinder, noisy_scan_points, sample_surface, sphere
 
@@ -106,6 +109,35 @@ def test_a_scan_too_noisy_for_what_is_asked_is_refused_with_what_it_could_show(
     deep = np.where(np.linalg.norm(points[:, :2], axis=1) < np.sqrt(area_mm2 / 2), 2.0, 0.0)
     dented = noisy - np.where(points[:, 2] > 0, depth_mm * deep, 0.0)[:, None] * normals
     assert Label.MISSING in {r.label for r in detect(Scan(dented, 0.04, "template"), ball).regions}
+
+
+def test_as_normal_is_as_rare_as_student_s_t() -> None:
+    """Against scipy's own tails: Wallace's approximation, within 3 % from three degrees on."""
+    freedom = np.array([3.0, 8.0, 30.0, 300.0, np.inf])
+    for value in (0.5, 2.0, 5.0, 15.0):
+        t = np.full((2, len(freedom)), value)
+        found = as_normal(t, freedom)
+        expected = norm.isf(student.sf(value, np.where(np.isfinite(freedom), freedom, 1e12)))
+        assert np.allclose(found, expected, rtol=0.03)
+        back = [float(as_student(z, freedom)[k]) for k, z in enumerate(found[0])]
+        assert np.allclose(back, value, rtol=1e-6)
+    assert as_normal(np.array([-np.inf]), freedom[:1])[0] == -np.inf
+
+
+def test_a_small_scan_tells_its_wander_less_surely_than_a_large_one(ball: AnalyticTemplate) -> None:
+    """As places 10 mm apart, of which a ball of 30 mm has some 110 and one of 10 mm some 12."""
+    small = sphere((0, 0, 0), 10.0)
+    points, normals = sample_surface(small.body, SPACING_MM, seed=0)
+    points = (
+        points + np.random.default_rng(0).normal(scale=0.06, size=len(points))[:, None] * normals
+    )
+    usual = [
+        float(np.median(level.freedom))
+        for scan, part in ((Scan(points, 0.04, "template"), small), (rough(ball, 0), ball))
+        for level in judged_levels(detect(scan, part))[1:2]
+    ]
+    assert usual[1] > 60.0
+    assert usual[0] > 5.0
 
 
 def test_few_peaks_tell_a_tail_less_surely_than_many() -> None:
