@@ -144,7 +144,9 @@ DEEP = {
 }
 
 
-@pytest.mark.parametrize("name", DEEP)
+@pytest.mark.parametrize(
+    "name", [pytest.param("notch", marks=pytest.mark.slow), "slot", "wider slot"]
+)
 @pytest.mark.parametrize("printer", ["voron_2_4"])
 def test_what_the_head_alone_allows_is_filled_where_a_floor_is_near(
     name: str, printer: str

@@ -45,7 +45,7 @@ def seen_from_around(solid: m3.Manifold, seed: int) -> Scan:
     return Scan((np.asarray(points) + noise)[~foot], 0.04, "template")
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_wide_break_over_a_foot_that_nobody_saw_is_no_ceiling(seed: int) -> None:
     # regression: the opening of the foot was larger than that of the break, whose floor was turned
     # to face it: 10,294 mm3 below it were missing, and the 7,135 mm3 above stood

@@ -83,6 +83,7 @@ def _events(folder: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in (folder / "run.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_errors_that_hang_together_are_learned_told_and_used(small: Small, tmp_path: Path) -> None:
     report, _, said = _run(small, tmp_path, HIGH_MM)
     assert [str(look.decision.action) for look in report.looks] == ["go on"] * len(LAYERS)

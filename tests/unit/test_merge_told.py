@@ -79,6 +79,7 @@ def test_bad_files_of_poses_end_in_a_sentence(
         read_poses(tmp_path / name)
 
 
+@pytest.mark.slow
 def test_a_rotation_written_the_other_way_round_is_turned() -> None:
     """As the Stanford bunny's file has it of two views: the views decide, also on the unit."""
     rng = np.random.default_rng(0)
@@ -93,6 +94,7 @@ def test_a_rotation_written_the_other_way_round_is_turned() -> None:
         assert placed[k] == pytest.approx(np.linalg.inv(pose), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_told_pose_that_is_wrong_is_found_anew() -> None:
     rng = np.random.default_rng(0)
     poses = [np.eye(4), pose_of(1), pose_of(2)]

@@ -340,6 +340,7 @@ def test_a_prior_of_nothing_is_refused() -> None:
         NuisanceOptions(scale_sigma_ratio=0.0)
 
 
+@pytest.mark.slow
 def test_a_real_plate_is_told_to_be_bent_and_what_stands_on_it_keeps_its_height(
     data_dir: Path,
 ) -> None:
