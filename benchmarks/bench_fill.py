@@ -21,6 +21,7 @@ from typing import Any
 import manifold3d
 import numpy as np
 
+from amrepair.loop.sites import lines_of_job
 from gcode.check import find_refusals
 from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import job_for
@@ -95,11 +96,8 @@ def case_of(name: str) -> Case | None:
 def lines_of(part: Any, setup: PrintSetup) -> JobLines:
     """What our own slicer lays for a part."""
     program = write(plan_part(part, setup).toolpath, setup, title="bench")
-    beads = job_for(program, setup.printer).beads
-    rim = np.array([role.lower().endswith("perimeter") for role in beads.roles])
-    mine = beads.layer >= 0
-    ends = beads.start_mm[mine], beads.end_mm[mine]
-    return JobLines(*ends, beads.section_mm2[mine], beads.height_mm[mine], rim[beads.role[mine]])
+    job = job_for(program, setup.printer)
+    return lines_of_job(job, job.beads.layer >= 0)
 
 
 def run(name: str, setup: PrintSetup, cell_mm: float, *, along_job: bool) -> dict[str, Any] | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -267,7 +268,7 @@ class _Pair:
         return self.explained > EXPLAINED_SHARE or self.beyond > ENOUGH_BEYOND
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Scene:
     """A scan and its template, and how near is on."""
 
@@ -278,7 +279,6 @@ class _Scene:
     diagonal_mm: float
     limit_mm: float
     surface_mm: Float[np.ndarray, "m 3"]
-    _neighbours: list[Int[np.ndarray, "n k"]] = field(default_factory=list)
 
     @classmethod
     def of(
@@ -293,13 +293,11 @@ class _Scene:
         sigma_mm = max(sigma_mm, 1e-3)
         return cls(thinned, cloud, template, sigma_mm, diagonal_mm, limit_mm, surface_mm)
 
-    @property
+    @cached_property
     def neighbours(self) -> Int[np.ndarray, "n k"]:
         """(n, k) points of the cloud around each; most scans are whole, and never ask."""
-        if not self._neighbours:
-            near = [*range(1, min(NEIGHBOURS, len(self.cloud)) + 1)]
-            self._neighbours.append(cKDTree(self.cloud).query(self.cloud, k=near)[1])
-        return self._neighbours[0]
+        near = [*range(1, min(NEIGHBOURS, len(self.cloud)) + 1)]
+        return np.asarray(cKDTree(self.cloud).query(self.cloud, k=near)[1])
 
     def held(self, on: Bool[np.ndarray, " n"]) -> float:
         """Share of the places that are held."""

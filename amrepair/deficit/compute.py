@@ -162,7 +162,7 @@ def compute_deficit(
     look = as_built or partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
-        cell_mm=options.heights.cell_mm, options=options.heights,
+        options=options.heights,
     )  # fmt: skip
     of_label = {Label.MISSING: lines, Label.EXCESS: None}
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid

@@ -36,8 +36,6 @@ def as_built_heights(
     *,
     build_from_template: Transform,
     printed_z_mm: float | None,
-    cell_mm: float,
-    unseen_margin_mm: float = USUAL_DEFICIT.heights.unseen_margin_mm,
     images: tuple[RangeImage, ...] = (),
     options: HeightOptions = USUAL_DEFICIT.heights,
 ) -> HeightField:
@@ -47,9 +45,8 @@ def as_built_heights(
     ----------
     spacing_mm
         Mean distance between neighbouring points.
-    unseen_margin_mm
-        What nobody saw is solid up to the printed height, or without rays up to the template, and
-        this much more.
+    options
+        How wide its columns are, and how what nobody saw is taken.
     images
         The scan's range images, template frame: what nobody saw, as the bottom of a deep hole, is
         solid no higher than rays crossed it.
@@ -58,11 +55,11 @@ def as_built_heights(
     corners = box_corners(template.bounds_mm)
     box = build_from_template.apply(corners)
     low, high = box.min(axis=0) - options.beside_part_mm, box.max(axis=0) + options.beside_part_mm
-    cell_mm = max(cell_mm, 1.2 * spacing_mm)
+    cell_mm = max(options.cell_mm, 1.2 * spacing_mm)
     nx, ny = (math.ceil(v) for v in (high[:2] - low[:2]) / cell_mm)
     shape = (ny, nx)
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
-    solid_z = np.full(shape, top_z + unseen_margin_mm)
+    solid_z = np.full(shape, top_z + options.unseen_margin_mm)
     z, seen = _tops(points, low[:2], cell_mm, shape, options)
     known = seen
     if scan.sensors_mm is None:
@@ -70,7 +67,7 @@ def as_built_heights(
         bare = ~seen & (designed_z <= 0)
         z = np.where(bare, 0.0, z)
         known = seen | bare
-        solid_z = np.minimum(solid_z, designed_z + unseen_margin_mm)
+        solid_z = np.minimum(solid_z, designed_z + options.unseen_margin_mm)
     z, closed = _close_gaps(z, known, cell_mm, options)
     seen = seen | (closed & ~known)
     known = closed

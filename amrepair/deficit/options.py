@@ -64,7 +64,7 @@ class HeightOptions:
     Attributes
     ----------
     cell_mm
-        Of what the scan alone says.
+        Width of the columns of what the scan alone says.
     unseen_margin_mm
         What nobody saw is solid up to the printed height, or the template, and this much more.
     beside_part_mm

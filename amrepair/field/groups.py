@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
+from amrepair.field.options import USUAL_SURFELS
+
 # Pieces nearer than this are one defect, and so are cells of a field that touch at a corner.
 GROUP_MM, CELLS_APART = 1.2, 1.8
-# The area of points is counted in cells of this edge; a surface at a random slope fills 2/3 more.
-AREA_CELL_MM, AREA_PER_CELL = 2.0, 1.5
+AREA_CELL_MM = 2.0  # the area of points is counted in cells of this edge
 
 
 def group_points(
@@ -38,4 +39,4 @@ def area_per_point(surface_mm: Float[np.ndarray, "m 3"]) -> float:
     index -= index.min(axis=0)
     size = index.max(axis=0) + 1
     cells = len(np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]))
-    return AREA_PER_CELL * AREA_CELL_MM**2 * cells / len(surface_mm)
+    return USUAL_SURFELS.area_per_cell * AREA_CELL_MM**2 * cells / len(surface_mm)

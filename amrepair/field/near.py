@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from amrepair.field import near_kernels as kernels
 from amrepair.frames import box_of
 
 # In one grid; cells of a larger one are wider than the distance asked for.
 MOST_NEAR_CELLS = 16_000_000
+SPACING_POINTS = 2_000  # that tell how dense a cloud is
+
+
+def spacing_in(tree: cKDTree) -> float:
+    """1/√ρ of ρ points a mm² of surface, from a sample's nearest neighbours.
+
+    Random points have their 8th neighbour at √(8/πρ) on average.
+    """
+    some = tree.data[:: max(1, tree.n // SPACING_POINTS)]
+    count = min(8, tree.n - 1)
+    reach = tree.query(some, k=[count + 1], workers=-1)[0][:, 0]
+    return float(np.median(reach) * np.sqrt(np.pi / max(count, 1)))
 
 
 def has_near(

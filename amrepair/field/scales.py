@@ -144,6 +144,12 @@ def _scale(
     )
 
 
+def ways_of(normal: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " c"]:
+    """(c,) which of the six ways along the axes normals face most: −x, x, −y, y, −z, z."""
+    axis = np.abs(normal).argmax(axis=1)
+    return np.asarray(2 * axis + (normal[np.arange(len(normal)), axis] > 0))
+
+
 def _grouped(
     place_mm: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, "c 3"], cell_mm: float
 ) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
@@ -152,9 +158,7 @@ def _grouped(
     index = np.floor((place_mm - low) / cell_mm).astype(np.int64) + 1
     shape = index.max(axis=0) + 2
     strides = (int(shape[1] * shape[2]), int(shape[2]))
-    axis = np.abs(normal).argmax(axis=1)
-    way = 2 * axis + (normal[np.arange(len(normal)), axis] > 0)
-    key = (index @ np.array([*strides, 1])) * kernels.SLOTS + way
+    key = (index @ np.array([*strides, 1])) * kernels.SLOTS + ways_of(normal)
     order = np.argsort(key, kind="stable")
     ranked = key[order]
     begins = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]])

@@ -73,6 +73,7 @@ def _heights_later(
 ) -> Callable[[], HeightField]:
     """How what stood on the bed can be made of a thinned scan."""
     template, printed_z_mm = site.template, site.printed_z_mm
+    options = site.options.deficit.heights
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     return lambda: as_built_heights(
         scan,
@@ -80,7 +81,7 @@ def _heights_later(
         spacing_mm,
         build_from_template=placed,
         printed_z_mm=printed_z_mm,
-        cell_mm=site.options.as_built_cell_mm,
+        options=options,
     )
 
 

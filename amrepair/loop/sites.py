@@ -81,7 +81,7 @@ def sites(
                 grid,
                 build_from_template,
                 calibration=NORMAL_NOISE,
-                lines=_lines(job, every),
+                lines=lines_of_job(job, every),
                 beside=_beside(job, every),
                 laid=_laid(job, every),
             )
@@ -104,7 +104,7 @@ def sites(
             calibration=NORMAL_NOISE,
             planned=planned,
             beads=recent,
-            lines=_lines(job, done),
+            lines=lines_of_job(job, done),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
             beside=None if by_beads else _beside(job, done),
             laid=_laid(job, done),
@@ -152,7 +152,7 @@ def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> Heig
     return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
 
 
-def _lines(job: Job, which: Bool[np.ndarray, " n"]) -> JobLines:
+def lines_of_job(job: Job, which: Bool[np.ndarray, " n"]) -> JobLines:
     """Some of a job's beads as lines that a patch may follow."""
     beads = job.beads
     rim = np.array([any(word in role.lower() for word in RIMS) for role in beads.roles])

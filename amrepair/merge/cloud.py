@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
+from amrepair.field.near import spacing_in
 from amrepair.merge import fuse_kernels as kernels
 
 # Points that planes are fitted to, on average: few where walls are thin, or more, by the tilt.
@@ -70,14 +71,8 @@ class Cells:
 
 
 def spacing_of(points_mm: Float[np.ndarray, "n 3"]) -> float:
-    """Mean distance of neighbouring points on the surface, from a sample's nearest neighbours.
-
-    Random points of density ρ have their 8th neighbour at sqrt(8 / πρ) on average.
-    """
-    step = max(1, len(points_mm) // 2_000)
-    count = min(9, len(points_mm))
-    reach = cKDTree(points_mm).query(points_mm[::step], k=[count])[0][:, 0]
-    return float(np.median(reach) * np.sqrt(np.pi / max(count - 1, 1)))
+    """Mean distance of neighbouring points on the surface (`near.spacing_in`)."""
+    return spacing_in(cKDTree(points_mm))
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from amrepair.errors import InputError
 from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.fuse import Cloud, Fused, fuse
 from amrepair.merge.joint import Slack
-from amrepair.merge.options import MergeOptions
+from amrepair.merge.options import USUAL_MERGE, MergeOptions
 from amrepair.merge.place import Placement, place
 from amrepair.merge.views import LEAST_VIEW_POINTS, View
 from amrepair.scans import Scan
@@ -90,7 +90,7 @@ def fit_from_scans(
     *,
     poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
     turntable_deg: float | None = None,
-    options: MergeOptions | None = None,
+    options: MergeOptions = USUAL_MERGE,
     seed: int = 0,
     progress: Progress = silent,
 ) -> ScanFit:

@@ -12,7 +12,7 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge.groups import Graph, grouped
 from amrepair.merge.joint import Slack, slacks, together
-from amrepair.merge.options import MergeOptions
+from amrepair.merge.options import USUAL_MERGE, MergeOptions
 from amrepair.merge.told import of_views, on_turntable
 from amrepair.merge.views import JUDGED_POINTS, Fit, Placed, View, joined, judged
 from gcode.progress import Progress, silent
@@ -51,7 +51,7 @@ def place(
     told: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
     unit_mm: float = 1.0,
     turntable_deg: float | None = None,
-    options: MergeOptions | None = None,
+    options: MergeOptions = USUAL_MERGE,
     progress: Progress = silent,
 ) -> Placement:
     """Bring views of one part into one frame.
@@ -68,7 +68,6 @@ def place(
     AlignmentError
         If no group that agrees has more than half of the views.
     """
-    options = options or MergeOptions()
     if len(views) == 1:
         return Placement({0: np.eye(4)}, 0.0)
     size_mm = max(view.size_mm for view in views)

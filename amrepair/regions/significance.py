@@ -23,7 +23,7 @@ from scipy.special import comb
 from scipy.stats import norm
 
 from amrepair.field import scales_kernels
-from amrepair.field.scales import RANK, WINDOW_FACING, Scale
+from amrepair.field.scales import RANK, WINDOW_FACING, Scale, ways_of
 from amrepair.regions.calibration import Calibration, Tail
 from amrepair.regions.options import RegionOptions
 
@@ -303,19 +303,18 @@ def _wander(
     one, other = one[kept], other[kept]
     off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_QUARTILE
     # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
-    found = _by_class(np.maximum(group[one], group[other]), off_mm, classes, options, 0.25)
+    worse = np.maximum(group[one], group[other])
+    found = _by_class(worse, off_mm, classes, options, 0.25)
     # a bent part wanders too, but no scanner does so smoothly and so far
     found *= min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
-    return found, _freedom(
-        scale, np.maximum(group[one], group[other]), (one, other), found, options
-    )
+    return found, _freedom(scale, worse, (one, other), classes, options)
 
 
 def _freedom(
     scale: Scale,
     of_pair: Int[np.ndarray, " q"],
     pairs: tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q"]],
-    wander_mm: Float[np.ndarray, " c"],
+    classes: int,
     options: RegionOptions,
 ) -> Float[np.ndarray, " c"]:
     """(c,) degrees of freedom of each class's wander: by places farther apart than errors reach.
@@ -323,13 +322,12 @@ def _freedom(
     A class too small to be told has those of the one whose value it took.
     """
     edge_mm = 0.5 * options.far_mm
-    axis = np.abs(scale.normal).argmax(axis=1)
-    side = 2 * axis + (scale.normal[np.arange(len(axis)), axis] > 0)
-    patch = np.column_stack([np.floor(scale.place_mm / edge_mm).astype(np.int64), side])
+    cell = np.floor(scale.place_mm / edge_mm).astype(np.int64)
+    patch = np.column_stack([cell, ways_of(scale.normal)])
     _, patch_of = np.unique(patch, axis=0, return_inverse=True)
-    freedom = np.full(len(wander_mm), np.inf)
+    freedom = np.empty(classes)
     last = 1.0
-    for k in range(len(wander_mm)):
+    for k in range(classes):
         here = of_pair == k
         if here.sum() >= options.least_cells:
             places = len(np.unique(patch_of[np.concatenate([each[here] for each in pairs])]))

@@ -20,13 +20,12 @@ from scipy.stats import norm
 from amrepair.errors import InputError
 from amrepair.field import scales_kernels
 from amrepair.field.fused import estimate_spacing
+from amrepair.field.near import spacing_in
 from amrepair.field.scales import Scale, scales_of
 from amrepair.frames import unit_vectors
 from amrepair.regions.calibration import Tail
 from amrepair.regions.significance import LEAST_SIGMA_MM
 from amrepair.template.port import Template
-
-SPACING_POINTS = 2_000  # that tell how dense sound scans are
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +97,7 @@ class _Known:
     ) -> _Known:
         """By points of sound scans, and their deviations."""
         tree = cKDTree(points_mm)
-        spacing_mm = _spacing_mm(tree)
+        spacing_mm = spacing_in(tree)
         within_mm = options.gap_spacings * spacing_mm
         surface = template.surface_points(spacing_mm)[0]
         away = tree.query(surface, distance_upper_bound=within_mm, workers=-1)[0]
@@ -260,14 +259,6 @@ class SoundTest:
                 farthest = np.array([float(z.max()) / spread])
                 least = min(least, float(windows.log_expected(farthest)[0]))
         return Judged(least + float(np.log(max(len(found), 1))), off_mm, sigma_mm)
-
-
-def _spacing_mm(tree: cKDTree) -> float:
-    """1/√ρ of ρ points a mm²: random ones have their 8th neighbour at √(8/πρ) on average."""
-    some = tree.data[:: max(1, tree.n // SPACING_POINTS)]
-    count = min(8, tree.n - 1)
-    reach = tree.query(some, k=[count + 1], workers=-1)[0][:, 0]
-    return float(np.median(reach) * np.sqrt(np.pi / max(count, 1)))
 
 
 def _joined(

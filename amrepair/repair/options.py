@@ -24,8 +24,6 @@ class RepairOptions:
     off_the_part_mm, over_beside_mm, on_bed_mm
         What lies beside the part: so far off it, no higher than it was to be by this much, and
         higher than what is taken for the bed.
-    as_built_cell_mm
-        Width of the columns of what stands there.
     open_cell_margin_mm
         What is added to what stands there where nobody saw it. No sensor sees to the bottom of a
         deep cell of infill, and the nozzle has just been over it: nothing.
@@ -42,7 +40,6 @@ class RepairOptions:
     off_the_part_mm: float = 0.3
     over_beside_mm: float = 0.3
     on_bed_mm: float = 0.2
-    as_built_cell_mm: float = 0.25
     open_cell_margin_mm: float = 0.0
     upright: float = 1e-7
     same_repair_ratio: float = 0.8

@@ -232,9 +232,9 @@ def _stands(laid: _Laid, anomaly: AnomalyMap, site: Site) -> HeightField:
         evidence.spacing_mm,
         build_from_template=laid.placed,
         printed_z_mm=site.printed_z_mm,
-        cell_mm=site.options.as_built_cell_mm,
-        unseen_margin_mm=site.options.open_cell_margin_mm,
-        options=site.options.deficit.heights,
+        options=replace(
+            site.options.deficit.heights, unseen_margin_mm=site.options.open_cell_margin_mm
+        ),
         images=evidence.images,
     )
 

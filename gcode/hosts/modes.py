@@ -17,6 +17,10 @@ _CODE_NAME = re.compile(r"([GM])\s*0*(\d+)")
 _TOUCH_LINE = re.compile(r"G38\.2\s+Z(?P<to>[-+.\d]+)|AMREPAIR_TOUCH\s+DEPTH=(?P<by>[.\d]+)")
 
 
+GO_MM_MIN, LIFT_MM_MIN = 6000, 600
+"""Back to where the machine was, along the bed and along Z."""
+
+
 @dataclass(frozen=True, slots=True)
 class Modes:
     """Modal state of a machine; positions are logical, as M114 tells them, None if unknown."""
@@ -32,8 +36,8 @@ class Modes:
 
     def restore(self, x_mm: float, y_mm: float, z_mm: float, e_mm: float) -> tuple[str, ...]:
         """Commands that bring the machine to a place and back into these modes."""
-        commands = ["G21", "G90", f"G1 X{x_mm:.3f} Y{y_mm:.3f} F6000", f"G1 Z{z_mm:.3f} F600"]
-        commands.append(f"G92 E{e_mm:.5f}")
+        commands = ["G21", "G90", f"G1 X{x_mm:.3f} Y{y_mm:.3f} F{GO_MM_MIN}"]
+        commands += [f"G1 Z{z_mm:.3f} F{LIFT_MM_MIN}", f"G92 E{e_mm:.5f}"]
         if self.feed_mm_min is not None:
             commands.append(f"G1 F{self.feed_mm_min:g}")
         if not self.absolute:

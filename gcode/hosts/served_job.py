@@ -22,7 +22,7 @@ from urllib.parse import quote
 from gcode.check.touches import touch_lines
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.job_text import JobText
-from gcode.hosts.modes import Modes, commands_of, modes_after
+from gcode.hosts.modes import GO_MM_MIN, LIFT_MM_MIN, Modes, commands_of, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
 from gcode.hosts.proof import require_checked
 from gcode.hosts.rejoin import require_as_left
@@ -31,8 +31,6 @@ from gcode.hosts.server import ServerPrinter, Session
 from gcode.progress import Progress, silent
 
 AGENT = "amrepair"
-LIFT_MM_MIN, GO_MM_MIN = 600, 6000
-"""As a pause's way back (`modes`)."""
 Answer = TypeVar("Answer")
 
 
@@ -281,9 +279,7 @@ class ServedJob(ServerPrinter[Session]):
             return  # the server has it in hand
         checked, first, end, done = sent[-1]
         self._asked(self._settled)
-        anew = not done and bool(
-            touch_lines(checked.program)
-        )  # they lay nothing, and are made again
+        anew = not done and bool(touch_lines(checked.program))  # touches lay nothing
         if not done:
             end = first if anew else self._reached_at_rest(checked, range(first, end))
         sent = [*sent[:-1], (checked, first, end, done)]

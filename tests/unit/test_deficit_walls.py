@@ -9,6 +9,7 @@ import trimesh
 from scipy import ndimage
 
 from amrepair.deficit.heights import as_built_heights, columns_of
+from amrepair.deficit.options import HeightOptions
 from amrepair.deficit.walls import (
     with_even_crests,
     with_rising_rims,
@@ -261,7 +262,7 @@ def test_cells_that_chance_left_empty_are_as_high_as_what_is_next_to_them() -> N
         0.25,
         build_from_template=Transform.identity("build", "template"),
         printed_z_mm=None,
-        cell_mm=cell_mm,
+        options=HeightOptions(cell_mm=cell_mm),
     )
     told = field.sample(np.column_stack([x, y])[empty], outside_mm=np.nan)
     beside = column[empty] == 29
