@@ -27,7 +27,8 @@ class KindOptions:
         A surface that bends: range of its parabola, height of its rim; share of the deviation that
         the parabola explains.
     risen_share
-        Where its parabola is highest a curled surface itself is as high, by this much.
+        Where its parabola is highest a curled surface itself is as high, by this much; and where
+        walls are shifted, those that face the shift's way, and those that face it, are so far off.
     layer_share
         Of a layer's beads: too little or too much flow over at least this share is the layer's own.
     clog_least, clog_most, clog_lasts, clog_layers

@@ -186,19 +186,35 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | N
     up = np.argsort(z)
     design = np.column_stack([out, np.ones(len(z)), dev])[up]
     sums = np.cumsum(design[:, :, None] * design[:, None, :], axis=0)
-    best = (0.0, 0.0)
+    best = (0.0, 0, np.zeros(3), np.zeros(3))
     for cut in np.linspace(0.1, 0.9, 17):
-        below = sums[int(cut * len(z)) - 1]
-        parts = [_fitted(moments) for moments in (sums[-1] - below, below)]
-        left = parts[0][1] + parts[1][1]
-        jump = float(np.linalg.norm(parts[0][0][:2] - parts[1][0][:2]))
-        best = max(best, (total - left, jump))
-    gained, jump_mm = best
+        count = int(cut * len(z))
+        parts = [_fitted(moments) for moments in (sums[-1] - sums[count - 1], sums[count - 1])]
+        gained = total - parts[0][1] - parts[1][1]
+        if gained > best[0]:
+            best = (gained, count, parts[0][0], parts[1][0])
+    gained, count, above, below = best
+    jump_mm = float(np.linalg.norm(above[:2] - below[:2]))
     share = gained / max(total - len(walls) * walls.noise_mm**2, 0.3 * total, 1e-12)
-    if jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
+    top = design[count:]
+    moved = _moved_so(top[:, :2] @ (above - below)[:2], top[:, 3] - top[:, :3] @ below, options)
+    if moved and jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
         sure = _sure(jump_mm, options.shift_layers * layer_mm)
         return Kind(DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share)))
     return None
+
+
+def _moved_so(
+    told_mm: Float[np.ndarray, " n"], seen_mm: Float[np.ndarray, " n"], options: KindOptions
+) -> bool:
+    """Whether walls that face along a shift stand out by it, and those that face it stand back.
+
+    What broke off stands back on one side, and nothing stands out.
+    """
+    wide = np.abs(told_mm) > 0.5 * np.abs(told_mm).max(initial=0.0)
+    told, so = told_mm[wide], seen_mm[wide] / told_mm[wide]
+    sides = [so[side] for side in (told > 0, told < 0) if side.any()]
+    return all(float(np.median(side)) > options.risen_share for side in sides)
 
 
 def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"], float]:
