@@ -26,9 +26,9 @@ class KindOptions:
     warp_layers, lifted_layers, warp_share
         A surface that bends: range of its parabola, height of its rim; share of the deviation that
         the parabola explains.
-    risen_share
-        Where its parabola is highest a curled surface itself is as high, by this much; and where
-        walls are shifted, those that face the shift's way, and those that face it, are so far off.
+    moved_share
+        Of how far a shift or a curl moves surface, where that is far: so far it stands off, in the
+        median.
     layer_share
         Of a layer's beads: too little or too much flow over at least this share is the layer's own.
     clog_least, clog_most, clog_lasts, clog_layers
@@ -67,7 +67,7 @@ class KindOptions:
     warp_layers: float = 1.0
     lifted_layers: float = 0.6
     warp_share: float = 0.45
-    risen_share: float = 0.5
+    moved_share: float = 0.5
     layer_share: float = 0.55
     clog_least: float = 0.12
     clog_most: float = 0.9

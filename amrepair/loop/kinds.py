@@ -197,7 +197,10 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | N
     jump_mm = float(np.linalg.norm(above[:2] - below[:2]))
     share = gained / max(total - len(walls) * walls.noise_mm**2, 0.3 * total, 1e-12)
     top = design[count:]
-    moved = _moved_so(top[:, :2] @ (above - below)[:2], top[:, 3] - top[:, :3] @ below, options)
+    told, seen = top[:, :2] @ (above - below)[:2], top[:, 3] - top[:, :3] @ below
+    # walls that face along it stand out, and those that face it stand back; one side may be unseen
+    ways = [way for way in (1.0, -1.0) if (way * told).max() > 0.5 * jump_mm]
+    moved = bool(ways) and all(_moved_so(way * told, way * seen, options) for way in ways)
     if moved and jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
         sure = _sure(jump_mm, options.shift_layers * layer_mm)
         return Kind(DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share)))
@@ -207,14 +210,12 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | N
 def _moved_so(
     told_mm: Float[np.ndarray, " n"], seen_mm: Float[np.ndarray, " n"], options: KindOptions
 ) -> bool:
-    """Whether walls that face along a shift stand out by it, and those that face it stand back.
+    """Whether surface stands off wherever a motion of all of it has it stand off far.
 
-    What broke off stands back on one side, and nothing stands out.
+    Of what broke off, or lies on it, the rest is where it was.
     """
-    wide = np.abs(told_mm) > 0.5 * np.abs(told_mm).max(initial=0.0)
-    told, so = told_mm[wide], seen_mm[wide] / told_mm[wide]
-    sides = [so[side] for side in (told > 0, told < 0) if side.any()]
-    return all(float(np.median(side)) > options.risen_share for side in sides)
+    far = told_mm > 0.5 * told_mm.max()
+    return float(np.median(seen_mm[far] / told_mm[far])) > options.moved_share
 
 
 def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -242,10 +243,10 @@ def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> Kind | None
         return None
     high_mm = float(np.percentile(fitted[rim], 90))
     lifted_mm = high_mm - float(fitted[middle].mean())
-    # what sinks in the middle is no curl; nor is a chip, whose parabola rises where nothing does
-    risen_mm = float(np.median(dev[rim & (fitted >= high_mm)]))
-    up = high_mm > options.lifted_layers * layer_mm and risen_mm > options.risen_share * high_mm
-    if up and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
+    # what sinks in the middle is no curl
+    up = high_mm > options.lifted_layers * layer_mm
+    bent = up and _moved_so(fitted, dev, options)
+    if bent and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
         sure = _sure(lifted_mm, options.warp_layers * layer_mm)
         return Kind(DefectType.WARP, sure * min(1.0, share / (1.5 * options.warp_share)))
     return None

@@ -132,6 +132,28 @@ def top_of(rise: np.ndarray, xy: np.ndarray, noise_mm: float) -> kinds._Surface:
     return kinds._Surface(np.column_stack([xy, flat]), seen, up, noise_mm)
 
 
+@pytest.mark.parametrize("radius_mm", [1.0, 1.5, 2.5])
+@pytest.mark.parametrize("inner_mm", [0.0, 6.0, 7.0])
+def test_a_blob_is_no_curl(radius_mm: float, inner_mm: float) -> None:
+    # regression: a parabola through the crest of a hook with a blob on it rises at the blob, as
+    # the crest does; everywhere else that it rises nothing does. The run ended
+    xy = np.random.default_rng(0).uniform(-8.0, 8.0, (6000, 2))
+    xy = xy[(np.hypot(*xy.T) < 8.0) & (np.hypot(*xy.T) >= inner_mm)]
+    inside = (np.hypot(*(xy - [7.0, 0.0]).T) / radius_mm) ** 2
+    blob = 1.5 * np.sqrt(np.maximum(1.0 - inside, 0.0))
+    assert kinds._warped(top_of(blob, xy, 0.03), 0.2, USUAL_KINDS) is None
+
+
+@pytest.mark.parametrize("corners", [1, 2, 4])
+def test_corners_that_curl_up_are_told(corners: int) -> None:
+    xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
+    angle = np.arctan2(xy[:, 1], xy[:, 0]) % (2.0 * np.pi)
+    rise = np.where(angle < corners * np.pi / 2.0, 0.8 * (np.hypot(*xy.T) / 11.3) ** 2, 0.0)
+    found = kinds._warped(top_of(rise, xy, 0.03), 0.2, USUAL_KINDS)
+    assert found is not None
+    assert found.type is DefectType.WARP
+
+
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (6.0, 6.0)])
 @pytest.mark.parametrize("radius_mm", [3.0, 4.0, 5.0])
 def test_a_chip_is_no_curl(centre: tuple[float, float], radius_mm: float) -> None:
