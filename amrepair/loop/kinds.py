@@ -199,8 +199,9 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | N
     top = design[count:]
     told, seen = top[:, :2] @ (above - below)[:2], top[:, 3] - top[:, :3] @ below
     # walls that face along it stand out, and those that face it stand back; one side may be unseen
-    ways = [way for way in (1.0, -1.0) if (way * told).max() > 0.5 * jump_mm]
-    moved = bool(ways) and all(_moved_so(way * told, way * seen, options) for way in ways)
+    bands = options.shift_bands
+    ways = [way for way in (1.0, -1.0) if (way * told).max() > bands[0] * jump_mm]
+    moved = bool(ways) and all(_moved_so(way * told, way * seen, bands, options) for way in ways)
     if moved and jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
         sure = _sure(jump_mm, options.shift_layers * layer_mm)
         return Kind(DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share)))
@@ -208,14 +209,19 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | N
 
 
 def _moved_so(
-    told_mm: Float[np.ndarray, " n"], seen_mm: Float[np.ndarray, " n"], options: KindOptions
+    told_mm: Float[np.ndarray, " n"],
+    seen_mm: Float[np.ndarray, " n"],
+    bands: tuple[float, ...],
+    options: KindOptions,
 ) -> bool:
-    """Whether surface stands off wherever a motion of all of it has it stand off far.
+    """Whether surface stands off wherever a motion of all of it has it do so, band by band.
 
-    Of what broke off, or lies on it, the rest is where it was.
+    Of what broke off, or lies on it, the rest is where it was. Bands begin at
+    shares of the farthest.
     """
-    far = told_mm > 0.5 * told_mm.max()
-    return float(np.median(seen_mm[far] / told_mm[far])) > options.moved_share
+    band = np.digitize(told_mm / told_mm.max(), bands)
+    seen = (seen_mm[band == k] / told_mm[band == k] for k in range(1, len(bands) + 1))
+    return all(np.median(one) > options.moved_share for one in seen if len(one))
 
 
 def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -245,7 +251,9 @@ def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> Kind | None
     lifted_mm = high_mm - float(fitted[middle].mean())
     # what sinks in the middle is no curl
     up = high_mm > options.lifted_layers * layer_mm
-    bent = up and _moved_so(fitted, dev, options)
+    # layers that contract by a strain more than those below bend a part so far, and no farther
+    most_mm = options.most_strain * float((half**2).sum()) / float(np.median(top.place_mm[:, 2]))
+    bent = up and lifted_mm < most_mm and _moved_so(fitted, dev, options.warp_bands, options)
     if bent and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
         sure = _sure(lifted_mm, options.warp_layers * layer_mm)
         return Kind(DefectType.WARP, sure * min(1.0, share / (1.5 * options.warp_share)))
