@@ -156,6 +156,13 @@ def unit_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
+def nearest_rotation(matrix: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "... 3 3"]:
+    """(..., 3, 3) the rotation next to a matrix, least squares (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
+
+
 def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """Rotation matrix of an axis-angle vector (Rodrigues), exact near zero."""
     angle_rad = float(np.linalg.norm(vector_rad))

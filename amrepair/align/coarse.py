@@ -12,6 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.frames import nearest_rotation
+
 VOXEL_RATIOS = (0.012, 0.02)  # of the part's diagonal
 
 
@@ -49,8 +51,7 @@ def _kiss(
     rotation = np.asarray(answer.rotation, dtype=np.float64)
     if not answer.valid or not np.isfinite(rotation).all():
         return None
-    u, _, vt = np.linalg.svd(rotation)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation(rotation)
     shift = np.asarray(answer.translation, dtype=np.float64).reshape(3)
     return _pose(rotation, target + shift - rotation @ source)
 

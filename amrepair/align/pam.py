@@ -19,7 +19,7 @@ from amrepair.align.options import PUBLISHED_PAM, PamOptions
 from amrepair.align.registration import Registration
 from amrepair.device import open3d
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, nearest_rotation
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -127,8 +127,7 @@ def _in_mm(
     middle: Float[np.ndarray, " 3"],
     radius_mm: float,
 ) -> Float[np.ndarray, "4 4"]:
-    u, _, vt = np.linalg.svd(pose[:3, :3])  # ten products of rotations drift
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation(pose[:3, :3])  # ten products of rotations drift
     found = np.eye(4)
     found[:3, :3] = rotation
     found[:3, 3] = middle + radius_mm * pose[:3, 3] - rotation @ start

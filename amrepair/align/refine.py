@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.align import refine_kernels as kernels
-from amrepair.template.port import OnGrid, Template
+from amrepair.frames import nearest_rotation
+from amrepair.template.port import Distances, OnGrid
 
 MAX_ITERATIONS = 60
 
@@ -65,7 +66,7 @@ class Refined:
 
 def refine(
     points_mm: Float[np.ndarray, "n 3"],
-    template: Template,
+    template: Distances,
     matrix: Float[np.ndarray, "4 4"],
     *,
     start_scale_mm: float,
@@ -105,7 +106,7 @@ def refine(
 
 def refine_all(
     points_mm: Float[np.ndarray, "n 3"],
-    template: Template,
+    template: Distances,
     matrices: Sequence[Float[np.ndarray, "4 4"]],
     *,
     start_scale_mm: float,
@@ -139,8 +140,7 @@ def refine_all(
         )
     else:
         hessians, residuals, ends = _refine_by_asking(local, rotations, places, *asked, template)
-    u, _, vt = np.linalg.svd(rotations)
-    rotations = u @ vt
+    rotations = nearest_rotation(rotations)
     found = []
     for k, (rotation, place) in enumerate(zip(rotations, places, strict=True)):
         matrix = np.eye(4)
@@ -160,7 +160,7 @@ def _refine_by_asking(
     max_iterations: int,
     limits: tuple[float, float, float, float, float],
     outside_mm: float,
-    template: Template,
+    template: Distances,
 ) -> tuple[Float[np.ndarray, "k 6 6"], Float[np.ndarray, "k n"], Int[np.ndarray, "k 2"]]:
     """As `refine_kernels.refine_all`, of any template."""
     hessians = np.zeros((len(rotations), 6, 6))

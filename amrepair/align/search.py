@@ -19,6 +19,7 @@ from jaxtyping import Float
 from amrepair.align import search_kernels as kernels
 from amrepair.align.options import USUAL_ALIGN, CoarseOptions, Effort
 from amrepair.align.thinning import Thinned
+from amrepair.frames import nearest_rotation
 from amrepair.template.port import Template
 
 # Roots of x⁴ = x + 4 and 2 (Alexa, eq. 5).
@@ -208,7 +209,6 @@ def spread_rotations(count: int) -> Float[np.ndarray, "k 3 3"]:
 def _matrix(
     rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "4 4"]:
-    u, _, vt = np.linalg.svd(rotation)
     found = np.eye(4)
-    found[:3, :3], found[:3, 3] = u @ vt, translation
+    found[:3, :3], found[:3, 3] = nearest_rotation(rotation), translation
     return found

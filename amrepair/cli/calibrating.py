@@ -10,7 +10,7 @@ import numpy as np
 from amrepair.cli.scanners import Bed, open_scanner
 from amrepair.errors import InputError
 from amrepair.frames import Transform
-from amrepair.loop.calibrate import calibrate, target_solid, write_calibration
+from amrepair.loop.calibrate import PoseOptions, calibrate, target_solid, write_calibration
 from amrepair.scans import Scan, ScanRequest, read_scan
 from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
@@ -65,9 +65,8 @@ def run(
     with bars.shown():
         standing = _standing(setup, source.job, source.layer)
         cloud = _scan(setup, source, bars)
-        found = calibrate(
-            cloud, standing, max_residual_mm=max_residual_mm, rng=np.random.default_rng(seed)
-        )
+        options = PoseOptions(max_residual_mm=max_residual_mm)
+        found = calibrate(cloud, standing, options=options, rng=np.random.default_rng(seed))
     about = {"printer": setup.printer.id, "scan": cloud.source}
     write_calibration(output, found, about)
     if as_json:

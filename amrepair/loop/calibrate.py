@@ -16,9 +16,10 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align.refine import refine
 from amrepair.align.thinning import thin_out
 from amrepair.errors import AlignmentError, InputError
-from amrepair.frames import Transform, rotation_from_vector
+from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
@@ -26,16 +27,48 @@ from gcode.whole import put_in_place
 
 SENSOR_RIGID = 1e-4
 """A rotation's rows are orthonormal to this."""
-MAX_RESIDUAL_MM = 0.15
-"""Beyond it the refinement of every scan may start from the wrong place."""
 TARGET_MM = 1.0
-TURNS_TRIED = 90
-TRIED_POINTS, FIT_POINTS, FIT_STEPS = 1_000, 10_000, 24
-BED_TRIES, PLANE_MM, LEAST_BED = 200, 0.15, 0.2
-CAP_MM = 3.0
-SAME_TURN_FIT = 1.25
-"""Another turn that fits within this factor may as well be the true one."""
-LEAST_APART_RAD = float(np.deg2rad(20.0))
+
+
+@dataclass(frozen=True, slots=True)
+class PoseOptions:
+    """How the scanner's pose is found.
+
+    Attributes
+    ----------
+    max_residual_mm
+        Beyond it the refinement of every scan may start from the wrong place.
+    turns, tried_points, finest
+        Turns about the vertical that are tried, with how many points, and how many of the best
+        are refined.
+    fit_points, first_scale_mm
+        Points of a refinement, and its loss's first scale: some degrees at the target's end.
+    bed_tries, plane_mm, least_bed
+        Planes that are tried for the bed, how near to it its points lie, and their least share.
+    cap_mm
+        A point farther off says no more.
+    same_fit
+        Another turn that fits within this factor may as well be the true one.
+    least_apart_deg
+        Poses that differ by less are one.
+    """
+
+    max_residual_mm: float = 0.15
+    turns: int = 90
+    tried_points: int = 1_000
+    finest: int = 12
+    fit_points: int = 10_000
+    first_scale_mm: float = 2.0
+    bed_tries: int = 200
+    plane_mm: float = 0.15
+    least_bed: float = 0.2
+    cap_mm: float = 3.0
+    same_fit: float = 1.25
+    least_apart_deg: float = 20.0
+
+
+USUAL_POSE = PoseOptions()
+"""What `calibrate` goes by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +120,7 @@ def calibrate(
     scan: Scan,
     standing: Template,
     *,
-    max_residual_mm: float = MAX_RESIDUAL_MM,
+    options: PoseOptions = USUAL_POSE,
     rng: np.random.Generator | None = None,
 ) -> Calibration:
     """Find the scanner's pose from a scan of the bed and of what stands on it.
@@ -105,7 +138,7 @@ def calibrate(
         If there is no bed, nothing on it, another turn fits as well, or the residual is too large.
     """
     rng = rng or np.random.default_rng(0)
-    level, bed_mm = _level(scan, rng)
+    level, bed_mm = _level(scan, options, rng)
     flat = level.apply(scan.points_mm)
     top_mm = float(standing.bounds_mm[1, 2])
     above = (flat[:, 2] > min(0.5 * top_mm, top_mm - 3 * bed_mm)) & (flat[:, 2] < 2 * top_mm + 1)
@@ -115,33 +148,33 @@ def calibrate(
             "needed; is the target there, and is the bed seen around it?"
         )
     centre = _middle(standing)
-    tried = thin_out(flat[above], TRIED_POINTS, rng)
-    turns = [
-        _turned(angle, tried, centre) for angle in np.arange(TURNS_TRIED) * 2 * np.pi / TURNS_TRIED
-    ]
-    cost = np.array([_cost(standing, turn, tried) for turn in turns])
+    tried = thin_out(flat[above], options.tried_points, rng)
+    angles = np.arange(options.turns) * 2 * np.pi / options.turns
+    turns = [_turned(angle, tried, centre) for angle in angles]
+    cost = np.array([_cost(standing, turn, tried, options.cap_mm) for turn in turns])
     near = np.abs(flat[:, 2]) < top_mm + 1.0
-    cloud = thin_out(scan.points_mm[near & _around(flat, flat[above])], FIT_POINTS, rng)
-    limit_mm = max(0.1, 3 * scan.sigma_mm)
+    cloud = thin_out(scan.points_mm[near & _around(flat, flat[above])], options.fit_points, rng)
+    limit_mm, apart_rad = max(0.1, 3 * scan.sigma_mm), np.deg2rad(options.least_apart_deg)
     fits: list[tuple[float, Transform]] = []
-    for k in np.argsort(cost)[:12]:
-        if any(_apart(turns[k] @ level, other) < LEAST_APART_RAD for _, other in fits):
+    for k in np.argsort(cost)[: options.finest]:
+        if any(_apart(turns[k] @ level, other) < apart_rad for _, other in fits):
             continue
-        pose = _fit(cloud, standing, turns[k] @ level, limit_mm)
-        fits.append((_residual(standing, pose, cloud), pose))
+        pose = _fit(cloud, standing, turns[k] @ level, limit_mm, options.first_scale_mm)
+        fits.append((_residual(standing, pose, cloud, options.cap_mm), pose))
     fits.sort(key=lambda fit: fit[0])
     residual_mm, pose = fits[0]
-    others = [mm for mm, other in fits[1:] if _apart(pose, other) >= LEAST_APART_RAD]
+    others = [mm for mm, other in fits[1:] if _apart(pose, other) >= apart_rad]
     runner_up = min(others, default=np.inf) / max(residual_mm, 1e-6)
-    if residual_mm > max_residual_mm:
+    if residual_mm > options.max_residual_mm:
         raise AlignmentError(
             f"the target lies {residual_mm:.3f} mm off where it should be (root mean square), the "
-            f"limit is {max_residual_mm:g} mm; clean the bed, let the printer finish, scan again"
+            f"limit is {options.max_residual_mm:g} mm; clean the bed, let the printer finish, scan "
+            "again"
         )
-    if runner_up < SAME_TURN_FIT:
+    if runner_up < options.same_fit:
         raise AlignmentError(
             f"another turn of the scan fits nearly as well ({runner_up:.2f} times the residual, at "
-            f"least {SAME_TURN_FIT:g} is needed); use a target that looks like itself from one "
+            f"least {options.same_fit:g} is needed); use a target that looks like itself from one "
             "side only"
         )
     return Calibration(pose, residual_mm, bed_mm, float(min(runner_up, 1e3)), len(cloud))
@@ -164,12 +197,12 @@ def write_calibration(
         raise InputError(f"the calibration {path} cannot be written ({error.strerror})") from error
 
 
-def _level(scan: Scan, rng: np.random.Generator) -> tuple[Transform, float]:
+def _level(scan: Scan, options: PoseOptions, rng: np.random.Generator) -> tuple[Transform, float]:
     """The bed as the plane of most points, up where the sensors or fewer points are."""
-    points = thin_out(scan.points_mm, FIT_POINTS, rng)
-    limit_mm = max(PLANE_MM, 3 * scan.sigma_mm)
+    points = thin_out(scan.points_mm, options.fit_points, rng)
+    limit_mm = max(options.plane_mm, 3 * scan.sigma_mm)
     best: tuple[int, Float[np.ndarray, " 3"], float] = (0, np.array([0.0, 0.0, 1.0]), 0.0)
-    for _ in range(BED_TRIES):
+    for _ in range(options.bed_tries):
         a, b, c = points[rng.choice(len(points), 3, replace=False)]
         normal = np.cross(b - a, c - a)
         size = float(np.linalg.norm(normal))
@@ -180,10 +213,10 @@ def _level(scan: Scan, rng: np.random.Generator) -> tuple[Transform, float]:
         if count > best[0]:
             best = (count, normal, float(a @ normal))
     count, normal, offset = best
-    if count < LEAST_BED * len(points):
+    if count < options.least_bed * len(points):
         raise AlignmentError(
-            f"no plane holds {LEAST_BED:.0%} of the points of {scan.source} (the best {count} of "
-            f"{len(points)}); the bed must be seen around the target"
+            f"no plane holds {options.least_bed:.0%} of the points of {scan.source} (the best "
+            f"{count} of {len(points)}); the bed must be seen around the target"
         )
     for limit in (limit_mm, limit_mm, 0.7 * limit_mm):
         on = points[np.abs(points @ normal - offset) < limit]
@@ -226,9 +259,29 @@ def _turned(
     )
 
 
-def _cost(standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"]) -> float:
+def _cost(
+    standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"], cap_mm: float
+) -> float:
     distance = standing.distance(pose.apply(points))
-    return float(np.minimum(np.abs(distance), CAP_MM).mean())
+    return float(np.minimum(np.abs(distance), cap_mm).mean())
+
+
+@dataclass(frozen=True, slots=True)
+class _OnBed:
+    """The field of a target and the bed that it stands on: whichever is nearer."""
+
+    standing: Template
+
+    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        return np.minimum(self.standing.distance(points_mm), points_mm[:, 2])
+
+    def distance_and_gradient(
+        self, points_mm: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        f_mm, gradient = self.standing.distance_and_gradient(points_mm)
+        bed = points_mm[:, 2] < f_mm
+        up = np.array([0.0, 0.0, 1.0])
+        return np.where(bed, points_mm[:, 2], f_mm), np.where(bed[:, None], up, gradient)
 
 
 def _around(flat: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Any:  # (n,) bool
@@ -237,44 +290,32 @@ def _around(flat: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) ->
     return ((flat[:, :2] >= low) & (flat[:, :2] <= high)).all(axis=1)
 
 
-def _field(
-    standing: Template, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Signed distance, and gradient, from target and bed together: whichever is nearer."""
-    f_mm, gradient = standing.distance_and_gradient(points)
-    bed = points[:, 2] < f_mm
-    return (
-        np.where(bed, points[:, 2], f_mm),
-        np.where(bed[:, None], np.array([0.0, 0.0, 1.0]), gradient),
-    )
-
-
 def _fit(
-    points: Float[np.ndarray, "n 3"], standing: Template, guess: Transform, limit_mm: float
+    points: Float[np.ndarray, "n 3"],
+    standing: Template,
+    guess: Transform,
+    limit_mm: float,
+    first_scale_mm: float,
 ) -> Transform:
-    """Gauss-Newton on the field of target and bed, its robust scale falling to `limit_mm`."""
-    pose = guess
-    for scale_mm in np.geomspace(2.0, limit_mm, FIT_STEPS):
-        placed = pose.apply(points)
-        f_mm, gradient = _field(standing, placed)
-        weight = 1.0 / (1.0 + (f_mm / scale_mm) ** 2) ** 2
-        centre = placed.mean(axis=0)
-        jacobian = np.concatenate([np.cross(placed - centre, gradient), gradient], axis=1)
-        normal = jacobian.T @ (weight[:, None] * jacobian) + 1e-6 * np.eye(6)
-        step = -np.linalg.solve(normal, jacobian.T @ (weight * f_mm))
-        turn = rotation_from_vector(step[:3])
-        moved = Transform.from_rotation_translation(
-            "build", "build", rotation=turn, translation_mm=step[3:] + centre - turn @ centre
-        )
-        pose = moved @ pose
-    return pose
+    """To the next minimum on the field of target and bed."""
+    found = refine(
+        points,
+        _OnBed(standing),
+        guess.matrix,
+        start_scale_mm=first_scale_mm,
+        end_scale_mm=limit_mm,
+        sigma_mm=limit_mm / 3,
+    )
+    return Transform("build", "scanner", found.matrix)
 
 
-def _residual(standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"]) -> float:
+def _residual(
+    standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"], cap_mm: float
+) -> float:
     """Root mean square distance of the points from the target or the bed, whichever is nearer."""
     placed = pose.apply(points)
     off = np.minimum(np.abs(standing.distance(placed)), np.abs(placed[:, 2]))
-    return float(np.sqrt((np.minimum(off, CAP_MM) ** 2).mean()))
+    return float(np.sqrt((np.minimum(off, cap_mm) ** 2).mean()))
 
 
 def _apart(a: Transform, b: Transform) -> float:

@@ -26,8 +26,15 @@ class KindOptions:
     warp_layers, lifted_layers, warp_share
         A surface that bends: range of its parabola, height of its rim; share of the deviation that
         the parabola explains.
-    risen_share
-        Where its parabola is highest a curled surface itself is as high, by this much.
+    moved_share
+        Of how far a shift or a curl moves surface: so far it stands off, in the median.
+    shift_bands, warp_bands
+        Of the farthest, where each band of surface begins that is looked at. A curl rises slowly,
+        a blob has a rim.
+    most_strain
+        A plastic contracts by no more from its melt: 1e-4 for a kelvin (ABS), over 200 K. Where the
+        top of a part of height h contracts by ε and its foot does not, it bends by κ = ε / h; by
+        twice as much at most, and its rim, at L from the middle, rises by κ L² / 2.
     layer_share
         Of a layer's beads: too little or too much flow over at least this share is the layer's own.
     clog_least, clog_most, clog_lasts, clog_layers
@@ -66,7 +73,10 @@ class KindOptions:
     warp_layers: float = 1.0
     lifted_layers: float = 0.6
     warp_share: float = 0.45
-    risen_share: float = 0.5
+    moved_share: float = 0.5
+    shift_bands: tuple[float, ...] = (0.5,)
+    warp_bands: tuple[float, ...] = (0.2, 0.47, 0.73)
+    most_strain: float = 0.02
     layer_share: float = 0.55
     clog_least: float = 0.12
     clog_most: float = 0.9

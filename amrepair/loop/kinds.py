@@ -186,19 +186,42 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | N
     up = np.argsort(z)
     design = np.column_stack([out, np.ones(len(z)), dev])[up]
     sums = np.cumsum(design[:, :, None] * design[:, None, :], axis=0)
-    best = (0.0, 0.0)
+    best = (0.0, 0, np.zeros(3), np.zeros(3))
     for cut in np.linspace(0.1, 0.9, 17):
-        below = sums[int(cut * len(z)) - 1]
-        parts = [_fitted(moments) for moments in (sums[-1] - below, below)]
-        left = parts[0][1] + parts[1][1]
-        jump = float(np.linalg.norm(parts[0][0][:2] - parts[1][0][:2]))
-        best = max(best, (total - left, jump))
-    gained, jump_mm = best
+        count = int(cut * len(z))
+        parts = [_fitted(moments) for moments in (sums[-1] - sums[count - 1], sums[count - 1])]
+        gained = total - parts[0][1] - parts[1][1]
+        if gained > best[0]:
+            best = (gained, count, parts[0][0], parts[1][0])
+    gained, count, above, below = best
+    jump_mm = float(np.linalg.norm(above[:2] - below[:2]))
     share = gained / max(total - len(walls) * walls.noise_mm**2, 0.3 * total, 1e-12)
-    if jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
+    top = design[count:]
+    told, seen = top[:, :2] @ (above - below)[:2], top[:, 3] - top[:, :3] @ below
+    # walls that face along it stand out, and those that face it stand back; one side may be unseen
+    bands = options.shift_bands
+    ways = [way for way in (1.0, -1.0) if (way * told).max() > bands[0] * jump_mm]
+    moved = bool(ways) and all(_moved_so(way * told, way * seen, bands, options) for way in ways)
+    if moved and jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
         sure = _sure(jump_mm, options.shift_layers * layer_mm)
         return Kind(DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share)))
     return None
+
+
+def _moved_so(
+    told_mm: Float[np.ndarray, " n"],
+    seen_mm: Float[np.ndarray, " n"],
+    bands: tuple[float, ...],
+    options: KindOptions,
+) -> bool:
+    """Whether surface stands off wherever a motion of all of it has it do so, band by band.
+
+    Of what broke off, or lies on it, the rest is where it was. Bands begin at
+    shares of the farthest.
+    """
+    band = np.digitize(told_mm / told_mm.max(), bands)
+    seen = (seen_mm[band == k] / told_mm[band == k] for k in range(1, len(bands) + 1))
+    return all(np.median(one) > options.moved_share for one in seen if len(one))
 
 
 def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -226,10 +249,12 @@ def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> Kind | None
         return None
     high_mm = float(np.percentile(fitted[rim], 90))
     lifted_mm = high_mm - float(fitted[middle].mean())
-    # what sinks in the middle is no curl; nor is a chip, whose parabola rises where nothing does
-    risen_mm = float(np.median(dev[rim & (fitted >= high_mm)]))
-    up = high_mm > options.lifted_layers * layer_mm and risen_mm > options.risen_share * high_mm
-    if up and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
+    # what sinks in the middle is no curl
+    up = high_mm > options.lifted_layers * layer_mm
+    # layers that contract by a strain more than those below bend a part so far, and no farther
+    most_mm = options.most_strain * float((half**2).sum()) / float(np.median(top.place_mm[:, 2]))
+    bent = up and lifted_mm < most_mm and _moved_so(fitted, dev, options.warp_bands, options)
+    if bent and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
         sure = _sure(lifted_mm, options.warp_layers * layer_mm)
         return Kind(DefectType.WARP, sure * min(1.0, share / (1.5 * options.warp_share)))
     return None

@@ -20,7 +20,14 @@ from amrepair.frames import Transform
 from amrepair.loop import travel
 from amrepair.loop.looks import Stop
 from amrepair.loop.tape import FELT
-from amrepair.loop.touch_design import Flats, TouchOptions, first_places, flats_of, next_places
+from amrepair.loop.touch_design import (
+    USUAL_TOUCHES,
+    Flats,
+    TouchOptions,
+    first_places,
+    flats_of,
+    next_places,
+)
 from amrepair.loop.touched import Touches, measured_sigma_mm, scan_of
 from amrepair.loop.wire import Wire
 from amrepair.scans import PROBE, Scan, ScanRequest
@@ -158,13 +165,13 @@ class ProbeScanner:
         job: Job,
         setup: PrintSetup,
         *,
-        options: TouchOptions | None = None,
+        options: TouchOptions = USUAL_TOUCHES,
         clock: Callable[[], float] = time.monotonic,
         progress: Progress = silent,
     ) -> None:
         self._feeler = feeler
         self._probe = setup.printer.feeler
-        self._job, self._setup, self._options = job, setup, options or TouchOptions()
+        self._job, self._setup, self._options = job, setup, options
         self._clock, self._progress = clock, progress
         self._before: list[tuple[Stop, Touches]] = []
         self._wire: Wire | None = None
@@ -198,7 +205,7 @@ class ProbeScanner:
         began_s = self._clock()
         stop = self._stop(request)
         standing = standing_field(self._job.beads, stop.line, self._setup.printer)
-        flats = flats_of(self._job, stop, self._setup, standing)
+        flats = flats_of(self._job, stop, self._setup, standing, self._options)
         touches, count = self._touched(stop, flats, standing)
         self._before.append((stop, touches))
         off = int(touches.is_off.sum())
@@ -235,11 +242,14 @@ class ProbeScanner:
             z_mm = self._feel(ask, flats, standing, rest, f"touch {stop.label}", count)
             if len(repeated):
                 same = z_mm[: len(repeated) + 1]
-                sigma_mm, repeated = measured_sigma_mm(same, self._probe.sigma_mm), places[:0]
+                sigma_mm, repeated = (
+                    measured_sigma_mm(same, self._probe.sigma_mm, self._options),
+                    places[:0],
+                )
                 z_mm = np.append(same.mean(), z_mm[len(same) :])
             count += len(ask)
             felt_mm = np.concatenate([felt_mm, np.column_stack([places, z_mm])])
-            touches = Touches(felt_mm, self._planned(felt_mm, flats), sigma_mm)
+            touches = Touches(felt_mm, self._planned(felt_mm, flats), sigma_mm, self._options)
             places = next_places(
                 flats, felt_mm[:, :2], touches.off_mm, touches.is_off,
                 reach_mm=self._reach_mm, most=most - count,

@@ -31,14 +31,6 @@ from gcode.reader import Job
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField, raster_kernels
 
-DESIGN_CELL_MM = 0.25
-FLAT_MM = 0.02
-"""Of one flat: digits of the text, and what the nozzle's own flat evens out."""
-LEAST_COVER = 0.4
-"""Of the tip's flat that rests on planned beads: a single line of open infill is as much."""
-CANDIDATE_MM = 0.75
-LINE_MARGIN_MM = 2.0
-"""Plastic is weighed over so far around: some beads."""
 CENTRED = 12
 """Steps towards the middle of a cell: to a twelfth of its radius."""
 EVENED = 12
@@ -48,7 +40,7 @@ HEXAGON = np.array([[np.cos(a), np.sin(a)] for a in np.arange(6) * np.pi / 3])
 
 @dataclass(frozen=True, slots=True)
 class TouchOptions:
-    """How many touches, and how far one speaks.
+    """How many touches, where they may be, and how far one speaks.
 
     Attributes
     ----------
@@ -60,12 +52,40 @@ class TouchOptions:
         Of the first place, to measure the probe's noise: its standard deviation to a third.
     fade_mm
         A touch of an earlier look counts as so much farther away for each layer between.
+    cell_mm
+        Edge of a cell of the grid that places are chosen on.
+    candidate_mm
+        First places are chosen of cells so far apart.
+    flat_mm
+        Of one flat: digits of the text, and what the nozzle's own flat evens out.
+    least_cover
+        Of the tip's flat that rests on planned beads: a single line of open infill is as much.
+    around_mm
+        Plastic is weighed over so far around: some beads.
+    lattice_ratio
+        Of the pitch of a lattice that just covers: nearer to a touch none is added.
+    prior_touches
+        The profile's noise counts as so many touches beside those that measure it.
+    sure_sigmas
+        A touch is off beyond so many standard deviations of one.
     """
 
     most: int = 60
     first: int = 40
     repeats: int = 3
     fade_mm: float = 1.0
+    cell_mm: float = 0.25
+    candidate_mm: float = 0.75
+    flat_mm: float = 0.02
+    least_cover: float = 0.4
+    around_mm: float = 2.0
+    lattice_ratio: float = 0.6
+    prior_touches: int = 4
+    sure_sigmas: float = 4.0
+
+
+USUAL_TOUCHES = TouchOptions()
+"""What a probe is told where nobody says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,25 +102,34 @@ class Flats:
         (ny, nx) plastic laid on an area, mm³ on mm², some beads around.
     may
         (ny, nx) where the tip rests on a flat, and the head is clear of all that stands there.
+    options
+        The grid's cell, and what else places go by.
     """
 
     origin_mm: Float[np.ndarray, " 2"]
     top_mm: Float[np.ndarray, "ny nx"]
     worth_mm: Float[np.ndarray, "ny nx"]
     may: Bool[np.ndarray, "ny nx"]
+    options: TouchOptions = USUAL_TOUCHES
 
     def xy_mm(self, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "k 2"]:
         """(k, 2) middles of cells."""
-        return self.origin_mm + (np.column_stack([columns, rows]) + 0.5) * DESIGN_CELL_MM
+        return self.origin_mm + (np.column_stack([columns, rows]) + 0.5) * self.options.cell_mm
 
     def at(self, xy_mm: Float[np.ndarray, "k 2"]) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the cells that hold places; the nearest where they lie outside."""
-        index = np.floor((xy_mm - self.origin_mm) / DESIGN_CELL_MM).astype(np.int64)
+        index = np.floor((xy_mm - self.origin_mm) / self.options.cell_mm).astype(np.int64)
         ny, nx = self.top_mm.shape
         return np.clip(index[:, 1], 0, ny - 1), np.clip(index[:, 0], 0, nx - 1)
 
 
-def flats_of(job: Job, stop: Stop, setup: PrintSetup, standing: HeightField) -> Flats:
+def flats_of(
+    job: Job,
+    stop: Stop,
+    setup: PrintSetup,
+    standing: HeightField,
+    options: TouchOptions = USUAL_TOUCHES,
+) -> Flats:
     """The last layer of a stop, or all tops of the finished part.
 
     Raises
@@ -116,21 +145,22 @@ def flats_of(job: Job, stop: Stop, setup: PrintSetup, standing: HeightField) -> 
         raise ScannerError(f"the probe has nothing to touch at {stop.label}: no bead lies there")
     start, end = beads.start_mm[pick], beads.end_mm[pick]
     half_mm = 0.5 * beads.width_mm[pick]
-    rim_mm = float(half_mm.max()) + LINE_MARGIN_MM
+    rim_mm = float(half_mm.max()) + options.around_mm
     low = np.minimum(start, end).min(axis=0)[:2] - rim_mm
     high = np.maximum(start, end).max(axis=0)[:2] + rim_mm
-    nx, ny = (int(v) for v in np.ceil((high - low) / DESIGN_CELL_MM))
+    nx, ny = (int(v) for v in np.ceil((high - low) / options.cell_mm))
     flat = [np.ascontiguousarray(xyz[:, :2]) for xyz in (start, end)]
     top_mm = raster_kernels.beside_lines(
-        *flat, half_mm, end[:, 2].copy(), low, DESIGN_CELL_MM, ny, nx
+        *flat, half_mm, end[:, 2].copy(), low, options.cell_mm, ny, nx
     )
     laid = np.isfinite(top_mm)
-    tip = _disc(probe.tip_radius_mm)
+    tip = _disc(probe.tip_radius_mm, options.cell_mm)
     highest = ndimage.maximum_filter(np.where(laid, top_mm, -np.inf), footprint=tip)
-    level = laid & (top_mm > highest - FLAT_MM)
+    level = laid & (top_mm > highest - options.flat_mm)
     cover = ndimage.convolve(level.astype(float), tip / tip.sum(), mode="constant")
     layer_mm = float(np.median(beads.height_mm[pick]))
-    flats = Flats(low, top_mm, layer_mm * _density(laid), level & (cover >= LEAST_COVER))
+    worth_mm, may = layer_mm * _density(laid, options), level & (cover >= options.least_cover)
+    flats = Flats(low, top_mm, worth_mm, may, options)
     flats.may[flats.may] = _clear(flats, setup, standing)
     if not flats.may.any():
         raise ScannerError(
@@ -144,7 +174,7 @@ def first_places(
     flats: Flats, count: int, earlier_mm: Float[np.ndarray, "e 3"]
 ) -> Float[np.ndarray, "k 2"]:
     """(k, 2) farthest places, weighted; `earlier_mm`: places felt before, and what they fade by."""
-    step = round(CANDIDATE_MM / DESIGN_CELL_MM)
+    step = round(flats.options.candidate_mm / flats.options.cell_mm)
     rows, columns = np.nonzero(flats.may)
     some = (rows % step == 0) & (columns % step == 0)
     rows, columns = (rows[some], columns[some]) if some.any() else (rows, columns)
@@ -222,7 +252,7 @@ def next_places(
             near_mm = felt.query(place)[0]
             if found:
                 near_mm = min(near_mm, np.linalg.norm(np.array(found) - place, axis=1).min())
-            if near_mm > 0.6 * pitch_mm:
+            if near_mm > flats.options.lattice_ratio * pitch_mm:
                 found.append(place)
     return _short_way(np.array(found[:most]).reshape(-1, 2))
 
@@ -231,8 +261,8 @@ def _clear(flats: Flats, setup: PrintSetup, standing: HeightField) -> Bool[np.nd
     """(k,) of the places that may be touched: whether the head is clear of what stands there."""
     rows, columns = np.nonzero(flats.may)
     tops_mm = flats.top_mm[rows, columns]
-    probe = setup.printer.feeler
-    clear = tops_mm - probe.offset_mm[2] >= standing.top_mm - FLAT_MM  # nothing is higher
+    probe, flat_mm = setup.printer.feeler, flats.options.flat_mm
+    clear = tops_mm - probe.offset_mm[2] >= standing.top_mm - flat_mm  # nothing is higher
     if clear.all():
         return clear
     tip_mm = np.column_stack([flats.xy_mm(rows, columns), tops_mm]) - probe.offset_mm
@@ -243,21 +273,21 @@ def _clear(flats: Flats, setup: PrintSetup, standing: HeightField) -> Bool[np.nd
     index = np.floor((tip_mm[ask, :2] - reach.field.origin_mm) / reach.cell_mm).astype(np.int64)
     least_mm = np.max([one.least_tip_mm for one in reach.obstacles], axis=0)
     iy, ix = (np.clip(index[:, k], 0, reach.shape[1 - k] - 1) for k in (1, 0))
-    clear[ask] = least_mm[iy, ix] <= tip_mm[ask, 2] + FLAT_MM
+    clear[ask] = least_mm[iy, ix] <= tip_mm[ask, 2] + flat_mm
     return clear
 
 
-def _density(laid: Bool[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
+def _density(laid: Bool[np.ndarray, "ny nx"], options: TouchOptions) -> Float[np.ndarray, "ny nx"]:
     """(ny, nx) how much of the area around is laid, of what lies within the layer's outline."""
-    wide = 2 * round(LINE_MARGIN_MM / DESIGN_CELL_MM) + 1
+    wide = 2 * round(options.around_mm / options.cell_mm) + 1
     within = ndimage.minimum_filter(ndimage.maximum_filter(laid, wide), wide) | laid
     full, share = (ndimage.uniform_filter(a.astype(float), wide) for a in (within, laid))
     return np.asarray(share / np.maximum(full, 1e-9))
 
 
-def _disc(radius_mm: float) -> Bool[np.ndarray, "d d"]:
-    half = int(np.ceil(radius_mm / DESIGN_CELL_MM))
-    y, x = np.mgrid[-half : half + 1, -half : half + 1] * DESIGN_CELL_MM
+def _disc(radius_mm: float, cell_mm: float) -> Bool[np.ndarray, "d d"]:
+    half = int(np.ceil(radius_mm / cell_mm))
+    y, x = np.mgrid[-half : half + 1, -half : half + 1] * cell_mm
     return np.asarray(np.hypot(x, y) <= radius_mm + 1e-9)
 
 

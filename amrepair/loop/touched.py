@@ -14,13 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from amrepair.loop.touch_design import FLAT_MM, Flats
+from amrepair.loop.touch_design import USUAL_TOUCHES, Flats, TouchOptions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import PROBE, Scan
 
-PRIOR_TOUCHES = 4
-"""The profile's noise counts as so many touches beside those that measure it."""
-SURE_SIGMAS = 4.0
 SIGHT_MM = 3000.0
 """Touches come from straight above: as rays, from so high that they slant by no hundredth."""
 
@@ -37,11 +34,14 @@ class Touches:
         (n,) the job's own height there.
     sigma_mm
         Standard deviation of one touch.
+    options
+        By which one is told to be off.
     """
 
     place_mm: Float[np.ndarray, "n 3"]
     planned_mm: Float[np.ndarray, " n"]
     sigma_mm: float
+    options: TouchOptions = USUAL_TOUCHES
 
     @property
     def off_mm(self) -> Float[np.ndarray, " n"]:
@@ -51,20 +51,23 @@ class Touches:
     @property
     def is_off(self) -> Bool[np.ndarray, " n"]:
         """(n,) whether a touch is beyond what a region goes on to, and beyond noise."""
-        options = RegionOptions()
-        allowed_mm = options.top_allowance_mm + options.registration_sigma_mm
-        least_mm = max(options.grow_share * allowed_mm, SURE_SIGMAS * self.sigma_mm)
+        region = RegionOptions()
+        allowed_mm = region.top_allowance_mm + region.registration_sigma_mm
+        least_mm = max(region.grow_share * allowed_mm, self.options.sure_sigmas * self.sigma_mm)
         return np.asarray(np.abs(self.off_mm) > least_mm)
 
 
-def measured_sigma_mm(repeated_mm: Float[np.ndarray, " r"], told_mm: float) -> float:
+def measured_sigma_mm(
+    repeated_mm: Float[np.ndarray, " r"], told_mm: float, options: TouchOptions = USUAL_TOUCHES
+) -> float:
     """Standard deviation of one touch, from touches of one place and what the profile says.
 
     Its variance is the mean of its inverse-gamma posterior, the profile's value as prior.
     """
     spread_mm2 = float(((repeated_mm - repeated_mm.mean()) ** 2).sum()) if len(repeated_mm) else 0.0
     freedom = max(len(repeated_mm) - 1, 0)
-    return float(np.sqrt((PRIOR_TOUCHES * told_mm**2 + spread_mm2) / (PRIOR_TOUCHES + freedom)))
+    prior = options.prior_touches
+    return float(np.sqrt((prior * told_mm**2 + spread_mm2) / (prior + freedom)))
 
 
 def scan_of(
@@ -83,7 +86,9 @@ def scan_of(
     best, nearest_mm = np.full(len(cells_mm), np.inf), np.full(len(cells_mm), np.inf)
     owner = np.full(len(cells_mm), -1)
     for k, place in enumerate(xy_mm):
-        own = np.abs(tops_mm - touches.planned_mm[k]) < FLAT_MM  # of another flat it says nothing
+        own = (
+            np.abs(tops_mm - touches.planned_mm[k]) < flats.options.flat_mm
+        )  # of another flat it says nothing
         away = np.linalg.norm(cells_mm - place, axis=1)
         lead = away - (tip_radius_mm if is_low[k] else -tip_radius_mm)
         nearer = own & (away <= reach_mm + tip_radius_mm) & (lead < best)

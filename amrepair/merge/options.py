@@ -51,6 +51,9 @@ class JointOptions:
         At most; a smaller step ends it.
     within_spacings
         Of the other scan: farther apart are no pair.
+    over_spacings
+        A point lies over the other scan's nearest one, or beyond its rim; chance leaves such a
+        place without one in exp(-pi) = 4 %.
     agrees
         Cosine of the normals of a pair: edges are blends of two faces.
     least_pairs
@@ -77,6 +80,7 @@ class JointOptions:
     rounds: int = 15
     still_spacings: float = 1e-3
     within_spacings: float = 4.0
+    over_spacings: float = 1.0
     agrees: float = 0.9
     least_pairs: int = 100
     scale_noises: float = 4.0

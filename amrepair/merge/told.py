@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from amrepair.errors import AlignmentError, InputError
-from amrepair.frames import moved
+from amrepair.frames import moved, nearest_rotation
 from amrepair.merge.match import featured, searched
 from amrepair.merge.options import MergeOptions
 from amrepair.merge.views import Fit, Placed, View, joined
@@ -106,8 +106,7 @@ def of_views(
         ways = [pose.copy(), pose.copy()]
         ways[1][:3, :3] = pose[:3, :3].T
         for way in ways:
-            u, _, vt = np.linalg.svd(way[:3, :3])
-            way[:3, :3] = u @ vt
+            way[:3, :3] = nearest_rotation(way[:3, :3])
             way[:3, 3] *= unit_mm
         if placed:
             known = joined(views, placed, TRIAL_POINTS).tree

@@ -66,8 +66,8 @@ class View:
         (n,) how far the points around lie from the plane, beyond the noise.
     tilt_rad
         (n,) standard error of the normals.
-    sure
-        (n,) whether it is clear which way the normals face.
+    incidence
+        (n,) cosine of the angle at which its sensor saw each point; NaN where nobody knows.
     thin
         About `THIN_POINTS` of them.
     spacing_mm, sigma_mm
@@ -80,7 +80,7 @@ class View:
     surface: Surface
     rough_mm: Float[np.ndarray, " n"]
     tilt_rad: Float[np.ndarray, " n"]
-    sure: Bool[np.ndarray, " n"]
+    incidence: Float[np.ndarray, " n"]
     thin: Surface
     spacing_mm: float
     thin_spacing_mm: float
@@ -114,14 +114,14 @@ class View:
         looks = _looks(points, sensors, index, rng)
         spacing_mm = spacing_of(points)
         plane = planes(points, spacing_mm)
-        normals, sure = _facing(
+        normals, incidence = _facing(
             points, plane.normals, spacing_mm, plane.sigma_mm, sensors, index, looks
         )
         surface = Surface.of(points, normals)
         which = surface.tree.query(thin_out(points, THIN_POINTS, rng))[1]
         thin = Surface.of(points[which], normals[which])
         return cls(
-            scan.source, surface, plane.rough_mm, plane.tilt_rad, sure, thin, spacing_mm,
+            scan.source, surface, plane.rough_mm, plane.tilt_rad, incidence, thin, spacing_mm,
             spacing_of(thin.points_mm), plane.sigma_mm, looks,
         )  # fmt: skip
 
@@ -129,6 +129,19 @@ class View:
     def size_mm(self) -> float:
         """Its diagonal."""
         return float(np.linalg.norm(np.ptp(self.thin.points_mm, axis=0)))
+
+    @property
+    def sure(self) -> Bool[np.ndarray, " n"]:
+        """(n,) whether it is clear which way the normals face."""
+        return np.asarray(self.incidence > CLEAR)
+
+    @property
+    def confidence(self) -> Float[np.ndarray, " n"]:
+        """(n,) inverse variance of what the angle of incidence adds; 1 head-on, or unknown.
+
+        Below `CLEAR` the cosine is the normal's noise.
+        """
+        return np.where(np.isnan(self.incidence), 1.0, np.maximum(self.incidence, CLEAR) ** 2)
 
 
 def _looks(
@@ -153,16 +166,19 @@ def _facing(
     sensors_mm: Float[np.ndarray, "k 3"] | None,
     sensor_index: Int[np.ndarray, " n"] | None,
     looks: sight.Looks,
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Normals to the sensor that saw each point, else to where more of the distance is in sight."""
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Normals to the sensor that saw each point, else to where more of the distance is in sight.
+
+    And the cosines of the angles of incidence.
+    """
     if sensors_mm is not None and sensor_index is not None:
         rays = sensors_mm[sensor_index] - points_mm
     elif len(looks.each):
         rays = looks.sensors_mm.mean(axis=0) - points_mm
     else:
-        return outward(points_mm, normals, spacing_mm, sigma_mm), np.zeros(len(points_mm), bool)
+        return outward(points_mm, normals, spacing_mm, sigma_mm), np.full(len(points_mm), np.nan)
     along = (normals * rays).sum(axis=1) / np.linalg.norm(rays, axis=1)
-    return normals * np.where(along < 0.0, -1.0, 1.0)[:, None], np.abs(along) > CLEAR
+    return normals * np.where(along < 0.0, -1.0, 1.0)[:, None], np.abs(along)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,21 @@ from jaxtyping import Float
 
 
 @runtime_checkable
-class Template(Protocol):
+class Distances(Protocol):
+    """A signed distance field: all that a pose is refined by."""
+
+    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) signed distance at (n, 3) points, mm, negative inside."""
+        ...
+
+    def distance_and_gradient(
+        self, points_mm: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """(n,) signed distance, mm, and its (n, 3) gradient (unit outward normal near f = 0)."""
+        ...
+
+
+class Template(Distances, Protocol):
     """A signed distance field of the expected part."""
 
     @property
@@ -24,16 +38,6 @@ class Template(Protocol):
     @property
     def bias_mm(self) -> float:
         """How far the field's zero level may lie from the true surface (99th percentile)."""
-        ...
-
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """(n,) signed distance at (n, 3) points, mm, negative inside."""
-        ...
-
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-        """(n,) signed distance, mm, and its (n, 3) gradient (unit outward normal near f = 0)."""
         ...
 
     def below_z(self, z_mm: float) -> Template:

@@ -16,11 +16,10 @@ from gcode.moves import Role
 from gcode.slicing import infill_kernels as kernels
 from gcode.slicing.beads import Bead, loop_bead
 from gcode.slicing.medial import fill_thin
+from gcode.slicing.options import FillOptions
 from gcode.slicing.regions import flattened, offset, peel, pieces
 
 SOLID_ANGLES_RAD = (math.pi / 4, -math.pi / 4)
-FLOW_SPAN = (0.75, 1.25)  # how far the weighing may move flow before it is a mistake of geometry
-CONNECT_SPACINGS = 2.5
 
 
 def solid_fill(
@@ -29,8 +28,8 @@ def solid_fill(
     spacing_mm: float,
     angle_rad: float,
     role: Role,
-    least_mm: float,
-    most_mm: float,
+    bore_mm: float,
+    options: FillOptions,
     pattern: Literal["rectilinear", "concentric"] = "rectilinear",
     overlap_ratio: float = 0.0,
 ) -> tuple[list[Bead], float]:
@@ -45,30 +44,40 @@ def solid_fill(
     if area_mm2 <= 0:
         return [], 0.0
     if pattern == "concentric":
-        return _concentric(region, spacing_mm, role, least_mm=least_mm, most_mm=most_mm)
+        return _concentric(region, spacing_mm, role, bore_mm, options)
     wide = offset(offset(region, -spacing_mm), spacing_mm)
     narrow = region - wide
-    beads, lost_mm2 = _thin(narrow, least_mm=least_mm, most_mm=most_mm)
-    laid = _lines_up_to_the_rim(wide, spacing_mm, angle_rad, role, overlap_ratio)
+    beads, lost_mm2 = _thin(narrow, bore_mm, options)
+    laid = _lines_up_to_the_rim(wide, spacing_mm, angle_rad, role, overlap_ratio, options)
     if not laid and wide.area() > 0:
-        more, lost = _thin(wide, least_mm=least_mm, most_mm=most_mm)
+        more, lost = _thin(wide, bore_mm, options)
         return beads + more, lost_mm2 + lost
     weigh_mm2 = wide.area() + lost_mm2  # crumbs along the narrow seams go to their neighbours
     total_mm2 = sum(bead.area_mm2 for bead in laid)
     factor = weigh_mm2 / total_mm2 if total_mm2 else 1.0
-    applied = min(max(factor, FLOW_SPAN[0]), FLOW_SPAN[1])
+    least, most = options.flow_span
+    applied = min(max(factor, least), most)
     left_mm2 = max(0.0, weigh_mm2 - total_mm2 * applied)
     return beads + [bead.scaled(applied) for bead in laid], left_mm2
 
 
 def _lines_up_to_the_rim(
-    region: Any, spacing_mm: float, angle_rad: float, role: Role, overlap_ratio: float
+    region: Any,
+    spacing_mm: float,
+    angle_rad: float,
+    role: Role,
+    overlap_ratio: float,
+    options: FillOptions,
 ) -> list[Bead]:
     """Lines that end so near to the rim that they carry the region's area, if they may."""
 
     def ending(inset_mm: float) -> tuple[list[Bead], float]:
         beads = rectilinear(
-            offset(region, -inset_mm), spacing_mm=spacing_mm, angle_rad=angle_rad, role=role
+            offset(region, -inset_mm),
+            spacing_mm=spacing_mm,
+            angle_rad=angle_rad,
+            role=role,
+            connect_mm=options.connect_spacings * spacing_mm,
         )
         return beads, float(sum(bead.area_mm2 for bead in beads))
 
@@ -114,10 +123,10 @@ def rectilinear(
     spacing_mm: float,
     angle_rad: float,
     role: Role,
+    connect_mm: float,
     share_mm: float | None = None,
-    connect_mm: float | None = None,
 ) -> list[Bead]:
-    """Parallel lines across a region, chained to and fro where their ends are near."""
+    """Parallel lines across a region, chained where their ends are within `connect_mm`."""
     points, starts = flattened(region)
     if len(points) < 3:
         return []
@@ -125,11 +134,10 @@ def rectilinear(
     turn = np.array([[c, -s], [s, c]])  # row vectors: world → scan frame
     turned = np.ascontiguousarray(points @ turn)
     share = spacing_mm if share_mm is None else share_mm
-    reach = CONNECT_SPACINGS * spacing_mm if connect_mm is None else connect_mm
     line, low, high, first = kernels.scan_lines(turned, starts, spacing_mm, 0.0)
     if len(line) == 0:
         return []
-    order, code = kernels.chain_chords(low, high, first, reach)
+    order, code = kernels.chain_chords(low, high, first, connect_mm)
     y = line[order] * spacing_mm
     backward = (code & 1).astype(bool)
     x0 = np.where(backward, high[order], low[order])
@@ -145,7 +153,7 @@ def rectilinear(
 
 
 def _concentric(
-    region: Any, spacing_mm: float, role: Role, *, least_mm: float, most_mm: float
+    region: Any, spacing_mm: float, role: Role, bore_mm: float, options: FillOptions
 ) -> tuple[list[Bead], float]:
     """Rings all the way in, medial beads where they meet."""
     beads: list[Bead] = []
@@ -154,31 +162,35 @@ def _concentric(
     count = math.ceil(max(box[2] - box[0], box[3] - box[1]) / spacing_mm) + 1
     peeled = peel(region, spacing_mm, count)
     for ring in peeled.rings:
-        beads += ring_beads(ring.centre, ring.area_mm2, spacing_mm, role)
+        beads += ring_beads(ring.centre, ring.area_mm2, spacing_mm, role, options)
     for part in peeled.thin:
-        more, lost = _thin(part, least_mm=least_mm, most_mm=most_mm)
+        more, lost = _thin(part, bore_mm, options)
         beads += more
         lost_mm2 += lost
     return beads, lost_mm2
 
 
-def ring_beads(centre: Any, area_mm2: float, spacing_mm: float, role: Role) -> list[Bead]:
+def ring_beads(
+    centre: Any, area_mm2: float, spacing_mm: float, role: Role, options: FillOptions
+) -> list[Bead]:
     """Closed beads along a ring's centre, weighed to the ring's area."""
     loops = [loop_bead(np.asarray(c), spacing_mm, role) for c in centre.to_polygons() if len(c) > 2]
     laid_mm2 = sum(bead.area_mm2 for bead in loops)
     if laid_mm2 <= 0:
         return []
-    factor = min(max(area_mm2 / laid_mm2, FLOW_SPAN[0]), FLOW_SPAN[1])
+    least, most = options.flow_span
+    factor = min(max(area_mm2 / laid_mm2, least), most)
     return [bead.scaled(factor) for bead in loops]
 
 
-def _thin(region: Any, *, least_mm: float, most_mm: float) -> tuple[list[Bead], float]:
+def _thin(region: Any, bore_mm: float, options: FillOptions) -> tuple[list[Bead], float]:
     """Medial beads of every piece; crumbs count as lost."""
     beads: list[Bead] = []
+    least_mm, _ = options.widths_mm(bore_mm)
     found_mm2 = 0.0
     lost_mm2 = 0.0
     for part in pieces(region, least_mm2=0.25 * least_mm * least_mm):
-        thin = fill_thin(part, least_mm=least_mm, most_mm=most_mm)
+        thin = fill_thin(part, bore_mm, options)
         beads += thin.beads
         lost_mm2 += thin.lost_mm2
         found_mm2 += part.area()

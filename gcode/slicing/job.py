@@ -25,11 +25,10 @@ from gcode.slicing.beads import Bead, loop_bead, spacing_of
 from gcode.slicing.layer_plan import LayerPlan, PartLayers, Unprintable
 from gcode.slicing.layers import LayerGrid, Slab, plan_slabs
 from gcode.slicing.objects import Labels, boxes_apart_mm
+from gcode.slicing.options import USUAL_PART, PartOptions
 from gcode.slicing.order import nearest_first, seam_index
 from gcode.slicing.pen import MERGE_MM, Pen
 from gcode.slicing.regions import flattened, union
-
-SHORT_TRAVEL_MM = 1.5  # below this oozing costs less than a retraction
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +41,12 @@ class PartPlan:
 
 
 def slice_part(
-    solid: Any, setup: PrintSetup, *, workers: int = 1, progress: Progress = silent
+    solid: Any,
+    setup: PrintSetup,
+    *,
+    options: PartOptions = USUAL_PART,
+    workers: int = 1,
+    progress: Progress = silent,
 ) -> Toolpath:
     """Slice a solid (`Manifold` or `ClosedMesh`, build frame) into a whole job; see `plan_part`.
 
@@ -55,7 +59,8 @@ def slice_part(
     >>> 0.97 < toolpath.volume_mm3 / solid.volume() < 1.03
     True
     """
-    return plan_part(solid, setup, workers=workers, progress=progress).toolpath
+    plan = plan_part(solid, setup, options=options, workers=workers, progress=progress)
+    return plan.toolpath
 
 
 def plan_part(
@@ -63,6 +68,7 @@ def plan_part(
     setup: PrintSetup,
     *,
     grid: LayerGrid | None = None,
+    options: PartOptions = USUAL_PART,
     workers: int = 1,
     progress: Progress = silent,
 ) -> PartPlan:
@@ -74,6 +80,8 @@ def plan_part(
         A `manifold3d.Manifold` or a `gcode.meshes.ClosedMesh`, build frame, mm.
     grid
         Heights to lie on; the process profile's by default.
+    options
+        What profiles do not say.
     workers
         Processes that plan layers at once, forked from this one: 1 where it has other threads. What
         they plan does not depend on how many they are.
@@ -85,9 +93,10 @@ def plan_part(
     """
     _refuse(solid, setup)
     solid = closed_mesh(solid)
-    nozzle_mm = setup.printer.nozzle_diameter_mm
-    slabs = plan_slabs(solid, grid or LayerGrid.from_setup(setup), nozzle_diameter_mm=nozzle_mm)
-    layers = PartLayers(Cuts.of(solid, np.array([s.middle_mm for s in slabs])), slabs, setup)
+    grid, bore_mm = grid or LayerGrid.from_setup(setup), setup.printer.nozzle_diameter_mm
+    slabs = plan_slabs(solid, grid, nozzle_diameter_mm=bore_mm, options=options)
+    cuts = Cuts.of(solid, np.array([s.middle_mm for s in slabs]))
+    layers = PartLayers(cuts, slabs, setup, options)
     pen = Pen(setup, np.array(setup.printer.park_mm, float))
     lost: list[Unprintable] = []
     _begin(pen, setup, float(solid.bounding_box()[5]))
@@ -98,8 +107,8 @@ def plan_part(
         lost += plan.lost
         _change_layer(pen, slab, setup)
         if slab.index == 0:
-            _skirt(pen, layers.section(0), slab, setup)
-        seam_mm = _emit(pen, plan, slab, seam_mm, setup, labels)
+            _skirt(pen, layers, slab)
+        seam_mm = _emit(pen, plan, slab, seam_mm, layers, labels)
         progress("slice", float(slab.index + 1), float(len(slabs)))
     pen.retract()
     pen.move_to(np.array([*pen.position_mm[:2], slabs[-1].top_mm + setup.printer.z_hop_mm + 1.0]))
@@ -174,7 +183,7 @@ def _emit(
     plan: LayerPlan,
     slab: Slab,
     seam_mm: Float[np.ndarray, " 2"],
-    setup: PrintSetup,
+    layers: PartLayers,
     labels: Labels,
 ) -> Float[np.ndarray, " 2"]:
     """Moves of one layer, nearest island next; returns where its last seam was."""
@@ -185,17 +194,17 @@ def _emit(
         island = left.pop(int(np.argmin([_box_distance(one.box_mm, here) for one in left])))
         labels.of_box(pen, island.box_mm)
         for group in island.groups:
-            beads = [_seamed(bead, seam) for bead in group]
+            beads = [_seamed(bead, seam, layers.options) for bead in group]
             if beads and beads[0].role is Role.EXTERNAL_PERIMETER:
                 seam = beads[0].xy_mm[0]
             for bead in nearest_first(beads, pen.position_mm[:2]):
-                _lay(pen, bead, slab, (island.outline_mm, island.starts), setup)
+                _lay(pen, bead, slab, (island.outline_mm, island.starts), layers)
     labels.of_none(pen)
     return seam
 
 
-def _seamed(bead: Bead, seam_mm: Float[np.ndarray, " 2"]) -> Bead:
-    return bead.started_at(seam_index(bead.xy_mm[:-1], seam_mm)) if bead.closed else bead
+def _seamed(bead: Bead, seam_mm: Float[np.ndarray, " 2"], options: PartOptions) -> Bead:
+    return bead.started_at(seam_index(bead.xy_mm[:-1], seam_mm, options)) if bead.closed else bead
 
 
 def _box_distance(box: tuple[float, float, float, float], p: Float[np.ndarray, " 2"]) -> float:
@@ -204,8 +213,9 @@ def _box_distance(box: tuple[float, float, float, float], p: Float[np.ndarray, "
     return math.hypot(dx, dy)
 
 
-def _lay(pen: Pen, bead: Bead, slab: Slab, outline: Any, setup: PrintSetup) -> None:
+def _lay(pen: Pen, bead: Bead, slab: Slab, outline: Any, layers: PartLayers) -> None:
     """Go to a bead (combing inside the island, else retracted and lifted) and lay it."""
+    setup, short_mm = layers.setup, layers.options.short_travel_mm
     start = np.array([*bead.xy_mm[0], slab.top_mm])
     gap = start - pen.position_mm
     level = abs(gap[2]) < 1e-6
@@ -218,7 +228,7 @@ def _lay(pen: Pen, bead: Bead, slab: Slab, outline: Any, setup: PrintSetup) -> N
             bead.closed,
         )
     elif level and (
-        far < SHORT_TRAVEL_MM or not kernels.crosses(*pen.position_mm[:2], *bead.xy_mm[0], *outline)
+        far < short_mm or not kernels.crosses(*pen.position_mm[:2], *bead.xy_mm[0], *outline)
     ):
         pen.move_to(start)
     else:
@@ -239,8 +249,9 @@ def _speed(bead: Bead, slab: Slab, setup: PrintSetup) -> float:
     }.get(bead.role, process.solid_infill_speed_mm_s)
 
 
-def _skirt(pen: Pen, section: Any, slab: Slab, setup: PrintSetup) -> None:
+def _skirt(pen: Pen, layers: PartLayers, slab: Slab) -> None:
     """Loops around everything on the bed, to get the filament flowing."""
+    setup, section = layers.setup, layers.section(0)
     process = setup.process
     if process.skirt_loops == 0 or slab.bottom_mm > 1e-3 or section.is_empty():
         return
@@ -254,4 +265,4 @@ def _skirt(pen: Pen, section: Any, slab: Slab, setup: PrintSetup) -> None:
             if (loop < 0.5).any() or (loop > np.array(size) - 0.5).any():
                 continue
             bead = loop_bead(loop, share_mm, Role.SKIRT)
-            _lay(pen, bead, slab, flattened(hull), setup)
+            _lay(pen, bead, slab, flattened(hull), layers)

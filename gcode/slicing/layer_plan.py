@@ -21,14 +21,8 @@ from gcode.slicing.beads import Bead, spacing_of
 from gcode.slicing.infill import SOLID_ANGLES_RAD, ring_beads, solid_fill, sparse_fill
 from gcode.slicing.layers import Slab
 from gcode.slicing.medial import fill_thin
+from gcode.slicing.options import PartOptions
 from gcode.slicing.regions import SIMPLIFY_MM, flattened, offset, peel, pieces
-
-LEAST_NOZZLES = 0.5
-MOST_NOZZLES = 2.0
-INFILL_OVERLAP = 0.25  # of a spacing: PrusaSlicer's default overlap of infill and perimeters
-FLOW_CORRECTION = (0.85, 1.6)  # slab volume over section × height, outside of which flow is wrong
-LEAST_LEFT_MM3 = 1e-3
-DENSE_RATIO = 0.999  # from here on infill is solid
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +72,7 @@ class PartLayers:
     cuts: Cuts
     slabs: tuple[Slab, ...]
     setup: PrintSetup
+    options: PartOptions
     _sections: Any = field(init=False)
 
     def __post_init__(self) -> None:
@@ -94,8 +89,8 @@ class PartLayers:
     def plan(self, index: int) -> LayerPlan:
         """Beads of one layer, in the same place and of the same weight whoever asks when."""
         section, slab = self.section(index), self.slabs[index]
-        layer = _planned(section, self._solid_mask(index), slab, self.setup)
-        factor = _flow(layer, slab, section)
+        layer = _planned(section, self._solid_mask(index), slab, self.setup, self.options)
+        factor = _flow(layer, slab, section, self.options)
         islands = tuple(
             Island(
                 part.bounds(),
@@ -104,12 +99,12 @@ class PartLayers:
             )
             for part, groups in layer.islands
         )
-        return LayerPlan(islands, tuple(_listed(layer, slab)))
+        return LayerPlan(islands, tuple(_listed(layer, slab, self.options)))
 
     def _solid_mask(self, index: int) -> Any | None:
         """What lies within the shells' reach of air above or below; None = everything."""
         process = self.setup.process
-        if process.infill_ratio >= DENSE_RATIO:
+        if process.infill_ratio >= self.options.dense_ratio:
             return None
         section = buried = self.section(index)
         for j in range(index - process.bottom_layers, index + process.top_layers + 1):
@@ -129,22 +124,23 @@ class _Layer:
     lost: list[Any] = field(default_factory=list)
 
 
-def _planned(section: Any, mask: Any | None, slab: Slab, setup: PrintSetup) -> _Layer:
+def _planned(
+    section: Any, mask: Any | None, slab: Slab, setup: PrintSetup, options: PartOptions
+) -> _Layer:
     """Rings, thin beads and fills of one section."""
-    process, nozzle_mm = setup.process, setup.printer.nozzle_diameter_mm
+    process, bore_mm = setup.process, setup.printer.nozzle_diameter_mm
     share_mm = spacing_of(max(process.line_width_mm, 1.05 * slab.height_mm), slab.height_mm)
-    least_mm, most_mm = LEAST_NOZZLES * nozzle_mm, MOST_NOZZLES * nozzle_mm
     layer = _Layer()
     for island in pieces(section):
         peeled = peel(island, share_mm, process.perimeters)
         groups: list[list[Bead]] = []
         for i, ring in enumerate(peeled.rings):
             role = Role.PERIMETER if i else Role.EXTERNAL_PERIMETER
-            groups.append(ring_beads(ring.centre, ring.area_mm2, share_mm, role))
+            groups.append(ring_beads(ring.centre, ring.area_mm2, share_mm, role, options.fill))
         groups.reverse()  # the outer wall last of the rings, against its support
         thin_beads: list[Bead] = []
         for part in peeled.thin:
-            thin = fill_thin(part, least_mm=least_mm, most_mm=most_mm)
+            thin = fill_thin(part, bore_mm, options.fill)
             thin_beads += thin.beads
             if not thin.beads:
                 layer.lost.append(part)
@@ -155,10 +151,10 @@ def _planned(section: Any, mask: Any | None, slab: Slab, setup: PrintSetup) -> _
             spacing_mm=share_mm,
             angle_rad=SOLID_ANGLES_RAD[top],
             role=Role.SOLID_INFILL,
-            least_mm=least_mm,
-            most_mm=most_mm,
+            bore_mm=bore_mm,
+            options=options.fill,
             pattern="concentric" if process.infill_pattern == "concentric" else "rectilinear",
-            overlap_ratio=INFILL_OVERLAP,
+            overlap_ratio=options.overlap_ratio,
         )
         if mask is not None:
             fills += sparse_fill(
@@ -172,7 +168,7 @@ def _planned(section: Any, mask: Any | None, slab: Slab, setup: PrintSetup) -> _
     return layer
 
 
-def _flow(layer: _Layer, slab: Slab, section: Any) -> float:
+def _flow(layer: _Layer, slab: Slab, section: Any, options: PartOptions) -> float:
     """By what flow is scaled so that full areas carry the slab's exact volume.
 
     Lost slivers are not put elsewhere: where they are more than rounding, they are listed.
@@ -188,15 +184,16 @@ def _flow(layer: _Layer, slab: Slab, section: Any) -> float:
         laid_mm2 = sum(b.area_mm2 for b in beads)
         if laid_mm2 > 0:
             factor *= max(area_mm2 - listed_mm2, 0.0) / laid_mm2
-    return float(min(max(factor, FLOW_CORRECTION[0]), FLOW_CORRECTION[1]))
+    least, most = options.flow_correction
+    return float(min(max(factor, least), most))
 
 
-def _listed(layer: _Layer, slab: Slab) -> list[Unprintable]:
+def _listed(layer: _Layer, slab: Slab, options: PartOptions) -> list[Unprintable]:
     out = []
     for part in layer.lost:
         volume = part.area() * slab.height_mm
         x0, y0, x1, y1 = part.bounds()
         box = (x0, y0, slab.bottom_mm, x1, y1, slab.top_mm)
-        if volume > LEAST_LEFT_MM3:
+        if volume > options.least_left_mm3:
             out.append(Unprintable(volume, box, "thinner than half a nozzle"))
     return out

@@ -18,10 +18,9 @@ from gcode.meshes import mesh_of
 from gcode.meshes_kernels import level_faces
 from gcode.profiles import PrintSetup
 from gcode.slicing import volume_kernels as kernels
+from gcode.slicing.options import USUAL_PART, PartOptions
 
 MAX_LAYERS = 20_000
-HIGHEST_LAYER_OF_NOZZLE = 0.8  # layers above 0.8 nozzle diameters no longer press onto the last
-SNAP_SHARE = 0.01  # horizontal faces above this share of the largest section bend the grid
 _SAME_LAYER_MM = 1e-4
 
 
@@ -110,21 +109,23 @@ def slab_volumes(solid: Any, cuts_mm: Float[np.ndarray, " n"]) -> Float[np.ndarr
     return np.maximum(np.diff(below), 0.0)
 
 
-def plan_slabs(solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float) -> tuple[Slab, ...]:
+def plan_slabs(
+    solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float, options: PartOptions = USUAL_PART
+) -> tuple[Slab, ...]:
     """Layers of a part on a grid that bends to the part's own horizontal faces.
 
     A face between two grid heights would cost or add up to half a layer of its whole area, so
-    the nearest top moves onto it; no layer gets thinner than half the grid's nor thicker than
-    0.8 nozzle diameters.
+    the nearest top moves onto it; no layer gets thinner than half the grid's nor higher than
+    a nozzle of that bore presses onto the last.
     """
     box = solid.bounding_box()
     bottom_mm, end_mm = max(0.0, float(box[2])), float(box[5])
     if end_mm - bottom_mm <= _SAME_LAYER_MM:
         return ()
     h_mm = grid.layer_height_mm
-    highest_mm = max(1.05 * h_mm, HIGHEST_LAYER_OF_NOZZLE * nozzle_diameter_mm)
+    highest_mm = max(1.05 * h_mm, options.highest_nozzles * nozzle_diameter_mm)
     tops = list(grid.tops_to(end_mm))
-    faces = sorted({*_horizontal_faces(solid), end_mm, bottom_mm})
+    faces = sorted({*_horizontal_faces(solid, options), end_mm, bottom_mm})
     cuts = _snapped([bottom_mm, *[z for z in tops if z > bottom_mm + _SAME_LAYER_MM]], faces, h_mm)
     cuts = [z for z in cuts if bottom_mm - _SAME_LAYER_MM <= z <= end_mm + _SAME_LAYER_MM]
     cuts = _split_thick(cuts, highest_mm, max(h_mm, grid.first_layer_height_mm))
@@ -135,7 +136,7 @@ def plan_slabs(solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float) -> tup
     )
 
 
-def _horizontal_faces(solid: Any) -> list[float]:
+def _horizontal_faces(solid: Any, options: PartOptions) -> list[float]:
     """Heights of level faces that are large enough to matter."""
     z, areas = level_faces(*mesh_of(solid), _SAME_LAYER_MM)
     if not len(z):
@@ -144,7 +145,7 @@ def _horizontal_faces(solid: Any) -> list[float]:
     total = np.bincount(group, areas)
     box = solid.bounding_box()
     extent_mm = float(box[5] - box[2])
-    enough = SNAP_SHARE * max(float(total.max()), float(solid.volume()) / extent_mm)
+    enough = options.snap_share * max(float(total.max()), float(solid.volume()) / extent_mm)
     return [float(z) for z in heights[total >= enough]]
 
 

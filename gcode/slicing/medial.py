@@ -21,10 +21,10 @@ from jaxtyping import Float
 from gcode.moves import Role
 from gcode.slicing import medial_kernels as kernels
 from gcode.slicing.beads import Bead
+from gcode.slicing.options import FillOptions
 from gcode.slicing.regions import flattened
 
-FACING_RATIO = 1.5  # feet further apart than 1.5 r: walls meeting at less than 97° face each other
-END_INSET_RATIO = 0.5  # of r: an open bead ends r/2 short of the wall, its round cap fills the rest
+SAMPLE_MM = 0.12  # of a contour
 ON_AXIS_MM = 1e-5
 APART_MM = 0.15  # points of a bead
 Chain = tuple[Float[np.ndarray, "_k 2"], Float[np.ndarray, " _k"]]  # points, distances to walls
@@ -38,28 +38,26 @@ class ThinFill:
     lost_mm2: float
 
 
-def fill_thin(region: Any, *, least_mm: float, most_mm: float, sample_mm: float = 0.12) -> ThinFill:
+def fill_thin(region: Any, bore_mm: float, options: FillOptions) -> ThinFill:
     """Beads along the medial axis of one connected thin region.
 
     Parameters
     ----------
     region
-        A connected cross-section nowhere wider than about `most_mm`.
-    least_mm, most_mm
-        Limits of a bead's share (half a nozzle to two of them).
+        A connected cross-section nowhere wider than about the widest bead from such a bore.
     """
+    least_mm, most_mm = options.widths_mm(bore_mm)
     area_mm2 = float(region.area())
-    chains = [
-        piece for chain in _axis(region, sample_mm) for piece in _long_enough(*chain, least_mm)
-    ]
+    chains = [piece for chain in _axis(region, options) for piece in _long_enough(*chain, least_mm)]
     if not chains:
         return _stroke(region, area_mm2, least_mm=least_mm, most_mm=most_mm)
-    beads = [_bead(points, radius, most_mm) for points, radius in chains]
+    beads = [_bead(points, radius, most_mm, options) for points, radius in chains]
     laid_mm2 = sum(bead.area_mm2 for bead in beads)
     # what narrower stretches hold cannot be told from rounding in the sum: measure it by the
     # bead's reach; a factor beyond a quarter means area without axis
     factor = area_mm2 / laid_mm2 if laid_mm2 > 0 else 1.0
-    applied = min(max(factor, 0.75), 1.25)
+    least, most = options.flow_span
+    applied = min(max(factor, least), most)
     lost_mm2 = max(0.0, area_mm2 - laid_mm2 * applied)
     scaled = [_capped(bead.scaled(applied), most_mm) for bead in beads]
     return ThinFill(tuple(scaled), lost_mm2)
@@ -88,7 +86,7 @@ def _stroke(region: Any, area_mm2: float, *, least_mm: float, most_mm: float) ->
     return ThinFill((Bead(xy, np.array([share_mm]), Role.GAP_FILL, closed=False),), 0.0)
 
 
-def _axis(region: Any, sample_mm: float) -> list[Chain]:
+def _axis(region: Any, options: FillOptions) -> list[Chain]:
     """Chains of the medial axis: points and distances to the walls.
 
     From Delaunay triangles. Which samples make one is undecided where many lie on one circle, as
@@ -98,7 +96,7 @@ def _axis(region: Any, sample_mm: float) -> list[Chain]:
     if len(points) < 3:
         return []
     nodes, radius, runs, starts_at = kernels.axis_of(
-        points, starts, sample_mm, ON_AXIS_MM, FACING_RATIO
+        points, starts, SAMPLE_MM, ON_AXIS_MM, options.facing_ratio
     )
     paths = [run.tolist() for run in np.split(runs, starts_at[1:-1]) if len(run)]
     return [(nodes[path], radius[path]) for path in _joined(paths, nodes) if len(path) > 1]
@@ -161,15 +159,19 @@ def _long_enough(
 
 
 def _bead(
-    points: Float[np.ndarray, "k 2"], radius: Float[np.ndarray, " k"], most_mm: float
+    points: Float[np.ndarray, "k 2"],
+    radius: Float[np.ndarray, " k"],
+    most_mm: float,
+    options: FillOptions,
 ) -> Bead:
     """A smooth bead along a chain, its open ends drawn out to half a radius from the wall."""
     closed = len(points) > 3 and bool((np.abs(points[0] - points[-1]) < 1e-9).all())
     if not closed:
+        inset = options.end_inset_ratio
         head = points[0] - points[min(2, len(points) - 1)]
         tail = points[-1] - points[-min(3, len(points))]
-        head = points[0] + head / max(np.hypot(*head), 1e-12) * END_INSET_RATIO * radius[0]
-        tail = points[-1] + tail / max(np.hypot(*tail), 1e-12) * END_INSET_RATIO * radius[-1]
+        head = points[0] + head / max(np.hypot(*head), 1e-12) * inset * radius[0]
+        tail = points[-1] + tail / max(np.hypot(*tail), 1e-12) * inset * radius[-1]
         points = np.concatenate([[head], points, [tail]])
         radius = np.concatenate([radius[:1], radius, radius[-1:]])
     keep = kernels.apart_by(points, APART_MM)

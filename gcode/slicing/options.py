@@ -1,4 +1,4 @@
-"""How a patch is planned: each number once. Nozzles and bores are the printer's, layers the job's.
+"""How parts and patches are planned: each number once. Bores are the printer's, layers the job's.
 
 What keeps the head clear of what stands there is not among them: those limits are the checker's.
 """
@@ -231,6 +231,83 @@ class LeftOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class FillOptions:
+    """How an area is filled with beads, of a part's layer and of a patch's pass.
+
+    Attributes
+    ----------
+    least_nozzles, most_nozzles
+        Widths of a bead, in bores: a thinner one is not drawn out evenly, a wider one does not
+        reach its edges from under the nozzle's flat (Kuipers et al. 2020, Arachne, section 3).
+    flow_span
+        Weighing may change flow so far; beyond that the geometry is wrong.
+    connect_spacings
+        Ends of lines that are no farther apart are joined by a stroke.
+    facing_ratio
+        Feet farther apart than this many radii: walls that meet at less than 97 degrees face each
+        other, and an axis runs between them.
+    end_inset_ratio
+        Of the radius: an open bead ends so far short of its wall, its round cap fills the rest.
+    """
+
+    least_nozzles: float = 0.5
+    most_nozzles: float = 2.0
+    flow_span: tuple[float, float] = (0.75, 1.25)
+    connect_spacings: float = 2.5
+    facing_ratio: float = 1.5
+    end_inset_ratio: float = 0.5
+
+    def widths_mm(self, bore_mm: float) -> tuple[float, float]:
+        """Least and greatest width of a bead from a nozzle of such a bore."""
+        return self.least_nozzles * bore_mm, self.most_nozzles * bore_mm
+
+
+@dataclass(frozen=True, slots=True)
+class PartOptions:
+    """How a whole part is sliced, beside what its profiles say.
+
+    Attributes
+    ----------
+    fill
+        Beads of an area.
+    overlap_ratio
+        Of a spacing, how far fills reach into walls: PrusaSlicer's default.
+    dense_ratio
+        Infill is solid from here on.
+    flow_correction
+        A slab's volume over its section times its height: outside of this, flow would be wrong.
+    least_left_mm3
+        Less of what no bead can make is not told.
+    highest_nozzles
+        In bores: higher layers no longer press onto the last.
+    snap_share
+        Horizontal faces above this share of the largest section bend the layers' heights.
+    short_travel_mm
+        Oozing costs less than a retraction below this.
+    corner_rad
+        Turns sharper than this hide a seam.
+    inward_mm, other_mm
+        What a corner is worth: an inward one hides the seam wherever on the loop it is.
+    """
+
+    fill: FillOptions = field(default_factory=FillOptions)
+    overlap_ratio: float = 0.25
+    dense_ratio: float = 0.999
+    flow_correction: tuple[float, float] = (0.85, 1.6)
+    least_left_mm3: float = 1e-3
+    highest_nozzles: float = 0.8
+    snap_share: float = 0.01
+    short_travel_mm: float = 1.5
+    corner_rad: float = 0.6
+    inward_mm: float = 1000.0
+    other_mm: float = 1.5
+
+
+USUAL_PART = PartOptions()
+"""What parts are sliced by."""
+
+
+@dataclass(frozen=True, slots=True)
 class PatchOptions:
     """Settings of a patch; its plan records those it was made with."""
 
@@ -241,6 +318,7 @@ class PatchOptions:
     lines: JobLineOptions = field(default_factory=JobLineOptions)
     skin: SkinOptions = field(default_factory=SkinOptions)
     left: LeftOptions = field(default_factory=LeftOptions)
+    fill: FillOptions = field(default_factory=FillOptions)
 
 
 USUAL_PATCH = PatchOptions()

@@ -11,13 +11,14 @@ from jaxtyping import Float
 
 from gcode.slicing import order_kernels as kernels
 from gcode.slicing.beads import Bead
-
-CORNER_RAD = 0.6  # turns sharper than this hide a seam
-# Millimetres that a corner is worth: an inward one hides the seam wherever on the loop it is.
-INWARD_MM, OTHER_MM = 1000.0, 1.5
+from gcode.slicing.options import USUAL_PART, PartOptions
 
 
-def seam_index(loop: Float[np.ndarray, "n 2"], aim_mm: Float[np.ndarray, " 2"]) -> int:
+def seam_index(
+    loop: Float[np.ndarray, "n 2"],
+    aim_mm: Float[np.ndarray, " 2"],
+    options: PartOptions = USUAL_PART,
+) -> int:
     """Vertex of an open-ended loop (first point not repeated) at which to begin.
 
     Parameters
@@ -26,7 +27,8 @@ def seam_index(loop: Float[np.ndarray, "n 2"], aim_mm: Float[np.ndarray, " 2"]) 
         Where the seam should be near (the seam below).
     """
     x, y = float(aim_mm[0]), float(aim_mm[1])
-    return int(kernels.seam_at(loop, x, y, CORNER_RAD, INWARD_MM, OTHER_MM))
+    corner = options.corner_rad, options.inward_mm, options.other_mm
+    return int(kernels.seam_at(loop, x, y, *corner))
 
 
 def nearest_first(beads: list[Bead], start_mm: Float[np.ndarray, " 2"]) -> list[Bead]:

@@ -17,9 +17,8 @@ from gcode.profiles import PrintSetup
 from gcode.slicing.beads import ROUND_LOSS, Bead, spacing_of
 from gcode.slicing.infill import ring_beads, solid_fill
 from gcode.slicing.job_lines import JobPieces, gathered
-from gcode.slicing.layer_plan import LEAST_NOZZLES, MOST_NOZZLES
 from gcode.slicing.medial import fill_thin
-from gcode.slicing.options import PatchOptions
+from gcode.slicing.options import FillOptions, PatchOptions
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
@@ -96,7 +95,8 @@ def draw(
     share_mm = spacing_of(max(setup.process.line_width_mm, 1.05 * height_mm), height_mm)
     # centres may go as far as the nozzle is free; the fill reaches half a line beyond them
     region = offset(drawn_in, 0.5 * share_mm) ^ wanted
-    return Drawn(*fill(region, share_mm, angle_rad, setup, rings=rings), height_mm)
+    options = model.options.fill
+    return Drawn(*fill(region, share_mm, angle_rad, setup, options, rings=rings), height_mm)
 
 
 def begun_inside(run: Bead, model: PatchModel) -> Bead:
@@ -203,7 +203,7 @@ def weighed(
             volume[mine], shares.length_mm[mine], closed=run.closed
         )
         deep = np.maximum(depth[mine], options.beads.least_thick_mm)
-        most = _most_section(deep, options.beads.bond_ratio * own[mine], setup)
+        most = _most_section(deep, options.beads.bond_ratio * own[mine], setup, model.options.fill)
         given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9)) * met[mine]
         section = np.minimum(section, most)
         chains += _split(Chain(run.xy_mm, tip_mm, section, deep, run.role), options)
@@ -213,10 +213,13 @@ def weighed(
 
 
 def _most_section(
-    deep_mm: Float[np.ndarray, " n"], own_mm2: Float[np.ndarray, " n"], setup: PrintSetup
+    deep_mm: Float[np.ndarray, " n"],
+    own_mm2: Float[np.ndarray, " n"],
+    setup: PrintSetup,
+    options: FillOptions,
 ) -> Float[np.ndarray, " n"]:
     """Greatest cross-sections: as wide as a bead may get, or the job's own, as the printer may."""
-    wide_mm = MOST_NOZZLES * setup.printer.nozzle_diameter_mm
+    _, wide_mm = options.widths_mm(setup.printer.nozzle_diameter_mm)
     most = np.maximum(deep_mm * (wide_mm - deep_mm * ROUND_LOSS), own_mm2)
     return np.asarray(np.minimum(most, setup.printer.max_bead_section_mm2))
 
@@ -332,19 +335,24 @@ def _outline(
 
 
 def fill(
-    region: Any, share_mm: float, angle_rad: float, setup: PrintSetup, *, rings: int
+    region: Any,
+    share_mm: float,
+    angle_rad: float,
+    setup: PrintSetup,
+    options: FillOptions,
+    *,
+    rings: int,
 ) -> tuple[list[Bead], Any, float]:
     """Perimeters, then solid lines; along the medial axis where it is thin."""
-    nozzle_mm = setup.printer.nozzle_diameter_mm
-    least_mm, most_mm = LEAST_NOZZLES * nozzle_mm, MOST_NOZZLES * nozzle_mm
+    bore_mm = setup.printer.nozzle_diameter_mm
     beads: list[Bead] = []
     lost_mm2 = 0.0
     for island in pieces(region):
         peeled = peel(island, share_mm, rings)
         for ring in peeled.rings:
-            beads += ring_beads(ring.centre, ring.area_mm2, share_mm, Role.PERIMETER)
+            beads += ring_beads(ring.centre, ring.area_mm2, share_mm, Role.PERIMETER, options)
         for part in peeled.thin:
-            thin = fill_thin(part, least_mm=least_mm, most_mm=most_mm)
+            thin = fill_thin(part, bore_mm, options)
             beads += thin.beads
             lost_mm2 += thin.lost_mm2
         fills, left_mm2 = solid_fill(
@@ -352,8 +360,8 @@ def fill(
             spacing_mm=share_mm,
             angle_rad=angle_rad,
             role=Role.SOLID_INFILL,
-            least_mm=least_mm,
-            most_mm=most_mm,
+            bore_mm=bore_mm,
+            options=options,
         )
         beads += fills
         lost_mm2 += left_mm2

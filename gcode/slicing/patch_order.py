@@ -14,7 +14,6 @@ from scipy import ndimage
 
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import divided
-from gcode.slicing.layer_plan import MOST_NOZZLES
 from gcode.slicing.patch_beads import Chain
 from gcode.slicing.patch_free import surely_free
 from gcode.slicing.patch_model import PatchModel
@@ -73,7 +72,8 @@ def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reac
     wide_mm = (
         np.concatenate([chain.section_mm2 for chain in laid]) / model.options.columns.least_high_mm
     )
-    wide_mm = np.minimum(wide_mm, MOST_NOZZLES * setup.printer.nozzle_diameter_mm)
+    _, widest_mm = model.options.fill.widths_mm(setup.printer.nozzle_diameter_mm)
+    wide_mm = np.minimum(wide_mm, widest_mm)
     stands_mm = raster_kernels.beside_lines(
         np.concatenate([chain.xy_mm[:-1] for chain in laid]),
         np.concatenate([chain.xy_mm[1:] for chain in laid]),

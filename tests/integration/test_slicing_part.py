@@ -14,7 +14,7 @@ from gcode.profiles.schema import MaterialProfile, ProcessProfile
 from gcode.profiles.setup import PrintSetup
 from gcode.slicing.infill import solid_fill
 from gcode.slicing.job import slice_part
-from gcode.slicing.layer_plan import INFILL_OVERLAP
+from gcode.slicing.options import USUAL_PART
 from gcode.writer import write
 from tests.unit.link_helpers import profile
 
@@ -97,9 +97,9 @@ def test_lines_of_a_solid_fill_carry_their_own_strip_and_no_more() -> None:
         spacing_mm=0.407,
         angle_rad=np.pi / 4,
         role=Role.SOLID_INFILL,
-        least_mm=0.2,
-        most_mm=0.8,
-        overlap_ratio=INFILL_OVERLAP,
+        bore_mm=0.4,
+        options=USUAL_PART.fill,
+        overlap_ratio=USUAL_PART.overlap_ratio,
     )
     lines = [bead for bead in beads if bead.role is Role.SOLID_INFILL]
     flow = np.concatenate([bead.share_mm for bead in lines]) / 0.407

@@ -17,8 +17,9 @@ from gcode.cli.app import app
 from gcode.errors import SliceError
 from gcode.moves import Extrude, ModalState, Program
 from gcode.profiles import PrintSetup, load_setup
-from gcode.slicing.job import SHORT_TRAVEL_MM, slice_part
+from gcode.slicing.job import slice_part
 from gcode.slicing.layers import LayerGrid
+from gcode.slicing.options import USUAL_PART
 from gcode.slicing.patch import slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
@@ -168,7 +169,7 @@ def test_a_whole_part_is_combed_inside_its_walls() -> None:
     steps = [step for step in steps_of(program.text) if step.layer > 0]
     combed = 0
     for way in ways_of(steps):
-        across = [step for step in way if step.sideways_mm > SHORT_TRAVEL_MM]
+        across = [step for step in way if step.sideways_mm > USUAL_PART.short_travel_mm]
         if any(step.e_mm < 0 for step in way):
             assert all(step.pulled_mm > 0 for step in across)
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -90,12 +91,66 @@ def test_a_clean_surface_has_no_type(bench: ModuleType, scene) -> None:  # type:
     assert not typed(plan, job, site, stop.line, pose).deficit.regions
 
 
+def walls_of(moved: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> kinds._Surface:
+    """Walls of a round tower, 16 mm across and 12 mm high, moved by so much along their normals."""
+    rng = np.random.default_rng(2)
+    angle, z = rng.uniform(0.0, 2.0 * np.pi, 4000), rng.uniform(0.8, 11.5, 4000)
+    out = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(z))])
+    seen = moved(angle, z) + rng.normal(0.0, 0.03, len(z))
+    return kinds._Surface(np.column_stack([8.0 * out[:, :2], z]), seen, out, 0.03)
+
+
+@pytest.mark.parametrize("wide_rad", [0.4, 0.8, 1.4])
+@pytest.mark.parametrize("from_mm", [6.0, 9.5, 10.5])
+def test_a_chip_is_no_shift(wide_rad: float, from_mm: float) -> None:
+    # regression: two shifts told the walls of a chipped hook better than one, and the run ended;
+    # but the walls across from the chip stood where they should
+    chipped = walls_of(
+        lambda angle, z: np.where((np.abs(angle - 1.0) < wide_rad) & (z > from_mm), -1.2, 0.0)
+    )
+    assert kinds._shifted(chipped, 0.2, USUAL_KINDS) is None
+
+
+@pytest.mark.parametrize("seen_rad", [3.2, 1.2])
+@pytest.mark.parametrize("from_mm", [4.0, 9.5])
+def test_a_shift_is_told_from_all_sides_or_from_one(seen_rad: float, from_mm: float) -> None:
+    walls = walls_of(lambda angle, z: np.where(z > from_mm, 0.5 * np.cos(angle), 0.0))
+    found = kinds._shifted(
+        walls.part(np.abs(np.arctan2(*walls.outward[:, 1::-1].T)) < seen_rad, 4000),
+        0.2,
+        USUAL_KINDS,
+    )
+    assert found is not None
+    assert found.type is DefectType.LAYER_SHIFT
+
+
 def top_of(rise: np.ndarray, xy: np.ndarray, noise_mm: float) -> kinds._Surface:
     """A flat top of 16 × 16 mm as it was seen, that much higher than it should be."""
     flat = np.full(len(xy), 5.0)
     up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
     seen = rise + np.random.default_rng(1).normal(0.0, noise_mm, len(xy))
     return kinds._Surface(np.column_stack([xy, flat]), seen, up, noise_mm)
+
+
+@pytest.mark.parametrize("centre", [(4.0, 0.0), (6.0, 6.0), (7.0, 3.0)])
+@pytest.mark.parametrize("radius_mm", [2.0, 3.0, 4.0])
+def test_a_blob_is_no_curl(centre: tuple[float, float], radius_mm: float) -> None:
+    # regression: a blob on the corner of a small top was taken for a curled corner, and the run
+    # ended; a corner that curls rises slowly, and a parabola that rises so does not fit a blob
+    xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
+    inside = (np.hypot(*(xy - centre).T) / radius_mm) ** 2
+    blob = np.sqrt(np.maximum(1.0 - inside, 0.0))
+    assert kinds._warped(top_of(blob, xy, 0.03), 0.2, USUAL_KINDS) is None
+
+
+@pytest.mark.parametrize("corners", [1, 2, 4])
+def test_corners_that_curl_up_are_told(corners: int) -> None:
+    xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
+    angle = np.arctan2(xy[:, 1], xy[:, 0]) % (2.0 * np.pi)
+    rise = np.where(angle < corners * np.pi / 2.0, 0.45 * (np.hypot(*xy.T) / 11.3) ** 2, 0.0)
+    found = kinds._warped(top_of(rise, xy, 0.03), 0.2, USUAL_KINDS)
+    assert found is not None
+    assert found.type is DefectType.WARP
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (6.0, 6.0)])
