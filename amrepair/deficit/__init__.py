@@ -5,5 +5,13 @@ It turns a detected difference into geometry with a tolerance; it does not decid
 
 from amrepair.deficit.compute import Deficit, Standing, compute_deficit, measured_regions
 from amrepair.deficit.heights import as_built_heights
+from amrepair.deficit.line_heights import standing_in_job
 
-__all__ = ["Deficit", "Standing", "as_built_heights", "compute_deficit", "measured_regions"]
+__all__ = [
+    "Deficit",
+    "Standing",
+    "as_built_heights",
+    "compute_deficit",
+    "measured_regions",
+    "standing_in_job",
+]

@@ -132,16 +132,11 @@ def standing_heights(
     -------
     The field; from end to end how much is missing of each of its columns; their tops as expected.
     """
-    box = seen.box_mm
-    area_mm2 = (box[2] - box[0]) * (box[3] - box[1])
-    cell_mm = max(options.fine_cell_mm, float(np.sqrt(area_mm2 / options.most_fine_cells)))
-    ny, nx = (math.ceil((box[k + 2] - box[k]) / cell_mm - 1e-9) for k in (1, 0))
-    fine = HeightField(
-        np.array(box[:2]), cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool)
-    )
+    fine = fine_over(seen, options)
+    ny, nx = fine.shape
     whole, lost = (columns_of(solid, fine) for solid in (expected, missing))
     z_mm = raster_kernels.column_rest(*whole, *lost, options.film_mm, 0.0).reshape(ny, nx)
-    at = _cells_over(seen, fine)
+    at = cells_over(seen, fine)
     # a film that the scan sees, around there too, is what is left of the part
     films = raster_kernels.column_rest(*whole, *lost, options.least_film_mm, 0.0).reshape(ny, nx)
     # a few cells without a point on it among others are chance
@@ -157,10 +152,38 @@ def standing_heights(
             z_mm[rows, columns], gone[rows, columns], seen_mm, options
         )
     if not excess.is_empty():
-        z_mm = np.maximum(z_mm, HeightField.from_manifold(excess, cell_mm, box_mm=box).z_mm)
+        more = HeightField.from_manifold(excess, fine.cell_mm, box_mm=seen.box_mm)
+        z_mm = np.maximum(z_mm, more.z_mm)
+    field = _sharpened(seen, fine, z_mm, gone, options)
+    offset, z = lost
+    ends = [raster_kernels.column_top(*of, 0.0) for of in (whole, lost, (offset, -z))]
+    designed_mm, high_mm, low_mm = (of.reshape(ny, nx) for of in ends)
+    return field, high_mm + low_mm, designed_mm
+
+
+def fine_over(seen: HeightField, options: HeightOptions) -> HeightField:
+    """An empty field over the same, in cells as fine as there may be so many of."""
+    box = seen.box_mm
+    area_mm2 = (box[2] - box[0]) * (box[3] - box[1])
+    cell_mm = max(options.fine_cell_mm, float(np.sqrt(area_mm2 / options.most_fine_cells)))
+    ny, nx = (math.ceil((box[k + 2] - box[k]) / cell_mm - 1e-9) for k in (1, 0))
+    return HeightField(
+        np.array(box[:2]), cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool)
+    )
+
+
+def _sharpened(
+    seen: HeightField,
+    fine: HeightField,
+    z_mm: Float[np.ndarray, "ny nx"],
+    gone: Bool[np.ndarray, "ny nx"],
+    options: HeightOptions,
+) -> HeightField:
+    """Heights of the scan on a fine grid, beside walls those of what was planned (`z_mm`)."""
+    at = cells_over(seen, fine)
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
     # beside walls, where the solids are the sharper of the two unless something else stands there
-    around = 2 * math.ceil(options.by_wall_cells * seen.cell_mm / cell_mm) + 1
+    around = 2 * math.ceil(options.by_wall_cells * seen.cell_mm / fine.cell_mm) + 1
     highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
     by_wall = (highest - lowest > options.trust_mm) & (seen.z_mm[at] < highest + options.trust_mm)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
@@ -173,14 +196,12 @@ def standing_heights(
     # its rim, where columns and cells do not end alike
     rim = ndimage.maximum_filter(gone, around)
     sharp = np.where(known, by_wall | agrees | beneath, rim)
-    field = HeightField(fine.origin_mm, cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim)
-    offset, z = lost
-    ends = [raster_kernels.column_top(*of, 0.0) for of in (whole, lost, (offset, -z))]
-    designed_mm, high_mm, low_mm = (of.reshape(ny, nx) for of in ends)
-    return field, high_mm + low_mm, designed_mm
+    return HeightField(
+        fine.origin_mm, fine.cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim
+    )
 
 
-def _cells_over(
+def cells_over(
     coarse: HeightField, fine: HeightField
 ) -> tuple[Int[np.ndarray, "ny 1"], Int[np.ndarray, "1 nx"]]:
     """Indices of the coarse field's cells under every cell of the fine one."""

@@ -13,7 +13,7 @@ import numpy as np
 from amrepair.align import align
 from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
-from amrepair.deficit import Deficit, as_built_heights, compute_deficit
+from amrepair.deficit import Deficit, as_built_heights, compute_deficit, standing_in_job
 from amrepair.deficit.options import DeficitOptions
 from amrepair.frames import Transform
 from amrepair.observe.rays import RangeImage, range_images
@@ -223,19 +223,24 @@ def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -
     )
 
 
-def _stands(laid: _Laid, anomaly: AnomalyMap, site: Site) -> HeightField:
+def _stands(
+    laid: _Laid, anomaly: AnomalyMap, site: Site, missing: manifold3d.Manifold
+) -> HeightField:
     """What stands there is all that was seen, the bottoms of open cells too."""
     evidence = anomaly.evidence
     assert evidence is not None
-    return as_built_heights(
+    options = _deficit_options(site).heights
+    seen = as_built_heights(
         laid.whole,
         site.template,
         evidence.spacing_mm,
         build_from_template=laid.placed,
         printed_z_mm=site.printed_z_mm,
-        options=_deficit_options(site).heights,
+        options=options,
         images=evidence.images,
     )
+    scan = laid.whole.moved(laid.placed)
+    return standing_in_job(seen, site.lines, missing, scan, evidence.spacing_mm, options)
 
 
 def _deficit_options(site: Site) -> DeficitOptions:

@@ -34,6 +34,7 @@ from amrepair.report.data import (
     Rule,
     SolidMesh,
 )
+from amrepair.report.left import left_parts
 from amrepair.report.text import NEGLIGIBLE_MM3, kind_name, plan_lines, quantity
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
@@ -282,6 +283,7 @@ def look_of(
         missing=solid_mesh(plan.deficit.missing),
         excess=solid_mesh(plan.deficit.excess),
         beads=beads,
+        left=() if plan.patch is None else left_parts(plan.patch.left),
         missing_mm3=plan.deficit.missing_mm3,
         excess_mm3=plan.deficit.excess_mm3,
         unseen_area_mm2=plan.deficit.unseen_area_mm2,

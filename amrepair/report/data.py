@@ -45,6 +45,24 @@ class SolidMesh:
 
 
 @dataclass(frozen=True, slots=True)
+class LeftPart:
+    """What a repair leaves open for one cause.
+
+    Attributes
+    ----------
+    key
+        `left_reach`, `left_bead` or `left_covered`: out of the head's reach; too small for a bead,
+        or with nothing that holds one; under what stands above it.
+    shape
+        As columns, the surface of all of them.
+    """
+
+    key: str
+    volume_mm3: float
+    shape: SolidMesh
+
+
+@dataclass(frozen=True, slots=True)
 class BeadPath:
     """The beads of a repair, one segment a row, in the order they are printed.
 
@@ -252,6 +270,8 @@ class Look:
         Solids, or None where there is none.
     beads
         What was printed after this look, or None.
+    left
+        What the repair after this look does not fill, by cause.
     missing_mm3, excess_mm3
         Volumes at this look, as measured.
     height_map
@@ -277,6 +297,7 @@ class Look:
     missing: SolidMesh | None = None
     excess: SolidMesh | None = None
     beads: BeadPath | None = None
+    left: tuple[LeftPart, ...] = ()
     missing_mm3: float = 0.0
     excess_mm3: float = 0.0
     unseen_area_mm2: float = 0.0

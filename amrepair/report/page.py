@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from amrepair.report.data import Look, Outcome, ReportData
 from amrepair.report.payload import drawn_looks
-from amrepair.report.tables import DASH, decisions, escape, regions, run
+from amrepair.report.tables import DASH, LEFT_CAUSES, decisions, escape, left, regions, run
 from amrepair.report.text import (
     HEADLINES,
     NEGLIGIBLE_MM3,
@@ -38,6 +38,7 @@ def body(data: ReportData) -> str:
         ("compare", "Before and after", _compare(data)),
         ("volumes", _volumes_title(data), _volumes(data)),
         ("regions", "Defects", regions(data)),
+        ("left", "What repairs leave", left(data)),
         ("decisions", "Decisions", decisions(data)),
         ("run", "The run", run(data)),
     ]
@@ -202,6 +203,7 @@ def _layers() -> str:
         ("excess", "Too much", "dot excess"),
         ("beads", "Repair beads", "dot beads"),
         ("unseen", "Not seen", "dot unseen"),
+        *((key, f"Left: {cause}", f"dot {key}") for key, cause in LEFT_CAUSES.items()),
     )
     boxes = "".join(
         f'<label class="check" data-layer="{key}"><input type="checkbox" data-layer="{key}">'

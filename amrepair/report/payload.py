@@ -179,6 +179,7 @@ def _look(look: Look, index: int, share: int, scale_mm: float, side: tuple[int, 
         "shade": encode.integers(encode.shading(points_mm, normals, side)),
         "missing": _solid(look.missing, faces),
         "excess": _solid(look.excess, faces),
+        **{part.key: _boxes(part.shape) for part in look.left},
         "unseen": _unseen(look.unseen_mm),
         "beads": None if look.beads is None else _beads(look.beads, BEADS_TOTAL // share),
         "histogram": _histogram(look, scale_mm),
@@ -203,11 +204,12 @@ def _unseen(points_mm: np.ndarray | None) -> Json | None:
 def _solid(mesh: SolidMesh | None, budget: int) -> Json | None:
     if mesh is None or len(mesh.faces) == 0:
         return None
-    small = encode.simplified(mesh, budget=budget)
-    return {
-        "vertices": encode.quantised(small.vertices_mm),
-        "faces": encode.integers(small.faces),
-    }
+    return _boxes(encode.simplified(mesh, budget=budget))
+
+
+def _boxes(mesh: SolidMesh) -> Json:
+    """As it is: boxes are few, and have none to spare."""
+    return {"vertices": encode.quantised(mesh.vertices_mm), "faces": encode.integers(mesh.faces)}
 
 
 def _expected(mesh: SolidMesh) -> Json | None:

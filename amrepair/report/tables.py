@@ -9,10 +9,16 @@ import html
 import math
 from collections.abc import Sequence
 
-from amrepair.report.data import ReportData
-from amrepair.report.text import duration, kind_name, percent, quantity
+from amrepair.report.data import ReportData, SolidMesh
+from amrepair.report.text import NEGLIGIBLE_MM3, duration, kind_name, percent, quantity
 
 DASH = "–"
+# Why a repair leaves something, as the drawing and the table call it.
+LEFT_CAUSES = {
+    "left_reach": "out of the head's reach",
+    "left_bead": "no bead fits, or nothing holds one",
+    "left_covered": "under what stands above it",
+}
 
 
 def regions(data: ReportData) -> str:
@@ -48,6 +54,30 @@ def regions(data: ReportData) -> str:
     if not any(row[-1] for row in rows):
         heads, rows = heads[:-1], [row[:-1] for row in rows]
     return table("Defects that were found", heads, rows, numeric=(0, 2, 3, 4, 5))
+
+
+def left(data: ReportData) -> str:
+    """What repairs leave open, by cause, in the drawing's colours; nothing where that is none."""
+    rows = [
+        (
+            escape(look.label),
+            f'<span class="dot {part.key}" aria-hidden="true"></span> {LEFT_CAUSES[part.key]}',
+            quantity(part.volume_mm3, ""),
+            escape(_box_of(part.shape)),
+        )
+        for look in data.looks
+        for part in look.left
+        if part.volume_mm3 > NEGLIGIBLE_MM3
+    ]
+    if not rows:
+        return ""
+    heads = ("Planned after", "Why", "Volume, mm³", "From X, Y, Z to X, Y, Z, mm")
+    return table("What repairs leave open, by cause", heads, rows, numeric=(2, 3))
+
+
+def _box_of(shape: SolidMesh) -> str:
+    low, high = shape.vertices_mm.min(axis=0), shape.vertices_mm.max(axis=0)
+    return " to ".join(", ".join(f"{value:.1f}" for value in corner) for corner in (low, high))
 
 
 def decisions(data: ReportData) -> str:

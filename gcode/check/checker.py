@@ -145,6 +145,7 @@ def judge(
     top_mm = as_built.top_mm if as_built is not None else None
     one = Judge(program, setup, top_mm, initial, policy, touches)
     text = Text.of(program.text)
+    one.moves.with_room_for(len(text))  # a table that grows is held twice while it does
     number, said = 1, 0
     while number <= len(text):
         number = one.follow(text, number, min(len(text), said + SAY_EVERY_LINES) + 1)

@@ -121,8 +121,9 @@ class Text:
     @classmethod
     def of(cls, text: str) -> Text:
         """Lines as `split("\\n")` makes them."""
-        data = np.frombuffer(text.encode(errors="replace") + b"\n", dtype=np.uint8)
-        return cls(data, np.concatenate([[0], np.flatnonzero(data == ord("\n")) + 1]))
+        data = np.frombuffer(text.encode(errors="replace"), dtype=np.uint8)
+        ends = np.flatnonzero(data == ord("\n")) + 1
+        return cls(data, np.concatenate([[0], ends, [len(data) + 1]]))  # as if one more ended it
 
     def __len__(self) -> int:
         """How many lines."""

@@ -140,11 +140,13 @@ def _whole(
     from gcode.solids import read_closed
 
     with bars.stage("read solid"):
-        shape, moved_mm = _placed(read_closed(solid), setup, place)
-    toolpath = slice_part(shape, setup, workers=workers or cores(), progress=bars)
+        shape, moved_mm = _placed(gives_back(read_closed)(solid), setup, place)
+    toolpath = gives_back(slice_part)(shape, setup, workers=workers or cores(), progress=bars)
     where = _where(shape, moved_mm) if place == CENTRE else None
-    program = _written(toolpath, setup, title, (), bars)
-    return _Made(program, toolpath.volume_mm3, float(shape.volume()), moved_mm, where)
+    solid_mm3 = float(shape.volume())
+    del shape  # half of what is held
+    program = gives_back(_written)(toolpath, setup, title, (), bars)
+    return _Made(program, toolpath.volume_mm3, solid_mm3, moved_mm, where)
 
 
 def _patch(

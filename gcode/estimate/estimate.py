@@ -1,16 +1,20 @@
-"""`estimate`: time, filament, bounds of a program."""
+"""`estimate`: time, filament, bounds of a program, read block by block."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
+from gcode.errors import ReadError
 from gcode.estimate import planner_kernels as kernels
 from gcode.moves import Program
 from gcode.profiles import AxisLimits, PrinterProfile
 from gcode.progress import Progress, silent
-from gcode.reader import Job, read_job
+from gcode.reader import Job
+from gcode.reader.blocks import Block, blocks_of
+from gcode.reader.job import NOTHING_LAID, layers_of, mark_of
 from gcode.units import filament_area_mm2
 
 # A plain desktop machine, for files whose printer nobody names.
@@ -64,33 +68,69 @@ def estimate(
     (45, True)
     """
     diameter_mm = printer.filament_diameter_mm if printer is not None else _PLAIN_DIAMETER_MM
-    job = program
-    if isinstance(job, Program):
-        job = read_job(job, filament_diameter_mm=diameter_mm, progress=progress)
-    progress("estimate", 0.0, 1.0)
-    speed, acceleration, jerk = (
-        (printer.max_speed_mm_s, printer.max_acceleration_mm_s2, printer.max_jerk_mm_s)
-        if printer is not None
-        else (_PLAIN_SPEED, _PLAIN_ACCELERATION, _PLAIN_JERK)
-    )
-    steps, pushed, feed = job.moves()
-    spent_s = kernels.seconds(
-        steps, pushed, feed, _four(speed), _four(acceleration), _four(jerk), acceleration.x
-    )
-    low = np.minimum(job.beads.start_mm, job.beads.end_mm).min(axis=0)
-    high = np.maximum(job.beads.start_mm, job.beads.end_mm).max(axis=0)
-    x0, y0, z0, x1, y1, z1 = (float(v) for v in (*low, *high))
-    # Filament that was retracted must come forward again before more of it counts.
-    position = np.cumsum(pushed)
-    used_mm = float(np.maximum.accumulate(np.maximum(position, 0.0))[-1])
-    progress("estimate", 1.0, 1.0)
-    return Estimate(
-        print_time_s=float(spent_s.sum()),
-        filament_mm=used_mm,
-        filament_mm3=used_mm * filament_area_mm2(diameter_mm),
-        layers=len(job.layers),
-        bounds_mm=(x0, y0, z0, x1, y1, z1),
-    )
+    blocks = (program.block,) if isinstance(program, Job) else blocks_of(program)
+    text = program.program.text if isinstance(program, Job) else program.text
+    lines = text.count("\n") + 1
+    taken = _Taken(printer, lines)
+    for block in blocks:
+        taken.add(block)
+        progress("estimate", float(block.end_line), float(lines))
+    return taken.told(diameter_mm)
+
+
+class _Taken:
+    """What the blocks of a program take so far: a few figures of each line, no states."""
+
+    def __init__(self, printer: PrinterProfile | None, lines: int) -> None:
+        speed, acceleration, jerk = (
+            (printer.max_speed_mm_s, printer.max_acceleration_mm_s2, printer.max_jerk_mm_s)
+            if printer is not None
+            else (_PLAIN_SPEED, _PLAIN_ACCELERATION, _PLAIN_JERK)
+        )
+        self._limits = _four(speed), _four(acceleration), _four(jerk)
+        self._before = np.zeros(6)
+        self._planned = np.zeros((4, lines))
+        self._pushed = np.zeros(lines)
+        self._marks: list[tuple[int, str]] = []
+        self._laid: list[tuple[Float[np.ndarray, " n"], ...]] = []
+        self._box = np.array([[np.inf] * 3, [-np.inf] * 3])
+
+    def add(self, block: Block) -> None:
+        """The next one."""
+        steps, pushed, feed = block.moves()
+        own = slice(block.first_line, block.end_line)
+        kernels.limits(steps, pushed, feed, *self._limits, self._before, self._planned[:, own])
+        self._pushed[own] = pushed
+        self._marks += [(k, text) for k, text in block.comments if mark_of(text) is not None]
+        self._laid.append((block.end_mm[:, 2].copy(), block.line, block.filament_mm))
+        for ends_mm in (block.start_mm, block.end_mm):
+            if len(ends_mm):
+                np.minimum(self._box[0], ends_mm.min(axis=0), out=self._box[0])
+                np.maximum(self._box[1], ends_mm.max(axis=0), out=self._box[1])
+
+    def told(self, diameter_mm: float) -> Estimate:
+        """All of them together.
+
+        Raises
+        ------
+        ReadError
+            If nothing is extruded.
+        """
+        end_z_mm, line, filament_mm = (np.concatenate(of) for of in zip(*self._laid, strict=True))
+        if not len(line):
+            raise ReadError(NOTHING_LAID)
+        layers = layers_of(self._marks, end_z_mm, line, filament_mm, len(self._pushed))
+        # Filament that was retracted must come forward again before more of it counts.
+        used_mm = float(np.cumsum(self._pushed).max(initial=0.0))
+        spent_s = kernels.seconds(self._planned)
+        x0, y0, z0, x1, y1, z1 = (float(v) for v in self._box.ravel())
+        return Estimate(
+            print_time_s=float(spent_s.sum()),
+            filament_mm=used_mm,
+            filament_mm3=used_mm * filament_area_mm2(diameter_mm),
+            layers=len(layers),
+            bounds_mm=(x0, y0, z0, x1, y1, z1),
+        )
 
 
 def _four(limits: AxisLimits) -> np.ndarray:

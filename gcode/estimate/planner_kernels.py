@@ -9,54 +9,58 @@ from gcode.compiled import njit
 
 
 @njit(cache=True, nogil=True)
-def seconds(steps, pushed, feed, max_speed, max_acceleration, jerk, print_acceleration):
-    """(n,) time of every line; zero for those that do not move.
+def limits(steps, pushed, feed, max_speed, max_acceleration, jerk, before, planned):
+    """What each line's move may do by itself and after the one before it.
 
-    Junction speed is classic jerk's: no axis may change its speed by more than its jerk at once.
+    `before` (6,), which is changed: unit vector of the last move, its speed, whether there was one.
+    `planned` (4, n) takes lengths (zero for what does not move), cruising speeds, accelerations and
+    speeds at entry. Junction speed is classic jerk's: no axis may change its speed by more than its
+    jerk at once. Accelerations are at most the X axis's where more than one moves.
     """
-    n = len(pushed)
-    length = np.zeros(n)
-    cruise = np.zeros(n)
-    accel = np.zeros(n)
-    entry = np.zeros(n + 1)
-    unit = np.zeros((n, 4))
-    last = -1
-    for k in range(n):
+    unit = np.zeros(4)
+    for k in range(len(pushed)):
         e = pushed[k]
         d = steps[k]
         flat = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         if not flat >= 0.0:  # the place before is not known
             flat = 0.0
         distance = np.sqrt(flat)
+        unit[:] = 0.0
         if distance < 1e-9:
             distance = abs(e)
             if distance < 1e-9:
                 continue
-            unit[k, 3] = 1.0 if e > 0 else -1.0
+            unit[3] = 1.0 if e > 0 else -1.0
         else:
             for axis in range(3):
-                unit[k, axis] = d[axis] / distance
-            unit[k, 3] = e / distance
-        length[k] = distance
+                unit[axis] = d[axis] / distance
+            unit[3] = e / distance
         speed = max(feed[k], 0.1)
-        a = print_acceleration
+        a = max_acceleration[0]
         for axis in range(4):
-            share = abs(unit[k, axis])
+            share = abs(unit[axis])
             if share > 1e-12:
                 speed = min(speed, max_speed[axis] / share)
                 a = min(a, max_acceleration[axis] / share)
-        cruise[k], accel[k] = speed, a
         limit = 0.0
-        if last >= 0:
-            limit = min(speed, cruise[last])
+        if before[5] > 0.0:
+            limit = min(speed, before[4])
             worst = 1.0
             for axis in range(4):
-                change = abs(unit[k, axis] - unit[last, axis]) * limit
+                change = abs(unit[axis] - before[axis]) * limit
                 if change > jerk[axis]:
                     worst = min(worst, jerk[axis] / change)
             limit *= worst
-        entry[k] = limit
-        last = k
+        planned[0, k], planned[1, k], planned[2, k], planned[3, k] = distance, speed, a, limit
+        before[:4] = unit
+        before[4], before[5] = speed, 1.0
+
+
+@njit(cache=True, nogil=True)
+def seconds(planned):
+    """(n,) time of every line, as `limits` planned them; speeds at entry are changed."""
+    length, cruise, accel, entry = planned
+    n = len(length)
     out = np.zeros(n)
     following = 0.0  # reverse: a move must be able to slow down to the next one's entry
     for k in range(n - 1, -1, -1):

@@ -11,13 +11,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from gcode.dialects import dialect_of
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile
 from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
-from gcode.reader.lines import comments_of, lines_of, tokens_of
+from gcode.reader.blocks import READ_STEPS, Block, BlockReader
 from gcode.units import filament_area_mm2
 
 _LAYER_MARKS = ("LAYER_CHANGE", "CHANGE_LAYER", "BEFORE_LAYER_CHANGE")
@@ -29,7 +28,7 @@ _ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$")
 _LEAST_LAYER_MM = 0.015
 _SQUARE_LOSS = 1.0 - math.pi / 4.0
 UNKNOWN_ROLE = "unknown"
-READ_STEPS = 4.0  # words, states, beads, layers: about a second each for a million lines
+NOTHING_LAID = "The program extrudes nothing; it is no print job."
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +96,8 @@ class Job:
         First line of the first layer: what is before is the start script.
     footer_start_line
         The line after the last bead: what follows retracts, parks, switches off.
+    block
+        All of it: the machine's states, line by line.
     """
 
     program: Program
@@ -106,17 +107,13 @@ class Job:
     footer_start_line: int
     filament_diameter_mm: float
     filament_mm: float
-    _states: Float[np.ndarray, "m 13"]
-    _pushed_mm: Float[np.ndarray, " k"]
+    block: Block
 
     def moves(
         self,
     ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """By program line: (k, 3) displacement, mm (NaN where the place before is not known), (k,)
-        filament pushed, mm, and (k,) commanded speed, mm/s.
-        """
-        steps = np.diff(self._states[:, :3], axis=0)
-        return steps, self._pushed_mm, self._states[1:, kernels.S_FEED]
+        """By program line, as `Block.moves`."""
+        return self.block.moves()
 
     def state_after(self, line: int) -> ModalState:
         """The machine's state after lines [0, line).
@@ -126,9 +123,10 @@ class Job:
         ReadError
             If the program has no such line, or the nozzle's place is not known there.
         """
-        if not 0 <= line < len(self._states):
-            raise ReadError(f"Line {line} is not in a program of {len(self._states) - 1} lines.")
-        s = self._states[line]
+        states = self.block.states
+        if not 0 <= line < len(states):
+            raise ReadError(f"Line {line} is not in a program of {len(states) - 1} lines.")
+        s = states[line]
         if not np.isfinite(s[:3]).all():
             raise ReadError(
                 f"Before line {line + 1} the nozzle's place is not known: the program has not "
@@ -180,34 +178,12 @@ def read_job(
     if isinstance(program, str):
         program = Program(program, dialect)
     progress("read", 0.0, READ_STEPS)
-    data, starts = lines_of(program.text)
-    kinds, codes, words = tokens_of(data, starts)
-    comments = comments_of(data, starts, kinds)
-    del data
-    progress("read", 1.0, READ_STEPS)
-    states = np.zeros((len(starts), kernels.STATES))
-    states[0, :3] = np.nan
-    states[0, [kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
-    states[0, kernels.S_ACC] = np.nan
-    pushed = np.zeros(len(kinds))
-    words_of = dialect_of(program.dialect)
-    both, g91 = words_of.g90_sets_e, words_of.g91_moves_e
-    kernels.run(kinds, codes, words, both, g91, states, pushed)
-    progress("read", 2.0, READ_STEPS)
-    none3, none1, none0 = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
-    count = kernels.beads(kinds, codes, words, states, pushed, none3, none3, none1, none0, True)
-    if count == 0:
-        raise ReadError("The program extrudes nothing; it is no print job.")
-    start, end = np.zeros((count, 3)), np.zeros((count, 3))
-    filament, owner = np.zeros(count), np.zeros(count, np.int64)
-    kernels.beads(kinds, codes, words, states, pushed, start, end, filament, owner, False)
-    del words  # as much as all the rest
-    known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
-    if not known.all():
-        start, end, filament, owner = start[known], end[known], filament[known], owner[known]
-    progress("read", 3.0, READ_STEPS)
-    layers = _layers(comments, end, owner, filament, len(kinds))
-    beads = _beads(comments, layers, start, end, filament, owner, filament_diameter_mm)
+    block = BlockReader(program.dialect).read(program.text, progress)
+    end, owner, filament = block.end_mm, block.line, block.filament_mm
+    if not len(owner):
+        raise ReadError(NOTHING_LAID)
+    layers = layers_of(block.comments, end[:, 2], owner, filament, block.end_line)
+    beads = _beads(block, layers, filament_diameter_mm)
     progress("read", READ_STEPS, READ_STEPS)
     return Job(
         program=program,
@@ -217,8 +193,7 @@ def read_job(
         footer_start_line=int(owner[-1]) + 1,
         filament_diameter_mm=filament_diameter_mm,
         filament_mm=float(filament.sum()),
-        _states=states,
-        _pushed_mm=pushed,
+        block=block,
     )
 
 
@@ -244,17 +219,27 @@ def job_for(program: Program | str, printer: PrinterProfile) -> Job:
     )
 
 
-def _layers(
+def layers_of(
     comments: list[tuple[int, str]],
-    end: Float[np.ndarray, "n 3"],
+    end_z_mm: Float[np.ndarray, " n"],
     owner: Int[np.ndarray, " n"],
     filament: Float[np.ndarray, " n"],
     lines: int,
 ) -> tuple[JobLayer, ...]:
-    """Layers by the slicer's own marks, else by the heights at which plastic is laid."""
+    """Layers by the slicer's own marks, else by the heights at which plastic is laid.
+
+    Parameters
+    ----------
+    comments
+        With their lines.
+    end_z_mm, owner, filament
+        (n,) of what extrudes: where it ends, its line, its filament.
+    lines
+        Of the program.
+    """
     marks = _marks(comments)
     if not marks:
-        marks = _marks_by_height(end, owner, filament)
+        marks = _marks_by_height(end_z_mm, owner)
     bounds = [*marks, lines]
     found: list[JobLayer] = []
     below_mm = 0.0
@@ -265,7 +250,7 @@ def _layers(
                 last = found[-1]
                 found[-1] = JobLayer(last.index, last.z_mm, last.height_mm, last.first_line, stop)
             continue
-        z_mm = _main_height(end[a:b, 2], filament[a:b])
+        z_mm = _main_height(end_z_mm[a:b], filament[a:b])
         found.append(JobLayer(len(found), z_mm, max(z_mm - below_mm, 0.0), first, stop))
         below_mm = z_mm
     return _with_heights(found, comments)
@@ -289,26 +274,30 @@ def _with_heights(layers: list[JobLayer], comments: list[tuple[int, str]]) -> tu
     return tuple(out)
 
 
+def mark_of(comment: str) -> str | None:
+    """What kind of layer mark a comment is, if it is one."""
+    body = comment.strip().lstrip(";").strip()
+    if _CURA_LAYER.match(body):
+        return "LAYER:"
+    return body if body in _LAYER_MARKS else None
+
+
 def _marks(comments: list[tuple[int, str]]) -> list[int]:
     """Lines of the slicer's layer marks; one kind of mark only."""
     by_kind: dict[str, list[int]] = {}
     for line, text in comments:
-        body = text.strip().lstrip(";").strip()
-        if _CURA_LAYER.match(body):
-            by_kind.setdefault("LAYER:", []).append(line)
-        elif body in _LAYER_MARKS:
-            by_kind.setdefault(body, []).append(line)
+        kind = mark_of(text)
+        if kind is not None:
+            by_kind.setdefault(kind, []).append(line)
     for kind in ("LAYER_CHANGE", "CHANGE_LAYER", "LAYER:"):
         if by_kind.get(kind):
             return by_kind[kind]
     return []
 
 
-def _marks_by_height(
-    end: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], filament: Float[np.ndarray, " n"]
-) -> list[int]:
+def _marks_by_height(end_z_mm: Float[np.ndarray, " n"], owner: Int[np.ndarray, " n"]) -> list[int]:
     """First lines of runs of beads at one height."""
-    z = np.round(end[:, 2], 4)
+    z = np.round(end_z_mm, 4)
     marks = [int(owner[0])]
     current = z[0]
     for i in np.flatnonzero(np.diff(z) != 0) + 1:
@@ -324,15 +313,9 @@ def _main_height(z_mm: Float[np.ndarray, " n"], filament: Float[np.ndarray, " n"
     return float(heights[int(np.argmax(np.bincount(group, filament)))])
 
 
-def _beads(
-    comments: list[tuple[int, str]],
-    layers: tuple[JobLayer, ...],
-    start: Float[np.ndarray, "n 3"],
-    end: Float[np.ndarray, "n 3"],
-    filament: Float[np.ndarray, " n"],
-    owner: Int[np.ndarray, " n"],
-    diameter_mm: float,
-) -> Beads:
+def _beads(block: Block, layers: tuple[JobLayer, ...], diameter_mm: float) -> Beads:
+    comments, owner, filament = block.comments, block.line, block.filament_mm
+    start, end = block.start_mm, block.end_mm
     firsts = np.array([layer.first_line for layer in layers])
     layer = np.searchsorted(firsts, owner, side="right") - 1
     role_of_line, roles = _roles(comments, owner)

@@ -97,9 +97,11 @@ def parse(data, starts, letters, codes, kinds, words):
 
 
 @njit(cache=True, nogil=True)
-def run(kinds, codes, words, both_modes, g91_moves_e, states, pushed):
-    """States after every line (row line + 1) and filament pushed by it, mm."""
-    offset = np.zeros(3)
+def run(kinds, codes, words, both_modes, g91_moves_e, offset, states, pushed):
+    """States after every line (row line + 1) and filament pushed by it, mm.
+
+    `offset` (3,) is what G92 moved the axes' zero by so far; it is changed.
+    """
     for line in range(len(kinds)):
         now = states[line + 1]
         now[:] = states[line]

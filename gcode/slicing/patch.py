@@ -25,6 +25,8 @@ from gcode.slicing.options import USUAL_PATCH, PatchOptions
 from gcode.slicing.patch_laying import after_first, begin, emit, end, first_pass_words
 from gcode.slicing.patch_left import (
     NOT_CLOSED,
+    LeftCause,
+    LeftColumns,
     PatchRegion,
     Unreachable,
     left_over,
@@ -35,7 +37,15 @@ from gcode.slicing.patch_order import stages_of
 from gcode.slicing.patch_plan import PatchPasses, best_plan
 from gcode.surfaces import HeightField
 
-__all__ = ["NOT_CLOSED", "PatchPlan", "PatchRegion", "Unreachable", "slice_patch"]
+__all__ = [
+    "NOT_CLOSED",
+    "LeftCause",
+    "LeftColumns",
+    "PatchPlan",
+    "PatchRegion",
+    "Unreachable",
+    "slice_patch",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +62,8 @@ class PatchPlan:
         The surface after the patch.
     first_pass
         How the first pass is laid onto what has long been cold, in words.
+    left
+        Columns that stay open, by cause: where, and from which height to which.
     options
         That it was planned with.
     """
@@ -64,6 +76,7 @@ class PatchPlan:
     regions: tuple[PatchRegion, ...]
     predicted: HeightField
     first_pass: str
+    left: tuple[LeftColumns, ...] = ()
     options: PatchOptions = USUAL_PATCH
 
 
@@ -157,6 +170,8 @@ def slice_patch(
         regions=left.regions,
         predicted=best.state.surface(model),
         first_pass=first_pass_words(setup, hotend_c),
+        left=left.columns,
+        options=options,
     )
 
 

@@ -52,7 +52,7 @@ def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
     )
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
     active &= state.planar_top_mm > at.z_mm - 0.5 * at.layer_mm
-    return _lidded(model, at, thick, active, active & (gap > at.deep_mm), gap)
+    return _lidded(model, at, thick, active, active & (gap > at.deep_mm), gap, at.layer_mm)
 
 
 def due_of_job(
@@ -83,7 +83,8 @@ def due_of_job(
     )
     active = planned & due & (thick >= least_mm) & _gone_at(model, at)
     active &= ~deep | (wanted > options.beads.least_thick_mm / 2)  # beside the part all is deep
-    due = _lidded(model, at, thick, active, deep & active, gap)
+    # of what the job laid there a strand that hangs takes the place of as much as is in it
+    due = _lidded(model, at, thick, active, deep & active, gap, at.most_mm)
     return replace(due, hangs=due.hangs | (at.z_mm - state.surface_mm > gap + options.due.agree_mm))
 
 
@@ -135,12 +136,13 @@ def _lidded(
     active: Bool[np.ndarray, "ny nx"],
     deep: Bool[np.ndarray, "ny nx"],
     gap: Float[np.ndarray, "ny nx"],
+    most_mm: float,
 ) -> Due:
-    """Over what is too deep a layer is drawn, as far as a bead holds on to what stands beside.
+    """Over what is too deep up to `most_mm` is drawn, as far as a bead holds on to what is beside.
 
     What the head cannot get over holds on from a little farther away: beads begin no nearer to it
     than the flat around the bore lets them. A strand that nothing holds falls: where the floor is
-    near enough it lies under the nozzle all the same. Counted is only what a layer holds, wherever
+    near enough it lies under the nozzle all the same. Counted is only what that holds, wherever
     it comes to lie, so that none of it is too much.
     """
     options = model.options
@@ -154,7 +156,7 @@ def _lidded(
         held |= beside(holds & blocked, deep, hang_mm + options.beads.to_wall_mm, model.cell_mm)
         falls = deep & (gap <= model.drop_mm)
         held |= falls & beside(~blocked, falls, model.spread_mm, model.cell_mm)
-        lidded = np.minimum(thick, at.layer_mm)
+        lidded = np.minimum(thick, most_mm)
         sunk = np.where(deep & held, thick - lidded, 0.0)
         thick = np.where(deep & held, lidded, thick)
         active = active & (~deep | held)

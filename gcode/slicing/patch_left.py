@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from gcode.slicing.layer_plan import Unprintable
@@ -36,13 +37,53 @@ class PatchRegion:
     reachable_ratio: float
 
 
+class LeftCause(enum.IntEnum):
+    """Why a column is not filled."""
+
+    NO_BEAD = 0
+    """It is too small for a bead, or nothing holds one."""
+    OUT_OF_REACH = 1
+    """The head would touch what stands beside it."""
+    COVERED = 2
+    """Something stands above it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftColumns:
+    """Columns of a patch that stay open, for one cause.
+
+    Attributes
+    ----------
+    middle_mm
+        (n, 2) of each, build frame; `cell_mm` is the edge of all.
+    low_mm, high_mm
+        (n,) from where to where nothing fills it, build frame: over what is laid, or under what
+        hangs over it.
+    """
+
+    cause: LeftCause
+    cell_mm: float
+    middle_mm: Float[np.ndarray, "n 2"]
+    low_mm: Float[np.ndarray, " n"]
+    high_mm: Float[np.ndarray, " n"]
+
+    @property
+    def volume_mm3(self) -> float:
+        """As columns have it."""
+        return float((self.high_mm - self.low_mm).sum()) * self.cell_mm**2
+
+
 @dataclass(frozen=True, slots=True)
 class LeftOver:
-    """What the head cannot get to, what no bead is laid for, and the pieces of the deficit."""
+    """What the head cannot get to, what no bead is laid for, and the pieces of the deficit.
+
+    And where that is, column by column.
+    """
 
     unreachable: tuple[Unreachable, ...]
     unprintable: tuple[Unprintable, ...]
     regions: tuple[PatchRegion, ...]
+    columns: tuple[LeftColumns, ...]
 
 
 def not_worth_it(state: PatchState, model: PatchModel) -> Bool[np.ndarray, "ny nx"]:
@@ -82,6 +123,7 @@ def left_over(
         state.done_mm > model.top_mm - options.left.staircase_mm
     )
     left = np.where(done, np.minimum(left, state.sunk_mm), left)
+    kinds = _kinds(state, model)
     unreachable: list[Unreachable] = []
     lost = list(state.lost)
     regions: list[PatchRegion] = []
@@ -98,13 +140,48 @@ def left_over(
         if stuck_mm3 <= options.left.least_listed_mm3:
             continue
         ended = NOT_CLOSED if given_up[cells].any() else ""
-        for reason, part in _causes(state, model, cells, left[cells], apart=not ended):
+        for reason, part in _causes(state, model, kinds, cells, left[cells], apart=not ended):
             cause_mm3 = volume_mm3 * (1.0 - share) * part
             if reason is None:
                 lost.append(Unprintable(cause_mm3, box, TOO_SMALL))
             else:
                 unreachable.append(Unreachable(cause_mm3, box, reason + ended))
-    return LeftOver(tuple(unreachable), tuple(lost), tuple(regions))
+    columns = _columns(state, model, kinds, left)
+    return LeftOver(tuple(unreachable), tuple(lost), tuple(regions), columns)
+
+
+def _tips_mm(state: PatchState, model: PatchModel) -> Float[np.ndarray, "ny nx"]:
+    """The tip over the first bead that is lacking: the lowest, where a bridge was laid over it."""
+    lies = model.floor_mm + np.where(state.sunk_mm > 0, 0.0, state.laid_mm)
+    return np.minimum(lies + model.most_mm, model.top_mm)
+
+
+def _kinds(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
+    """Of each column, why it would not be filled: a `LeftCause`."""
+    kind = np.where(
+        model.need_mm > _tips_mm(state, model), LeftCause.OUT_OF_REACH, LeftCause.NO_BEAD
+    )
+    covered = model.floor_mm > model.top_mm + model.options.beads.least_thick_mm
+    return np.where(covered, LeftCause.COVERED, kind)
+
+
+def _columns(
+    state: PatchState,
+    model: PatchModel,
+    kinds: Int[np.ndarray, "ny nx"],
+    left: Float[np.ndarray, "ny nx"],
+) -> tuple[LeftColumns, ...]:
+    """Where it is left, by cause."""
+    low = np.where(state.sunk_mm > 0, model.floor_mm, model.top_mm - left)
+    found = []
+    for cause in LeftCause:
+        own = np.flatnonzero((left > 0) & (kinds == cause))
+        if len(own):
+            from_mm = low.ravel()[own]
+            to_mm = from_mm + model.weight * left.ravel()[own]
+            places = model.points_mm[own]
+            found.append(LeftColumns(cause, model.cell_mm, places, from_mm, to_mm))
+    return tuple(found)
 
 
 def _cells_of(model: PatchModel, box: Box) -> tuple[slice, slice]:
@@ -116,6 +193,7 @@ def _cells_of(model: PatchModel, box: Box) -> tuple[slice, slice]:
 def _causes(
     state: PatchState,
     model: PatchModel,
+    kinds: Int[np.ndarray, "ny nx"],
     cells: tuple[slice, slice],
     stuck: Float[np.ndarray, "a b"],
     *,
@@ -127,12 +205,7 @@ def _causes(
     column with most left speaks for all.
     """
     options = model.options
-    floor, top = model.floor_mm[cells], model.top_mm[cells]
-    # the tip over the first bead that is lacking: the lowest, where a bridge was laid over it
-    lies = floor + np.where(state.sunk_mm[cells] > 0, 0.0, state.laid_mm[cells])
-    tip = np.minimum(lies + model.most_mm, top)
-    kind = np.where(model.need_mm[cells] > tip, 1, 0)
-    kind = np.where(floor > top + options.beads.least_thick_mm, 2, kind)
+    kind, tip = kinds[cells], _tips_mm(state, model)[cells]
     total = float(stuck.sum())
     shares = np.bincount(kind.ravel(), stuck.ravel(), minlength=3) / total
     worst = int(kind.flat[int(np.argmax(stuck))])
@@ -142,8 +215,8 @@ def _causes(
         at = int(np.argmax(np.where(kind == k, stuck, -1.0)))
         iy, ix = np.unravel_index(at, stuck.shape)
         place = (int(iy) + cells[0].start, int(ix) + cells[1].start)
-        reason = COVERED if k == 2 else None
-        if k == 1:
+        reason = COVERED if k == LeftCause.COVERED else None
+        if k == LeftCause.OUT_OF_REACH:
             point = model.points_mm.reshape(*model.shape, 2)[place]
             reason = model.reach.reason_at(point, float(tip[iy, ix]))
         found.append((reason, float(shares[k])))

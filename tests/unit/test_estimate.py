@@ -11,6 +11,8 @@ from gcode.estimate import estimate
 from gcode.firmware import FirmwareCore
 from gcode.moves import Program
 from gcode.profiles import load_printer
+from gcode.reader import read_job
+from gcode.reader.blocks import blocks_of
 
 
 def test_one_long_move_takes_what_the_formula_says() -> None:
@@ -18,6 +20,20 @@ def test_one_long_move_takes_what_the_formula_says() -> None:
     program = Program("G90\nM83\nG1 X0 Y0 Z0.2 F6000\nG1 X100 E4 F6000\n", "prusa")
     a, v = printer.max_acceleration_mm_s2.x, 100.0
     assert estimate(program, printer).print_time_s == pytest.approx(100 / v + v / a, rel=1e-6)
+
+
+def test_a_text_takes_what_the_job_read_from_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    lines = ["G28", "M83", "G1 X100 Y100 Z0.2 F6000"]
+    for k, (x, y, e) in enumerate(rng.uniform(0.0, 5.0, size=(3000, 3))):
+        lines += [";LAYER_CHANGE", f"G1 Z{0.2 * k / 500:.1f}"] if k % 500 == 0 else []
+        lines.append(f"G1 X{100 + x:.3f} Y{100 + y:.3f} E{e / 50:.4f} F{1200 + k}")
+    program = Program("\n".join(lines), "prusa")
+    printer = load_printer("prusa_mk3s")
+    whole = estimate(read_job(program), printer)
+    monkeypatch.setattr(blocks_of, "__defaults__", (1000,))
+    assert estimate(program, printer) == whole
+    assert whole.layers == 6
 
 
 def test_filament_pulled_back_is_not_counted_twice() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from gcode.errors import ReadError
 from gcode.reader import read_job
+from gcode.reader.blocks import blocks_of
 
 AREA_MM2 = np.pi / 4 * 1.75**2
 
@@ -109,3 +110,19 @@ def test_another_fan_than_the_parts_is_not_the_parts() -> None:
     job = read_job(text)
     assert job.state_after(7).fan_ratio == 0.5
     assert job.state_after(8).fan_ratio == 0.0
+
+
+@pytest.mark.parametrize("chars", [1, 40, 1000])
+def test_blocks_are_what_the_whole_is(chars: int) -> None:
+    text = "G28\nM82\nG92 E0\n;LAYER_CHANGE\n" + square(0.2, 0, relative=False)
+    text += "G92 X5 E0\nG91\n;LAYER_CHANGE\nG1 X1 Y2 Z0.2 E0.1\nG2 X0 Y0 I-5 J0 E1\nG90\nG20\nG1 X1"
+    whole = read_job(text)
+    blocks = list(blocks_of(whole.program, chars))
+    assert (len(blocks) > 1) == (chars < len(text))
+    assert [block.first_line for block in blocks[1:]] == [block.end_line for block in blocks[:-1]]
+    states = np.concatenate([blocks[0].states[:1], *(block.states[1:] for block in blocks)])
+    np.testing.assert_array_equal(states, whole.block.states)
+    for of in ("pushed_mm", "start_mm", "end_mm", "filament_mm", "line"):
+        together = np.concatenate([getattr(block, of) for block in blocks])
+        np.testing.assert_array_equal(together, getattr(whole.block, of))
+    assert [each for block in blocks for each in block.comments] == whole.block.comments

@@ -94,7 +94,8 @@
   // ---- traces -------------------------------------------------------------------------------
   const LIGHTING = { ambient: 0.62, diffuse: 0.55, specular: 0.12, roughness: 0.7, fresnel: 0.1, facenormalsepsilon: 0, vertexnormalsepsilon: 0 };
   const LIGHT = { x: 4000 * data.facing[0], y: 6000 * data.facing[1], z: 9000 };
-  const ORDER = ["scan", "ghost", "edges", "missing", "excess", "past", "now", "unseen"];
+  const LEFT = ["left_reach", "left_bead", "left_covered"];  // what a repair does not fill, by cause
+  const ORDER = ["scan", "ghost", "edges", "missing", "excess", "past", "now", "unseen", ...LEFT];
   const solid = (name, colour, mesh, opacity, extra) => Object.assign({
     type: "mesh3d", name, color: colour, opacity, flatshading: true, lighting: LIGHTING, lightposition: LIGHT,
     hoverinfo: "skip" }, mesh, extra || {});
@@ -129,6 +130,7 @@
       solid("now", css("--beads"), bead("now"), 1, { visible: see("beads") }),
       Object.assign({ type: "scatter3d", mode: "markers", name: "unseen", visible: see("unseen"), hoverinfo: "skip",
         marker: { size: 2, symbol: "square", color: css("--unseen"), line: { width: 0 }, opacity: 0.75 } }, look.unseen ? xyz(look.unseen) : { x: [], y: [], z: [] }),
+      ...LEFT.map((name) => solid(name, css("--" + name.replace("_", "-")), look[name] ? meshOf(look[name]) : none, 1, { visible: see(name) })),
     ];
   }
 
@@ -339,7 +341,7 @@
 
   // ---- wiring -------------------------------------------------------------------------------
   let main = null, before = null, after = null, timer = null;
-  const PRESETS = { deviation: ["scan", "ghost"], defects: ["ghost", "missing", "excess", "unseen"], repair: ["ghost", "missing", "beads"] };
+  const PRESETS = { deviation: ["scan", "ghost"], defects: ["ghost", "missing", "excess", "unseen"], repair: ["ghost", "missing", "beads", ...LEFT] };
   const present = (look, name) => name === "scan" || (name === "ghost" ? !!data.expected : !!look[name]);
   function boxes() {
     document.querySelectorAll("input[data-layer]").forEach((box) => {

@@ -1,0 +1,166 @@
+"""What stands in mid-job: the scan's heights with the walls of the lines that the job laid there.
+
+A cell of the scan is as high as the highest thing in it: beside a void that makes its walls up to a
+cell thicker than they are, and what keeps the head off them as much wider. The job knows where its
+lines lie to the hundredth of a millimetre; what is missing says which of them do not stand.
+"""
+
+from __future__ import annotations
+
+import math
+
+import manifold3d
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from amrepair.deficit.heights import (
+    cells_over,
+    fine_over,
+    with_what_stands_out,
+    without_missing,
+)
+from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
+from amrepair.scans import Scan
+from gcode.meshes import mesh_of
+from gcode.slicing.job_lines import SAME_LEVEL_MM, JobLines
+from gcode.surfaces import HeightField, raster_kernels
+
+
+def standing_in_job(
+    seen: HeightField,
+    lines: JobLines | None,
+    missing: manifold3d.Manifold,
+    scan: Scan,
+    spacing_mm: float,
+    options: HeightOptions = USUAL_DEFICIT.heights,
+) -> HeightField:
+    """The as-built field in mid-job: as seen, without what is missing, with the lines' own walls.
+
+    Parameters
+    ----------
+    seen
+        Heights of the scan, cell by cell (`as_built_heights`).
+    lines
+        All that the job has laid so far, build frame; None: nobody knows, and cells stay as seen.
+    missing
+        Solid, build frame.
+    scan
+        Build frame: what of its points stands out of the field raises it.
+    spacing_mm
+        Mean distance between neighbouring points.
+    """
+    seen = without_missing(seen, missing, options)
+    if lines is None or missing.is_empty():
+        return seen
+    sharp = standing_lines(seen, lines, missing, options)
+    return with_what_stands_out(sharp, scan.points_mm, scan.sigma_mm, spacing_mm, options)
+
+
+def standing_lines(
+    seen: HeightField,
+    lines: JobLines,
+    missing: manifold3d.Manifold,
+    options: HeightOptions = USUAL_DEFICIT.heights,
+) -> HeightField:
+    """The as-built field on a fine grid, beside what is missing with the walls of lines laid.
+
+    Elsewhere the scan alone decides, and also there where it saw something higher.
+
+    Parameters
+    ----------
+    seen
+        Heights of the scan, cell by cell (`as_built_heights`).
+    lines
+        All that the job has laid so far, build frame.
+    missing
+        Solid, build frame; not empty.
+    """
+    fine = fine_over(seen, options)
+    at = cells_over(seen, fine)
+    z_mm, known = seen.z_mm[at].astype(np.float64), seen.seen[at].copy()
+    x0, y0, _, x1, y1, _ = (float(v) for v in missing.bounding_box())
+    far_mm = options.beside_part_mm
+    box = (x0 - far_mm, y0 - far_mm, x1 + far_mm, y1 + far_mm)
+    rows, columns = fine.window(box)
+    near = fine.crop(box)
+    planned_mm, gone = _planned(near, lines, missing)
+    z_mm[rows, columns], known[rows, columns] = _steps_of_plan(
+        z_mm[rows, columns],
+        known[rows, columns],
+        planned_mm,
+        gone,
+        2 * math.ceil(options.by_wall_cells * seen.cell_mm / fine.cell_mm) + 1,
+        options,
+    )
+    return HeightField(fine.origin_mm, fine.cell_mm, z_mm, known)
+
+
+def _steps_of_plan(
+    seen_mm: Float[np.ndarray, "ny nx"],
+    told: Bool[np.ndarray, "ny nx"],
+    planned_mm: Float[np.ndarray, "ny nx"],
+    gone: Bool[np.ndarray, "ny nx"],
+    around: int,
+    options: HeightOptions,
+) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+    """Heights as seen, whose steps lie where the plan has them; and which are known.
+
+    A cell reads as high as the highest thing in it: what it is too high by beside a wall is the
+    wall's. What is lower than planned is not there. Where both agree what was seen is right: layers
+    are not as high as planned, and a floor off by a tenth of a layer is a tenth of a bead.
+    """
+    off_mm = seen_mm - planned_mm
+    agrees = told & (np.abs(off_mm) < options.trust_mm)
+    share = ndimage.uniform_filter(agrees.astype(np.float64), around)
+    level_mm = ndimage.uniform_filter(np.where(agrees, off_mm, 0.0), around)
+    # how far off the plan what lies around was seen to be
+    as_planned_mm = planned_mm + level_mm / np.maximum(share, 1.0 / around**2)
+    highest, lowest = (
+        of(planned_mm, around) for of in (ndimage.maximum_filter, ndimage.minimum_filter)
+    )
+    by_wall = (highest - lowest > options.trust_mm) & (seen_mm < highest + options.trust_mm)
+    rim = ndimage.maximum_filter(gone, around)
+    by_plan = np.where(told, by_wall & (off_mm >= options.trust_mm), rim)
+    return np.where(by_plan, as_planned_mm, seen_mm), told | rim
+
+
+def _planned(
+    near: HeightField, lines: JobLines, missing: manifold3d.Manifold
+) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+    """How high the lines stand that are not missing, and where something is.
+
+    A layer of a column stands where more of it is there than not.
+    """
+    ny, nx = near.shape
+    low_mm = float(missing.bounding_box()[2])
+    (x0, y0, x1, y1), high_mm = near.box_mm, float(lines.end_mm[:, 2].max())
+    lines = lines.near(np.array([x0, y0, -np.inf]), np.array([x1, y1, high_mm]))
+    vertices, faces = mesh_of(missing)
+    offsets, z, up = raster_kernels.column_crossings(vertices, faces, x0, y0, near.cell_mm, nx, ny)
+    column = np.repeat(np.arange(nx * ny), np.diff(offsets))
+
+    def lost_below(level_mm: float) -> Float[np.ndarray, "ny nx"]:
+        below = np.bincount(column, up * np.minimum(z, level_mm), minlength=nx * ny)
+        return below.reshape(ny, nx)
+
+    def over(some: JobLines) -> Float[np.ndarray, "ny nx"]:
+        within = 0.5 * some.section_mm2 / np.maximum(some.height_mm, SAME_LEVEL_MM)
+        found = raster_kernels.beside_lines(
+            some.start_mm[:, :2], some.end_mm[:, :2], within, some.end_mm[:, 2],
+            near.origin_mm, near.cell_mm, ny, nx,
+        )  # fmt: skip
+        return np.asarray(found)
+
+    tops_mm = lines.end_mm[:, 2]
+    stands_mm = np.maximum(over(lines.some(tops_mm <= low_mm)), 0.0)
+    levels = np.unique(np.round(tops_mm[tops_mm > low_mm], 3))
+    for level_mm in levels.tolist():
+        own = lines.at(level_mm)
+        if not len(own.rim):
+            continue
+        height_mm = float(np.median(own.height_mm))
+        lost = lost_below(level_mm) - lost_below(level_mm - height_mm)
+        there = np.isfinite(over(own)) & (lost < 0.5 * height_mm)
+        stands_mm = np.where(there, level_mm, stands_mm)
+    return stands_mm, np.asarray(lost_below(np.inf) > 0)
