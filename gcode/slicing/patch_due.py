@@ -83,9 +83,11 @@ def due_of_job(
     )
     active = planned & due & (thick >= least_mm) & _gone_at(model, at)
     active &= ~deep | (wanted > options.beads.least_thick_mm / 2)  # beside the part all is deep
-    # of what the job laid there a strand that hangs takes the place of as much as is in it
-    due = _lidded(model, at, thick, active, deep & active, gap, at.most_mm)
-    return replace(due, hangs=due.hangs | (at.z_mm - state.surface_mm > gap + options.due.agree_mm))
+    # over what the job left open a strand has room to be round, and takes the place of lower ones
+    open_below = at.z_mm - state.surface_mm > gap + options.due.agree_mm
+    most_mm = np.where(open_below, at.most_mm, at.layer_mm)
+    due = _lidded(model, at, thick, active, deep & active, gap, most_mm)
+    return replace(due, hangs=due.hangs | open_below)
 
 
 def _gone_at(model: PatchModel, at: Height) -> Bool[np.ndarray, "ny nx"]:
@@ -136,7 +138,7 @@ def _lidded(
     active: Bool[np.ndarray, "ny nx"],
     deep: Bool[np.ndarray, "ny nx"],
     gap: Float[np.ndarray, "ny nx"],
-    most_mm: float,
+    most_mm: float | Float[np.ndarray, "ny nx"],
 ) -> Due:
     """Over what is too deep up to `most_mm` is drawn, as far as a bead holds on to what is beside.
 
