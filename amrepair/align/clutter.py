@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from amrepair.align.options import USUAL_ALIGN, ClutterOptions
 
@@ -93,7 +93,7 @@ def noise_across(
     basis = np.linalg.qr(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2))[0]
     left = (z**2).sum(axis=1) - (np.einsum("nkc,nk->nc", basis, z) ** 2).sum(axis=1)
     low = float(np.quantile(np.maximum(left, 0.0), options.noise_quantile))
-    return float(np.sqrt(low / chi2.ppf(options.noise_quantile, count - 6)))
+    return float(np.sqrt(low / chdtri(count - 6, 1.0 - options.noise_quantile)))
 
 
 def _neighbourhoods(

@@ -8,10 +8,12 @@ from typing import Annotated
 import typer
 
 from amrepair.cli.options import (
+    SCAN_TIMEOUT_S,
     JsonOption,
     MaterialOption,
     PrinterOption,
     ProcessOption,
+    ScanTimeoutOption,
     SeedOption,
 )
 from amrepair.errors import InputError
@@ -78,7 +80,7 @@ def calibrate_command(
     max_residual_mm: Annotated[
         float, typer.Option(min=0.001, max=1.0, help="Refuse a calibration that is worse.")
     ] = 0.15,
-    scan_timeout_s: Annotated[float, typer.Option(min=1.0, help="Wait for a scan.")] = 120.0,
+    scan_timeout_s: ScanTimeoutOption = SCAN_TIMEOUT_S,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:

@@ -135,6 +135,89 @@ class Faces:
         return best
 
 
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Points of a scan looked at one by one.
+
+    Attributes
+    ----------
+    place_mm, plane
+        (n, 3) moved onto the planes through their neighbours, and those planes' normals.
+    area_mm2, neighbours
+        (n,) that each stands for, (n, k) which lie beside it.
+    deviation_mm, outward
+        (n,) the template's distance, (n, 3) its unit gradient.
+    is_broken
+        (n,) on a surface that is not the template's.
+    """
+
+    place_mm: Float[np.ndarray, "n 3"]
+    plane: Float[np.ndarray, "n 3"]
+    area_mm2: Float[np.ndarray, " n"]
+    neighbours: Int[np.ndarray, "n k"]
+    deviation_mm: Float[np.ndarray, " n"]
+    outward: Float[np.ndarray, "n 3"]
+    is_broken: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls,
+        points_mm: Float[np.ndarray, "n 3"],
+        template: Template,
+        *,
+        spacing_mm: float,
+        sigma_mm: float,
+        threshold_mm: float,
+        options: FaceOptions,
+    ) -> _Places:
+        """Planes through the points, and which are none of the template's."""
+        place, plane, area_mm2, neighbours = _planes(
+            points_mm, spacing_mm=spacing_mm, sigma_mm=sigma_mm, options=options
+        )
+        deviation, gradient = template.distance_and_gradient(place)
+        outward = unit_vectors(gradient)
+        along = np.abs((outward * plane).sum(axis=1))
+        is_broken = np.abs(deviation) > threshold_mm
+        is_broken |= (along < options.strip_cosine) & (deviation < -options.strip_mm)
+        # a lone point among others is noise, as are crumbs along the rim of what nobody saw
+        is_broken &= is_broken[neighbours].mean(axis=1) > options.lone_ratio
+        return cls(place, plane, area_mm2, neighbours, deviation, outward, is_broken)
+
+
+def _looked_at(
+    scan: Scan,
+    template: Template,
+    surfels: Surfels,
+    off: Bool[np.ndarray, " s"],
+    threshold_mm: float,
+    options: FaceOptions,
+) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " n"], _Places]:
+    """Which cells and points are looked at, and what they say: around what lies off, and from
+    what is broken there on, as far as that goes.
+    """
+    kept = surfels.of_point >= 0
+    far = np.abs(surfels.point_deviation_mm[kept]) > threshold_mm
+    share = np.bincount(surfels.of_point[kept], far, len(surfels)) / surfels.count
+    near_cell = has_near(surfels.place_mm, surfels.place_mm[off], options.around_mm)
+    while True:
+        chosen = np.zeros(len(scan.points_mm), bool)
+        chosen[kept] = near_cell[surfels.of_point[kept]]
+        found = _Places.of(
+            scan.points_mm[chosen],
+            template,
+            spacing_mm=surfels.spacing_mm,
+            sigma_mm=max(scan.sigma_mm, surfels.spread_mm),
+            threshold_mm=threshold_mm,
+            options=options,
+        )
+        broken_mm = found.place_mm[found.is_broken]
+        beside = has_near(surfels.place_mm, broken_mm, options.around_mm) & ~near_cell
+        # a film's cell has both its sides, and lies off as a whole only where one of them does
+        if not (share[beside] > options.lone_ratio).any():
+            return near_cell, chosen, found
+        near_cell |= beside
+
+
 def find_faces(
     scan: Scan,
     template: Template,
@@ -154,37 +237,22 @@ def find_faces(
     threshold_mm
         Deviation from the template that is more than noise for a mean of a plane's points.
     """
-    near_cell = has_near(surfels.place_mm, surfels.place_mm[off], options.faces.around_mm)
-    chosen = np.zeros(len(scan.points_mm), bool)
-    kept = surfels.of_point >= 0
-    chosen[kept] = near_cell[surfels.of_point[kept]]
-    place, plane, area_mm2, neighbours = _planes(
-        scan.points_mm[chosen],
-        spacing_mm=surfels.spacing_mm,
-        sigma_mm=max(scan.sigma_mm, surfels.spread_mm),
-        options=options.faces,
-    )
-    deviation, gradient = template.distance_and_gradient(place)
-    gradient = unit_vectors(gradient)
-    along = np.abs((gradient * plane).sum(axis=1))
-    is_broken = np.abs(deviation) > threshold_mm
-    is_broken |= (along < options.faces.strip_cosine) & (deviation < -options.faces.strip_mm)
-    # a lone point among others is noise, as are crumbs along the rim of what nobody saw
-    is_broken &= is_broken[neighbours].mean(axis=1) > options.faces.lone_ratio
+    near_cell, chosen, at = _looked_at(scan, template, surfels, off, threshold_mm, options.faces)
+    place, plane, deviation, is_broken = at.place_mm, at.plane, at.deviation_mm, at.is_broken
     which = np.flatnonzero(is_broken)
     broken = Broken(place[which], plane[which], deviation[which])
-    spacing_mm = float(np.sqrt(np.median(area_mm2))) or surfels.spacing_mm  # 0: all in one place
-    on_mm = np.concatenate([place[~is_broken], scan.points_mm[kept & ~chosen]])
+    spacing_mm = float(np.sqrt(np.median(at.area_mm2))) or surfels.spacing_mm  # 0: all in one place
+    on_mm = np.concatenate([place[~is_broken], scan.points_mm[(surfels.of_point >= 0) & ~chosen]])
     occupancy = find_occupancy(
         template, broken, on_mm, surface, spacing_mm=spacing_mm, options=options.occupancy
     )
     given = None
     if scan.normals is not None:
-        given = _given(scan.normals[chosen], gradient, ~is_broken, options.faces)
+        given = _given(scan.normals[chosen], at.outward, ~is_broken, options.faces)
     if given is not None:
         side = (plane[which] * given[which]).sum(axis=1)
     else:
-        side = _voted(occupancy.open_side(broken), plane, gradient, which, neighbours)
+        side = _voted(occupancy.open_side(broken), plane, at.outward, which, at.neighbours)
     rest = ~near_cell
     places = np.concatenate([place, surfels.place_mm[rest]])
     normal = np.zeros_like(places)

@@ -7,6 +7,7 @@ Kobbelt 2006; Labatut, Pons & Keriven 2009). It needs neither rays nor normals.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -165,7 +166,12 @@ def find_occupancy(
     facets = _facets(grid)
     nats = unseen[facets.axis]
     nats *= _unexplained(facets, template, broken, here_mm, spacing_mm, grid.voxel_mm, options)
-    empty = _labelled(facets, nats, _told(grid, template, here_mm, spacing_mm, options))
+    told = _told(grid, template, here_mm, spacing_mm, options)
+    empty = _labelled(facets, nats, told)
+    sides = _Sides.of(grid, template, broken, spacing_mm, options)
+    scan_mm = np.concatenate([broken.place_mm, here_mm])
+    least = np.pi * (options.bead_mm / spacing_mm) ** 2  # around less no bead fits
+    empty = _with_open_sides(empty, facets, nats, told, grid, sides, scan_mm, least)
     designed = grid.f_mm < 0
     solid = np.zeros(designed.shape, bool)
     solid[grid.number >= 0] = ~empty
@@ -393,6 +399,122 @@ def _labelled(
     room[one, 2 * axis], room[other, 2 * axis + 1] = whole[both].T
     rest = np.round(np.clip(told, -MOST_NATS, MOST_NATS) / UNIT_NATS).astype(np.int32)
     return np.asarray(least_cut(neighbour, room, rest))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sides:
+    """Voxels on both sides of broken surface, and what it costs where both are solid.
+
+    Nobody sees a surface with material on both sides: such a place is a stray, at its price. A cut
+    cannot say "one side or the other"; labellings that open a side are proposed, and compared.
+
+    Attributes
+    ----------
+    toward, away
+        (q,) number of the voxel on each side, by which way the template's surface is nearer; −1 is
+        air, or was not looked at.
+    askew
+        (q,) neither side is.
+    beyond
+        (2, q) voxels farther off, before and behind.
+    price
+        Of a place with material on both sides, nats.
+    """
+
+    toward: Int[np.ndarray, " q"]
+    away: Int[np.ndarray, " q"]
+    askew: Bool[np.ndarray, " q"]
+    beyond: Int[np.ndarray, "2 q"]
+    price: float
+
+    @classmethod
+    def of(
+        cls,
+        grid: _Grid,
+        template: Template,
+        broken: Broken,
+        spacing_mm: float,
+        options: OccupancyOptions,
+    ) -> _Sides:
+        """Of broken surface, a voxel's edge before and behind it."""
+        outward = unit_vectors(template.distance_and_gradient(broken.place_mm)[1])
+        along = (outward * broken.plane).sum(axis=1)
+        step_mm = grid.voxel_mm * np.sign(along)[:, None] * broken.plane
+        toward, away, *beyond = (
+            grid.numbers_at(broken.place_mm + way * step_mm)
+            for way in (1.0, -1.0, LOOK_VOXELS[-1], -LOOK_VOXELS[-1])
+        )
+        askew = np.abs(along) < options.way_cosine
+        # of a wide facet's many places together no more is known than of a facet that nobody saw
+        most = -np.log1p(-options.largest_cover) / (grid.voxel_mm / spacing_mm) ** 2
+        price = float(min(-np.log(options.stray), most))
+        return cls(toward, away, askew, np.stack(beyond), price)
+
+    def is_shut(self, empty: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, " q"]:
+        """(q,) whether both sides are solid."""
+        solid = np.append(~empty, False)
+        return np.asarray(solid[self.toward] & solid[self.away])
+
+    def proposed(
+        self,
+        empty: Bool[np.ndarray, " v"],
+        room: Int[np.ndarray, " v"],
+        told: Float[np.ndarray, " v"],
+        least: float,
+    ) -> Iterator[Float[np.ndarray, " v"]]:
+        """What voxels would say were shut places open towards the surface; away from it, as in a
+        hollow under a film too thin to be told from it; or were a room empty that they bound.
+
+        `least` of them, or no room is.
+        """
+        shut = self.is_shut(empty)
+        for side in (self.toward, self.away):
+            which = side[shut & ~self.askew]
+            yield told - self.price * np.bincount(which, minlength=len(told))
+        beside = np.where(self.beyond < 0, 0, room[self.beyond])[:, shut]
+        bounds = np.bincount(beside[:, beside[0] != beside[1]].ravel(), minlength=2)
+        for k in 1 + np.flatnonzero(bounds[1:] >= least):
+            yield np.where(room == k, -MOST_NATS, told)
+
+
+def _with_open_sides(
+    empty: Bool[np.ndarray, " v"],
+    facets: _Facets,
+    nats: Float[np.ndarray, "k 2"],
+    told: Float[np.ndarray, " v"],
+    grid: _Grid,
+    sides: _Sides,
+    scan_mm: Float[np.ndarray, "p 3"],
+    least: float,
+) -> Bool[np.ndarray, " v"]:
+    """The same, or a cheaper labelling in which broken surface has an open side.
+
+    `least` of the broken places must have none, or it stays.
+    """
+
+    def cost(labels: Bool[np.ndarray, " v"]) -> float:
+        solid = np.append(~labels, False)
+        one, other = solid[facets.one], solid[facets.other]
+        surface = nats[one & ~other, 0].sum() + nats[other & ~one, 1].sum()
+        return float(told[labels].sum() + surface + sides.price * sides.is_shut(labels).sum())
+
+    if sides.is_shut(empty).sum() < least:
+        return empty
+    within = grid.number >= 0
+    uncut = within.copy()
+    uncut[within] = ~empty
+    index, ok = _cells(scan_mm, grid.low_mm, grid.voxel_mm, uncut.shape)
+    scanned = np.zeros(uncut.shape, bool)
+    scanned[tuple(index[ok].T)] = True
+    # rooms are what scanned surface separates, of which a voxel may hold no point by chance
+    uncut &= ~ndimage.binary_dilation(scanned, np.ones((3, 3, 3), bool))
+    room = ndimage.label(uncut)[0][within]
+    best, least_cost = empty, cost(empty)
+    for proposed in sides.proposed(empty, room, told, least):
+        tried = _labelled(facets, nats, proposed)
+        if (price := cost(tried)) < least_cost:
+            best, least_cost = tried, price
+    return best
 
 
 def _as_seen(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from amrepair.field import scales_kernels as kernels
 
@@ -19,6 +19,8 @@ from amrepair.field import scales_kernels as kernels
 WINDOW_FACING = 0.5
 # The third lowest and highest of a window: three cells together are a surface, two may be chance.
 RANK = 3
+# Observations in a cell of what strays: it has a place, and no part in what is seen around it.
+NOTHING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,14 @@ class Scale:
     def __len__(self) -> int:
         return len(self.value_mm)
 
+    @property
+    def is_surface(self) -> Bool[np.ndarray, " s"]:
+        """(s,) windows of as many cells as a surface has, most of them of more than one point.
+
+        Points that stray in the air fall into one window by and by, each in a cell of its own.
+        """
+        return np.asarray((self.count >= RANK) & (self.window_weight >= 2.0 * self.count))
+
 
 def scales_of(
     place_mm: Float[np.ndarray, "b 3"],
@@ -73,6 +83,8 @@ def scales_of(
     widest_mm: float,
 ) -> tuple[Scale, ...]:
     """The field at cells of `cell_mm` and wider, up to windows of `widest_mm` across.
+
+    What is no surface at the first scale is none at any other, faces nowhere and weighs nothing.
 
     Parameters
     ----------
@@ -95,6 +107,10 @@ def scales_of(
             return tuple(found)
         of_base = scale.of_base
         inner = (scale.place_mm, scale.normal, scale.value_mm, scale.weight)
+        if len(found) == 1:
+            stray = ~scale.is_surface
+            normal = np.where(stray[:, None], 0.0, scale.normal)
+            inner = (scale.place_mm, normal, scale.value_mm, np.where(stray, NOTHING, scale.weight))
         size_mm *= 2.0
 
 
@@ -145,9 +161,10 @@ def _scale(
 
 
 def ways_of(normal: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " c"]:
-    """(c,) which of the six ways along the axes normals face most: −x, x, −y, y, −z, z."""
+    """(c,) which of the six ways along the axes normals face most: −x, x, −y, y, −z, z; 6: none."""
     axis = np.abs(normal).argmax(axis=1)
-    return np.asarray(2 * axis + (normal[np.arange(len(normal)), axis] > 0))
+    most = normal[np.arange(len(normal)), axis]
+    return np.where(most == 0.0, 6, 2 * axis + (most > 0))
 
 
 def _grouped(

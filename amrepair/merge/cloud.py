@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from amrepair.field.near import spacing_in
 from amrepair.merge import fuse_kernels as kernels
@@ -30,6 +30,7 @@ MOST_CELLS = 250  # along the longest side
 # nearer than so many of their radii are not in the way if they are of the looker's own sheet.
 SHEET_SLOPE, SHEET_NOISES, OWN_DISCS = 0.2, 4.0, 2.5
 TELLS_SPACINGS, TOLD_BY = 2.2, 8
+TOLD_ENOUGH = 1.0  # neighbours on one's own sheet, that say the way of a normal
 NOISE_QUANTILE, LEAST_PLANE_POINTS = 0.1, 8
 AGREE_ROUNDS = 60  # places that a verdict travels
 
@@ -140,7 +141,7 @@ def _planes(
     if sigma_mm is None:
         enough = m >= LEAST_PLANE_POINTS
         freedom = m[enough] - 3
-        ratio = variance[enough] * m[enough] / chi2.ppf(NOISE_QUANTILE, freedom)
+        ratio = variance[enough] * m[enough] / chdtri(freedom, 1.0 - NOISE_QUANTILE)
         sigma_mm = float(np.sqrt(np.quantile(ratio, NOISE_QUANTILE))) if enough.any() else 0.0
     # residuals over the points' lever: over a disc, each coordinate has a quarter of r² as variance
     freedom = np.maximum(m - 3, 0.5)
@@ -163,26 +164,83 @@ def outward(
     normals: Float[np.ndarray, "n 3"],
     spacing_mm: float,
     sigma_mm: float,
+    asked: Int[np.ndarray, " a"] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """(n, 3) the normals, turned to the side from which more of the distance is in sight.
 
     A closed surface lets no ray out from within; one with gaps fewer than from without. What hides
     is a disc about each point, not a cell: a wall thinner than a cell has two sides.
+
+    Parameters
+    ----------
+    asked
+        Which of them may turn; all where none are given.
     """
-    step = len(points_mm) // LOOKING_POINTS + 1
-    look, facing = (np.ascontiguousarray(each[::step]) for each in (points_mm, normals))
+    whose = np.arange(len(points_mm)) if asked is None else asked
+    step = len(whose) // LOOKING_POINTS + 1
+    look, facing = (np.ascontiguousarray(each[whose[::step]]) for each in (points_mm, normals))
     votes = _seen_from(look, facing, points_mm, normals, spacing_mm, sigma_mm)
     side = _agreed(look, facing, (facing * votes).sum(axis=1), spacing_mm * np.sqrt(step), sigma_mm)
-    near = min(TOLD_BY, len(look))
-    away, index = cKDTree(look).query(points_mm, k=[*range(1, near + 1)], workers=-1)
+    told, _ = _told_by(
+        points_mm[whose], normals[whose], look, facing * np.sign(side)[:, None],
+        spacing_mm, sigma_mm,
+    )  # fmt: skip
+    found = normals.copy()
+    found[whose] *= np.where(told < 0, -1.0, 1.0)[:, None]
+    return found
+
+
+def outward_by(
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    known: Bool[np.ndarray, " n"],
+    spacing_mm: float,
+    sigma_mm: float,
+) -> Float[np.ndarray, "n 3"]:
+    """(n, 3) the normals, those that are not known turned as the known ones beside them are.
+
+    Only where no known one lies beside them on their sheet do places look around themselves.
+    """
+    asked = np.flatnonzero(~known)
+    told, by = _told_by(
+        points_mm[asked], normals[asked], points_mm[known], normals[known], spacing_mm, sigma_mm,
+        within_mm=TELLS_SPACINGS * spacing_mm,
+    )  # fmt: skip
+    found = normals.copy()
+    found[asked] *= np.where(told < 0, -1.0, 1.0)[:, None]
+    rest = asked[by < TOLD_ENOUGH]
+    return outward(points_mm, found, spacing_mm, sigma_mm, rest) if len(rest) else found
+
+
+def _told_by(
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    look_mm: Float[np.ndarray, "s 3"],
+    facing: Float[np.ndarray, "s 3"],
+    spacing_mm: float,
+    sigma_mm: float,
+    within_mm: float = np.inf,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """(n,) what the places beside each say for its normal, or against it; (n,) how many say it.
+
+    Those on its own sheet: at its height, by the mean of both planes.
+    """
+    near = min(TOLD_BY, len(look_mm))
+    if near == 0:
+        return np.zeros(len(points_mm)), np.zeros(len(points_mm))
+    away, index = cKDTree(look_mm).query(
+        points_mm, k=[*range(1, near + 1)], distance_upper_bound=within_mm, workers=-1
+    )
+    there = np.isfinite(away)
+    away, index = np.where(there, away, 0.0), np.where(there, index, 0)
     cosine = np.einsum("na,nka->nk", normals, facing[index])
-    offset = look[index] - points_mm[:, None]
+    offset = look_mm[index] - points_mm[:, None]
     mean = normals[:, None] + np.sign(cosine)[..., None] * facing[index]
     height = np.einsum("nka,nka->nk", offset, mean) / 2
     slack = np.maximum(SHEET_SLOPE * away, SHEET_NOISES * sigma_mm) + 1e-9
-    weight = np.exp(-((height / slack) ** 2)) / (away + 0.1 * spacing_mm) ** 2
-    told = (weight * cosine * np.sign(side)[index]).sum(axis=1)
-    return normals * np.where(told < 0, -1.0, 1.0)[:, None]
+    beside = np.where(there, np.exp(-((height / slack) ** 2)) * np.abs(cosine), 0.0)
+    said = beside * np.sign(cosine) / (away + 0.1 * spacing_mm) ** 2
+    return said.sum(axis=1), beside.sum(axis=1)
 
 
 def _seen_from(

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 import amrepair
 from amrepair.errors import InputError
-from amrepair.merge.cloud import outward, planes, spacing_of
+from amrepair.merge.cloud import outward_by, planes, spacing_of
 from amrepair.merge.fuse import Cloud, Fused, fuse
 from amrepair.merge.joint import Slack
 from amrepair.merge.options import USUAL_MERGE, MergeOptions
@@ -227,9 +227,9 @@ def _by_all(
     Together they are denser, and reach less far across thin walls.
     """
     every = planes(points_mm, spacing_mm)
-    better = (every.tilt_rad < tilt_rad)[:, None]
-    found = outward(points_mm, np.where(better, every.normals, normals), spacing_mm, sigma_mm)
-    return np.where(sure[:, None], normals, found)
+    better = (every.tilt_rad < tilt_rad) & ~sure
+    found = np.where(better[:, None], every.normals, normals)
+    return outward_by(points_mm, found, sure, spacing_mm, sigma_mm)
 
 
 def _outvoted(cloud: Cloud, fused: Fused, which: Sequence[int]) -> dict[int, float]:

@@ -19,7 +19,7 @@ from amrepair.errors import TemplateError
 from amrepair.merge import fuse_kernels as kernels
 from amrepair.merge.cloud import Cells
 from amrepair.template.extract import zero_level
-from amrepair.template.grid import Coverage
+from amrepair.template.grid import Coverage, surface_elements
 from amrepair.template.mesh_file import manifold_arrays
 from amrepair.template.mesh_sdf import MeshSdf
 from gcode.solids import as_manifold, is_valid
@@ -37,7 +37,7 @@ BLOCK_NODES = 8  # nodes along its edge
 POISSON_DEPTH, POISSON_POINTS = 8, 150_000
 MOST_EDGES = 400  # of the grid, along the longest side
 OUTVOTED_MARKS = 2  # marks in a cell, or it is chance
-# Surface farther than so many of the sparsest scan's spacings from any point was not seen.
+# A disc of so many of the sparsest scan's spacings that holds no point was not seen.
 SEEN_SPACINGS = 3.0
 SIDE_AGREEMENT = 0.97  # share of a component's neighbours that must agree about its side
 DUST_RATIO = 1e-3  # closed pieces smaller than this share of the whole are clutter
@@ -186,7 +186,7 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
     close = np.isfinite(field) & (np.abs(field) < edge)
     spread = _spread(cloud, excess, close, index, low, edge, shape) if cloud.scans > 1 else None
     area_mm2, at_mm = _outvoted(cloud, against, nodes[close], overruled[close], radius_mm)
-    coverage = _coverage(mesh, points, SEEN_SPACINGS * cloud.sparsest_mm)
+    coverage = coverage_of(mesh, points, normals, SEEN_SPACINGS * cloud.sparsest_mm)
     return Fused(
         mesh=mesh,
         spread=spread,
@@ -235,15 +235,37 @@ def _outvoted(
     return area, at
 
 
-def _coverage(
-    mesh: trimesh.Trimesh, points_mm: Float[np.ndarray, "n 3"], reach_mm: float
+def coverage_of(
+    mesh: trimesh.Trimesh,
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    reach_mm: float,
 ) -> Coverage:
-    """Which of the surface no point lies near, in cells as wide as that reach."""
+    """Which of the surface was not seen: what a disc on it, of that radius and without points,
+    covers (the complement of an alpha shape, Edelsbrunner, Kirkpatrick and Seidel 1983).
+
+    So the border of what was seen lies at its outermost points, and no point is unseen. Points on
+    the other side of a thin wall say nothing of this one.
+    """
     from scipy.spatial import cKDTree
 
     centre, area = np.asarray(mesh.triangles_center), np.asarray(mesh.area_faces)
-    far = np.isinf(cKDTree(points_mm).query(centre, distance_upper_bound=reach_mm)[0])
-    return Coverage.of(centre[far], area[far], np.asarray(mesh.bounds), reach_mm)
+    pieces = surface_elements(centre, np.asarray(mesh.face_normals), reach_mm)
+    away, near = cKDTree(points_mm).query(centre, distance_upper_bound=reach_mm)
+    found = np.isfinite(away)
+    empty = ~found
+    told = surface_elements(points_mm[near[found]], normals[near[found]], reach_mm)
+    empty[found] = np.linalg.norm(pieces[found] - told, axis=1) > reach_mm
+    some = np.flatnonzero(empty & found)
+    if len(some):  # none of the nearest: of those around, each faces as the surface under it
+        around = np.isfinite(
+            cKDTree(centre[some]).query(points_mm, distance_upper_bound=reach_mm)[0]
+        )
+        under = cKDTree(centre).query(points_mm[around])[1]
+        told = surface_elements(points_mm[around], np.asarray(mesh.face_normals)[under], reach_mm)
+        empty[some] = np.isinf(cKDTree(told).query(pieces[some], distance_upper_bound=reach_mm)[0])
+    covers = cKDTree(pieces[empty]).query(pieces, distance_upper_bound=reach_mm)[0]
+    return Coverage.of(centre, np.asarray(mesh.face_normals), area, np.isfinite(covers), reach_mm)
 
 
 def reach_mm(cloud: Cloud) -> float:

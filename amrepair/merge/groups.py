@@ -24,6 +24,7 @@ from amrepair.merge.match import (
     searched,
 )
 from amrepair.merge.options import MergeOptions
+from amrepair.merge.threads import in_threads
 from amrepair.merge.views import Fit, Placed, View, joined, judged, settled
 from gcode.progress import Progress, silent
 
@@ -91,9 +92,8 @@ class Graph:
             spacing_mm = max(self.views[k].thin_spacing_mm for k in (*fixed, *moving))
             reach_mm = self.options.reach_spacings * spacing_mm
             within = np.geomspace(2.0 * reach_mm, reach_mm, GROUP_STEPS)
-            for pose in poses:
-                there = settled(whole, own, pose, within, GROUP_POINTS)
-                fits.append(judged(self.views, fixed, moving, there, self.options))
+            there = in_threads(lambda p: settled(whole, own, p, within, GROUP_POINTS), poses)
+            fits = [judged(self.views, fixed, moving, pose, self.options) for pose in there]
             fits = self._ranked(distinct(fits, own, self.options.same_size * self.size_mm))
         self._judged[key] = fits
         return fits
@@ -155,7 +155,12 @@ class Graph:
         near_mm = self.options.same_size * self.size_mm
         every = [*self.pairs.get(pair, []), *fits]
         self.pairs[pair] = distinct(every, self.views[pair[1]].thin, near_mm)
-        self._judged.clear()
+        one, other = pair
+        self._judged = {
+            sides: said
+            for sides, said in self._judged.items()
+            if not any(one in a and other in b for a, b in (sides[:2], sides[1::-1]))
+        }
 
     def _sides(self, a: int, b: int) -> tuple[int, int]:
         """The larger group stays."""

@@ -19,7 +19,6 @@ surface of 1/cos; the weights of Turk and Levoy, Zippered polygon meshes, SIGGRA
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,8 +28,8 @@ from amrepair.align.registration import bounded_inverse
 from amrepair.frames import motion_about, moved
 from amrepair.merge.kept import Kept
 from amrepair.merge.options import USUAL_MERGE, JointOptions
+from amrepair.merge.threads import in_threads
 from amrepair.merge.views import View, loss_weight
-from gcode.crew import cores
 
 JOINT_DAMPING = 1e-7
 
@@ -246,8 +245,7 @@ def _pairs(
         return of, np.full(len(near), r), own[k][near], plane, turned, height, rough, confidence
 
     # a thread a pair of scans, not a thread a piece of each query: queries are short
-    with ThreadPoolExecutor(cores()) as pool:
-        found = list(pool.map(pair, answers))
+    found = in_threads(pair, answers)
     return _Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

@@ -20,6 +20,7 @@ from amrepair.align.search_kernels import peaks
 from amrepair.frames import moved, nearest_rotation
 from amrepair.merge import search_kernels as kernels
 from amrepair.merge.options import MatchOptions, MergeOptions
+from amrepair.merge.threads import in_threads
 from amrepair.merge.views import Fit, Surface, View, judged, settled
 
 # The grid of free space: nodes along each side, and its side in sizes. A view in a wrong place
@@ -115,21 +116,20 @@ def _fitted(
     fixed, moving = views[i].thin, views[j].thin
     match = options.match
     within = np.geomspace(first, match.last_within, 6) * size_mm
-    rough: list[tuple[float, np.ndarray]] = []
-    for guess in guesses:
+
+    def roughly(guess: Float[np.ndarray, "4 4"]) -> tuple[float, Float[np.ndarray, "4 4"]]:
         pose = settled(fixed, moving, guess, within, match.rough_points)
         some = moving.some(match.rough_points)
         near = fixed.tree.query(moved(moving.points_mm[some], pose))[0]
-        rough.append((float((near < match.last_within * size_mm).mean()), pose))
+        return float((near < match.last_within * size_mm).mean()), pose
+
+    rough = in_threads(roughly, guesses)
     last_mm = options.reach_spacings * max(views[i].thin_spacing_mm, views[j].thin_spacing_mm)
-    within = np.geomspace(max(match.last_within * size_mm, last_mm), last_mm, 12)
+    finer = np.geomspace(max(match.last_within * size_mm, last_mm), last_mm, 12)
     poses = apart([p for _, p in sorted(rough, key=lambda r: -r[0])], moving,
                   options.same_size * size_mm)[:match.most_poses]  # fmt: skip
-    fits = [
-        judged(views, {i: np.eye(4)}, {j: np.eye(4)},
-               settled(fixed, moving, pose, within, match.points), options)
-        for pose in poses
-    ]  # fmt: skip
+    poses = in_threads(lambda p: settled(fixed, moving, p, finer, match.points), poses)
+    fits = [judged(views, {i: np.eye(4)}, {j: np.eye(4)}, pose, options) for pose in poses]
     return distinct(fits, moving, options.same_size * size_mm)
 
 

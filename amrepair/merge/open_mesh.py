@@ -274,9 +274,10 @@ def _holes(
     across_mm = options.small_hole_ratio * diagonal
     areas, _ = triangle_areas_normals(vertices, faces)
     spacing_mm = across_mm / SAMPLES_ACROSS
-    points, _, _ = sample_surface(vertices, faces, count=count_for_spacing(areas, spacing_mm))
+    points, normals, _ = sample_surface(vertices, faces, count=count_for_spacing(areas, spacing_mm))
     each_mm2 = float(areas.sum()) / len(points)
-    bare = points[tree.nearest(points).size_mm > off_mm]
+    off = tree.nearest(points).size_mm > off_mm
+    bare = points[off]
     if not len(bare):
         return None, []
     cell = np.floor((bare - bare.min(axis=0)) / (2.0 * spacing_mm)).astype(int)
@@ -295,6 +296,6 @@ def _holes(
         f"{len(large)} large holes, {large.sum():,.0f} mm² in all, are closed by a guess: they are "
         "unknown, and nothing in them is called missing"
     )
-    unknown = bare[size[which] > limit_mm2]
-    bounds = np.asarray(made.bounds)
-    return Coverage.of(unknown, np.full(len(unknown), each_mm2), bounds, 2.0 * spacing_mm), notes
+    off[off] = size[which] > limit_mm2
+    each = np.full(len(points), each_mm2)
+    return Coverage.of(points, normals, each, off, 2.0 * spacing_mm), notes

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gcode.compiled import njit, prange
+from gcode.compiled import njit
 
 
 class Camera(NamedTuple):
@@ -51,7 +51,7 @@ def pixels(points, camera):
     return u, v, reach
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def seen_through(points, normals, asked, camera, first, least, outside, within, edge_on,
                  silhouette, found):  # fmt: skip
     """Say of the places asked about whether the sensor saw through them; in `found`.
@@ -62,7 +62,7 @@ def seen_through(points, normals, asked, camera, first, least, outside, within, 
     """
     rows, columns = least.shape
     has_normals = len(normals) > 0
-    for q in prange(len(asked)):
+    for q in range(len(asked)):
         k = asked[q]
         u, v, depth, x, y, z = _pixel(points[k], camera)
         reach = np.sqrt(x * x + y * y + z * z)
@@ -101,27 +101,31 @@ def behind_edge_on(points, asked, veil, normals, camera, first, last, edge_on, w
         inside[k] = np.all(pixel[k] >= first) and np.all(pixel[k] <= last)
         if inside[k]:
             low, high = np.minimum(low, pixel[k]), np.maximum(high, pixel[k])
-    rows, columns = high[0] - low[0] + 1, high[1] - low[1] + 1
-    if rows <= 0 or columns <= 0:
+    if np.any(high < low):
         return
+    low, high = low - 1, high + 1  # between its points a surface is closed: over the next pixels
+    rows, columns = high[0] - low[0] + 1, high[1] - low[1] + 1
     least = np.full((rows, columns), np.inf)
     limit = edge_on * edge_on
+    sensor, way = camera.sensor, camera.axes[1]
     for q in range(len(veil)):
-        u, v, depth, x, y, z = _pixel(veil[q], camera)
+        # most of a surface is not edge-on: that is told before its pixel is
+        x, y, z = veil[q, 0] - sensor[0], veil[q, 1] - sensor[1], veil[q, 2] - sensor[2]
+        down = camera.sheet * (way[0] * x + way[1] * y + way[2] * z)
+        x, y, z = x - down * way[0], y - down * way[1], z - down * way[2]
         square = x * x + y * y + z * z
         along = x * normals[q, 0] + y * normals[q, 1] + z * normals[q, 2]
         if along * along > limit * square:
             continue
+        u, v, depth, _, _, _ = _pixel(veil[q], camera)
         u, v = u - low[0], v - low[1]
-        if depth <= 0.0 or u < -1 or v < -1 or u > rows or v > columns:
-            continue
-        reach = np.sqrt(square)
-        # between its points a surface is closed
-        for i in range(max(u - 1, 0), min(u + 2, rows)):
-            for j in range(max(v - 1, 0), min(v + 2, columns)):
-                least[i, j] = min(least[i, j], reach)
+        if depth > 0.0 and 0 <= u < rows and 0 <= v < columns:
+            least[u, v] = min(least[u, v], np.sqrt(square))
     for k in range(count):
         if not inside[k]:
             continue
-        before = least[pixel[k, 0] - low[0], pixel[k, 1] - low[1]]
+        u, v, before = pixel[k, 0] - low[0], pixel[k, 1] - low[1], np.inf
+        for i in range(u - 1, u + 2):
+            for j in range(v - 1, v + 2):
+                before = min(before, least[i, j])
         hidden[asked[k]] = far[k] > before + within

@@ -18,6 +18,7 @@ from amrepair.frames import motion_about, moved
 from amrepair.merge import sight
 from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.options import MergeOptions
+from amrepair.merge.threads import in_threads
 from amrepair.scans import Scan
 
 LEAST_VIEW_POINTS = 2_000
@@ -311,14 +312,19 @@ def judged(
 ) -> Fit:
     """How well one group of placed views, in a pose, agrees with what the other saw."""
     there = {k: pose @ own for k, own in moving.items()}
-    everything = joined(views, {**fixed, **there}, JUDGED_POINTS)
+    every = {**fixed, **there}
+    everything = joined(views, every, JUDGED_POINTS)
+
+    def marks(between: tuple[int, int]) -> Int[np.ndarray, "3 _"]:
+        a, b = between
+        veil = sight.Veil(everything.points_mm, everything.normals, every[b])
+        pose = np.linalg.inv(every[b]) @ every[a]
+        return _marks(views[b], views[a], pose, veil, options).astype(np.int64)
+
+    between = [pair for k in there for m in fixed for pair in ((k, m), (m, k))]
     votes: dict[int, Int[np.ndarray, "3 _"]] = {}
-    for k, one in there.items():
-        for m, home in fixed.items():
-            for a, b, own, others in ((k, m, one, home), (m, k, home, one)):
-                veil = sight.Veil(everything.points_mm, everything.normals, others)
-                found = _marks(views[b], views[a], np.linalg.inv(others) @ own, veil, options)
-                votes[a] = votes[a] + found if a in votes else found.astype(np.int64)
+    for (a, _), found in zip(between, in_threads(marks, between), strict=True):
+        votes[a] = votes[a] + found if a in votes else found
     sides = [float(np.concatenate([votes[k][0] > 0 for k in s]).mean()) for s in (fixed, moving)]
     guessed = any(views[k].looks.guessed for k in votes)
     # what as many views have there as have it elsewhere is no contradiction of this pose
@@ -360,5 +366,9 @@ def _marks(
     beside = view.looks.free(points, free_mm, normals, veil) & ~on
     asked = np.flatnonzero(beside)
     through = np.zeros(len(points), bool)
-    through[asked] = view.looks.free(points[asked], free_mm, normals[asked], veil, silhouette=False)
+    # where a sensor may have stood, all looks have lifted the veil from these places already
+    lifted = None if view.looks.guessed else veil
+    through[asked] = view.looks.free(
+        points[asked], free_mm, normals[asked], lifted, silhouette=False
+    )
     return np.stack([on, off | through, off | beside])

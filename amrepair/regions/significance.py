@@ -353,7 +353,7 @@ def _level(
     error_mm = np.hypot(own_mm, errors.common_mm)
     freedom = errors.freedom_of(error_mm)
     z = as_normal((sides - tolerance_mm) / error_mm, freedom)
-    alone = scale.count < RANK  # fewer cells than that are no surface
+    alone = ~scale.is_surface
     z[:, alone] = -np.inf
     n = max(int((~alone).sum()), 1)
     # `together` of a window's cells are all as far out: Q^r in any of C(k, r) choices

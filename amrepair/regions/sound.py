@@ -302,13 +302,12 @@ def _looked(
 
     A hollow that the template closed by a guess has no sound point on the guess.
     """
-    feet_mm = points_mm - f_mm[:, None] * normals
     if known is not None:
-        return known.looked(feet_mm, f_mm)
+        return known.looked(points_mm - f_mm[:, None] * normals, f_mm)
     told = getattr(template, "coverage", None)
     if told is None:
         return np.ones(len(points_mm), bool)
-    return np.asarray(~(told.unseen_at(points_mm) | told.unseen_at(feet_mm)))
+    return np.asarray(~told.unknown_at(points_mm, f_mm, normals))
 
 
 def _noise_mm(off_mm: Float[np.ndarray, " n"], scale: Scale) -> float:

@@ -24,9 +24,9 @@ class RepairOptions:
     off_the_part_mm, over_beside_mm, on_bed_mm
         What lies beside the part: so far off it, no higher than it was to be by this much, and
         higher than what is taken for the bed.
-    open_cell_margin_mm
-        What is added to what stands there where nobody saw it. No sensor sees to the bottom of a
-        deep cell of infill, and the nozzle has just been over it: nothing.
+    just_printed_margin_mm
+        What is added, where nobody saw it, to the height that a job has just printed to: no sensor
+        sees into a deep cell of infill, or behind a wall, and the head has just been there.
     upright
         A part stands upright where its Z is the bed's: 1 − cos of 0.05 mm over 100 mm.
     same_repair_ratio
@@ -40,7 +40,7 @@ class RepairOptions:
     off_the_part_mm: float = 0.3
     over_beside_mm: float = 0.3
     on_bed_mm: float = 0.2
-    open_cell_margin_mm: float = 0.0
+    just_printed_margin_mm: float = 0.0
     upright: float = 1e-7
     same_repair_ratio: float = 0.8
     align: AlignOptions = field(default_factory=AlignOptions)

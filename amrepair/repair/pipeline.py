@@ -14,6 +14,7 @@ from amrepair.align import align
 from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
 from amrepair.deficit import Deficit, as_built_heights, compute_deficit, standing_in_job
+from amrepair.deficit.options import DeficitOptions
 from amrepair.frames import Transform
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
@@ -216,7 +217,7 @@ def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -
         build_from_template=laid.placed,
         printed_z_mm=site.printed_z_mm,
         as_built=None if site.planned is None else partial(_stands, laid, anomaly, site),
-        options=site.options.deficit,
+        options=_deficit_options(site),
         beads=site.beads,
         progress=progress,
     )
@@ -228,9 +229,7 @@ def _stands(
     """What stands there is all that was seen, the bottoms of open cells too."""
     evidence = anomaly.evidence
     assert evidence is not None
-    options = replace(
-        site.options.deficit.heights, unseen_margin_mm=site.options.open_cell_margin_mm
-    )
+    options = _deficit_options(site).heights
     seen = as_built_heights(
         laid.whole,
         site.template,
@@ -242,6 +241,15 @@ def _stands(
     )
     scan = laid.whole.moved(laid.placed)
     return standing_in_job(seen, site.lines, missing, scan, evidence.spacing_mm, options)
+
+
+def _deficit_options(site: Site) -> DeficitOptions:
+    """What nobody saw stands no higher than the job, where one has just been printed there."""
+    options = site.options.deficit
+    if site.laid is None and site.planned is None:
+        return options
+    margin_mm = site.options.just_printed_margin_mm
+    return replace(options, heights=replace(options.heights, unseen_margin_mm=margin_mm))
 
 
 def _slice(

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from amrepair.loop import Action, LoopReport
 from amrepair.loop import Look as LoopLook
 from amrepair.loop.afterwards import Afterwards
+from amrepair.loop.buried import buried_mm3, pieces_of
 from amrepair.loop.findings import reach_of
 from amrepair.loop.learning import to_json
 from amrepair.observe.options import USUAL_BACKGROUND
@@ -132,6 +133,17 @@ def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None)
     }
 
 
+def covered_mm3(report: LoopReport) -> float:
+    """What repairs did not get to and no look sees any more: it lies under what they printed."""
+    covered = 0.0
+    for last in report.last_looks:
+        here = [look for look in report.looks if look.stop == last.stop]
+        if any(look.printed for look in here):
+            left_mm3 = buried_mm3(pieces_of(last.plan, here))
+            covered += max(left_mm3 - last.plan.deficit.missing_mm3, 0.0)
+    return covered
+
+
 def together_mm3(solids: Iterable[manifold3d.Manifold]) -> float:
     """Volume of what any of some solids holds."""
     found = [solid for solid in solids if not solid.is_empty()]
@@ -164,6 +176,7 @@ def loop_result(
         **plan_figures(
             [look.plan for look in report.first_looks], [look.plan for look in report.last_looks]
         ),
+        "covered_mm3": covered_mm3(report),
         "repaired_ratio": repaired_ratio,
         "iterations": len(printed),
         "gcode": gcode,

@@ -323,6 +323,7 @@ class Figures:
     filament_mm: float
     print_time_s: float
     unprintable_mm3: float = 0.0
+    covered_mm3: float = 0.0
 
     @classmethod
     def from_result(cls, result: Mapping[str, object]) -> Figures:
@@ -339,6 +340,7 @@ class Figures:
             filament_mm=_number(result, "filament_mm") or 0.0,
             print_time_s=_number(result, "print_time_s") or 0.0,
             unprintable_mm3=_number(result, "unprintable_mm3") or 0.0,
+            covered_mm3=_number(result, "covered_mm3") or 0.0,
         )
 
 

@@ -9,7 +9,7 @@ from amrepair.report.data import LeftPart, SolidMesh
 from gcode.slicing.patch import LeftCause, LeftColumns
 
 MOST_BOXES = 4_000  # in the page 12 faces each
-KEYS = {
+LEFT_KEYS = {
     LeftCause.OUT_OF_REACH: "left_reach",
     LeftCause.NO_BEAD: "left_bead",
     LeftCause.COVERED: "left_covered",
@@ -24,7 +24,7 @@ FACES = np.array(
 
 def left_parts(left: tuple[LeftColumns, ...]) -> tuple[LeftPart, ...]:
     """What is left by cause, the most first; volumes are those of all columns."""
-    parts = [LeftPart(KEYS[each.cause], each.volume_mm3, shape_of(each)) for each in left]
+    parts = [LeftPart(LEFT_KEYS[each.cause], each.volume_mm3, shape_of(each)) for each in left]
     return tuple(sorted(parts, key=lambda part: -part.volume_mm3))
 
 

@@ -119,6 +119,8 @@ def _tiles(data: ReportData) -> Iterable[tuple[str, str, str]]:
         yield "Left out", _big(left_mm3, "mm³"), why
     else:
         yield "Out of reach", _big(figures.unreachable_mm3, "mm³"), "for this nozzle"
+    if figures.covered_mm3 > NEGLIGIBLE_MM3:
+        yield "Covered", _big(figures.covered_mm3, "mm³"), "left open under what was printed"
     yield "Not seen", _big(figures.unseen_area_mm2, "mm²"), "unknown, never filled"
     if figures.filament_mm > 0:
         yield (

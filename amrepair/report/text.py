@@ -238,7 +238,12 @@ def _left(outcome: Outcome, figures: Figures) -> str:
     elif figures.missing_mm3_after > NEGLIGIBLE_MM3:
         parts.append(f"{quantity(figures.missing_mm3_after, 'mm³')} still missing")
     else:
-        parts.append("Nothing is missing any more")
+        looks = " that a look shows" if figures.covered_mm3 > NEGLIGIBLE_MM3 else ""
+        parts.append(f"Nothing is missing any more{looks}")
+    if figures.covered_mm3 > NEGLIGIBLE_MM3:
+        parts.append(
+            f"{quantity(figures.covered_mm3, 'mm³')} that the nozzle did not get to are covered now"
+        )
     if figures.excess_mm3_after is not None and figures.excess_mm3_after > NEGLIGIBLE_MM3:
         parts.append(f"{quantity(figures.excess_mm3_after, 'mm³')} too much")
     if figures.unreachable_mm3 > NEGLIGIBLE_MM3:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from amrepair.template.grid import Grid, GridSdf
-from amrepair.template.grid_kernels import NOBODY, carry, near_triangles
+from amrepair.template.grid_kernels import NOBODY, carry, near_triangles, shared_nodes
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.options import USUAL_FIT, FitOptions
 from amrepair.template.signs import signed_grid, signs_in_blocks
@@ -164,18 +164,19 @@ def _blocks(
     """(b, r+1, r+1, r+1) exact distances; nodes that blocks share are asked once."""
     fine = options.fine
     inner = np.stack(np.meshgrid(*[np.arange(fine + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    nodes = (cells[:, None, :] * fine + inner).reshape(-1, 3)
-    extent = np.array(bare.base.shape) * fine
-    key = (nodes[:, 0] * extent[1] + nodes[:, 1]) * extent[2] + nodes[:, 2]
-    first, back = np.unique(key, return_index=True, return_inverse=True)[1:]
-    where = bare.origin_mm + nodes[first] * (bare.cell_mm / fine)
+    block_of = np.full(bare.block_of.shape, -1, np.int64)
+    block_of[tuple(cells.T)] = np.arange(len(cells))
+    back, first = shared_nodes(cells, block_of, fine)
+    block, own = np.divmod(first, len(inner))
+    where = bare.origin_mm + (cells[block] * fine + inner[own]) * (bare.cell_mm / fine)
     size = _in_parts(exact.unsigned_distance, where, "fit: details", progress).astype(np.float32)
     blocks = size[back].reshape(len(cells), *[fine + 1] * 3)
     ends = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1)
     corners = np.moveaxis(cells[:, None, None, None, :] + ends, -1, 0)
     corner_sign = np.sign(bare.base[tuple(corners)]).astype(np.int8)
     sign = signs_in_blocks(blocks, corner_sign, bare.cell_mm / fine)
-    asked = np.unique(back[sign.ravel() == 0])
+    back = back.reshape(sign.shape)
+    asked = np.unique(back[sign == 0])
     side = np.zeros(len(first), dtype=np.int8)
     side[asked] = np.where(exact.inside(where[asked]), -1, 1)
-    return blocks * np.where(sign == 0, side[back].reshape(sign.shape), sign)
+    return blocks * np.where(sign == 0, side[back], sign)

@@ -8,14 +8,17 @@ business.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from amrepair.errors import TemplateError
+from amrepair.frames import unit_vectors
 from amrepair.template import trilinear_kernels as kernels
 from amrepair.template.file import (
     read_template,
@@ -30,7 +33,6 @@ if TYPE_CHECKING:
     import trimesh
 
 GRID_KIND = "grid"
-MOST_COVER_CELLS = 200  # of what is known, along the longest side: 8 MB
 _ARRAYS = ("base", "cells", "blocks", "vertices_mm", "faces")
 
 
@@ -117,49 +119,96 @@ class Grid:
         return self.origin_mm, self.cell_mm, self.base, self.block_of, self.blocks
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Coverage:
     """Where nobody knows what the part's surface is like: no scan of it looked there.
 
+    Pieces of the surface, each seen or not: a place is what the nearest piece is. The other side
+    of a thin wall is another place: pieces that face apart count as so much farther apart.
+
     Attributes
     ----------
-    origin_mm, cell_mm
-        Corner and edge of the cells, template frame.
+    place_mm, normal
+        (k, 3) middles of pieces and (k, 3) outward unit normals, template frame: all that nobody
+        saw, and those that were seen near them.
     unseen
-        (x, y, z) cells that hold surface nobody saw, and those beside them.
+        (k,) whether nobody saw it.
+    reach_mm
+        A place farther from a piece says nothing of it; so far apart are pieces of one place that
+        face at right angles, so that neither tells of the other.
     unseen_mm2
-        Area of that surface.
+        Area that nobody saw.
     """
 
-    origin_mm: Float[np.ndarray, " 3"]
-    cell_mm: float
-    unseen: Bool[np.ndarray, "x y z"]
+    place_mm: Float[np.ndarray, "k 3"]
+    normal: Float[np.ndarray, "k 3"]
+    unseen: Bool[np.ndarray, " k"]
+    reach_mm: float
     unseen_mm2: float
 
     @classmethod
     def of(
         cls,
         places_mm: Float[np.ndarray, "n 3"],
+        normals: Float[np.ndarray, "n 3"],
         area_mm2: Float[np.ndarray, " n"],
-        bounds_mm: Float[np.ndarray, "2 3"],
-        cell_mm: float,
+        unseen: Bool[np.ndarray, " n"],
+        reach_mm: float,
     ) -> Coverage:
-        """Of pieces of surface that nobody saw: where, and how large each is."""
-        cell_mm = max(cell_mm, float(np.ptp(bounds_mm, axis=0).max()) / MOST_COVER_CELLS)
-        origin = bounds_mm[0] - 2.0 * cell_mm
-        shape = np.ceil((bounds_mm[1] + 2.0 * cell_mm - origin) / cell_mm).astype(int)
-        unseen = np.zeros(tuple(shape), bool)
-        unseen[tuple(((places_mm - origin) / cell_mm).astype(int).T)] = True
-        unseen = ndimage.binary_dilation(unseen, np.ones((3, 3, 3)))
-        return cls(origin, cell_mm, unseen, float(area_mm2.sum()))
+        """Of all pieces of a surface: where, how each faces, how large it is, whether unseen.
 
-    def unseen_at(self, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """(n,) whether the surface nearest to a place near it is unknown."""
-        index = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
-        inside = ((index >= 0) & (index < self.unseen.shape)).all(axis=1)
-        found = np.zeros(len(points_mm), bool)
-        found[inside] = self.unseen[tuple(index[inside].T)]
-        return found
+        `reach_mm`: several times as far as pieces lie apart.
+        """
+        pieces = surface_elements(places_mm, normals, reach_mm)
+        far = cKDTree(pieces[unseen]).query(pieces, distance_upper_bound=2.0 * reach_mm)[0]
+        kept = np.isfinite(far)
+        unseen_mm2 = float(area_mm2[unseen].sum())
+        return cls(places_mm[kept], normals[kept], unseen[kept], reach_mm, unseen_mm2)
+
+    @cached_property
+    def _trees(self) -> tuple[cKDTree, cKDTree, cKDTree]:
+        """Of pieces that were seen, of those that were not, and of the latter's places alone."""
+        pieces = surface_elements(self.place_mm, self.normal, self.reach_mm)
+        return (
+            cKDTree(pieces[~self.unseen]),
+            cKDTree(pieces[self.unseen]),
+            cKDTree(self.place_mm[self.unseen]),
+        )
+
+    def unknown_at(
+        self,
+        points_mm: Float[np.ndarray, "n 3"],
+        f_mm: Float[np.ndarray, " n"],
+        outward: Float[np.ndarray, "n 3"],
+    ) -> Bool[np.ndarray, " n"]:
+        """(n,) whether nobody knows the surface that places near it are told by.
+
+        It is the piece at a place's foot; and where one that nobody saw, and that is a guess, lies
+        nearer to that than the place does, the true surface may pass through the place.
+
+        Parameters
+        ----------
+        f_mm, outward
+            The template's distance there, and its unit gradient.
+        """
+        feet_mm = points_mm - f_mm[:, None] * outward
+        seen, unseen, guess = self._trees
+        asked = surface_elements(feet_mm, outward, self.reach_mm)
+        to_unseen = unseen.query(asked, distance_upper_bound=self.reach_mm, workers=-1)[0]
+        found = np.isfinite(to_unseen)
+        to_seen = seen.query(asked[found], distance_upper_bound=self.reach_mm, workers=-1)[0]
+        found[found] = to_unseen[found] <= to_seen
+        rest = np.flatnonzero(~found)
+        to_guess = guess.query(feet_mm[rest], workers=-1)[0]
+        found[rest] = to_guess <= np.abs(f_mm[rest])
+        return np.asarray(found)
+
+
+def surface_elements(
+    places_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], reach_mm: float
+) -> Float[np.ndarray, "n 6"]:
+    """(n, 6) places with how they face: those at right angles lie `reach_mm` apart at least."""
+    return np.hstack([places_mm, reach_mm / np.sqrt(2.0) * normals])
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,11 +247,9 @@ class GridSdf(MeshShape):
         """(n,) standard deviation between normal parts: the part's size where nobody knows."""
         found = self._told_spread_mm(points_mm)
         if self.coverage is not None:
-            # A place off the surface is unseen, too, where the surface nearest to it was not seen.
-            f_mm, outward = self.distance_and_gradient(points_mm)
-            unseen = self.coverage.unseen_at(points_mm - f_mm[:, None] * outward)
-            size_mm = float(np.linalg.norm(np.ptp(self.bounds_mm, axis=0)))
-            found = np.where(unseen | self.coverage.unseen_at(points_mm), size_mm, found)
+            f_mm, gradient = self.distance_and_gradient(points_mm)
+            unknown = self.coverage.unknown_at(points_mm, f_mm, unit_vectors(gradient))
+            found = np.where(unknown, float(np.linalg.norm(np.ptp(self.bounds_mm, axis=0))), found)
         return found
 
     def _told_spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -235,9 +282,10 @@ class GridSdf(MeshShape):
             **self.metadata,
         }
         if self.coverage is not None:
-            arrays["unseen"] = self.coverage.unseen.astype(np.uint8)
-            head["unseen_origin_mm"] = self.coverage.origin_mm.tolist()
-            head["unseen_cell_mm"] = self.coverage.cell_mm
+            arrays["coverage_mm"] = self.coverage.place_mm.astype(np.float32)
+            arrays["coverage_normal"] = self.coverage.normal.astype(np.float32)
+            arrays["coverage_unseen"] = self.coverage.unseen.astype(np.uint8)
+            head["coverage_reach_mm"] = self.coverage.reach_mm
             head["unseen_mm2"] = self.coverage.unseen_mm2
         return arrays, head
 
@@ -282,11 +330,18 @@ def stored_grid(
 
 
 def _stored_coverage(arrays: dict[str, np.ndarray], head: dict[str, Any]) -> Coverage | None:
-    if "unseen" not in arrays:
+    if "coverage_unseen" in arrays:
+        place, normal = (
+            arrays[name].astype(np.float64) for name in ("coverage_mm", "coverage_normal")
+        )
+        unseen, reach_mm = arrays["coverage_unseen"].astype(bool), head["coverage_reach_mm"]
+    elif "unseen" in arrays:  # of earlier versions: cells, with a layer of cells around them
+        around = arrays["unseen"].astype(bool)
+        cells = np.argwhere(around)
+        unseen = ndimage.binary_erosion(around, np.ones((3, 3, 3)))[around]
+        reach_mm = 2.0 * float(head["unseen_cell_mm"])
+        place = np.array(head["unseen_origin_mm"]) + 0.5 * reach_mm * (cells + 0.5)
+        normal = np.zeros_like(place)
+    else:
         return None
-    return Coverage(
-        np.array(head["unseen_origin_mm"], dtype=np.float64),
-        float(head["unseen_cell_mm"]),
-        arrays["unseen"].astype(bool),
-        float(head["unseen_mm2"]),
-    )
+    return Coverage(place, normal, unseen, float(reach_mm), float(head["unseen_mm2"]))

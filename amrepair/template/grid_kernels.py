@@ -123,3 +123,51 @@ def carry(squared, which, fixed, corner, ab, ac, dots, origin, cell, sx, sy, sz)
                     if found < squared[i, j, k]:
                         squared[i, j, k] = found
                         which[i, j, k] = t
+
+
+@njit(cache=True, nogil=True)
+def shared_nodes(cells, block_of, fine):
+    """Nodes of finer blocks in those cells, numbered; what blocks share has one number.
+
+    Returns (b, (fine + 1)**3) the number of each block's nodes, x-major, and (k,) where among all
+    of them each number stands first. `block_of` is a cell's number in `cells`, or −1.
+    """
+    side, blocks, count = fine + 1, len(cells), 0
+    number = np.full((blocks, side**3), -1, np.int64)
+    first = np.empty(blocks * side**3, np.int64)
+    inner = np.empty(3, np.int64)
+    for b in range(blocks):
+        for node in range(side**3):
+            inner[0], inner[1], inner[2] = node // side**2, node // side % side, node % side
+            # the other blocks at this node lie one cell on, along each axis at whose end it is
+            for beside in range(1, 8):
+                there, same = -1, 0
+                x, y, z = cells[b, 0], cells[b, 1], cells[b, 2]
+                for a in range(3):
+                    here = inner[a]
+                    if beside >> a & 1:
+                        if 0 < here < fine:
+                            there = -2
+                            break
+                        step = -1 if here == 0 else 1
+                        here = fine - here
+                        if a == 0:
+                            x += step
+                        elif a == 1:
+                            y += step
+                        else:
+                            z += step
+                    same = same * side + here
+                if there == -2 or min(x, y, z) < 0:
+                    continue
+                if x >= block_of.shape[0] or y >= block_of.shape[1] or z >= block_of.shape[2]:
+                    continue
+                at = block_of[x, y, z]
+                if 0 <= at < b:
+                    number[b, node] = number[at, same]
+                    break
+            if number[b, node] < 0:
+                number[b, node] = count
+                first[count] = b * side**3 + node
+                count += 1
+    return number, first[:count]

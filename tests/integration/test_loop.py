@@ -29,7 +29,8 @@ from gcode.reader import read_job
 
 KEYS = {
     "missing_mm3_before", "missing_mm3_after", "excess_mm3_before", "excess_mm3_after",
-    "repaired_ratio", "unreachable_mm3", "unseen_area_mm2", "iterations", "regions", "gcode",
+    "repaired_ratio", "unreachable_mm3", "covered_mm3", "unseen_area_mm2", "iterations",
+    "regions", "gcode",
     "filament_mm", "print_time_s", "seconds", "seed", "versions",
 }  # fmt: skip
 

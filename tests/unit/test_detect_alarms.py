@@ -74,6 +74,30 @@ def test_a_bed_around_the_part_is_no_excess() -> None:
     assert detect(on_bed(0.0, seen_from_below=False), box((0, 0, 0), (40, 30, 6))).regions == ()
 
 
+def with_strays(scan: Scan, count: int, seed: int) -> Scan:
+    """The scan, and so many single points in the air over the bed beside the part, not by y 15."""
+    rng = np.random.default_rng(seed)
+    strays = rng.uniform((-14.0, -14.0, 0.4), (-1.0, 36.0, 1.6), (count, 3))
+    strays[strays[:, 1] > 11.0, 1] += 8.0
+    return Scan(np.concatenate([scan.points_mm, strays]), SIGMA_MM, "template")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_that_stray_in_the_air_are_no_surface(seed: int) -> None:
+    # regression: a laser line's strays fell into one wide window by and by, and were 20 mm³ of
+    # excess beside a sound part
+    plate, bare = box((0, 0, 0), (40, 30, 6)), on_bed(0.0, seen_from_below=False)
+    strayed = with_strays(bare, 27, seed)
+    assert detect(strayed, plate, calibration=NORMAL_NOISE).regions == ()
+    # a crumb of 1.5 mm among them is one
+    turn, up = np.random.default_rng(seed).uniform((0, 0), (2 * np.pi, 1), (60, 2)).T
+    flat = np.sqrt(1.0 - up**2)
+    crumb = 0.75 * np.column_stack([flat * np.cos(turn), flat * np.sin(turn), up]) + (-7, 15, 0.2)
+    both = Scan(np.concatenate([strayed.points_mm, crumb]), SIGMA_MM, "template")
+    (found,) = detect(both, plate, calibration=NORMAL_NOISE).regions
+    assert (np.abs(found.box_mm.mean(axis=0)[:2] - (-7, 15)) < 1.0).all()
+
+
 def strand(noise_mm: float, high_mm: float, seed: int) -> Scan:
     """A plate of 24 × 20 × 3 mm over which a strand 0.8 mm wide and 12 mm long lies askew."""
     rng = np.random.default_rng(seed)

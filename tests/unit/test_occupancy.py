@@ -190,3 +190,16 @@ def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
         emptied_mm3.append(float((found.designed & ~found.solid).sum()) * found.voxel_mm**3)
     assert emptied_mm3[0] > 5_000.0  # what the labels alone would say
     assert emptied_mm3[1] == 0.0
+
+
+@pytest.mark.slow
+def test_a_hollow_under_a_film_is_open_though_its_mouth_is_narrow() -> None:
+    """Regression: surface with material on both sides cost nothing, and 0.09 of it was found."""
+    block = analytic.box((0, 0, 0), (24, 16, 9))
+    hollow = m3.Manifold.cube((14, 10, 7.55)).translate((5, 3, 1.3))  # 0.15 mm below the top
+    hollow += m3.Manifold.cube((1.5, 5, 1.5)).translate((11, -1, 4))
+    points, _ = analytic.noisy_scan_points(
+        block.body - hollow, spacing_mm=0.25, sigma_mm=0.03, seed=4
+    )
+    deficit = compute_deficit(Scan(points, 0.03, "template"), block, build_from_template=PLACED)
+    assert deficit.missing_mm3 == pytest.approx((block.body ^ hollow).volume(), rel=0.05)

@@ -87,8 +87,9 @@ def test_what_no_scan_saw_speaks_against_none(template: GridSdf, sound: SoundTes
         points[np.linalg.norm(points - (10.0, 10.0, 12.0), axis=1) > 4.0]
         for points in (scanned(seed) for seed in range(4))
     ]
-    centre = np.array([[10.0, 10.0, 12.0]])
-    unseen = Coverage.of(centre, np.ones(1), np.asarray(template.bounds_mm), 6.0)
+    pieces, normals = template.surface_points(0.5)
+    far = np.linalg.norm(pieces - (10.0, 10.0, 12.0), axis=1) > 4.0
+    unseen = Coverage.of(pieces, normals, np.full(len(pieces), 0.25), ~far, 2.0)
     for partial in (
         SoundTest.of(template, holed),
         SoundTest.of(replace(template, coverage=unseen), holed[:1]),

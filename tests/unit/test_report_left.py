@@ -10,7 +10,7 @@ import pytest
 
 import gcode
 from amrepair.report.data import ReportData
-from amrepair.report.left import KEYS, left_parts, shape_of
+from amrepair.report.left import LEFT_KEYS, left_parts, shape_of
 from amrepair.report.page import body
 from amrepair.report.payload import payload
 from gcode.slicing.layers import LayerGrid
@@ -69,11 +69,11 @@ def test_page_and_drawing_have_each_cause(patch: PatchPlan) -> None:
     page, looks = body(data), payload(data)["looks"]
     assert "What repairs leave" in page
     for each in patch.left:
-        assert KEYS[each.cause] in looks[0]  # type: ignore[index, operator]
-        assert f'class="dot {KEYS[each.cause]}"' in page
+        assert LEFT_KEYS[each.cause] in looks[0]  # type: ignore[index, operator]
+        assert f'class="dot {LEFT_KEYS[each.cause]}"' in page
     without = replace(data, looks=tuple(replace(look, left=()) for look in data.looks))
     assert "What repairs leave" not in body(without)
-    assert not set(KEYS.values()) & set(payload(without)["looks"][0])  # type: ignore[index]
+    assert not set(LEFT_KEYS.values()) & set(payload(without)["looks"][0])  # type: ignore[index]
 
 
 def test_columns_apart_stay_apart() -> None:
