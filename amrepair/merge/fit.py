@@ -129,7 +129,7 @@ def fit_from_scans(
     )  # fmt: skip
     progress("fuse scans", 0.0, 1.0)
     cloud = _joined(views, placed)
-    fused = fuse(cloud)
+    fused = fuse(cloud, options=options.fuse)
     progress("fuse scans", 1.0, 1.0)
     weak = {k: s for k, s in placed.slacks.items() if s.sigma_mm > cloud.sigma_mm}
     outvoted = _outvoted(cloud, fused, list(placed.poses))

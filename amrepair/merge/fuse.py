@@ -18,6 +18,7 @@ from amrepair.device import open3d
 from amrepair.errors import TemplateError
 from amrepair.merge import fuse_kernels as kernels
 from amrepair.merge.cloud import Cells
+from amrepair.merge.options import USUAL_FUSE, FuseOptions
 from amrepair.template.extract import zero_level
 from amrepair.template.grid import Coverage, surface_elements
 from amrepair.template.mesh_file import manifold_arrays
@@ -27,24 +28,10 @@ from gcode.solids import as_manifold, is_valid
 if TYPE_CHECKING:
     import trimesh
 
-LEAST_NODE_POINTS = 6  # in reach of a node, or it has no support
-FIT_ROUNDS = 3  # of the robust fit
-FIT_OUTLIER_SIGMAS, OUTLIER_SPACINGS = 5.0, 0.05
-FAR_SPACINGS = 24.0  # how far along the normal another scan's surface contradicts a point
-SUPPORT_FACING = 0.3
 MAX_NODES = 60_000_000
 BLOCK_NODES = 8  # nodes along its edge
-POISSON_DEPTH, POISSON_POINTS = 8, 150_000
 MOST_EDGES = 400  # of the grid, along the longest side
-OUTVOTED_MARKS = 2  # marks in a cell, or it is chance
-# A disc of so many of the sparsest scan's spacings that holds no point was not seen.
-SEEN_SPACINGS = 3.0
-SIDE_AGREEMENT = 0.97  # share of a component's neighbours that must agree about its side
-DUST_RATIO = 1e-3  # closed pieces smaller than this share of the whole are clutter
 SPREAD_CELLS = 5  # nodes along the edge of a cell of the stored spread
-WANTED_SPACINGS = 0.05
-LEAST_NODES = 8  # that a cell's spread is pooled from
-LEAST_SPREAD_NOISES = 1 / 3  # below this chance cannot be told from disagreement
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +134,9 @@ class Fused:
     coverage: Coverage
 
 
-def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
+def fuse(
+    cloud: Cloud, *, voxel_mm: float | None = None, options: FuseOptions = USUAL_FUSE
+) -> Fused:
     """Fuse placed scans.
 
     Parameters
@@ -160,10 +149,10 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
     TemplateError
         If the points make no closed surface, or the grid would be too large.
     """
-    against, lonely = _contradicted(cloud)
+    against, lonely = _contradicted(cloud, options)
     keep = ~(against | lonely)
     points, normals, scan = cloud.points_mm[keep], cloud.normals[keep], cloud.scan[keep]
-    radius_mm = reach_mm(cloud)
+    radius_mm = reach_mm(cloud, options)
     edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
     low, shape, nodes, index = _band(points, edge, radius_mm)
     cells = Cells.of(points, radius_mm)
@@ -172,8 +161,9 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
         np.ascontiguousarray(normals[cells.order]), np.ascontiguousarray(scan[cells.order]),
         cloud.scans, cells.grid,
         kernels.Rules(
-            radius_mm, max(cloud.sigma_mm, 1e-4 * cloud.spacing_mm), FIT_ROUNDS, LEAST_NODE_POINTS,
-            FIT_OUTLIER_SIGMAS, OUTLIER_SPACINGS * cloud.spacing_mm,
+            radius_mm, max(cloud.sigma_mm, 1e-4 * cloud.spacing_mm), options.rounds,
+            options.least_node_points, options.outlier_sigmas,
+            options.outlier_spacings * cloud.spacing_mm,
         ),
     )  # fmt: skip
     # a plane fitted to points far below says little about a node high above them
@@ -181,12 +171,14 @@ def fuse(cloud: Cloud, *, voxel_mm: float | None = None) -> Fused:
     grid = np.full(tuple(shape), np.nan, dtype=np.float32)
     grid[tuple(index.T)] = field
     seen = np.isfinite(grid)
-    _fill(grid, seen, low, edge, (points, normals))
-    mesh = solid_surface(grid, low, edge)
+    _fill(grid, seen, low, edge, (points, normals), options)
+    mesh = solid_surface(grid, low, edge, options.dust_ratio)
     close = np.isfinite(field) & (np.abs(field) < edge)
-    spread = _spread(cloud, excess, close, index, low, edge, shape) if cloud.scans > 1 else None
-    area_mm2, at_mm = _outvoted(cloud, against, nodes[close], overruled[close], radius_mm)
-    coverage = coverage_of(mesh, points, normals, SEEN_SPACINGS * cloud.sparsest_mm)
+    spread = None
+    if cloud.scans > 1:
+        spread = _spread(cloud, excess, close, index, (low, edge, shape), options)
+    area_mm2, at_mm = _outvoted(cloud, against, nodes[close], overruled[close], radius_mm, options)
+    coverage = coverage_of(mesh, points, normals, options.seen_spacings * cloud.sparsest_mm)
     return Fused(
         mesh=mesh,
         spread=spread,
@@ -207,6 +199,7 @@ def _outvoted(
     nodes_mm: Float[np.ndarray, "k 3"],
     overruled: Int[np.ndarray, " k"],
     radius_mm: float,
+    options: FuseOptions,
 ) -> tuple[Float[np.ndarray, " scans"], Float[np.ndarray, "scans 3"]]:
     """The largest connected piece of surface on which each scan was outvoted, and its middle.
 
@@ -222,7 +215,7 @@ def _outvoted(
         cell, count = np.unique(
             np.floor((places - low) / radius_mm).astype(np.int64), axis=0, return_counts=True
         )
-        cell = cell[count >= OUTVOTED_MARKS]
+        cell = cell[count >= options.outvoted_marks]
         if not len(cell):
             continue
         box = np.zeros(tuple(np.ptp(cell, axis=0) + 1), bool)
@@ -268,18 +261,20 @@ def coverage_of(
     return Coverage.of(centre, np.asarray(mesh.face_normals), area, np.isfinite(covers), reach_mm)
 
 
-def reach_mm(cloud: Cloud) -> float:
+def reach_mm(cloud: Cloud, options: FuseOptions) -> float:
     """Radius of a fit: enough points to bring the noise to a twentieth of the spacing.
 
     The kernel (1 − d²/r²)⁴ over a plane has 0.36 of its points' weight (Σw)²/Σw².
     """
-    wanted_mm = WANTED_SPACINGS * cloud.spacing_mm
+    wanted_mm = options.wanted_spacings * cloud.spacing_mm
     least = max(24.0, 8.0 * cloud.scans)  # so that each scan alone has a word
     count = float(np.clip((cloud.sigma_mm / wanted_mm) ** 2 / 0.36, least, 120.0))
     return float(np.sqrt(count / np.pi)) * cloud.spacing_mm
 
 
-def _contradicted(cloud: Cloud) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def _contradicted(
+    cloud: Cloud, options: FuseOptions
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """(n,) points that most other scans contradict; (n,) in cells that hold next to nothing."""
     cell_mm = 2.2 * cloud.spacing_mm * np.sqrt(cloud.scans)
     low = cloud.points_mm.min(axis=0) - 2 * cell_mm
@@ -299,10 +294,10 @@ def _contradicted(cloud: Cloud) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray
     table = np.full((cloud.scans, *shape), -1, dtype=np.int32)
     table.reshape(-1)[places] = np.arange(len(places))
     whose = places // int(np.prod(shape))
-    near_mm = max(0.7 * reach_mm(cloud), 5.0 * cloud.sigma_mm)
-    far_mm = max(FAR_SPACINGS * cloud.spacing_mm, 6.0 * near_mm)
+    near_mm = max(0.7 * reach_mm(cloud, options), 5.0 * cloud.sigma_mm)
+    far_mm = max(options.far_spacings * cloud.spacing_mm, 6.0 * near_mm)
     support, conflict, _ = kernels.columns(
-        place, normal, whose, table, low, cell_mm, near_mm, far_mm, SUPPORT_FACING
+        place, normal, whose, table, low, cell_mm, near_mm, far_mm, options.facing
     )
     against = conflict > support + 1
     if cloud.scans == 2:  # one word against one: the first scan's stands
@@ -310,7 +305,9 @@ def _contradicted(cloud: Cloud) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray
     around = ndimage.uniform_filter(
         np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.float32), 3
     ).reshape(-1)
-    lonely = (27.0 * around[places % int(np.prod(shape))] < LEAST_NODE_POINTS) & (support == 0)
+    lonely = (27.0 * around[places % int(np.prod(shape))] < options.least_node_points) & (
+        support == 0
+    )
     return against[surfel], lonely[surfel]
 
 
@@ -342,6 +339,7 @@ def _fill(
     low: Float[np.ndarray, " 3"],
     edge: float,
     oriented: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
+    options: FuseOptions,
 ) -> None:
     """Give the nodes without support a side: their neighbours', or that of a smooth closure."""
     parts, count = ndimage.label(~seen)
@@ -358,17 +356,17 @@ def _fill(
             touching += np.bincount(labels, minlength=count + 1)
             sides = grid[tuple(there)][mask] > 0
             positive += np.bincount(labels, weights=sides, minlength=count + 1)
-    share = positive / np.maximum(touching, 1)
+    share, sure = positive / np.maximum(touching, 1), options.side_agreement
     outer = parts[0, 0, 0]
-    clear = (share >= SIDE_AGREEMENT) | (share <= 1 - SIDE_AGREEMENT) | (touching < 30)
+    clear = (share >= sure) | (share <= 1 - sure) | (touching < 30)
     side = np.where(share > 0.5, edge, -edge).astype(np.float32)
     side[outer] = edge
     grid[~seen] = side[parts[~seen]]
-    is_leaking = share[outer] < SIDE_AGREEMENT and touching[outer] > 0
+    is_leaking = share[outer] < sure and touching[outer] > 0
     doubtful = [k for k in range(1, count + 1) if not clear[k] and k != outer]
     if is_leaking or doubtful:
         asked = np.isin(parts, [outer, *doubtful]) & ~seen
-        _ask(grid, asked, _poisson(*oriented), low, edge)
+        _ask(grid, asked, _poisson(*oriented, options), low, edge)
 
 
 def _ask(
@@ -396,16 +394,20 @@ def _ask(
     grid[asked] = found
 
 
-def _poisson(points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> MeshSdf:
+def _poisson(
+    points_mm: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    options: FuseOptions = USUAL_FUSE,
+) -> MeshSdf:
     """A closed surface through oriented points."""
     import trimesh
 
     o3d = open3d()
-    step = max(1, len(points_mm) // POISSON_POINTS)
+    step = max(1, len(points_mm) // options.poisson_points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_mm[::step]))
     cloud.normals = o3d.utility.Vector3dVector(normals[::step])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        cloud, depth=POISSON_DEPTH, scale=1.2, linear_fit=False, n_threads=1
+        cloud, depth=options.poisson_depth, scale=1.2, linear_fit=False, n_threads=1
     )[0]
     made = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), process=False)
     made.metadata["notes"] = ()  # only its distance is asked, and its sides by ray counts
@@ -415,7 +417,10 @@ def _poisson(points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
 
 
 def solid_surface(
-    grid: Float[np.ndarray, "x y z"], low: Float[np.ndarray, " 3"], edge: float
+    grid: Float[np.ndarray, "x y z"],
+    low: Float[np.ndarray, " 3"],
+    edge: float,
+    dust_ratio: float = USUAL_FUSE.dust_ratio,
 ) -> trimesh.Trimesh:
     """Marching cubes, without dust; a valid solid."""
     import manifold3d as m3
@@ -438,7 +443,7 @@ def solid_surface(
         solid = as_manifold(whole, turned[:, ::-1])
     pieces = solid.decompose()
     largest = max(abs(piece.volume()) for piece in pieces)
-    kept = [piece for piece in pieces if abs(piece.volume()) >= DUST_RATIO * largest]
+    kept = [piece for piece in pieces if abs(piece.volume()) >= dust_ratio * largest]
     solid = m3.Manifold.compose(kept) if len(kept) < len(pieces) else solid
     vertices, faces = manifold_arrays(solid)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -451,11 +456,11 @@ def _spread(
     excess: Float[np.ndarray, " k"],
     close: Bool[np.ndarray, " k"],
     index: Int[np.ndarray, "k 3"],
-    low: Float[np.ndarray, " 3"],
-    edge: float,
-    shape: Int[np.ndarray, " 3"],
+    box: tuple[Float[np.ndarray, " 3"], float, Int[np.ndarray, " 3"]],
+    options: FuseOptions,
 ) -> Spread:
     """Variance between scans pooled over coarse cells: chance averages out, disagreement stays."""
+    low, edge, shape = box
     used = close & np.isfinite(excess)
     coarse = index[used] // SPREAD_CELLS
     size = shape // SPREAD_CELLS + 1
@@ -463,9 +468,9 @@ def _spread(
     cells = int(np.prod(size))
     count = np.bincount(key, minlength=cells)
     pooled = np.bincount(key, weights=excess[used], minlength=cells) / np.maximum(count, 1)
-    pooled[count < LEAST_NODES] = 0.0
+    pooled[count < options.least_nodes] = 0.0
     found = np.sqrt(np.maximum(pooled, 0.0)).astype(np.float32)
-    found[found < LEAST_SPREAD_NOISES * cloud.sigma_mm] = 0.0
+    found[found < options.least_spread_noises * cloud.sigma_mm] = 0.0
     grown = ndimage.maximum_filter(found.reshape(tuple(size)), size=3)
     return Spread(low - 0.5 * edge, SPREAD_CELLS * edge, grown)
 

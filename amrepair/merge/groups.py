@@ -92,7 +92,9 @@ class Graph:
             spacing_mm = max(self.views[k].thin_spacing_mm for k in (*fixed, *moving))
             reach_mm = self.options.reach_spacings * spacing_mm
             within = np.geomspace(2.0 * reach_mm, reach_mm, GROUP_STEPS)
-            there = in_threads(lambda p: settled(whole, own, p, within, GROUP_POINTS), poses)
+            there = in_threads(
+                lambda p: settled(whole, own, p, within, GROUP_POINTS, self.options.judge), poses
+            )
             fits = [judged(self.views, fixed, moving, pose, self.options) for pose in there]
             fits = self._ranked(distinct(fits, own, self.options.same_size * self.size_mm))
         self._judged[key] = fits
@@ -174,7 +176,9 @@ class Graph:
             reach_mm = self.options.reach_spacings * self.views[k].thin_spacing_mm
             whole = joined(self.views, others, GROUP_POINTS)
             within = np.array([1.0, 1.0]) * reach_mm
-            group[k] = settled(whole, self.views[k].thin, group[k], within, GROUP_POINTS)
+            group[k] = settled(
+                whole, self.views[k].thin, group[k], within, GROUP_POINTS, self.options.judge
+            )
 
 
 def grouped(

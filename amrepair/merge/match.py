@@ -118,7 +118,7 @@ def _fitted(
     within = np.geomspace(first, match.last_within, 6) * size_mm
 
     def roughly(guess: Float[np.ndarray, "4 4"]) -> tuple[float, Float[np.ndarray, "4 4"]]:
-        pose = settled(fixed, moving, guess, within, match.rough_points)
+        pose = settled(fixed, moving, guess, within, match.rough_points, options.judge)
         some = moving.some(match.rough_points)
         near = fixed.tree.query(moved(moving.points_mm[some], pose))[0]
         return float((near < match.last_within * size_mm).mean()), pose
@@ -128,7 +128,9 @@ def _fitted(
     finer = np.geomspace(max(match.last_within * size_mm, last_mm), last_mm, 12)
     poses = apart([p for _, p in sorted(rough, key=lambda r: -r[0])], moving,
                   options.same_size * size_mm)[:match.most_poses]  # fmt: skip
-    poses = in_threads(lambda p: settled(fixed, moving, p, finer, match.points), poses)
+    poses = in_threads(
+        lambda p: settled(fixed, moving, p, finer, match.points, options.judge), poses
+    )
     fits = [judged(views, {i: np.eye(4)}, {j: np.eye(4)}, pose, options) for pose in poses]
     return distinct(fits, moving, options.same_size * size_mm)
 

@@ -96,6 +96,86 @@ class JointOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class FuseOptions:
+    """The field of placed scans, and the surface that is made of it.
+
+    Attributes
+    ----------
+    least_node_points
+        In reach of a node, or it has no support.
+    rounds, outlier_sigmas, outlier_spacings
+        Of the robust fit, and what is an outlier of it.
+    far_spacings, facing
+        How far along its normal another scan's surface contradicts a point, and the cosine to it.
+    outvoted_marks
+        Marks in a cell, or it is chance.
+    seen_spacings
+        A disc of so many of the sparsest scan's spacings that holds no point was not seen.
+    side_agreement
+        Share of a component's neighbours that must agree about its side.
+    dust_ratio
+        Closed pieces smaller than this share of the whole are clutter.
+    wanted_spacings
+        The mean's standard error that a reach is chosen for.
+    least_nodes, least_spread_noises
+        That a cell's spread is pooled from; and a share of the noise, below which chance cannot be
+        told from disagreement.
+    poisson_depth, poisson_points
+        Of the closure where nothing was seen (Kazhdan and Hoppe 2013).
+    """
+
+    least_node_points: int = 6
+    rounds: int = 3
+    outlier_sigmas: float = 5.0
+    outlier_spacings: float = 0.05
+    far_spacings: float = 24.0
+    facing: float = 0.3
+    outvoted_marks: int = 2
+    seen_spacings: float = 3.0
+    side_agreement: float = 0.97
+    dust_ratio: float = 1e-3
+    wanted_spacings: float = 0.05
+    least_nodes: int = 8
+    least_spread_noises: float = 1 / 3
+    poisson_depth: int = 8
+    poisson_points: int = 150_000
+
+
+USUAL_FUSE = FuseOptions()
+"""What scans are fused by."""
+
+
+@dataclass(frozen=True, slots=True)
+class JudgeOptions:
+    """How one view is held against another.
+
+    Attributes
+    ----------
+    points
+        Of each, at most.
+    paired, agrees
+        Cosine between normals of points that may be, and that are, one surface.
+    least_pairs
+        Of two views that are settled on each other.
+    loss_reach
+        Scale of the loss, of how far pairs may lie apart.
+    over_spacings
+        Over or under a surface is where it has a point within so many spacings; chance leaves such
+        a place without one in exp(-pi) = 4 %.
+    above
+        Cosine to a surface's normal: above or below it, not beside it.
+    """
+
+    points: int = 3_000
+    paired: float = 0.5
+    agrees: float = 0.8
+    least_pairs: int = 30
+    loss_reach: float = 0.3
+    over_spacings: float = 1.0
+    above: float = 0.8
+
+
+@dataclass(frozen=True, slots=True)
 class MergeOptions:
     """Each figure once. "Noise" is a scan's own, "spacing" its own, "size" the part's diagonal.
 
@@ -121,7 +201,7 @@ class MergeOptions:
         it (spacings), and noise.
     same_size
         Of the size: poses that differ by less are one.
-    match, joint
+    match, joint, judge, fuse
         Of each stage.
     """
 
@@ -139,6 +219,8 @@ class MergeOptions:
     same_size: float = 0.02
     match: MatchOptions = field(default_factory=MatchOptions)
     joint: JointOptions = field(default_factory=JointOptions)
+    judge: JudgeOptions = field(default_factory=JudgeOptions)
+    fuse: FuseOptions = field(default_factory=FuseOptions)
 
     def overlap(self, *, guessed: bool) -> float:
         """Of one group on another, at least."""

@@ -14,7 +14,7 @@ from amrepair.merge.groups import Graph, grouped
 from amrepair.merge.joint import Slack, slacks, together
 from amrepair.merge.options import USUAL_MERGE, MergeOptions
 from amrepair.merge.told import of_views, on_turntable
-from amrepair.merge.views import JUDGED_POINTS, Fit, Placed, View, joined, judged
+from amrepair.merge.views import Fit, Placed, View, joined, judged
 from gcode.progress import Progress, silent
 
 # Sensors within this of one direction (cosine) did not walk round the part: it turned.
@@ -166,7 +166,7 @@ def _consistent(
         if not bad:
             break
         worst = min(bad, key=lambda k: bad[k].score)
-        gap_mm = _gap_mm(views, kept, worst)
+        gap_mm = _gap_mm(views, kept, worst, options)
         dropped[worst] = bad[worst].why_not(options) + (
             f"; where they face each other its surface is {gap_mm:.2f} mm off in the median"
             if np.isfinite(gap_mm) else ""
@@ -175,9 +175,9 @@ def _consistent(
     return kept, dropped
 
 
-def _gap_mm(views: Sequence[View], poses: Placed, k: int) -> float:
+def _gap_mm(views: Sequence[View], poses: Placed, k: int, options: MergeOptions) -> float:
     """Median height of a view over the others' surface beside it; NaN where there is none."""
-    rest = joined(views, {m: p for m, p in poses.items() if m != k}, JUDGED_POINTS)
+    rest = joined(views, {m: p for m, p in poses.items() if m != k}, options.judge.points)
     points = moved(views[k].thin.points_mm, poses[k])
     within = GAP_SPACINGS * views[k].thin_spacing_mm
     distance, index = rest.tree.query(points, distance_upper_bound=within)

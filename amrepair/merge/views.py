@@ -17,7 +17,7 @@ from amrepair.errors import InputError
 from amrepair.frames import motion_about, moved
 from amrepair.merge import sight
 from amrepair.merge.cloud import outward, planes, spacing_of
-from amrepair.merge.options import MergeOptions
+from amrepair.merge.options import JudgeOptions, MergeOptions
 from amrepair.merge.threads import in_threads
 from amrepair.scans import Scan
 
@@ -25,14 +25,6 @@ LEAST_VIEW_POINTS = 2_000
 MAX_POINTS = 400_000  # of one scan; more add time, not accuracy
 THIN_POINTS, IMAGE_POINTS, GUESS_POINTS = 15_000, 40_000, 8_000
 CLEAR = 0.2  # cosine of a normal to a sensor's ray, or it is not clear which way it faces
-JUDGED_POINTS = 3_000
-PAIRED, AGREES = 0.5, 0.8  # cosine between normals of points that may be, and that are, one surface
-LEAST_VIEW_PAIRS = 30
-LOSS_REACH = 0.3  # scale of the loss, of how far pairs may lie apart
-# Over or under a surface is where it has a point within so many spacings; chance leaves such a
-# place without one in exp(-pi) = 4 %.
-OVER_SPACINGS = 1.0
-ABOVE = 0.8  # cosine to a surface's normal: above or below it, not beside it
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,6 +253,7 @@ def settled(
     pose: Float[np.ndarray, "4 4"],
     within_mm: Float[np.ndarray, " steps"],
     count: int,
+    options: JudgeOptions,
 ) -> Float[np.ndarray, "4 4"]:
     """The pose after some steps point to plane, each with pairs no farther apart than it says."""
     some = moving.some(count)
@@ -271,12 +264,12 @@ def settled(
         near = np.isfinite(distance)
         index = index[near]
         normals = moving.normals[some][near] @ found[:3, :3].T
-        facing = (normals * fixed.normals[index]).sum(axis=1) > PAIRED
-        if facing.sum() < LEAST_VIEW_PAIRS:
+        facing = (normals * fixed.normals[index]).sum(axis=1) > options.paired
+        if facing.sum() < options.least_pairs:
             return found
         here, normal = points[near][facing], fixed.normals[index[facing]]
         height = ((here - fixed.points_mm[index[facing]]) * normal).sum(axis=1)
-        found = _step(here, normal, height, max(LOSS_REACH * reach_mm, 1e-9)) @ found
+        found = _step(here, normal, height, max(options.loss_reach * reach_mm, 1e-9)) @ found
     return found
 
 
@@ -313,7 +306,7 @@ def judged(
     """How well one group of placed views, in a pose, agrees with what the other saw."""
     there = {k: pose @ own for k, own in moving.items()}
     every = {**fixed, **there}
-    everything = joined(views, every, JUDGED_POINTS)
+    everything = joined(views, every, options.judge.points)
 
     def marks(between: tuple[int, int]) -> Int[np.ndarray, "3 _"]:
         a, b = between
@@ -346,7 +339,7 @@ def _marks(
     off_mm = options.off_spacings * spacing_mm + options.off_noises * noise_mm
     free_mm = options.free_spacings * spacing_mm + options.off_noises * noise_mm
     reach_mm = options.reach_spacings * spacing_mm + options.off_noises * noise_mm
-    some = other.thin.some(JUDGED_POINTS)
+    some = other.thin.some(options.judge.points)
     points = moved(other.thin.points_mm[some], pose)
     normals = other.thin.normals[some] @ pose[:3, :3].T
     sighted = bool(view.looks.each)
@@ -355,14 +348,14 @@ def _marks(
     )
     near = distance < reach_mm
     index = np.where(np.isfinite(distance), index, 0)
-    near &= (normals * view.thin.normals[index]).sum(axis=1) > AGREES
+    near &= (normals * view.thin.normals[index]).sum(axis=1) > options.judge.agrees
     height = ((points - view.thin.points_mm[index]) * view.thin.normals[index]).sum(axis=1)
     on = near & (np.abs(height) <= min(off_mm, free_mm))
     # beside an edge, the nearest surface is the step's other level
-    over = distance**2 - height**2 <= (OVER_SPACINGS * spacing_mm) ** 2
+    over = distance**2 - height**2 <= (options.judge.over_spacings * spacing_mm) ** 2
     off = near & over & (np.abs(height) > off_mm)
     if not sighted:  # a point over the middle of a surface is not beside it, however far
-        off |= (distance > reach_mm) & (np.abs(height) > ABOVE * distance)
+        off |= (distance > reach_mm) & (np.abs(height) > options.judge.above * distance)
     beside = view.looks.free(points, free_mm, normals, veil) & ~on
     asked = np.flatnonzero(beside)
     through = np.zeros(len(points), bool)
