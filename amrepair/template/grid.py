@@ -135,7 +135,7 @@ class Coverage:
         (k,) whether nobody saw it.
     reach_mm
         A place farther from a piece says nothing of it; so far apart are pieces of one place that
-        face at right angles, so that neither tells of the other.
+        face opposite ways, so that neither tells of the other.
     unseen_mm2
         Area that nobody saw.
     """
@@ -207,8 +207,8 @@ class Coverage:
 def surface_elements(
     places_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], reach_mm: float
 ) -> Float[np.ndarray, "n 6"]:
-    """(n, 6) places with how they face: those at right angles lie `reach_mm` apart at least."""
-    return np.hstack([places_mm, reach_mm / np.sqrt(2.0) * normals])
+    """(n, 6) places with how they face: opposite ways they lie `reach_mm` apart at least."""
+    return np.hstack([places_mm, 0.5 * reach_mm * normals])
 
 
 @dataclass(frozen=True, slots=True)
