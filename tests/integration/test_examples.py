@@ -97,6 +97,7 @@ NEEDS = {"02_template_from_scans": "amrepair.merge", "05_octoprint": "gcode.host
 SLOW = {
     "02_template_from_scans",
     "03_layerwise_loop",
+    "04_real_printer_over_serial",
     "07_custom_scanner",
     "08_custom_defect",
 }  # fits, whole runs

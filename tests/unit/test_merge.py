@@ -229,6 +229,7 @@ def halves(part: AnalyticTemplate, first_mm: float, second_mm: float) -> list[Sc
     return found
 
 
+@pytest.mark.slow
 def test_overlapping_partial_scans_find_each_other(part: AnalyticTemplate) -> None:
     found = placed_together(halves(part, 34.0, 5.0))
     turn, shift = pose(1)

@@ -34,6 +34,7 @@ def in_holes(points: np.ndarray) -> np.ndarray:
     return np.asarray(far < RADIUS_MM)
 
 
+@pytest.mark.slow
 def test_a_merged_scan_with_holes_is_a_template_that_knows_them(tmp_path: Path) -> None:
     points = cloud(40_000, 0)
     seen = points[~in_holes(points)]

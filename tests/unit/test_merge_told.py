@@ -121,6 +121,7 @@ def test_turns_about_an_axis_come_from_one_pair() -> None:
     assert placed[8] @ pair == pytest.approx(np.eye(4), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_depth_camera_with_a_millimetre_of_noise_finds_its_views() -> None:
     """Limits are in units of the noise: 1 mm on a part of 120 mm, as 0.03 mm on one of 40 mm."""
     rng = np.random.default_rng(0)
