@@ -3,11 +3,12 @@
 It turns a detected difference into geometry with a tolerance; it does not decide what to print.
 """
 
-from amrepair.deficit.compute import Deficit, Standing, compute_deficit, measured_regions
+from amrepair.deficit.compute import AsBuilt, Deficit, Standing, compute_deficit, measured_regions
 from amrepair.deficit.heights import as_built_heights
 from amrepair.deficit.line_heights import standing_in_job
 
 __all__ = [
+    "AsBuilt",
     "Deficit",
     "Standing",
     "as_built_heights",

@@ -65,6 +65,22 @@ class Standing:
 
 
 @dataclass(frozen=True, slots=True)
+class AsBuilt:
+    """How what stands on the bed is made, where the caller knows more than one scan and solids.
+
+    Attributes
+    ----------
+    seen
+        Makes the scan's heights, which wait for no solid.
+    standing
+        Makes of them and of what is missing (build frame) what stands there (`standing_in_job`).
+    """
+
+    seen: Callable[[], HeightField]
+    standing: Callable[[HeightField, manifold3d.Manifold], HeightField]
+
+
+@dataclass(frozen=True, slots=True)
 class Deficit:
     """What is missing and what is too much, build frame.
 
@@ -120,7 +136,7 @@ def compute_deficit(
     build_from_template: Transform,
     tolerance_mm: float | None = None,
     printed_z_mm: float | None = None,
-    as_built: Callable[[manifold3d.Manifold], HeightField] | None = None,
+    as_built: AsBuilt | None = None,
     beads: PlannedBeads | None = None,
     options: DeficitOptions = USUAL_DEFICIT,
     progress: Progress = silent,
@@ -140,8 +156,7 @@ def compute_deficit(
     printed_z_mm
         Height printed so far, build frame; None is the template's own top.
     as_built
-        Makes what stands on the bed of what is missing (build frame), where the caller knows more
-        (`standing_in_job`); None has it made of scan and solids.
+        What makes what stands on the bed; None has it made of scan and solids.
     options
         How solids and heights are made.
     beads
@@ -159,7 +174,7 @@ def compute_deficit(
     if not tau_mm >= 0:
         raise DeficitError(f"the tolerance is {tau_mm} mm; it must be ≥ 0")
     evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
-    look = partial(
+    look = as_built.seen if as_built is not None else partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
         options=options.heights,
@@ -167,7 +182,7 @@ def compute_deficit(
     of_label = {Label.MISSING: lines, Label.EXCESS: None}
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
         many = _roughly_missing(anomaly, evidence) > options.early_mm3
-        early = beside.submit(look) if many and as_built is None else None
+        early = beside.submit(look) if many else None
         solids = {
             label: pieces_of(template, evidence, anomaly, label, tau_mm, gone, options, progress)
             for label, gone in of_label.items()
@@ -180,9 +195,9 @@ def compute_deficit(
     missing, excess = (_in_build_frame(found, build_from_template) for found in solids.values())
 
     def stands() -> HeightField:
-        if as_built is not None:
-            return as_built(missing)
         seen = look() if early is None else early.result()
+        if as_built is not None:
+            return as_built.standing(seen, missing)
         parts = missing, excess
         return _standing(seen, scan, template, build_from_template, *parts, evidence, options)
 

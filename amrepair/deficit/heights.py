@@ -183,9 +183,8 @@ def _sharpened(
     at = cells_over(seen, fine)
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
     # beside walls, where the solids are the sharper of the two unless something else stands there
-    around = 2 * math.ceil(options.by_wall_cells * seen.cell_mm / fine.cell_mm) + 1
-    highest, lowest = ndimage.maximum_filter(z_mm, around), ndimage.minimum_filter(z_mm, around)
-    by_wall = (highest - lowest > options.trust_mm) & (seen.z_mm[at] < highest + options.trust_mm)
+    around = around_walls(seen, fine, options)
+    by_wall = beside_walls(z_mm, seen.z_mm[at], around, options)
     # where nothing is missing and the scan agrees, its noise would only raise what is highest
     off_mm = seen.z_mm[at] - z_mm
     agrees = ~gone & ((np.abs(off_mm) < options.noise_mm) | _by_chance(off_mm, around, options))
@@ -199,6 +198,25 @@ def _sharpened(
     return HeightField(
         fine.origin_mm, fine.cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim
     )
+
+
+def around_walls(seen: HeightField, fine: HeightField, options: HeightOptions) -> int:
+    """Cells of the fine grid across which a cell of the scan may be wrong beside a wall."""
+    return 2 * math.ceil(options.by_wall_cells * seen.cell_mm / fine.cell_mm) + 1
+
+
+def beside_walls(
+    planned_mm: Float[np.ndarray, "ny nx"],
+    seen_mm: Float[np.ndarray, "ny nx"],
+    around: int,
+    options: HeightOptions,
+) -> Bool[np.ndarray, "ny nx"]:
+    """Cells beside a planned step, but for those in which something higher than it was seen."""
+    highest, lowest = (
+        of(planned_mm, around) for of in (ndimage.maximum_filter, ndimage.minimum_filter)
+    )
+    is_step = highest - lowest > options.trust_mm
+    return np.asarray(is_step & (seen_mm < highest + options.trust_mm))
 
 
 def cells_over(

@@ -7,14 +7,14 @@ lines lie to the hundredth of a millimetre; what is missing says which of them d
 
 from __future__ import annotations
 
-import math
-
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from amrepair.deficit.heights import (
+    around_walls,
+    beside_walls,
     cells_over,
     fine_over,
     with_what_stands_out,
@@ -90,7 +90,7 @@ def standing_lines(
         known[rows, columns],
         planned_mm,
         gone,
-        2 * math.ceil(options.by_wall_cells * seen.cell_mm / fine.cell_mm) + 1,
+        around_walls(seen, fine, options),
         options,
     )
     return HeightField(fine.origin_mm, fine.cell_mm, z_mm, known)
@@ -116,10 +116,7 @@ def _steps_of_plan(
     level_mm = ndimage.uniform_filter(np.where(agrees, off_mm, 0.0), around)
     # how far off the plan what lies around was seen to be
     as_planned_mm = planned_mm + level_mm / np.maximum(share, 1.0 / around**2)
-    highest, lowest = (
-        of(planned_mm, around) for of in (ndimage.maximum_filter, ndimage.minimum_filter)
-    )
-    by_wall = (highest - lowest > options.trust_mm) & (seen_mm < highest + options.trust_mm)
+    by_wall = beside_walls(planned_mm, seen_mm, around, options)
     rim = ndimage.maximum_filter(gone, around)
     by_plan = np.where(told, by_wall & (off_mm >= options.trust_mm), rim)
     return np.where(by_plan, as_planned_mm, seen_mm), told | rim

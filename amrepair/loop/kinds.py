@@ -216,8 +216,8 @@ def _moved_so(
 ) -> bool:
     """Whether surface stands off wherever a motion of all of it has it do so, band by band.
 
-    Of what broke off, or lies on it, the rest is where it was. Bands begin at
-    shares of the farthest.
+    Of what broke off, or lies on it, the rest is where it was. Bands begin at shares of the
+    farthest.
     """
     band = np.digitize(told_mm / told_mm.max(), bands)
     seen = (seen_mm[band == k] / told_mm[band == k] for k in range(1, len(bands) + 1))

@@ -242,10 +242,8 @@ class ProbeScanner:
             z_mm = self._feel(ask, flats, standing, rest, f"touch {stop.label}", count)
             if len(repeated):
                 same = z_mm[: len(repeated) + 1]
-                sigma_mm, repeated = (
-                    measured_sigma_mm(same, self._probe.sigma_mm, self._options),
-                    places[:0],
-                )
+                sigma_mm = measured_sigma_mm(same, self._probe.sigma_mm, self._options)
+                repeated = places[:0]
                 z_mm = np.append(same.mean(), z_mm[len(same) :])
             count += len(ask)
             felt_mm = np.concatenate([felt_mm, np.column_stack([places, z_mm])])

@@ -13,7 +13,7 @@ import numpy as np
 from amrepair.align import align
 from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
-from amrepair.deficit import Deficit, as_built_heights, compute_deficit, standing_in_job
+from amrepair.deficit import AsBuilt, Deficit, as_built_heights, compute_deficit, standing_in_job
 from amrepair.deficit.options import DeficitOptions
 from amrepair.frames import Transform
 from amrepair.observe.rays import RangeImage, range_images
@@ -216,31 +216,32 @@ def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -
         anomaly,
         build_from_template=laid.placed,
         printed_z_mm=site.printed_z_mm,
-        as_built=None if site.planned is None else partial(_stands, laid, anomaly, site),
+        as_built=None if site.planned is None else _as_built(laid, anomaly, site),
         options=_deficit_options(site),
         beads=site.beads,
         progress=progress,
     )
 
 
-def _stands(
-    laid: _Laid, anomaly: AnomalyMap, site: Site, missing: manifold3d.Manifold
-) -> HeightField:
+def _as_built(laid: _Laid, anomaly: AnomalyMap, site: Site) -> AsBuilt:
     """What stands there is all that was seen, the bottoms of open cells too."""
     evidence = anomaly.evidence
     assert evidence is not None
-    options = _deficit_options(site).heights
-    seen = as_built_heights(
-        laid.whole,
-        site.template,
+    spacing_mm, images, options = (
         evidence.spacing_mm,
-        build_from_template=laid.placed,
-        printed_z_mm=site.printed_z_mm,
-        options=options,
-        images=evidence.images,
+        evidence.images,
+        _deficit_options(site).heights,
     )
-    scan = laid.whole.moved(laid.placed)
-    return standing_in_job(seen, site.lines, missing, scan, evidence.spacing_mm, options)
+
+    def standing(seen: HeightField, missing: manifold3d.Manifold) -> HeightField:
+        scan = laid.whole.moved(laid.placed)
+        return standing_in_job(seen, site.lines, missing, scan, spacing_mm, options)
+
+    seen = partial(
+        as_built_heights, laid.whole, site.template, spacing_mm, images=images, options=options,
+        build_from_template=laid.placed, printed_z_mm=site.printed_z_mm,
+    )  # fmt: skip
+    return AsBuilt(seen, standing)
 
 
 def _deficit_options(site: Site) -> DeficitOptions:

@@ -27,6 +27,7 @@ class Distances(Protocol):
         ...
 
 
+@runtime_checkable
 class Template(Distances, Protocol):
     """A signed distance field of the expected part."""
 
