@@ -20,6 +20,7 @@ from amrepair.cli.options import (
     SeedOption,
     SensorOption,
     calibration_named,
+    numbers,
     part_pose,
     sensors,
 )
@@ -86,6 +87,13 @@ def repair(
             "or job: it stands still where --job prints it.",
         ),
     ] = None,
+    damage_at: Annotated[
+        str | None,
+        typer.Option(
+            help="X,Y: where on the bed the largest damage is, roughly; for a part that looks the "
+            "same in several turns."
+        ),
+    ] = None,
     on_fixture: Annotated[
         bool,
         typer.Option(
@@ -121,6 +129,7 @@ def repair(
         raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
     if pose == OF_JOB and job is None:
         raise InputError("--part-pose job takes the place from the job; name it by --job JOB.gcode")
+    damage_at_mm = _damage_at(damage_at, scan_frame)
     text = program_text(job) if job is not None else None
     setup, _ = job_setup(text, job or "", printer, material, process)
     _ = setup.printer.head  # refused before any work
@@ -169,6 +178,7 @@ def repair(
             grid,
             placed if frame == "scanner" else None,
             on_fixture=on_fixture,
+            damage_at_mm=damage_at_mm,
             calibration=known_errors,
         )
         plan = plan_repair(
@@ -249,6 +259,19 @@ def repair(
             console.out.print(f"Left open inside: {line}.", markup=False)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+def _damage_at(text: str | None, scan_frame: str) -> tuple[float, float] | None:
+    """Where on the bed the largest damage was said to be, mm."""
+    if text is None:
+        return None
+    if scan_frame == "build":
+        raise InputError(
+            "--damage-at tells the turns of a part apart whose scan is in the scanner's frame; a "
+            "scan in the build frame tells them itself: leave it out, or say --scan-frame unknown"
+        )
+    x_mm, y_mm = numbers(text, 2, "--damage-at")
+    return float(x_mm), float(y_mm)
 
 
 def _foot_z_mm(template: Template, plan: RepairPlan) -> float:

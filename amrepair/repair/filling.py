@@ -8,14 +8,11 @@ from dataclasses import replace
 import manifold3d
 import numpy as np
 
-from amrepair.align.registration import Registration
 from amrepair.deficit import Deficit
-from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.policy import PolicyOptions, worth
 from amrepair.regions import Label, Region
 from amrepair.repair.site import Site
-from amrepair.scans import Scan
 from gcode.slicing.job_lines import JobLines
 
 
@@ -52,25 +49,3 @@ def _region_of(piece: manifold3d.Manifold, regions: list[Region]) -> Region:
     box = np.asarray(piece.bounding_box()).reshape(2, 3)
     off_mm = [float(np.abs(np.asarray(region.box_mm) - box).max()) for region in regions]
     return regions[int(np.argmin(off_mm))]
-
-
-def refuse_ambiguity(scan: Scan, site: Site, registration: Registration, deficit: Deficit) -> None:
-    """Refuse a pose that fits no better than another which would repair something else."""
-    if site.build_from_template is None or deficit.missing.is_empty():
-        return  # the scan is in the build frame: every pose that fits puts the repair there
-    for other in registration.symmetric_alternatives:
-        # the same scanned hole, seen in the template through the other pose
-        motion = (
-            site.build_from_template
-            @ other
-            @ registration.template_from_scan.inverse()
-            @ site.build_from_template.inverse()
-        )
-        turned = deficit.missing.transform(motion.matrix[:3])
-        shared_mm3 = (turned ^ deficit.missing).volume()
-        if shared_mm3 < site.options.same_repair_ratio * deficit.missing_mm3:
-            raise AlignmentError(
-                f"the scan {scan.source} fits its template in "
-                f"{1 + len(registration.symmetric_alternatives)} poses equally well, and they "
-                "would repair different places; scan in the build frame or give a better pose"
-            )

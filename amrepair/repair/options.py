@@ -31,6 +31,8 @@ class RepairOptions:
         A part stands upright where its Z is the bed's: 1 − cos of 0.05 mm over 100 mm.
     same_repair_ratio
         Two poses whose repairs share less than this are two different repairs.
+    damage_told_within_mm
+        A hand shows where on the bed a damage is no more exactly than this.
     align, regions, deficit, patch
         Of each stage. What the process may leave, and how far it wanders, is the site's.
     """
@@ -43,6 +45,7 @@ class RepairOptions:
     just_printed_margin_mm: float = 0.0
     upright: float = 1e-7
     same_repair_ratio: float = 0.8
+    damage_told_within_mm: float = 3.0
     align: AlignOptions = field(default_factory=AlignOptions)
     regions: RegionOptions = field(default_factory=RegionOptions)
     deficit: DeficitOptions = field(default_factory=DeficitOptions)

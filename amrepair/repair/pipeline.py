@@ -20,7 +20,8 @@ from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.calibration import of_touches
 from amrepair.repair import in_view
-from amrepair.repair.filling import fillable, lines_of, refuse_ambiguity
+from amrepair.repair.alike import registration_of_damage
+from amrepair.repair.filling import fillable, lines_of
 from amrepair.repair.plan import RepairPlan
 from amrepair.repair.site import Site
 from amrepair.repair.stopwatch import Stopwatch
@@ -90,12 +91,12 @@ def plan_repair(
         site = replace(site, calibration=of_touches(scan.sigma_mm, site.process_sigma_mm))
     with watch("align"):
         laid = _align(scan, site, guess, rng, progress)
-    with watch("detect"):
-        anomaly = _detect(laid, site, progress)
-    with watch("deficit"):
-        deficit = _deficit(laid, anomaly, site, progress)
-        refuse_ambiguity(scan, site, laid.registration, deficit)
-        missing = fillable(deficit, wanted, site.policy)
+    anomaly, deficit = _judge(laid, site, watch, progress)
+    chosen = registration_of_damage(scan, site, laid.registration, deficit)
+    if chosen is not laid.registration:
+        laid = laid.by(chosen)
+        anomaly, deficit = _judge(laid, site, watch, progress)
+    missing = fillable(deficit, wanted, site.policy)
     plan = laid.plan(anomaly, deficit, site)
     if missing.is_empty():
         return plan
@@ -133,6 +134,17 @@ class _Laid:
     judged: Scan
     images: tuple[RangeImage, ...] | None
     known: bool
+
+    def by(self, other: Registration) -> _Laid:
+        """The same scan in another pose of the part that it fits as well."""
+        motion = other.template_from_scan @ self.registration.template_from_scan.inverse()
+        return replace(
+            self,
+            registration=other,
+            whole=self.whole.moved(motion),
+            judged=self.judged.moved(motion),
+            images=None if self.images is None else tuple(i.moved(motion) for i in self.images),
+        )
 
     def plan(self, anomaly: AnomalyMap, deficit: Deficit, site: Site) -> RepairPlan:
         """The verdict, as yet without a program."""
@@ -186,6 +198,16 @@ def _align(
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
         known is not None,
     )
+
+
+def _judge(
+    laid: _Laid, site: Site, watch: Stopwatch, progress: Progress
+) -> tuple[AnomalyMap, Deficit]:
+    """Find the regions, and make solids of them."""
+    with watch("detect"):
+        anomaly = _detect(laid, site, progress)
+    with watch("deficit"):
+        return anomaly, _deficit(laid, anomaly, site, progress)
 
 
 def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:

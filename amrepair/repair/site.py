@@ -57,6 +57,9 @@ class Site:
         What sound parts look like to this scanner; None: as the scan itself tells.
     on_fixture
         Somebody said that a finished part's foot is above the bed.
+    damage_at_mm
+        (2,) where on the bed somebody said that the largest damage is; it tells the poses of a
+        symmetric part apart.
     beads
         What the job has laid so far, template frame: lines that were skipped are looked for.
     lines
@@ -94,6 +97,7 @@ class Site:
     calibration: Calibration | None = None
     planned: Template | None = None
     on_fixture: bool = False
+    damage_at_mm: tuple[float, float] | None = None
     beads: PlannedBeads | None = None
     lines: JobLines | None = None
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
