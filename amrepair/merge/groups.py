@@ -4,13 +4,15 @@ Every view begins as a group of its own. The two groups that are surest of each 
 then the next: most of the smaller on what the other saw, next to nothing of any view in another's
 free space, and no second pose nearly as good. A pair that is wrong contradicts what the other pairs
 of its groups say, and is outvoted (cycles: Zach, Klopschitz and Pollefeys, CVPR 2010). What never
-becomes sure stays a group of its own, and is said.
+becomes sure stays a group of its own, and is said. A join that was wrong shows in that neither half
+fits anywhere any more: where half of a group is surer of another group than of its own other half,
+the join is undone.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,6 +35,24 @@ GROUP_POINTS = 3_000  # of each view, that groups are settled on
 GROUP_STEPS = 8
 
 Pairs = dict[tuple[int, int], list[Fit]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Join:
+    """Two groups that became one: what they were, and the score that held them together."""
+
+    halves: tuple[Placed, Placed]
+    score: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Surest:
+    """Of many pairs of groups the one that is surest: by their places in a list, and how."""
+
+    margin: float
+    fixed: int
+    moving: int
+    fit: Fit
 
 
 @dataclass(slots=True)
@@ -61,6 +81,7 @@ class Graph:
     _judged: dict[tuple[frozenset[int], frozenset[int], int], list[Fit]] = field(
         default_factory=dict
     )
+    _joins: dict[frozenset[int], _Join] = field(default_factory=dict)
 
     def proposed(self, fixed: Placed, moving: Placed) -> list[Float[np.ndarray, "4 4"]]:
         """Poses of one group in the other's frame, those that most pairs speak for first."""
@@ -120,30 +141,64 @@ class Graph:
         while len(self.groups) > 1:
             progress("place views", float(len(self.views) - len(self.groups)),
                      float(len(self.views)))  # fmt: skip
-            best: tuple[float, int, int, Fit] | None = None
-            for a, b in itertools.combinations(range(len(self.groups)), 2):
-                fixed, moving = self._sides(a, b)
-                fits = self.ways(self.groups[fixed], self.groups[moving])
-                if self.why_not(fits):
-                    continue
-                margin = fits[0].score - (fits[1].score if len(fits) > 1 else 0.0)
-                if best is None or margin > best[0]:
-                    best = margin, fixed, moving, fits[0]
+            every = itertools.combinations(range(len(self.groups)), 2)
+            best = self._surest(self.groups, every)
             if best is None:
-                return
-            _, fixed, moving, fit = best
-            if self._has_rival(fixed, moving):
-                continue
-            self.groups[fixed] |= {k: fit.pose @ p for k, p in self.groups[moving].items()}
-            del self.groups[moving]
-            self.even(max(fixed - (moving < fixed), 0))
+                if not self._undo_a_join():
+                    return
+            elif not self._has_rival(self.groups[best.fixed], self.groups[best.moving]):
+                self.join(best.fixed, best.moving, best.fit)
 
-    def _has_rival(self, fixed: int, moving: int) -> bool:
+    def _surest(self, groups: Sequence[Placed], pairs: Iterable[tuple[int, int]]) -> _Surest | None:
+        """The pair of some groups whose best pose is farthest before the next; None is sure."""
+        best: _Surest | None = None
+        for a, b in pairs:  # the larger group stays
+            fixed, moving = (a, b) if len(groups[a]) >= len(groups[b]) else (b, a)
+            fits = self.ways(groups[fixed], groups[moving])
+            if self.why_not(fits):
+                continue
+            margin = fits[0].score - (fits[1].score if len(fits) > 1 else 0.0)
+            if best is None or margin > best.margin:
+                best = _Surest(margin, fixed, moving, fits[0])
+        return best
+
+    def join(self, fixed: int, moving: int, fit: Fit) -> None:
+        """Two groups, by their places, become one whose poses share out what they disagree."""
+        halves = self.groups[fixed], self.groups[moving]
+        whole = halves[0] | {k: fit.pose @ pose for k, pose in halves[1].items()}
+        self._joins[frozenset(whole)] = _Join(halves, fit.score)
+        kept = [group for k, group in enumerate(self.groups) if k not in (fixed, moving)]
+        self.groups = [*kept, whole]
+        self.even(len(kept))
+
+    def _undo_a_join(self) -> bool:
+        """Whether half of a group is surer of another group than of its other half: it goes there.
+
+        The sum of the scores that hold the groups together grows each time, so that it ends.
+        """
+        for own, group in enumerate(self.groups):
+            was = self._joins.get(frozenset(group))
+            if was is None:
+                continue
+            others = [g for k, g in enumerate(self.groups) if k != own]
+            apart_ = [*others, *was.halves]
+            halves = range(len(others), len(apart_))
+            best = self._surest(apart_, itertools.product(range(len(others)), halves))
+            if best is None or best.fit.score <= was.score:
+                continue
+            if self._has_rival(apart_[best.fixed], apart_[best.moving]):
+                return True  # more is known of that pair now: all is asked again
+            self.groups = apart_
+            self.join(best.fixed, best.moving, best.fit)
+            return True
+        return False
+
+    def _has_rival(self, fixed: Placed, moving: Placed) -> bool:
         """Whether every rotation of the pair that shares most proposes more; asked once a pair.
 
         Features find one pose of a part that lies on itself in several, and say nothing of these.
         """
-        between = [(min(i, j), max(i, j)) for i in self.groups[fixed] for j in self.groups[moving]]
+        between = [(min(i, j), max(i, j)) for i in fixed for j in moving]
         best = max((p for p in between if self.pairs.get(p)),
                    key=lambda p: self.pairs[p][0].score)  # fmt: skip
         if best in self.searched or len(between) > len(self.views):
@@ -163,10 +218,6 @@ class Graph:
             for sides, said in self._judged.items()
             if not any(one in a and other in b for a, b in (sides[:2], sides[1::-1]))
         }
-
-    def _sides(self, a: int, b: int) -> tuple[int, int]:
-        """The larger group stays."""
-        return (a, b) if len(self.groups[a]) >= len(self.groups[b]) else (b, a)
 
     def even(self, number: int) -> None:
         """Share out what a group's poses disagree, each but the first against all others."""

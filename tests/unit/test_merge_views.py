@@ -327,3 +327,27 @@ def test_sensor_at_is_given_once_or_for_each(tmp_path: Path, bracket: Shape) -> 
     answer = CliRunner().invoke(app, [*call, "--sensor-at", "0,0,1", "--sensor-at", "0,0,2"])
     assert isinstance(answer.exception, InputError)
     assert "2 times for 3 scans" in str(answer.exception)
+
+
+def test_a_join_that_was_wrong_is_undone(bracket: Shape) -> None:
+    """Regression: two halves of a smooth part, one of them wrong in itself, never became one."""
+    ways = [(1.0, 0.3, 1.2), (-0.4, 1.0, 1.1), (-1.0, -0.5, 1.0), (0.5, -1.0, 1.2)]
+    rng = np.random.default_rng(0)
+    scans = [view_of(bracket, way, k, moves=False, count=16_000)[0] for k, way in enumerate(ways)]
+    views = [View.of(scan, rng) for scan in scans]
+    options = MergeOptions()
+    graph = Graph(views, max(view.size_mm for view in views), options)
+    true = np.eye(4)
+    for i, j in itertools.combinations(range(4), 2):
+        graph.add((i, j), [judged(views, {i: true}, {j: true}, true, options)])
+        graph.searched.add((i, j))
+    turned = np.eye(4)
+    turned[:3, :3] = rotation_from_vector(np.array([0.0, 0.0, 0.6]))
+    wrong = judged(views, {2: true}, {3: true}, turned, options)
+    graph.groups = [{0: true, 1: true}, {2: true}, {3: true}]
+    graph.join(1, 2, wrong)
+    graph.grow(lambda *_: None)
+    assert [sorted(group) for group in graph.groups] == [[0, 1, 2, 3]]
+    for pose in graph.groups[0].values():
+        there = np.linalg.inv(graph.groups[0][0]) @ pose
+        assert np.abs(there - true).max() < 0.3  # mm; and a turn of 0.6 rad is more, too
