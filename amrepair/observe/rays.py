@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from amrepair.frames import Transform
+from amrepair.frames import Transform, unit_vectors
 from amrepair.observe import range_kernels as kernels
 from amrepair.scans import Scan
 from gcode.compiled import get_num_threads
@@ -21,6 +22,10 @@ MAX_PIXELS = 4_000_000
 LEAST_RAY_POINTS = 16
 # A ray that grazes the surface says little about depth across it: 80° is the limit used.
 MIN_COSINE = 0.17
+# Where in its pixel a ray went nobody knows: standard deviation of an even spread over it.
+PIXEL_SIGMA = 1.0 / np.sqrt(12.0)
+# How deep rays pass is found to this power of two of a pixel, or of what they have passed.
+DEPTH_HALVINGS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +63,19 @@ class RangeImage:
             sensor_mm=target_from_source.apply(self.sensor_mm[None])[0],
             axes=target_from_source.rotate(self.axes),
         )
+
+    def passing_error(
+        self, points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, " n"]:
+        """(n,) standard error of how deep rays pass below surface with such normals, mm.
+
+        A ray is known to its pixel, sideways. Where it grazes the surface all of that is depth,
+        where it meets it squarely none: the sine of the angle of incidence.
+        """
+        ways = points_mm - self.sensor_mm
+        along = (unit_vectors(ways) * normals).sum(axis=1)
+        sideways_mm = PIXEL_SIGMA * self.pixel * np.linalg.norm(ways, axis=1)
+        return np.asarray(sideways_mm * np.sqrt(np.maximum(1.0 - along**2, 0.0)))
 
     def raise_clearance(
         self,
@@ -106,6 +124,64 @@ def clearances(
     for image in images:
         image.raise_clearance(points_mm, best, least)
     return best, least
+
+
+@dataclass(frozen=True, slots=True)
+class Passed:
+    """Places of a surface that rays passed where they should have ended.
+
+    Attributes
+    ----------
+    which
+        (c,) their numbers.
+    depth_mm, error_mm
+        (c,) how deep below them rays still pass, and its standard error.
+    """
+
+    which: Int[np.ndarray, " c"]
+    depth_mm: Float[np.ndarray, " c"]
+    error_mm: Float[np.ndarray, " c"]
+
+
+def passed(
+    images: tuple[RangeImage, ...],
+    surface_mm: Float[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "m 3"],
+) -> Passed:
+    """Which places of a surface rays passed, and how deep below it they do without a gap.
+
+    A ray that grazes an edge sees far beyond it, whatever hair's breadth it passed inside: what
+    counts is how deep below the surface rays still pass. From the surface down, since on the far
+    side of a sound part rays pass again: by pixels, then by as much as was passed, then halved.
+    """
+    beyond_mm = clearances(images, surface_mm, -np.inf)[1]
+    which = np.flatnonzero(beyond_mm > 0)
+    surface_mm, normals, most_mm = surface_mm[which], normals[which], 2.0 * beyond_mm[which]
+
+    def passes(among: Int[np.ndarray, " k"], deep_mm: Float[np.ndarray, " k"]) -> Any:
+        below_mm = surface_mm[among] - deep_mm[:, None] * normals[among]
+        return clearances(images, below_mm, -np.inf)[1] > 0
+
+    every = np.arange(len(which))
+    passed_mm = np.zeros(len(which))
+    stopped_mm = np.full(len(which), min(image.step_mm for image in images))
+    going = every
+    while len(going):
+        going = going[passes(going, stopped_mm[going]) & (stopped_mm[going] < most_mm[going])]
+        passed_mm[going] = stopped_mm[going]
+        stopped_mm[going] *= 2.0
+    for _ in range(DEPTH_HALVINGS):
+        middle_mm = 0.5 * (passed_mm + stopped_mm)
+        deeper = passes(every, middle_mm)
+        passed_mm = np.where(deeper, middle_mm, passed_mm)
+        stopped_mm = np.where(deeper, stopped_mm, middle_mm)
+    at_mm = surface_mm - passed_mm[:, None] * normals
+    error_mm = np.full(len(which), np.inf)
+    for image in images:  # the squarest of the rays that went so deep tells it best
+        went = clearances((image,), at_mm, -np.inf)[1] > 0
+        own_mm = np.where(went, image.passing_error(at_mm, normals), np.inf)
+        error_mm = np.minimum(error_mm, own_mm)
+    return Passed(which, passed_mm, error_mm)
 
 
 def _image(scan: Scan, k: int) -> RangeImage | None:

@@ -181,9 +181,9 @@ def _tested(
     )
     missing, excess = labels[:, : len(surfels)]
     gone = np.zeros(len(seen.surface_mm), bool)
-    gone[seen.crossed] = labels[0, len(surfels) :]
+    gone[seen.crossed.which] = labels[0, len(surfels) :]
     gone_p_value = np.ones(len(seen.surface_mm))
-    gone_p_value[seen.crossed] = np.exp(log_p[0, len(surfels) :])
+    gone_p_value[seen.crossed.which] = np.exp(log_p[0, len(surfels) :])
     errors = as_student(levels[1].quantile, levels[1].freedom)
     noise_mm = float(np.median(errors * levels[1].error_mm))
     limit_mm, top_mm = (t + noise_mm for t in tolerances_mm)

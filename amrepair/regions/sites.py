@@ -21,7 +21,7 @@ from amrepair.observe.background import (
 from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
-from amrepair.observe.rays import RangeImage, clearances, range_images
+from amrepair.observe.rays import Passed, RangeImage, passed, range_images
 from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.observe.views import Contradiction, contradictions
 from amrepair.regions.options import RegionOptions
@@ -38,8 +38,6 @@ ByView = tuple[
 ]
 # A template point is present where scanned surface lies within so many cells of it.
 PRESENT_CELLS = 1.8
-# How deep rays pass below a template point is found to this power of two.
-DEPTH_HALVINGS = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +56,9 @@ class Sites:
     facing
         (b,) cosine of the angle of incidence.
     pose_mm
-        (b,) standard error of the value by what is left open of the pose, the size and the bow,
-        and by what views say differently.
+        (b,) standard error of the value that neighbours share: by what is left open of the pose,
+        the size and the bow, by what views say differently, and by where in their pixels rays
+        passed.
     """
 
     cells: int
@@ -87,9 +86,8 @@ class Observed:
         What rays saw.
     surface_mm, normals
         (m, 3) each: the template's surface.
-    crossed, depth_mm
-        (c,) numbers of surface points with no scanned surface near that rays passed, and how deep
-        below them.
+    crossed
+        Surface points with no scanned surface near that rays passed.
     """
 
     f_mm: Float[np.ndarray, " n"]
@@ -98,8 +96,7 @@ class Observed:
     images: tuple[RangeImage, ...]
     surface_mm: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
-    crossed: Int[np.ndarray, " c"]
-    depth_mm: Float[np.ndarray, " c"]
+    crossed: Passed
 
 
 def observed(
@@ -133,8 +130,8 @@ def observed(
             seen = tuple(i for i in seen if np.isclose(sensors_mm, i.sensor_mm).all(axis=1).any())
     if surfels.spacing_mm > options.spacing_mm:
         surface_mm, normals = template.surface_points(surfels.spacing_mm)
-    crossed, depth_mm = _crossed(surface_mm, normals, surfels, seen)
-    return Observed(f_mm, keep, surfels, seen, surface_mm, normals, crossed, depth_mm)
+    crossed = _crossed(surface_mm, normals, surfels, seen)
+    return Observed(f_mm, keep, surfels, seen, surface_mm, normals, crossed)
 
 
 def _refuse_other_frame(scan: Scan) -> None:
@@ -157,27 +154,17 @@ def _crossed(
     normals: Float[np.ndarray, "m 3"],
     surfels: Surfels,
     images: tuple[RangeImage, ...],
-) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Template points with no scanned surface near that rays passed, and how deep below them, mm.
+) -> Passed:
+    """Template points with no scanned surface near that rays passed.
 
-    What is gone leaves no points of its own: the ray that should have ended there says so. A ray
-    that grazes an edge sees far beyond it, whatever hair's breadth it passed inside: what counts
-    is how deep below the template's surface rays still pass, found by bisection.
+    What is gone leaves no points of its own: the ray that should have ended there says so.
     """
     if not images:
-        return np.zeros(0, np.int64), np.zeros(0)
+        return Passed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
     near = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     absent = np.flatnonzero(near < 0)
-    beyond_mm = clearances(images, surface_mm[absent], -np.inf)[1]
-    crossed, beyond_mm = absent[beyond_mm > 0], beyond_mm[beyond_mm > 0]
-    passed_mm, stopped_mm = np.zeros(len(crossed)), 2.0 * beyond_mm
-    for _ in range(DEPTH_HALVINGS):
-        middle_mm = 0.5 * (passed_mm + stopped_mm)
-        below_mm = surface_mm[crossed] - middle_mm[:, None] * normals[crossed]
-        passes = clearances(images, below_mm, -np.inf)[1] > 0
-        passed_mm = np.where(passes, middle_mm, passed_mm)
-        stopped_mm = np.where(passes, stopped_mm, middle_mm)
-    return crossed, passed_mm
+    found = passed(images, surface_mm[absent], normals[absent])
+    return replace(found, which=absent[found.which])
 
 
 def sites_of(
@@ -196,8 +183,9 @@ def sites_of(
     half_mm = 0.5 * surfels.cell_mm
     aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
     feet_mm = surfels.place_mm - aside_mm[:, None] * outward
-    crossed_mm = seen.surface_mm[seen.crossed]
-    value_mm = np.concatenate([surfels.deviation_mm, -seen.depth_mm])
+    crossed = seen.crossed
+    crossed_mm = seen.surface_mm[crossed.which]
+    value_mm = np.concatenate([surfels.deviation_mm, -crossed.depth_mm])
     # what rays passed has no points of its own: it was seen as most places were
     facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels)), scan))
     typical, faced = (
@@ -219,12 +207,12 @@ def sites_of(
         cells=len(surfels),
         cell_mm=surfels.cell_mm,
         place_mm=np.concatenate([feet_mm, crossed_mm]),
-        normal=np.concatenate([outward, seen.normals[seen.crossed]]),
+        normal=np.concatenate([outward, seen.normals[crossed.which]]),
         value_mm=value_mm,
         weight=np.concatenate([surfels.count, typical]),
         tolerance_mm=tolerance_mm,
         facing=np.concatenate([facing, faced]),
-        pose_mm=np.zeros(len(value_mm)),
+        pose_mm=np.concatenate([np.zeros(len(surfels)), crossed.error_mm]),
     )
 
 
@@ -292,7 +280,7 @@ def _without_nuisance(
     removed_mm = np.bincount(cell, count * share_mm, n) / np.bincount(cell, count, n)
     whole_mm = sites.value_mm.copy()
     whole_mm[:n] -= removed_mm
-    pose_mm = found.error_mm(sites.place_mm, sites.normal)
+    pose_mm = np.hypot(sites.pose_mm, found.error_mm(sites.place_mm, sites.normal))
     told = None
     if view is not None:
         told = cell, view, value_mm - share_mm, count

@@ -141,8 +141,8 @@ def test_a_ray_past_an_edge_counts_by_how_deep_it_passed_not_how_far_it_saw(
         sensor_index=np.zeros(len(points), np.int64),
     )  # fmt: skip
     seen = observed(scan, plate, RegionOptions(), None, None, ())
-    side = np.abs(seen.surface_mm[seen.crossed, 0]) < 1e-6
+    side = np.abs(seen.surface_mm[seen.crossed.which, 0]) < 1e-6
     assert side.sum() > 20
     # a pixel holds 0.1 mm, and its neighbours are asked too
-    assert seen.depth_mm[side].max() < gone_mm + 0.05
-    assert np.median(seen.depth_mm[side]) > gone_mm - 0.35
+    assert seen.crossed.depth_mm[side].max() < gone_mm + 0.05
+    assert np.median(seen.crossed.depth_mm[side]) > gone_mm - 0.35

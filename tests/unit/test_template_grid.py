@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 
 from amrepair.errors import TemplateError
 from amrepair.template import GridSdf, MeshSdf, PlannedSdf, fit_template, load_or_fit
+from amrepair.template.file import write_template
 
 KNOB = Path(__file__).parents[2] / "examples" / "parts" / "knob.stl"
 
@@ -176,3 +178,38 @@ def test_no_beads_no_template() -> None:
     none = np.zeros((0, 3))
     with pytest.raises(TemplateError, match="no beads"):
         PlannedSdf.from_beads(none, none, np.zeros(0), np.zeros(0))
+
+
+def test_what_an_earlier_version_kept_of_unseen_surface_is_read_as_it_was(
+    knob: GridSdf, tmp_path: Path
+) -> None:
+    """Cells that held surface nobody saw, and a layer of cells around: it was in the first."""
+    cell_mm = 1.3
+    origin_mm = knob.bounds_mm[0] - 2.3 * cell_mm  # no face lies on the border of cells
+    shape = np.ceil((np.ptp(knob.bounds_mm, axis=0) + 4.0 * cell_mm) / cell_mm).astype(int)
+    places, outward = knob.surface_points(0.4)
+    index = ((places - origin_mm) / cell_mm).astype(int)
+    # whole cells: of the upper end, on one side of the middle
+    low, side = np.quantile(index[:, 2], 0.7), np.median(index[:, 0])
+    unseen = (index[:, 2] > low) & (index[:, 0] > side)
+    assert 0.05 < unseen.mean() < 0.4
+    cells = np.zeros(tuple(shape), bool)
+    cells[tuple(index[unseen].T)] = True
+    arrays, head = knob._packed()
+    arrays["unseen"] = ndimage.binary_dilation(cells, np.ones((3, 3, 3))).astype(np.uint8)
+    head |= {
+        "unseen_origin_mm": origin_mm.tolist(),
+        "unseen_cell_mm": cell_mm,
+        "unseen_mm2": 12.5,
+    }
+    write_template(tmp_path / "old.safetensors", arrays, head)
+    read = GridSdf.load(tmp_path / "old.safetensors")
+    assert read.coverage is not None
+    assert read.coverage.unseen_mm2 == 12.5
+    unknown = read.coverage.unknown_at(places, np.zeros(len(places)), outward)
+    assert np.array_equal(unknown, unseen)
+    # what is written anew is read as the same
+    read.save(tmp_path / "new.safetensors")
+    again = GridSdf.load(tmp_path / "new.safetensors").coverage
+    assert again is not None
+    assert np.array_equal(again.unknown_at(places, np.zeros(len(places)), outward), unknown)
