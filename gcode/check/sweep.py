@@ -2,7 +2,7 @@
 
 Slices of the envelope reach up to the next one, and the last to infinity; over a height field
 only what looks down can touch, lower faces and cones. What is laid on the way stands there for the
-moves after it.
+moves after it, as wide and as high as `surfaces.standing` says: the planner goes by the same.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from gcode.check.findings import Moves, Refusal, Text
 from gcode.profiles import EnvelopeSlice, PrinterProfile
 from gcode.surfaces import HeightField
 from gcode.surfaces.heightfield import footprint_rows
+from gcode.surfaces.standing import half_widths_mm
 
 # A floor is rough, and a scan is noisy: the tip may press this deep into what it prints on.
 TIP_SLACK_MM = 0.2
@@ -47,10 +48,10 @@ def sweep(
         return [], np.inf
     pushed = moves.pushed_mm3
     length = np.linalg.norm(end - start, axis=1)
-    width = np.clip(pushed / np.maximum(length, 1e-9) / 0.2, 0.0, 2 * printer.nozzle_diameter_mm)
+    half_mm = half_widths_mm(pushed / np.maximum(length, 1e-9), printer.nozzle_diameter_mm)
     worst = np.full(len(start), -np.inf)
     which = np.zeros(len(start), dtype=np.int64)
-    swept = _Swept(start, end, pushed, width)
+    swept = _Swept(start, end, pushed, half_mm)
     near = [k for k, part in enumerate(slices) if part.reach_mm <= WIDE_SLICE_MM]
     far = [k for k, part in enumerate(slices) if part.reach_mm > WIDE_SLICE_MM]
     for own, found in (
@@ -96,12 +97,12 @@ def deepest_along(
 
 @dataclass(frozen=True, slots=True)
 class _Swept:
-    """Moves: (n, 3) start and end, (n,) plastic and width."""
+    """Moves: (n, 3) start and end, (n,) plastic and half the width that it stands as."""
 
     start_mm: Float[np.ndarray, "n 3"]
     end_mm: Float[np.ndarray, "n 3"]
     pushed_mm3: Float[np.ndarray, " n"]
-    width_mm: Float[np.ndarray, " n"]
+    half_mm: Float[np.ndarray, " n"]
 
     @property
     def low_mm(self) -> Float[np.ndarray, " n"]:
@@ -186,7 +187,7 @@ class _Swept:
             self.start_mm,
             self.end_mm,
             ((self.pushed_mm3 > 0) & grows).astype(np.int64),
-            0.5 * self.width_mm,
+            self.half_mm,
             field.z_mm.astype(np.float64).copy(),
             field.origin_mm.astype(np.float64),
             field.cell_mm,

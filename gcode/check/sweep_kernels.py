@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from gcode.compiled import njit
+from gcode.surfaces.standing_kernels import across_row, columns_of, height_over, rows_of
 
 
 @njit(cache=True, nogil=True)
@@ -46,21 +47,18 @@ def sweep(
                 whose[k] = which[iy, ix]
         if laid[k] <= 0:
             continue
-        for i in range(count + 1):  # what is laid now stands there from now on
-            t = i / count
-            x, y, z = start[k, 0] + dx * t, start[k, 1] + dy * t, start[k, 2] + dz * t
-            reach = int(np.ceil(half_width[k] / cell))
-            cx = int(np.floor((x - origin[0]) / cell))
-            cy = int(np.floor((y - origin[1]) / cell))
-            for jy in range(-reach, reach + 1):
-                for jx in range(-reach, reach + 1):
-                    iy, ix = cy + jy, cx + jx
-                    if iy < 0 or ix < 0 or iy >= ny or ix >= nx or field[iy, ix] >= z:
-                        continue
-                    px = origin[0] + (ix + 0.5) * cell - x
-                    py = origin[1] + (iy + 0.5) * cell - y
-                    if px * px + py * py > half_width[k] * half_width[k]:
-                        continue
+        # what is laid now stands there from now on
+        ax, ay, az = start[k, 0], start[k, 1], start[k, 2]
+        bx, by, bz = end[k, 0], end[k, 1], end[k, 2]
+        half = half_width[k]
+        first, last = rows_of(ay, by, half, origin[1], cell, ny)
+        for iy in range(first, last):
+            py = origin[1] + (iy + 0.5) * cell
+            x_low, x_high = across_row(ax, ay, bx, by, half, py)
+            for ix in range(*columns_of(x_low, x_high, origin[0], cell, nx)):
+                px = origin[0] + (ix + 0.5) * cell
+                z = height_over(ax, ay, az, bx, by, bz, half, px, py)
+                if field[iy, ix] < z:
                     field[iy, ix] = z
                     raise_need(need, which, rows, row_at, iy, ix, z, above, owner, later[k])
     return worst, whose

@@ -28,8 +28,6 @@ class ColumnOptions:
     spread_nozzles
         From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which
         is 2.5 bores across (E3D V6): not to its very rim.
-    least_high_mm
-        A bead's plastic spreads as if it lay no higher.
     seam_mm
         Around a loop's seam, as far as old material hides it.
     job_layer_mm
@@ -46,7 +44,6 @@ class ColumnOptions:
     most_thick_nozzles: float = 0.8
     drop_nozzles: float = 6.0
     spread_nozzles: float = 1.125
-    least_high_mm: float = 0.2
     seam_mm: float = 1.0
     job_layer_mm: float = 0.5
     no_lift_mm: float = 1.0

@@ -20,7 +20,7 @@ from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_passes import Pass
 from gcode.slicing.patch_state import PatchState
 from gcode.slicing.reach import Reach
-from gcode.surfaces import raster_kernels
+from gcode.surfaces.standing import with_beads
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,23 +67,14 @@ def stages_of(
 
 
 def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reach:
-    """Where the nozzle may be once beads are laid, each as wide and as high as it may get."""
-    field = model.as_built
-    wide_mm = (
-        np.concatenate([chain.section_mm2 for chain in laid]) / model.options.columns.least_high_mm
+    """Where the nozzle may be once beads are laid, as the checker will have them stand."""
+    start, end = (
+        np.concatenate([np.column_stack([c.xy_mm, c.z_mm])[cut] for c in laid])
+        for cut in (slice(None, -1), slice(1, None))
     )
-    _, widest_mm = model.options.fill.widths_mm(setup.printer.nozzle_diameter_mm)
-    wide_mm = np.minimum(wide_mm, widest_mm)
-    stands_mm = raster_kernels.beside_lines(
-        np.concatenate([chain.xy_mm[:-1] for chain in laid]),
-        np.concatenate([chain.xy_mm[1:] for chain in laid]),
-        0.5 * wide_mm + field.cell_mm,  # wherever in its cell it ends
-        np.concatenate([np.maximum(chain.z_mm[:-1], chain.z_mm[1:]) for chain in laid]),
-        field.origin_mm.astype(np.float64),
-        field.cell_mm,
-        *field.shape,
-    )
-    return model.reach_of(field.raised(stands_mm))
+    section_mm2 = np.concatenate([chain.section_mm2 for chain in laid])
+    bore_mm = setup.printer.nozzle_diameter_mm
+    return model.reach_of(with_beads(model.as_built, start, end, section_mm2, bore_mm))
 
 
 def _regions(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
