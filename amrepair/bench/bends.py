@@ -1,22 +1,137 @@
-"""Where a part is bent a little: the cut beyond which another rigid motion explains more.
+"""A part bent in two: its pieces, over how much of it, and where it is bent a little.
 
-To first order a rigid motion of a piece changes the deviation at x by n·(t + ω × x), n the field's
+No material is bent in a crease: from one piece to the other the part turns over a zone. There
+points lie in neither pose, and some were moved along their own surface, which no distance tells.
+
+A little bend is found by the cut beyond which another rigid motion explains more. To first order a
+rigid motion of a piece changes the deviation at x by n·(t + ω × x), n the field's
 gradient. So what the best motion of either side of a cut explains are sums over points, and all
 cuts across an axis are judged in one pass. It finds where to look; `bodies` moves the pieces.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.frames import unit_vectors
+from amrepair.frames import moved, unit_vectors
 from amrepair.template.port import Template
 
 CUT_SHARES = np.arange(0.2, 0.81, 0.05)  # shares of the points on one side of a cut
 MOTION_RIDGE = 1e-6  # of a motion that the points of a side do not show
+# Widths that the zone of a bend may have, of the diagonal (0 is a crease), and how far its middle
+# may lie from the plane that the pieces were parted by.
+ZONE_RATIOS, ASIDE_RATIOS = np.linspace(0.0, 0.2, 11), np.linspace(-0.04, 0.04, 9)
+ZONE_POINTS = 1_500  # about the plane: enough to tell both
+CREASE_MM = 1e-6  # a narrower zone is a crease
+
+Pose = Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """A part in one piece, or in two that stand in poses of their own.
+
+    Attributes
+    ----------
+    pose
+        (4, 4) template from scan, of the piece that stands where it was.
+    other
+        The same of the other piece; None where there is none.
+    normal, through_mm
+        Of the plane between them, template frame, away from the standing one.
+    zone_mm
+        The part turns over so much of its length, half on either side of the plane.
+    """
+
+    pose: Pose
+    other: Pose | None = None
+    normal: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    through_mm: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    zone_mm: float = 0.0
+
+    def moved_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) how far points of the scan, in its frame, were moved with the other piece."""
+        return np.asarray(np.linalg.norm(self.motion_mm(points_mm), axis=1))
+
+    def motion_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """(n, 3) by what points of the scan, in its frame, were moved; template frame.
+
+        In an evenly bent zone a place has been turned by the share w of the angle that lies before
+        it, about the middle of that: to first order by w of the whole motion, and by what the
+        lines that it was turned about lie nearer to the standing piece.
+        """
+        if self.other is None:
+            return np.zeros_like(points_mm)
+        home = moved(points_mm, self.other)
+        return _motion_mm(
+            moved(points_mm, self.pose) - home,
+            (home - self.through_mm) @ self.normal,
+            self.zone_mm,
+            self.turned,
+        )
+
+    @property
+    def turned(self) -> Float[np.ndarray, " 3"]:
+        """By what a place moves that lies 1 mm farther along the normal; nothing in one piece."""
+        if self.other is None:
+            return np.zeros(3)
+        turn = (self.pose @ np.linalg.inv(self.other))[:3, :3]
+        return np.asarray(turn @ self.normal - self.normal)
+
+
+def _motion_mm(
+    whole_mm: Float[np.ndarray, "n 3"],
+    height_mm: Float[np.ndarray, "*k n"],
+    zone_mm: Any,
+    turned: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "*k n 3"]:
+    """(*k, n, 3) motions of places at some heights over the middle of a zone, k ways."""
+    share = np.clip(height_mm / np.maximum(zone_mm, CREASE_MM) + 0.5, 0.0, 1.0)
+    nearer_mm = 0.5 * zone_mm * share * (1.0 - share)
+    return np.asarray(share[..., None] * whole_mm + nearer_mm[..., None] * turned)
+
+
+def with_zone(
+    pieces: Pieces,
+    points_mm: Float[np.ndarray, "n 3"],
+    template: Template,
+    *,
+    limit_mm: float,
+    sigma_mm: float,
+) -> Pieces:
+    """The pieces with the zone that what lies about the plane between them tells.
+
+    Its middle and its width are means over what is likely: where the points tell nothing, no crease
+    and nothing very wide.
+
+    Parameters
+    ----------
+    points_mm
+        (n, 3) in the scan's frame, of noise `sigma_mm`.
+    limit_mm
+        Farther off the template a point counts as so far off.
+    """
+    if pieces.other is None:
+        return pieces
+    diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    widest_mm = (0.5 * ZONE_RATIOS[-1] + ASIDE_RATIOS[-1]) * diagonal_mm
+    home = moved(points_mm, pieces.other)
+    height_mm = (home - pieces.through_mm) @ pieces.normal
+    near = np.flatnonzero(np.abs(height_mm) < widest_mm)
+    near = near[:: len(near) // ZONE_POINTS + 1]
+    here, home, height_mm = moved(points_mm[near], pieces.pose), home[near], height_mm[near]
+    aside, zone = (diagonal_mm * each.ravel() for each in np.meshgrid(ASIDE_RATIOS, ZONE_RATIOS))
+    motion = _motion_mm(here - home, height_mm - aside[:, None], zone[:, None], pieces.turned)
+    off_mm = np.abs(template.distance((here - motion).reshape(-1, 3))).reshape(len(zone), -1)
+    misfit = (np.minimum(off_mm, limit_mm) ** 2).sum(axis=1) / sigma_mm**2
+    likely = np.exp(0.5 * (misfit.min() - misfit))
+    likely /= likely.sum()
+    through_mm = pieces.through_mm + float(likely @ aside) * pieces.normal
+    return replace(pieces, through_mm=through_mm, zone_mm=float(likely @ zone))
 
 
 @dataclass(frozen=True, slots=True)

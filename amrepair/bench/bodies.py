@@ -11,7 +11,7 @@ motions of both sides of a cut explain (`bends`). It judges poses; it makes no s
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.stats import chi2
 from amrepair.align.refine import Prior, refine_all
 from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
-from amrepair.bench.bends import best_cuts
+from amrepair.bench.bends import Pieces, Pose, best_cuts, with_zone
 from amrepair.frames import moved, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
@@ -67,36 +67,6 @@ CUT_RANGE = (0.1, 0.9)  # of the points: shares below a cut
 # Of what is off in one pose, within the limit, two explain so much more: of bends of 0.6° 0.15, of
 # sound views, whose pieces slide along what the template is off by, up to 0.07.
 LEAST_EXPLAINED = 0.1
-
-Pose = Float[np.ndarray, "4 4"]
-
-
-@dataclass(frozen=True, slots=True)
-class Pieces:
-    """A part in one piece, or in two that stand in poses of their own.
-
-    Attributes
-    ----------
-    pose
-        (4, 4) template from scan, of the piece that stands where it was.
-    other
-        The same of the other piece; None where there is none.
-    normal, through_mm
-        Of the plane between them, template frame, away from the standing one.
-    """
-
-    pose: Pose
-    other: Pose | None = None
-    normal: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
-    through_mm: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
-
-    def moved_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """(n,) how far points of the scan, in its frame, were moved with the other piece."""
-        if self.other is None:
-            return np.zeros(len(points_mm))
-        here, home = moved(points_mm, self.pose), moved(points_mm, self.other)
-        beyond = (here - self.through_mm) @ self.normal > 0.0
-        return np.asarray(np.where(beyond, np.linalg.norm(here - home, axis=1), 0.0))
 
 
 def surface_of(template: Template) -> Float[np.ndarray, "m 3"]:
@@ -146,7 +116,7 @@ def pieces_of(
     alone = scene.held(scene.on(tried[0]))
     gained = 0.0 if best is None else best.explained - alone
     if best is not None and best.beyond >= LEAST_OF_PAIR and gained >= LEAST_GAINED:
-        return Pieces(
+        return scene.in_two(
             scene.finished(best.standing, best.normal, best.through_mm),
             scene.finished(best.other, -best.normal, best.through_mm),
             best.normal,
@@ -207,7 +177,7 @@ def _parted(
     surface = scene.surface_mm @ axis
     stands = 0 if (surface < at).mean() > 0.5 else 1
     normal = axis if stands == 0 else -axis
-    return off_mean, Pieces(poses[stands], poses[1 - stands], normal, at * axis)
+    return off_mean, scene.in_two(poses[stands], poses[1 - stands], normal, at * axis)
 
 
 def _nothing_outside(poses: Sequence[Pose], scene: _Scene) -> Pose | None:
@@ -334,6 +304,19 @@ class _Scene:
         f_mm, gradient = self.template.distance_and_gradient(placed)
         return np.asarray(placed - f_mm[:, None] * unit_vectors(gradient))
 
+    def in_two(
+        self,
+        standing: Pose,
+        other: Pose,
+        normal: Float[np.ndarray, " 3"],
+        through_mm: Float[np.ndarray, " 3"],
+    ) -> Pieces:
+        """Both pieces, and the zone between them as the points tell it."""
+        pieces = Pieces(standing, other, normal, through_mm)
+        return with_zone(
+            pieces, self.cloud, self.template, limit_mm=self.limit_mm, sigma_mm=self.sigma_mm
+        )
+
     def refined(
         self,
         points: Float[np.ndarray, "k 3"],
@@ -406,9 +389,10 @@ class _Scene:
 
 
 def _seeds(poses: Sequence[Pose], scene: _Scene) -> Iterator[list[tuple[Pose, Pose]]]:
-    """Of each pose, two poses to start from: of what it leaves, and of both sides of some planes.
+    """Of each pose, two poses to start from: of what it leaves, then of both sides of some planes.
 
-    A side is moved from all the poses at once: they are many where a part fits in many ways.
+    Mostly the first will do. A side is moved from all the poses at once: they are many where a part
+    fits in many ways.
     """
     cloud = scene.thinned.to(2 * PIECE_POINTS)
     local = cloud - cloud.mean(axis=0)

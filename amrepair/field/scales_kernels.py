@@ -209,3 +209,16 @@ def surest(table, count, chosen, log_p):
                 j = table[i, k]
                 out[j] = min(out[j], log_p[i])
     return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def window_farthest(table, count, value):
+    """(s,) the cell of each window whose value is farthest from zero."""
+    out = np.empty(table.shape[0], np.int64)
+    for i in prange(table.shape[0]):
+        most = table[i, 0]
+        for k in range(1, count[i]):
+            if abs(value[table[i, k]]) > abs(value[most]):
+                most = table[i, k]
+        out[i] = most
+    return out

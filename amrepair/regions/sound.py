@@ -27,6 +27,9 @@ from amrepair.regions.calibration import Tail
 from amrepair.regions.significance import LEAST_SIGMA_MM
 from amrepair.template.port import Template
 
+# Of a sum of terms of variance 1 and more: less is rounding.
+LEAST_VARIANCE = 1e-9
+
 
 @dataclass(frozen=True, slots=True)
 class SoundTestOptions:
@@ -46,6 +49,9 @@ class SoundTestOptions:
         Windows reach up to this width, as in `RegionOptions`.
     most_off_mm
         Farther off the template a point counts as so far off: clutter must not decide alone.
+    stray
+        Probability of a point that lies on no surface, or deep in a nook that no sound scan looked
+        into: one alone is no defect, however far off it lies.
     """
 
     neighbours: int = 6
@@ -53,6 +59,7 @@ class SoundTestOptions:
     gap_spacings: float = 2.5
     widest_mm: float = 10.0
     most_off_mm: float = 3.0
+    stray: float = 0.003
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +128,9 @@ class _Known:
         return looked
 
     def at(
-        self, points_mm: Float[np.ndarray, "q 3"], count: int
-    ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
-        """(q,) mean deviation of the nearest sound points, and their standard deviation.
+        self, points_mm: Float[np.ndarray, "q 3"], looked: Bool[np.ndarray, " q"], count: int
+    ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+        """(q,) mean deviation of the nearest sound points, their standard deviation, and `shared`.
 
         Nearest in space, not over the surface: where a template closed a hollow by a guess, the
         floor of the hollow is normal, and so is what lies above it.
@@ -131,7 +138,9 @@ class _Known:
         count = min(count, len(self.f_mm))
         index = self.tree.query(points_mm, k=[*range(1, count + 1)], workers=-1)[1]
         near = self.f_mm[index]
-        return near.mean(axis=1), near.std(axis=1)
+        asked = np.bincount(index[looked].ravel(), minlength=len(self.f_mm))
+        shared = asked[index].sum(axis=1) / count**2
+        return near.mean(axis=1), near.std(axis=1), shared
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +153,9 @@ class Seen:
         (n,) deviation from the template, (n, 3) its outward normals.
     expected_mm, spread_mm
         (n,) what sound points there deviate by in the mean, and their standard deviation.
+    shared
+        (n,) variance of `expected_mm` as a sum over points has it, in that of a sound point: where
+        few sound points tell many of a scan, what these err by is common to many.
     looked
         (n,) whether a sound scan looked at the surface that tells the deviation.
     """
@@ -152,6 +164,7 @@ class Seen:
     normals: Float[np.ndarray, "n 3"]
     expected_mm: Float[np.ndarray, " n"]
     spread_mm: Float[np.ndarray, " n"]
+    shared: Float[np.ndarray, " n"]
     looked: Bool[np.ndarray, " n"]
 
     @classmethod
@@ -165,12 +178,11 @@ class Seen:
         """Of points, (n, 3) template frame; `known` is None where one sound scan is alone."""
         f_mm, gradient = template.distance_and_gradient(points_mm)
         normals = unit_vectors(gradient)
-        if known is None:
-            expected_mm, spread_mm = np.zeros(len(f_mm)), np.zeros(len(f_mm))
-        else:
-            expected_mm, spread_mm = known.at(points_mm, options.neighbours)
         looked = _looked(points_mm, f_mm, normals, template, known)
-        return cls(f_mm, normals, expected_mm, spread_mm, looked)
+        expected_mm = spread_mm = shared = np.zeros(len(f_mm))
+        if known is not None:
+            expected_mm, spread_mm, shared = known.at(points_mm, looked, options.neighbours)
+        return cls(f_mm, normals, expected_mm, spread_mm, shared, looked)
 
     def followed(self, within_mm: float) -> Bool[np.ndarray, " n"]:
         """(n,) whether sound scans lie on the template there, within so much.
@@ -229,7 +241,9 @@ class SoundTest:
             known = _joined(scans_mm, f_mm, others, template, options) if others else None
             seen = Seen.of(points, template, known, options)
             off_mm, sigma_mm, scales = _observed(points, seen, options)
-            for level, z in enumerate(_standardised(off_mm, sigma_mm, scales)):
+            for level, z in enumerate(
+                _standardised(off_mm, sigma_mm, seen.shared, scales, options)
+            ):
                 if level == len(found):
                     found.append([])
                 found[level].append(z)
@@ -251,7 +265,8 @@ class SoundTest:
         """
         seen = seen or self.look(points_mm)
         off_mm, sigma_mm, scales = _observed(points_mm, seen, self.options)
-        found = list(_standardised(off_mm, sigma_mm, scales))[: len(self.statistics)]
+        found = list(_standardised(off_mm, sigma_mm, seen.shared, scales, self.options))
+        found = found[: len(self.statistics)]
         least = 0.0
         for z, (spread, tail) in zip(found, self.statistics, strict=False):
             if len(z):
@@ -321,21 +336,49 @@ def _noise_mm(off_mm: Float[np.ndarray, " n"], scale: Scale) -> float:
 
 
 def _standardised(
-    off_mm: Float[np.ndarray, " n"], sigma_mm: Float[np.ndarray, " n"], scales: tuple[Scale, ...]
+    off_mm: Float[np.ndarray, " n"],
+    sigma_mm: Float[np.ndarray, " n"],
+    shared: Float[np.ndarray, " n"],
+    scales: tuple[Scale, ...],
+    options: SoundTestOptions,
 ) -> Iterator[Float[np.ndarray, " w"]]:
-    """|Mean| over cells and windows of each scale, the finest first, in its standard errors."""
-    counted = np.isfinite(sigma_mm).astype(np.float64)
+    """|Mean| over cells and windows of each scale, the finest first, in its standard errors.
+
+    Of which a single point makes up no more than chance gives to what strays.
+    """
     value = off_mm / sigma_mm
+    variance = np.where(np.isfinite(sigma_mm), 1.0 + shared, 0.0)
+    alone = float(norm.isf(0.5 * options.stray))
+    rising = np.argsort(np.abs(value), kind="stable")
     for scale in scales:
-        total = np.bincount(scale.of_base, value, len(scale))
-        points = np.bincount(scale.of_base, counted, len(scale))
-        around = [
+        total, spread = (np.bincount(scale.of_base, each, len(scale)) for each in (value, variance))
+        last = np.zeros(len(scale), np.int64)
+        last[scale.of_base[rising]] = rising  # of a cell's points the farthest off is written last
+        far, its = value[last], variance[last]
+        yield _beyond_one(total, spread, far, its, alone)
+        around, its_spread = (
             scales_kernels.window_means(scale.table, scale.count, each) * scale.count
-            for each in (total, points)
-        ]
-        for sums, weight in ((total, points), around):
-            seen = weight > 0
-            yield np.abs(sums[seen]) / np.sqrt(weight[seen])
+            for each in (total, spread)
+        )
+        most = scales_kernels.window_farthest(scale.table, scale.count, far)
+        yield _beyond_one(around, its_spread, far[most], its[most], alone)
+
+
+def _beyond_one(
+    total: Float[np.ndarray, " w"],
+    variance: Float[np.ndarray, " w"],
+    far: Float[np.ndarray, " w"],
+    its: Float[np.ndarray, " w"],
+    alone: float,
+) -> Float[np.ndarray, " s"]:
+    """(s,) |sum| in standard deviations, where something was looked at.
+
+    By at most `alone` more than without the term that is farthest off.
+    """
+    seen = variance > 0
+    rest, left = np.abs(total - far)[seen], (variance - its)[seen]
+    without = np.where(left > LEAST_VARIANCE, rest / np.sqrt(np.maximum(left, LEAST_VARIANCE)), 0.0)
+    return np.asarray(np.minimum(np.abs(total[seen]) / np.sqrt(variance[seen]), without + alone))
 
 
 def _null(z: Float[np.ndarray, " w"], options: SoundTestOptions) -> tuple[float, Tail]:

@@ -259,6 +259,31 @@ def test_a_little_bend_tells_how_far_the_smaller_piece_was_moved(
     assert float(np.quantile(off_mm, 0.95)) < 0.1
 
 
+@pytest.mark.parametrize(("turned_deg", "zone_mm"), [(4.0, 12.0), (1.0, 12.0), (2.0, 4.0)])
+def test_what_lies_in_the_zone_of_a_bend_was_moved_along_its_own_surface(
+    turned_deg: float, zone_mm: float
+) -> None:
+    """A bar 12 mm thick, bent evenly over a zone: what is moved along its sides, no distance tells.
+
+    Regression: the pieces met in a crease, and half of the zone counted as not moved.
+    """
+    bar = difference(box((0, 0, 0), (60, 20, 12)), box((50, 12, -1), (61, 21, 13)))
+    home = sample_surface(bar.body, 0.6, seed=5)[0]
+    beyond = np.maximum(home[:, 0] - 34.0, 0.0)
+    phi = np.deg2rad(turned_deg) * np.minimum(beyond / zone_mm, 1.0)
+    radius_mm = zone_mm / np.deg2rad(turned_deg) - home[:, 2]  # of the bend; the bed's side is kept
+    rest = np.maximum(beyond - zone_mm, 0.0)
+    bent = home.copy()
+    bent[:, 0] = home[:, 0] - beyond + radius_mm * np.sin(phi) + rest * np.cos(phi)
+    bent[:, 2] += radius_mm * (1.0 - np.cos(phi)) + rest * np.sin(phi)
+    truth_mm = np.linalg.norm(bent - home, axis=1)
+    points = bent + np.random.default_rng(5).normal(0, SIGMA_MM, bent.shape)
+    pieces = pieces_of(points, bar, [np.eye(4)], SIGMA_MM, np.random.default_rng(0))
+    about = np.abs(home[:, 0] - 34.0 - 0.5 * zone_mm) < zone_mm
+    off_mm = np.abs(pieces.moved_mm(points) - truth_mm)[about]
+    assert float(np.quantile(off_mm, 0.95)) < 0.1
+
+
 @pytest.mark.slow
 def test_a_bent_part_that_was_laid_elsewhere_is_found() -> None:
     # regression: the scan lay somewhere else, where more of it is nearly right than of either piece

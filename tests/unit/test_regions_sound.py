@@ -126,6 +126,42 @@ def test_a_hollow_deeper_than_the_template_guesses_is_unknown() -> None:
     assert test.judge(down_to(5.0, 9)).log_expected > STATED
 
 
+def test_a_single_point_is_no_defect(sound: SoundTest) -> None:
+    """It strays, or lies in a nook that no sound scan looked into; a crack has some points more.
+
+    Regression: one point 1.7 mm inside a sound scan's part said so with a p-value of e⁻³⁸.
+    """
+    points = scanned(9)
+    points[np.argmin(np.linalg.norm(points - (10.0, 10.0, 12.0), axis=1)), 2] -= 1.7
+    assert sound.judge(points).log_expected > STATED
+    crack = (np.abs(points[:, 0] - 20.0) < 0.5) & (np.abs(points[:, 1] - 10.0) < 2.0)
+    crack &= points[:, 2] > 11.0
+    assert crack.sum() < 10
+    points[crack, 2] -= 0.8
+    assert sound.judge(points).log_expected < -10.0
+
+
+def test_what_few_sound_points_err_by_is_common_to_many_of_a_scan(template: GridSdf) -> None:
+    """A near view of a side that sound scans saw aslant is as likely as they are.
+
+    Regression: in each of its windows the same few sound points told what is normal.
+    """
+
+    def aslant(seed: int) -> Float[np.ndarray, "n 3"]:
+        points = scanned(seed)
+        thinned = np.random.default_rng(seed).random(len(points)) < 0.15
+        return points[(points[:, 0] > 0.6) | thinned]
+
+    def near(seed: int) -> Float[np.ndarray, "n 3"]:
+        points = sample_surface(PART.body, 0.25, seed=seed)[0]
+        points = points[points[:, 0] < 15.0]
+        return points + np.random.default_rng(seed).normal(0, SIGMA_MM, points.shape)
+
+    test = SoundTest.of(template, [aslant(seed) for seed in range(4)])
+    assert min(test.judge(near(seed)).log_expected for seed in range(3)) > STATED
+    assert test.judge(dented(near(50), 2.0, 0.4)).log_expected < -10.0
+
+
 def test_noise_is_the_scan_s_own(sound: SoundTest) -> None:
     """A scan three times as noisy is no defective part."""
     points = sample_surface(PART.body, 0.8, seed=60)[0]
