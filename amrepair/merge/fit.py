@@ -18,7 +18,7 @@ from amrepair.merge.fuse import Cloud, Fused, fuse
 from amrepair.merge.joint import Slack
 from amrepair.merge.options import USUAL_MERGE, MergeOptions
 from amrepair.merge.place import Placement, place
-from amrepair.merge.views import LEAST_VIEW_POINTS, View
+from amrepair.merge.views import View
 from amrepair.scans import Scan
 from amrepair.template import GridSdf, MeshSdf
 from amrepair.template.fit import fit_fast
@@ -29,16 +29,7 @@ from gcode.progress import Progress, silent
 if TYPE_CHECKING:
     pass
 
-# Of one point's noise: a template that follows what is finer is larger, slower, and no truer (4
-# scans of 200,000 points, noise 30 µm: 8.8 µm off, 8.2 so).
-FOLLOWED = 0.5
-UNIT_SIZE_JUMP = 3.0  # scans of one part in one unit differ by less
 METRE_MM, LEAST_PART_MM = 1000.0, 1.0  # no printed part is smaller: its numbers are metres
-# A scan that is held worse than its points are noisy is named. So is one that was outvoted on more
-# surface than chance marks: so many spacings square, that share of the part's area, and so many
-# times what the scans have in the median (where a scanner errs, each is outvoted somewhere).
-OUTVOTED_SPACINGS, OUTVOTED_SHARE, OUTVOTED_TIMES = 20.0, 1e-3, 5.0
-TOLD_SHARE = 0.002  # of the surface: less that is unseen, or guessed, is not told
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +108,12 @@ def fit_from_scans(
         If they enclose no solid.
     """
     scans, unit_mm = _in_millimetres(scans)
-    _refuse(scans)
+    _refuse(scans, options)
     rng = np.random.default_rng(seed)
     views = []
     for k, scan in enumerate(scans):
         progress("measure scans", float(k), float(len(scans)))
-        views.append(View.of(scan, rng))
+        views.append(View.of(scan, rng, options))
     placed = place(
         views, rng, told=poses, unit_mm=unit_mm, turntable_deg=turntable_deg,
         options=options, progress=progress,
@@ -132,18 +123,18 @@ def fit_from_scans(
     fused = fuse(cloud, options=options.fuse)
     progress("fuse scans", 1.0, 1.0)
     weak = {k: s for k, s in placed.slacks.items() if s.sigma_mm > cloud.sigma_mm}
-    outvoted = _outvoted(cloud, fused, list(placed.poses))
+    outvoted = _outvoted(cloud, fused, list(placed.poses), options)
     notes = (
         *(["the scans are taken as metres: as millimetres the part would be smaller than one"]
           if unit_mm != 1.0 else []),
-        *_notes(scans, placed, fused),
+        *_notes(scans, placed, fused, options),
         *_said_outvoted(scans, fused, list(placed.poses), outvoted),
         *_said_weak(scans, weak),
     )  # fmt: skip
     made = fit_fast(
         MeshSdf.from_mesh(fused.mesh),
         seed=seed,
-        least_residual_mm=FOLLOWED * cloud.sigma_mm,
+        least_residual_mm=options.followed_noises * cloud.sigma_mm,
         metadata=_metadata(scans, notes, seed),
         progress=progress,
     )
@@ -174,19 +165,19 @@ def _in_millimetres(scans: Sequence[Scan]) -> tuple[list[Scan], float]:
     ], METRE_MM
 
 
-def _refuse(scans: Sequence[Scan]) -> None:
+def _refuse(scans: Sequence[Scan], options: MergeOptions) -> None:
     if not scans:
         raise InputError("a template from scans needs at least one scan; none was given")
     for scan in scans:
-        if len(scan) < LEAST_VIEW_POINTS:
+        if len(scan) < options.view.least_points:
             raise InputError(
                 f"the scan {scan.source} has {len(scan)} points; a template needs at least "
-                f"{LEAST_VIEW_POINTS:,} of each scan"
+                f"{options.view.least_points:,} of each scan"
             )
     sizes = [float(np.linalg.norm(np.ptp(scan.points_mm, axis=0))) for scan in scans]
     usual = float(np.median(sizes))
     for scan, size in zip(scans, sizes, strict=True):
-        if not usual / UNIT_SIZE_JUMP < size < usual * UNIT_SIZE_JUMP:
+        if not usual / options.unit_size_jump < size < usual * options.unit_size_jump:
             hint = " (metres for millimetres?)" if size < usual / 100 else ""
             raise InputError(
                 f"the scan {scan.source} is {size:.3g} mm across, the scans' median is "
@@ -232,12 +223,14 @@ def _by_all(
     return outward_by(points_mm, found, sure, spacing_mm, sigma_mm)
 
 
-def _outvoted(cloud: Cloud, fused: Fused, which: Sequence[int]) -> dict[int, float]:
+def _outvoted(
+    cloud: Cloud, fused: Fused, which: Sequence[int], options: MergeOptions
+) -> dict[int, float]:
     """By number of a scan: the mm² on which it was outvoted, where that is no chance."""
     least_mm2 = max(
-        OUTVOTED_SPACINGS * cloud.sparsest_mm**2,
-        OUTVOTED_SHARE * float(fused.mesh.area),
-        OUTVOTED_TIMES * float(np.median(fused.outvoted_mm2)),
+        options.outvoted_spacings * cloud.sparsest_mm**2,
+        options.outvoted_share * float(fused.mesh.area),
+        options.outvoted_times * float(np.median(fused.outvoted_mm2)),
     )
     return {
         k: float(area)
@@ -283,11 +276,13 @@ def _metadata(scans: Sequence[Scan], notes: Sequence[str], seed: int) -> dict[st
     }
 
 
-def _notes(scans: Sequence[Scan], placed: Placement, fused: Fused) -> list[str]:
+def _notes(
+    scans: Sequence[Scan], placed: Placement, fused: Fused, options: MergeOptions
+) -> list[str]:
     used = len(placed.poses)
     notes = [f"{used} of {len(scans)} scans merged"]
     notes += [f"{scans[k].source} {why}, and was left out" for k, why in placed.left_out.items()]
-    if fused.unseen_ratio > TOLD_SHARE:
+    if fused.unseen_ratio > options.told_share:
         notes.append(
             f"{fused.coverage.unseen_mm2:,.0f} mm² ({fused.unseen_ratio:.1%}) of the surface was "
             "seen by no scan and is closed by a guess, is unknown, and is never called missing"

@@ -30,10 +30,6 @@ from amrepair.merge.threads import in_threads
 from amrepair.merge.views import Fit, Placed, View, joined, judged, settled
 from gcode.progress import Progress, silent
 
-TRIED = 4  # poses of two groups that are looked at closely
-GROUP_POINTS = 3_000  # of each view, that groups are settled on
-GROUP_STEPS = 8
-
 Pairs = dict[tuple[int, int], list[Fit]]
 
 
@@ -91,14 +87,16 @@ class Graph:
                 pose = fit.pose if i < j else np.linalg.inv(fit.pose)
                 whole = fixed[i] @ pose @ np.linalg.inv(moving[j])
                 found.append((max(fit.score, 0.01 * fit.overlap), whole))
-        surface = joined(self.views, moving, GROUP_POINTS)
+        surface = joined(self.views, moving, self.options.group.points)
         near_mm = self.options.same_size * self.size_mm
         kept = apart([p for _, p in sorted(found, key=lambda f: -f[0])], surface, near_mm)
         votes = [
             sum(score for score, pose in found if len(apart([one, pose], surface, near_mm)) == 1)
             for one in kept
         ]
-        return [kept[k] for k in np.argsort(-np.array(votes), kind="stable")[:TRIED]]
+        return [
+            kept[k] for k in np.argsort(-np.array(votes), kind="stable")[: self.options.group.tried]
+        ]
 
     def ways(self, fixed: Placed, moving: Placed) -> list[Fit]:
         """How one group may lie on another, settled and judged by all that both saw; best first."""
@@ -109,12 +107,15 @@ class Graph:
         poses = self.proposed(fixed, moving)
         fits: list[Fit] = []
         if poses:
-            whole, own = (joined(self.views, g, GROUP_POINTS) for g in (fixed, moving))
+            whole, own = (joined(self.views, g, self.options.group.points) for g in (fixed, moving))
             spacing_mm = max(self.views[k].thin_spacing_mm for k in (*fixed, *moving))
             reach_mm = self.options.reach_spacings * spacing_mm
-            within = np.geomspace(2.0 * reach_mm, reach_mm, GROUP_STEPS)
+            within = np.geomspace(2.0 * reach_mm, reach_mm, self.options.group.steps)
             there = in_threads(
-                lambda p: settled(whole, own, p, within, GROUP_POINTS, self.options.judge), poses
+                lambda p: settled(
+                    whole, own, p, within, self.options.group.points, self.options.judge
+                ),
+                poses,
             )
             fits = [judged(self.views, fixed, moving, pose, self.options) for pose in there]
             fits = self._ranked(distinct(fits, own, self.options.same_size * self.size_mm))
@@ -225,10 +226,15 @@ class Graph:
         for k in list(group)[1:]:
             others = {m: pose for m, pose in group.items() if m != k}
             reach_mm = self.options.reach_spacings * self.views[k].thin_spacing_mm
-            whole = joined(self.views, others, GROUP_POINTS)
+            whole = joined(self.views, others, self.options.group.points)
             within = np.array([1.0, 1.0]) * reach_mm
             group[k] = settled(
-                whole, self.views[k].thin, group[k], within, GROUP_POINTS, self.options.judge
+                whole,
+                self.views[k].thin,
+                group[k],
+                within,
+                self.options.group.points,
+                self.options.judge,
             )
 
 

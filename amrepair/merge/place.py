@@ -17,10 +17,6 @@ from amrepair.merge.told import of_views, on_turntable
 from amrepair.merge.views import Fit, Placed, View, joined, judged
 from gcode.progress import Progress, silent
 
-# Sensors within this of one direction (cosine) did not walk round the part: it turned.
-ONE_SENSOR_SIDE = 0.9
-GAP_SPACINGS = 8.0  # how far off a contradicting view's surface is looked for
-
 
 @dataclass(frozen=True, slots=True)
 class Placement:
@@ -109,7 +105,7 @@ def _as_given(views: Sequence[View], options: MergeOptions) -> Placed:
     for view in views:
         way = (view.looks.sensors_mm - view.thin.points_mm.mean(axis=0)).mean(axis=0)
         sides.append(way / max(float(np.linalg.norm(way)), 1e-12))
-    if (np.array(sides) @ np.array(sides).T).min() > ONE_SENSOR_SIDE:
+    if (np.array(sides) @ np.array(sides).T).min() > options.one_sensor_side:
         return {}
     rest: Placed = {k: np.eye(4) for k in range(len(views))}
     kept, dropped = _consistent(views, rest, options)
@@ -179,7 +175,7 @@ def _gap_mm(views: Sequence[View], poses: Placed, k: int, options: MergeOptions)
     """Median height of a view over the others' surface beside it; NaN where there is none."""
     rest = joined(views, {m: p for m, p in poses.items() if m != k}, options.judge.points)
     points = moved(views[k].thin.points_mm, poses[k])
-    within = GAP_SPACINGS * views[k].thin_spacing_mm
+    within = options.gap_spacings * views[k].thin_spacing_mm
     distance, index = rest.tree.query(points, distance_upper_bound=within)
     near = np.isfinite(distance)
     if not near.any():

@@ -16,27 +16,7 @@ from scipy import ndimage
 from amrepair.frames import moved, ways_across
 from amrepair.merge import sight_kernels as kernels
 from amrepair.merge.cloud import directions, outward, planes, spacing_of
-
-PIXEL_SPACINGS = 1.6  # every pixel of a face seen at an angle of up to 60° has a point
-CLOSING = 2  # pixels: gaps that chance leaves are closed
-# A surface that is seen this nearly edge-on returns nothing, though it stands there (cosine); where
-# the sensor's place is a guess, this much more.
-EDGE_ON, EDGE_ON_GUESSED = 0.25, 0.35
-# Where the sensor may have stood, from the points alone.
-PLACES = 400
-BEHIND_PIXELS, STEEPEST = 3.5, 0.25
-GRAZING, GRAZING_COUNTS = 0.12, 0.5
-# Hidden shares up to this, or so much above the least, are noise and chance: of 48 views of eight
-# parts the sensor's true direction was within 9° of one that passed, always.
-HIDDEN_RATIO, ABOVE_LEAST = 0.02, 0.01
-# No view's least share was above this (0.031 at most); whole scans of ten parts had 0.088 and more.
-VIEW_RATIO = 0.05
-MOST_GUESSES = 10
-FEW_GUESSES, RING_RAD = 8, 0.16  # fewer are widened to what lies beside them
-SENSOR_DISTANCES = (2.0, 8.0)  # of the view's diagonal: nearer and farther than scanners stand
-LEAST_SEEN = 100  # points of one sensor, or it saw nothing to speak of
-# Places of one sensor that lie within this share of their length of a line are its way.
-WAY_RATIO = 1e-3
+from amrepair.merge.options import USUAL_MERGE, SightOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +61,14 @@ class Look:
         sensor_mm: Float[np.ndarray, " 3"],
         *,
         way: Float[np.ndarray, " 3"] | None = None,
-        edge_on: float = EDGE_ON,
+        guessed: bool = False,
+        options: SightOptions = USUAL_MERGE.sight,
     ) -> Look:
         """The image of what a sensor saw, that stood still or moved along a way (unit vector)."""
-        pixel_mm = PIXEL_SPACINGS * spacing_of(points_mm)
+        closing, edge_on = options.closing_px, options.edge_on
+        if guessed:
+            edge_on = options.edge_on_guessed
+        pixel_mm = options.pixel_spacings * spacing_of(points_mm)
         ahead = points_mm.mean(axis=0) - sensor_mm
         if way is not None:
             ahead = ahead - (ahead @ way) * way
@@ -101,8 +85,8 @@ class Look:
         np.minimum.at(near_mm, tuple(pixel.T), reach)
         seen = np.isfinite(near_mm)
         square = np.ones((3, 3), dtype=bool)
-        seen |= ndimage.binary_closing(np.pad(seen, CLOSING), square, iterations=CLOSING)[
-            CLOSING:-CLOSING, CLOSING:-CLOSING
+        seen |= ndimage.binary_closing(np.pad(seen, closing), square, iterations=closing)[
+            closing:-closing, closing:-closing
         ]
         outside_px = np.asarray(ndimage.distance_transform_edt(~np.pad(seen, 1)))
         return cls(camera, pixel_mm, first, near_mm, outside_px, edge_on, {})
@@ -215,23 +199,26 @@ def told(
     points_mm: Float[np.ndarray, "n 3"],
     sensors_mm: Float[np.ndarray, "k 3"],
     sensor_index: Int[np.ndarray, " n"],
+    options: SightOptions = USUAL_MERGE.sight,
 ) -> Looks:
     """Looks of sensors whose places are known; many places on a line are one that moved along."""
     if len(sensors_mm) > 3:
         middle = sensors_mm.mean(axis=0)
         _, size, ways = np.linalg.svd(sensors_mm - middle, full_matrices=False)
-        if size[1] <= WAY_RATIO * size[0]:
-            return Looks((Look.of(points_mm, middle, way=ways[0]),), False)
+        if size[1] <= options.way_ratio * size[0]:
+            return Looks((Look.of(points_mm, middle, way=ways[0], options=options),), False)
     own = [points_mm[sensor_index == k] for k in range(len(sensors_mm))]
     each = [
-        Look.of(seen, place)
+        Look.of(seen, place, options=options)
         for seen, place in zip(own, sensors_mm, strict=True)
-        if len(seen) > LEAST_SEEN
+        if len(seen) > options.least_seen
     ]
     return Looks(tuple(each), False)
 
 
-def guess_directions(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+def guess_directions(
+    points_mm: Float[np.ndarray, "n 3"], options: SightOptions = USUAL_MERGE.sight
+) -> Float[np.ndarray, "k 3"]:
     """Ways to where one sensor may have stood that saw all of these points; none of a whole scan.
 
     A view passes from behind as well: the side to which more of its surface is open is taken (of
@@ -240,29 +227,33 @@ def guess_directions(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "
     spacing_mm = spacing_of(points_mm)
     plane = planes(points_mm, spacing_mm)
     normals = plane.normals
-    ways = directions(PLACES)
-    hidden = np.array([_hidden(points_mm, normals, way, spacing_mm) for way in ways])
-    if hidden.min() > VIEW_RATIO:
+    ways = directions(options.places)
+    hidden = np.array([_hidden(points_mm, normals, way, spacing_mm, options) for way in ways])
+    if hidden.min() > options.view_ratio:
         return np.empty((0, 3))
-    passed = ways[hidden <= max(HIDDEN_RATIO, hidden.min() + ABOVE_LEAST)]
+    passed = ways[hidden <= max(options.hidden_ratio, hidden.min() + options.above_least)]
     best = ways[int(np.argmin(hidden))]
     side = float(np.sign(outward(points_mm, normals, spacing_mm, plane.sigma_mm) @ best).mean())
     mean = best if side >= 0.0 else -best
     turned = passed * np.where(passed @ mean < 0.0, -1.0, 1.0)[:, None]
-    if len(turned) < FEW_GUESSES:
-        turned = ways[(ways @ turned.T).max(axis=1) > np.cos(RING_RAD)]
-    return _spread(turned, MOST_GUESSES)
+    if len(turned) < options.few_guesses:
+        turned = ways[(ways @ turned.T).max(axis=1) > np.cos(options.ring_rad)]
+    return _spread(turned, options.most_guesses)
 
 
-def guessed(points_mm: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, "k 3"]) -> Looks:
+def guessed(
+    points_mm: Float[np.ndarray, "n 3"],
+    towards: Float[np.ndarray, "k 3"],
+    options: SightOptions = USUAL_MERGE.sight,
+) -> Looks:
     """Looks from every place where the sensor may have stood."""
     centre = points_mm.mean(axis=0)
     diagonal_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
     return Looks(
         tuple(
-            Look.of(points_mm, centre + ratio * diagonal_mm * way, edge_on=EDGE_ON_GUESSED)
+            Look.of(points_mm, centre + ratio * diagonal_mm * way, guessed=True, options=options)
             for way in towards
-            for ratio in SENSOR_DISTANCES
+            for ratio in options.sensor_distances
         ),
         len(towards) > 0,
     )
@@ -273,10 +264,11 @@ def _hidden(
     normals: Float[np.ndarray, "n 3"],
     way: Float[np.ndarray, " 3"],
     spacing_mm: float,
+    options: SightOptions,
 ) -> float:
     """Share of the points that another hides along a direction, from either end, or edge-on."""
     axes, _ = axes_towards(way)
-    pixel_mm = PIXEL_SPACINGS * spacing_mm
+    pixel_mm = options.pixel_spacings * spacing_mm
     local = (points_mm - points_mm.mean(axis=0)) @ axes.T
     pixel = np.floor(local[:, :2] / pixel_mm).astype(np.int64)
     pixel -= pixel.min(axis=0)
@@ -284,8 +276,9 @@ def _hidden(
     least = np.full(key.max() + 1, np.inf)
     np.minimum.at(least, key, local[:, 2])
     steep = np.abs(normals @ way)
-    behind = local[:, 2] - least[key] > BEHIND_PIXELS * pixel_mm / np.maximum(steep, STEEPEST)
-    return float(behind.mean() + GRAZING_COUNTS * (steep < GRAZING).mean())
+    behind_mm = options.behind_pixels * pixel_mm / np.maximum(steep, options.steepest)
+    behind = local[:, 2] - least[key] > behind_mm
+    return float(behind.mean() + options.grazing_counts * (steep < options.grazing).mean())
 
 
 def _spread(towards: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, "k 3"]:

@@ -17,14 +17,9 @@ from amrepair.errors import InputError
 from amrepair.frames import motion_about, moved
 from amrepair.merge import sight
 from amrepair.merge.cloud import outward, planes, spacing_of
-from amrepair.merge.options import JudgeOptions, MergeOptions
+from amrepair.merge.options import USUAL_MERGE, JudgeOptions, MergeOptions
 from amrepair.merge.threads import in_threads
 from amrepair.scans import Scan
-
-LEAST_VIEW_POINTS = 2_000
-MAX_POINTS = 400_000  # of one scan; more add time, not accuracy
-THIN_POINTS, IMAGE_POINTS, GUESS_POINTS = 15_000, 40_000, 8_000
-CLEAR = 0.2  # cosine of a normal to a sensor's ray, or it is not clear which way it faces
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +57,13 @@ class View:
     incidence
         (n,) cosine of the angle at which its sensor saw each point; NaN where nobody knows.
     thin
-        About `THIN_POINTS` of them.
+        Some of them, that poses are looked for with.
     spacing_mm, sigma_mm
         Of `surface`: measured.
     looks
         What its sensors saw through.
+    clear
+        Cosine of a normal to its sensor's ray, or it is not clear which way it faces.
     """
 
     name: str
@@ -79,9 +76,10 @@ class View:
     thin_spacing_mm: float
     sigma_mm: float
     looks: sight.Looks
+    clear: float
 
     @classmethod
-    def of(cls, scan: Scan, rng: np.random.Generator) -> View:
+    def of(cls, scan: Scan, rng: np.random.Generator, options: MergeOptions = USUAL_MERGE) -> View:
         """Measure a scan.
 
         Raises
@@ -89,33 +87,34 @@ class View:
         InputError
             If too few of its points are different.
         """
+        least, most = options.view.least_points, options.view.most_points
         chosen = np.arange(len(scan))
-        if scan.edge is not None and int((scan.edge == 0).sum()) >= LEAST_VIEW_POINTS:
+        if scan.edge is not None and int((scan.edge == 0).sum()) >= least:
             chosen = np.flatnonzero(scan.edge == 0)
-        if len(chosen) > MAX_POINTS:
-            chosen = np.sort(rng.permutation(chosen)[:MAX_POINTS])
+        if len(chosen) > most:
+            chosen = np.sort(rng.permutation(chosen)[:most])
         points, first = np.unique(scan.points_mm[chosen], axis=0, return_index=True)
-        if len(points) < LEAST_VIEW_POINTS:
+        if len(points) < least:
             raise InputError(
                 f"the scan {scan.source} has only {len(points)} different points among "
-                f"{len(chosen)}; a template needs {LEAST_VIEW_POINTS:,} of each scan: check the "
+                f"{len(chosen)}; a template needs {least:,} of each scan: check the "
                 "export"
             )
         sensors, index = scan.sensors_mm, scan.sensor_index
         if index is not None:
             index = index[chosen][first]
-        looks = _looks(points, sensors, index, rng)
+        looks = _looks(points, sensors, index, rng, options)
         spacing_mm = spacing_of(points)
         plane = planes(points, spacing_mm)
         normals, incidence = _facing(
             points, plane.normals, spacing_mm, plane.sigma_mm, sensors, index, looks
         )
         surface = Surface.of(points, normals)
-        which = surface.tree.query(thin_out(points, THIN_POINTS, rng))[1]
+        which = surface.tree.query(thin_out(points, options.view.thin_points, rng))[1]
         thin = Surface.of(points[which], normals[which])
         return cls(
             scan.source, surface, plane.rough_mm, plane.tilt_rad, incidence, thin, spacing_mm,
-            spacing_of(thin.points_mm), plane.sigma_mm, looks,
+            spacing_of(thin.points_mm), plane.sigma_mm, looks, options.view.clear,
         )  # fmt: skip
 
     @property
@@ -126,15 +125,15 @@ class View:
     @property
     def sure(self) -> Bool[np.ndarray, " n"]:
         """(n,) whether it is clear which way the normals face."""
-        return np.asarray(self.incidence > CLEAR)
+        return np.asarray(self.incidence > self.clear)
 
     @property
     def confidence(self) -> Float[np.ndarray, " n"]:
         """(n,) inverse variance of what the angle of incidence adds; 1 head-on, or unknown.
 
-        Below `CLEAR` the cosine is the normal's noise.
+        Below `clear` the cosine is the normal's noise.
         """
-        return np.where(np.isnan(self.incidence), 1.0, np.maximum(self.incidence, CLEAR) ** 2)
+        return np.where(np.isnan(self.incidence), 1.0, np.maximum(self.incidence, self.clear) ** 2)
 
 
 def _looks(
@@ -142,13 +141,16 @@ def _looks(
     sensors_mm: Float[np.ndarray, "k 3"] | None,
     sensor_index: Int[np.ndarray, " n"] | None,
     rng: np.random.Generator,
+    options: MergeOptions,
 ) -> sight.Looks:
-    few = rng.permutation(len(points_mm))[:IMAGE_POINTS]
+    few = rng.permutation(len(points_mm))[: options.view.image_points]
     image = np.ascontiguousarray(points_mm[few])
     if sensors_mm is not None and sensor_index is not None:
-        return sight.told(image, sensors_mm, sensor_index[few])
-    towards = sight.guess_directions(thin_out(points_mm, GUESS_POINTS, rng))
-    return sight.guessed(image, towards) if len(towards) else sight.NOWHERE
+        return sight.told(image, sensors_mm, sensor_index[few], options.sight)
+    towards = sight.guess_directions(
+        thin_out(points_mm, options.view.guess_points, rng), options.sight
+    )
+    return sight.guessed(image, towards, options.sight) if len(towards) else sight.NOWHERE
 
 
 def _facing(
