@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,18 +54,20 @@ def run(
     ids: tuple[str, str, str],
     source: Source,
     *,
-    max_residual_mm: float,
+    max_residual_mm: float | None,
     seed: int,
     as_json: bool,
 ) -> None:
     """Find the scanner and write the file."""
     setup = load_setup(*ids)
+    options = PoseOptions()
+    if max_residual_mm is not None:
+        options = replace(options, max_residual_mm=max_residual_mm)
     bars = console.Bars()
     console.writable(output)
     with bars.shown():
         standing = _standing(setup, source.job, source.layer)
         cloud = _scan(setup, source, bars)
-        options = PoseOptions(max_residual_mm=max_residual_mm)
         found = calibrate(cloud, standing, options=options, rng=np.random.default_rng(seed))
     about = {"printer": setup.printer.id, "scan": cloud.source}
     write_calibration(output, found, about)
@@ -74,8 +76,8 @@ def run(
         return
     console.out.print(
         f"{output}: the target lies {found.residual_mm:.3f} mm off where it should be (limit "
-        f"{max_residual_mm:g}), the bed {found.bed_mm:.3f} mm off a plane; the next best turn fits "
-        f"{found.runner_up:.1f} times worse."
+        f"{options.max_residual_mm:g}), the bed {found.bed_mm:.3f} mm off a plane; "
+        f"the next best turn fits {found.runner_up:.1f} times worse."
     )
 
 

@@ -78,8 +78,13 @@ def calibrate_command(
         Path | None, typer.Option(help="Only write the target's G-code, to print it elsewhere.")
     ] = None,
     max_residual_mm: Annotated[
-        float, typer.Option(min=0.001, max=1.0, help="Refuse a calibration that is worse.")
-    ] = 0.15,
+        float | None,
+        typer.Option(
+            min=0.001,
+            max=1.0,
+            help="Refuse a calibration that is worse, mm. Left out: as 'doctor --options' says.",
+        ),
+    ] = None,
     scan_timeout_s: ScanTimeoutOption = SCAN_TIMEOUT_S,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
