@@ -13,6 +13,9 @@ from gcode.surfaces.sizes import PARSER_ERRORS, in_words
 
 MESH_SPACING_MM = 0.2
 MAX_MESH_SAMPLES = 2_000_000
+# glTF 2.0, 3.4: lengths are metres, and Y is up.
+GLTF_SUFFIX, GLTF_UNIT_MM = ".glb", 1000.0
+Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mesh(path: Path, frame: str, sigma_mm: float, *, unit_mm: float = 1.0) -> Scan:
@@ -26,6 +29,8 @@ def read_mesh(path: Path, frame: str, sigma_mm: float, *, unit_mm: float = 1.0) 
     """
     try:
         vertices, faces = read_triangles(path)
+        if path.suffix.lower() == GLTF_SUFFIX:
+            vertices, unit_mm = vertices @ Z_UP_FROM_Y_UP.T, GLTF_UNIT_MM
         if len(faces) == 0:
             raise InputError(f"{path}: the mesh has no faces; export it again")
         import trimesh  # half a second, which a file that is refused need not wait

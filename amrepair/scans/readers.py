@@ -2,8 +2,8 @@
 
 It reads, and refuses with one sentence what it cannot read; it does not clean or guess frames.
 Points that are not finite are refused, not dropped, but in range images: there NaN is the format's
-word for "nothing seen", a gap. Lengths are millimetres, but where the format (PTX) or the file
-(a PLY's `comment unit m`) says otherwise.
+word for "nothing seen", a gap. Lengths are millimetres, but where the format (PTX, glTF) or the
+file (a PLY's `comment unit m`) says otherwise.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ from amrepair.scans.viewpoint import viewpoint_of
 from gcode.surfaces.depth_maps import is_depth_map
 
 POINT_SUFFIXES = frozenset(
-    {".ply", ".pcd", ".ptx", ".xyz", ".txt", ".csv", ".asc", ".npy", ".npz", ".png"}
+    {".ply", ".pcd", ".ptx", ".pts", ".xyz", ".txt", ".csv", ".asc", ".npy", ".npz", ".png"}
 )
-MESH_SUFFIXES = frozenset({".stl", ".obj", ".3mf"})
+MESH_SUFFIXES = frozenset({".stl", ".obj", ".3mf", ".off", ".glb"})
+UNIT_LENGTH_WITHIN, UNIT_LENGTH_SHARE = 0.05, 0.9  # two digits; some programs have gaps of 0 0 0
 HEIGHT_SUFFIXES = frozenset({".tif", ".tiff"})
 
 __all__ = ["read_height_map", "read_scan", "write_ply"]
@@ -61,8 +62,8 @@ def read_scan(
     Parameters
     ----------
     path
-        .ply, .pcd, .ptx, .xyz/.txt/.csv/.asc, .npy/.npz, .png/.tif/.tiff with a camera's .json
-        beside it (depth map), .tif/.tiff without (height map), .stl/.obj/.3mf.
+        .ply, .pcd, .ptx, .pts/.xyz/.txt/.csv/.asc, .npy/.npz, .png/.tif/.tiff with a camera's
+        .json beside it (depth map), .tif/.tiff without (height map), .stl/.obj/.3mf/.off/.glb.
     frame
         The frame that the coordinates are in.
     sigma_mm
@@ -273,14 +274,17 @@ def _viewpoint(
 
 
 def _read_table(path: Path, frame: str) -> Scan:
-    """Text or .npy rows of x y z, or x y z nx ny nz; one line of names is allowed in text."""
+    """Text or .npy rows of x y z, or x y z nx ny nz; one line of names, or a count, may be before.
+
+    Six columns may be x y z and a colour, too: normals are as long as one another, colours are not.
+    """
     if path.suffix.lower() == ".npy":
         table = load_npy(path)
     else:
         text = _bytes(path).decode("utf-8", "replace")
         bare = (line.split("#", 1)[0].strip() for line in text.splitlines())
         lines = [line for line in bare if line and line[0] not in "/;"]
-        if lines and not _is_row(lines[0]):
+        if lines and (not _is_row(lines[0]) or lines[0].isdecimal()):
             lines = lines[1:]
         if not lines:
             raise InputError(f"{path}: the file holds no points; check the export")
@@ -288,8 +292,16 @@ def _read_table(path: Path, frame: str) -> Scan:
         table = read_table(lines, path, "the points", delimiter=delimiter)
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: rows need at least x y z, the array has shape {table.shape}")
-    names = ["x", "y", "z", "nx", "ny", "nz"] if table.shape[1] == 6 else ["x", "y", "z"]
+    names = ["x", "y", "z"]
+    if table.shape[1] == 6 and _are_unit(table[:, 3:]):
+        names += ["nx", "ny", "nz"]
     return _from_columns({n: table[:, i] for i, n in enumerate(names)}, path, frame)
+
+
+def _are_unit(vectors: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether nearly all are of length 1, as files round it."""
+    length = np.linalg.norm(vectors, axis=1)
+    return bool((np.abs(length - 1.0) < UNIT_LENGTH_WITHIN).mean() > UNIT_LENGTH_SHARE)
 
 
 def _is_row(line: str) -> bool:

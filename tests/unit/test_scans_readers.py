@@ -100,12 +100,38 @@ def test_pcd_of_open3d(tmp_path: Path, scan: Scan, kind: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "separator", "head"),
-    [("a.xyz", " ", ""), ("a.csv", ",", "x,y,z\n"), ("a.txt", ";", "")],
+    [
+        ("a.xyz", " ", ""),
+        ("a.csv", ",", "x,y,z\n"),
+        ("a.txt", ";", ""),
+        ("a.pts", " ", "400\n"),
+    ],
 )
 def test_text(tmp_path: Path, scan: Scan, name: str, separator: str, head: str) -> None:
     path = tmp_path / name
     path.write_text(head + "\n".join(separator.join(map(repr, r)) for r in scan.points_mm.tolist()))
     assert np.array_equal(read_scan(path, frame="scanner").points_mm, scan.points_mm)
+
+
+def test_colours_after_the_points_are_no_normals(tmp_path: Path, scan: Scan) -> None:
+    """Regression: x y z red green blue, as CloudCompare writes it, was read as with normals."""
+    points = scan.points_mm
+    rng = np.random.default_rng(0)
+    colours = rng.integers(1, 256, points.shape)
+    normals = rng.normal(size=points.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for name, more, kept in (("rgb.asc", colours, False), ("n.asc", normals, True)):
+        np.savetxt(tmp_path / name, np.column_stack([points, more]), fmt="%.4f")
+        back = read_scan(tmp_path / name, frame="scanner")
+        assert (back.normals is not None) == kept
+
+
+def test_gltf_is_in_metres_and_y_up(tmp_path: Path) -> None:
+    box = trimesh.creation.box(extents=[0.03, 0.012, 0.02])  # 20 mm deep, 12 mm high
+    trimesh.Scene(box).export(tmp_path / "phone.glb")
+    points = read_scan(tmp_path / "phone.glb", frame="scanner").points_mm
+    assert np.ptp(points, axis=0) == pytest.approx([30.0, 20.0, 12.0], abs=0.01)
+    assert points[:, 2].max() == pytest.approx(6.0, abs=0.01)
 
 
 @pytest.mark.parametrize("name", ["h.npz", "h.tif"])
@@ -165,6 +191,9 @@ BROKEN = {
     "bad.npy": b"\x93NUMPY",
     "bad.npz": b"PK",
     "bad.stl": b"",
+    "bad.glb": b"glTF\x02\x00\x00\x00\x0c\x00\x00\x00",
+    "bad.off": b"OFF\n8 6",
+    "bad.pts": b"3\n1 2\n",
     "bad.tif": b"II*",
     "what.doc": b"1 2 3",
 }
