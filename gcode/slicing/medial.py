@@ -15,8 +15,9 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
+import manifold3d
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gcode.moves import Role
 from gcode.slicing import medial_kernels as kernels
@@ -50,7 +51,7 @@ def fill_thin(region: Any, bore_mm: float, options: FillOptions) -> ThinFill:
     area_mm2 = float(region.area())
     chains = [piece for chain in _axis(region, options) for piece in _long_enough(*chain, least_mm)]
     if not chains:
-        return _stroke(region, area_mm2, least_mm=least_mm, most_mm=most_mm)
+        return _dot(region, area_mm2, bore_mm, options)
     beads = [_bead(points, radius, most_mm, options) for points, radius in chains]
     laid_mm2 = sum(bead.area_mm2 for bead in beads)
     # what narrower stretches hold cannot be told from rounding in the sum: measure it by the
@@ -67,8 +68,13 @@ def _capped(bead: Bead, most_mm: float) -> Bead:
     return Bead(bead.xy_mm, np.minimum(bead.share_mm, most_mm), bead.role, bead.closed)
 
 
-def _stroke(region: Any, area_mm2: float, *, least_mm: float, most_mm: float) -> ThinFill:
-    """One straight stroke through a region that is about as long as wide: a dot."""
+def _dot(region: Any, area_mm2: float, bore_mm: float, options: FillOptions) -> ThinFill:
+    """One straight stroke through a region that is about as long as wide.
+
+    A thread too thin for a bead has no axis, either: a stroke from end to end of one that is bent
+    would lie beside it, and across the hole that a ring of it runs around.
+    """
+    least_mm, most_mm = options.widths_mm(bore_mm)
     points = np.asarray(max(region.to_polygons(), key=len), np.float64)
     centre = points.mean(axis=0)
     # This is the direction of the longest chord through the corners.
@@ -83,6 +89,11 @@ def _stroke(region: Any, area_mm2: float, *, least_mm: float, most_mm: float) ->
     run_mm = max(length_mm - 0.5 * breadth_mm, area_mm2 / most_mm)
     xy = middle + np.array([[-0.5], [0.5]]) * run_mm * axes[0]
     share_mm = area_mm2 / run_mm
+    aside = 0.5 * share_mm * axes[1]
+    corners = np.array([xy[0] - aside, xy[1] - aside, xy[1] + aside, xy[0] + aside])
+    covered = manifold3d.CrossSection([corners], manifold3d.FillRule.NonZero)  # either way round
+    if (covered ^ region).area() < options.dot_inside_ratio * area_mm2:
+        return ThinFill((), area_mm2)
     return ThinFill((Bead(xy, np.array([share_mm]), Role.GAP_FILL, closed=False),), 0.0)
 
 
@@ -148,14 +159,25 @@ def _leaving(
 def _long_enough(
     points: Float[np.ndarray, "k 2"], radius: Float[np.ndarray, " k"], least_mm: float
 ) -> list[Chain]:
-    """Stretches where the wall is at least `least_mm` thick."""
-    wide = np.concatenate([[False], 2 * radius >= least_mm * (1 - 1e-6), [False]])
-    edges = np.flatnonzero(wide[1:] != wide[:-1]).tolist()
-    return [
-        (points[a:b], radius[a:b])
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-        if b - a >= 2
-    ]
+    """Stretches where the wall is at least `least_mm` thick.
+
+    A wall that is thinner for less than such a length breaks no bead, and one that is thick enough
+    for less holds none: a wall of just that thickness would be a row of dashes.
+    """
+    wide = 2 * radius >= least_mm * (1 - 1e-6)
+    along_mm = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    for holds in (False, True):  # short gaps are closed before short stretches go
+        for a, b in _runs(wide == holds):
+            inside = a > 0 and b < len(wide)
+            if along_mm[b - 1] - along_mm[a] < least_mm and (holds or inside):
+                wide[a:b] = not holds
+    return [(points[a:b], radius[a:b]) for a, b in _runs(wide) if b - a >= 2]
+
+
+def _runs(true: Bool[np.ndarray, " k"]) -> list[tuple[int, int]]:
+    """First and past-the-last place of each run of true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]))).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _bead(

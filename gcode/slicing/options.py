@@ -245,6 +245,8 @@ class FillOptions:
         other, and an axis runs between them.
     end_inset_ratio
         Of the radius: an open bead ends so far short of its wall, its round cap fills the rest.
+    dot_inside_ratio
+        A stroke that fills a dot lies in it with at least this share of its area.
     """
 
     least_nozzles: float = 0.5
@@ -253,6 +255,7 @@ class FillOptions:
     connect_spacings: float = 2.5
     facing_ratio: float = 1.5
     end_inset_ratio: float = 0.5
+    dot_inside_ratio: float = 0.5
 
     def widths_mm(self, bore_mm: float) -> tuple[float, float]:
         """Least and greatest width of a bead from a nozzle of such a bore."""
