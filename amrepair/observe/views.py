@@ -68,10 +68,11 @@ def contradictions(
     """
     found: list[Contradiction] = []
     views = int(view.max(initial=0)) + 1
-    key, index = np.unique(cell * views + view, return_inverse=True)
+    key = cell * views + view
+    total, points = np.bincount(key, count * value_mm), np.bincount(key, count)
+    key = np.flatnonzero(points)
     cell, view = key // views, key % views
-    value_mm = np.bincount(index, count * value_mm) / np.bincount(index, count)
-    count = np.bincount(index, count)
+    value_mm, count = total[key] / points[key], points[key]
     while True:
         total = np.bincount(cell, count * value_mm)[cell] - count * value_mm
         others = np.bincount(cell, count)[cell] - count
