@@ -69,11 +69,11 @@ def contradictions(
     found: list[Contradiction] = []
     views = int(view.max(initial=0)) + 1
     key = cell * views + view
-    total, points = np.bincount(key, count * value_mm), np.bincount(key, count)
+    summed, points = np.bincount(key, count * value_mm), np.bincount(key, count)
     key = np.flatnonzero(points)
     cell, view = key // views, key % views
     points = points[key]
-    value_mm = total[key] / points
+    value_mm = summed[key] / points
     while True:
         total = np.bincount(cell, points * value_mm)[cell] - points * value_mm
         others = np.bincount(cell, points)[cell] - points
