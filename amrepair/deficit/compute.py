@@ -32,6 +32,7 @@ from amrepair.deficit.walls import (
 )
 from amrepair.errors import DeficitError
 from amrepair.field.as_built import Evidence, with_stubs
+from amrepair.field.groups import area_per_point
 from amrepair.frames import Transform, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
@@ -351,7 +352,5 @@ def _is_skipped(piece: manifold3d.Manifold, gone: PlannedBeads | None) -> bool:
 
 def _unseen_area(anomaly: AnomalyMap) -> float:
     """Area of the unseen template points, from their mean spacing."""
-    from amrepair.field.groups import area_per_point
-
     count = int((anomaly.template_label == int(Label.UNSEEN)).sum())
     return count * area_per_point(anomaly.template_points_mm)

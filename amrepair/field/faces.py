@@ -240,7 +240,7 @@ def find_faces(
     near_cell, chosen, at = _looked_at(scan, template, surfels, off, threshold_mm, options.faces)
     place, plane, deviation, is_broken = at.place_mm, at.plane, at.deviation_mm, at.is_broken
     which = np.flatnonzero(is_broken)
-    broken = Broken(place[which], plane[which], deviation[which])
+    broken = Broken(place[which], plane[which], deviation[which], at.outward[which])
     spacing_mm = float(np.sqrt(np.median(at.area_mm2))) or surfels.spacing_mm  # 0: all in one place
     on_mm = np.concatenate([place[~is_broken], scan.points_mm[(surfels.of_point >= 0) & ~chosen]])
     occupancy = find_occupancy(

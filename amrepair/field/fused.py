@@ -111,10 +111,11 @@ class Surfels:
         """Cell, view, mean deviation and number of points of each view's share of a cell."""
         has = self.of_point >= 0
         views = int(view_index.max()) + 1
-        keys, index, count = np.unique(
-            self.of_point[has] * views + view_index[has], return_inverse=True, return_counts=True
-        )
-        mean = np.bincount(index, self.point_deviation_mm[has]) / count
+        key = self.of_point[has] * views + view_index[has]
+        count = np.bincount(key)
+        keys = np.flatnonzero(count)
+        count = count[keys]
+        mean = np.bincount(key, self.point_deviation_mm[has])[keys] / count
         return keys // views, keys % views, mean, count
 
     def toward_sensors(

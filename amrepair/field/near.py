@@ -33,21 +33,30 @@ def has_near(
     enough: int = 1,
 ) -> Bool[np.ndarray, " k"]:
     """(k,) whether at least so many of the points lie within a distance of each place."""
-    if len(asked_mm) == 0 or len(points_mm) == 0:
-        return np.zeros(len(asked_mm), dtype=bool)
-    asked = np.ascontiguousarray(asked_mm)
-    start, ordered, _, *grid = cells_of(asked, points_mm, within_mm)
-    return np.asarray(kernels.has_enough(asked, start, ordered, *grid, within_mm, enough))
+    return _beside(asked_mm, points_mm, within_mm, enough)[1] >= enough
 
 
 def nearest_within(
     asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "n 3"], within_mm: float
 ) -> Int[np.ndarray, " k"]:
     """(k,) number of the point nearest to each place, −1 where none is nearer than a distance."""
+    return _beside(asked_mm, points_mm, within_mm, len(points_mm) + 1)[0]
+
+
+def _beside(
+    asked_mm: Float[np.ndarray, "k 3"],
+    points_mm: Float[np.ndarray, "n 3"],
+    within_mm: float,
+    enough: int,
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """(k,) the nearest within a distance, or −1, and (k,) how many are, up to `enough`."""
     if len(asked_mm) == 0 or len(points_mm) == 0:
-        return np.full(len(asked_mm), -1, dtype=np.int32)
+        return np.full(len(asked_mm), -1, dtype=np.int32), np.zeros(len(asked_mm), dtype=np.int32)
     asked = np.ascontiguousarray(asked_mm)
-    return np.asarray(kernels.nearest(asked, *cells_of(asked, points_mm, within_mm), within_mm))
+    nearest, count = kernels.beside(
+        asked, *cells_of(asked, points_mm, within_mm), within_mm, enough
+    )
+    return nearest, count
 
 
 def cells_of(

@@ -53,61 +53,8 @@ def by_cell(asked: Any, points: Any, low: Any, cell: float, shape: Any) -> Any:
     return start[1:], ordered, number
 
 
-@njit(cache=True, nogil=True)
-def reaches(
-    place: Any,
-    start: Any,
-    ordered: Any,
-    low: Any,
-    cell: float,
-    shape: Any,
-    within: float,
-    enough: int,
-) -> bool:
-    """Whether so many of the points lie within a distance of a place, at most a cell's edge."""
-    ix = int((place[0] - low[0]) / cell)
-    iy = int((place[1] - low[1]) / cell)
-    iz = int((place[2] - low[2]) / cell)
-    count = 0
-    for x in range(ix - 1, ix + 2):
-        for y in range(iy - 1, iy + 2):
-            first = (x * shape[1] + y) * shape[2] + iz - 1
-            for p in range(start[first], start[first + 3]):
-                dx, dy, dz = (
-                    ordered[p, 0] - place[0],
-                    ordered[p, 1] - place[1],
-                    ordered[p, 2] - place[2],
-                )
-                if dx * dx + dy * dy + dz * dz <= within * within:
-                    count += 1
-                    if count >= enough:
-                        return True
-    return False
-
-
 @njit(cache=True, nogil=True, parallel=True)
-def has_enough(
-    asked: Any,
-    start: Any,
-    ordered: Any,
-    low: Any,
-    cell: float,
-    shape: Any,
-    within: float,
-    enough: int,
-) -> Any:
-    """(k,) `reaches` of each place; `start` and `ordered` are of `by_cell`.
-
-    Its box has an empty layer around all places.
-    """
-    found = np.zeros(len(asked), np.bool_)
-    for k in prange(len(asked)):
-        found[k] = reaches(asked[k], start, ordered, low, cell, shape, within, enough)
-    return found
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def nearest(
+def beside(
     asked: Any,
     start: Any,
     ordered: Any,
@@ -116,28 +63,37 @@ def nearest(
     cell: float,
     shape: Any,
     within: float,
+    enough: int,
 ) -> Any:
     """(k,) number of the point nearest to each place, −1 where none is within a distance.
 
-    At most a cell's edge; `start`, `ordered` and `number` are of `by_cell`.
+    And (k,) how many are; no more are looked at than are `enough`. The distance is at most a
+    cell's edge; `start`, `ordered` and `number` are of `by_cell`.
     """
-    found = np.empty(len(asked), np.int32)
+    nearest, count = np.empty(len(asked), np.int32), np.zeros(len(asked), np.int32)
     for k in prange(len(asked)):
         ix = int((asked[k, 0] - low[0]) / cell)
         iy = int((asked[k, 1] - low[1]) / cell)
         iz = int((asked[k, 2] - low[2]) / cell)
-        best, least = -1, within * within
-        for x in range(ix - 1, ix + 2):
-            for y in range(iy - 1, iy + 2):
-                first = (x * shape[1] + y) * shape[2] + iz - 1
-                for p in range(start[first], start[first + 3]):
-                    dx, dy, dz = (
-                        ordered[p, 0] - asked[k, 0],
-                        ordered[p, 1] - asked[k, 1],
-                        ordered[p, 2] - asked[k, 2],
-                    )
-                    apart = dx * dx + dy * dy + dz * dz
-                    if apart < least:
-                        best, least = number[p], apart
-        found[k] = best
-    return found
+        best, least = -1, np.inf
+        for line in range(9):  # cells one above the other: their points lie one after the other
+            x, y = ix - 1 + line // 3, iy - 1 + line % 3
+            first = (x * shape[1] + y) * shape[2] + iz - 1
+            for p in range(start[first], start[first + 3]):
+                dx, dy, dz = (
+                    ordered[p, 0] - asked[k, 0],
+                    ordered[p, 1] - asked[k, 1],
+                    ordered[p, 2] - asked[k, 2],
+                )
+                apart = dx * dx + dy * dy + dz * dz
+                if apart > within * within:
+                    continue
+                count[k] += 1
+                if apart < least:
+                    best, least = number[p], apart
+                if count[k] >= enough:
+                    break
+            if count[k] >= enough:
+                break
+        nearest[k] = best
+    return nearest, count

@@ -39,13 +39,14 @@ class Broken:
     ----------
     place_mm, plane
         (q, 3) places, and unit normals of the planes through their neighbours.
-    f_mm
-        (q,) the template's distance there.
+    f_mm, outward
+        (q,) the template's distance there, and (q, 3) its unit gradient.
     """
 
     place_mm: Float[np.ndarray, "q 3"]
     plane: Float[np.ndarray, "q 3"]
     f_mm: Float[np.ndarray, " q"]
+    outward: Float[np.ndarray, "q 3"]
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def find_occupancy(
     nats *= _unexplained(facets, template, broken, here_mm, spacing_mm, grid.voxel_mm, options)
     told = _told(grid, template, here_mm, spacing_mm, options)
     empty = _labelled(facets, nats, told)
-    sides = _Sides.of(grid, template, broken, spacing_mm, options)
+    sides = _Sides.of(grid, broken, spacing_mm, options)
     scan_mm = np.concatenate([broken.place_mm, here_mm])
     least = np.pi * (options.bead_mm / spacing_mm) ** 2  # around less no bead fits
     empty = _with_open_sides(empty, facets, nats, told, grid, sides, scan_mm, least)
@@ -429,16 +430,10 @@ class _Sides:
 
     @classmethod
     def of(
-        cls,
-        grid: _Grid,
-        template: Template,
-        broken: Broken,
-        spacing_mm: float,
-        options: OccupancyOptions,
+        cls, grid: _Grid, broken: Broken, spacing_mm: float, options: OccupancyOptions
     ) -> _Sides:
         """Of broken surface, a voxel's edge before and behind it."""
-        outward = unit_vectors(template.distance_and_gradient(broken.place_mm)[1])
-        along = (outward * broken.plane).sum(axis=1)
+        along = (broken.outward * broken.plane).sum(axis=1)
         step_mm = grid.voxel_mm * np.sign(along)[:, None] * broken.plane
         toward, away, *beyond = (
             grid.numbers_at(broken.place_mm + way * step_mm)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.field import scales_kernels as kernels
+from amrepair.frames import unit_vectors
 
 # Neighbours of one window face within 60° of each other: a curved surface is one, the two sides
 # of a wall and the faces of an edge are not.
@@ -131,8 +132,7 @@ def _scale(
     first = start[:-1]
     total = np.add.reduceat(weight[order], first)
     place = np.add.reduceat((place_mm * weight[:, None])[order], first) / total[:, None]
-    facing = np.add.reduceat((normal * weight[:, None])[order], first)
-    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    facing = unit_vectors(np.add.reduceat((normal * weight[:, None])[order], first))
     value = (
         kernels.group_medians(order, start, value_mm)
         if medians

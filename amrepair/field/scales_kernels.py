@@ -174,6 +174,35 @@ def group_medians(order, start, value):
 
 
 @njit(cache=True, nogil=True)
+def pairs_apart(place, normal, which, least, most, cosine):
+    """(p, 2) pairs of some cells that face the same way, farther apart than one length, by another.
+
+    Each pair once, rising.
+    """
+    many = len(which) * (len(which) - 1) // 2
+    found = np.empty((many, 2), np.int32)
+    n = 0
+    for p in range(len(which)):
+        i = which[p]
+        for q in range(p + 1, len(which)):
+            j = which[q]
+            dx, dy, dz = (
+                place[j, 0] - place[i, 0], place[j, 1] - place[i, 1], place[j, 2] - place[i, 2]
+            )  # fmt: skip
+            square = dx * dx + dy * dy + dz * dz
+            if square > most * most or np.sqrt(square) <= least:
+                continue
+            dot = (
+                normal[i, 0] * normal[j, 0] + normal[i, 1] * normal[j, 1]
+                + normal[i, 2] * normal[j, 2]
+            )  # fmt: skip
+            if dot > cosine:
+                found[n, 0], found[n, 1] = i, j
+                n += 1
+    return found[:n].copy()
+
+
+@njit(cache=True, nogil=True)
 def components(table, count, chosen):
     """(s,) number of the connected group of each chosen cell, −1 for the others; how many."""
     n = len(chosen)

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.frames import unit_vectors
+
 REACH_LENGTHS = 3.0  # exp(-3): what lies farther shares 5 % of its error and is left out
 SPLITS = 4  # 2⁴ blocks: a sixteenth of the surface is more than most regions of defects
 
@@ -64,8 +66,7 @@ def gather(
     slack = HALF_SLACK * reached[-1]
     low, high = (np.searchsorted(reached, half + side) for side in (-slack, slack))
     by_weight = np.add.reduceat(weight[:, None] * place_mm[order], first) / total[:, None]
-    facing_to = np.add.reduceat(weight[:, None] * normal[order], first)
-    facing_to /= np.maximum(np.linalg.norm(facing_to, axis=1, keepdims=True), 1e-12)
+    facing_to = unit_vectors(np.add.reduceat(weight[:, None] * normal[order], first))
     seen_by = view[order][first]
     known = np.minimum(total / np.median(total), 1.0)  # few points: less is known
     return Cells(

@@ -68,16 +68,18 @@ def contradictions(
     """
     found: list[Contradiction] = []
     views = int(view.max(initial=0)) + 1
-    key, index = np.unique(cell * views + view, return_inverse=True)
+    key = cell * views + view
+    summed, points = np.bincount(key, count * value_mm), np.bincount(key, count)
+    key = np.flatnonzero(points)
     cell, view = key // views, key % views
-    value_mm = np.bincount(index, count * value_mm) / np.bincount(index, count)
-    count = np.bincount(index, count)
+    points = points[key]
+    value_mm = summed[key] / points
     while True:
-        total = np.bincount(cell, count * value_mm)[cell] - count * value_mm
-        others = np.bincount(cell, count)[cell] - count
+        total = np.bincount(cell, points * value_mm)[cell] - points * value_mm
+        others = np.bincount(cell, points)[cell] - points
         shared = others > 0
         apart_mm = value_mm[shared] - total[shared] / others[shared]
-        noise_mm = point_sigma_mm * np.sqrt(1.0 / count[shared] + 1.0 / others[shared])
+        noise_mm = point_sigma_mm * np.sqrt(1.0 / points[shared] + 1.0 / others[shared])
         table = []
         for k in np.unique(view):
             own = view[shared] == k
@@ -96,4 +98,4 @@ def contradictions(
         )[2]
         found.append(worst)
         stays = view != worst.view
-        cell, view, value_mm, count = cell[stays], view[stays], value_mm[stays], count[stays]
+        cell, view, value_mm, points = cell[stays], view[stays], value_mm[stays], points[stays]

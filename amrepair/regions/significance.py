@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from scipy.special import comb
 from scipy.stats import norm
 
@@ -295,12 +294,9 @@ def _wander(
     worse one was seen.
     """
     pick = np.arange(0, len(scale), max(len(scale) // options.most_windows, 1))
-    pairs = cKDTree(scale.place_mm[pick]).query_pairs(options.far_mm, output_type="ndarray")
-    one, other = pick[pairs.T]
-    apart_mm = np.linalg.norm(scale.place_mm[one] - scale.place_mm[other], axis=1)
-    alike = (scale.normal[one] * scale.normal[other]).sum(axis=1) > WINDOW_FACING
-    kept = alike & (apart_mm > 0.5 * options.far_mm)
-    one, other = one[kept], other[kept]
+    one, other = scales_kernels.pairs_apart(
+        scale.place_mm, scale.normal, pick, 0.5 * options.far_mm, options.far_mm, WINDOW_FACING
+    ).T
     off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_QUARTILE
     # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
     worse = np.maximum(group[one], group[other])
@@ -330,7 +326,8 @@ def _freedom(
     for k in range(classes):
         here = of_pair == k
         if here.sum() >= options.least_cells:
-            places = len(np.unique(patch_of[np.concatenate([each[here] for each in pairs])]))
+            in_pairs = np.bincount(patch_of[np.concatenate([each[here] for each in pairs])])
+            places = np.count_nonzero(in_pairs)
             last = max(PAIRS_EFFICIENCY * (places - 1), 1.0)
         freedom[k] = last
     return freedom

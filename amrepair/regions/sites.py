@@ -236,10 +236,10 @@ def agreed(
         if out or by_view is None:
             return seen, sites, nuisance, out
         cell, view, value_mm, count = by_view
-        feet = np.floor(sites.place_mm[cell] / seen.surfels.cell_mm).astype(np.int64)
+        feet = np.floor(sites.place_mm[: sites.cells] / seen.surfels.cell_mm).astype(np.int64)
         place = np.unique(feet, axis=0, return_inverse=True)[1].ravel()
         out = contradictions(
-            place,
+            place[cell],
             view,
             value_mm,
             count,

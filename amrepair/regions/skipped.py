@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.field.as_built import SOLID_MM, Evidence
+from amrepair.frames import unit_vectors
 from amrepair.regions import skipped_kernels as kernels
 from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
 from amrepair.template.port import Template
@@ -278,8 +279,7 @@ def _wall_shift(
     )
     if not len(which):
         return shift
-    outward = template.distance_and_gradient(s.place_mm[which])[1]
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    outward = unit_vectors(template.distance_and_gradient(s.place_mm[which])[1])
     wall = np.abs(outward[:, 2]) < options.upright_wall
     which, outward = which[wall], outward[wall, :2]
     if not len(which):

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.field.fused import Surfels
 from amrepair.field.near import cells_of
-from amrepair.frames import ways_across
+from amrepair.frames import unit_vectors, ways_across
 from amrepair.regions import strands_kernels as kernels
 from amrepair.template.port import Template
 
@@ -47,8 +47,7 @@ def on_strands(
     if len(asked) == 0:
         return on
     places = np.ascontiguousarray(surfels.place_mm[asked])
-    outward = template.distance_and_gradient(places)[1]
-    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    outward = unit_vectors(template.distance_and_gradient(places)[1])
     enough = SEEN * 4 * LONG_MM * WIDE_MM / surfels.spacing_mm**2
     reach = np.array([LONG_MM, WIDE_MM, TALL_MM])
     cells = cells_of(places, surfels.place_mm, float(np.linalg.norm(reach)))

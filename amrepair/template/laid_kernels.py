@@ -28,13 +28,13 @@ def plastic(start, end, section, width, corner, cell, ny, nx):
         across = max(1, int(np.ceil(width[k] / (0.125 * cell))))
         part = volume / (along * across)
         ux, uy = (dx / flat, dy / flat) if flat > 1e-9 else (1.0, 0.0)
+        aside = ((np.arange(across) + 0.5) / across - 0.5) * width[k]
         for i in range(along):
             t = (i + 0.5) / along
             x, y = start[k, 0] + t * dx, start[k, 1] + t * dy
             for j in range(across):
-                aside = ((j + 0.5) / across - 0.5) * width[k]
-                ix = int(np.floor((x - aside * uy - corner[0]) / cell))
-                iy = int(np.floor((y + aside * ux - corner[1]) / cell))
+                ix = int(np.floor((x - aside[j] * uy - corner[0]) / cell))
+                iy = int(np.floor((y + aside[j] * ux - corner[1]) / cell))
                 if 0 <= ix < nx and 0 <= iy < ny:
                     found[iy, ix] += part
                     widest[iy, ix] = max(widest[iy, ix], width[k])

@@ -78,7 +78,8 @@ def test_space_in_a_pit_is_empty_and_around_it_solid_whichever_way_its_planes_lo
     )
     f_mm = block.distance(points)
     off = f_mm < -0.2
-    broken = Broken(points[off], -normals[off] if turned else normals[off], f_mm[off])
+    planes = -normals[off] if turned else normals[off]
+    broken = Broken(points[off], planes, *block.distance_and_gradient(points[off]))
     surface = block.surface_points(0.4)
     found = find_occupancy(
         block, broken, points[~off], surface, spacing_mm=0.25, options=OccupancyOptions()
@@ -104,7 +105,7 @@ def test_a_large_box_has_larger_voxels_and_the_same_answer() -> None:
     )
     f_mm = block.distance(points)
     off = f_mm < -0.2
-    broken = Broken(points[off], normals[off], f_mm[off])
+    broken = Broken(points[off], normals[off], *block.distance_and_gradient(points[off]))
     few = OccupancyOptions(most_voxels=4000)
     found = find_occupancy(
         block, broken, points[~off], block.surface_points(0.4), spacing_mm=0.25, options=few
@@ -176,7 +177,8 @@ def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
     top = np.column_stack([rng.uniform(-0.5, 0.5, (9_600, 2)) * size[:2], np.full(9_600, 2.0)])
     seen = top[top[:, 0] < 12.0]
     strays = np.column_stack([rng.uniform(24, 26, 12), rng.uniform(-1, 1, 12), np.zeros(12)])
-    broken = Broken(strays, np.tile([0.0, 0.0, 1.0], (12, 1)), plate.distance(strays))
+    planes = np.tile([0.0, 0.0, 1.0], (12, 1))
+    broken = Broken(strays, planes, *plate.distance_and_gradient(strays))
     emptied_mm3 = []
     for least_seen in (0.0, OccupancyOptions().least_seen):
         found = find_occupancy(
