@@ -67,10 +67,6 @@ class LinkError(GcodeError):
     exit_code = 4
 
 
-class RemoteProtocolError(LinkError):
-    """The printer sent something that its protocol does not allow here."""
-
-
 class PrinterError(LinkError):
     """The printer reported a fault of its own (thermal runaway, kill, halt)."""
 

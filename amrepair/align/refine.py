@@ -59,10 +59,6 @@ class Refined:
     converged: bool
     iterations: int
 
-    def inliers(self, limit_mm: float) -> Float[np.ndarray, " n"]:
-        """(n,) 1 where |f| is within the limit."""
-        return (np.abs(self.residual_mm) <= limit_mm).astype(np.float64)
-
 
 def refine(
     points_mm: Float[np.ndarray, "n 3"],

@@ -147,5 +147,3 @@ class EvidenceOptions:
 
 USUAL_SURFELS = SurfelOptions()
 """What scans are condensed by."""
-USUAL_EVIDENCE = EvidenceOptions()
-"""What the test for regions goes by."""

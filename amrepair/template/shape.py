@@ -41,9 +41,3 @@ class MeshShape:
     def solid(self) -> Any:
         """The part as a `manifold3d.Manifold`."""
         return as_manifold(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
-
-    def extracted(self, voxel_mm: float, *, level_mm: float = 0.0) -> trimesh.Trimesh:
-        """A level set as a closed mesh (`extract.extract_mesh`)."""
-        from amrepair.template.extract import extract_mesh
-
-        return extract_mesh(self, voxel_mm, level_mm=level_mm)  # type: ignore[arg-type]

@@ -332,7 +332,6 @@ class ProcessProfile(_Profile):
     repair_spill_weight: Annotated[float, Field(ge=0, le=10)] = 1.0  # to a volume that is filled
     repair_worth_mm3_s: Annotated[float, Field(ge=0, le=1)] = 0.002  # to fill for each second more
     nonplanar_top: bool = False  # patches end along gentle slopes instead of in steps
-    surface_allowance_mm: Annotated[float, Field(ge=0, le=1)] = 0.05
     unasked_max_mm3: Positive = 500.0  # the most that a repair may be printed of without asking
     unasked_max_s: Positive = 1800.0
     unasked_min_reachable_ratio: Ratio = 0.5

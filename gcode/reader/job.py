@@ -92,8 +92,6 @@ class Job:
 
     Attributes
     ----------
-    header_end_line
-        First line of the first layer: what is before is the start script.
     footer_start_line
         The line after the last bead: what follows retracts, parks, switches off.
     block
@@ -103,7 +101,6 @@ class Job:
     program: Program
     layers: tuple[JobLayer, ...]
     beads: Beads
-    header_end_line: int
     footer_start_line: int
     filament_diameter_mm: float
     filament_mm: float
@@ -189,7 +186,6 @@ def read_job(
         program=program,
         layers=layers,
         beads=beads,
-        header_end_line=layers[0].first_line,
         footer_start_line=int(owner[-1]) + 1,
         filament_diameter_mm=filament_diameter_mm,
         filament_mm=float(filament.sum()),
