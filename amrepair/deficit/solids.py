@@ -88,6 +88,13 @@ def _solid_in_box(
         can_be &= samples[:, 2] > float(template.bounds_mm[0, 2])  # nothing stands in the bed
     near = np.flatnonzero(can_be)
     best, cautious = _clearances(evidence, label, samples, f, near)
+    if gone is not None and len(gone.width_mm):
+        # the floor under a line that hung there is as designed, and says nothing of the line
+        held = near[best[near] < 0]
+        held = held[gone.holds(samples[held])]
+        below_mm = samples[held] - np.array([0.0, 0.0, float(np.median(gone.height_mm))])
+        held = held[template.distance(below_mm) > 0]
+        best[held] = np.maximum(best[held], evidence.rays_say(samples[held]))
     # solid = both negative: inside the template and outside the as-built part (or the reverse)
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
     beyond = -sign * cautious  # missing: how empty; excess: how solid

@@ -41,6 +41,8 @@ class SkippedOptions:
     about, top_share
         Cells about a look that are asked for its line's top; how near to it, as a share of half a
         line.
+    under_share
+        Of a line's width: as near under its middle nothing is seen where the line is.
     """
 
     look_step_mm: float = 0.25
@@ -65,6 +67,7 @@ class SkippedOptions:
     same_wall: float = 0.7
     about: int = 6
     top_share: float = 1.0
+    under_share: float = 0.25
 
 
 USUAL_SKIPPED = SkippedOptions()

@@ -111,17 +111,7 @@ def skipped(
     middle[ask] += _wall_shift(middle[ask], evidence, template, options)
     rays_mm[ask] = evidence.rays_say(middle[ask])
     ask = ask[rays_mm[ask] > 0]
-    by_surface = np.full(len(middle), -1.0)  # what nobody looked into is there
-    by_both = by_surface.copy()
-    if len(ask):
-        told_mm = evidence.clearance(middle[ask], template.distance(middle[ask]))[0]
-        looked_into = told_mm > SOLID_MM + 1e-6
-        known = ask[looked_into]
-        surface = np.clip(told_mm[looked_into] / half_mm[known], -1.0, 1.0)
-        rays = np.clip(rays_mm[known] / half_mm[known], -1.0, options.most_share)
-        by_surface[known], by_both[known] = surface, 0.5 * (surface + rays)
-        by_both[known[_topped(middle[known], half_mm[known], lines.width_mm[line[known]],
-                              evidence, options)]] = -1.0  # fmt: skip
+    by_surface, by_both = _shares(middle, half_mm, ask, rays_mm, paths, evidence, template, options)
     surface_says = _together(by_surface, paths.path, options.looks_together)
     sure = surface_says >= options.gone_share
     both = _together(by_both, paths.path, options.looks_together)
@@ -294,6 +284,74 @@ def _wall_shift(
     farther_mm = np.nanmedian(np.where(same[ask], deviation_mm, np.nan), axis=1)
     shift[ask, :2] = np.minimum(farther_mm, 0.0)[:, None] * outward[ask, 0]
     return shift
+
+
+def _shares(
+    middle_mm: Float[np.ndarray, "m 3"],
+    half_mm: Float[np.ndarray, " m"],
+    ask: Int[np.ndarray, " a"],
+    rays_mm: Float[np.ndarray, " m"],
+    paths: _Paths,
+    evidence: Evidence,
+    template: Template,
+    options: SkippedOptions,
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """(m,) how open each look is by surfaces, in halves of a line, and by rays and surfaces both.
+
+    Where a line hangs, the floor below it is where it should be whether the line is there or not:
+    it says nothing, unless it was seen right under the line. What nobody looked into is there.
+    """
+    by_surface = np.full(len(middle_mm), -1.0)
+    by_both = by_surface.copy()
+    if not len(ask):
+        return by_surface, by_both
+    told_mm = evidence.clearance(middle_mm[ask], template.distance(middle_mm[ask]))[0]
+    looked_into = told_mm > SOLID_MM + 1e-6
+    known = ask[looked_into]
+    half = half_mm[known]
+    surface = np.clip(told_mm[looked_into] / half, -1.0, 1.0)
+    rays = np.clip(rays_mm[known] / half, -1.0, options.most_share)
+    width_mm = paths.lines.width_mm[paths.line[known]]
+    topped = _topped(middle_mm[known], half, width_mm, evidence, options)
+    below_mm = middle_mm[known] - 2.0 * half[:, None] * np.array([0.0, 0.0, 1.0])
+    asked = np.flatnonzero(~topped & (surface < 0))
+    asked = asked[template.distance(below_mm[asked]) > 0]
+    seen = _seen_below(middle_mm[known[asked]], half[asked], width_mm[asked], evidence, options)
+    surface[asked] = np.where(seen < 0, surface[asked], seen)
+    rays[asked] = np.minimum(rays[asked], 1.0)
+    by_surface[known] = surface
+    by_both[known] = np.where(topped, -1.0, 0.5 * (surface + rays))
+    return by_surface, by_both
+
+
+def _seen_below(
+    middle_mm: Float[np.ndarray, "m 3"],
+    half_mm: Float[np.ndarray, " m"],
+    width_mm: Float[np.ndarray, " m"],
+    evidence: Evidence,
+    options: SkippedOptions,
+) -> Int[np.ndarray, " m"]:
+    """(m,) 1 where something was seen right under a line that would have hidden it, 0 where not.
+
+    −1 where it was seen as high as the line, or as it hangs when it has sagged. Not deeper than
+    the line is wide: farther down, slanting rays get in past its side.
+    """
+    found = np.zeros(len(middle_mm), dtype=np.int64)
+    if not len(middle_mm):
+        return found
+    place_mm = evidence.surfels.place_mm
+    low_mm = middle_mm[:, 2] - half_mm
+    place_mm = place_mm[place_mm[:, 2] > (low_mm - width_mm).min()]
+    near = cKDTree(place_mm[:, :2]).query_ball_point(
+        middle_mm[:, :2], options.under_share * width_mm
+    )
+    for k, others in enumerate(near):
+        under_mm = low_mm[k] - place_mm[others, 2]
+        if (under_mm < half_mm[k]).any():
+            found[k] = -1
+        elif (under_mm < width_mm[k]).any():
+            found[k] = 1
+    return found
 
 
 def _topped(

@@ -12,7 +12,7 @@ from gcode.profiles import PrintSetup
 from gcode.slicing.infill import SOLID_ANGLES_RAD
 from gcode.slicing.job_lines import runs_of
 from gcode.slicing.layer_plan import Unprintable
-from gcode.slicing.patch_beads import Chain, begun_inside, beside_runs, draw, weighed
+from gcode.slicing.patch_beads import Chain, begun_inside, draw, weighed
 from gcode.slicing.patch_due import Due, due_at, due_of_job, hemmed, strips_along_walls
 from gcode.slicing.patch_free import eased, free_between, free_runs
 from gcode.slicing.patch_heights import Height
@@ -141,7 +141,7 @@ def _along_own(
     lost = []
     if lost_mm3 > model.options.left.least_listed_mm3:
         lost.append(_thin(drawn.region, at.z_mm, drawn.height_mm, lost_mm3))
-    return _Laying(chains, laid, _served(chains, thick, model), drawn.height_mm, lost)
+    return _Laying(chains, laid, _served(laid, thick), drawn.height_mm, lost)
 
 
 def _along_job(
@@ -172,15 +172,12 @@ def _along_job(
     wanted = state.left_below(model, at.z_mm)
     share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), options.least_of_gap, 1.0))
     chains, laid = weighed(runs, tips_mm, share * thick, strips, model, setup, job=job)
-    served = float(thick[beside_runs(runs, options.off_line_mm, model)].sum()) / float(thick.sum())
-    return _Laying(chains, laid, served, height_mm, [])
+    return _Laying(chains, laid, _served(laid, share * thick), height_mm, [])
 
 
-def _served(chains: list[Chain], thick: Float[np.ndarray, "ny nx"], model: PatchModel) -> float:
-    """Share of what is due that beads lay."""
-    beads_mm3 = sum(chain.volume_mm3 for chain in chains)
-    due_mm3 = float(thick.sum()) * model.cell_mm**2 * model.weight
-    return beads_mm3 / (model.options.beads.bond_ratio * due_mm3)
+def _served(laid_mm: Float[np.ndarray, "ny nx"], due_mm: Float[np.ndarray, "ny nx"]) -> float:
+    """Share of what is due that columns get, by whatever lines: only so can they be compared."""
+    return float(np.minimum(laid_mm, due_mm).sum()) / float(due_mm.sum())
 
 
 def plan_skin(

@@ -16,6 +16,7 @@ from amrepair.regions import detect
 from amrepair.regions.options import USUAL_SKIPPED
 from amrepair.regions.skipped import PlannedBeads, _Paths, skipped
 from amrepair.scans import Scan
+from amrepair.template import MeshSdf
 from tests import analytic
 
 SIGMA_MM = 0.03
@@ -267,3 +268,48 @@ def test_a_stretch_goes_on_round_a_corner_as_long_as_looks_say_open(open_again: 
     assert len(found.width_mm) == 2
     assert found.end_mm[0] == pytest.approx([10.0, 0.0, 1.0], abs=1e-6)
     assert found.start_mm[1] == pytest.approx([10.0, 0.0, 1.0], abs=1e-6)
+
+
+FLOOR_MM, RIM_MM, HANGS_MM = 3.0, 1.2, 3.4
+
+
+def tray(gone: int | None) -> m3.Manifold:
+    """A floor with a rim, and lines that hang from rim to rim, their own height over the floor."""
+    whole = m3.Manifold.cube((24.0, 18.0, HANGS_MM))
+    whole -= m3.Manifold.cube((24.0 - 2 * RIM_MM, 18.0 - 2 * RIM_MM, 5.0)).translate(
+        (RIM_MM, RIM_MM, FLOOR_MM)
+    )
+    for k, line in enumerate(hanging().start_mm):
+        if k != gone:
+            bar = m3.Manifold.cube((24.0, WIDE_MM, HIGH_MM))
+            whole += bar.translate((0.0, line[1] - WIDE_MM / 2, HANGS_MM - HIGH_MM))
+    return whole
+
+
+def hanging() -> PlannedBeads:
+    """Lines of sparse infill, laid across those of the layer before."""
+    y = np.arange(4.0, 15.0, 2.5)
+    start, end = (np.column_stack([np.full(len(y), x), y, np.full(len(y), HANGS_MM)])
+                  for x in (RIM_MM, 24.0 - RIM_MM))  # fmt: skip
+    return PlannedBeads(start, end, np.full(len(y), WIDE_MM), np.full(len(y), HIGH_MM))
+
+
+@pytest.mark.parametrize("gone", [None, 2])
+def test_a_line_that_hung_low_over_a_floor_is_missed_and_the_floor_does_not_stand_for_it(
+    gone: int | None,
+) -> None:
+    # regression: over a bottom's skin the first lines of infill that hung were taken to be there,
+    # for the floor 0.2 mm below them lay as designed: half of the layer stayed open
+    template = MeshSdf.from_mesh(analytic.to_trimesh(tray(None)))
+    scan = scan_of(tray(gone), 0)
+    anomaly = detect(scan, template, top_z_mm=HANGS_MM)
+    found = compute_deficit(scan, template, anomaly, build_from_template=HERE, beads=hanging())
+    if gone is None:
+        assert found.missing_mm3 == 0.0
+        return
+    true_mm3 = (24.0 - 2 * RIM_MM) * WIDE_MM * HIGH_MM
+    assert found.missing_mm3 == pytest.approx(true_mm3, rel=0.25)
+    place = m3.Manifold.cube((24.0, WIDE_MM + 0.3, HIGH_MM + 0.2)).translate(
+        (0.0, hanging().start_mm[gone, 1] - WIDE_MM / 2 - 0.15, HANGS_MM - HIGH_MM - 0.1)
+    )
+    assert (found.missing - place).volume() < 0.1 * true_mm3
