@@ -26,7 +26,7 @@ from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge import fit_from_scans
-from amrepair.regions.sound import SoundTest
+from amrepair.regions.sound import SoundTest, SoundTestOptions
 from amrepair.scans.scan import Scan
 from amrepair.template import (
     GridSdf,
@@ -248,8 +248,8 @@ class FieldMethod:
                 laid.append(moved(cloud, pose))
         if refused is not None and not laid:
             raise refused
-        model = FieldModel(
-            template, data.sigma_mm, SoundTest.of(template, laid), distance, surface_of(template)
-        )
+        options = SoundTestOptions(template_is_known=data.mesh is not None)
+        sound = SoundTest.of(template, laid, options)
+        model = FieldModel(template, data.sigma_mm, sound, distance, surface_of(template))
         model.score(data.clouds_mm[0], np.random.default_rng(seed))  # compiled before it is timed
         return model

@@ -52,6 +52,8 @@ class SoundTestOptions:
     stray
         Probability of a point that lies on no surface, or deep in a nook that no sound scan looked
         into: one alone is no defect, however far off it lies.
+    template_is_known
+        The template is of the part's own mesh: a guess nowhere, whatever sound scans looked at.
     """
 
     neighbours: int = 6
@@ -60,6 +62,7 @@ class SoundTestOptions:
     widest_mm: float = 10.0
     most_off_mm: float = 3.0
     stray: float = 0.003
+    template_is_known: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +181,10 @@ class Seen:
         """Of points, (n, 3) template frame; `known` is None where one sound scan is alone."""
         f_mm, gradient = template.distance_and_gradient(points_mm)
         normals = unit_vectors(gradient)
-        looked = _looked(points_mm, f_mm, normals, template, known)
+        if options.template_is_known:
+            looked = np.ones(len(f_mm), bool)
+        else:
+            looked = _looked(points_mm, f_mm, normals, template, known)
         expected_mm = spread_mm = shared = np.zeros(len(f_mm))
         if known is not None:
             expected_mm, spread_mm, shared = known.at(points_mm, looked, options.neighbours)

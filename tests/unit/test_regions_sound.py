@@ -9,7 +9,7 @@ import pytest
 from jaxtyping import Float
 
 from amrepair.errors import InputError
-from amrepair.regions.sound import SoundTest
+from amrepair.regions.sound import SoundTest, SoundTestOptions
 from amrepair.template import GridSdf, MeshSdf
 from amrepair.template.fit import fit_fast
 from amrepair.template.grid import Coverage
@@ -97,6 +97,9 @@ def test_what_no_scan_saw_speaks_against_none(template: GridSdf, sound: SoundTes
         judged = partial.judge(dent)
         assert judged.log_expected > STATED
         assert np.isinf(judged.sigma_mm).any()
+    # regression: of a class with a mesh, too, what its training clouds had not seen was unknown
+    known = SoundTest.of(template, holed, SoundTestOptions(template_is_known=True))
+    assert known.judge(dent).log_expected < -10.0
 
 
 def test_a_defect_beside_what_no_scan_saw_is_found(template: GridSdf) -> None:
