@@ -89,11 +89,7 @@ def _solid_in_box(
     near = np.flatnonzero(can_be)
     best, cautious = _clearances(evidence, label, samples, f, near)
     if gone is not None and len(gone.width_mm):
-        # the floor under a line that hung there is as designed, and says nothing of the line
-        held = near[best[near] < 0]
-        held = held[gone.holds(samples[held])]
-        below_mm = samples[held] - np.array([0.0, 0.0, float(np.median(gone.height_mm))])
-        held = held[template.distance(below_mm) > 0]
+        held = _where_lines_hung(template, samples, near[best[near] < 0], gone)
         best[held] = np.maximum(best[held], evidence.rays_say(samples[held]))
     # solid = both negative: inside the template and outside the as-built part (or the reverse)
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
@@ -149,6 +145,21 @@ def _clearances(
         crossed = evidence.cautious(samples_mm[near], f_mm[near])
         best[near] = np.maximum(best[near], crossed)
     return best, best
+
+
+def _where_lines_hung(
+    template: Template,
+    samples_mm: Float[np.ndarray, "v 3"],
+    near: Int[np.ndarray, " k"],
+    gone: PlannedBeads,
+) -> Int[np.ndarray, " h"]:
+    """Those of some samples that lie in lines which are gone and hung over a floor.
+
+    The floor under such a line is as designed, and says nothing of the line.
+    """
+    held = near[gone.holds(samples_mm[near])]
+    below_mm = samples_mm[held] - np.array([0.0, 0.0, float(np.median(gone.height_mm))])
+    return held[template.distance(below_mm) > 0]
 
 
 def _grown_back(

@@ -58,8 +58,6 @@ class PatchPlan:
         Plastic laid as beads.
     reachable_mm3
         Volume of the deficit that the nozzle gets to.
-    predicted
-        The surface after the patch.
     first_pass
         How the first pass is laid onto what has long been cold, in words.
     left
@@ -74,7 +72,6 @@ class PatchPlan:
     unreachable: tuple[Unreachable, ...]
     unprintable: tuple[Unprintable, ...]
     regions: tuple[PatchRegion, ...]
-    predicted: HeightField
     first_pass: str
     left: tuple[LeftColumns, ...] = ()
     options: PatchOptions = USUAL_PATCH
@@ -168,7 +165,6 @@ def slice_patch(
         unreachable=left.unreachable,
         unprintable=left.unprintable,
         regions=left.regions,
-        predicted=best.state.surface(model),
         first_pass=first_pass_words(setup, hotend_c),
         left=left.columns,
         options=options,

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float
 
 from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_model import PatchModel
-from gcode.surfaces import HeightField
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,3 @@ class PatchState:
             laid_mm=self.laid_mm * nothing,
             sunk_mm=self.sunk_mm * nothing,
         )
-
-    def surface(self, model: PatchModel) -> HeightField:
-        """The as-built field with the patch on it."""
-        return model.raised(self.laid_mm > 0, self.surface_mm)
