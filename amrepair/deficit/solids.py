@@ -74,9 +74,8 @@ def _solid_in_box(
     labels = np.asarray(anomaly.surfel_label)
     inside = in_box(s.place_mm, low_mm, high_mm) & (labels == int(label))
     across = int(np.argmax(np.abs(evidence.normal[inside]).sum(axis=0))) if inside.any() else 2
-    box = VoxelBox.around(
-        low_mm, high_mm, thickness_mm=depth_mm, across=across, options=options.voxels
-    )
+    voxels = options.voxels
+    box = VoxelBox.around(low_mm, high_mm, thickness_mm=depth_mm, across=across, options=voxels)
     samples = box.samples_mm()
     f = template.distance(samples)
     sign = -1.0 if label is Label.MISSING else 1.0
@@ -88,9 +87,8 @@ def _solid_in_box(
         can_be &= samples[:, 2] > float(template.bounds_mm[0, 2])  # nothing stands in the bed
     near = np.flatnonzero(can_be)
     best, cautious = _clearances(evidence, label, samples, f, near)
-    if gone is not None and len(gone.width_mm):
-        held = _where_lines_hung(template, samples, near[best[near] < 0], gone)
-        best[held] = np.maximum(best[held], evidence.rays_say(samples[held]))
+    held = _where_lines_hung(template, samples, near[best[near] < 0], gone)
+    best[held] = np.maximum(best[held], evidence.rays_say(samples[held]))
     # solid = both negative: inside the template and outside the as-built part (or the reverse)
     clip = np.maximum(-sign * f, -best if label is Label.MISSING else best)
     beyond = -sign * cautious  # missing: how empty; excess: how solid
@@ -151,12 +149,14 @@ def _where_lines_hung(
     template: Template,
     samples_mm: Float[np.ndarray, "v 3"],
     near: Int[np.ndarray, " k"],
-    gone: PlannedBeads,
+    gone: PlannedBeads | None,
 ) -> Int[np.ndarray, " h"]:
     """Those of some samples that lie in lines which are gone and hung over a floor.
 
     The floor under such a line is as designed, and says nothing of the line.
     """
+    if gone is None or not len(gone.width_mm):
+        return near[:0]
     held = near[gone.holds(samples_mm[near])]
     below_mm = samples_mm[held] - np.array([0.0, 0.0, float(np.median(gone.height_mm))])
     return held[template.distance(below_mm) > 0]
