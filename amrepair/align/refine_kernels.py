@@ -17,7 +17,10 @@ REFINE_SHRINK = 0.6  # of the loss's scale, from one iteration to the next
 STILL_MM = 2e-4  # of the scan's far points: below this nothing moves any more
 STEP_SIGMAS = 0.02  # nor where it moves by less than this share of the noise
 HASTE = 15  # iterations with whole steps
-SLOWEST = 1.0 / 32  # of a step
+# Of a step that turned back, and of one that went on, as in Rprop (Riedmiller and Braun 1993): with
+# a doubling for each halving, steps to and fro about an edge would go on for ever.
+TURNED_BACK, WENT_ON = 0.5, 1.2
+SLOWEST = 1.0 / 256  # of a step
 UNHINDERED_RATIO = 0.1  # of the limit: distances that change by less do not hinder the motion
 WIDEST_REFINE_RAD = 0.2  # a step this wide has left the linear range
 REFINE_DAMPING = 1e-9
@@ -116,7 +119,8 @@ def step(hessian, slope, known, first, rotation, place, last, pace, scale, itera
         along = 0.0
         for a in range(6):
             along += b[a] * last[a]
-        pace = max(SLOWEST, 0.5 * pace) if along < 0.0 else min(1.0, 2.0 * pace)
+        pace *= TURNED_BACK if along < 0.0 else WENT_ON
+        pace = min(max(pace, SLOWEST), 1.0)
     for a in range(6):
         last[a] = b[a]
         b[a] *= pace

@@ -10,6 +10,7 @@ import trimesh
 from jaxtyping import Float
 
 from amrepair.align import align
+from amrepair.align import refine_kernels as kernels
 from amrepair.align.coarse import cube_rotations
 from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, rotation_from_vector
@@ -141,3 +142,25 @@ def test_a_cube_turns_in_24_ways() -> None:
     turns = np.array(cube_rotations())
     assert len(np.unique(turns.reshape(-1, 9), axis=0)) == 24
     assert np.linalg.det(turns) == pytest.approx(np.ones(24))
+
+
+def test_steps_to_and_fro_about_an_edge_come_to_rest() -> None:
+    """Regression: a round cup's walls turned to and fro about its facets, and were refused.
+
+    Along one motion that hardly changes any distance the slope turns at an edge, all at once.
+    """
+    hessian, rotation, place = np.eye(6), np.eye(3), np.array([0.3, 0.0, 0.0])
+    hessian[3, 3] = 1e-4
+    last, known, first = np.zeros(6), np.zeros(6), np.eye(3, 4)
+    limits = (1.0, 0.0, 0.05, 0.1, 0.0)
+    pace, scale, ended = 1.0, 0.1, kernels.GO_ON
+    for iteration in range(1, 121):
+        slope = np.zeros(6)
+        slope[3] = 1e-4 * np.sign(place[0])  # a millimetre's step, whichever side it is on
+        ended, pace, scale = kernels.step(
+            hessian, slope, known, first, rotation, place, last, pace, scale, iteration, limits
+        )
+        if ended != kernels.GO_ON:
+            break
+    assert ended == kernels.CONVERGED
+    assert abs(place[0]) < 0.2
