@@ -127,6 +127,9 @@ class RegionOptions:
         So many windows tell by how much means wander: enough for a few per cent.
     spacing_mm
         Template surface points are asked for so far apart.
+    guess_depths
+        Behind surface that stands, as thick as a part may be there, a place is nobody's knowledge
+        where a template's guess lies within so many times its depth.
     background, surfels, evidence
         What is not the part, how the scan is condensed, and how space around broken surface is
         known.
@@ -152,6 +155,7 @@ class RegionOptions:
     least_cells: int = 30
     most_windows: int = 3000
     spacing_mm: float = 0.6
+    guess_depths: float = 2.0
     background: BackgroundOptions = field(default_factory=BackgroundOptions)
     surfels: SurfelOptions = field(default_factory=SurfelOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)

@@ -201,6 +201,10 @@ def sites_of(
     place_mm = np.concatenate([surfels.place_mm, crossed_mm])
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
+    unknown = _behind_what_stands(surfels, outward, template, anywhere_mm, options)
+    tolerance_mm[:, : len(surfels)][:, unknown] += np.linalg.norm(
+        np.ptp(template.bounds_mm, axis=0)
+    )
     if rounded_up is not None:
         tolerance_mm[1] += rounded_up(place_mm, value_mm)
     return Sites(
@@ -214,6 +218,33 @@ def sites_of(
         facing=np.concatenate([facing, faced]),
         pose_mm=np.concatenate([np.zeros(len(surfels)), crossed.error_mm]),
     )
+
+
+def _behind_what_stands(
+    surfels: Surfels,
+    outward: Float[np.ndarray, "n 3"],
+    template: Template,
+    tolerance_mm: float,
+    options: RegionOptions,
+) -> Bool[np.ndarray, " n"]:
+    """(n,) whether a cell lies behind surface that stands, where nobody knows how thick it is.
+
+    A template of scans is closed by a guess where no scan looked, as over the floor of a cup. What
+    a later scan sees in there has the cup's outer wall for its nearest known surface; but that was
+    seen to stand, so that nothing can be missing from that side.
+    """
+    found = np.zeros(len(surfels), bool)
+    coverage = getattr(template, "coverage", None)
+    if coverage is None:
+        return found
+    deep = np.flatnonzero(surfels.deviation_mm < -tolerance_mm)
+    depth_mm = -surfels.deviation_mm[deep]
+    feet_mm = surfels.place_mm[deep] + depth_mm[:, None] * outward[deep]
+    near = nearest_within(feet_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
+    stands = (near >= 0) & (np.abs(surfels.deviation_mm[near]) <= tolerance_mm)
+    to_guess_mm = coverage.to_guess_mm(surfels.place_mm[deep])
+    found[deep] = stands & (to_guess_mm < options.guess_depths * depth_mm)
+    return found
 
 
 def agreed(

@@ -203,6 +203,10 @@ class Coverage:
         found[rest] = to_guess <= np.abs(f_mm[rest])
         return np.asarray(found)
 
+    def to_guess_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """(n,) how far it is to surface that nobody saw, and that is a guess; inf without any."""
+        return np.asarray(self._trees[2].query(points_mm, workers=-1)[0], np.float64)
+
 
 def surface_elements(
     places_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], reach_mm: float

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import manifold3d
 import numpy as np
 import pytest
 import trimesh
@@ -11,10 +13,12 @@ import trimesh
 from amrepair.errors import TemplateError
 from amrepair.merge import fit_from_scans, fit_mesh, open_mesh
 from amrepair.merge.open_mesh import OpenMeshOptions
-from amrepair.regions import detect
+from amrepair.regions import Label, detect
 from amrepair.scans import Scan
-from amrepair.template import GridSdf, load_template
-from tests.analytic import box, cylinder, difference, sample_surface, union
+from amrepair.template import GridSdf, MeshSdf, load_template
+from amrepair.template.fit import fit_fast
+from amrepair.template.grid import Coverage
+from tests.analytic import box, cylinder, difference, sample_surface, to_trimesh, union
 
 PART = difference(
     union(box((0, 0, 0), (40, 25, 8)), cylinder((30, 15, 4), 6, 14)), cylinder((10, 9, -1), 4, 12)
@@ -108,3 +112,33 @@ def test_triangles_that_bound_nothing_are_refused_before_their_grid(
     soup.export(tmp_path / "soup.stl")
     with pytest.raises(TemplateError, match=r"soup\.stl"):
         fit_mesh(tmp_path / "soup.stl", options=OpenMeshOptions(cells=64))
+
+
+def cup(floor_mm: float) -> trimesh.Trimesh:
+    body = manifold3d.Manifold.cylinder(24.0, 14.0, 14.0, 96)
+    bore = manifold3d.Manifold.cylinder(30.0, 11.6, 11.6, 96).translate((0.0, 0.0, floor_mm))
+    return to_trimesh(body - bore)
+
+
+def test_what_lies_behind_a_wall_that_stands_is_no_defect_of_that_wall() -> None:
+    """Regression: a turntable saw no floor of a cup; who saw it later was told of 946 mm³ missing.
+
+    The guess closes the cup higher up. The bore's true wall below that has the outer wall for its
+    nearest known surface, and lies 2.4 mm behind it.
+    """
+    made = fit_fast(MeshSdf.from_mesh(cup(10.0)), seed=0)
+    place, normal = made.surface_points(0.4)
+    in_bore = np.linalg.norm(place[:, :2], axis=1) < 11.5
+    unseen = (in_bore & (place[:, 2] < 10.5)) | (place[:, 2] < 0.1)
+    coverage = Coverage.of(place, normal, np.full(len(place), 0.16), unseen, 1.0)
+    template = replace(made, coverage=coverage)
+    true = cup(2.0)
+    points, face = trimesh.sample.sample_surface(true, 40_000, seed=1)
+    points = np.array(points) + np.random.default_rng(2).normal(scale=0.03, size=points.shape)
+    points = points[np.asarray(true.face_normals)[face][:, 2] > -0.5]
+    assert not detect(Scan(points, 0.03, "template"), template).regions
+    worn = np.linalg.norm(points - (14.0, 0.0, 16.0), axis=1) < 2.5
+    outer = np.linalg.norm(points[:, :2], axis=1) > 13.0
+    points = points - np.outer(worn & outer, (0.8, 0.0, 0.0))
+    found = detect(Scan(points, 0.03, "template"), template).regions
+    assert [region.label for region in found] == [Label.MISSING]
