@@ -196,6 +196,11 @@ def ways_across(
     return across, np.cross(along, across)
 
 
+def diagonal(bounds_mm: Float[np.ndarray, "2 3"]) -> float:
+    """Length of a box from its lowest to its highest corner."""
+    return float(np.linalg.norm(np.ptp(bounds_mm, axis=0)))
+
+
 def box_corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
     """(8, 3) corners of a box, given its lowest and its highest corner."""
     grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)

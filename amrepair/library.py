@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import Registration, align
 from amrepair.errors import AlignmentError, InputError
+from amrepair.frames import diagonal
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -169,7 +170,7 @@ def misfit(
     """
     step = max(1, len(scan) // LIBRARY_POINTS)
     placed = found.template_from_scan.apply(scan.points_mm[::step])
-    diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    diagonal_mm = diagonal(template.bounds_mm)
     cap_mm = LOST_PIECE_RATIO * diagonal_mm
     distance = np.sort(np.minimum(np.abs(template.distance(placed)), cap_mm))
     off = float(distance[: max(1, round(part_ratio * len(distance)))].mean())

@@ -16,7 +16,7 @@ from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.thinning import in_order, thin_out
 from amrepair.errors import AlignmentError, InputError, PartMovedError
-from amrepair.frames import Transform, in_box, moved
+from amrepair.frames import Transform, diagonal, in_box, moved
 from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
@@ -300,7 +300,7 @@ def _part_only(
 def _other_size(scan: Scan, template: Template, told_jump: float) -> str:
     """What to add to a refusal, where the sizes differ much."""
     size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
-    other = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    other = diagonal(template.bounds_mm)
     if 1.0 / told_jump < size / max(other, 1e-12) < told_jump:
         return ""
     return f" (the scan is {size:.3g} mm across, its template {other:.3g} mm)"
@@ -308,7 +308,7 @@ def _other_size(scan: Scan, template: Template, told_jump: float) -> str:
 
 def _refuse_other_size(scan: Scan, template: Template, options: AlignOptions) -> None:
     size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
-    other = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    other = diagonal(template.bounds_mm)
     ratio, slack = size / max(other, 1e-12), options.unit_slack
     if options.smallest_ratio <= ratio <= options.largest_ratio:
         return

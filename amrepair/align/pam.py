@@ -19,7 +19,7 @@ from amrepair.align.options import PUBLISHED_PAM, PamOptions
 from amrepair.align.registration import Registration
 from amrepair.device import open3d
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform, nearest_rotation
+from amrepair.frames import Transform, diagonal, nearest_rotation
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -214,7 +214,7 @@ def _loss(
 
 def template_cloud(template: Template, count: int) -> Float[np.ndarray, "m 3"]:
     """(m, 3) about `count` points of the template's surface."""
-    diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    diagonal_mm = diagonal(template.bounds_mm)
     spacing_mm = diagonal_mm / 40.0
     few = len(template.surface_points(spacing_mm)[0])
     return template.surface_points(spacing_mm * float(np.sqrt(few / count)))[0]

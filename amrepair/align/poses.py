@@ -14,7 +14,7 @@ from jaxtyping import Float
 from amrepair.align.options import PoseOptions
 from amrepair.align.refine import Refined, refine_all
 from amrepair.align.thinning import Thinned
-from amrepair.frames import box_corners
+from amrepair.frames import box_corners, diagonal
 from amrepair.template.port import Template
 
 
@@ -41,7 +41,7 @@ class Clouds:
         """Of a scan's points; the diagonal is the template's."""
         dense = Thinned(points_mm, rng).to(options.dense_points)
         box = np.stack([dense.min(axis=0), dense.max(axis=0)])
-        diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+        diagonal_mm = diagonal(template.bounds_mm)
         return cls(dense, Thinned(dense, rng), box_corners(box), diagonal_mm, sigma_mm, options)
 
     @property

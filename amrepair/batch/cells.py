@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.errors import InputError
 from amrepair.field.near import nearest_within
+from amrepair.frames import diagonal
 from amrepair.regions import AnomalyMap, Label, Region
 from amrepair.template.port import Template
 
@@ -51,7 +52,7 @@ class Cells:
     @classmethod
     def of(cls, template: Template) -> Cells:
         """Those of a template."""
-        diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+        diagonal_mm = diagonal(template.bounds_mm)
         spacing_mm = diagonal_mm / CELLS_PER_DIAGONAL
         place_mm, normal = template.surface_points(spacing_mm)
         return cls(np.array(place_mm), np.array(normal), spacing_mm)

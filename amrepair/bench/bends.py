@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.frames import moved, unit_vectors
+from amrepair.frames import diagonal, moved, unit_vectors
 from amrepair.template.port import Template
 
 CUT_SHARES = np.arange(0.2, 0.81, 0.05)  # shares of the points on one side of a cut
@@ -117,7 +117,7 @@ def with_zone(
     """
     if pieces.other is None:
         return pieces
-    diagonal_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    diagonal_mm = diagonal(template.bounds_mm)
     widest_mm = (0.5 * ZONE_RATIOS[-1] + ASIDE_RATIOS[-1]) * diagonal_mm
     home = moved(points_mm, pieces.other)
     height_mm = (home - pieces.through_mm) @ pieces.normal

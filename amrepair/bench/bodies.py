@@ -23,7 +23,7 @@ from amrepair.align.refine import Prior, refine_all
 from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.bench.bends import Pieces, Pose, best_cuts, with_zone
-from amrepair.frames import moved, rotation_from_vector, unit_vectors, ways_across
+from amrepair.frames import diagonal, moved, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
 LEAST_BENT_SHARE = 0.1  # of the points: with fewer off the template nothing was bent
@@ -71,7 +71,7 @@ LEAST_EXPLAINED = 0.1
 
 def surface_of(template: Template) -> Float[np.ndarray, "m 3"]:
     """(m, 3) places of a template's surface, as dense as bends are judged."""
-    return template.surface_points(SURFACE_RATIO * _diagonal_mm(template))[0]
+    return template.surface_points(SURFACE_RATIO * diagonal(template.bounds_mm))[0]
 
 
 def pieces_of(
@@ -98,7 +98,7 @@ def pieces_of(
         What `surface_of` says of the template; None asks it.
     """
     thinned = Thinned(points_mm, rng)
-    limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * _diagonal_mm(template))
+    limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * diagonal(template.bounds_mm))
     surface = surface_of(template) if surface_mm is None else surface_mm
     scene = _Scene.of(thinned, template, sigma_mm, limit_mm, surface)
     if (~scene.on(known[0])).mean() < LEAST_BENT_SHARE:
@@ -259,7 +259,7 @@ class _Scene:
         limit_mm: float,
         surface_mm: Float[np.ndarray, "m 3"],
     ) -> _Scene:
-        cloud, diagonal_mm = thinned.to(BODY_POINTS), _diagonal_mm(template)
+        cloud, diagonal_mm = thinned.to(BODY_POINTS), diagonal(template.bounds_mm)
         sigma_mm = max(sigma_mm, 1e-3)
         return cls(thinned, cloud, template, sigma_mm, diagonal_mm, limit_mm, surface_mm)
 
@@ -389,10 +389,9 @@ class _Scene:
 
 
 def _seeds(poses: Sequence[Pose], scene: _Scene) -> Iterator[list[tuple[Pose, Pose]]]:
-    """Of each pose, two poses to start from: of what it leaves, then of both sides of some planes.
+    """Of each pose, two poses to start from: of what it leaves, and of both sides of some planes.
 
-    Mostly the first will do. A side is moved from all the poses at once: they are many where a part
-    fits in many ways.
+    A side is moved from all the poses at once: they are many where a part fits in many ways.
     """
     cloud = scene.thinned.to(2 * PIECE_POINTS)
     local = cloud - cloud.mean(axis=0)
@@ -426,10 +425,6 @@ def _of_the_rest(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
         starts.append(start)
     found = scene.refined(few, starts, SECOND_PIECE_RATIO)
     yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
-
-
-def _diagonal_mm(template: Template) -> float:
-    return float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
 
 
 def _some(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from amrepair.deficit.options import VoxelOptions
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
+from amrepair.frames import diagonal
 from amrepair.regions import AnomalyMap, Label
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.template.port import Template
@@ -92,7 +93,7 @@ def _paths_out(
     )
     front, along = s.place_mm[which[first]], evidence.normal[which[first]]
     found = []
-    reach_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    reach_mm = diagonal(template.bounds_mm)
     for _ in range(int(reach_mm / step_mm) + 1):
         front = front + step_mm * along
         f = template.distance(front)

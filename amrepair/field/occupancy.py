@@ -19,7 +19,7 @@ from amrepair.field.cut_kernels import least_cut
 from amrepair.field.groups import group_points
 from amrepair.field.near import has_near, nearest_within
 from amrepair.field.options import OccupancyOptions
-from amrepair.frames import box_of, in_box, unit_vectors
+from amrepair.frames import box_of, diagonal, in_box, unit_vectors
 from amrepair.template.port import Template
 
 # Capacities are whole numbers of this share of a nat; none is larger than that many.
@@ -227,7 +227,7 @@ def _ways_out(
     along = np.concatenate([broken.plane[some], -broken.plane[some]])
     step_mm = 0.5 * options.hole_mm
     out = []
-    for _ in range(int(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)) / step_mm) + 1):
+    for _ in range(int(diagonal(template.bounds_mm) / step_mm) + 1):
         front_mm = front_mm + step_mm * along
         f_mm = template.distance(front_mm)
         left = f_mm >= 0

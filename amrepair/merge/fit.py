@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,9 +25,6 @@ from amrepair.template.fit import fit_fast
 from amrepair.template.grid import Coverage
 from amrepair.template.learned import LearnedSdf, Tolerance
 from gcode.progress import Progress, silent
-
-if TYPE_CHECKING:
-    pass
 
 METRE_MM, LEAST_PART_MM = 1000.0, 1.0  # no printed part is smaller: its numbers are metres
 

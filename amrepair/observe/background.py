@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from amrepair.errors import InputError
+from amrepair.frames import diagonal
 from amrepair.observe.options import USUAL_BACKGROUND, BackgroundOptions
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -20,7 +21,7 @@ def refuse_wrong_scale(scan: Scan, template: Template) -> None:
     """Metres or inches read as millimetres: the sizes differ by the factor between the units."""
     some = scan.points_mm[:: max(1, len(scan) // SIZE_POINTS)]
     scan_mm = float(np.linalg.norm(np.ptp(some, axis=0)))
-    part_mm = float(np.linalg.norm(np.ptp(template.bounds_mm, axis=0)))
+    part_mm = diagonal(template.bounds_mm)
     if 0 < scan_mm * 200 < part_mm:
         raise InputError(
             f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from amrepair.errors import InputError
 from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.near import nearest_within
-from amrepair.frames import unit_vectors
+from amrepair.frames import diagonal, unit_vectors
 from amrepair.observe.background import (
     ON_PLANE_MM,
     background,
@@ -202,9 +202,7 @@ def sites_of(
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
     unknown = _behind_what_stands(surfels, outward, template, anywhere_mm, options)
-    tolerance_mm[:, : len(surfels)][:, unknown] += np.linalg.norm(
-        np.ptp(template.bounds_mm, axis=0)
-    )
+    tolerance_mm[:, : len(surfels)][:, unknown] += diagonal(template.bounds_mm)
     if rounded_up is not None:
         tolerance_mm[1] += rounded_up(place_mm, value_mm)
     return Sites(

@@ -36,7 +36,9 @@ def registration_of_damage(
         If poses would lead to different repairs and nobody said where the damage is, or what was
         said suits several of them.
     """
-    if site.build_from_template is None or deficit.missing.is_empty():
+    if not registration.symmetric_alternatives or deficit.missing.is_empty():
+        return registration
+    if site.build_from_template is None:
         return registration  # a scan in the build frame: each pose that fits repairs that place
     repairs = _repairs(site, registration, deficit)
     first = repairs[0]

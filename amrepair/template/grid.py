@@ -18,7 +18,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from amrepair.errors import TemplateError
-from amrepair.frames import unit_vectors
+from amrepair.frames import diagonal, unit_vectors
 from amrepair.template import trilinear_kernels as kernels
 from amrepair.template.file import (
     read_template,
@@ -253,7 +253,7 @@ class GridSdf(MeshShape):
         if self.coverage is not None:
             f_mm, gradient = self.distance_and_gradient(points_mm)
             unknown = self.coverage.unknown_at(points_mm, f_mm, unit_vectors(gradient))
-            found = np.where(unknown, float(np.linalg.norm(np.ptp(self.bounds_mm, axis=0))), found)
+            found = np.where(unknown, diagonal(self.bounds_mm), found)
         return found
 
     def _told_spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:

@@ -188,7 +188,7 @@ class _Swept:
             self.end_mm,
             ((self.pushed_mm3 > 0) & grows).astype(np.int64),
             self.half_mm,
-            field.z_mm.astype(np.float64).copy(),
+            field.z_mm.astype(np.float64),
             field.origin_mm.astype(np.float64),
             field.cell_mm,
             np.array([step.z_from_mm + _slack_mm(slices[k]) for step, k in steps]),

@@ -10,14 +10,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-import numpy as np
-
 from gcode.dialects import number
 from gcode.errors import InputError
 from gcode.moves import ModalState
 from gcode.profiles import PrinterProfile
 from gcode.reader import Job, JobObjects, objects_of
 from gcode.resumption.head import feed, filament_back_mm
+from gcode.stretches import stretches_of
 
 MOVE_OR_ARC = re.compile(r"^\s*[Gg]0*[0123](?!\d)")
 LEAST_MOVE_MM = 5e-4
@@ -67,10 +66,8 @@ def lines_without(job: Job, first: int, name: str, printer: PrinterProfile) -> t
 
 def _gaps(job: Job, objects: JobObjects, index: int, first: int) -> Sequence[tuple[int, int]]:
     """Lines [start, stop) from the object's first bead to after its last, each time it is laid."""
-    own = objects.of_bead == index
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], own, [False]]).astype(int)))
     gaps = []
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in stretches_of(objects.of_bead == index):
         lines = job.beads.line[start:stop]
         if lines[-1] >= first:
             gaps.append((max(int(lines[0]), first), int(lines[-1]) + 1))

@@ -25,6 +25,7 @@ from gcode.reader import Job, JobObjects, objects_of, read_job
 from gcode.reader.objects import box_of_beads_mm
 from gcode.resumption.head import feed, filament_back_mm
 from gcode.resumption.leaving_out import LEAST_MOVE_MM, MOVE_OR_ARC, modes_as
+from gcode.stretches import stretches_of
 from gcode.surfaces import HeightField
 
 OVER_PART_MM = 2.0
@@ -137,7 +138,6 @@ def _pieces(
     """
     later = np.flatnonzero(job.beads.line >= first)
     kept, lines = ~given_up[later], job.beads.line[later]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(int)))
     pieces: list[tuple[int, int, bool]] = []
     at, end = first, job.program.text.count("\n")
 
@@ -145,7 +145,7 @@ def _pieces(
         bounds = [at, *(s for s in sorted(stops) if at < s < until), until]
         pieces.extend((a, b, False) for a, b in pairwise(bounds))
 
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in stretches_of(kept):
         gap(int(lines[start]))
         last = stop == len(lines)
         at = end if last else int(lines[stop - 1]) + 1

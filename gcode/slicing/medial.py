@@ -17,13 +17,14 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from gcode.moves import Role
 from gcode.slicing import medial_kernels as kernels
 from gcode.slicing.beads import Bead
 from gcode.slicing.options import FillOptions
 from gcode.slicing.regions import flattened
+from gcode.stretches import stretches_of
 
 SAMPLE_MM = 0.12  # of a contour
 ON_AXIS_MM = 1e-5
@@ -167,17 +168,11 @@ def _long_enough(
     wide = 2 * radius >= least_mm * (1 - 1e-6)
     along_mm = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     for holds in (False, True):  # short gaps are closed before short stretches go
-        for a, b in _runs(wide == holds):
+        for a, b in stretches_of(wide == holds):
             inside = a > 0 and b < len(wide)
             if along_mm[b - 1] - along_mm[a] < least_mm and (holds or inside):
                 wide[a:b] = not holds
-    return [(points[a:b], radius[a:b]) for a, b in _runs(wide) if b - a >= 2]
-
-
-def _runs(true: Bool[np.ndarray, " k"]) -> list[tuple[int, int]]:
-    """First and past-the-last place of each run of true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]))).tolist()
-    return list(zip(edges[::2], edges[1::2], strict=True))
+    return [(points[a:b], radius[a:b]) for a, b in stretches_of(wide) if b - a >= 2]
 
 
 def _bead(

@@ -158,10 +158,10 @@ class JobLineOptions:
         Shares that a line which is gone reads, at least, and more than what is around it.
     beside_widths
         From a line to its neighbour.
-    off_line_mm, least_of_gap, served
-        From a line: more than half of it. Where the gap is more than the deficit, both are right to
-        about this share. And the share of what is due from which on the job's lines serve; where
-        they serve less, others may serve more.
+    least_of_gap, served
+        Where the gap is more than the deficit, both are right to about this share. And the share
+        of what is due from which on the job's lines serve; where they serve less, others may serve
+        more.
     """
 
     rim_mm: float = 0.3
@@ -171,7 +171,6 @@ class JobLineOptions:
     nearly_all: float = 0.75
     stands_out: float = 0.1
     beside_widths: float = 1.4
-    off_line_mm: float = 0.3
     least_of_gap: float = 0.9
     served: float = 0.95
 

@@ -11,6 +11,7 @@ from scipy import ndimage
 from gcode.slicing import reach_kernels
 from gcode.slicing.beads import Bead, divided
 from gcode.slicing.reach import Reach
+from gcode.stretches import stretches_of
 
 GAP_STEP_MM = 0.4  # along a bead, between two samples of the gap
 LEAST_RUN_MM = 0.4
@@ -107,7 +108,6 @@ def free_runs(
     count = steps_of(bead)
     points, owner = divided(bead.xy_mm, count)
     ok = is_free(points[:-1], points[1:])
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(np.int8)))
     pieces_mm = (lengths / count)[owner]
     return [
         Bead(
@@ -116,7 +116,7 @@ def free_runs(
             bead.role,
             closed=bool(bead.closed and b - a == len(owner)),
         )
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
+        for a, b in stretches_of(ok)
         if pieces_mm[a:b].sum() >= LEAST_RUN_MM
     ]
 

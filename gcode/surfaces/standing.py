@@ -41,7 +41,7 @@ def with_beads(
     bore_mm
         Of the nozzle.
     """
-    z_mm = field.z_mm.astype(np.float64).copy()
+    z_mm = field.z_mm.astype(np.float64)
     start, end = (np.ascontiguousarray(at, dtype=np.float64) for at in (start_mm, end_mm))
     kernels.raise_by_beads(
         z_mm, start, end, half_widths_mm(section_mm2, bore_mm),
