@@ -128,11 +128,10 @@ def _tried(
     printer = setup.printer
     rest = standing.rotate(turn)
     low, high = np.array(rest.bounding_box()).reshape(2, 3)
-    bed = np.array(printer.bed_size_mm)
     size = high - low
-    if (size[:2] > bed).any() or size[2] > printer.max_z_mm:
+    if (size[:2] > printer.bed_size_mm).any() or size[2] > printer.max_z_mm:
         return Turn(name, 0.0, stands=False)
-    move = (*(0.5 * bed - 0.5 * (low + high)[:2]), -low[2])
+    move = (*(printer.bed_middle_mm - 0.5 * (low + high)[:2]), -low[2])
     rest, wanted = rest.translate(move), missing.rotate(turn).translate(move)
     patch = slice_patch(
         wanted,

@@ -57,8 +57,9 @@ def refuse_impossible(
         f"X {low[0]:.1f} to {high[0]:.1f}, Y {low[1]:.1f} to {high[1]:.1f}, "
         f"Z {low[2]:.1f} to {high[2]:.1f} mm"
     )
-    room = np.array([*printer.bed_size_mm, printer.max_z_mm])
-    beyond = bool((low[:2] < -SLACK_MM).any() or (high > room + SLACK_MM).any())
+    x0, y0, x1, y1 = printer.bed_box_mm
+    foot, room = np.array([x0, y0]), np.array([x1, y1, printer.max_z_mm])
+    beyond = bool((low[:2] < foot - SLACK_MM).any() or (high > room + SLACK_MM).any())
     floats = bool(low[2] > RAFT_MM) and not raised
     if low[2] >= -SLACK_MM and not beyond and not floats:
         return

@@ -107,9 +107,9 @@ def target_solid(printer: PrinterProfile) -> manifold3d.Manifold:
 
     Large, so that a turn shows; low, so that it is printed in minutes.
     """
-    x, y = printer.bed_size_mm
+    (x, y), (x0, y0) = printer.bed_size_mm, printer.bed_min_mm
     long_mm, short_mm = 0.45 * x, 0.3 * y
-    corner = (0.275 * x, 0.3 * y)
+    corner = (x0 + 0.275 * x, y0 + 0.3 * y)
     arms = manifold3d.Manifold.cube((long_mm, 8.0, TARGET_MM)).translate((*corner, 0.0))
     arms += manifold3d.Manifold.cube((8.0, short_mm, TARGET_MM)).translate((*corner, 0.0))
     square = manifold3d.Manifold.cube((14.0, 14.0, TARGET_MM))

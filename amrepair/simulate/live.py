@@ -52,9 +52,10 @@ class PrintedScanner:
         seed: int = 0,
     ) -> None:
         model = told.scanner(scanner)
-        centre = (0.5 * printer.bed_size_mm[0], 0.5 * printer.bed_size_mm[1])
+        centre = printer.bed_middle_mm
         self.world = World(
             printer.bed_size_mm,
+            bed_min_mm=printer.bed_min_mm,
             cell_mm=told.columns_mm,
             nozzle_diameter_mm=printer.nozzle_diameter_mm,
             filament_diameter_mm=printer.filament_diameter_mm,

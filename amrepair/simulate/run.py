@@ -140,7 +140,7 @@ def place_on_bed(bounds_mm: Float[np.ndarray, "2 3"], setup: PrintSetup) -> Tran
             "use --scale fit, or a factor below 1"
         )
     middle = 0.5 * (low + high)
-    shift = np.array([0.5 * room[0] - middle[0], 0.5 * room[1] - middle[1], -low[2]])
+    shift = np.array([*(printer.bed_middle_mm - middle[:2]), -low[2]])
     return Transform.from_rotation_translation(
         "build", "template", rotation=np.eye(3), translation_mm=shift
     )
@@ -228,6 +228,7 @@ def set_stage(
     model = told.scanner(scanner)
     standing = World(
         printer.bed_size_mm,
+        bed_min_mm=printer.bed_min_mm,
         cell_mm=told.columns_mm,
         nozzle_diameter_mm=printer.nozzle_diameter_mm,
         filament_diameter_mm=printer.filament_diameter_mm,

@@ -39,7 +39,7 @@ class World:
     Parameters
     ----------
     bed_size_mm
-        Bed in X and Y; its corner is the build frame's origin.
+        Bed in X and Y.
     cell_mm
         Edge of a column, at most 0.15 mm.
     nozzle_diameter_mm, filament_diameter_mm
@@ -48,6 +48,8 @@ class World:
         How far the world goes beyond the bed (some printers prime there).
     bead, thermal
         How plastic lies, and how it cools; without `thermal` it neither shrinks nor curls.
+    bed_min_mm
+        The bed's corner of least X and Y, build frame.
     middle_mm
         XY that the part shrinks towards and curls around, build frame; the bed's middle.
 
@@ -67,6 +69,7 @@ class World:
         margin_mm: float = 10.0,
         bead: BeadModel | None = None,
         thermal: ThermalModel | None = None,
+        bed_min_mm: tuple[float, float] = (0.0, 0.0),
         middle_mm: tuple[float, float] | None = None,
     ) -> None:
         if not 0.02 <= cell_mm <= MAX_WORLD_CELL_MM:
@@ -75,13 +78,13 @@ class World:
             )
         self.bead = bead or BeadModel()
         self.thermal = thermal or ThermalModel()
-        middle = (0.5 * bed_size_mm[0], 0.5 * bed_size_mm[1]) if middle_mm is None else middle_mm
-        self._middle_mm = np.array(middle)
+        corner, size = np.array(bed_min_mm), np.array(bed_size_mm)
+        self._middle_mm = corner + 0.5 * size if middle_mm is None else np.array(middle_mm)
         self.nozzle_diameter_mm = nozzle_diameter_mm
         self.filament_mm2 = np.pi / 4 * filament_diameter_mm**2
         self.columns = Columns(
-            origin_mm=(-margin_mm, -margin_mm),
-            size_mm=(bed_size_mm[0] + 2 * margin_mm, bed_size_mm[1] + 2 * margin_mm),
+            origin_mm=tuple(corner - margin_mm),
+            size_mm=tuple(size + 2 * margin_mm),
             cell_mm=cell_mm,
         )
         self._near, self._counts = _neighbours(cell_mm, nozzle_diameter_mm, self.bead)

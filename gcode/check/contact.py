@@ -76,11 +76,12 @@ def draw(
     contact: Contact, moves: Moves, printer: PrinterProfile, as_built: HeightField, path: Path
 ) -> None:
     """Write a picture (SVG) of the bed from above: what stands there, the way, the contact."""
+    bed_x0, _, _, bed_y1 = printer.bed_box_mm
     width_mm, depth_mm = printer.bed_size_mm
     x, y, z = contact.place_mm
     last = int(np.searchsorted(moves.line, contact.line, side="right"))
     first = max(0, last - NEAR_MOVES)
-    way = " ".join(f"{v[0]:.2f},{depth_mm - v[1]:.2f}" for v in moves.end_mm[first:last])
+    way = " ".join(f"{v[0] - bed_x0:.2f},{bed_y1 - v[1]:.2f}" for v in moves.end_mm[first:last])
     x0, y0, x1, y1 = as_built.box_mm
     image = base64.b64encode(_png(_shaded(as_built))).decode()
     radius = max(width_mm, depth_mm) / 60.0
@@ -93,11 +94,11 @@ def draw(
         f'font-size="{font:.2f}">'
         f'<rect x="0" y="0" width="{width_mm:g}" height="{depth_mm:g}" fill="#f4f4f0" '
         'stroke="#666" stroke-width="0.5"/>'
-        f'<image x="{x0:.3f}" y="{depth_mm - y1:.3f}" width="{x1 - x0:.3f}" '
+        f'<image x="{x0 - bed_x0:.3f}" y="{bed_y1 - y1:.3f}" width="{x1 - x0:.3f}" '
         f'height="{y1 - y0:.3f}" preserveAspectRatio="none" '
         f'href="data:image/png;base64,{image}"/>'
         f'<polyline points="{way}" fill="none" stroke="#33658a" stroke-width="0.3"/>'
-        f'<circle cx="{x:.3f}" cy="{depth_mm - y:.3f}" r="{radius:.2f}" fill="none" '
+        f'<circle cx="{x - bed_x0:.3f}" cy="{bed_y1 - y:.3f}" r="{radius:.2f}" fill="none" '
         'stroke="#c1121f" stroke-width="1"/>'
         f'<text x="0" y="{depth_mm + margin + font:.2f}">{text}</text></svg>\n',
         encoding="utf-8",

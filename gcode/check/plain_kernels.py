@@ -138,7 +138,7 @@ def follow(data, starts, first, last, limits, state, rows, counts):
             return line
         pulled, short_mm3 = state[PULLED], state[SHORT_MM3]
         if pushed != 0.0:
-            if pushed > 0.0 and limits[COLD] > 0:
+            if (pushed > 0.0 and limits[COLD] > 0) or pulled > limits[ALONE]:
                 return line
             back = max(0.0, min(pushed, pulled))
             if length > limits[SHORT_MOVE]:

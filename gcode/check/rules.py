@@ -17,6 +17,7 @@ from gcode.check.words import (
     PROBES,
     STARTS,
     parameters,
+    start_heats,
     words_of,
 )
 from gcode.moves import ModalState, Program
@@ -34,7 +35,7 @@ UNSAID_HEATS = frozenset("BFI")
 _COMMAND_HEAD = re.compile(r"([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
 _NUMBERED_LINE = re.compile(r"N\s*\d")
 # M486 A tells an object's name
-FREE_TEXT = frozenset({"M117", "M118", "M486", "M862.3", "M115"})
+FREE_TEXT = frozenset({"M117", "M118", "M486", "M708", "M862.3", "M862.6", "M115"})
 _TOOL = re.compile(r"T\d+")
 _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
@@ -48,6 +49,9 @@ OTHER_AXES = frozenset("ABCUVW")
 DWELLS = {"S": 1.0, "P": 1e-3}
 # Klipper's Pressure_Advance.md has 0.05 to 1 s, the most with bowden extruders.
 MOST_ADVANCE_S = 2.0
+# Prusa's scripts let filament be pushed from 155 °C on, to probe with a nozzle that does not ooze;
+# PLA melts at 150 to 160 °C.
+LEAST_COLD_C = 150.0
 FULL_FAN = 255.0
 HOMING_SLACK_MM = 0.2  # as much as the tip may press into what it prints on
 
@@ -71,7 +75,6 @@ class Judge(Motion):
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
         own = {self._begins.name if self._begins else "", self._ends or ""}
         self._macros = macros | STARTS - {self._begins.name.upper() if self._begins else ""}
-        self._heats_unsaid = False  # whether a macro ran that may have heated something
         self._waited_s, self._waited_at = 0.0, -1
         self._known = KNOWN_COMMANDS[program.dialect] | macros | {name.upper() for name in own}
         self._feels = touches.TOUCH_COMMANDS.get(program.dialect, "") if planned else ""
@@ -101,12 +104,13 @@ class Judge(Motion):
             self._named(upper)
             return
         name = head.group(1) + head.group(2) + (f".{head.group(3)}" if head.group(3) else "")
-        lenient = self._dialect in LENIENT_OF_TOOLS and _TOOL.fullmatch(name) is not None
-        if name not in self._known and not lenient:
+        tool = _TOOL.fullmatch(name) is not None
+        if tool and name not in self._known and self._dialect not in LENIENT_OF_TOOLS:
+            self._refuse("another tool", name, "the only one, T0")
+            return
+        if name not in self._known and not tool:
             self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
             return
-        if lenient:
-            self._choose(name)
         if name in FREE_TEXT:
             return
         if "*" in upper:
@@ -154,7 +158,9 @@ class Judge(Motion):
         name = match.group(1) if match else command.split(maxsplit=1)[0]
         given = parameters(command)
         if name not in self._known:
-            self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
+            own = "; a macro of the printer's own is told in its profile's 'macros'"
+            limit = f"those of {self._dialect}{own if self._dialect == 'klipper' else ''}"
+            self._refuse("command unknown or not allowed", name, limit)
         elif name == self._feels:
             told = {key: self._number(value) for key, value in given.items()}
             self._touch(touches.words_of_macro(told, self._place[2]))
@@ -164,8 +170,10 @@ class Judge(Motion):
             self._home({}, name)
             for heat, key in (("M109", self._begins.hotend), ("M190", self._begins.bed)):
                 self._heat(heat, {"S": self._number(given.get(key.upper()))})
-        elif name in STARTS and self._occupied:
-            self._refuse("homing Z onto a standing part", name, "nothing may stand there")
+        elif name in STARTS:
+            self._home({}, name)
+            for heat, key in start_heats(given):
+                self._heat(heat, {"S": self._number(given[key])})
         elif name == "TURN_OFF_HEATERS" or (self._ends and name == self._ends.upper()):
             self._hotend_c = self._ready_c = self._bed_c = self._chamber_c = 0.0
             if name != "TURN_OFF_HEATERS":
@@ -269,6 +277,8 @@ class Judge(Motion):
             off = [k for k, letter in enumerate("XYZ") if letter in words]
             for axis in off or ([] if "E" in words else range(3)):
                 self._homed[axis] = False
+        elif _TOOL.fullmatch(name):
+            self._choose(name)
         else:
             self._set_one(name, words)
 
@@ -286,6 +296,14 @@ class Judge(Motion):
             self._within("fan", words.get("S"), 0.0, FULL_FAN, "")
         elif name == "M572":
             self._advance(words.get("S"))
+        elif name == "M302":
+            if words.get("P") or (words.get("S") or 0.0) < LEAST_COLD_C:
+                told = " ".join(f"{letter}{value or 0:g}" for letter, value in words.items())
+                self._refuse("cold extrusion allowed", told, f"S{LEAST_COLD_C:g} and more")
+        elif name == "M200" and (words.get("D") or words.get("S")):
+            self._refuse("extrusion told as a volume", name, "D0")
+        elif name == "G27":
+            self._place = [None] * 3  # up, and to where it parks
         elif name == "M558" and "P" in words:
             self._refuse("type of the probe that homes Z", name, "the machine's own")
         elif name == "M862.1":
@@ -384,10 +402,11 @@ class Judge(Motion):
 
     def _home(self, words: dict[str, float | None], by: str = "G28 with Z") -> None:
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
-        if 2 in axes and self._occupied:
-            self._refuse("homing Z onto a standing part", by, "G28 X Y only")
-        elif self._occupied:
-            self._homes_above(self._place[2])
+        if self._occupied and not self._setup.printer.delta:
+            if 2 in axes:
+                self._refuse("homing Z onto a standing part", by, "G28 X Y only")
+            else:
+                self._homes_above(self._place[2])
         for axis in axes:
             self._homed[axis] = True
             self._place[axis] = None  # the place of an end stop is the firmware's business

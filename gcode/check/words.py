@@ -1,14 +1,18 @@
 """Which commands a program may hold, by dialect.
 
 What changes the machine lastingly, or switches a protection off, is left out on purpose: EEPROM
-(M500, M502), steps per mm (M92), cold extrusion (M302), homing offsets (M206, M428), PID tuning,
-the numbers of lines (M110).
-So are curves whose course nothing here follows (G5).
+(M500, M502), steps per mm (M92), homing offsets (M206, M428), PID tuning, the numbers of lines
+(M110). So are curves whose course nothing here follows (G5), and tools that are picked up (P0).
+
+Sources: marlinfw.org/docs/gcode; klipper3d.org/G-Codes.html; Duet's G-code dictionary; Prusa's
+`lib/Marlin` and `src/common/marlin_server` of Prusa-Firmware-Buddy, whose jobs slicers call Marlin;
+and the scripts of PrusaSlicer's bundles, which every job of their printers begins with.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 _OPTIONAL_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
 _MOTION = "G0 G1 G2 G3 G4 G10 G11 G17 G20 G21 G28 G90 G91 G92"
@@ -17,29 +21,44 @@ _COMMON = (
     "M191 M201 M203 M204 M205 M220 M221 M300 M400 M900 T0 M155 M150 M486 M600 M601 M25"
 )
 _PROBING = "G29 G32 G34 G80 G81"
+# Print timers, what a firmware reports, what it watches the filament with.
+_MARLINS = "M0 M1 M31 M75 M76 M77 M78 M85 M113 M119 M123 M142 M145 M192 M200 M302 M355 M412 M413"
+# Checks of printer, nozzle and firmware; the mass of the part, the area that is probed, pressure
+# advance; a stuck filament; a multi-material unit's own commands.
+_PRUSAS = (
+    "M862.1 M862.2 M862.3 M862.4 M862.5 M862.6 M74 M555 M569 M572 M591 M593 "
+    "M403 M701 M702 M708 TX TC T?"
+)
 
 KNOWN_COMMANDS: dict[str, frozenset[str]] = {
-    "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M0 M1 M31 M85 M113 M145 M420 M569 M593 "
-                        "M862.1 M862.3 M413 M142".split()),
-    "prusa": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M0 M1 M31 M85 M862.1 M862.2 M862.3 M862.4 "
-                       "M862.5 M907 M572 M142 G76".split()),
+    "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} {_MARLINS} {_PRUSAS} M217 M420 G12 G27 "
+                        "G33".split()),
+    "prusa": frozenset(f"{_MOTION} {_COMMON} {_PROBING} {_MARLINS} {_PRUSAS} M907 G76".split()),
     "klipper": frozenset(
         f"{_MOTION} {_COMMON} {_PROBING} SET_VELOCITY_LIMIT SET_PRESSURE_ADVANCE "
         "BED_MESH_CALIBRATE BED_MESH_PROFILE BED_MESH_CLEAR SET_HEATER_TEMPERATURE "
         "TEMPERATURE_WAIT TURN_OFF_HEATERS "
         "QUAD_GANTRY_LEVEL SET_GCODE_OFFSET EXCLUDE_OBJECT_DEFINE EXCLUDE_OBJECT_START "
         "EXCLUDE_OBJECT_END SET_PRINT_STATS_INFO CLEAR_PAUSE PRINT_START PRINT_END START_PRINT "
-        "END_PRINT PAUSE AMREPAIR_SCAN".split()
+        "END_PRINT PAUSE AMREPAIR_SCAN Z_TILT_ADJUST SET_FILAMENT_SENSOR SET_INPUT_SHAPER "
+        "SET_DISPLAY_TEXT SET_LED SET_FAN_SPEED RESPOND TIMELAPSE_TAKE_FRAME "
+        "TIMELAPSE_RENDER".split()
     ),
     "reprap": frozenset(f"{_MOTION} {_COMMON} {_PROBING} M116 M144 M207 M290 M561 M562 M566 M568 "
-                        "M572 M376 M557 M558 M593 M0 M1 M226".split()),
+                        "M572 M376 M557 M558 M593 M0 M1 M226 G30 M75 M119 M122".split()),
 }  # fmt: skip
 # What measures or moves against the bed with a probe or the nozzle: never over a standing part.
 PROBES = frozenset(
-    {"G29", "G32", "G34", "G76", "G80", "G81", "BED_MESH_CALIBRATE", "QUAD_GANTRY_LEVEL"}
+    {
+        *("G12", "G29", "G30", "G32", "G33", "G34", "G76", "G80", "G81"),
+        *("BED_MESH_CALIBRATE", "QUAD_GANTRY_LEVEL", "Z_TILT_ADJUST"),
+    }
 )
-# Macros that begin a job by convention: they home all axes, and most of them probe.
+# Macros that begin a job by convention: they home all axes, most of them probe, and they heat to
+# what their parameters say.
 STARTS = frozenset({"START_PRINT", "PRINT_START"})
+# What names those parameters: EXTRUDER, EXTRUDER_TEMP, HOTEND, NOZZLE_TEMP; BED, BED_TEMP.
+_START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
@@ -56,6 +75,12 @@ def parameters(command: str) -> dict[str, str]:
     """KEY=VALUE pairs of a named command, keys and values in capitals."""
     pairs = (word.partition("=") for word in command.upper().split()[1:])
     return {key: value for key, _, value in pairs}
+
+
+def start_heats(given: dict[str, str]) -> Iterator[tuple[str, str]]:
+    """The heaters that a macro of `STARTS` waits for: the command, and the parameter's key."""
+    for command, names in _START_HEATS.items():
+        yield from ((command, key) for key in given if any(name in key for name in names))
 
 
 def words_of(rest: str) -> tuple[dict[str, float | None], tuple[str, str, str] | None]:

@@ -85,15 +85,17 @@ def plain_text(path: Path) -> str:
     InputError
         If it cannot be read, or is no text.
     """
+    from gcode.reader import binary
+
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}).") from error
+    if binary.is_binary(data):
+        return binary.text_of(data, str(path))
+    text = data.decode("utf-8", "replace").replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
-        raise InputError(
-            f"{path} is no text; give a program as plain G-code (a slicer may have to be told not "
-            "to write binary G-code)."
-        )
+        raise InputError(f"{path} is no text; give a program as plain or Prusa's binary G-code.")
     return text
 
 

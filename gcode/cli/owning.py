@@ -57,6 +57,12 @@ def job_setup(
     from gcode.profiles import load_setup
 
     own = _own(text, name, printer)
+    if printer is None and own is None and text is not None:
+        from gcode.profiles.own_settings import printer_of_words
+
+        printer = printer_of_words(text)
+        told = f"{name}: no --printer is given and no slicer's settings are in it"
+        console.errors.print(f"{told}; {printer} is taken.", markup=False)
     ids = (printer or DEFAULT_PRINTER, material or DEFAULT_MATERIAL, process or DEFAULT_PROCESS)
     if own is None:
         return load_setup(*ids), None
@@ -66,19 +72,10 @@ def job_setup(
 
 
 def _own(text: str | None, name: Path | str, printer: str | None) -> OwnSettings | SlicedFor | None:
-    """A job's own settings, where they are asked for; that there are none is told."""
+    """A job's own settings, where they are asked for."""
     from gcode.profiles.own_settings import own_settings
 
-    if printer is not None or text is None:
-        return None
-    own = own_settings(text, str(name))
-    if own is None:
-        console.errors.print(
-            f"{name}: no --printer is given and no slicer's settings are in it; "
-            f"{DEFAULT_PRINTER} is taken.",
-            markup=False,
-        )
-    return own
+    return None if printer is not None or text is None else own_settings(text, str(name))
 
 
 def setup_to_judge(

@@ -22,7 +22,9 @@ class Laid:
     """Heights of all beads laid so far."""
 
     def __init__(self, profile: PrinterProfile) -> None:
-        self.surface = HeightField.flat(profile.bed_size_mm, LAID_CELL_MM)
+        self.surface = HeightField.flat(
+            profile.bed_size_mm, LAID_CELL_MM, origin_mm=profile.bed_min_mm
+        )
         self._area_mm2 = filament_area_mm2(profile.filament_diameter_mm)
 
     def add(self, motion: MotionBatch) -> None:

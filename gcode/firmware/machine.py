@@ -117,9 +117,12 @@ class Machine(Mechanics):
 
     def _g28(self, rest: bytes) -> None:
         axes = {chr(token[0]) for token in rest.split()} & {"X", "Y", "Z"} or {"X", "Y", "Z"}
+        if self.profile.delta:  # its carriages know no axis alone
+            axes = {"X", "Y", "Z"}
+        ends = (0.0, 0.0, self.profile.max_z_mm if self.profile.delta else 0.0)
         target = tuple(
-            0.0 if letter in axes else value
-            for letter, value in zip("XYZ", (self.x, self.y, self.z), strict=True)
+            end if letter in axes else value
+            for letter, value, end in zip("XYZ", (self.x, self.y, self.z), ends, strict=True)
         )
         distance = math.dist(target, (self.x, self.y, self.z))
         drained_s = self.planner.drained_s(self.clock_s)

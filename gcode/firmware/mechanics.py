@@ -208,9 +208,9 @@ class Mechanics:
             self.replies.append(f"{self.variant.echo_prefix} cold extrusion prevented")
 
     def _soft_limits(self, target: tuple[float, float, float]) -> tuple[float, float, float]:
-        width, depth = self.profile.bed_size_mm
-        x = min(max(target[0], -SOFT_MARGIN_MM), width + SOFT_MARGIN_MM)
-        y = min(max(target[1], -SOFT_MARGIN_MM), depth + SOFT_MARGIN_MM)
+        x0, y0, x1, y1 = self.profile.bed_box_mm
+        x = min(max(target[0], x0 - SOFT_MARGIN_MM), x1 + SOFT_MARGIN_MM)
+        y = min(max(target[1], y0 - SOFT_MARGIN_MM), y1 + SOFT_MARGIN_MM)
         return x, y, min(max(target[2], 0.0), self.profile.max_z_mm)
 
     def let_pass(self, until_s: float) -> None:

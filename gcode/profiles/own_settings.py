@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -16,9 +17,9 @@ from typing import ClassVar
 from gcode.dialects import dialect_of
 from gcode.errors import ProfileError
 from gcode.profiles.importers import ImportedFile, import_job, write_profiles
-from gcode.profiles.importers.jobs import generator
+from gcode.profiles.importers.jobs import dialect_of_words, generator
 from gcode.profiles.machines import machine_named
-from gcode.profiles.names import DEFAULT_PROCESS
+from gcode.profiles.names import DEFAULT_PRINTER, DEFAULT_PROCESS
 from gcode.profiles.schema import PrinterProfile
 from gcode.profiles.setup import PrintSetup, load_setup
 from gcode.profiles.store import load_printer
@@ -29,7 +30,6 @@ NAMED_WITHIN = 4096
 NO_HOSTS = "Bambu Lab"
 """Whose printers are driven by their maker's own programs."""
 _SLICED_FOR = "profiles: "
-_POINT = re.compile(r"(-?\d+(?:\.\d+)?)x(-?\d+(?:\.\d+)?)")
 # What one would ask first, and what no slicer tells.
 _ASKED_FIRST = {
     "bed_size_mm": "bed",
@@ -115,11 +115,19 @@ class OwnSettings:
             )
         values = self.found.profiles[0].values
         why = []
+        corner_mm = values.get("bed_min_mm", (0.0, 0.0)) if self.bed_size_mm else None
         if self.bed_size_mm is not None and any(
             abs(job - own) > SAME_BED_RATIO * own
             for job, own in zip(self.bed_size_mm, printer.bed_size_mm, strict=True)
         ):
             why.append(f"a bed of {_bed(self.bed_size_mm)}, not {_bed(printer.bed_size_mm)}")
+        elif corner_mm is not None and any(
+            abs(job - own) > SAME_BED_RATIO * side
+            for job, own, side in zip(
+                corner_mm, printer.bed_min_mm, printer.bed_size_mm, strict=True
+            )
+        ):
+            why.append(f"a bed from {_corner(corner_mm)} on, not {_corner(printer.bed_min_mm)}")
         nozzle_mm = values.get("nozzle_diameter_mm")
         if nozzle_mm is not None and abs(nozzle_mm - printer.nozzle_diameter_mm) > SAME_NOZZLE_MM:
             why.append(f"a nozzle of {nozzle_mm:g} mm, not {printer.nozzle_diameter_mm:g} mm")
@@ -209,6 +217,12 @@ def _sliced_for(text: str, name: str) -> SlicedFor | None:
     return found
 
 
+def printer_of_words(text: str) -> str:
+    """The profile to take for a job without settings: by the firmware whose words it has."""
+    spoken = dialect_of_words(text)
+    return DEFAULT_PRINTER if spoken is None else f"generic_{spoken}"
+
+
 def own_settings(text: str, name: str) -> OwnSettings | SlicedFor | None:
     """What a job's slicer wrote into it; None where there is nothing.
 
@@ -231,12 +245,9 @@ def own_settings(text: str, name: str) -> OwnSettings | SlicedFor | None:
     if found is None:
         return None
     made = found.profiles[0]
-    outline = [row.source_value for row in made.mapped if row.key == "bed_size_mm"]
-    outline += [row.source_value for row in found.left if row.source_key == "bed_shape"]
     machine = None if made.inherits.startswith("generic") else made.inherits
-    size_mm = _extent(outline[0]) if outline else None
-    if size_mm is None and (told := made.values.get("bed_size_mm")) is not None:
-        size_mm = (told[0], told[1])
+    told = made.values.get("bed_size_mm")
+    size_mm = None if told is None else (told[0], told[1])
     if machine is not None and not _named(made.name, found, machine):
         machine = None  # a dialect's stand-in, no machine that the job names
     return OwnSettings(Path(name).name, generator(text), found, machine, size_mm)
@@ -247,23 +258,15 @@ def _named(name: str, found: ImportedFile, machine: str) -> bool:
     return machine_named(*models, name) == machine
 
 
-def _extent(outline: str) -> tuple[float, float] | None:
-    """From the least to the greatest X and Y of an outline `0x0,250x0,…`, from the origin on."""
-    points = [(float(x), float(y)) for x, y in _POINT.findall(outline)]
-    if len(points) < 3:
-        return None
-    sides = []
-    for values in zip(*points, strict=True):
-        low, high = min(values), max(values)
-        sides.append(high - low if low < -SAME_BED_RATIO * (high - low) else high)
-    return sides[0], sides[1]
-
-
 def _described(printer: PrinterProfile) -> str:
     return (
         f"{printer.name}, bed {_bed(printer.bed_size_mm)}, {printer.max_z_mm:g} mm high, nozzle "
         f"{printer.nozzle_diameter_mm:g} mm, {printer.dialect}"
     )
+
+
+def _corner(at_mm: Sequence[float]) -> str:
+    return f"X {at_mm[0]:g} Y {at_mm[1]:g}"
 
 
 def _bed(size_mm: tuple[float, float]) -> str:

@@ -206,6 +206,8 @@ class PrinterProfile(_Profile):
 
     dialect: DialectName
     bed_size_mm: tuple[Positive, Positive]
+    bed_min_mm: Xy = (0.0, 0.0)  # its corner of least X and Y; beds about the origin have one below
+    delta: bool = False  # three towers: the bed is round, homing lifts the head to their tops
     max_z_mm: Positive
     reach_min_mm: Xy | None = None  # where the nozzle may go off the bed (purge, wiper); the bed
     reach_max_mm: Xy | None = None  # itself where left out
@@ -279,16 +281,29 @@ class PrinterProfile(_Profile):
         return self.envelope
 
     @property
+    def bed_box_mm(self) -> tuple[float, float, float, float]:
+        """(x_min, y_min, x_max, y_max) of the bed."""
+        (x, y), (width, depth) = self.bed_min_mm, self.bed_size_mm
+        return x, y, x + width, y + depth
+
+    @property
+    def bed_middle_mm(self) -> tuple[float, float]:
+        """X and Y of the bed's middle."""
+        x0, y0, x1, y1 = self.bed_box_mm
+        return 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+
+    @property
+    def reach_is_told(self) -> bool:
+        """Whether somebody has said how far the nozzle goes; else the bed alone is known."""
+        return self.reach_min_mm is not None or self.reach_max_mm is not None
+
+    @property
     def reach_box_mm(self) -> tuple[float, float, float, float]:
         """(x_min, y_min, x_max, y_max) where the nozzle may go; at least the bed."""
-        low = self.reach_min_mm or (0.0, 0.0)
-        high = self.reach_max_mm or self.bed_size_mm
-        return (
-            min(low[0], 0.0),
-            min(low[1], 0.0),
-            max(high[0], self.bed_size_mm[0]),
-            max(high[1], self.bed_size_mm[1]),
-        )
+        x0, y0, x1, y1 = self.bed_box_mm
+        low = self.reach_min_mm or (x0, y0)
+        high = self.reach_max_mm or (x1, y1)
+        return min(low[0], x0), min(low[1], y0), max(high[0], x1), max(high[1], y1)
 
 
 class MaterialProfile(_Profile):

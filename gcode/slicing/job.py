@@ -132,11 +132,15 @@ def _refuse(solid: Any, setup: PrintSetup) -> None:
     if solid.is_empty() or solid.volume() <= 0:
         raise SliceError("The solid is empty (0 mm³); nothing can be sliced.")
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
-    size = np.array([*setup.printer.bed_size_mm, setup.printer.max_z_mm])
-    if (low < -0.01).any() or (high > size + 0.01).any():
+    printer = setup.printer
+    x0, y0, x1, y1 = printer.bed_box_mm
+    room = np.array([[x0, y0, 0.0], [x1, y1, printer.max_z_mm]])
+    if (low < room[0] - 0.01).any() or (high > room[1] + 0.01).any():
+        size = room[1] - room[0]
+        corner = f" from X {x0:g} Y {y0:g} on" if x0 or y0 else ""
         raise SliceError(
             f"The part spans {_box_text((*low, *high))} mm, outside the printer's "
-            f"{size[0]:g} × {size[1]:g} × {size[2]:g} mm; move, turn or scale it."
+            f"{size[0]:g} × {size[1]:g} × {size[2]:g} mm{corner}; move, turn or scale it."
         )
 
 
@@ -257,12 +261,12 @@ def _skirt(pen: Pen, layers: PartLayers, slab: Slab) -> None:
         return
     share_mm = spacing_of(process.line_width_mm, slab.height_mm)
     hull = union([section]).hull()
-    size = setup.printer.bed_size_mm
+    bed = np.array(setup.printer.bed_box_mm)
     for i in range(process.skirt_loops):
         distance = process.skirt_distance_mm + (i + 0.5) * share_mm
         for contour in hull.offset(distance).simplify(0.05).to_polygons():
             loop = np.asarray(contour, float)
-            if (loop < 0.5).any() or (loop > np.array(size) - 0.5).any():
+            if (loop < bed[:2] + 0.5).any() or (loop > bed[2:] - 0.5).any():
                 continue
             bead = loop_bead(loop, share_mm, Role.SKIRT)
             _lay(pen, bead, slab, flattened(hull), layers)

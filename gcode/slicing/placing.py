@@ -20,9 +20,6 @@ def in_the_middle(solid: Any, printer: PrinterProfile) -> tuple[Any, Xyz]:
     The solid, build frame, and by how much it was moved in X, Y, Z, mm.
     """
     x0, y0, z0, x1, y1, _ = solid.bounding_box()
-    by_mm = (
-        0.5 * (printer.bed_size_mm[0] - x0 - x1),
-        0.5 * (printer.bed_size_mm[1] - y0 - y1),
-        -z0,
-    )
+    x, y = printer.bed_middle_mm
+    by_mm = (x - 0.5 * (x0 + x1), y - 0.5 * (y0 + y1), -z0)
     return solid.translate(by_mm), by_mm

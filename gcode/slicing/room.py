@@ -84,12 +84,22 @@ def bare_place(field: HeightField, printer: PrinterProfile) -> tuple[float, floa
 
 def _starts(printer: PrinterProfile) -> list[tuple[float, float]]:
     """The profile's own place, and places along the bed's edges."""
-    width, depth = printer.bed_size_mm
-    xs = np.arange(INSET_MM, width - INSET_MM + 1e-6, EVERY_MM)
-    ys = np.arange(INSET_MM, depth - INSET_MM + 1e-6, EVERY_MM)
-    edges = [(float(x), y) for y in (INSET_MM, depth - INSET_MM) for x in xs]
-    edges += [(x, float(y)) for x in (INSET_MM, width - INSET_MM) for y in ys]
+    x0, y0, x1, y1 = np.array(printer.bed_box_mm) + INSET_MM * np.array([1, 1, -1, -1])
+    xs, ys = np.arange(x0, x1 + 1e-6, EVERY_MM), np.arange(y0, y1 + 1e-6, EVERY_MM)
+    edges = [(float(x), float(y)) for y in (y0, y1) for x in xs]
+    edges += [(float(x), float(y)) for x in (x0, x1) for y in ys]
+    if printer.delta:
+        edges = [_on_the_ellipse(at, printer) for at in edges]
     return [(printer.prime_mm[0], printer.prime_mm[1]), *edges]
+
+
+def _on_the_ellipse(at_mm: tuple[float, float], printer: PrinterProfile) -> tuple[float, float]:
+    """The place in the same direction at the edge of a round bed."""
+    middle = np.array(printer.bed_middle_mm)
+    radii = 0.5 * np.array(printer.bed_size_mm) - INSET_MM
+    towards = (np.array(at_mm) - middle) / radii
+    x, y = middle + radii * towards / np.linalg.norm(towards)
+    return float(x), float(y)
 
 
 def _bare(field: HeightField, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:

@@ -313,11 +313,17 @@ class HeightField:
 
     @classmethod
     def flat(
-        cls, size_mm: tuple[float, float], cell_mm: float, *, z_mm: float = 0.0
+        cls,
+        size_mm: tuple[float, float],
+        cell_mm: float,
+        *,
+        z_mm: float = 0.0,
+        origin_mm: tuple[float, float] = (0.0, 0.0),
     ) -> HeightField:
-        """A plane of `size_mm` at one height, its corner at the origin."""
+        """A plane of `size_mm` at one height; `origin_mm` is its corner of least X and Y."""
         ny, nx = (math.ceil(size_mm[1] / cell_mm), math.ceil(size_mm[0] / cell_mm))
-        return cls(np.zeros(2), cell_mm, np.full((ny, nx), z_mm), np.ones((ny, nx), bool))
+        origin = np.array(origin_mm, np.float64)
+        return cls(origin, cell_mm, np.full((ny, nx), z_mm), np.ones((ny, nx), bool))
 
     @classmethod
     def from_mesh(

@@ -28,7 +28,9 @@ TASTE = {
 # Told in a user's job, by the names they have among the planted faults; all others can hurt.
 TOLD = {
     "feed beyond the machine's", "acceleration", "acceleration of an axis", "jerk",
-    "machine limit", "heater left on", "bed left on", "chamber left on",
+    "machine limit", "heater left on", "bed left on", "chamber left on", "melts too much",
+    "melts too much by a flow factor", "melts too much by a speed factor",
+    "pushed faster than it melts", "pushed fast bit by bit", "pushed fast on the spot",
 }  # fmt: skip
 
 
@@ -52,8 +54,6 @@ def test_what_can_hurt_is_refused_in_a_users_job_too(name: str) -> None:
     text = GOOD.replace(old, new, 1)
     if name == "relative mode lost":
         text = text.replace("X80 E0.7", "X80 E120")
-    if name.startswith("melts"):  # three times what melts is no matter of taste
-        text = text.replace("E3.5 F12000", "E15 F12000").replace("F2700", "F27000")
     found = find_refusals(program(text), SETUP, policy=Policy.DANGER)
     assert found
     assert said is None or any(said in refusal.what for refusal in found)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gcode.errors import InputError, ProfileError
@@ -337,9 +338,8 @@ def test_files_that_are_none_of_these(tmp_path: Path, name: str, text: str, said
 @pytest.mark.parametrize(
     ("outline", "why"),
     [
-        ("-100x-100,100x-100,100x100,-100x100", "corner is not at the origin"),
-        ("5x0,215x0,215x220,5x220", "corner is not at the origin"),  # ours would be too large
-        ("0x0,100x0,50x80", "no rectangle"),
+        ("0x0,100x0,50x80", "triangle"),
+        ("0x0,100x0,200x0,50x0", "no area"),
         ("round", "no outline"),
     ],
 )
@@ -348,9 +348,39 @@ def test_beds_that_ours_cannot_say(tmp_path: Path, outline: str, why: str) -> No
     assert why in reasons(read(tmp_path, "a.ini", text))["bed_shape"]
 
 
-def test_a_bed_that_begins_below_the_origin_is_used_from_there(tmp_path: Path) -> None:
-    text = PRUSA.replace("0x0,180x0,180x180,0x180", "-10x-15,298x-15,298x230,-10x230")
-    assert read(tmp_path, "a.ini", text).profiles[0].values["bed_size_mm"] == [298.0, 230.0]
+@pytest.mark.parametrize(
+    ("outline", "size", "corner"),
+    [
+        ("-10x-15,298x-15,298x230,-10x230", [308.0, 245.0], [-10.0, -15.0]),
+        ("5x5,305x5,305x305,5x305", [300.0, 300.0], [5.0, 5.0]),  # Creality's CR-10
+        ("-100x-100,100x-100,100x100,-100x100", [200.0, 200.0], [-100.0, -100.0]),
+    ],
+)
+def test_a_bed_lies_where_its_outline_says(
+    tmp_path: Path, outline: str, size: list[float], corner: list[float]
+) -> None:
+    found = read(tmp_path, "a.ini", PRUSA.replace("0x0,180x0,180x180,0x180", outline))
+    values = found.profiles[0].values
+    assert values["bed_size_mm"] == size
+    assert values["bed_min_mm"] == corner
+    x0, y0 = corner
+    for key in ("park_mm", "prime_mm"):
+        x, y, _ = values[key]
+        assert x0 < x < x0 + size[0], f"{key} lies on this bed"
+        assert y0 < y < y0 + size[1]
+
+
+def test_a_round_bed_is_about_the_origin_and_nothing_is_parked_in_its_corners(
+    tmp_path: Path,
+) -> None:
+    turns = np.linspace(0.0, 2 * np.pi, 72, endpoint=False)
+    circle = ",".join(f"{100 * np.cos(a):.6g}x{100 * np.sin(a):.6g}" for a in turns)
+    found = read(tmp_path, "a.ini", PRUSA.replace("0x0,180x0,180x180,0x180", circle))
+    values = found.profiles[0].values
+    assert (values["bed_size_mm"], values["bed_min_mm"]) == ([200.0, 200.0], [-100.0, -100.0])
+    assert values["delta"] is True
+    for key in ("park_mm", "prime_mm"):
+        assert np.hypot(*values[key][:2]) <= 95.0 + 1e-3
 
 
 @pytest.mark.parametrize(

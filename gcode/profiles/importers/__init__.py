@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from gcode.errors import InputError, ProfileError
@@ -208,16 +210,10 @@ def _settle(made: Imported) -> list[str]:
     if made.inherits not in _GENERIC_IDS and made.values.get("dialect") == "marlin":
         # Slicers call Prusa's firmware Marlin; older ones, and Cura, call Klipper so, too.
         made.values["dialect"] = above["dialect"]
-    merged = {**above, **made.values}
+    merged = {"bed_min_mm": (0.0, 0.0), "delta": False, **above, **made.values}
     notes = []
-    size_mm, top_mm = merged["bed_size_mm"], merged["max_z_mm"]
     for key in ("park_mm", "prime_mm"):
-        x_mm, y_mm, z_mm = merged[key]
-        kept = [
-            min(x_mm, size_mm[0] - BED_EDGE_MM),
-            min(y_mm, size_mm[1] - BED_EDGE_MM),
-            min(z_mm, top_mm),
-        ]
+        kept = _on_the_bed(merged[key], merged) if key not in made.values else list(merged[key])
         if kept != list(merged[key]):
             made.values[key] = kept
             notes.append(f"{key} of {made.inherits} was moved onto this bed: {kept}")
@@ -227,6 +223,18 @@ def _settle(made: Imported) -> list[str]:
         f"before printing on a part"
     )
     return notes
+
+
+def _on_the_bed(place_mm: Sequence[float], bed: Mapping[str, Any]) -> list[float]:
+    """A place that was told from the corner of another machine's bed, kept on this one."""
+    corner, size = np.array(bed["bed_min_mm"]), np.array(bed["bed_size_mm"])
+    at = corner + np.minimum(place_mm[:2], size - BED_EDGE_MM)
+    middle, radii = corner + 0.5 * size, 0.5 * size - BED_EDGE_MM
+    out = float(np.linalg.norm((at - middle) / radii))
+    if bed["delta"] and out > 1.0:
+        at = middle + (at - middle) / out
+    x_mm, y_mm = at.round(3).tolist()
+    return [x_mm, y_mm, min(place_mm[2], bed["max_z_mm"])]
 
 
 def _validate(path: Path, made: Imported) -> None:

@@ -17,6 +17,7 @@ from gcode.profiles.importers.rules import (
     NotMappedError,
     Rule,
     Source,
+    bed,
     choice,
     limit,
     number,
@@ -45,18 +46,23 @@ _SCRIPT = script(
 
 
 def _dialect(text: str, source: Source) -> str:
-    named = choice(**{"marlin": "marlin", "marlin (volumetric)": "marlin", "reprap": "reprap"})
-    return named(text, source)
+    named = choice(
+        **{"marlin (volumetric)": "marlin"}, marlin="marlin", reprap="reprap", klipper="klipper"
+    )
+    return named({"reprapfirmware": "reprap"}.get(text, text), source)
 
 
-def _bed(text: str, source: Source) -> list[float]:
-    """Both sides at once; a bed about the origin has another frame than ours."""
-    if source.values.get("machine_center_is_zero", "").lower() == "true":
-        raise NotMappedError("the bed's corner is not at the origin")
-    sides = [source.values.get(key) for key in ("machine_width", "machine_depth")]
-    if None in sides:
+def _bed(text: str, source: Source) -> dict[str, Any]:
+    """Both sides at once."""
+    keys = ("machine_width", "machine_depth")
+    if any(key not in source.values for key in keys):
         raise NotMappedError("only one side of the bed is given")
-    return [number(side, source) for side in sides if side is not None]
+    x_mm, y_mm = (number(source.values[key], source) for key in keys)
+    centred = source.values.get("machine_center_is_zero", "").lower() == "true"
+    rounded = source.values.get("machine_shape", "") == "elliptic"
+    if centred:
+        return bed((-x_mm / 2, x_mm / 2), (-y_mm / 2, y_mm / 2), rounded=rounded)
+    return bed((0.0, x_mm), (0.0, y_mm), rounded=rounded)
 
 
 def _steady(rule: Rule) -> Rule:
@@ -73,8 +79,8 @@ def _steady(rule: Rule) -> Rule:
 _CURA_RULES: dict[str, Rule] = {
     "FLAVOR": Rule("printers", "dialect", _dialect),
     "EXTRUDER_TRAIN.0.NOZZLE.DIAMETER": Rule("printers", "nozzle_diameter_mm", number),
-    "machine_width": Rule("printers", "bed_size_mm", _bed),
-    "machine_depth": Rule("printers", "bed_size_mm", _bed),
+    "machine_width": Rule("printers", "", _bed),
+    "machine_depth": Rule("printers", "", _bed),
     "machine_height": Rule("printers", "max_z_mm", number),
     "machine_nozzle_size": Rule("printers", "nozzle_diameter_mm", number),
     "machine_gcode_flavor": Rule("printers", "dialect", _dialect),

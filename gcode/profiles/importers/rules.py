@@ -12,7 +12,7 @@ from typing import Any
 
 from gcode.profiles.names import Kind
 
-_LENGTH = re.compile(r"[-+]?\d+(?:\.\d+)?")
+_LENGTH = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 class NotMappedError(Exception):
@@ -92,7 +92,7 @@ Convert = Callable[[str, Source], Any]
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Where a key goes, and how its text is read."""
+    """Where a key goes, and how its text is read; without a key of ours it becomes several."""
 
     kind: Kind
     key: str
@@ -126,16 +126,18 @@ def apply(
             left.append(Left(key, text, f"it belongs to {rule.kind}, which this file is not"))
         else:
             try:
-                made[rule.kind].put(key, text, rule.key, rule.convert(text, source))
+                value = rule.convert(text, source)
             except NotMappedError as reason:
                 left.append(Left(key, text, str(reason)))
+                continue
+            for ours, one in {rule.key: value}.items() if rule.key else value.items():
+                made[rule.kind].put(key, text, ours, one)
     return tuple(made.values()), tuple(left)
 
 
 # ---------------------------------------------------------------------- conversions
 
-OVERHANG_RATIO = 0.2
-"""A bed may begin this share of its size below the origin."""
+LEAST_ROUND_CORNERS = 16  # a slicer's circle has 72 and more; fewer are a plate with cut corners
 
 
 def first(text: str) -> str:
@@ -207,19 +209,29 @@ def choice(**names: str) -> Convert:
     return convert
 
 
-def corners(text: str, source: Source) -> list[float]:
-    """Read a bed outline `0x0,250x0,250x210,0x210` as its size."""
+def bed(
+    x_mm: tuple[float, float], y_mm: tuple[float, float], *, rounded: bool = False
+) -> dict[str, Any]:
+    """Our keys of a bed that goes so far in X and Y, least and greatest."""
+    size = [x_mm[1] - x_mm[0], y_mm[1] - y_mm[0]]
+    if min(size) <= 0:
+        raise NotMappedError("the bed has no area")
+    made: dict[str, Any] = {"bed_size_mm": size}
+    if x_mm[0] or y_mm[0]:
+        made["bed_min_mm"] = [x_mm[0], y_mm[0]]
+    return made | ({"delta": True} if rounded else {})
+
+
+def outline(text: str, source: Source) -> dict[str, Any]:
+    """Read a bed's outline `0x0,250x0,250x210,0x210`; of another shape the box is taken."""
     pairs = [tuple(map(float, _LENGTH.findall(pair))) for pair in text.split(",")]
     if any(len(pair) != 2 for pair in pairs):
         raise NotMappedError(f"{text!r} is no outline of points XxY")
-    x_mm, y_mm = {pair[0] for pair in pairs}, {pair[1] for pair in pairs}
-    if len(pairs) != 4 or len(x_mm) != 2 or len(y_mm) != 2:
-        raise NotMappedError("the bed is no rectangle")
-    for axis in (x_mm, y_mm):
-        # What reaches below the origin is given away; a bed about the origin would be a quarter.
-        if not -OVERHANG_RATIO * max(axis) <= min(axis) <= 0.0:
-            raise NotMappedError("the bed's corner is not at the origin")
-    return [max(x_mm), max(y_mm)]
+    x_mm, y_mm = ([round(pair[axis], 3) for pair in pairs] for axis in (0, 1))
+    around = (min(x_mm), max(x_mm)), (min(y_mm), max(y_mm))
+    if len(pairs) < 4:
+        raise NotMappedError("the bed is a triangle at most")
+    return bed(*around, rounded=len(pairs) >= LEAST_ROUND_CORNERS)
 
 
 def script(placeholders: Mapping[str, str]) -> Convert:

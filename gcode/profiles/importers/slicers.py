@@ -17,10 +17,10 @@ from gcode.profiles.importers.rules import (
     Rule,
     Source,
     choice,
-    corners,
     limit,
     number,
     of_key,
+    outline,
     percent,
     script,
     share,
@@ -76,7 +76,7 @@ _PRUSA_SCRIPT = script(
 )
 PRUSA: dict[str, Rule] = {
     **_axes("feedrate"),
-    "bed_shape": Rule("printers", "bed_size_mm", corners),
+    "bed_shape": Rule("printers", "", outline),
     "max_print_height": Rule("printers", "max_z_mm", number),
     "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
     "filament_diameter": Rule("printers", "filament_diameter_mm", number),
@@ -131,7 +131,7 @@ _ORCA_SCRIPT = script(
 )
 ORCA: dict[str, Rule] = {
     **_axes("speed"),
-    "printable_area": Rule("printers", "bed_size_mm", corners),
+    "printable_area": Rule("printers", "", outline),
     "printable_height": Rule("printers", "max_z_mm", number),
     "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
     "filament_diameter": Rule("printers", "filament_diameter_mm", number),
