@@ -13,7 +13,7 @@ from jaxtyping import Float
 from gcode.check import plain_kernels as plain
 from gcode.check.arcs import points_of_arc
 from gcode.check.findings import Moves, Policy, Refusal, Text, Warnings
-from gcode.check.words import G91_MOVES_E, LINE_LIMIT
+from gcode.check.words import CLAMPS, G91_MOVES_E, LINE_LIMIT, MOVES_UNHOMED
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader.text_kernels import INCH_MM
@@ -249,10 +249,20 @@ class Motion:
         moved = [axis for axis, letter in enumerate("XYZ") if letter in words]
         for axis in moved:
             if not self._homed[axis]:
-                self._refuse("move before homing", "XYZ"[axis], "home first")
-                self._homed[axis] = True  # said once
+                self._unhomed(axis, words)
         target = self._target(words)
         self._go(target, self._pushed(words), moved=bool(moved))
+
+    def _unhomed(self, axis: int, words: dict[str, float | None]) -> None:
+        """Up and away from the bed is told in a user's job, where firmwares do it; said once."""
+        value = words["XYZ"[axis]] or 0.0
+        rises = axis == 2 and value > 0 and not (self._absolute and self._occupied)
+        told = ("move before homing", "XYZ"[axis], "home first")
+        if rises and self._dialect in MOVES_UNHOMED:
+            self._beyond(*told, 1.0)
+        else:
+            self._refuse(*told)
+        self._homed[axis] = True
 
     def _arc(self, words: dict[str, float | None], *, clockwise: bool) -> None:
         self._feed(words)
@@ -282,7 +292,7 @@ class Motion:
     def _go(self, target: list[float | None], pushed_mm: float, *, moved: bool) -> None:
         here = self._place
         if moved:
-            self._bounds(target)
+            target = self._bounded(target, lays=pushed_mm > 0)
         length_mm = 0.0
         known = None not in here and None not in target
         if known:
@@ -328,20 +338,27 @@ class Motion:
                     math.inf,  # the firmware goes no faster than it can
                 )
 
-    def _bounds(self, target: list[float | None]) -> None:
-        """Off a bed of which the profile tells no more, a user's own job may know its way."""
-        printer = self._setup.printer
+    def _bounded(self, target: list[float | None], *, lays: bool) -> list[float | None]:
+        """Where the head comes to.
+
+        Off a bed of which the profile tells no more, a user's job may know its way; what is far off
+        the firmware cuts short, at a place that nobody has told.
+        """
+        printer, reached = self._setup.printer, list(target)
         x0, y0, x1, y1 = printer.reach_box_mm
+        cuts = self._dialect in CLAMPS and not lays
         for axis, low, high in ((0, x0, x1), (1, y0, y1), (2, 0.0, printer.max_z_mm)):
             value = target[axis]
             if value is None or low - PLACE_SLACK_MM <= value <= high + PLACE_SLACK_MM:
                 continue
             told = (f"{'XYZ'[axis]} out of reach", f"{value:g} mm", f"{low:g} to {high:g} mm")
             into_the_bed = axis == 2 and value < low
-            if printer.reach_is_told or into_the_bed:
+            near = max(low - value, value - high) <= OFF_BED_MM
+            if into_the_bed or printer.reach_is_told or not (near or cuts):
                 self._refuse(*told)
-            else:
-                self._beyond(*told, max(low - value, value - high) / OFF_BED_MM, 1.0)
+            elif not self._beyond(*told, 1.0) and not near:
+                reached[axis] = None
+        return reached
 
     def _extrude(self, pushed_mm: float, length_mm: float, *, known: bool) -> None:
         printer = self._setup.printer

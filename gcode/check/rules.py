@@ -402,9 +402,11 @@ class Judge(Motion):
 
     def _home(self, words: dict[str, float | None], by: str = "G28 with Z") -> None:
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
-        if self._occupied and not self._setup.printer.delta:
+        printer = self._setup.printer
+        if self._occupied and not (printer.delta or printer.homes_up):
             if 2 in axes:
-                self._refuse("homing Z onto a standing part", by, "G28 X Y only")
+                unless = "" if self.policy is Policy.STRICT else ", or 'homes_up' in the profile"
+                self._refuse("homing Z onto a standing part", by, f"G28 X Y only{unless}")
             else:
                 self._homes_above(self._place[2])
         for axis in axes:

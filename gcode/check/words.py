@@ -22,7 +22,10 @@ _COMMON = (
 )
 _PROBING = "G29 G32 G34 G80 G81"
 # Print timers, what a firmware reports, what it watches the filament with.
-_MARLINS = "M0 M1 M31 M75 M76 M77 M78 M85 M113 M119 M123 M142 M145 M192 M200 M302 M355 M412 M413"
+_MARLINS = (
+    "M0 M1 M31 M75 M76 M77 M78 M80 M85 M113 M119 M123 M142 M145 M192 M200 M202 M302 M355 "
+    "M412 M413 M911"
+)
 # Checks of printer, nozzle and firmware; the mass of the part, the area that is probed, pressure
 # advance; a stuck filament; a multi-material unit's own commands.
 _PRUSAS = (
@@ -62,6 +65,10 @@ _START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
+# Marlin's software end stops cut a move short at the machine's own; Klipper gives the job up.
+CLAMPS = frozenset({"marlin", "prusa"})
+# What they take before homing; Klipper refuses it ("Must home axis first").
+MOVES_UNHOMED = frozenset({"marlin", "prusa"})
 # Klipper refuses G20 (klippy/extras/gcode_move.py), the MK3's firmware passes over it; both go on
 # in millimetres.
 NO_INCHES = frozenset({"klipper", "prusa"})

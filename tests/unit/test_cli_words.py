@@ -91,7 +91,12 @@ def test_what_a_program_does_is_said_before_it_is_sent() -> None:
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(b"", "no command"), (b"; only words\n\n", "no command"), (b"GCDE\0\0\1", "is no text")],
+    [
+        (b"", "no command"),
+        (b"; only words\n\n", "no command"),
+        (b"GCDE\0\0\1", "cut or damaged"),
+        (b"PK\0\0\1", "is no text"),
+    ],
 )
 def test_a_file_without_gcode_passes_no_check(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "job.gcode"
