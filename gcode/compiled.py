@@ -33,6 +33,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when the first of it
 import numba
 import numba.np.linalg
 from numba import get_num_threads, prange, set_num_threads
+from numba.core.runtime import nrt, nrtdynmod
 
 __all__ = ["get_num_threads", "njit", "prange", "set_num_threads"]
 
@@ -65,7 +66,29 @@ def without_scipy() -> None:
         numba.np.linalg.ensure_blas = asked
 
 
+def runtime_when_asked() -> None:
+    """Compile numba's own functions that count references when a kernel is compiled, not before.
+
+    With its first kernel numba compiles them, and so loads LLVM's optimiser: 0.03 s and 30 MB at
+    the start of every command. A kernel that was kept on disk has them in its own code; what they
+    call is made known to it all the same.
+    """
+    compile_now: Any = nrtdynmod.compile_nrt_functions
+    kind: Any = type(nrt.rtsys)
+    asked = kind.library.fget
+
+    def library(runtime: Any) -> Any:
+        found = asked(runtime)
+        if isinstance(found, functools.partial):
+            found = runtime._library = found()
+        return found
+
+    nrtdynmod.compile_nrt_functions = functools.partial(functools.partial, compile_now)
+    kind.library = property(library)
+
+
 without_scipy()
+runtime_when_asked()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -35,7 +35,7 @@ class Verdict:
     contact
         Where the head first touches what stands there; None where it does not, or nothing stands.
     moves
-        All moves with known ends, for a picture.
+        All moves with known ends, for a picture; None where nothing stands that they might touch.
     """
 
     refusals: tuple[Refusal, ...]
@@ -145,11 +145,14 @@ def judge(
     top_mm = as_built.top_mm if as_built is not None else None
     one = Judge(program, setup, top_mm, initial, policy, touches)
     text = Text.of(program.text)
-    one.moves.with_room_for(len(text))  # a table that grows is held twice while it does
+    if as_built is not None:
+        one.moves.with_room_for(len(text))  # a table that grows is held twice while it does
     number, said = 1, 0
     while number <= len(text):
         number = one.follow(text, number, min(len(text), said + SAY_EVERY_LINES) + 1)
         if number - said > SAY_EVERY_LINES:
+            if as_built is None:
+                one.moves.forget()
             progress("check", float(number - 1), float(len(text)))
             said = number - 1
         elif number <= len(text):
@@ -169,11 +172,11 @@ def judge(
     refusals.sort(key=lambda refusal: refusal.line)
     report = CheckReport(
         commands=one.commands,
-        moves=one.moves.count,
+        moves=one.moves.told,
         swept=as_built is not None,
         least_clearance_mm=clearance_mm if math.isfinite(clearance_mm) else None,
         policy=policy,
         warnings=one.warnings.told(),
         added=one.added,
     )
-    return Verdict(tuple(refusals), report, contact, one.moves)
+    return Verdict(tuple(refusals), report, contact, one.moves if as_built is not None else None)

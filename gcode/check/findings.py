@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 MOST_SHOWN = 60  # characters of a line in a message
+PIECE_BYTES = 1 << 18  # of a text, looked through at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +123,14 @@ class Text:
     def of(cls, text: str) -> Text:
         """Lines as `split("\\n")` makes them."""
         data = np.frombuffer(text.encode(errors="replace"), dtype=np.uint8)
-        ends = np.flatnonzero(data == ord("\n")) + 1
-        return cls(data, np.concatenate([[0], ends, [len(data) + 1]]))  # as if one more ended it
+        starts = np.zeros(text.count("\n") + 2, np.int64)
+        starts[-1] = len(data) + 1  # as if one more ended it
+        at = 1
+        for first in range(0, len(data), PIECE_BYTES):  # a flag for every byte takes as much again
+            ends = np.flatnonzero(data[first : first + PIECE_BYTES] == ord("\n"))
+            starts[at : at + len(ends)] = ends + (first + 1)
+            at += len(ends)
+        return cls(data, starts)
 
     def __len__(self) -> int:
         """How many lines."""
@@ -135,12 +142,83 @@ class Text:
         return str(self.data[begin:end].tobytes(), "utf-8")
 
 
+@dataclass(frozen=True, slots=True)
+class MoveSums:
+    """What is asked of moves all together.
+
+    Attributes
+    ----------
+    count
+        How many they are.
+    pushed, laid
+        Whether plastic is pushed on any of them, and on any that goes over the bed.
+    top_mm
+        How high the highest end is to which plastic is laid; 0 where none is.
+    pulled, first_pulled
+        On how many that go over the bed plastic is pulled back, and the line of the first; 0: none.
+    pulled_mm, way_mm
+        How far those go, and all on which plastic moves.
+    """
+
+    count: int = 0
+    pushed: bool = False
+    laid: bool = False
+    top_mm: float = 0.0
+    pulled: int = 0
+    first_pulled: int = 0
+    pulled_mm: float = 0.0
+    way_mm: float = 0.0
+
+    def __add__(self, later: MoveSums) -> MoveSums:
+        return MoveSums(
+            self.count + later.count,
+            self.pushed or later.pushed,
+            self.laid or later.laid,
+            max(self.top_mm, later.top_mm),
+            self.pulled + later.pulled,
+            self.first_pulled or later.first_pulled,
+            self.pulled_mm + later.pulled_mm,
+            self.way_mm + later.way_mm,
+        )
+
+
 class Moves:
-    """Moves with known ends; rows of line, start, end and plastic, below 0 where pulled back."""
+    """Moves with known ends; rows of line, start, end and plastic, below 0 where pulled back.
+
+    Where only their sums will be asked for, rows may be forgotten.
+    """
 
     def __init__(self) -> None:
         self.count = 0
         self._rows = np.empty((1024, 8))
+        self._forgotten = MoveSums()
+
+    @property
+    def told(self) -> int:
+        """How many there were."""
+        return self._forgotten.count + self.count
+
+    @property
+    def sums(self) -> MoveSums:
+        """Of all, those forgotten too."""
+        rows = self._rows[: self.count]
+        aside = (rows[:, 4] != rows[:, 1]) | (rows[:, 5] != rows[:, 2])
+        pushed, pulled = rows[:, 7] > 0, (rows[:, 7] < 0) & aside
+        way_mm = np.hypot(rows[:, 4] - rows[:, 1], rows[:, 5] - rows[:, 2])
+        return self._forgotten + MoveSums(
+            self.count,
+            bool(pushed.any()),
+            bool((pushed & aside).any()),
+            float(np.max(rows[:, 6], initial=0.0, where=pushed & aside)),
+            int(pulled.sum()),
+            int(rows[np.argmax(pulled), 0]) if pulled.any() else 0,
+            float(way_mm[pulled].sum()),
+            float(way_mm[pulled | pushed].sum()),
+        )
+
+    def forget(self) -> None:
+        """Keep the sums alone."""
+        self._forgotten, self.count = self.sums, 0
 
     def with_room_for(self, more: int) -> Float[np.ndarray, "_rows 8"]:
         """The table, with rows to spare after the first `count`."""
@@ -180,14 +258,3 @@ class Moves:
     def pushed_mm3(self) -> Float[np.ndarray, " n"]:
         """(n,) plastic laid on each."""
         return np.maximum(self._rows[: self.count, 7], 0.0)
-
-    @property
-    def pulled(self) -> Bool[np.ndarray, " n"]:
-        """(n,) whether plastic is pulled back on it."""
-        return np.asarray(self._rows[: self.count, 7] < 0)
-
-    @property
-    def sideways_mm(self) -> Float[np.ndarray, " n"]:
-        """(n,) how far each goes over the bed."""
-        rows = self._rows[: self.count]
-        return np.asarray(np.hypot(rows[:, 4] - rows[:, 1], rows[:, 5] - rows[:, 2]))

@@ -150,14 +150,12 @@ class Motion:
     @property
     def _occupied(self) -> bool:
         """Whether something stands on the bed: from before, or laid by the program itself."""
-        return self._stood or bool((self.moves.pushed_mm3 * self.moves.sideways_mm).any())
+        return self._stood or self.moves.sums.laid
 
     @property
     def _top_mm(self) -> float | None:
         """How high what stands there is, as far as is known; None where nothing is."""
-        laid = self.moves.pushed_mm3 * self.moves.sideways_mm > 0
-        laid_mm = float(self.moves.end_mm[laid, 2].max(initial=0.0))
-        return max(laid_mm, self._standing_top_mm or 0.0) or None
+        return max(self.moves.sums.top_mm, self._standing_top_mm or 0.0) or None
 
     @property
     def _hot_on_part(self) -> bool:
@@ -165,12 +163,12 @@ class Motion:
 
     def _backwards(self, text: Text) -> None:
         """Relative values of E that are read as absolute go back and forth."""
-        pulled, way_mm = self.moves.pulled, self.moves.sideways_mm
-        if (pulled & (way_mm > 0)).sum() < BACKWARDS_MOVES:
+        sums = self.moves.sums
+        if sums.pulled < BACKWARDS_MOVES:
             return
-        ratio = way_mm[pulled].sum() / way_mm[pulled | (self.moves.pushed_mm3 > 0)].sum()
+        ratio = sums.pulled_mm / sums.way_mm
         if ratio > BACKWARDS_RATIO:
-            self._line = int(self.moves.line[np.flatnonzero(pulled & (way_mm > 0))[0]])
+            self._line = sums.first_pulled
             self._text = text.line(self._line)
             self._refuse(
                 "pulls filament back as it goes (relative values of E, read as absolute?)",

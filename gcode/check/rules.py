@@ -224,7 +224,7 @@ class Judge(Motion):
 
     def _choose(self, tool: str) -> None:
         """The only tool may have any number, but another one later would be another colour."""
-        used = bool(self.moves.pushed_mm3.any())
+        used = self.moves.sums.pushed
         before = self._tool or ("T0" if used else tool)
         if tool != before:
             self._refuse("change of tool", tool, f"one tool: {before}")
@@ -321,8 +321,8 @@ class Judge(Motion):
 
     def _dwell(self, words: dict[str, float | None]) -> None:
         """Waits add up as long as nothing moves between them."""
-        if self._waited_at != self.moves.count:
-            self._waited_s, self._waited_at = 0.0, self.moves.count
+        if self._waited_at != self.moves.told:
+            self._waited_s, self._waited_at = 0.0, self.moves.told
         for letter, per_s in DWELLS.items():
             seconds = (words.get(letter) or 0.0) * per_s
             if seconds < 0:

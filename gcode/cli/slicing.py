@@ -85,7 +85,7 @@ def slice_solid(
             made = _patch(solid, setup, title, place, (as_built, job), bars)
         program = made.program
         gives_back(check_program)(program, setup, as_built=made.field, progress=bars)
-        cost = estimate_program(program, setup.printer, progress=bars)
+        cost = gives_back(estimate_program)(program, setup.printer, progress=bars)
     console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
     result = {
         "gcode": str(output),

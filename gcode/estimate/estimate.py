@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from gcode.errors import ReadError
 from gcode.estimate import planner_kernels as kernels
@@ -90,9 +89,12 @@ class _Taken:
         self._limits = _four(speed), _four(acceleration), _four(jerk)
         self._before = np.zeros(6)
         self._planned = np.zeros((4, lines))
-        self._pushed = np.zeros(lines)
+        self._lines = 0
+        self._pushed_mm = self._most_pushed_mm = 0.0
         self._marks: list[tuple[int, str]] = []
-        self._laid: list[tuple[Float[np.ndarray, " n"], ...]] = []
+        self._laid = 0
+        self._end_z_mm, self._filament_mm = np.zeros(lines), np.zeros(lines)
+        self._line = np.zeros(lines, np.int64)
         self._box = np.array([[np.inf] * 3, [-np.inf] * 3])
 
     def add(self, block: Block) -> None:
@@ -100,13 +102,29 @@ class _Taken:
         steps, pushed, feed = block.moves()
         own = slice(block.first_line, block.end_line)
         kernels.limits(steps, pushed, feed, *self._limits, self._before, self._planned[:, own])
-        self._pushed[own] = pushed
+        self._lines = block.end_line
+        # Filament that was retracted must come forward again before more of it counts.
+        sums_mm = np.cumsum(np.concatenate([[self._pushed_mm], pushed]))
+        self._pushed_mm = float(sums_mm[-1])
+        self._most_pushed_mm = max(self._most_pushed_mm, float(sums_mm.max()))
         self._marks += [(k, text) for k, text in block.comments if mark_of(text) is not None]
-        self._laid.append((block.end_mm[:, 2].copy(), block.line, block.filament_mm))
+        self._keep(block)
         for ends_mm in (block.start_mm, block.end_mm):
             if len(ends_mm):
                 np.minimum(self._box[0], ends_mm.min(axis=0), out=self._box[0])
                 np.maximum(self._box[1], ends_mm.max(axis=0), out=self._box[1])
+
+    def _keep(self, block: Block) -> None:
+        """Of what extrudes where it ends, its line and its filament; of an arc's chords each."""
+        first, self._laid = self._laid, self._laid + len(block.line)
+        if self._laid > len(self._line):
+            more = max(self._laid - len(self._line), len(self._line))
+            self._end_z_mm = np.append(self._end_z_mm, np.zeros(more))
+            self._filament_mm = np.append(self._filament_mm, np.zeros(more))
+            self._line = np.append(self._line, np.zeros(more, np.int64))
+        self._end_z_mm[first : self._laid] = block.end_mm[:, 2]
+        self._filament_mm[first : self._laid] = block.filament_mm
+        self._line[first : self._laid] = block.line
 
     def told(self, diameter_mm: float) -> Estimate:
         """All of them together.
@@ -116,16 +134,18 @@ class _Taken:
         ReadError
             If nothing is extruded.
         """
-        end_z_mm, line, filament_mm = (np.concatenate(of) for of in zip(*self._laid, strict=True))
-        if not len(line):
+        if self._laid == 0:
             raise ReadError(NOTHING_LAID)
-        layers = layers_of(self._marks, end_z_mm, line, filament_mm, len(self._pushed))
-        # Filament that was retracted must come forward again before more of it counts.
-        used_mm = float(np.cumsum(self._pushed).max(initial=0.0))
-        spent_s = kernels.seconds(self._planned)
+        spent_s = float(kernels.seconds(self._planned).sum())
+        del self._planned  # half of what is held
+        own = slice(self._laid)
+        layers = layers_of(
+            self._marks, self._end_z_mm[own], self._line[own], self._filament_mm[own], self._lines
+        )
+        used_mm = self._most_pushed_mm
         x0, y0, z0, x1, y1, z1 = (float(v) for v in self._box.ravel())
         return Estimate(
-            print_time_s=float(spent_s.sum()),
+            print_time_s=spent_s,
             filament_mm=used_mm,
             filament_mm3=used_mm * filament_area_mm2(diameter_mm),
             layers=len(layers),

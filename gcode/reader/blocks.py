@@ -18,7 +18,7 @@ from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
 from gcode.reader.lines import comments_of, lines_of, tokens_of
 
-BLOCK_CHARS = 1 << 18  # some 8,000 lines: 2 MB of words and states
+BLOCK_CHARS = 1 << 16  # some 2,000 lines: half a megabyte of words and states
 READ_STEPS = 4.0  # words, states, beads, layers: about a second each for a million lines
 
 

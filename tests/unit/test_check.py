@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcode.check import CheckedProgram, CheckReport, check, find_refusals
+from gcode.check import CheckedProgram, CheckReport, check, checker, find_refusals, judge
 from gcode.errors import CheckRefusedError, LocalProtocolError
 from gcode.moves import ModalState, Program
 from gcode.profiles import load_setup
@@ -301,6 +301,19 @@ def test_relative_values_read_as_absolute_are_refused_by_their_going_back_and_fo
     (first, *_) = find_refusals(program(RELATIVE.replace("M83", "M82")), SETUP)
     assert "relative values of E" in first.what
     assert str(first).startswith("line 19 ('G1 X80 E0.3 F1200')")
+
+
+def test_of_moves_that_are_forgotten_the_sums_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checker of a whole job need not hold every move: what is asked of all stays the same."""
+    over = f"{RELATIVE.replace('M83', 'M82')}G28\n"
+    texts = (GOOD, RELATIVE, over)
+    at_once = [judge(program(text), SETUP) for text in texts]
+    monkeypatch.setattr(checker, "SAY_EVERY_LINES", 3)
+    assert [judge(program(text), SETUP) for text in texts] == at_once
+    assert at_once[0].report.moves > 8
+    kinds = [refusal.what for refusal in at_once[2].refusals]
+    assert any("relative values of E" in kind for kind in kinds)
+    assert any("homing" in kind for kind in kinds)
 
 
 def test_factors_that_change_little_are_let_pass() -> None:

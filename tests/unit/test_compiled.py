@@ -89,6 +89,26 @@ def test_threads_are_those_that_sleep_while_they_wait() -> None:
     assert os.environ["OMP_WAIT_POLICY"] == "passive"
 
 
+def test_numbas_own_functions_are_compiled_with_a_kernel_and_not_to_load_one() -> None:
+    """What a command loads from disk is whole; LLVM's optimiser takes 30 MB more."""
+    code = (
+        "import numpy as np\n"
+        "from numba.core.runtime import rtsys\n"
+        "from gcode.compiled import njit\n"
+        "from gcode.estimate import planner_kernels\n"
+        "length = np.array([[10.0, 10.0], [5.0, 5.0], [100.0, 100.0], [1.0, 1.0]])\n"
+        "taken = planner_kernels.seconds(length)  # an array of its own: counted by numba\n"
+        "before = callable(rtsys._library)\n"
+        "twice = njit()(lambda given: given * 2.0)(np.ones(3))\n"
+        "print(taken.shape, before, callable(rtsys._library), twice.tolist())\n"
+    )
+    for _ in range(2):  # the first compiles it where nobody has before
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+    assert done.stdout.split("\n")[0] == "(2,) True False [2.0, 2.0, 2.0]"
+
+
 def test_sums_in_any_order_have_one_machine_code() -> None:
     """A `fastmath` kernel that another one calls is inlined there.
 
