@@ -15,7 +15,7 @@ from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker_session import MoonrakerSession
 from gcode.hosts.moonraker_state import MOONRAKER_ENDS
 from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
-from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter
+from gcode.hosts.server import LOOK_EVERY, Left, Reach, ServerPrinter
 from gcode.hosts.upload import JobFile
 from gcode.hosts.web import LIFT_COMMANDS, sentence
 from gcode.progress import Progress
@@ -31,8 +31,8 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         self.connect()
         return self
 
-    def _new_session(self) -> MoonrakerSession:
-        return MoonrakerSession(self.address, self._key, self._timing, self._clock, self._log)
+    def _new_session(self, reach: Reach) -> MoonrakerSession:
+        return MoonrakerSession(reach)
 
     def _greet(self, ready: Callable[[], None]) -> None:
         ready()

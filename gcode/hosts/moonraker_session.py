@@ -5,15 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Callable
 from typing import Any
 
 import gcode
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.moonraker_state import MOONRAKER_SUBSCRIPTION, KlippyState
-from gcode.hosts.secret import ApiKey
-from gcode.hosts.server import ServerSession
-from gcode.hosts.web import Address, WebLog, WebTiming, json_object, refused_key, sentence
+from gcode.hosts.server import Reach, ServerSession
+from gcode.hosts.web import json_object, refused_key, sentence
 
 _MESSAGE = re.compile(r"""['"]message['"]:\s*(['"])(.*?)\1\s*[,}]""", re.DOTALL)
 
@@ -31,16 +29,12 @@ class MoonrakerSession(ServerSession[KlippyState]):
 
     def __init__(
         self,
-        address: Address,
-        key: ApiKey,
-        timing: WebTiming,
-        clock: Callable[[], float],
-        log: WebLog | None,
+        reach: Reach,
         *,
         agent: str = "",
         methods: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(address, key, timing, clock, log, KlippyState(methods=methods))
+        super().__init__(reach, KlippyState(methods=methods))
         self._numbers = itertools.count(1)
         self._agent, self._methods = agent, methods
 

@@ -16,9 +16,8 @@ import httpx
 
 from gcode.errors import LinkError
 from gcode.hosts.octoprint_state import ServerState, part_of
-from gcode.hosts.secret import ApiKey
-from gcode.hosts.server import ServerSession
-from gcode.hosts.web import Address, WebLog, WebTiming, json_object, sentence
+from gcode.hosts.server import Reach, ServerSession
+from gcode.hosts.web import json_object, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
@@ -37,15 +36,11 @@ class OctoPrintSession(ServerSession[ServerState]):
 
     def __init__(
         self,
-        address: Address,
-        key: ApiKey,
-        timing: WebTiming,
-        clock: Callable[[], float],
-        log: WebLog | None,
+        reach: Reach,
         *,
         plugin: str = "",
     ) -> None:
-        super().__init__(address, key, timing, clock, log, ServerState(plugin=plugin))
+        super().__init__(reach, ServerState(plugin=plugin))
         self._asking = threading.Lock()
 
     def get(self, path: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from operator import sub
 from pathlib import Path
 
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.hosts.conversation import Line
 from gcode.hosts.fast_path import Exchange, waiting
 from gcode.hosts.guarded import GuardedConversation
 from gcode.hosts.jobbook import TEMPERATURE_EVERY_S
@@ -71,16 +72,7 @@ class SerialPrinter(GuardedConversation):
         guard: bool = True,
     ) -> None:
         super().__init__(
-            port,
-            baud=baud,
-            dialect=dialect,
-            window=window,
-            wire_log=wire_log,
-            journal=journal,
-            timing=timing,
-            clock=clock,
-            supervise=supervise,
-            guard=guard,
+            Line(port, baud, dialect, window, wire_log, journal, timing, clock, supervise, guard)
         )
         self._round_trips = RoundTrips()
         self._pause_asked = threading.Event()

@@ -21,13 +21,7 @@ import httpx
 
 from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.lock import PortLock
-from gcode.hosts.port import (
-    Capabilities,
-    LinkLostError,
-    PrintableProgram,
-    PrintReport,
-    Temperatures,
-)
+from gcode.hosts.port import LinkLostError, PrintableProgram, Printer, PrintReport
 from gcode.hosts.proof import require_checked
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.upload import JobFile, part_prefix
@@ -46,6 +40,17 @@ class News(Protocol):
         """Take one message."""
 
 
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """A server and how it is reached; no log where none is kept."""
+
+    address: Address
+    key: ApiKey
+    timing: WebTiming
+    clock: Callable[[], float]
+    log: WebLog | None
+
+
 State = TypeVar("State", bound=News)
 Answer = TypeVar("Answer")
 
@@ -59,23 +64,13 @@ class ServerSession(ABC, Generic[State]):
         Notified whenever `state` may have changed; hold it to read several fields at once.
     """
 
-    def __init__(
-        self,
-        address: Address,
-        key: ApiKey,
-        timing: WebTiming,
-        clock: Callable[[], float],
-        log: WebLog | None,
-        state: State,
-    ) -> None:
-        self.address = address
+    def __init__(self, reach: Reach, state: State) -> None:
+        self.address = reach.address
         self.state = state
         self.news = threading.Condition()
-        self._key = key
-        self._timing = timing
-        self._clock = clock
-        self._log = log
-        self._client = WebClient(address, key, timing, log)
+        self._key, self._timing = reach.key, reach.timing
+        self._clock, self._log = reach.clock, reach.log
+        self._client = WebClient(reach.address, reach.key, reach.timing, reach.log)
         self._socket: PushSocket | None = None
 
     def close(self) -> None:
@@ -148,7 +143,7 @@ class Left:
     ended_s: float | None = None
 
 
-class ServerPrinter(ABC, Generic[Session]):
+class ServerPrinter(Printer, ABC, Generic[Session]):
     """A printer that a server drives.
 
     Parameters
@@ -208,7 +203,9 @@ class ServerPrinter(ABC, Generic[Session]):
         self._lock.acquire()
         try:
             self._log = WebLog(self._wire_log) if self._wire_log else None
-            self._open = self._new_session()
+            self._open = self._new_session(
+                Reach(self.address, self._key, self._timing, self._clock, self._log)
+            )
             self._greet(ready)
         except BaseException:
             self.close()
@@ -268,7 +265,7 @@ class ServerPrinter(ABC, Generic[Session]):
         return self._open
 
     @abstractmethod
-    def _new_session(self) -> Session:
+    def _new_session(self, reach: Reach) -> Session:
         """A session, not yet listening."""
 
     @abstractmethod
@@ -284,40 +281,8 @@ class ServerPrinter(ABC, Generic[Session]):
         """Whether the nozzle is where the firmware believes it is, as far as the server knows."""
 
     @abstractmethod
-    def position_mm(self) -> tuple[float, float, float]:
-        """Ask for the logical position."""
-
-    @abstractmethod
     def command(self, text: str) -> None:
         """Have one command of the host's own carried out."""
-
-    @abstractmethod
-    def __enter__(self) -> ServerPrinter[Session]:
-        """Connected."""
-
-    @abstractmethod
-    def capabilities(self) -> Capabilities:
-        """What firmware and server say of themselves."""
-
-    @abstractmethod
-    def finish_moves(self) -> None:
-        """Return when every buffered move has been made."""
-
-    @abstractmethod
-    def pause(self) -> None:
-        """Have the server pause."""
-
-    @abstractmethod
-    def resume(self) -> None:
-        """Have the server go on."""
-
-    @abstractmethod
-    def emergency_stop(self) -> None:
-        """Stop everything now."""
-
-    @abstractmethod
-    def heaters_off(self) -> None:
-        """Switch every heater and the fan off."""
 
     @abstractmethod
     def _refuse_unless_ready(self) -> None:
@@ -437,14 +402,6 @@ class ServerPrinter(ABC, Generic[Session]):
         )
 
     # ------------------------------------------------------------------ safety
-
-    @abstractmethod
-    def temperatures(self) -> Temperatures:
-        """Ask for temperatures."""
-
-    @abstractmethod
-    def abort(self) -> None:
-        """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""
 
     def _make_safe(self, error: BaseException) -> None:
         """Make safe what can be reached, and add to the error how that went."""
