@@ -181,17 +181,13 @@ def edge_distance_mm(
     return np.asarray(np.maximum(away[at[:, 0], at[:, 1]], 0.0))
 
 
-def record(
-    views: Sequence[ViewResiduals], *, source: str, pitch_mm: float | None = None
-) -> Recording:
-    """Rasters of placed views.
+def record(views: Sequence[ViewResiduals], *, source: str) -> Recording:
+    """Rasters of placed views; a cell is as wide as neighbours are apart in the image planes.
 
     Parameters
     ----------
     source
         What was scanned, in words.
-    pitch_mm
-        Edge of a cell; the views' own distance of neighbours in their image planes.
 
     Raises
     ------
@@ -204,7 +200,7 @@ def record(
             "no view has a hundred points with a known deviation; nothing is recorded from so "
             "little: place more views, on a surface that they follow"
         )
-    pitch = pitch_mm or float(np.median([_spacing_mm(view.points_mm[:, :2]) for view in views]))
+    pitch = float(np.median([_spacing_mm(view.points_mm[:, :2]) for view in views]))
     if not PITCH_MM[0] <= pitch <= PITCH_MM[1]:
         raise InputError(
             f"neighbouring points are {pitch:.3g} mm apart, a recording takes {PITCH_MM[0]:g} to "

@@ -30,6 +30,7 @@ from gcode.firmware.motion import MotionBatch
 from gcode.surfaces import HeightField
 
 MAX_WORLD_CELL_MM = 0.15
+WORLD_MARGIN_MM, TOP_MARGIN_MM = 10.0, 2.0  # of the bed, and of what stands there
 _PHASES = 8  # sub-column positions of the nozzle that have a list of neighbours of their own
 
 
@@ -64,7 +65,6 @@ class World:
         cell_mm: float = 0.125,
         nozzle_diameter_mm: float = 0.4,
         filament_diameter_mm: float = 1.75,
-        margin_mm: float = 10.0,
         bead: BeadModel | None = None,
         thermal: ThermalModel | None = None,
         middle_mm: tuple[float, float] | None = None,
@@ -80,8 +80,8 @@ class World:
         self.nozzle_diameter_mm = nozzle_diameter_mm
         self.filament_mm2 = np.pi / 4 * filament_diameter_mm**2
         self.columns = Columns(
-            origin_mm=(-margin_mm, -margin_mm),
-            size_mm=(bed_size_mm[0] + 2 * margin_mm, bed_size_mm[1] + 2 * margin_mm),
+            origin_mm=(-WORLD_MARGIN_MM, -WORLD_MARGIN_MM),
+            size_mm=(bed_size_mm[0] + 2 * WORLD_MARGIN_MM, bed_size_mm[1] + 2 * WORLD_MARGIN_MM),
             cell_mm=cell_mm,
         )
         self._near, self._counts = _neighbours(cell_mm, nozzle_diameter_mm, self.bead)
@@ -226,19 +226,15 @@ class World:
         spread_mm = self.bead.spread_ratio * self.nozzle_diameter_mm
         return self.columns.window(margin_mm=spread_mm + self.cell_mm)
 
-    def missing_versus(
-        self, reference: World, box_mm: Float[np.ndarray, "2 3"] | None = None
-    ) -> Difference:
+    def missing_versus(self, reference: World) -> Difference:
         """What this world lacks, and has too much, against a reference without defects."""
         window = self.window().union(reference.window())
         mine, other = self.snapshot(window), reference.snapshot(window)
-        if box_mm is not None:
-            mine, other = mine.clipped(box_mm), other.clipped(box_mm)
         return Difference(missing=other.minus(mine), excess=mine.minus(other))
 
-    def top(self, margin_mm: float = 2.0) -> HeightField:
+    def top(self) -> HeightField:
         """The highest solid of every column in use, as a height field; all of it is seen."""
-        window = self.columns.window(margin_mm=margin_mm)
+        window = self.columns.window(margin_mm=TOP_MARGIN_MM)
         z_mm = self.snapshot(window).top_mm()
         return HeightField(
             origin_mm=np.array(window.corner_mm),

@@ -62,7 +62,7 @@ class Motion:
         setup: PrintSetup,
         standing_top_mm: float | None,
         initial: ModalState | None,
-        policy: Policy = Policy.STRICT,
+        policy: Policy,
     ) -> None:
         self.refusals: list[Refusal] = []
         self.warnings = Warnings()
