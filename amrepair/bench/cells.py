@@ -33,7 +33,7 @@ BAD_ALIGNMENT_SIGMAS, BAD_ALIGNMENT_MM = 4.0, 0.001 * DIAGONAL_MM
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ScoreRow:
     """What one cell came to; None where a method has nothing to measure.
 
     Attributes
@@ -91,17 +91,17 @@ class Cell:
         return self.out / "cells" / self.method / self.one.name / f"{self.seed}.json"
 
 
-def finished(cell: Cell) -> Row | None:
+def finished(cell: Cell) -> ScoreRow | None:
     """The row of a cell that an earlier run finished."""
     if not cell.result_path.is_file():
         return None
-    return Row(**json.loads(cell.result_path.read_text()))
+    return ScoreRow(**json.loads(cell.result_path.read_text()))
 
 
 def run_cell(
     cell: Cell,
     progress: Progress = silent,
-) -> Row:
+) -> ScoreRow:
     """Do what is left of a cell and judge it.
 
     Raises
@@ -186,7 +186,7 @@ def _score(
         )
 
 
-def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
+def _judge(cell: Cell, fit: dict[str, float | None]) -> ScoreRow:
     stored = [_load(_path(cell, sample)) for sample in cell.one.test]
     kept = [one for one in stored if one is not None]
     whole = detection(
@@ -200,7 +200,7 @@ def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
     failed = np.array([not bool(one["aligned"]) for one in kept])
     judged = bool(np.isfinite(residual).any() or failed.any())
     limit_mm = max(BAD_ALIGNMENT_SIGMAS * float(fit["sigma_mm"] or 0.0), BAD_ALIGNMENT_MM)
-    return Row(
+    return ScoreRow(
         method=cell.method,
         class_name=cell.one.name,
         seed=cell.seed,

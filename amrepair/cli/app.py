@@ -33,6 +33,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
 
 
 def _version(asked: bool) -> bool:
@@ -51,20 +52,11 @@ def _root(
     """Options before a command."""
 
 
-simulation.add_to(app)
-templates.add_to(app)
-inspect.add_to(app)
-repairing.add_to(app)
-printing.add_to(app)
-postprocessing.add_to(app)
-calibration.add_to(app)
-replaying.add_to(app)
-batching.add_to(app)
-benchmark.add_to(app)
-health.add_to(app)
-live.add_to(app)
-fleeting.add_to(app)
-agenting.add_to(app)
+console.add(app, simulation, inspect, repairing, printing, postprocessing, calibration, replaying)
+console.add(app, benchmark, health, live, fleeting, agenting)
+app.add_typer(template_app, name="template")
+console.add(template_app, templates)
+app.add_typer(batching.batch_app, name="batch")
 
 
 def main() -> None:

@@ -77,7 +77,7 @@ class View:
     spacing_mm: float
     thin_spacing_mm: float
     sigma_mm: float
-    looks: sight.Looks
+    looks: sight.DepthImages
     clear: float
 
     @classmethod
@@ -144,7 +144,7 @@ def _looks(
     sensor_index: Int[np.ndarray, " n"] | None,
     rng: np.random.Generator,
     options: MergeOptions,
-) -> sight.Looks:
+) -> sight.DepthImages:
     few = rng.permutation(len(points_mm))[: options.view.image_points]
     image = np.ascontiguousarray(points_mm[few])
     if sensors_mm is not None and sensor_index is not None:
@@ -162,7 +162,7 @@ def _facing(
     sigma_mm: float,
     sensors_mm: Float[np.ndarray, "k 3"] | None,
     sensor_index: Int[np.ndarray, " n"] | None,
-    looks: sight.Looks,
+    looks: sight.DepthImages,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Normals to the sensor that saw each point, else to where more of the distance is in sight.
 

@@ -23,10 +23,11 @@ from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.columns_kernels import Stacks
 from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.deposit_kernels import LAYER, STATE_SIZE, deposit
-from amrepair.simulate.parameters import BeadModel, ThermalModel
-from amrepair.simulate.strand_kernels import Head, Path, Standing
+from amrepair.simulate.parameters import BeadModel, ThermalModel, WorldParameters
+from amrepair.simulate.strand_kernels import Head, Path, StandingColumns
 from amrepair.simulate.truth import Difference
 from gcode.firmware.motion import MotionBatch
+from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
 
 MAX_WORLD_CELL_MM = 0.15
@@ -93,6 +94,24 @@ class World:
         self._layer_tops_mm = np.zeros(0)  # heights extruded at so far, rising
         self.pushed_mm3 = 0.0
 
+    @classmethod
+    def of(
+        cls,
+        printer: PrinterProfile,
+        told: WorldParameters,
+        middle_mm: tuple[float, float] | None = None,
+    ) -> World:
+        """An empty world over a printer's bed; `middle_mm` is where parts shrink to."""
+        return cls(
+            printer.bed_size_mm,
+            cell_mm=told.columns_mm,
+            nozzle_diameter_mm=printer.nozzle_diameter_mm,
+            filament_diameter_mm=printer.filament_diameter_mm,
+            bead=told.bead,
+            thermal=told.thermal,
+            middle_mm=middle_mm,
+        )
+
     @property
     def cell_mm(self) -> float:
         """Edge of a column."""
@@ -147,7 +166,7 @@ class World:
             thickness_mm,
             np.ascontiguousarray(regions),
         )
-        world = Standing(Stacks(*self.columns.arrays), self._before, self._stamp)
+        world = StandingColumns(Stacks(*self.columns.arrays), self._before, self._stamp)
         lay_all: Any = deposit
         pool, pool_next, pushed = lay_all(
             world, self._head(onto_cold=onto_cold), path, self.columns.touched, self._state

@@ -337,10 +337,7 @@ class Motion:
         if pushed_mm < 0:
             self._pull(pushed_mm)
             return
-        back_mm = min(pushed_mm, self._pulled_mm)  # a wipe or an unretraction on the move
-        self._pulled_mm -= back_mm
-        volume_mm3 = (pushed_mm - back_mm) * self._area_mm2
-        section_mm2 = volume_mm3 / length_mm
+        section_mm2 = self._fresh_mm3(pushed_mm) / length_mm
         limit_mm2 = printer.max_bead_section_mm2
         if section_mm2 > SECTION_SLACK * limit_mm2:
             over = section_mm2 / limit_mm2
@@ -361,9 +358,7 @@ class Motion:
         if pushed_mm < 0:
             self._pull(pushed_mm)
             return
-        back_mm = min(pushed_mm, self._pulled_mm)
-        self._pulled_mm -= back_mm
-        fresh_mm3 = (pushed_mm - back_mm) * self._area_mm2
+        fresh_mm3 = self._fresh_mm3(pushed_mm)
         self._short_mm3 += fresh_mm3
         if fresh_mm3 > 0 and self._short_mm3 > MOLTEN_MM * self._area_mm2:
             self._melts(fresh_mm3 / (length_mm or pushed_mm))  # alone, F is the filament's own
@@ -375,6 +370,12 @@ class Motion:
                 f"{printer.max_extrude_only_mm:g} mm",
             )
             self._short_mm3 = 0.0
+
+    def _fresh_mm3(self, pushed_mm: float) -> float:
+        """What leaves the nozzle of what is pushed: first comes back what was pulled."""
+        back_mm = min(pushed_mm, self._pulled_mm)
+        self._pulled_mm -= back_mm
+        return (pushed_mm - back_mm) * self._area_mm2
 
     def _pull(self, pushed_mm: float) -> None:
         self._pulled_mm -= pushed_mm

@@ -48,17 +48,9 @@ def _root(
     """Options before a command."""
 
 
-slicing.add_to(app)
-checking.add_to(app)
-estimating.add_to(app)
-resuming.add_to(app)
-touching.add_to(app)
-stacking.add_to(app)
-sending.add_to(app)
-emulating.add_to(app)
+console.add(app, slicing, checking, estimating, resuming, touching, stacking, sending, emulating)
 app.add_typer(profiles_app, name="profiles")
-listing.add_to(profiles_app)
-importing.add_to(profiles_app)
+console.add(profiles_app, listing, importing)
 
 
 def main() -> None:

@@ -132,13 +132,14 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
     InputError
         If it cannot be read.
     """
+    from gcode import clouds
     from gcode.solids import SOLID_SUFFIXES, NotClosedError, read_solid, read_triangles
-    from gcode.surfaces import HeightField, clouds, depth_maps, scanned
+    from gcode.surfaces import HeightField, depth_maps, scanned
 
     suffix = path.suffix.lower()
     if path.is_file() and depth_maps.is_depth_map(path):
         seen = depth_maps.read_on_bed(path, None if printer is None else printer.reach_box_mm)
-        console.errors.print(seen.told, markup=False)
+        console.errors.print(seen.told)
         cell_mm = max(AS_BUILT_CELL_MM, PIXELS_IN_CELL * seen.spacing_mm)
         return scanned.from_points(seen.points_mm, cell_mm, what=str(path))
     if suffix in clouds.CLOUD_SUFFIXES and not (suffix == ".ply" and _has_faces(path)):

@@ -61,7 +61,7 @@ def job_setup(
     if own is None:
         return load_setup(*ids), None
     setup = own.setup(material, process)
-    console.errors.print(f"{own.in_words(setup)}.", markup=False)
+    console.errors.print(f"{own.in_words(setup)}.")
     return setup, own
 
 
@@ -75,8 +75,7 @@ def _own(text: str | None, name: Path | str, printer: str | None) -> OwnSettings
     if own is None:
         console.errors.print(
             f"{name}: no --printer is given and no slicer's settings are in it; "
-            f"{DEFAULT_PRINTER} is taken.",
-            markup=False,
+            f"{DEFAULT_PRINTER} is taken."
         )
     return own
 

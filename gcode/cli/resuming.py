@@ -18,18 +18,12 @@ from gcode.cli.owning import (
 from gcode.errors import InputError
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "resume-at",
-        epilog=console.examples(
-            "gcode resume-at job.gcode --layer 41 --printer prusa_mk3s -o rest.gcode",
-            "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
-            "gcode resume-at job.gcode --layer 41 --without lid_copy_2 -o rest.gcode",
-        ),
-    )(resume_at_command)
-
-
+@console.command(
+    "resume-at",
+    "gcode resume-at job.gcode --layer 41 --printer prusa_mk3s -o rest.gcode",
+    "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
+    "gcode resume-at job.gcode --layer 41 --without lid_copy_2 -o rest.gcode",
+)
 def resume_at_command(
     job: Annotated[Path, typer.Argument(help="The whole job's G-code, of any slicer.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],

@@ -13,18 +13,6 @@ from gcode.errors import InputError
 from gcode.profiles import DEFAULT_MATERIAL
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "touch",
-        epilog=console.examples(
-            "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin "
-            "--port /dev/ttyACM0",
-            "gcode touch --klipper-macro klipper_touch.cfg",
-        ),
-    )(touch_command)
-
-
 def _hand_out(path: Path) -> None:
     """Write the macro that touches need on Klipper."""
     from gcode.resumption.klipper import TOUCH_MACRO
@@ -39,6 +27,11 @@ def _given(value: Any, name: str) -> Any:
     return value
 
 
+@console.command(
+    "touch",
+    "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin --port /dev/ttyACM0",
+    "gcode touch --klipper-macro klipper_touch.cfg",
+)
 def touch_command(
     job: Annotated[
         Path | None, typer.Argument(help="The whole job's G-code, of any slicer.")

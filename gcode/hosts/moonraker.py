@@ -15,7 +15,7 @@ from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker_session import MoonrakerSession
 from gcode.hosts.moonraker_state import MOONRAKER_ENDS
 from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
-from gcode.hosts.server import LOOK_EVERY, Left, Reach, ServerPrinter
+from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
 from gcode.hosts.web import LIFT_COMMANDS, sentence
 from gcode.progress import Progress
@@ -31,7 +31,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         self.connect()
         return self
 
-    def _new_session(self, reach: Reach) -> MoonrakerSession:
+    def _new_session(self, reach: ServerReach) -> MoonrakerSession:
         return MoonrakerSession(reach)
 
     def _greet(self, ready: Callable[[], None]) -> None:

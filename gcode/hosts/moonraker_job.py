@@ -17,7 +17,7 @@ from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.moonraker_session import MoonrakerSession
 from gcode.hosts.port import NothingMetError, PrintableProgram
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
-from gcode.hosts.server import Reach
+from gcode.hosts.server import ServerReach
 from gcode.hosts.web import LIFT_COMMANDS
 from gcode.progress import Progress, silent
 
@@ -36,7 +36,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
 
     _unsure_s: float | None = None
 
-    def _new_session(self, reach: Reach) -> MoonrakerSession:
+    def _new_session(self, reach: ServerReach) -> MoonrakerSession:
         self._held_back = threading.Event()
         return MoonrakerSession(reach, agent=AGENT, methods=(METHOD,))
 

@@ -10,7 +10,7 @@ from typing import Any
 import gcode
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.moonraker_state import MOONRAKER_SUBSCRIPTION, KlippyState
-from gcode.hosts.server import Reach, ServerSession
+from gcode.hosts.server import ServerReach, ServerSession
 from gcode.hosts.web import json_object, refused_key, sentence
 
 _MESSAGE = re.compile(r"""['"]message['"]:\s*(['"])(.*?)\1\s*[,}]""", re.DOTALL)
@@ -29,7 +29,7 @@ class MoonrakerSession(ServerSession[KlippyState]):
 
     def __init__(
         self,
-        reach: Reach,
+        reach: ServerReach,
         *,
         agent: str = "",
         methods: tuple[str, ...] = (),

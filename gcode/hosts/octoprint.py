@@ -14,7 +14,7 @@ from gcode.hosts.octoprint_session import OctoPrintSession
 from gcode.hosts.octoprint_state import BUSY_STATES, part_of
 from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
-from gcode.hosts.server import LOOK_EVERY, Left, Reach, ServerPrinter
+from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
 from gcode.hosts.web import LIFT_COMMANDS, sentence
 from gcode.progress import Progress
@@ -35,7 +35,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         self.connect()
         return self
 
-    def _new_session(self, reach: Reach) -> OctoPrintSession:
+    def _new_session(self, reach: ServerReach) -> OctoPrintSession:
         return OctoPrintSession(reach)
 
     def _greet(self, ready: Callable[[], None]) -> None:

@@ -16,7 +16,7 @@ import httpx
 
 from gcode.errors import LinkError
 from gcode.hosts.octoprint_state import ServerState, part_of
-from gcode.hosts.server import Reach, ServerSession
+from gcode.hosts.server import ServerReach, ServerSession
 from gcode.hosts.web import json_object, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
@@ -36,7 +36,7 @@ class OctoPrintSession(ServerSession[ServerState]):
 
     def __init__(
         self,
-        reach: Reach,
+        reach: ServerReach,
         *,
         plugin: str = "",
     ) -> None:

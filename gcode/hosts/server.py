@@ -41,7 +41,7 @@ class News(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class ServerReach:
     """A server and how it is reached; no log where none is kept."""
 
     address: Address
@@ -64,7 +64,7 @@ class ServerSession(ABC, Generic[State]):
         Notified whenever `state` may have changed; hold it to read several fields at once.
     """
 
-    def __init__(self, reach: Reach, state: State) -> None:
+    def __init__(self, reach: ServerReach, state: State) -> None:
         self.address = reach.address
         self.state = state
         self.news = threading.Condition()
@@ -204,7 +204,7 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         try:
             self._log = WebLog(self._wire_log) if self._wire_log else None
             self._open = self._new_session(
-                Reach(self.address, self._key, self._timing, self._clock, self._log)
+                ServerReach(self.address, self._key, self._timing, self._clock, self._log)
             )
             self._greet(ready)
         except BaseException:
@@ -265,7 +265,7 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         return self._open
 
     @abstractmethod
-    def _new_session(self, reach: Reach) -> Session:
+    def _new_session(self, reach: ServerReach) -> Session:
         """A session, not yet listening."""
 
     @abstractmethod
