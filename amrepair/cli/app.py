@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import typer
 
 import amrepair
@@ -27,30 +25,12 @@ from amrepair.errors import AmrepairError
 from gcode.cli import console
 from gcode.errors import GcodeError
 
-app = typer.Typer(
-    name="amrepair",
-    help="Scan a print, find what is missing, print only that, scan again, resume.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
+app = console.application(
+    "amrepair",
+    "Scan a print, find what is missing, print only that, scan again, resume.",
+    amrepair,
 )
 template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
-
-
-def _version(asked: bool) -> bool:
-    if asked:
-        console.out.print(f"amrepair {amrepair.__version__}")
-        raise typer.Exit
-    return asked
-
-
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
-    ] = False,
-) -> None:
-    """Options before a command."""
-
 
 console.add(app, simulation, inspect, repairing, printing, postprocessing, calibration, replaying)
 console.add(app, benchmark, health, live, fleeting, agenting)

@@ -26,7 +26,7 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import AmrepairError, InputError
 from gcode.cli import console
-from gcode.cli.options import grid_of, job_of, program_text
+from gcode.cli.options import grid_of, job_of, program_text, refuse_standing
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption, job_setup
 from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_PROCESS
@@ -149,9 +149,8 @@ def repair(
         from gcode.cli.words import what_it_does
 
     turns = turns_named(turn or [])
-    if standing is not None and standing.suffix != ".npz":
-        raise InputError(f"{standing}: what stands there is written as .npz; rename it")
-    for path in filter(None, (output, report, standing)):
+    refuse_standing(standing)
+    for path in filter(None, (output, report)):
         console.writable(path)
     placed = part_pose(pose) if pose is not None and pose != OF_JOB else None
     known_errors = calibration_named(calibration)

@@ -153,6 +153,27 @@ def starting() -> Iterator[None]:
         yield
 
 
+def application(name: str, about: str, package: ModuleType) -> typer.Typer:
+    """A program with `--version`, which tells its help where nothing else is said."""
+    app = typer.Typer(name=name, help=about, no_args_is_help=True, pretty_exceptions_enable=False)
+
+    def told(asked: bool) -> bool:
+        if asked:
+            out.print(f"{name} {package.__version__}")
+            raise typer.Exit
+        return asked
+
+    said: bool = typer.Option(
+        False, "--version", callback=told, is_eager=True, help="Show the version."
+    )
+
+    @app.callback()
+    def root(version: bool = said) -> None:
+        """Options before a command."""
+
+    return app
+
+
 def examples(*lines: str) -> str:
     """The end of a command's help: lines that can be typed as they are."""
     return "\n\n".join(["Examples:", *(f"$ {line}" for line in lines)])

@@ -28,6 +28,13 @@ AsBuiltOption = Annotated[
         "height map (.npz, .tif, .npy)."
     ),
 ]
+ProgramOutput = Annotated[Path, typer.Option("-o", "--output", help="Program to write.")]
+StandingHeightOption = Annotated[
+    float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
+]
+FirstLayerOption = Annotated[
+    int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
+]
 FileArgument = Annotated[Path, typer.Argument(help="G-code file.")]
 
 PrinterOption = Annotated[
@@ -61,6 +68,20 @@ ProcessOption = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
 ]
+
+
+def refuse_standing(path: Path | None) -> None:
+    """Refuse a file that what stands there cannot be written to, before any work.
+
+    Raises
+    ------
+    InputError
+        If it is no .npz, or cannot be written.
+    """
+    if path is not None:
+        if path.suffix != ".npz":
+            raise InputError(f"{path}: what stands there is written as .npz; rename it.")
+        console.writable(path)
 
 
 def program_text(path: Path) -> str:

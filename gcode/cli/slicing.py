@@ -15,6 +15,7 @@ from gcode.cli.options import (
     MaterialOption,
     PrinterOption,
     ProcessOption,
+    ProgramOutput,
     grid_of,
     job_of,
     standing_on_bed,
@@ -39,7 +40,7 @@ CENTRE, KEEP = "centre", "keep"
 )
 def slice_solid(
     solid: Annotated[Path, typer.Argument(help="Solid, mm.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
+    output: ProgramOutput,
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
     process: ProcessOption = DEFAULT_PROCESS,

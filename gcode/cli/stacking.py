@@ -9,7 +9,7 @@ import typer
 
 from gcode.cli import console
 from gcode.cli.judging import tell_warnings, warnings_json
-from gcode.cli.options import JsonOption, program_text, standing_on_bed
+from gcode.cli.options import JsonOption, ProgramOutput, program_text, standing_on_bed
 from gcode.cli.owning import (
     JobMaterialOption,
     JobPrinterOption,
@@ -33,7 +33,7 @@ def print_onto_command(
     job: Annotated[
         Path, typer.Argument(help="The job, placed in X and Y where it is to stand on the part.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
+    output: ProgramOutput,
     printer: JobPrinterOption = None,
     material: JobMaterialOption = None,
     as_json: JsonOption = False,

@@ -8,7 +8,13 @@ from typing import Annotated, Any
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import JsonOption, MaterialOption, program_text
+from gcode.cli.options import (
+    FirstLayerOption,
+    JsonOption,
+    MaterialOption,
+    StandingHeightOption,
+    program_text,
+)
 from gcode.errors import InputError
 from gcode.profiles import DEFAULT_MATERIAL
 
@@ -44,12 +50,8 @@ def touch_command(
             "2 to 10. Turn Z by hand until it does."
         ),
     ] = None,
-    z_mm: Annotated[
-        float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
-    ] = None,
-    layer: Annotated[
-        int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
-    ] = None,
+    z_mm: StandingHeightOption = None,
+    layer: FirstLayerOption = None,
     printer: Annotated[
         str | None,
         typer.Option(

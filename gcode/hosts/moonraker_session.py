@@ -60,6 +60,11 @@ class MoonrakerSession(ServerSession[KlippyState]):
                 f"{self.address.name}; end that one first."
             ) from error
 
+    @property
+    def is_told(self) -> bool:
+        """Not by a Klipper that came back: it is asked anew what it prints."""
+        return self.listening and not self.state.stale
+
     def _logged(self, message: dict[str, Any]) -> str:
         return json.dumps({k: v for k, v in message.items() if k != "jsonrpc"})[:500]
 

@@ -166,14 +166,13 @@ class OctoPrintSession(ServerSession[ServerState]):
 
     def command(self, *commands: str) -> None:
         """Have commands sent, in turn with whatever else is sent; does not wait."""
-        answer = self._client.request(
-            "POST", "/api/printer/command", json={"commands": list(commands)}
+        self.expect(
+            204,
+            f"send {', '.join(commands)}; is its printer connected?",
+            "POST",
+            "/api/printer/command",
+            json={"commands": list(commands)},
         )
-        if answer.status_code != 204:
-            raise LinkError(
-                f"{self.address.name} does not send {', '.join(commands)} ({sentence(answer)}); "
-                f"is its printer connected?"
-            )
 
 
 def _sent_at(terminal: deque[str], command: str) -> int | None:

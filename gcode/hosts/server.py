@@ -36,6 +36,16 @@ LOOK_EVERY = 5
 class News(Protocol):
     """The state of a server, as its messages tell it."""
 
+    moved: bool
+    file_position: int
+
+    @property
+    def ended(self) -> bool:
+        """Whether the followed print is over."""
+
+    def follow(self, file: str) -> None:
+        """Follow the print of a file from now on."""
+
     def take(self, message: Any) -> None:
         """Take one message."""
 
@@ -86,6 +96,17 @@ class ServerSession(ABC, Generic[State]):
     def request(self, method: str, path: str, **kwargs: Any) -> httpx.Response:
         """Send an HTTP request once; see `WebClient.request`."""
         return self._client.request(method, path, **kwargs)
+
+    def expect(
+        self, status: int, otherwise: str, method: str, path: str, **kwargs: Any
+    ) -> httpx.Response:
+        """Send an HTTP request that is not to be refused; see `WebClient.expect`."""
+        return self._client.expect(status, otherwise, method, path, **kwargs)
+
+    @property
+    def is_told(self) -> bool:
+        """Whether what is known of the print is kept up to date by news."""
+        return self.listening
 
     @abstractmethod
     def listen(self) -> None:
@@ -362,9 +383,32 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
     def _start(self, job: JobFile) -> None:
         """Have the print begin."""
 
-    @abstractmethod
     def _follow(self, job: JobFile, progress: Progress) -> bool:
         """Wait for the print's end; False if it was cancelled."""
+        session, state = self._session, self._session.state
+        looked_s = self._clock()
+        while True:
+            with session.news:
+                session.news.wait_for(
+                    lambda: state.ended or state.moved or not session.is_told, self._timing.poll_s
+                )
+                state.moved = False
+                ended = state.ended
+            progress("printing", float(state.file_position), float(len(job.data)))
+            if ended:
+                return self._outcome(job)
+            if session.is_told and self._clock() - looked_s < LOOK_EVERY * self._timing.poll_s:
+                continue
+            self._look(job)
+            looked_s = self._clock()
+
+    @abstractmethod
+    def _outcome(self, job: JobFile) -> bool:
+        """How a print ended that is over; False if it was cancelled."""
+
+    @abstractmethod
+    def _look(self, job: JobFile) -> None:
+        """Ask what became of the print, in case that its news did not reach us."""
 
     @abstractmethod
     def _reached(

@@ -179,6 +179,30 @@ class WebClient:
             )
         return answer
 
+    def expect(
+        self, status: int, otherwise: str, method: str, path: str, **kwargs: Any
+    ) -> httpx.Response:
+        """Send a request that is answered with a status, or was refused.
+
+        Parameters
+        ----------
+        otherwise
+            What the server does not do then, such as 'pause'; a hint may follow after a `;`.
+
+        Raises
+        ------
+        LinkError
+            With the server's own words.
+        """
+        answer = self.request(method, path, **kwargs)
+        if answer.status_code != status:
+            what, _, hint = otherwise.partition("; ")
+            raise LinkError(
+                f"{self.address.name} does not {what} ({sentence(answer)})"
+                f"{f'; {hint}' if hint else '.'}"
+            )
+        return answer
+
     def get(self, path: str) -> dict[str, Any]:
         """Return an answer's JSON object.
 
