@@ -88,6 +88,14 @@ class Transform:
         matrix[:3, 3] = translation_mm
         return cls(target, source, matrix)
 
+    @classmethod
+    def on_bed(cls, x_mm: float, y_mm: float, z_mm: float, turn_deg: float) -> Transform:
+        """Build from template: where a part's own origin stands, and its turn about Z."""
+        turn = rotation_from_vector(np.array([0.0, 0.0, np.deg2rad(turn_deg)]))
+        return cls.from_rotation_translation(
+            "build", "template", rotation=turn, translation_mm=np.array([x_mm, y_mm, z_mm])
+        )
+
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """(3, 3) rotation."""
@@ -194,6 +202,14 @@ def ways_across(
     across = np.cross(along, helper)
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
     return across, np.cross(along, across)
+
+
+def spread_directions(count: int) -> Float[np.ndarray, "k 3"]:
+    """(k, 3) directions spread evenly over the sphere (Fibonacci)."""
+    index = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * index / count, np.pi * (1.0 + np.sqrt(5.0)) * index
+    flat = np.sqrt(1.0 - z**2)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
 def diagonal(bounds_mm: Float[np.ndarray, "2 3"]) -> float:

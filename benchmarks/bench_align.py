@@ -31,8 +31,8 @@ from amrepair.align import align
 from amrepair.align.coarse import by_features
 from amrepair.bench.synth_views import (
     Rays,
+    SeenSurface,
     Shape,
-    Surface,
     random_rotation,
     sample_shape,
     sensor_towards,
@@ -49,14 +49,14 @@ POOL = 1_200_000
 CLEAR_MM, CLEAR_RATIO, JUDGED = 0.2, 0.005, 20_000
 
 
-def pool_of(shape: Shape, rays: Rays) -> Surface:
+def pool_of(shape: Shape, rays: Rays) -> SeenSurface:
     """Points of the surface that any sensor sees."""
     points = sample_shape(shape, POOL, np.random.default_rng(0))
     return points.take(rays.seen(points, sensors_around(shape)))
 
 
 def scan_of(
-    shape: Shape, rays: Rays, pool: Surface, seed: int, count: int, view: str
+    shape: Shape, rays: Rays, pool: SeenSurface, seed: int, count: int, view: str
 ) -> tuple[Scan, np.ndarray]:
     """A scan in a random pose, and its points where they belong."""
     rng = np.random.default_rng(seed)

@@ -61,7 +61,7 @@ def by_hand(template: Path) -> Callable[[Path], None]:
 
 def overhead(folder: Path, template: Path, out: Path) -> dict[str, float]:
     """Processor time of a batch beside the same by hand, scan by scan in one process."""
-    from amrepair.batch import BatchOptions, Kind, run_batch
+    from amrepair.batch import BatchKind, BatchOptions, run_batch
 
     paths, hand = sorted(folder.glob("*.ply")), by_hand(template)
     spent_s: dict[str, list[float]] = {"hand": [], "batch": []}
@@ -86,7 +86,7 @@ def overhead(folder: Path, template: Path, out: Path) -> dict[str, float]:
     spent_s["hand"].clear()
     shutil.rmtree(out, ignore_errors=True)
     run_batch(
-        str(folder), options=BatchOptions(Kind.DETECT), template=template, out=str(out),
+        str(folder), options=BatchOptions(BatchKind.DETECT), template=template, out=str(out),
         executor="serial", progress=turn,
     )  # fmt: skip
     end_s = time.process_time() - began_s

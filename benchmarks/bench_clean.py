@@ -191,8 +191,7 @@ def run_job(
     pose = seeded_pose(
         rng,
         centre_mm=centre,
-        offset_mm=model.offset_mm,
-        tilt_rad=float(np.deg2rad(model.tilt_deg)),
+        model=model,
     )
     scanner = SimulatedScanner(
         world,

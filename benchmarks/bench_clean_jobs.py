@@ -195,8 +195,7 @@ def scans_of(
     pose = seeded_pose(
         rng,
         centre_mm=CENTRE_MM,
-        offset_mm=model.offset_mm,
-        tilt_rad=float(np.deg2rad(model.tilt_deg)),
+        model=model,
     )
     sensors_mm = default_sensors_mm(
         CENTRE_MM,

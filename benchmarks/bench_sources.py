@@ -23,7 +23,7 @@ import numpy as np
 from measured_page import table
 
 from amrepair.bench import BENCH_METHODS, SynthOptions, run_bench, synthesize
-from amrepair.bench.cells import Row
+from amrepair.bench.cells import ScoreRow
 from amrepair.bench.samples import Format
 
 SOURCES = {
@@ -55,7 +55,7 @@ def judged(
     return name, len(parts), *figures(report.rows)
 
 
-def figures(rows: Sequence[Row]) -> tuple[object, ...]:
+def figures(rows: Sequence[ScoreRow]) -> tuple[object, ...]:
     """O and P, mean and worst, in %; samples laid badly; seconds a sample."""
     whole, point = (np.array([getattr(row, key) for row in rows]) for key in ("o_auroc", "p_auroc"))
     told = [f"{100 * value:.1f}" for one in (whole, point) for value in (one.mean(), one.min())]

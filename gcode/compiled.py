@@ -117,6 +117,15 @@ def keep_safely(kept: Any) -> None:
     # A forked process has its parent's token, but a process number of its own.
     kept._data_name = lambda number: f"{base}.{os.getpid():x}-{_PROCESS_TOKEN}.{number}.nbc"
     kept._source_stamp = (*kept._source_stamp, kernels_stamp())
+    load = kept._load_index
+
+    def load_what_is_known() -> Any:
+        try:
+            return load()
+        except (AttributeError, ImportError):  # it names a record that the code no longer has
+            return {}
+
+    kept._load_index = load_what_is_known
 
 
 def compile_in_turn(cache: Any, lock: Path) -> None:

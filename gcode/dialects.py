@@ -24,8 +24,6 @@ class Dialect:
     ----------
     acceleration
         Command for the acceleration of printing moves, `{a}` in mm/s².
-    line_limit
-        Characters of a command that the firmware takes.
     g90_sets_e
         G90 and G91 set the extruder's mode too.
     g91_moves_e
@@ -36,21 +34,20 @@ class Dialect:
 
     name: str
     acceleration: str
-    line_limit: int
     g90_sets_e: bool = False
     g91_moves_e: bool = False
     reads: frozenset[str] = frozenset()
 
 
 DIALECTS: dict[str, Dialect] = {
-    # Marlin M204 P: printing acceleration (marlinfw.org/docs/gcode/M204.html); MAX_CMD_SIZE 96
-    "marlin": Dialect("marlin", "M204 P{a}", 95, g90_sets_e=True, reads=frozenset({"prusa"})),
+    # Marlin M204 P: printing acceleration (marlinfw.org/docs/gcode/M204.html)
+    "marlin": Dialect("marlin", "M204 P{a}", g90_sets_e=True, reads=frozenset({"prusa"})),
     # Prusa-Firmware keeps M204 P from Marlin 1.1; it is a Marlin
-    "prusa": Dialect("prusa", "M204 P{a}", 95, reads=frozenset({"marlin"})),
+    "prusa": Dialect("prusa", "M204 P{a}", reads=frozenset({"marlin"})),
     # Klipper knows M204 S alone (klipper3d.org/G-Codes.html); for G91 see its gcode_move.py.
     # Slicers that know no Klipper write Marlin's words for it.
-    "klipper": Dialect("klipper", "M204 S{a}", 4095, g91_moves_e=True, reads=frozenset({"marlin"})),
-    "reprap": Dialect("reprap", "M204 P{a}", 255),
+    "klipper": Dialect("klipper", "M204 S{a}", g91_moves_e=True, reads=frozenset({"marlin"})),
+    "reprap": Dialect("reprap", "M204 P{a}"),
 }
 
 

@@ -42,6 +42,17 @@ SAME_TEXT_MM = 5e-4  # half of the last digit that is written
 JOINT_MM = 0.01  # a bead that begins further from the nozzle than this was not travelled to
 
 
+def modes_restored(state: ModalState) -> list[str]:
+    """Lines that set extruder position, feed and modes as a job had them."""
+    return [
+        f"G92 E{number(state.e_mm, E_DIGITS)}",
+        *([f"G1 F{number(mm_min_from_mm_s(state.feed_mm_s), 1)}"] if state.feed_mm_s > 0 else []),
+        *([] if state.absolute_xyz else ["G91"]),
+        "M82" if state.absolute_e else "M83",  # after G90 and G91, always
+        *([] if state.units_mm else ["G20"]),
+    ]
+
+
 def write(
     toolpath: Toolpath,
     setup: PrintSetup,
@@ -232,11 +243,4 @@ class _Text:
         self._fan(state.fan_ratio)
         if state.acceleration_mm_s2 is not None:
             self._acceleration(state.acceleration_mm_s2)
-        self.lines.append(f"G92 E{number(state.e_mm, E_DIGITS)}")
-        if state.feed_mm_s > 0:
-            self.lines.append(f"G1 F{number(mm_min_from_mm_s(state.feed_mm_s), 1)}")
-        if not state.absolute_xyz:
-            self.lines.append("G91")
-        self.lines.append("M82" if state.absolute_e else "M83")
-        if not state.units_mm:
-            self.lines.append("G20")
+        self.lines += modes_restored(state)

@@ -13,13 +13,13 @@ import numpy as np
 from amrepair.report import (
     BeadPath,
     Counter,
-    Decision,
     Figures,
     HeightMap,
-    Look,
     Outcome,
     RegionRow,
     ReportData,
+    ReportDecision,
+    ReportLook,
     SolidMesh,
     TemperatureSeries,
 )
@@ -148,13 +148,13 @@ def heights(*, broken: bool) -> HeightMap:
     )
 
 
-def look(label: str, count: int, *, broken: bool, seed: int) -> Look:
+def look(label: str, count: int, *, broken: bool, seed: int) -> ReportLook:
     scene = scanned(count, broken=broken, seed=seed)
     flags = np.where(
         scene.deviation_mm < -THRESHOLD_MM, 1, np.where(scene.deviation_mm > THRESHOLD_MM, 2, 0)
     )
     below = sampled(mesh_of(part()), 9000, np.random.default_rng(3))
-    return Look(
+    return ReportLook(
         label=label,
         points_mm=scene.points_mm,
         deviation_mm=scene.deviation_mm,
@@ -223,7 +223,7 @@ def example(count: int = 60_000, *, title: str = "bracket.stl") -> ReportData:
             ),
         ),
         decisions=(
-            Decision(
+            ReportDecision(
                 "Finished part",
                 "fill now",
                 (
@@ -231,7 +231,7 @@ def example(count: int = 60_000, *, title: str = "bracket.stl") -> ReportData:
                     "99.8 % of it is in reach of the nozzle.",
                 ),
             ),
-            Decision("After repair 1", "done", ("1.9 mm³ are left, below the tolerance.",)),
+            ReportDecision("After repair 1", "done", ("1.9 mm³ are left, below the tolerance.",)),
         ),
         wire=(
             Counter("Lines acknowledged", 48213.0, "each proved to have been received"),

@@ -16,7 +16,7 @@ LOSSES = ("chamfer", "directed")
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class SearchRound:
     """A round of the search: points, Gauss-Newton steps, scales, poses kept.
 
     Attributes
@@ -49,7 +49,7 @@ class Effort:
     """
 
     rotations: int
-    stages: tuple[Stage, ...]
+    stages: tuple[SearchRound, ...]
     places: int = 1
     gap_ratio: float = np.inf
 
@@ -57,25 +57,25 @@ class Effort:
 QUICK = Effort(
     1_200,
     (
-        Stage(120, 6, 0.10, 0.03, 160),
-        Stage(300, 8, 0.03, 0.01, 40),
-        Stage(1_000, 6, 0.01, 0.005, 40),
+        SearchRound(120, 6, 0.10, 0.03, 160),
+        SearchRound(300, 8, 0.03, 0.01, 40),
+        SearchRound(1_000, 6, 0.01, 0.005, 40),
     ),
 )
 THOROUGH = Effort(
     3_600,
     (
-        Stage(160, 7, 0.10, 0.03, 480),
-        Stage(400, 10, 0.03, 0.01, 80),
-        Stage(1_500, 8, 0.01, 0.005, 40),
+        SearchRound(160, 7, 0.10, 0.03, 480),
+        SearchRound(400, 10, 0.03, 0.01, 80),
+        SearchRound(1_500, 8, 0.01, 0.005, 40),
     ),
 )
 PIECE = Effort(
     2_400,
     (
-        Stage(160, 7, 0.07, 0.02, 600),
-        Stage(400, 10, 0.02, 0.01, 120),
-        Stage(1_500, 8, 0.01, 0.005, 40),
+        SearchRound(160, 7, 0.07, 0.02, 600),
+        SearchRound(400, 10, 0.02, 0.01, 120),
+        SearchRound(1_500, 8, 0.01, 0.005, 40),
     ),
     places=12,
     gap_ratio=0.1,
@@ -83,9 +83,9 @@ PIECE = Effort(
 TWINS = Effort(
     192,
     (
-        Stage(120, 6, 0.10, 0.03, 48),
-        Stage(300, 8, 0.03, 0.01, 16),
-        Stage(1_000, 6, 0.01, 0.005, 16),
+        SearchRound(120, 6, 0.10, 0.03, 48),
+        SearchRound(300, 8, 0.03, 0.01, 16),
+        SearchRound(1_000, 6, 0.01, 0.005, 16),
     ),
 )
 PIECE_AGAIN = replace(PIECE, places=24)

@@ -69,8 +69,6 @@ def refine(
     end_scale_mm: float,
     sigma_mm: float,
     prior: Prior | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    enough_mm: float = 0.0,
 ) -> Refined:
     """Move a pose to the nearest minimum of Σ ρ(f(T x)).
 
@@ -84,8 +82,6 @@ def refine(
         Scale of the Geman–McClure loss ρ(r) = r²/(r² + s²), first and last.
     sigma_mm
         Noise of a point, for the information.
-    enough_mm
-        Stop where the next step would be smaller, converged or not.
     """
     return refine_all(
         points_mm,
@@ -95,8 +91,6 @@ def refine(
         end_scale_mm=end_scale_mm,
         sigma_mm=sigma_mm,
         prior=prior,
-        max_iterations=max_iterations,
-        enough_mm=enough_mm,
     )[0]
 
 

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 from gcode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from amrepair.batch.options import BatchOptions, Kind
+    from amrepair.batch.options import BatchKind, BatchOptions
     from amrepair.batch.run import BatchReport, run_batch
 
-__all__ = ["BatchOptions", "BatchReport", "Kind", "run_batch"]
+__all__ = ["BatchKind", "BatchOptions", "BatchReport", "run_batch"]
 
 # Loaded when first used: a worker sets its threads before numpy is there.
 _HOMES = {
     "BatchOptions": ("amrepair.batch.options", "BatchOptions"),
     "BatchReport": ("amrepair.batch.run", "BatchReport"),
-    "Kind": ("amrepair.batch.options", "Kind"),
+    "BatchKind": ("amrepair.batch.options", "BatchKind"),
     "run_batch": ("amrepair.batch.run", "run_batch"),
 }
 

@@ -36,7 +36,7 @@ CELL_COLUMNS = ("seen", "missing", "excess", "deviation", "squared", "missing_mm
 
 
 @dataclass(frozen=True)
-class Cells:
+class PartCells:
     """Places on a template's surface, the same wherever they are asked for.
 
     Attributes
@@ -50,7 +50,7 @@ class Cells:
     spacing_mm: float
 
     @classmethod
-    def of(cls, template: Template) -> Cells:
+    def of(cls, template: Template) -> PartCells:
         """Those of a template."""
         diagonal_mm = diagonal(template.bounds_mm)
         spacing_mm = diagonal_mm / CELLS_PER_DIAGONAL
@@ -126,7 +126,7 @@ def sums_of(
     anomaly: AnomalyMap,
     regions: Sequence[Region],
     centres_mm: Float[np.ndarray, "r 3"],
-    cells: Cells,
+    cells: PartCells,
 ) -> CellSums:
     """What one scan says of each cell.
 
@@ -164,7 +164,7 @@ def _rounded(total: Int[np.ndarray, " k"], count: Int[np.ndarray, " k"]) -> Int[
     return (2 * total + count) // (2 * count)
 
 
-def _cells_of(cells: Cells, anomaly: AnomalyMap, label: Label) -> np.ndarray:
+def _cells_of(cells: PartCells, anomaly: AnomalyMap, label: Label) -> np.ndarray:
     """(k,) cells at which the template's own surface has a label: what is gone has no points."""
     near = cells.nearest(anomaly.template_points_mm[anomaly.template_label == int(label)])
     return np.bincount(near[near >= 0], minlength=len(cells)) > 0
@@ -174,7 +174,7 @@ def _add_volumes(
     sums: CellSums,
     regions: Sequence[Region],
     centres_mm: Float[np.ndarray, "r 3"],
-    cells: Cells,
+    cells: PartCells,
 ) -> None:
     """Share each region's volume among the cells that were found to have it."""
     tree = cells.tree

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
-from amrepair.batch.options import Outcome, Task, Work
+from amrepair.batch.options import Task, TaskOutcome, Work
 from amrepair.errors import InputError
 
 EXECUTOR_NAMES = ("process", "serial", "ray")
@@ -20,7 +20,7 @@ EXECUTOR_NAMES = ("process", "serial", "ray")
 class Executor(Protocol):
     """Somebody who does tasks."""
 
-    def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
+    def outcomes(self, tasks: Iterator[Task]) -> Iterator[TaskOutcome]:
         """An outcome for each task, as they are done."""
         ...
 
@@ -35,7 +35,7 @@ class Serial:
     def __init__(self, work: Work) -> None:
         self._work = work
 
-    def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
+    def outcomes(self, tasks: Iterator[Task]) -> Iterator[TaskOutcome]:
         """One after another."""
         from amrepair.batch.work import Bench
 

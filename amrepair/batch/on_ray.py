@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amrepair.batch.options import MOST_ATTEMPTS, Outcome, Task, Work, given_up
+from amrepair.batch.options import MOST_ATTEMPTS, Task, TaskOutcome, Work, given_up
 from amrepair.errors import InputError, MissingDependencyError
 from gcode.process import one_thread
 
@@ -57,7 +57,7 @@ class OnRay:
         bare = replace(work, templates=tuple(replace(t, path=Path()) for t in work.templates))
         self._actors = [holder.remote(bare) for _ in range(count)]
 
-    def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
+    def outcomes(self, tasks: Iterator[Task]) -> Iterator[TaskOutcome]:
         """Never more than two tasks a worker are under way."""
         free = [actor for _ in range(TASKS_A_WORKER) for actor in self._actors]
         under_way: dict[Any, tuple[Any, Task]] = {}
@@ -85,9 +85,9 @@ class OnRay:
         if self._own:
             self._ray.shutdown()
 
-    def _outcome(self, reference: Any, task: Task) -> Outcome:
+    def _outcome(self, reference: Any, task: Task) -> TaskOutcome:
         try:
-            said: Outcome = self._ray.get(reference)
+            said: TaskOutcome = self._ray.get(reference)
         except self._ray.exceptions.RayError:  # an actor that did not survive its retries
             return given_up(task, MOST_ATTEMPTS)
         return said
@@ -101,7 +101,7 @@ class _Holder:
         self._folder = tempfile.TemporaryDirectory(prefix="amrepair-ray-")
         self._bench: Bench | None = None
 
-    def do(self, task: Task, references: Sequence[Any]) -> Outcome:
+    def do(self, task: Task, references: Sequence[Any]) -> TaskOutcome:
         """Judge one scan; an actor that was started again fetches the templates again."""
         if self._bench is None:
             from amrepair.batch.work import Bench

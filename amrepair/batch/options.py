@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 BATCH_LAYOUT_VERSION = 1
 
 
-class Kind(StrEnum):
+class BatchKind(StrEnum):
     """What is done to each scan, in the words of the command line."""
 
     ALIGN = "align"
@@ -51,7 +51,7 @@ class BatchOptions:
         Profiles; only `repair` asks.
     """
 
-    kind: Kind
+    kind: BatchKind
     seed: int = 0
     part_is_known: bool = False
     sensors_mm: tuple[tuple[float, float, float], ...] = ()
@@ -124,7 +124,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TaskOutcome:
     """What became of a task.
 
     Attributes
@@ -155,9 +155,9 @@ def scan_id(fingerprint: str, sha256: str, suffix: str) -> str:
     return hashlib.sha256(f"{fingerprint}\n{sha256}\n{suffix}".encode()).hexdigest()[:32]
 
 
-def given_up(task: Task, attempts: int) -> Outcome:
+def given_up(task: Task, attempts: int) -> TaskOutcome:
     """Of a task that its workers do not survive."""
-    return Outcome(
+    return TaskOutcome(
         task.scan_id,
         sentence=f"{{scan}} ended its worker {attempts} times (out of memory?); try it alone, or "
         "with fewer --workers",

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.batch.cells import Cells, CellSums
-from amrepair.batch.options import Kind
+from amrepair.batch.cells import CellSums, PartCells
+from amrepair.batch.options import BatchKind
 from amrepair.batch.table import DONE
 
 WORST = 20
@@ -42,10 +42,10 @@ svg{max-width:100%;height:auto}svg text{fill:currentColor;font:11px system-ui,sa
 NO_SCRIPT_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 
 
-class Part:
+class PartOverview:
     """A template's cells, and the sums of the scans that show it."""
 
-    def __init__(self, cells: Cells) -> None:
+    def __init__(self, cells: PartCells) -> None:
         self.cells = cells
         self.sums = CellSums.zero(len(cells))
         self.scans = 0
@@ -56,11 +56,13 @@ class Part:
         self.scans += 1
 
 
-def overview(rows: Sequence[Mapping[str, Any]], parts: Mapping[str, Part], kind: Kind) -> str:
+def overview(
+    rows: Sequence[Mapping[str, Any]], parts: Mapping[str, PartOverview], kind: BatchKind
+) -> str:
     """The page."""
     title = f"{kind.value.capitalize()} of {len(rows):,} scans"
     sections = [_key_figures(rows)]
-    if kind is not Kind.ALIGN:
+    if kind is not BatchKind.ALIGN:
         sections.append(_over_time(rows))
         for name, part in sorted(parts.items()):
             if part.scans:
@@ -138,7 +140,7 @@ def _bars(
     )
 
 
-def _places(name: str, part: Part) -> str:
+def _places(name: str, part: PartOverview) -> str:
     """Six views of the template, coloured by volume."""
     pictures = []
     for word, column, colour in (
@@ -160,7 +162,7 @@ def _places(name: str, part: Part) -> str:
 
 
 def _view(
-    cells: Cells,
+    cells: PartCells,
     share: Float[np.ndarray, " k"],
     view: tuple[str, int, float],
     colour: tuple[int, int, int],
@@ -193,7 +195,7 @@ def _view(
     return f"<figure><svg {size}>{''.join(squares)}</svg><figcaption>{word}</figcaption></figure>"
 
 
-def _heights(name: str, part: Part) -> str:
+def _heights(name: str, part: PartOverview) -> str:
     """Volume by height over the part's foot."""
     z_mm = part.cells.place_mm[:, 2]
     edges = np.linspace(z_mm.min(), z_mm.max(), HEIGHT_BANDS + 1)

@@ -34,7 +34,7 @@ def suffix_of(uri: str) -> str:
 
 
 @runtime_checkable
-class Place(Protocol):
+class ResultFolder(Protocol):
     """A folder, wherever it is."""
 
     def write(self, name: str, data: bytes) -> None:
@@ -133,7 +133,7 @@ class Store:
         yield
 
 
-def open_place(uri: str) -> Place:
+def open_place(uri: str) -> ResultFolder:
     """A folder or a store, by its address."""
     return Store(uri) if is_remote(uri) else Folder(Path(uri))
 

@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from amrepair.batch.options import MOST_ATTEMPTS, Outcome, Task, Work, given_up
+from amrepair.batch.options import MOST_ATTEMPTS, Task, TaskOutcome, Work, given_up
 from amrepair.errors import AmrepairError
 from gcode.process import end_with_parent, one_thread
 
@@ -56,7 +56,7 @@ class Pool:
         """Numbers of the workers' processes."""
         return tuple(one.process.pid or 0 for one in self._workers)
 
-    def outcomes(self, tasks: Iterator[Task]) -> Iterator[Outcome]:
+    def outcomes(self, tasks: Iterator[Task]) -> Iterator[TaskOutcome]:
         """Hand out one task a worker; the next is made ready while all are busy."""
         attempts: dict[str, int] = {}
         queue: deque[Task] = deque()
@@ -105,7 +105,7 @@ class Pool:
                 with contextlib.suppress(OSError):  # it is dead: heard of below
                     one.pipe.send(one.task)
 
-    def _heard(self, queue: deque[Task], attempts: dict[str, int]) -> Iterator[Outcome]:
+    def _heard(self, queue: deque[Task], attempts: dict[str, int]) -> Iterator[TaskOutcome]:
         """Wait for a word, or for a worker's end."""
         for pipe in wait([one.pipe for one in self._workers]):
             one = next(worker for worker in self._workers if worker.pipe is pipe)
@@ -121,7 +121,7 @@ class Pool:
 
     def _buried(
         self, one: _Worker, queue: deque[Task], attempts: dict[str, int]
-    ) -> Iterator[Outcome]:
+    ) -> Iterator[TaskOutcome]:
         """A worker is gone; what it was doing is done next, or given up."""
         one.process.join(GRACE_S)
         self._workers.remove(one)

@@ -21,20 +21,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from amrepair.batch.cells import Cells, CellSums
+from amrepair.batch.cells import CellSums, PartCells
 from amrepair.batch.entries import Entry, read_entries
 from amrepair.batch.executors import make_executor
 from amrepair.batch.options import (
+    BatchKind,
     BatchOptions,
-    Kind,
-    Outcome,
     Task,
+    TaskOutcome,
     TemplateFile,
     Work,
     scan_id,
 )
-from amrepair.batch.overview import Part, overview
-from amrepair.batch.places import Place, digest_of, is_remote, open_place, suffix_of
+from amrepair.batch.overview import PartOverview, overview
+from amrepair.batch.places import ResultFolder, digest_of, is_remote, open_place, suffix_of
 from amrepair.batch.table import DONE, as_csv, as_parquet, row_of
 from amrepair.batch.work import PROGRAM, SUMS
 from amrepair.errors import InputError
@@ -147,7 +147,7 @@ def run_batch(
     with tempfile.TemporaryDirectory(prefix="amrepair-batch-") as scratch, place.alone():
         files, parts = _templates(template, Path(scratch), progress)
         setup = None
-        if options.kind is Kind.REPAIR:
+        if options.kind is BatchKind.REPAIR:
             setup = load_setup(options.printer, options.material, options.process)
         work = Work(options, files, setup, calibration)
         books = _Books(_kept(place))
@@ -169,7 +169,7 @@ def run_batch(
 
 def _templates(
     path: Path, scratch: Path, progress: Progress
-) -> tuple[tuple[TemplateFile, ...], dict[str, Part]]:
+) -> tuple[tuple[TemplateFile, ...], dict[str, PartOverview]]:
     """Templates as workers load them, and their cells; a mesh is fitted once, here."""
     if not path.exists():
         raise InputError(f"--template {path}: there is no such file or folder")
@@ -182,11 +182,11 @@ def _templates(
             assert isinstance(template, (GridSdf, PaperSdf))
             template.save(fitted)
         found.append(TemplateFile(file.stem, digest_of(str(file))[0], fitted.resolve()))
-        parts[file.stem] = Part(Cells.of(open_template(fitted)))
+        parts[file.stem] = PartOverview(PartCells.of(open_template(fitted)))
     return tuple(found), parts
 
 
-def _kept(place: Place) -> set[str]:
+def _kept(place: ResultFolder) -> set[str]:
     """Ids of whole results."""
     folders = place.names("results")
     names = (name for folder in folders for name in place.names(f"results/{folder}"))
@@ -229,7 +229,7 @@ def _settled(books: _Books) -> int:
     return books.finished + books.before + books.repeated + len(books.sentence_of)
 
 
-def _keep(place: Place, outcome: Outcome, books: _Books) -> None:
+def _keep(place: ResultFolder, outcome: TaskOutcome, books: _Books) -> None:
     """Write a result; its JSON comes last and makes the rest count."""
     if not outcome.lasting:
         books.passing[outcome.scan_id] = outcome.sentence
@@ -251,7 +251,7 @@ def _keep(place: Place, outcome: Outcome, books: _Books) -> None:
     books.known.add(outcome.scan_id)
 
 
-def _add_cost(cost: dict[str, float], outcome: Outcome) -> None:
+def _add_cost(cost: dict[str, float], outcome: TaskOutcome) -> None:
     cost["computed"] += 1
     cost["cpu_s"] += outcome.cost.get("cpu_s", 0.0)
     cost["read_bytes"] += outcome.cost.get("read_bytes", 0.0)
@@ -259,11 +259,11 @@ def _add_cost(cost: dict[str, float], outcome: Outcome) -> None:
 
 
 def _written(
-    place: Place,
+    place: ResultFolder,
     entries: Sequence[Entry],
     books: _Books,
-    parts: dict[str, Part],
-    kind: Kind,
+    parts: dict[str, PartOverview],
+    kind: BatchKind,
     cost: Mapping[str, float],
     progress: Progress,
 ) -> BatchReport:
@@ -312,7 +312,7 @@ def _written(
     )
 
 
-def _summary(place: Place, report: BatchReport, executor: str, wall_s: float) -> None:
+def _summary(place: ResultFolder, report: BatchReport, executor: str, wall_s: float) -> None:
     said = {
         "scans": len(report.rows),
         "refused": report.refused,

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from amrepair.batch.entries import Entry
-from amrepair.batch.options import Kind
+from amrepair.batch.options import BatchKind
 
 _FIRST_COLUMNS = ("name", "label", "time", "scan_id", "status", "sentence")
 _POSE = ("template", "confidence", "rmse_mm", "inlier_ratio", "clutter_ratio",
@@ -22,9 +22,9 @@ _FOUND = ("regions", "missing_mm3", "excess_mm3", "worst_label", "worst_type", "
           "threshold_mm", "sigma_mm")  # fmt: skip
 _REPAIR_COLUMNS = ("within_tolerance", "unreachable_mm3", "filament_mm", "print_time_s", "gcode")
 TABLE_COLUMNS = {
-    Kind.ALIGN: (*_FIRST_COLUMNS, *_POSE, "template_from_scan"),
-    Kind.DETECT: (*_FIRST_COLUMNS, *_POSE, *_FOUND),
-    Kind.REPAIR: (*_FIRST_COLUMNS, *_POSE, *_FOUND, *_REPAIR_COLUMNS),
+    BatchKind.ALIGN: (*_FIRST_COLUMNS, *_POSE, "template_from_scan"),
+    BatchKind.DETECT: (*_FIRST_COLUMNS, *_POSE, *_FOUND),
+    BatchKind.REPAIR: (*_FIRST_COLUMNS, *_POSE, *_FOUND, *_REPAIR_COLUMNS),
 }
 DONE, REFUSED = "ok", "refused"
 
@@ -59,7 +59,7 @@ def row_of(
     return row
 
 
-def as_csv(rows: Sequence[Mapping[str, Any]], kind: Kind) -> bytes:
+def as_csv(rows: Sequence[Mapping[str, Any]], kind: BatchKind) -> bytes:
     """With every digit that a figure has."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, TABLE_COLUMNS[kind], extrasaction="ignore", lineterminator="\n")
@@ -68,7 +68,7 @@ def as_csv(rows: Sequence[Mapping[str, Any]], kind: Kind) -> bytes:
     return stream.getvalue().encode()
 
 
-def as_parquet(rows: Sequence[Mapping[str, Any]], kind: Kind) -> bytes | None:
+def as_parquet(rows: Sequence[Mapping[str, Any]], kind: BatchKind) -> bytes | None:
     """The same as Parquet; None where pyarrow is not installed."""
     try:
         import pyarrow as pa

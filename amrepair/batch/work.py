@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amrepair.align import align
-from amrepair.batch.cells import Cells, sums_of
-from amrepair.batch.options import Kind, Outcome, Task, Work
+from amrepair.batch.cells import PartCells, sums_of
+from amrepair.batch.options import BatchKind, Task, TaskOutcome, Work
 from amrepair.batch.places import at_hand, digest_of
 from amrepair.deficit import compute_deficit, measured_regions
 from amrepair.errors import AmrepairError
@@ -44,7 +44,7 @@ class _Held:
 
     name: str
     template: Template
-    cells: Cells
+    cells: PartCells
 
 
 class Bench:
@@ -60,16 +60,16 @@ class Bench:
         self._held: dict[str, _Held] = {}
         self._done = 0
 
-    def do(self, task: Task) -> Outcome:
+    def do(self, task: Task) -> TaskOutcome:
         """Judge one scan; whatever is wrong with it is its sentence."""
         self._done += 1
         return self._lean(task) if self._done % GIVE_BACK == 0 else self._do(task)
 
     @gives_back
-    def _lean(self, task: Task) -> Outcome:
+    def _lean(self, task: Task) -> TaskOutcome:
         return self._do(task)
 
-    def _do(self, task: Task) -> Outcome:
+    def _do(self, task: Task) -> TaskOutcome:
         wall_s, cpu_s, size = time.monotonic(), time.process_time(), 0
         try:
             with at_hand(task.uri) as path:
@@ -88,32 +88,34 @@ class Bench:
             "read_bytes": size,
             "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),
         }
-        return Outcome(done.scan_id, done.figures, done.sentence, done.lasting, done.files, cost)
+        return TaskOutcome(
+            done.scan_id, done.figures, done.sentence, done.lasting, done.files, cost
+        )
 
-    def _judged(self, task: Task, path: Any) -> Outcome:
+    def _judged(self, task: Task, path: Any) -> TaskOutcome:
         try:
             figures, files = self._figures(task, path)
         except (AmrepairError, GcodeError) as error:
-            return Outcome(task.scan_id, sentence=str(error).replace(str(path), "{scan}"))
+            return TaskOutcome(task.scan_id, sentence=str(error).replace(str(path), "{scan}"))
         except (OSError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001  one scan's surprise is not the batch's end
             said = f"{type(error).__name__}: {error}".replace(str(path), "{scan}")
-            return Outcome(
+            return TaskOutcome(
                 task.scan_id,
                 sentence=f"{{scan}} cannot be judged, by an error of the program ({said}); "
                 "please report it with the scan",
             )
-        return Outcome(task.scan_id, figures, files=files)
+        return TaskOutcome(task.scan_id, figures, files=files)
 
     def _figures(self, task: Task, path: Any) -> tuple[Mapping[str, Any], Mapping[str, bytes]]:
         options = self._work.options
-        build = options.kind is Kind.REPAIR and options.part_pose is None
+        build = options.kind is BatchKind.REPAIR and options.part_pose is None
         sensors = np.array(options.sensors_mm) if options.sensors_mm else None
         scan = read_scan(path, frame="build" if build else "scanner", sensor_at=sensors)
         held, found, confidence = self._template_of(scan)
         chosen = {"template": held.name, "confidence": confidence}
-        if options.kind is Kind.REPAIR:
+        if options.kind is BatchKind.REPAIR:
             return self._repair(task, scan, held, chosen)
         if found is None:
             found = align(
@@ -123,7 +125,7 @@ class Bench:
                 rng=np.random.default_rng(options.seed),
             )
         pose = {**chosen, **_pose_figures(found)}
-        if options.kind is Kind.ALIGN:
+        if options.kind is BatchKind.ALIGN:
             return pose, {}
         placed = scan.moved(found.template_from_scan)
         anomaly = detect(placed, held.template, calibration=self._work.calibration)
@@ -139,7 +141,7 @@ class Bench:
     ) -> tuple[Mapping[str, Any], Mapping[str, bytes]]:
         options, setup = self._work.options, self._work.setup
         assert setup is not None
-        placed = None if options.part_pose is None else _standing(options.part_pose)
+        placed = None if options.part_pose is None else Transform.on_bed(*options.part_pose)
         site = replace(
             Site.of_part(held.template, setup, build_from_template=placed),
             on_fixture=options.on_fixture,
@@ -188,24 +190,12 @@ class Bench:
         if name not in self._held:
             source = next(one for one in self._work.templates if one.name == name)
             template = open_template(source.path)
-            self._held[name] = _Held(name, template, Cells.of(template))
+            self._held[name] = _Held(name, template, PartCells.of(template))
         return self._held[name]
 
 
-def _refused(task: Task, sentence: str) -> Outcome:
-    return Outcome(task.scan_id, sentence=sentence, lasting=False)
-
-
-def _standing(pose: tuple[float, float, float, float]) -> Transform:
-    """Where the part stands, from X, Y, Z in mm and a turn in degrees."""
-    x, y, z, turn_deg = pose
-    c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
-    return Transform.from_rotation_translation(
-        "build",
-        "template",
-        rotation=np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]),
-        translation_mm=np.array([x, y, z]),
-    )
+def _refused(task: Task, sentence: str) -> TaskOutcome:
+    return TaskOutcome(task.scan_id, sentence=sentence, lasting=False)
 
 
 def _pose_figures(found: Registration) -> dict[str, Any]:

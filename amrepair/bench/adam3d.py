@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from PIL import Image
 
-from amrepair.bench.samples import GOOD, BenchClass, Cloud, Points, Sample
+from amrepair.bench.samples import GOOD, BenchClass, Points, Sample, SampleCloud
 from amrepair.errors import InputError, refused_as_ours
 from amrepair.observe.robust import MAD_TO_SIGMA
 from gcode.surfaces.sizes import (
@@ -69,7 +69,7 @@ def _sample(class_name: str, label: Path, path: Path) -> Sample:
     )
 
 
-def load(sample: Sample) -> Cloud:
+def load(sample: Sample) -> SampleCloud:
     """Points of the part and what the mask says of their pixels.
 
     Raises
@@ -82,7 +82,7 @@ def load(sample: Sample) -> Cloud:
     defective = np.zeros(part.shape, bool)
     if sample.truth_path is not None:
         defective = _read_mask(sample.truth_path, part.shape)
-    return Cloud(grid[part], defective[part].astype(np.int64))
+    return SampleCloud(grid[part], defective[part].astype(np.int64))
 
 
 def read_part(path: Path) -> Points:

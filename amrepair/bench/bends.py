@@ -12,20 +12,16 @@ cuts across an axis are judged in one pass. It finds where to look; `bodies` mov
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.bench.options import USUAL_BENDS, BendOptions
 from amrepair.frames import diagonal, moved, unit_vectors
 from amrepair.template.port import Template
 
-CUT_SHARES = np.arange(0.2, 0.81, 0.05)  # shares of the points on one side of a cut
-MOTION_RIDGE = 1e-6  # of a motion that the points of a side do not show
-# Widths that the zone of a bend may have, of the diagonal (0 is a crease), and how far its middle
-# may lie from the plane that the pieces were parted by.
-ZONE_RATIOS, ASIDE_RATIOS = np.linspace(0.0, 0.2, 11), np.linspace(-0.04, 0.04, 9)
-ZONE_POINTS = 1_500  # about the plane: enough to tell both
 CREASE_MM = 1e-6  # a narrower zone is a crease
 
 Pose = Float[np.ndarray, "4 4"]
@@ -102,6 +98,7 @@ def with_zone(
     *,
     limit_mm: float,
     sigma_mm: float,
+    options: BendOptions = USUAL_BENDS,
 ) -> Pieces:
     """The pieces with the zone that what lies about the plane between them tells.
 
@@ -118,13 +115,14 @@ def with_zone(
     if pieces.other is None:
         return pieces
     diagonal_mm = diagonal(template.bounds_mm)
-    widest_mm = (0.5 * ZONE_RATIOS[-1] + ASIDE_RATIOS[-1]) * diagonal_mm
+    widest_mm = (0.5 * options.widest_zone_ratio + options.aside_ratio) * diagonal_mm
     home = moved(points_mm, pieces.other)
     height_mm = (home - pieces.through_mm) @ pieces.normal
     near = np.flatnonzero(np.abs(height_mm) < widest_mm)
-    near = near[:: len(near) // ZONE_POINTS + 1]
+    near = near[:: len(near) // options.zone_points + 1]
     here, home, height_mm = moved(points_mm[near], pieces.pose), home[near], height_mm[near]
-    aside, zone = (diagonal_mm * each.ravel() for each in np.meshgrid(ASIDE_RATIOS, ZONE_RATIOS))
+    lattice = np.meshgrid(options.aside_ratios, options.zone_ratios)
+    aside, zone = (diagonal_mm * each.ravel() for each in lattice)
     motion = _motion_mm(here - home, height_mm - aside[:, None], zone[:, None], pieces.turned)
     off_mm = np.abs(template.distance((here - motion).reshape(-1, 3))).reshape(len(zone), -1)
     misfit = (np.minimum(off_mm, limit_mm) ** 2).sum(axis=1) / sigma_mm**2
@@ -160,6 +158,7 @@ def best_cuts(
     *,
     scale_mm: float,
     sigma_mm: float,
+    options: BendOptions = USUAL_BENDS,
 ) -> list[Cut]:
     """The best cut across each main axis of the template's surface, the best first.
 
@@ -187,7 +186,8 @@ def best_cuts(
         ],
         axis=1,
     )
-    whole = _explained(products.sum(axis=0))
+    explained = partial(_explained, ridge=options.ridge)
+    whole = explained(products.sum(axis=0))
     middle = surface_mm - surface_mm.mean(axis=0)
     found = []
     for axis in np.linalg.eigh(middle.T @ middle)[1].T:
@@ -196,19 +196,19 @@ def best_cuts(
         below = np.cumsum(products[order], axis=0)
         cuts = [
             Cut(
-                float(_explained(below[i - 1]) + _explained(below[-1] - below[i - 1]) - whole)
+                (explained(below[i - 1]) + explained(below[-1] - below[i - 1]) - whole)
                 / sigma_mm**2,
                 axis,
                 float(height[order[i]]),
             )
-            for i in (CUT_SHARES * len(height)).astype(int)
+            for i in (options.cut_shares * len(height)).astype(int)
         ]
         found.append(max(cuts, key=lambda cut: cut.gain))
     return sorted(found, key=lambda cut: -cut.gain)
 
 
-def _explained(sums: Float[np.ndarray, " 42"]) -> float:
+def _explained(sums: Float[np.ndarray, " 42"], ridge: float) -> float:
     """What the best motion takes from the sum of squares, from the sums of a side."""
     matrix, right = sums[:36].reshape(6, 6), sums[36:]
-    matrix = matrix + MOTION_RIDGE * max(float(np.trace(matrix)), 1e-12) * np.eye(6)
+    matrix = matrix + ridge * max(float(np.trace(matrix)), 1e-12) * np.eye(6)
     return float(right @ np.linalg.solve(matrix, right))

@@ -23,55 +23,14 @@ from amrepair.align.refine import Prior, refine_all
 from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.bench.bends import Pieces, Pose, best_cuts, with_zone
+from amrepair.bench.options import USUAL_BODIES, BodyOptions
 from amrepair.frames import diagonal, moved, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
-LEAST_BENT_SHARE = 0.1  # of the points: with fewer off the template nothing was bent
-BODY_POINTS, START_POINTS, PIECE_POINTS, LAST_POINTS = 4_000, 1_200, 600, 15_000
-CLEAR_SIGMAS, CLEAR_RATIO = 4.0, 0.002  # a point is off the surface; the ratio is of the diagonal
-FIRST_PIECE_RATIO, SECOND_PIECE_RATIO = (
-    0.02,
-    0.04,
-)  # scale of the loss to begin with, of the diagonal
-SHARP = 0.4  # of the limit: the loss's scale where a piece's pose ends
-ITERATIONS, BODY_ROUNDS = 40, 6
-ENOUGH_SIGMAS = 0.05  # of the noise: a smaller step changes nothing that is asked
-NEARBY = 3.0  # limits: a point this near may yet come to lie on a piece
-EXPLAINED_SHARE = 0.93  # of the points, explained by two poses: nothing better is looked for
-# Nor where they explain all but outliers off the bend itself, which is neither piece's: so far from
-# the plane between them (of the diagonal), where at least so many of the points lie.
-BENT_RATIO, ENOUGH_BEYOND, LEAST_BEYOND = 0.06, 0.985, 0.5
-# Fewer explained there: no bend. Of 117 bent scans one had less than 0.93, of 27 broken ones two
-# had more than 0.85; a view of a bend, in sixteen draws of its points, 0.89 to 0.93.
-LEAST_OF_PAIR = 0.87
-MOST_POLISHED = 2  # pairs of each pose, the best ones to begin with
-MOST_TRIED = 4  # poses of which a second piece is asked
-NEIGHBOURS, MOSTLY = 24, 0.9  # a place lies on the template where its neighbours do
-SAME_BODY_RATIO = 0.01  # of the diagonal: poses that move the scan by less are one
-PIECE_TURN_RAD = 0.14  # starts of the second piece, about the middle of what the first leaves
-CUTS = (0.3, 0.5, 0.7)  # shares of the scan on one side, along each of its main axes
-LEAST_TURNED_RAD, MOST_TURNED_RAD = 0.01, 0.5  # farther is another place that fits by chance
-HINGE_RATIO = 0.04  # of the diagonal: at the plane between the pieces both poses agree to this
-LEAST_PIECE_SHARE = 0.05  # of the points
-LEAST_GAINED = 0.08  # of the points, by the second pose
-MOST_WRONG = 0.2  # of either piece, on the wrong side of the plane between them
-ANGLES, AS_GOOD_RATIO = 36, 0.02  # of planes about the hinge; wrong by so little more is as good
-MOST_OF_BROKEN = 0.5  # where a pose holds more, the rest is a matter of its own
-MOST_OUTSIDE = 0.01  # of the points, beyond the noise, where something broke off
-SUNK_RATIOS = (0.01, 0.003)  # the loss's scale to begin with, of the diagonal
-SURFACE_RATIO = 1.0 / 60.0  # spacing of the template's points, of the diagonal
-# A bend that is looked for: noise alone has such a gain in one of so many scans.
-BENT_GAIN = float(chi2.isf(1e-6, 6))
-BENT_SCALE_RATIO = 0.01  # of the diagonal: scale of the loss, where pieces begin
-CUT_RANGE = (0.1, 0.9)  # of the points: shares below a cut
-# Of what is off in one pose, within the limit, two explain so much more: of bends of 0.6° 0.15, of
-# sound views, whose pieces slide along what the template is off by, up to 0.07.
-LEAST_EXPLAINED = 0.1
 
-
-def surface_of(template: Template) -> Float[np.ndarray, "m 3"]:
+def surface_of(template: Template, options: BodyOptions = USUAL_BODIES) -> Float[np.ndarray, "m 3"]:
     """(m, 3) places of a template's surface, as dense as bends are judged."""
-    return template.surface_points(SURFACE_RATIO * diagonal(template.bounds_mm))[0]
+    return template.surface_points(options.surface_ratio * diagonal(template.bounds_mm))[0]
 
 
 def pieces_of(
@@ -81,6 +40,7 @@ def pieces_of(
     sigma_mm: float,
     rng: np.random.Generator,
     surface_mm: Float[np.ndarray, "m 3"] | None = None,
+    options: BodyOptions = USUAL_BODIES,
 ) -> Pieces:
     """The larger piece's pose, and the other's, where the scan shows a part bent in two.
 
@@ -98,31 +58,35 @@ def pieces_of(
         What `surface_of` says of the template; None asks it.
     """
     thinned = Thinned(points_mm, rng)
-    limit_mm = max(CLEAR_SIGMAS * sigma_mm, CLEAR_RATIO * diagonal(template.bounds_mm))
-    surface = surface_of(template) if surface_mm is None else surface_mm
-    scene = _Scene.of(thinned, template, sigma_mm, limit_mm, surface)
-    if (~scene.on(known[0])).mean() < LEAST_BENT_SHARE:
+    limit_mm = max(
+        options.clear_sigmas * sigma_mm, options.clear_ratio * diagonal(template.bounds_mm)
+    )
+    surface = surface_of(template, options) if surface_mm is None else surface_mm
+    scene = _Scene.of(thinned, template, sigma_mm, limit_mm, surface, options)
+    if (~scene.on(known[0])).mean() < options.least_bent_share:
         return _little_bent(known[0], scene)
-    tried = scene.distinct(scene.refined(scene.thinned.to(START_POINTS), known))
+    tried = scene.distinct(scene.refined(scene.thinned.to(options.start_points), known))
     best = _best_pair(tried, scene)
-    if best is None or not best.is_enough:
+    if best is None or not scene.enough(best):
         coarse = CoarseField.of(template)
         poses = search(scene.thinned, coarse, effort=coarse.options.thorough)
         found = [pose.matrix for pose in poses]
-        more = scene.distinct([*tried, *scene.refined(scene.thinned.to(START_POINTS), found)])
+        more = scene.distinct(
+            [*tried, *scene.refined(scene.thinned.to(options.start_points), found)]
+        )
         untried = [pose for pose in more if not any(pose is one for one in tried)]
-        best = _best_pair(untried[:MOST_TRIED], scene, best)
+        best = _best_pair(untried[: options.most_tried], scene, best)
         tried = more
     alone = scene.held(scene.on(tried[0]))
     gained = 0.0 if best is None else best.explained - alone
-    if best is not None and best.beyond >= LEAST_OF_PAIR and gained >= LEAST_GAINED:
+    if best is not None and best.beyond >= options.least_of_pair and gained >= options.least_gained:
         return scene.in_two(
             scene.finished(best.standing, best.normal, best.through_mm),
             scene.finished(best.other, -best.normal, best.through_mm),
             best.normal,
             best.through_mm,
         )
-    if alone < MOST_OF_BROKEN:
+    if alone < options.most_of_broken:
         broken = _nothing_outside(tried, scene)
         if broken is not None:
             return Pieces(broken)
@@ -131,16 +95,19 @@ def pieces_of(
 
 def _little_bent(pose: Pose, scene: _Scene) -> Pieces:
     """The pose, or those of two pieces where these explain more than noise does."""
+    options = scene.options
     cuts = best_cuts(
         moved(scene.cloud, pose),
         scene.template,
         scene.surface_mm,
-        scale_mm=BENT_SCALE_RATIO * scene.diagonal_mm,
-        sigma_mm=max(scene.sigma_mm, CLEAR_RATIO / CLEAR_SIGMAS * scene.diagonal_mm),
+        scale_mm=options.scale_ratio * scene.diagonal_mm,
+        sigma_mm=max(
+            scene.sigma_mm, options.clear_ratio / options.clear_sigmas * scene.diagonal_mm
+        ),
     )
-    if cuts[0].gain < BENT_GAIN:
+    if cuts[0].gain < chi2.isf(options.gain_probability, 6):
         return Pieces(pose)
-    whole = scene.refined(scene.cloud, [pose], BENT_SCALE_RATIO)[0]
+    whole = scene.refined(scene.cloud, [pose], options.scale_ratio)[0]
     alone = float(scene.off(whole).mean())
     best: tuple[float, Pieces] | None = None
     for cut in cuts[:2]:
@@ -149,7 +116,7 @@ def _little_bent(pose: Pose, scene: _Scene) -> Pieces:
             continue  # what slid along a flat or round face is no bend
         if best is None or explained < best[0]:
             best = explained, pieces
-    if best is None or best[0] > (1.0 - LEAST_EXPLAINED) * alone:
+    if best is None or best[0] > (1.0 - options.least_explained) * alone:
         return Pieces(pose)
     return best[1]
 
@@ -158,14 +125,15 @@ def _parted(
     whole: Pose, axis: Float[np.ndarray, " 3"], height_mm: float, scene: _Scene
 ) -> tuple[float, Pieces]:
     """What is off, and the pieces on either side of a cut: each moved by itself, then the cut."""
+    options = scene.options
     cloud = scene.cloud
     height = scene.feet(whole) @ axis
     order = np.argsort(height)
-    first, last = (int(share * len(order)) for share in CUT_RANGE)
+    first, last = (int(share * len(order)) for share in options.cut_range)
     poses, off, at = [whole, whole], [np.zeros(len(cloud))] * 2, height_mm
-    for round_ in range(BODY_ROUNDS // 2):
+    for round_ in range(options.rounds // 2):
         for k, own in enumerate((height < at, height >= at)):
-            scale = BENT_SCALE_RATIO if round_ == 0 else 0.0
+            scale = options.scale_ratio if round_ == 0 else 0.0
             some = np.ascontiguousarray(cloud[own])
             poses[k] = scene.refined(some, [poses[k]], scale, held=True)[0]
             off[k] = scene.off(poses[k])
@@ -186,16 +154,17 @@ def _nothing_outside(poses: Sequence[Pose], scene: _Scene) -> Pose | None:
     A view into a broken face: on the template lies what is left beside it, below all the rest. Laid
     on a flat side near by, half of the face sticks out, and nothing that breaks makes that.
     """
-    few, best, most = scene.thinned.to(START_POINTS), None, LEAST_PIECE_SHARE
-    for ratio in SUNK_RATIOS:
+    options = scene.options
+    few, best, most = scene.thinned.to(options.start_points), None, options.least_piece_share
+    for ratio in options.sunk_ratios:
         for pose in scene.refined(few, poses, ratio, outside=False):
             distance = scene.template.distance(moved(scene.cloud, pose))
             held = scene.held(np.abs(distance) <= scene.limit_mm)
-            if held > most and (distance > scene.limit_mm).mean() <= MOST_OUTSIDE:
+            if held > most and (distance > scene.limit_mm).mean() <= options.most_outside:
                 best, most = pose, held
     if best is None:
         return None
-    return scene.refined(scene.thinned.to(LAST_POINTS), [best], 0.0, outside=False)[0]
+    return scene.refined(scene.thinned.to(options.last_points), [best], 0.0, outside=False)[0]
 
 
 def _best_pair(poses: Sequence[Pose], scene: _Scene, best: _Pair | None = None) -> _Pair | None:
@@ -203,11 +172,13 @@ def _best_pair(poses: Sequence[Pose], scene: _Scene, best: _Pair | None = None) 
     for few in (poses[:1], poses[1:]):
         for seeds in _seeds(few, scene):
             begun = [(scene.held(scene.on(a) | scene.on(b)), a, b) for a, b in seeds]
-            for _, first, second in sorted(begun, key=lambda one: -one[0])[:MOST_POLISHED]:
+            for _, first, second in sorted(begun, key=lambda one: -one[0])[
+                : scene.options.most_polished
+            ]:
                 pair = _polished(first, second, scene)
                 if pair is not None and (best is None or pair.explained > best.explained):
                     best = pair
-            if best is not None and best.is_enough:
+            if best is not None and scene.enough(best):
                 return best
     return best
 
@@ -232,11 +203,6 @@ class _Pair:
     normal: Float[np.ndarray, " 3"]
     through_mm: Float[np.ndarray, " 3"]
 
-    @property
-    def is_enough(self) -> bool:
-        """Whether nothing better need be looked for."""
-        return self.explained > EXPLAINED_SHARE or self.beyond > ENOUGH_BEYOND
-
 
 @dataclass(frozen=True)
 class _Scene:
@@ -249,6 +215,7 @@ class _Scene:
     diagonal_mm: float
     limit_mm: float
     surface_mm: Float[np.ndarray, "m 3"]
+    options: BodyOptions
 
     @classmethod
     def of(
@@ -258,16 +225,22 @@ class _Scene:
         sigma_mm: float,
         limit_mm: float,
         surface_mm: Float[np.ndarray, "m 3"],
+        options: BodyOptions,
     ) -> _Scene:
-        cloud, diagonal_mm = thinned.to(BODY_POINTS), diagonal(template.bounds_mm)
+        cloud, diagonal_mm = thinned.to(options.points), diagonal(template.bounds_mm)
         sigma_mm = max(sigma_mm, 1e-3)
-        return cls(thinned, cloud, template, sigma_mm, diagonal_mm, limit_mm, surface_mm)
+        return cls(thinned, cloud, template, sigma_mm, diagonal_mm, limit_mm, surface_mm, options)
 
     @cached_property
     def neighbours(self) -> Int[np.ndarray, "n k"]:
         """(n, k) points of the cloud around each; most scans are whole, and never ask."""
-        near = [*range(1, min(NEIGHBOURS, len(self.cloud)) + 1)]
+        near = [*range(1, min(self.options.neighbours, len(self.cloud)) + 1)]
         return np.asarray(cKDTree(self.cloud).query(self.cloud, k=near)[1])
+
+    def enough(self, pair: _Pair) -> bool:
+        """Whether nothing better need be looked for."""
+        share, beyond = self.options.explained_share, self.options.enough_beyond
+        return pair.explained > share or pair.beyond > beyond
 
     def held(self, on: Bool[np.ndarray, " n"]) -> float:
         """Share of the places that are held."""
@@ -278,7 +251,7 @@ class _Scene:
 
         What crosses the template somewhere, a broken face laid on a flat one, is on it in strips.
         """
-        return np.asarray(on & (on[self.neighbours].mean(axis=1) >= MOSTLY))
+        return np.asarray(on & (on[self.neighbours].mean(axis=1) >= self.options.mostly))
 
     def on(
         self, pose: Pose, points: Float[np.ndarray, "k 3"] | None = None
@@ -290,8 +263,9 @@ class _Scene:
     @property
     def prior(self) -> Prior:
         """A piece lies near where the whole does: a flat one must not slide."""
-        shift_mm = SECOND_PIECE_RATIO * self.diagonal_mm
-        return Prior(np.full(3, PIECE_TURN_RAD), np.full(3, shift_mm))
+        options = self.options
+        shift_mm = options.second_ratio * self.diagonal_mm
+        return Prior(np.full(3, options.piece_turn_rad), np.full(3, shift_mm))
 
     def off(self, pose: Pose) -> Float[np.ndarray, " n"]:
         """(n,) how far off the template the points lie, in limits; 1 beyond it."""
@@ -321,7 +295,7 @@ class _Scene:
         self,
         points: Float[np.ndarray, "k 3"],
         starts: Sequence[Pose],
-        first_ratio: float = FIRST_PIECE_RATIO,
+        first_ratio: float | None = None,
         *,
         outside: bool = True,
         held: bool = False,
@@ -331,7 +305,9 @@ class _Scene:
         Unless `outside`, those beyond it are drawn in from anywhere. If `held`, what the points do
         not tell of a pose stays.
         """
-        end_mm = SHARP * self.limit_mm
+        options = self.options
+        end_mm = options.sharp * self.limit_mm
+        first_ratio = options.first_ratio if first_ratio is None else first_ratio
         found = refine_all(
             points,
             self.template,
@@ -339,8 +315,8 @@ class _Scene:
             start_scale_mm=max(first_ratio * self.diagonal_mm, end_mm),
             end_scale_mm=end_mm,
             sigma_mm=self.sigma_mm,
-            max_iterations=ITERATIONS,
-            enough_mm=ENOUGH_SIGMAS * self.sigma_mm,
+            max_iterations=options.iterations,
+            enough_mm=options.enough_sigmas * self.sigma_mm,
             outside_mm=0.0 if outside else end_mm,
             prior=self.prior if held else None,
         )
@@ -353,13 +329,14 @@ class _Scene:
         through_mm: Float[np.ndarray, " 3"] | None = None,
     ) -> Pose:
         """The pose moved on all points that lie on the template, on its side of the plane."""
-        points = self.thinned.to(LAST_POINTS)
+        options = self.options
+        points = self.thinned.to(options.last_points)
         for _ in range(2):
             placed = moved(points, pose)
             own = np.abs(self.template.distance(placed)) <= self.limit_mm
             if away is not None and through_mm is not None:
-                own &= (placed - through_mm) @ away < -HINGE_RATIO * self.diagonal_mm
-            if own.sum() < LEAST_PIECE_SHARE * len(points):
+                own &= (placed - through_mm) @ away < -options.hinge_ratio * self.diagonal_mm
+            if own.sum() < options.least_piece_share * len(points):
                 break
             pose = refine_all(
                 np.ascontiguousarray(points[own]),
@@ -368,7 +345,7 @@ class _Scene:
                 start_scale_mm=self.limit_mm,
                 end_scale_mm=self.limit_mm,
                 sigma_mm=self.sigma_mm,
-                max_iterations=ITERATIONS,
+                max_iterations=options.iterations,
             )[0].matrix
         return pose
 
@@ -381,7 +358,7 @@ class _Scene:
             here = moved(few, poses[k])
             if all(
                 np.linalg.norm(here - moved(few, one), axis=1).max()
-                > SAME_BODY_RATIO * self.diagonal_mm
+                > self.options.same_ratio * self.diagonal_mm
                 for one in kept
             ):
                 kept.append(poses[k])
@@ -393,15 +370,18 @@ def _seeds(poses: Sequence[Pose], scene: _Scene) -> Iterator[list[tuple[Pose, Po
 
     A side is moved from all the poses at once: they are many where a part fits in many ways.
     """
-    cloud = scene.thinned.to(2 * PIECE_POINTS)
+    options = scene.options
+    cloud = scene.thinned.to(2 * options.piece_points)
     local = cloud - cloud.mean(axis=0)
     sides = []
     for axis in np.linalg.eigh(local.T @ local)[1].T[::-1]:
         height = local @ axis
-        for cut in np.quantile(height, CUTS):
+        for cut in np.quantile(height, options.cuts):
             for side in (height <= cut, height > cut):
                 sides.append(
-                    scene.refined(_some(cloud[side], PIECE_POINTS), poses, SECOND_PIECE_RATIO)
+                    scene.refined(
+                        _some(cloud[side], options.piece_points), poses, options.second_ratio
+                    )
                 )
     for pose, *moved_sides in zip(poses, *sides, strict=True):
         found = list(zip(moved_sides[::2], moved_sides[1::2], strict=True))
@@ -410,20 +390,21 @@ def _seeds(poses: Sequence[Pose], scene: _Scene) -> Iterator[list[tuple[Pose, Po
 
 def _of_the_rest(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
     """The pose, and that of what it leaves, where this is a piece."""
+    options = scene.options
     on = scene.on(first)
     rest = scene.cloud[~on]
-    if len(rest) <= LEAST_PIECE_SHARE * len(on):
+    if len(rest) <= options.least_piece_share * len(on):
         return
-    few = _some(rest, PIECE_POINTS)
+    few = _some(rest, options.piece_points)
     middle = moved(few, first).mean(axis=0)
     starts = [first]
     for vector in (*np.eye(3), *-np.eye(3)):
-        turn = rotation_from_vector(PIECE_TURN_RAD * vector)
+        turn = rotation_from_vector(options.piece_turn_rad * vector)
         start = np.eye(4)
         start[:3, :3] = turn @ first[:3, :3]
         start[:3, 3] = turn @ (first[:3, 3] - middle) + middle
         starts.append(start)
-    found = scene.refined(few, starts, SECOND_PIECE_RATIO)
+    found = scene.refined(few, starts, options.second_ratio)
     yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
 
 
@@ -433,18 +414,19 @@ def _some(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 
 
 def _polished(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     """Both poses, each moved on the points that it explains better; None if that is no bend."""
+    options = scene.options
     poses = [first, second]
-    for _ in range(BODY_ROUNDS):
+    for _ in range(options.rounds):
         off = np.stack([np.abs(scene.template.distance(moved(scene.cloud, one))) for one in poses])
         nearer = off[1] < off[0]
-        if min(nearer.mean(), 1.0 - nearer.mean()) < LEAST_PIECE_SHARE:
+        if min(nearer.mean(), 1.0 - nearer.mean()) < options.least_piece_share:
             return None
-        near = off.min(axis=0) <= NEARBY * scene.limit_mm
+        near = off.min(axis=0) <= options.nearby_limits * scene.limit_mm
         own = (near & ~nearer, near & nearer)
-        if min(which.sum() for which in own) < LEAST_PIECE_SHARE * len(nearer):
+        if min(which.sum() for which in own) < options.least_piece_share * len(nearer):
             return None
         poses = [
-            scene.refined(_some(scene.cloud[which], START_POINTS), [one], 0.0)[0]
+            scene.refined(_some(scene.cloud[which], options.start_points), [one], 0.0)[0]
             for which, one in zip(own, poses, strict=True)
         ]
     return _judged(poses[0], poses[1], scene)
@@ -452,6 +434,7 @@ def _polished(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
 
 def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     """The pair, if the second is the first turned about a line that parts what they explain."""
+    options = scene.options
     hinge = _hinge(second @ np.linalg.inv(first), scene)
     if hinge is None:
         return None
@@ -460,27 +443,27 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     off = np.stack([np.abs(scene.template.distance(one + through)) for one in placed])
     on = off <= scene.limit_mm
     only = (on[0] & ~on[1], on[1] & ~on[0])
-    if min(which.sum() for which in only) < LEAST_PIECE_SHARE * on.shape[1]:
+    if min(which.sum() for which in only) < options.least_piece_share * on.shape[1]:
         return None
     # Of the planes through the axis, the one with the fewest points on the wrong side is taken.
     u, v = ways_across(axis)
-    angles = 2.0 * np.pi * np.arange(ANGLES) / ANGLES
+    angles = 2.0 * np.pi * np.arange(options.angles) / options.angles
     normals = np.outer(np.cos(angles), u) + np.outer(np.sin(angles), v)
     wrong = (placed[0][only[0]] @ normals.T > 0.0).mean(axis=0)
     wrong += (placed[1][only[1]] @ normals.T < 0.0).mean(axis=0)
-    least = wrong <= wrong.min() + AS_GOOD_RATIO
+    least = wrong <= wrong.min() + options.as_good_ratio
     normal = normals[least].sum(axis=0)
     normal /= max(float(np.linalg.norm(normal)), 1e-9)
-    if 0.5 * wrong.min() > MOST_WRONG:
+    if 0.5 * wrong.min() > options.most_wrong:
         return None
-    zone_mm = HINGE_RATIO * scene.diagonal_mm
+    zone_mm = options.hinge_ratio * scene.diagonal_mm
     right = (on[0] & (placed[0] @ normal < zone_mm)) | (on[1] & (placed[1] @ normal > -zone_mm))
     held = scene.is_held(right)
     # a point of the second piece lies as far from the plane in its own pose as in the first
     height = np.where(on[0], placed[0] @ normal, placed[1] @ normal)
-    beyond = np.abs(height) > BENT_RATIO * scene.diagonal_mm
+    beyond = np.abs(height) > options.bent_ratio * scene.diagonal_mm
     share = float(held.mean())
-    share_beyond = float(held[beyond].mean()) if beyond.mean() > LEAST_BEYOND else share
+    share_beyond = float(held[beyond].mean()) if beyond.mean() > options.least_beyond else share
     in_front = float(((scene.surface_mm - through) @ normal > 0.0).mean())
     (standing, other), away = (
         ((second, first), -normal) if in_front > 0.5 else ((first, second), normal)
@@ -495,6 +478,7 @@ def _hinge(
 
     None where it was turned too little or too much, slid along the line, or the line is far away.
     """
+    options = scene.options
     rotation, shift = second_from_first[:3, :3], second_from_first[:3, 3]
     twist = 0.5 * np.array(
         [
@@ -505,7 +489,7 @@ def _hinge(
     )
     sine = float(np.linalg.norm(twist))
     angle = float(np.arctan2(sine, 0.5 * (np.trace(rotation) - 1.0)))
-    if not LEAST_TURNED_RAD < angle < MOST_TURNED_RAD:
+    if not options.least_turned_rad < angle < options.most_turned_rad:
         return None
     axis = twist / sine
     middle = scene.template.bounds_mm.mean(axis=0)
@@ -514,7 +498,7 @@ def _hinge(
     across = gap - along * axis
     # This is the fixed point of a plane rotation, relative to the middle.
     through = middle + 0.5 * (across + np.cross(axis, across) / np.tan(0.5 * angle))
-    if abs(along) > HINGE_RATIO * scene.diagonal_mm:
+    if abs(along) > options.hinge_ratio * scene.diagonal_mm:
         return None
     if np.linalg.norm(through - middle) > scene.diagonal_mm:
         return None

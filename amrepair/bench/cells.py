@@ -13,7 +13,6 @@ import shutil
 import time
 import zipfile
 import zlib
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -34,7 +33,7 @@ BAD_ALIGNMENT_SIGMAS, BAD_ALIGNMENT_MM = 4.0, 0.001 * DIAGONAL_MM
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ScoreRow:
     """What one cell came to; None where a method has nothing to measure.
 
     Attributes
@@ -92,18 +91,17 @@ class Cell:
         return self.out / "cells" / self.method / self.one.name / f"{self.seed}.json"
 
 
-def finished(cell: Cell) -> Row | None:
+def finished(cell: Cell) -> ScoreRow | None:
     """The row of a cell that an earlier run finished."""
     if not cell.result_path.is_file():
         return None
-    return Row(**json.loads(cell.result_path.read_text()))
+    return ScoreRow(**json.loads(cell.result_path.read_text()))
 
 
 def run_cell(
     cell: Cell,
     progress: Progress = silent,
-    clock: Callable[[], float] = time.perf_counter,
-) -> Row:
+) -> ScoreRow:
     """Do what is left of a cell and judge it.
 
     Raises
@@ -117,14 +115,14 @@ def run_cell(
     left = [sample for sample in cell.one.test if _load(_path(cell, sample)) is None]
     fit_path = cell.folder / "fit.json"
     if left or not fit_path.is_file():
-        started = clock()
+        started = time.perf_counter()
         data = class_input(cell.one, cell.format)
         method = make_method(cell.method, checkpoint=cell.checkpoint, paper=cell.paper)
         model = method.fit(data, seed=cell.seed, cache=cell.out / "partial" / "templates")
-        _write_fit(fit_path, model, clock() - started, data.sigma_mm)
+        _write_fit(fit_path, model, time.perf_counter() - started, data.sigma_mm)
         for i, sample in enumerate(left):
             progress(f"{cell.method} {cell.one.name}", float(i), float(len(left)))
-            _score(cell, sample, model, data.mm_per_unit, clock)
+            _score(cell, sample, model, data.mm_per_unit)
     row = _judge(cell, json.loads(fit_path.read_text()))
     write_bytes(cell.result_path, json.dumps(asdict(row)).encode(), durable=True)
     shutil.rmtree(cell.folder)
@@ -163,14 +161,13 @@ def _score(
     sample: Sample,
     model: Model,
     mm_per_unit: float,
-    clock: Callable[[], float],
 ) -> None:
     cloud = sample.load()
     words = [cell.seed, zlib.crc32(cell.one.name.encode()), zlib.crc32(sample.name.encode())]
     rng = np.random.default_rng(words)
-    started = clock()
+    started = time.perf_counter()
     scores = model.score(np.asarray(cloud.points * mm_per_unit), rng)
-    seconds = clock() - started
+    seconds = time.perf_counter() - started
     residual = math.nan
     normal = cloud.labels == 0
     if scores.residual_mm is not None and normal.any():
@@ -189,7 +186,7 @@ def _score(
         )
 
 
-def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
+def _judge(cell: Cell, fit: dict[str, float | None]) -> ScoreRow:
     stored = [_load(_path(cell, sample)) for sample in cell.one.test]
     kept = [one for one in stored if one is not None]
     whole = detection(
@@ -203,7 +200,7 @@ def _judge(cell: Cell, fit: dict[str, float | None]) -> Row:
     failed = np.array([not bool(one["aligned"]) for one in kept])
     judged = bool(np.isfinite(residual).any() or failed.any())
     limit_mm = max(BAD_ALIGNMENT_SIGMAS * float(fit["sigma_mm"] or 0.0), BAD_ALIGNMENT_MM)
-    return Row(
+    return ScoreRow(
         method=cell.method,
         class_name=cell.one.name,
         seed=cell.seed,

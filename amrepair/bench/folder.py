@@ -22,8 +22,8 @@ from amrepair.bench.samples import (
     GOOD,
     UNLABELLED,
     BenchClass,
-    Cloud,
     Sample,
+    SampleCloud,
     read_points,
     read_truth,
     without_labels,
@@ -87,7 +87,7 @@ def _sample(folder: Path, path: Path) -> Sample:
     )
 
 
-def load(sample: Sample) -> Cloud:
+def load(sample: Sample) -> SampleCloud:
     """Points and, where there is a mask, their labels.
 
     Raises
@@ -105,9 +105,9 @@ def load(sample: Sample) -> Cloud:
                 f"{sample.truth_path}: {len(labels)} labels for the {len(points)} points of "
                 f"{sample.cloud_path.name}; a mask has a label a point, or rows of x y z label"
             )
-        return Cloud(points, labels)
+        return SampleCloud(points, labels)
     rows, labels = read_truth(sample.truth_path)
-    return Cloud(points, match_labels(points, rows, labels, DECIMALS, sample.truth_path))
+    return SampleCloud(points, match_labels(points, rows, labels, DECIMALS, sample.truth_path))
 
 
 def _columns(path: Path) -> int:

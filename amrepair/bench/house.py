@@ -23,6 +23,7 @@ from amrepair.align.thinning import order_of
 from amrepair.bench.bodies import pieces_of, surface_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
+from amrepair.bench.options import USUAL_HOUSE
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge import fit_from_scans
@@ -45,23 +46,6 @@ if TYPE_CHECKING:
     import trimesh
 
 _log = logging.getLogger(__name__)
-
-# Near context removes noise, wide context carries a defect to those of its points that the
-# defect moved along the surface (bends) or hardly at all (rims).
-NEAR_NEIGHBOURS = 12
-WIDE_PASSES = 5  # means of means: as far as 64 neighbours, found in a quarter of the time
-WIDE_WEIGHT = 0.5
-LEAST_SET_SIGMA_MM = 0.001 * DIAGONAL_MM
-# Farther out than this share of the part nothing more is learned: clutter must not set the score.
-MAX_OFFSET_RATIO = 0.15
-REPAIR_POINTS = 16_384
-SURFACE_SPACING_MM = 0.3  # of the extracted surface; at 0.5 thin walls are off by 2.5 times as much
-RETRIES = 3
-# So near to the template, of the diagonal, sound clouds lie, or a pose is not told by it; where
-# less of a sample lies so, it is laid wrong, and all of it is asked.
-FOLLOWED_RATIO, LEAST_FOLLOWED = 0.002, 0.5
-# Where the surface fused from clouds lies far off, the second look is from nearer by.
-LEARNING_ROUNDS = 2
 
 
 def class_template(
@@ -104,7 +88,7 @@ def _from_clouds(data: ClassInput, seed: int) -> GridSdf:
         for cloud, pose in zip(data.clouds_mm, made.poses, strict=True)
         if pose is not None
     ]
-    for _ in range(LEARNING_ROUNDS):
+    for _ in range(USUAL_HOUSE.learning_rounds):
         template, _ = learn(template, placed)
     return template
 
@@ -118,17 +102,17 @@ def _laid(
 ) -> list[Float[np.ndarray, "4 4"]]:
     """Poses of points in the template, the best first; a failed alignment is tried again."""
     scan = Scan(points_mm, sigma_mm, "scanner", source="sample")
-    for attempt in range(RETRIES):
+    for attempt in range(USUAL_HOUSE.retries):
         try:
             found = align(scan, template, part_is_known=True, rng=rng)
         except AlignmentError as error:
-            if attempt == RETRIES - 1:
+            if attempt == USUAL_HOUSE.retries - 1:
                 raise
             _log.info("alignment failed (%s); trying again", error)
         else:
             poses = (found.template_from_scan, *found.symmetric_alternatives)
             return [pose.matrix for pose in poses]
-    raise AlignmentError("no alignment was tried")  # RETRIES is at least one
+    raise AlignmentError("no alignment was tried")  # USUAL_HOUSE.retries is at least one
 
 
 def repair_distance(
@@ -142,12 +126,12 @@ def repair_distance(
     """
     if data.mesh is None:
         return None
-    made = extract_mesh(template, SURFACE_SPACING_MM)
+    made = extract_mesh(template, USUAL_HOUSE.surface_spacing_mm)
     first, second = (
         sample_surface(
             np.asarray(mesh.vertices),
             np.asarray(mesh.faces),
-            count=REPAIR_POINTS,
+            count=USUAL_HOUSE.repair_points,
             offset=float(rng.random()),
         )[0]
         for mesh in (made, data.mesh)
@@ -175,19 +159,19 @@ def smoothed_score(
 
     In standard deviations `sigma_mm` of what sound parts leave there.
     """
-    limit_mm = MAX_OFFSET_RATIO * float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    limit_mm = USUAL_HOUSE.most_offset_ratio * float(np.linalg.norm(np.ptp(points_mm, axis=0)))
     order = order_of(points_mm)  # near points in a row are found sooner
     points = points_mm[order]
     offset = (np.clip(offset_mm, -limit_mm, limit_mm) / sigma_mm)[order]
-    count = min(NEAR_NEIGHBOURS, len(points))
+    count = min(USUAL_HOUSE.near_neighbours, len(points))
     tree = cKDTree(points, balanced_tree=False)
     index = tree.query(points, k=[*range(1, count + 1)], workers=-1)[1]
     near = np.abs(offset[index].mean(axis=1))
     wide = near
-    for _ in range(WIDE_PASSES):
+    for _ in range(USUAL_HOUSE.wide_passes):
         wide = wide[index].mean(axis=1)
     score = np.empty(len(points))
-    score[order] = near + WIDE_WEIGHT * wide
+    score[order] = near + USUAL_HOUSE.wide_weight * wide
     return score
 
 
@@ -209,17 +193,18 @@ class FieldModel:
             return Scores(np.zeros(len(points_mm)), np.inf, None, aligned=False)
         placed = moved(points_mm, known[0])
         seen = self.sound.look(placed)
-        followed = seen.followed(FOLLOWED_RATIO * DIAGONAL_MM)
-        some = points_mm[followed] if followed.mean() > LEAST_FOLLOWED else points_mm
+        followed = seen.followed(USUAL_HOUSE.followed_ratio * DIAGONAL_MM)
+        some = points_mm[followed] if followed.mean() > USUAL_HOUSE.least_followed else points_mm
         pieces = pieces_of(some, self.template, known, self.sigma_mm, rng, self.surface_mm)
         if not np.array_equal(pieces.pose, known[0]):
             placed = moved(points_mm, pieces.pose)
             seen = self.sound.look(placed)
         judged = self.sound.judge(placed, seen)
         # Published clouds may have no noise at all; the unit does not matter then.
-        sigma_mm = np.maximum(judged.sigma_mm, LEAST_SET_SIGMA_MM)
+        least_mm = USUAL_HOUSE.least_sigma_ratio * DIAGONAL_MM
+        sigma_mm = np.maximum(judged.sigma_mm, least_mm)
         score = smoothed_score(placed, judged.off_mm, sigma_mm)
-        aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, LEAST_SET_SIGMA_MM)
+        aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, least_mm)
         return Scores(score + aside, -judged.log_expected, np.abs(seen.f_mm))
 
 

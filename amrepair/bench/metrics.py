@@ -130,7 +130,6 @@ def cloud_distance(
     second: Float[np.ndarray, "m 3"],
     *,
     rng: np.random.Generator,
-    emd_points: int = EMD_POINTS,
 ) -> CloudDistance:
     """Chamfer on all points, earth mover's distance on a random subset of equal size."""
     if len(first) == 0 or len(second) == 0:
@@ -140,7 +139,7 @@ def cloud_distance(
     return CloudDistance(
         chamfer=float(forth.mean() + back.mean()),
         chamfer_squared=float((forth**2).mean() + (back**2).mean()),
-        emd=earth_movers_distance(first, second, rng=rng, points=emd_points),
+        emd=earth_movers_distance(first, second, rng=rng),
     )
 
 

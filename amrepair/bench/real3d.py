@@ -15,16 +15,16 @@ from pathlib import Path
 from amrepair.bench.samples import (
     GOOD,
     BenchClass,
-    Cloud,
     Sample,
+    SampleCloud,
     class_folders,
     defect_word,
     read_points,
     read_truth,
     without_labels,
 )
-from amrepair.errors import InputError
-from amrepair.scans.pcd import count_of_pcd
+from amrepair.errors import InputError, refused_as_ours
+from gcode.clouds.pcd import count_of_pcd
 
 REAL3D_DEFECTS = ("bulge", "sink", "concavity", "hole", "break", "bend", "crack")
 REAL3D_TRUTH_FOLDERS = ("gt", "GT")
@@ -66,7 +66,7 @@ def _sample(class_name: str, path: Path, truth: Path) -> Sample:
     )
 
 
-def load(sample: Sample) -> Cloud:
+def load(sample: Sample) -> SampleCloud:
     """Of anomalous samples geometry and labels from the txt alone, unless that is only a piece.
 
     Raises
@@ -78,10 +78,11 @@ def load(sample: Sample) -> Cloud:
     if truth_path is None:
         return without_labels(read_points(sample.cloud_path))
     points, labels = read_truth(truth_path)
-    count = count_of_pcd(sample.cloud_path)
+    with refused_as_ours():
+        count = count_of_pcd(sample.cloud_path)
     if not LEAST_OF_CLOUD * count <= len(points) <= count / LEAST_OF_CLOUD:
         raise InputError(
             f"{truth_path}: {len(points)} rows of truth for the {count} points of "
             f"{sample.cloud_path.name}; it is cut short or of another cloud: copy it again"
         )
-    return Cloud(points, labels)
+    return SampleCloud(points, labels)

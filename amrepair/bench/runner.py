@@ -21,7 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from amrepair.bench.cells import Cell, Row, run_cell
+from amrepair.bench.cells import Cell, ScoreRow, run_cell
 from amrepair.bench.dataset import open_dataset
 from amrepair.bench.paper import BENCH_PAPER
 from amrepair.bench.registry import BENCH_METHODS, PAPER_METHOD, make_method
@@ -52,7 +52,7 @@ class BenchReport:
         The files written.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[ScoreRow, ...]
     json_path: Path
     csv_path: Path
     markdown_path: Path
@@ -117,7 +117,7 @@ def run_bench(
         for method in names
         for seed in dict.fromkeys(seeds)
     ]
-    rows: list[Row] = []
+    rows: list[ScoreRow] = []
     for row in _work(cells, jobs, progress):
         rows.append(row)
         report = _write(out, chosen, rows, len(cells), paper)
@@ -170,7 +170,7 @@ def _claim(out: Path, data: BenchData, paper: PaperOptions | None) -> None:
     write_bytes(path, json.dumps(said).encode(), durable=True)
 
 
-def _work(cells: Sequence[Cell], jobs: int, progress: Progress) -> Iterator[Row]:
+def _work(cells: Sequence[Cell], jobs: int, progress: Progress) -> Iterator[ScoreRow]:
     if jobs == 1:
         for cell in cells:
             yield run_cell(cell, progress)
@@ -202,7 +202,7 @@ def _begin_worker(count: int) -> None:
 
 
 def _write(
-    out: Path, data: BenchData, rows: Sequence[Row], cells: int, paper: PaperOptions
+    out: Path, data: BenchData, rows: Sequence[ScoreRow], cells: int, paper: PaperOptions
 ) -> BenchReport:
     ordered = sorted(rows, key=lambda r: (BENCH_METHODS.index(r.method), r.class_name, r.seed))
     synthetic = (data.root / MANIFEST).is_file()

@@ -32,7 +32,7 @@ class Format(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Cloud:
+class SampleCloud:
     """A test cloud with its truth.
 
     Attributes
@@ -79,14 +79,14 @@ class Sample:
     kind: str
     cloud_path: Path
     truth_path: Path | None
-    read: Callable[[Sample], Cloud]
+    read: Callable[[Sample], SampleCloud]
 
     @property
     def anomalous(self) -> bool:
         """Whether the sample as a whole has a defect."""
         return self.kind != GOOD
 
-    def load(self) -> Cloud:
+    def load(self) -> SampleCloud:
         """Points and labels.
 
         Raises
@@ -102,9 +102,9 @@ def read_points(path: Path) -> Points:
     return np.asarray(read_scan(path, frame="scanner").points_mm)
 
 
-def without_labels(points: Points, label: int = 0) -> Cloud:
+def without_labels(points: Points, label: int = 0) -> SampleCloud:
     """A cloud all of whose points have one label; 0 is normal."""
-    return Cloud(points, np.full(len(points), label, np.int64))
+    return SampleCloud(points, np.full(len(points), label, np.int64))
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 from amrepair.bench.samples import (
     GOOD,
     BenchClass,
-    Cloud,
     Sample,
+    SampleCloud,
     class_folders,
     defect_word,
     read_points,
@@ -114,14 +114,14 @@ def _truth_path(truth: Path, class_name: str, stem: str) -> Path:
     return loose if loose.is_file() and not exact.is_file() else exact
 
 
-def load(sample: Sample) -> Cloud:
+def load(sample: Sample) -> SampleCloud:
     """Geometry from the cloud, labels from the truth by coordinates."""
     points = read_points(sample.cloud_path)
     if sample.truth_path is None:
         return without_labels(points)
     rows, labels = read_truth(sample.truth_path)
     decimals = 7 if "vase" in sample.name else 6
-    return Cloud(points, match_labels(points, rows, labels, decimals, sample.truth_path))
+    return SampleCloud(points, match_labels(points, rows, labels, decimals, sample.truth_path))
 
 
 def match_labels(

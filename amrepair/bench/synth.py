@@ -17,12 +17,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.bench.samples import Cloud, Format
-from amrepair.bench.synth_defects import BULGE_RATIO, Defect, Part, Size, damage, make_part
+from amrepair.bench.options import USUAL_LABELS, USUAL_MAKING
+from amrepair.bench.samples import Format, SampleCloud
+from amrepair.bench.synth_defects import Part, Size, SynthDefect, damage, make_part
 from amrepair.bench.synth_views import (
     Rays,
+    SeenSurface,
     Shape,
-    Surface,
     look,
     random_rotation,
     sample_shape,
@@ -35,21 +36,11 @@ from gcode.progress import Progress, silent
 MANIFEST = "synth.json"
 # A desktop structured-light scanner: 0.05 mm on a part of 100 mm.
 SIGMA_RATIO = 5e-4
-# Moved by less than this many σ, a point cannot be told from a normal one.
-VISIBLE_SIGMAS = 2.0
-# A sample counts as anomalous only where the view shows this much of the defect.
-MIN_LABELLED_RATIO = 0.003
-MIN_LABELLED = 8
-# A view of a bent end alone does not show what it is bent against.
-MIN_NORMAL_RATIO = 0.1
-MAX_VIEWS = 40
-MAX_SINGLE_VIEWS = 25  # then the defect is shown in a full scan
-SIDE_POINTS = 4000
-LOOSENESS = 0.6  # of the view's direction about the defect's normal
 SINGLE_VIEW_RATIO = {Format.SHAPENET: 1 / 3, Format.REAL3D: 2 / 3}
 FIRST_NUMBER = 101  # Real3D-AD names start with a running number
-USUAL_RATIO = 2 * BULGE_RATIO[0]  # width of the smallest bulges of the data sets' own size
-REAL3D_WORDS = {Defect.CONCAVITY: "sink"}
+# Width of the smallest bulges of the data sets' own size.
+USUAL_RATIO = 2 * USUAL_MAKING.bulge_ratio[0]
+REAL3D_WORDS = {SynthDefect.CONCAVITY: "sink"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +108,7 @@ class SynthOptions:
 class _Made:
     """One cloud to write."""
 
-    cloud: Cloud
+    cloud: SampleCloud
     role: str  # train or test
     kind: str  # good or a defect
     index: int
@@ -241,7 +232,7 @@ def _make_all(
         rng = np.random.default_rng([*key, 2, i])
         single = _is_single(i, ratio)
         yield _made(part, part.shape, options, rng, kind="good", index=i, single=single)
-    for k, defect in enumerate(Defect):
+    for k, defect in enumerate(SynthDefect):
         for i in range(options.per_defect):
             rng = np.random.default_rng([*key, 3, k, i])
             single = _is_single(k * options.per_defect + i, ratio)
@@ -281,7 +272,7 @@ def _made(
         pose[:3, :3] = random_rotation(rng)
         pose[:3, 3] = rng.uniform(-1, 1, 3) * part.diagonal_mm
     points = surface.points_mm @ pose[:3, :3].T + pose[:3, 3]
-    cloud = Cloud(points, _labels(surface, sigma_mm))
+    cloud = SampleCloud(points, _labels(surface, sigma_mm))
     return _Made(cloud, role, kind, index, single, pose)
 
 
@@ -289,22 +280,22 @@ def _side(shape: Shape, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
     """A direction to look from: any for a normal part, towards the defect for a damaged one."""
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    points = sample_shape(shape, SIDE_POINTS, rng)
+    points = sample_shape(shape, USUAL_LABELS.side_points, rng)
     changed = points.take(points.change_mm > 0)
     if len(changed.points_mm):
         outward = changed.normals.mean(axis=0)
         length = float(np.linalg.norm(outward))
-        direction = outward / max(length, 1e-9) + LOOSENESS * direction
+        direction = outward / max(length, 1e-9) + USUAL_LABELS.looseness * direction
     return direction
 
 
-def _labels(surface: Surface, sigma_mm: float) -> np.ndarray:
-    return (surface.change_mm > VISIBLE_SIGMAS * sigma_mm).astype(np.int64)
+def _labels(surface: SeenSurface, sigma_mm: float) -> np.ndarray:
+    return (surface.change_mm > USUAL_LABELS.visible_sigmas * sigma_mm).astype(np.int64)
 
 
 def _defective(
     part: Part,
-    defect: Defect,
+    defect: SynthDefect,
     options: SynthOptions,
     rng: np.random.Generator,
     *,
@@ -312,7 +303,7 @@ def _defective(
     single: bool,
 ) -> _Made:
     """A defect that the view shows; another place or view is drawn until it does."""
-    for attempt in range(MAX_VIEWS):
+    for attempt in range(USUAL_LABELS.most_views):
         size = options.size(rng)
         shape = damage(part, defect, rng, size)
         made = _made(
@@ -322,17 +313,20 @@ def _defective(
             rng,
             kind=str(defect),
             index=index,
-            single=single and attempt < MAX_SINGLE_VIEWS,
+            single=single and attempt < USUAL_LABELS.most_single_views,
         )
         labels = made.cloud.labels
         # The share that a view must show falls with the defect's surface.
-        need = max(MIN_LABELLED, MIN_LABELLED_RATIO * size.scale**2 * len(labels))
-        if labels.sum() >= need and 1.0 - labels.mean() >= MIN_NORMAL_RATIO:
+        need = max(
+            USUAL_LABELS.least_labelled,
+            USUAL_LABELS.least_labelled_ratio * size.scale**2 * len(labels),
+        )
+        if labels.sum() >= need and 1.0 - labels.mean() >= USUAL_LABELS.least_normal_ratio:
             return made
     raise InputError(
-        f"no view of a {defect} on this part showed {MIN_LABELLED_RATIO:.1%} of its points and "
-        f"{MIN_NORMAL_RATIO:.0%} beside it in {MAX_VIEWS} tries; ask for more points or leave the "
-        "part out"
+        f"no view of a {defect} on this part showed {USUAL_LABELS.least_labelled_ratio:.1%} of "
+        f"its points and {USUAL_LABELS.least_normal_ratio:.0%} beside it in "
+        f"{USUAL_LABELS.most_views} tries; ask for more points or leave the part out"
     )
 
 
@@ -347,7 +341,7 @@ def _write_cloud(
         _write_pcd_ascii(folder / made.role / f"{stem}.pcd", made.cloud.points)
         if word not in {"template", "good"}:
             order = rng.permutation(len(made.cloud.points))  # as in the published files
-            shuffled = Cloud(made.cloud.points[order], made.cloud.labels[order])
+            shuffled = SampleCloud(made.cloud.points[order], made.cloud.labels[order])
             _write_truth(folder / "GT" / f"{stem}.txt", shuffled, ",")
         return stem
     folder = out / name
@@ -355,8 +349,10 @@ def _write_cloud(
     if made.role == "train":
         stem = f"{number}_template"
     else:
-        kinds = ["good", *Defect]
-        word = REAL3D_WORDS.get(Defect(made.kind), made.kind) if made.kind != "good" else "good"
+        kinds = ["good", *SynthDefect]
+        word = (
+            REAL3D_WORDS.get(SynthDefect(made.kind), made.kind) if made.kind != "good" else "good"
+        )
         stem = f"{number + 100 * kinds.index(made.kind)}_{word}{'_cut' if made.single else ''}"
     _write_pcd_binary(folder / made.role / f"{stem}.pcd", made.cloud.points)
     if made.role == "test" and made.kind != "good":
@@ -385,7 +381,7 @@ def _write_pcd_binary(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
     path.write_bytes(head + points.astype("<f4").tobytes())
 
 
-def _write_truth(path: Path, cloud: Cloud, separator: str) -> None:
+def _write_truth(path: Path, cloud: SampleCloud, separator: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = np.concatenate([cloud.points, cloud.labels[:, None]], axis=1)
     with path.open("w", encoding="ascii", newline="\n") as stream:

@@ -17,27 +17,17 @@ import manifold3d as m3
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.bench.synth_views import Rays, Shape, Surface, sample_shape, sensors_around
+from amrepair.bench.options import USUAL_MAKING
+from amrepair.bench.synth_views import Rays, SeenSurface, Shape, sample_shape, sensors_around
 from amrepair.errors import InputError
-from amrepair.template.mesh_file import manifold_arrays
+from gcode.meshes import mesh_of
 from gcode.solids import as_manifold, is_valid
 
 # The face of a tool: a change without measure, above every limit of visibility.
 NEW_SURFACE_MM = 1e9
-SEED_POINTS = 400
-BEND_POINTS = 4_000
-MAX_ATTEMPTS = 30
-# Less material than this part of the diagonal under a seed is too thin to dent or crack.
-MIN_THICKNESS_RATIO = 0.008
-# A defect that moves less than this part of the diagonal, 3σ of the default noise twice over.
-MIN_DEPTH_RATIO = 0.004
-ROUGHNESS_WAVES = 6
-SPLINTER_RATIO = 0.01
-# A smooth defect's surface is divided into so many edges a radius; smaller ones are made no finer.
-SMOOTH_EDGES, LEAST_SMOOTH_RATIO = 5.0, 0.02
 
 
-class Defect(StrEnum):
+class SynthDefect(StrEnum):
     """Words as in Anomaly-ShapeNet."""
 
     BULGE = "bulge"
@@ -63,7 +53,7 @@ class Part:
 
     solid: Any  # manifold3d.Manifold, marked as original
     shape: Shape
-    seeds: Surface
+    seeds: SeenSurface
     thickness_mm: Float[np.ndarray, " n"]
 
     @property
@@ -79,7 +69,7 @@ def make_part(
     solid = as_manifold(vertices_mm, faces).as_original()
     shape = Shape(vertices_mm, faces, np.zeros((len(faces), 3)))
     rays = Rays(shape)
-    points = sample_shape(shape, SEED_POINTS, rng)
+    points = sample_shape(shape, USUAL_MAKING.seed_points, rng)
     seen = points.take(rays.seen(points, sensors_around(shape)))
     if len(seen.points_mm) == 0:
         raise InputError("no point of the part can be seen from outside; is it inside out?")
@@ -103,10 +93,9 @@ class Size:
 
 
 USUAL = Size()
-BULGE_RATIO = (0.04, 0.08)  # radius of bulges and concavities, of the part's diagonal
 
 
-def damage(part: Part, defect: Defect, rng: np.random.Generator, size: Size = USUAL) -> Shape:
+def damage(part: Part, defect: SynthDefect, rng: np.random.Generator, size: Size = USUAL) -> Shape:
     """The part with one defect.
 
     Raises
@@ -115,14 +104,14 @@ def damage(part: Part, defect: Defect, rng: np.random.Generator, size: Size = US
         If no place on the part takes this defect.
     """
     make = _MAKERS[defect]
-    for _ in range(MAX_ATTEMPTS):
+    for _ in range(USUAL_MAKING.attempts):
         i = int(rng.integers(len(part.thickness_mm)))
         seed = Seed(part.seeds.points_mm[i], part.seeds.normals[i], float(part.thickness_mm[i]))
         shape = make(part, seed, rng, size)
         if shape is not None and (shape.change_mm > 0).any():
             return shape
     raise InputError(
-        f"no place for a {defect} was found on the part in {MAX_ATTEMPTS} tries; "
+        f"no place for a {defect} was found on the part in {USUAL_MAKING.attempts} tries; "
         "it may be too thin: leave the part out"
     )
 
@@ -136,8 +125,8 @@ def _frame(seed: Seed, rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
 
 def _waves(rng: np.random.Generator, frequency: float) -> Callable[[np.ndarray], np.ndarray]:
     """A smooth random function of (n, 3) points, about −1…1: a few plane waves."""
-    k = frequency * rng.normal(size=(ROUGHNESS_WAVES, 3))
-    phase = rng.uniform(0, 2 * np.pi, ROUGHNESS_WAVES)
+    k = frequency * rng.normal(size=(USUAL_MAKING.waves, 3))
+    phase = rng.uniform(0, 2 * np.pi, USUAL_MAKING.waves)
     return lambda x: np.sin(x @ k.T + phase).mean(axis=1) * 2.0
 
 
@@ -154,7 +143,7 @@ def _result(part: Part, solid: Any) -> Shape | None:
     if not is_valid(solid):
         return None
     mesh = solid.to_mesh64()
-    vertices, faces = manifold_arrays(solid)
+    vertices, faces = mesh_of(solid)
     runs = np.asarray(mesh.run_index, dtype=np.int64) // 3
     origin = np.repeat(np.asarray(mesh.run_original_id), np.diff(runs))
     new = origin != part.solid.original_id()
@@ -163,11 +152,11 @@ def _result(part: Part, solid: Any) -> Shape | None:
 
 
 def _bulge(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
-    radius_mm = size.scale * rng.uniform(*BULGE_RATIO) * part.diagonal_mm
+    radius_mm = size.scale * rng.uniform(*USUAL_MAKING.bulge_ratio) * part.diagonal_mm
     height_mm = rng.uniform(0.35, 0.7) * radius_mm
     if size.smooth:
         return _swelling(part, seed, radius_mm, height_mm)
-    if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
+    if seed.thickness_mm < USUAL_MAKING.least_thickness_ratio * part.diagonal_mm:
         return None
     # The lump's lower half stays inside the material, or the far side would bulge, too.
     floor_mm = min(height_mm, 0.9 * seed.thickness_mm)
@@ -176,9 +165,9 @@ def _bulge(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shap
 
 
 def _concavity(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
-    radius_mm = size.scale * rng.uniform(*BULGE_RATIO) * part.diagonal_mm
+    radius_mm = size.scale * rng.uniform(*USUAL_MAKING.bulge_ratio) * part.diagonal_mm
     depth_mm = min(rng.uniform(0.35, 0.7) * radius_mm, 0.6 * seed.thickness_mm)
-    if depth_mm < MIN_DEPTH_RATIO * part.diagonal_mm:
+    if depth_mm < USUAL_MAKING.least_depth_ratio * part.diagonal_mm:
         return None
     if size.smooth:
         return _swelling(part, seed, radius_mm, -depth_mm)
@@ -191,8 +180,11 @@ def _swelling(part: Part, seed: Seed, radius_mm: float, height_mm: float) -> Sha
 
     What faces away from the normal stays: the far side of a wall is none of the bump.
     """
-    edge_mm = max(radius_mm, LEAST_SMOOTH_RATIO * part.diagonal_mm) / SMOOTH_EDGES
-    vertices, faces = manifold_arrays(part.solid.refine_to_length(edge_mm))
+    edge_mm = (
+        max(radius_mm, USUAL_MAKING.least_smooth_ratio * part.diagonal_mm)
+        / USUAL_MAKING.smooth_edges
+    )
+    vertices, faces = mesh_of(part.solid.refine_to_length(edge_mm))
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = np.zeros((len(vertices), 3))
@@ -209,7 +201,7 @@ def _swelling(part: Part, seed: Seed, radius_mm: float, height_mm: float) -> Sha
 
 def _hole(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     radius_mm = size.scale * rng.uniform(0.02, 0.045) * part.diagonal_mm
-    if seed.thickness_mm < MIN_THICKNESS_RATIO * part.diagonal_mm:
+    if seed.thickness_mm < USUAL_MAKING.least_thickness_ratio * part.diagonal_mm:
         return None
     # The hole goes through thin walls and is blind in thick ones.
     depth_mm = min(1.1 * seed.thickness_mm, 0.12 * part.diagonal_mm)
@@ -226,7 +218,7 @@ def _hole(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
 def _crack(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     diagonal_mm = part.diagonal_mm
     depth_mm = min(size.scale * rng.uniform(0.03, 0.06) * diagonal_mm, 0.7 * seed.thickness_mm)
-    if depth_mm < MIN_DEPTH_RATIO * diagonal_mm:
+    if depth_mm < USUAL_MAKING.least_depth_ratio * diagonal_mm:
         return None
     length_mm = size.scale * rng.uniform(0.12, 0.25) * diagonal_mm
     width_mm = size.scale * rng.uniform(0.012, 0.02) * diagonal_mm
@@ -276,7 +268,9 @@ def _break(part: Part, _seed: Seed, rng: np.random.Generator, size: Size) -> Sha
     if not is_valid(left):
         return None
     # Splinters are dropped; whole bodies of a part in several pieces stay.
-    kept = [body for body in left.decompose() if body.volume() > SPLINTER_RATIO * volume]
+    kept = [
+        body for body in left.decompose() if body.volume() > USUAL_MAKING.splinter_ratio * volume
+    ]
     return _result(part, m3.Manifold.compose(kept)) if kept else None
 
 
@@ -284,9 +278,9 @@ def _bend(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
     """The smaller end is bent about an axis across the part's longest direction."""
     diagonal_mm = part.diagonal_mm
     fine = part.solid.refine_to_length(diagonal_mm / 60)
-    vertices, faces = manifold_arrays(fine)
+    vertices, faces = mesh_of(fine)
     # Shares are of the surface and not of vertices, which crowd where the mesh is fine.
-    surface = sample_shape(part.shape, BEND_POINTS, rng).points_mm
+    surface = sample_shape(part.shape, USUAL_MAKING.bend_points, rng).points_mm
     middle = surface.mean(axis=0)
     axes = np.linalg.svd((surface - middle).T @ (surface - middle))[0]
     along = axes[:, 0] * (1 if rng.random() < 0.5 else -1)
@@ -309,11 +303,11 @@ def _bend(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
     return Shape(vertices + shift, faces, change[faces])
 
 
-_MAKERS: dict[Defect, Callable[[Part, Seed, np.random.Generator, Size], Shape | None]] = {
-    Defect.BULGE: _bulge,
-    Defect.CONCAVITY: _concavity,
-    Defect.HOLE: _hole,
-    Defect.BREAK: _break,
-    Defect.BEND: _bend,
-    Defect.CRACK: _crack,
+_MAKERS: dict[SynthDefect, Callable[[Part, Seed, np.random.Generator, Size], Shape | None]] = {
+    SynthDefect.BULGE: _bulge,
+    SynthDefect.CONCAVITY: _concavity,
+    SynthDefect.HOLE: _hole,
+    SynthDefect.BREAK: _break,
+    SynthDefect.BEND: _bend,
+    SynthDefect.CRACK: _crack,
 }

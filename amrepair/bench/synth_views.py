@@ -13,19 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from amrepair.bench.options import USUAL_VIEWING
 from amrepair.device import open3d
 from amrepair.errors import InputError
+from amrepair.frames import spread_directions
 from amrepair.template.surface import triangle_areas_normals
-
-# A full scan: this many viewpoints on a sphere leave only true cavities unseen.
-FULL_SENSORS = 32
-# Beyond this angle of incidence structured light returns nothing.
-MAX_INCIDENCE_COS = float(np.cos(np.deg2rad(80.0)))
-SENSOR_DISTANCE_RATIO = 4.0
-CANDIDATES_PER_POINT = 4
-# Ends of the part differ in density by up to e^1.5, about 4.5 times.
-MAX_DENSITY_LOG = 1.5
-MAX_ROUNDS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,16 +43,16 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class SeenSurface:
     """Points on a shape: (n, 3) points, (n, 3) outward normals, (n,) change."""
 
     points_mm: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     change_mm: Float[np.ndarray, " n"]
 
-    def take(self, chosen: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"]) -> Surface:
+    def take(self, chosen: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"]) -> SeenSurface:
         """Some of the points."""
-        return Surface(self.points_mm[chosen], self.normals[chosen], self.change_mm[chosen])
+        return SeenSurface(self.points_mm[chosen], self.normals[chosen], self.change_mm[chosen])
 
 
 class Rays:
@@ -79,14 +71,14 @@ class Rays:
     def _pack(self, origins: np.ndarray, directions: np.ndarray) -> Any:
         return self._tensor(np.concatenate([origins, directions], axis=1).astype(np.float32))
 
-    def thickness_mm(self, surface: Surface) -> Float[np.ndarray, " n"]:
+    def thickness_mm(self, surface: SeenSurface) -> Float[np.ndarray, " n"]:
         """(n,) how far the material goes straight below each point."""
         start = surface.points_mm - self._lift_mm * surface.normals
         hit = self._scene.cast_rays(self._pack(start, -surface.normals))["t_hit"].numpy()
         return hit.astype(np.float64) + self._lift_mm
 
     def seen(
-        self, surface: Surface, sensors_mm: Float[np.ndarray, "k 3"]
+        self, surface: SeenSurface, sensors_mm: Float[np.ndarray, "k 3"]
     ) -> Bool[np.ndarray, " n"]:
         """(n,) whether any sensor sees the point."""
         found = np.zeros(len(surface.points_mm), dtype=bool)
@@ -94,7 +86,8 @@ class Rays:
         for sensor in sensors_mm:
             to_sensor = sensor - start
             distance = np.linalg.norm(to_sensor, axis=1)
-            facing = (to_sensor * surface.normals).sum(axis=1) > MAX_INCIDENCE_COS * distance
+            least_cosine = np.cos(np.deg2rad(USUAL_VIEWING.most_incidence_deg))
+            facing = (to_sensor * surface.normals).sum(axis=1) > least_cosine * distance
             ask = np.flatnonzero(facing & ~found)
             if len(ask):
                 rays = self._pack(start[ask], to_sensor[ask] / distance[ask, None])
@@ -102,7 +95,7 @@ class Rays:
         return found
 
 
-def sample_shape(shape: Shape, count: int, rng: np.random.Generator) -> Surface:
+def sample_shape(shape: Shape, count: int, rng: np.random.Generator) -> SeenSurface:
     """Random points, evenly by area."""
     areas, normals = triangle_areas_normals(shape.vertices_mm, shape.faces)
     cumulative = np.cumsum(areas)
@@ -111,27 +104,23 @@ def sample_shape(shape: Shape, count: int, rng: np.random.Generator) -> Surface:
     root, along = np.sqrt(rng.random(count)), rng.random(count)
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
     corners = shape.vertices_mm[shape.faces[face]]
-    return Surface(
+    return SeenSurface(
         points_mm=np.einsum("nk,nkd->nd", weights, corners),
         normals=normals[face],
         change_mm=(weights * shape.change_mm[face]).sum(axis=1),
     )
 
 
-def sensors_around(shape: Shape, count: int = FULL_SENSORS) -> Float[np.ndarray, "k 3"]:
+def sensors_around(shape: Shape, count: int = USUAL_VIEWING.sensors) -> Float[np.ndarray, "k 3"]:
     """(k, 3) sensors on a Fibonacci sphere about the part."""
-    index = np.arange(count) + 0.5
-    z = 1 - 2 * index / count
-    turn = np.pi * (1 + 5**0.5) * index
-    flat = np.sqrt(1 - z**2)
-    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
-    return _centre(shape) + SENSOR_DISTANCE_RATIO * shape.diagonal_mm * directions
+    ways = spread_directions(count)
+    return _centre(shape) + USUAL_VIEWING.distance_ratio * shape.diagonal_mm * ways
 
 
 def sensor_towards(shape: Shape, direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "1 3"]:
     """(1, 3) one sensor in that direction from the part's centre."""
     unit = direction / np.linalg.norm(direction)
-    return (_centre(shape) + SENSOR_DISTANCE_RATIO * shape.diagonal_mm * unit)[None, :]
+    return (_centre(shape) + USUAL_VIEWING.distance_ratio * shape.diagonal_mm * unit)[None, :]
 
 
 def _centre(shape: Shape) -> Float[np.ndarray, " 3"]:
@@ -147,7 +136,7 @@ def look(
     count: int,
     sigma_mm: float,
     rng: np.random.Generator,
-) -> Surface:
+) -> SeenSurface:
     """`count` visible points of uneven density, with isotropic noise.
 
     Raises
@@ -156,14 +145,16 @@ def look(
         If the sensors see next to nothing.
     """
     gradient = rng.normal(size=3)
-    gradient *= rng.uniform(0, MAX_DENSITY_LOG) / np.linalg.norm(gradient) / shape.diagonal_mm
-    seen: list[Surface] = []
-    for _ in range(MAX_ROUNDS):
-        candidates = sample_shape(shape, CANDIDATES_PER_POINT * count, rng)
+    gradient *= (
+        rng.uniform(0, USUAL_VIEWING.density_log) / np.linalg.norm(gradient) / shape.diagonal_mm
+    )
+    seen: list[SeenSurface] = []
+    for _ in range(USUAL_VIEWING.rounds):
+        candidates = sample_shape(shape, USUAL_VIEWING.candidates * count, rng)
         seen.append(candidates.take(rays.seen(candidates, sensors_mm)))
         if sum(len(part.points_mm) for part in seen) >= 2 * count:
             break
-    pool = Surface(
+    pool = SeenSurface(
         np.concatenate([part.points_mm for part in seen]),
         np.concatenate([part.normals for part in seen]),
         np.concatenate([part.change_mm for part in seen]),
@@ -177,7 +168,7 @@ def look(
     keys = log_weight + rng.gumbel(size=len(log_weight))
     chosen = pool.take(rng.permutation(np.argpartition(-keys, count - 1)[:count]))
     noisy = chosen.points_mm + rng.normal(0.0, sigma_mm, chosen.points_mm.shape)
-    return Surface(noisy, chosen.normals, chosen.change_mm)
+    return SeenSurface(noisy, chosen.normals, chosen.change_mm)
 
 
 def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:

@@ -15,7 +15,7 @@ from dataclasses import asdict, fields
 
 import numpy as np
 
-from amrepair.bench.cells import Row
+from amrepair.bench.cells import ScoreRow
 from amrepair.bench.metrics import mean_and_spread
 from amrepair.bench.registry import PAPER_METHOD, PUBLISHED, PUBLISHED_REPAIR
 from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions
@@ -33,12 +33,12 @@ FIGURES = (
 )
 
 
-def _value(row: Row, figure: str) -> float:
+def _value(row: ScoreRow, figure: str) -> float:
     found = getattr(row, figure)
     return math.nan if found is None else float(found)
 
 
-def summary(rows: Sequence[Row], method: str) -> dict[str, tuple[float, float]]:
+def summary(rows: Sequence[ScoreRow], method: str) -> dict[str, tuple[float, float]]:
     """Figure → (mean, spread): mean over classes for each seed, then over seeds."""
     own = [row for row in rows if row.method == method]
     seeds = sorted({row.seed for row in own})
@@ -52,7 +52,7 @@ def summary(rows: Sequence[Row], method: str) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _methods(rows: Sequence[Row]) -> list[str]:
+def _methods(rows: Sequence[ScoreRow]) -> list[str]:
     return list(dict.fromkeys(row.method for row in rows))
 
 
@@ -72,7 +72,7 @@ def recipe_note(paper: PaperOptions) -> str:
 
 
 def as_json(
-    rows: Sequence[Row],
+    rows: Sequence[ScoreRow],
     format: str,
     *,
     synthetic: bool,
@@ -118,7 +118,7 @@ def as_json(
     return json.dumps(said, indent=1) + "\n"
 
 
-def _renamed(row: Row) -> dict[str, object]:
+def _renamed(row: ScoreRow) -> dict[str, object]:
     said = asdict(row)
     return {("class" if name == "class_name" else name): value for name, value in said.items()}
 
@@ -127,15 +127,15 @@ def _share(percent: float | None) -> float | None:
     return None if percent is None else round(percent / 100, 6)
 
 
-def _total(rows: Sequence[Row]) -> int | None:
+def _total(rows: Sequence[ScoreRow]) -> int | None:
     known = [row.badly_aligned for row in rows if row.badly_aligned is not None]
     return sum(known) if known else None
 
 
-def as_csv(rows: Sequence[Row]) -> str:
+def as_csv(rows: Sequence[ScoreRow]) -> str:
     """One line for each method, class and seed."""
     stream = io.StringIO()
-    names = ["class" if field.name == "class_name" else field.name for field in fields(Row)]
+    names = ["class" if field.name == "class_name" else field.name for field in fields(ScoreRow)]
     writer = csv.DictWriter(stream, names, lineterminator="\n")
     writer.writeheader()
     for row in rows:
@@ -158,7 +158,7 @@ def _published(format: str, method: str) -> str:
     return " / ".join("–" if value is None else f"{value:.1f}" for value in pair)
 
 
-def in_short(rows: Sequence[Row]) -> str:
+def in_short(rows: Sequence[ScoreRow]) -> str:
     """A line for each method: what one wants to know first."""
     lines = []
     for method in _methods(rows):
@@ -174,7 +174,7 @@ def in_short(rows: Sequence[Row]) -> str:
 
 
 def as_markdown(
-    rows: Sequence[Row],
+    rows: Sequence[ScoreRow],
     format: str,
     *,
     synthetic: bool,
@@ -241,7 +241,7 @@ def as_markdown(
     return "\n".join(lines) + "\n"
 
 
-def _pair(rows: Sequence[Row], class_name: str, method: str) -> str:
+def _pair(rows: Sequence[ScoreRow], class_name: str, method: str) -> str:
     own = [row for row in rows if row.method == method and row.class_name == class_name]
     if not own:
         return "–"

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from amrepair.cli.live import VIEW_PORT, HostOption, PortOption, TokenOption, ViewOption
+from amrepair.cli.live import (
+    VIEW_PORT,
+    HostOption,
+    PortOption,
+    TokenOption,
+    ViewOption,
+    ViewPlace,
+)
 from amrepair.cli.options import (
     SCAN_TIMEOUT_S,
     ProcessOption,
@@ -32,21 +39,14 @@ if TYPE_CHECKING:
     from gcode.hosts.web import Address
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "agent",
-        epilog=console.examples(
-            "amrepair agent --macros amrepair.cfg",
-            "amrepair agent --moonraker http://127.0.0.1:7125 --template part.stl "
-            "--scanner watch:scans",
-            "amrepair agent --octoprint http://octopi.local --api-key-file octoprint.key "
-            "--template parts --scanner watch:scans",
-            "amrepair agent --unit amrepair-agent.service",
-        ),
-    )(agent)
-
-
+@console.command(
+    "agent",
+    "amrepair agent --macros amrepair.cfg",
+    "amrepair agent --moonraker http://127.0.0.1:7125 --template part.stl --scanner watch:scans",
+    "amrepair agent --octoprint http://octopi.local --api-key-file octoprint.key "
+    "--template parts --scanner watch:scans",
+    "amrepair agent --unit amrepair-agent.service",
+)
 def agent(
     moonraker: Annotated[
         str | None, typer.Option(metavar="URL", help="The printer's Moonraker: http://HOST:PORT.")
@@ -126,14 +126,13 @@ def agent(
             raise InputError(f"{name} is missing; see 'amrepair agent --help'")
     with console.starting():
         from amrepair.cli import serving
-        from amrepair.cli.running import Page
 
     address, key = _server(moonraker, octoprint, api_key_file)
     errors = calibration_named(sound)
     serving.serve(
         serving.Served(
             address, key, Path(str(template)), out, (printer, material, process), calibration,
-            Page(view or octoprint is not None, view_host, view_port, token), once=once,
+            ViewPlace(view or octoprint is not None, view_host, view_port, token), once=once,
             pose_confirmed=pose_confirmed,
             said={
                 "scanner": scanner, "approve": approve, "scan_timeout_s": scan_timeout_s,
@@ -171,9 +170,8 @@ def _hand_out(macros: Path | None, unit: Path | None) -> None:
         if path is None:
             continue
         if str(path) == "-":
-            console.out.print(shipped(name), end="", markup=False, highlight=False, soft_wrap=True)
+            console.out.print(shipped(name), end="", highlight=False, soft_wrap=True)
             continue
         write = partial(Path.write_text, data=shipped(name), encoding="utf-8")
         console.write_whole(path, write)
-        console.errors.print(f"{path} is written; it says at its head where it belongs.",
-                             markup=False)  # fmt: skip
+        console.errors.print(f"{path} is written; it says at its head where it belongs.")

@@ -28,7 +28,7 @@ class Terminal:
         """Show what would be printed, and wait for a word."""
         with self._bars.paused():
             for line in plan_lines(plan):
-                console.errors.print(f"  {line}", markup=False)
+                console.errors.print(f"  {line}")
             return confirmed("Print this repair?")
 
     def to_go_on(self, decision: Decision) -> bool:
@@ -40,11 +40,10 @@ class Terminal:
                     low, high = one.box_mm
                     console.errors.print(
                         f"  {one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
-                        f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}.",
-                        markup=False,
+                        f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}."
                     )
             for way in decision.ways:
-                console.errors.print(f"  {way.told}", markup=False)
+                console.errors.print(f"  {way.told}")
             return confirmed("Go on all the same (no ends the run)?")
 
 
@@ -96,7 +95,7 @@ def confirmed(question: str) -> bool:
     InputError
         If standard input is closed: nobody can answer.
     """
-    console.errors.print(f"{question} [y/N] ", end="", markup=False)
+    console.errors.print(f"{question} [y/N] ", end="")
     try:
         answer = input()
     except EOFError as error:

@@ -71,11 +71,6 @@ FixtureOption = Annotated[
 Judging = tuple[Any, str | None]
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the group."""
-    app.add_typer(batch_app, name="batch")
-
-
 def _run(
     judging: Callable[..., Judging],
     *,
@@ -108,16 +103,15 @@ def _run(
             progress=bars,
         )
     for note in report.notes:
-        console.errors.print(note, markup=False)
+        console.errors.print(note)
     if as_json:
         console.show_json(_result(report, out))
     else:
         console.out.print(
             f"{len(report.rows)} scans: {report.computed} judged now, {report.known} known before, "
-            f"{report.repeated} of the same bytes as another, {report.refused} without figures.",
-            markup=False,
+            f"{report.repeated} of the same bytes as another, {report.refused} without figures."
         )
-        console.out.print(f"Overview: {out.rstrip('/')}/overview.html", markup=False)
+        console.out.print(f"Overview: {out.rstrip('/')}/overview.html")
     if report.refused == len(report.rows):
         raise typer.Exit(InputError.exit_code)
 
@@ -155,9 +149,9 @@ def _command(name: str, *examples: str) -> Callable[[Callable[..., Judging]], Ca
 @_command("align", "amrepair batch align scans --template part.stl --out out/batch")
 def align(*, part_is_known: KnownOption = False, **common: Any) -> Judging:
     """Find where each scan lies in its template."""
-    from amrepair.batch import BatchOptions, Kind
+    from amrepair.batch import BatchKind, BatchOptions
 
-    return BatchOptions(Kind.ALIGN, part_is_known=part_is_known, **common), None
+    return BatchOptions(BatchKind.ALIGN, part_is_known=part_is_known, **common), None
 
 
 @_command(
@@ -171,9 +165,9 @@ def detect(
     *, part_is_known: KnownOption = False, calibration: CalibrationOption = None, **common: Any
 ) -> Judging:
     """Say of each scan what is missing and what is too much."""
-    from amrepair.batch import BatchOptions, Kind
+    from amrepair.batch import BatchKind, BatchOptions
 
-    return BatchOptions(Kind.DETECT, part_is_known=part_is_known, **common), calibration
+    return BatchOptions(BatchKind.DETECT, part_is_known=part_is_known, **common), calibration
 
 
 @_command(
@@ -193,15 +187,15 @@ def repair(
     **common: Any,
 ) -> Judging:
     """Make for each scan the G-code that prints only what is missing."""
-    from amrepair.batch import BatchOptions, Kind
+    from amrepair.batch import BatchKind, BatchOptions
 
     placed = None
     if part_pose is not None:
         x, y, z, turn_deg = (float(value) for value in numbers(part_pose, 4, "--part-pose"))
         placed = (x, y, z, turn_deg)
     options = BatchOptions(
-        Kind.REPAIR, part_pose=placed, on_fixture=on_fixture, printer=printer, material=material,
-        process=process, **common,
+        BatchKind.REPAIR, part_pose=placed, on_fixture=on_fixture, printer=printer,
+        material=material, process=process, **common,
     )  # fmt: skip
     return options, calibration
 

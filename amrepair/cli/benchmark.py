@@ -26,28 +26,13 @@ FormatOption = Annotated[
 WrittenOption = Annotated[str, typer.Option("--format", help="anomaly-shapenet or real3d-ad.")]
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command(
-        "bench",
-        epilog=console.examples(
-            "amrepair bench out/synth --format anomaly-shapenet --method pasdf --out out/bench",
-            "amrepair bench out/synth --format anomaly-shapenet --method pasdf "
-            "--method btf-fpfh --out out/bench --jobs 2",
-            "amrepair bench my-scans --format folder --method pasdf --out out/mine",
-        ),
-    )(bench)
-    app.command(
-        "synth",
-        epilog=console.examples(
-            "amrepair synth examples/parts/knob.stl --format anomaly-shapenet --out out/synth",
-            "amrepair synth one.stl two.stl --format real3d-ad --seed 7 --out out/synth",
-            "amrepair synth part.stl --format anomaly-shapenet --smallest 0.01 --smooth 0.5 "
-            "--out out/hard",
-        ),
-    )(synth)
-
-
+@console.command(
+    "bench",
+    "amrepair bench out/synth --format anomaly-shapenet --method pasdf --out out/bench",
+    "amrepair bench out/synth --format anomaly-shapenet --method pasdf "
+    "--method btf-fpfh --out out/bench --jobs 2",
+    "amrepair bench my-scans --format folder --method pasdf --out out/mine",
+)
 def bench(
     dataset: Annotated[Path, typer.Argument(help="Folder of the data set.")],
     layout: FormatOption,
@@ -89,6 +74,12 @@ def bench(
     console.out.print(f"Results: {report.markdown_path}")
 
 
+@console.command(
+    "synth",
+    "amrepair synth examples/parts/knob.stl --format anomaly-shapenet --out out/synth",
+    "amrepair synth one.stl two.stl --format real3d-ad --seed 7 --out out/synth",
+    "amrepair synth part.stl --format anomaly-shapenet --smallest 0.01 --smooth 0.5 --out out/hard",
+)
 def synth(
     parts: Annotated[list[Path], typer.Argument(help="Meshes; each becomes a class.")],
     out: Annotated[Path, typer.Option(help="Folder of the data set.")],

@@ -10,7 +10,7 @@ import numpy as np
 from amrepair.cli.scanners import Bed, open_scanner
 from amrepair.errors import InputError
 from amrepair.frames import Transform
-from amrepair.loop.calibrate import PoseOptions, calibrate, target_solid, write_calibration
+from amrepair.loop.calibrate import CalibrateOptions, calibrate, target_solid, write_calibration
 from amrepair.scans import Scan, ScanRequest, read_scan
 from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
@@ -60,7 +60,7 @@ def run(
 ) -> None:
     """Find the scanner and write the file."""
     setup = load_setup(*ids)
-    options = PoseOptions()
+    options = CalibrateOptions()
     if max_residual_mm is not None:
         options = replace(options, max_residual_mm=max_residual_mm)
     bars = console.Bars()

@@ -21,20 +21,14 @@ from gcode.cli import console
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "calibrate",
-        epilog=console.examples(
-            "amrepair calibrate --port /dev/ttyACM0 --scanner watch:scans -o calibration.json",
-            "amrepair calibrate --target-gcode target.gcode",
-            "amrepair calibrate --scan target.ply -o calibration.json",
-            "amrepair calibrate --scan layer.ply --job job.gcode --layer 0 --json",
-            "amrepair calibrate --sound a.ply --sound b.ply --template part.stl --name bench",
-        ),
-    )(calibrate_command)
-
-
+@console.command(
+    "calibrate",
+    "amrepair calibrate --port /dev/ttyACM0 --scanner watch:scans -o calibration.json",
+    "amrepair calibrate --target-gcode target.gcode",
+    "amrepair calibrate --scan target.ply -o calibration.json",
+    "amrepair calibrate --scan layer.ply --job job.gcode --layer 0 --json",
+    "amrepair calibrate --sound a.ply --sound b.ply --template part.stl --name bench",
+)
 def calibrate_command(
     sound: Annotated[
         list[Path] | None,

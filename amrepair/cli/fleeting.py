@@ -22,17 +22,9 @@ STEP_S = 0.25
 LAST_LOOK_S = 1.5  # an open page asks every second, and is to show how it ended
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "fleet",
-        epilog=console.examples(
-            "amrepair fleet fleet.toml",
-            "amrepair fleet fleet.toml --view-port 9000 --until-done",
-        ),
-    )(fleet)
-
-
+@console.command(
+    "fleet", "amrepair fleet fleet.toml", "amrepair fleet fleet.toml --view-port 9000 --until-done"
+)
 def fleet(
     file: Annotated[
         Path, typer.Argument(metavar="FLEET", help="File that names printers and their jobs.")
@@ -49,30 +41,29 @@ def fleet(
         from amrepair.fleet.config import read_config
         from amrepair.fleet.history import History
         from amrepair.fleet.page import Page
-        from amrepair.fleet.supervisor import Fleet, State
+        from amrepair.fleet.supervisor import Fleet, RunState
 
     config = read_config(file)
     crew = Fleet(config)
     with crew.alone(), console.signals_end_it():
         history = History(config.options.out / "history.sqlite")
         page = Page(crew, history, host=view_host, port=view_port, token=token)
-        console.errors.print(f"Open {page.url} (Ctrl+C ends all runs safely)", markup=False)
+        console.errors.print(f"Open {page.url} (Ctrl+C ends all runs safely)")
         try:
             _watch(crew, history, until_done=until_done)
         finally:
-            console.errors.print("Ending all runs: nozzles lifted, heaters off.", markup=False)
+            console.errors.print("Ending all runs: nozzles lifted, heaters off.")
             crew.end()
             _remember(crew, history, {})
             page.close()
             history.close()
     for row in crew.told():
         console.out.print(
-            f"{row['name']}: {row['state']}{': ' if row['sentence'] else ''}{row['sentence']}",
-            markup=False,
+            f"{row['name']}: {row['state']}{': ' if row['sentence'] else ''}{row['sentence']}"
         )
-    if any(row["state"] == State.FAILED for row in crew.told()):
+    if any(row["state"] == RunState.FAILED for row in crew.told()):
         raise typer.Exit(LoopError.exit_code)
-    if any(row["state"] != State.DONE for row in crew.told()):
+    if any(row["state"] != RunState.DONE for row in crew.told()):
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
 
 
@@ -86,11 +77,10 @@ def _watch(crew: Fleet, history: History, *, until_done: bool) -> None:
             if told.get(row["name"]) != row["state"]:
                 told[row["name"]] = row["state"]
                 console.errors.print(
-                    f"{row['name']}: {row['state']}. {row['sentence']}".rstrip(". ") + ".",
-                    markup=False,
+                    f"{row['name']}: {row['state']}. {row['sentence']}".rstrip(". ") + "."
                 )
         while crew.notes:
-            console.errors.print(crew.notes.pop(0), markup=False)
+            console.errors.print(crew.notes.pop(0))
         _remember(crew, history, kept)
         if until_done and crew.over:
             time.sleep(LAST_LOOK_S)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from amrepair.cli.options import JsonOption
-from amrepair.doctor import Finding, State, examine
+from amrepair.doctor import CheckFinding, State, examine
 from gcode.cli import console
 
 _STATE_MARKS = {State.OK: "ok  ", State.NOTE: "note", State.BAD: "BAD "}
@@ -18,16 +18,9 @@ _STATE_COLOURS = {State.OK: "green", State.NOTE: "yellow", State.BAD: "bold red"
 BAD_EXIT = 2
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "doctor",
-        epilog=console.examples(
-            "amrepair doctor", "amrepair doctor --json > doctor.json", "amrepair doctor --options"
-        ),
-    )(doctor)
-
-
+@console.command(
+    "doctor", "amrepair doctor", "amrepair doctor --json > doctor.json", "amrepair doctor --options"
+)
 def doctor(
     options: Annotated[
         bool,
@@ -68,20 +61,20 @@ def _tell_options(*, as_json: bool) -> None:
     for one in found:
         if one.options != said:
             said = one.options
-            console.out.print(f"\n{said}", style="bold", markup=False)
+            console.out.print(f"\n{said}", style="bold")
         value = f"{one.value}{' ' + one.unit if one.unit not in ('', 'ratio') else ''}"
-        console.out.print(f"  {one.name:<24}{value:<16}{one.reason}", markup=False)
+        console.out.print(f"  {one.name:<24}{value:<16}{one.reason}")
 
 
-def _say(finding: Finding) -> None:
+def _say(finding: CheckFinding) -> None:
     colour = _STATE_COLOURS[finding.state]
     console.out.print(_STATE_MARKS[finding.state], style=colour, end=" ")
-    console.out.print(f"{finding.name:<17}{finding.found}", markup=False)
+    console.out.print(f"{finding.name:<17}{finding.found}")
     if finding.mend:
-        console.out.print(f"{'':22}→ {finding.mend}", markup=False)
+        console.out.print(f"{'':22}→ {finding.mend}")
 
 
-def _result(findings: tuple[Finding, ...], healthy: bool) -> dict[str, Any]:
+def _result(findings: tuple[CheckFinding, ...], healthy: bool) -> dict[str, Any]:
     import amrepair
 
     return {

@@ -48,25 +48,11 @@ KnownOption = Annotated[
 ]
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command(
-        "align",
-        epilog=console.examples(
-            "amrepair align scan.ply --template part.safetensors",
-            "amrepair align scan.ply --template part.stl -o aligned.ply --json",
-        ),
-    )(align)
-    app.command(
-        "detect",
-        epilog=console.examples(
-            "amrepair detect scan.ply --template part.safetensors --out out/detect",
-            "amrepair detect scan.ply --template part.stl --sensor-at 120,100,400 "
-            "--out out/detect --json",
-        ),
-    )(detect)
-
-
+@console.command(
+    "align",
+    "amrepair align scan.ply --template part.safetensors",
+    "amrepair align scan.ply --template part.stl -o aligned.ply --json",
+)
 def align(
     scan: Annotated[Path, typer.Argument(help="Point cloud, height map or scanned mesh, mm.")],
     template: TemplateOption,
@@ -127,12 +113,8 @@ def align(
                 console.write_whole(output, lambda path: write_ply(moved, path))
     # Other programs take the pose as input, so that it keeps all digits.
     result: dict[str, Any] = {
-        "template_from_scan": found.template_from_scan.matrix.tolist(),
-        "rmse_mm": found.rmse_mm,
-        "inlier_ratio": found.inlier_ratio,
-        "clutter_ratio": found.clutter_ratio,
+        **_pose_figures(found),
         "covariance": found.covariance.tolist(),
-        "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
         "method": found.method,
         "iterations": found.iterations,
         "seconds": round(watch.seconds["align"], 3),
@@ -149,6 +131,17 @@ def align(
         f"{len(found.symmetric_alternatives)} other poses fit as well."
     )
     console.out.print(np.array2string(found.template_from_scan.matrix, precision=6))
+
+
+def _pose_figures(found: Registration) -> dict[str, Any]:
+    """Where a scan lies, as results record it."""
+    return {
+        "template_from_scan": found.template_from_scan.matrix.tolist(),
+        "rmse_mm": found.rmse_mm,
+        "inlier_ratio": found.inlier_ratio,
+        "clutter_ratio": found.clutter_ratio,
+        "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
+    }
 
 
 def _say_clutter(found: Registration) -> None:
@@ -185,6 +178,11 @@ def chosen_part(known: Recognition) -> dict[str, Any]:
     }
 
 
+@console.command(
+    "detect",
+    "amrepair detect scan.ply --template part.safetensors --out out/detect",
+    "amrepair detect scan.ply --template part.stl --sensor-at 120,100,400 --out out/detect --json",
+)
 def detect(
     scan: Annotated[Path, typer.Argument(help="Point cloud, height map or scanned mesh, mm.")],
     template: TemplateOption,
@@ -264,11 +262,7 @@ def detect(
             for region in regions
         ],
         **_told(anomaly, calibration),
-        "template_from_scan": found.template_from_scan.matrix.tolist(),
-        "rmse_mm": found.rmse_mm,
-        "inlier_ratio": found.inlier_ratio,
-        "clutter_ratio": found.clutter_ratio,
-        "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
+        **_pose_figures(found),
         "seconds": {stage: round(spent, 3) for stage, spent in watch.seconds.items()},
         **chosen,
     }

@@ -47,17 +47,11 @@ TokenOption = Annotated[
 ]
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "view",
-        epilog=console.examples(
-            "amrepair view scan.ply part.stl",
-            "amrepair view out/demo/scan-1.ply out/demo/deficit-1.stl out/demo/repair-1.gcode",
-        ),
-    )(view)
-
-
+@console.command(
+    "view",
+    "amrepair view scan.ply part.stl",
+    "amrepair view out/demo/scan-1.ply out/demo/deficit-1.stl out/demo/repair-1.gcode",
+)
 def view(
     files: Annotated[
         list[Path], typer.Argument(help="Scans, meshes, templates (.safetensors), G-code.")
@@ -79,7 +73,7 @@ def view(
         for show in shown:
             show(page)
         page.say("Files", [path.name for path in files])
-        console.out.print(f"Open {page.url} (Ctrl+C ends it)", markup=False)
+        console.out.print(f"Open {page.url} (Ctrl+C ends it)")
         _until_interrupted()
     finally:
         page.close()
@@ -153,6 +147,17 @@ def _until_interrupted() -> None:
         over.wait()
     except KeyboardInterrupt:
         return
+
+
+@dataclass(frozen=True, slots=True)
+class ViewPlace:
+    """Whether and where a run is shown; and the desk that it is asked at instead."""
+
+    view: bool
+    host: str
+    port: int
+    token: str | None
+    desk: Path | None = None
 
 
 class NoView:
@@ -247,21 +252,21 @@ class ShownRun:
 
 
 @contextmanager
-def live_view(
-    asked: bool, *, ask: bool, title: str, host: str, port: int, token: str | None
-) -> Iterator[NoView | ShownRun]:
+def live_view(where: ViewPlace, *, ask: bool, title: str) -> Iterator[NoView | ShownRun]:
     """A page with buttons for a run, or nothing where nobody asked for one."""
     from amrepair.report.operator import Operator
 
-    if not asked:
+    if not where.view:
         yield NoView()
         return
     from amrepair.report.live import LiveView
 
     operator = Operator()
-    page = LiveView(title=title, operator=operator, host=host, port=port, token=token)
+    page = LiveView(
+        title=title, operator=operator, host=where.host, port=where.port, token=where.token
+    )
     there = "approve, skip and pause are" if ask else "a button to pause it is"
-    console.errors.print(f"Open {page.url}: {there} there.", markup=False)
+    console.errors.print(f"Open {page.url}: {there} there.")
     try:
         yield ShownRun(page, operator, ask)
     finally:

@@ -96,18 +96,9 @@ def numbers(text: str, count: int, option: str) -> np.ndarray:
 
 def part_pose(text: str) -> Transform:
     """`X,Y,Z,RZ`: where the part's origin stands on the bed, and its turn about Z, degrees."""
-    import numpy as np
-
     from amrepair.frames import Transform
 
-    x, y, z, turn_deg = numbers(text, 4, "--part-pose")
-    c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
-    return Transform.from_rotation_translation(
-        "build",
-        "template",
-        rotation=np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]),
-        translation_mm=np.array([x, y, z]),
-    )
+    return Transform.on_bed(*numbers(text, 4, "--part-pose").tolist())
 
 
 APPROVALS = ("ask", "auto")

@@ -20,18 +20,12 @@ if TYPE_CHECKING:
 EVERY = 20  # layers, where nothing else is asked for: 4 mm
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "postprocess",
-        epilog=console.examples(
-            "amrepair postprocess job.gcode",
-            "amrepair postprocess --every 0 --adaptive --at-z 12.5 job.gcode",
-            "amrepair postprocess --for marlin --command 'M600' job.gcode",
-        ),
-    )(postprocess)
-
-
+@console.command(
+    "postprocess",
+    "amrepair postprocess job.gcode",
+    "amrepair postprocess --every 0 --adaptive --at-z 12.5 job.gcode",
+    "amrepair postprocess --for marlin --command 'M600' job.gcode",
+)
 def postprocess(
     file: Annotated[Path, typer.Argument(help="The job, changed in place; the slicer adds it.")],
     every: Annotated[
@@ -75,7 +69,7 @@ def postprocess(
 
     Name it in the slicer's post-processing scripts. All that was in the job stays as it is.
     """
-    from amrepair.postprocess import TARGETS, Asked, mark, target_of
+    from amrepair.postprocess import TARGETS, LooksAsked, mark, target_of
     from amrepair.postprocess.mark import decoded
 
     if target is not None and target not in TARGETS:
@@ -88,7 +82,7 @@ def postprocess(
         raise InputError(f"{file} cannot be read ({error.strerror})") from error
     text = decoded(data, str(file))
     reader = target if target is not None else target_of(text, file.name, os.environ)
-    asked = Asked(every, tuple(at_z or ()), adaptive, covers_mm2, final, command)
+    asked = LooksAsked(every, tuple(at_z or ()), adaptive, covers_mm2, final, command)
     marked = mark(text, file.name, reader, asked)
     if marked.places:
         _replace(file, marked.text.encode("utf-8", "surrogateescape"))
@@ -107,7 +101,7 @@ def postprocess(
             }
         )
         return
-    console.errors.print(f"amrepair: {_in_words(file, marked, reader)}.", markup=False)
+    console.errors.print(f"amrepair: {_in_words(file, marked, reader)}.")
 
 
 def _in_words(file: Path, marked: Marked, reader: str) -> str:

@@ -14,6 +14,7 @@ from amrepair.cli.live import (
     PortOption,
     TokenOption,
     ViewOption,
+    ViewPlace,
 )
 from amrepair.cli.options import (
     SCAN_TIMEOUT_S,
@@ -35,24 +36,17 @@ from gcode.cli.owning import JobMaterialOption, JobPrinterOption
 from gcode.profiles import DEFAULT_PROCESS
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "loop",
-        epilog=console.examples(
-            "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
-            "--scanner watch:scans --every 20 --at 12.5",
-            "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
-            "--scanner watch:scans --adaptive",
-            "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
-            "--scanner watch:scans --view",
-            "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
-            "--scanner watch:scans --approve auto --json",
-            "amrepair loop --resume out/loop",
-        ),
-    )(loop)
-
-
+@console.command(
+    "loop",
+    "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
+    "--scanner watch:scans --every 20 --at 12.5",
+    "amrepair loop job.gcode --template part.safetensors --port /dev/ttyACM0 "
+    "--scanner watch:scans --adaptive",
+    "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 --scanner watch:scans --view",
+    "amrepair loop job.gcode --template part.stl --port /dev/ttyACM0 "
+    "--scanner watch:scans --approve auto --json",
+    "amrepair loop --resume out/loop",
+)
 def loop(
     job_file: Annotated[
         Path | None, typer.Argument(metavar="JOB", help="G-code of the whole job.")
@@ -145,7 +139,7 @@ def loop(
         (printer, material, process),
         running.Looks(every, adaptive, tuple(at_layer or ()), tuple(at_mm or ())),
         calibration,
-        running.Page(view, view_host, view_port, token, desk),
+        ViewPlace(view, view_host, view_port, token, desk),
         resume=resume,
         pose_confirmed=pose_confirmed,
         port=port,

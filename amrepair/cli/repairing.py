@@ -26,7 +26,7 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import AmrepairError, InputError
 from gcode.cli import console
-from gcode.cli.options import grid_of, job_of, program_text
+from gcode.cli.options import grid_of, job_of, program_text, refuse_standing
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption, job_setup
 from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_PROCESS
@@ -48,23 +48,17 @@ WORTH_TURNING_RATIO = 0.05
 SAME_AS_BED_MM = 0.15
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "repair",
-        epilog=console.examples(
-            "amrepair repair scan.ply --template part.safetensors -o repair.gcode "
-            "--standing standing.npz --report report.html",
-            "amrepair repair scan.ply --template part.stl -o repair.gcode "
-            "--scan-frame unknown --part-pose 100,80,0,90",
-            "amrepair repair scan.ply --template part.stl -o repair.gcode "
-            "--scan-frame unknown --job job.gcode --part-pose job",
-            "amrepair repair scan.ply --template part.stl -o repair.gcode --printer ender_3 "
-            "--material petg --job job.gcode",
-        ),
-    )(repair)
-
-
+@console.command(
+    "repair",
+    "amrepair repair scan.ply --template part.safetensors -o repair.gcode "
+    "--standing standing.npz --report report.html",
+    "amrepair repair scan.ply --template part.stl -o repair.gcode "
+    "--scan-frame unknown --part-pose 100,80,0,90",
+    "amrepair repair scan.ply --template part.stl -o repair.gcode "
+    "--scan-frame unknown --job job.gcode --part-pose job",
+    "amrepair repair scan.ply --template part.stl -o repair.gcode --printer ender_3 "
+    "--material petg --job job.gcode",
+)
 def repair(
     scan: Annotated[Path, typer.Argument(help="Scan of the damaged part, mm.")],
     template: TemplateOption,
@@ -155,9 +149,8 @@ def repair(
         from gcode.cli.words import what_it_does
 
     turns = turns_named(turn or [])
-    if standing is not None and standing.suffix != ".npz":
-        raise InputError(f"{standing}: what stands there is written as .npz; rename it")
-    for path in filter(None, (output, report, standing)):
+    refuse_standing(standing)
+    for path in filter(None, (output, report)):
         console.writable(path)
     placed = part_pose(pose) if pose is not None and pose != OF_JOB else None
     known_errors = calibration_named(calibration)
@@ -244,19 +237,19 @@ def repair(
         for line in _taken_for_granted(result):
             console.out.print(line)
         for line in left_out_lines(plan):
-            console.out.print(f"Left out, {line}.", markup=False)
+            console.out.print(f"Left out, {line}.")
         if program is not None and plan.estimate is not None:
             does = what_it_does(program, plan.estimate)
-            console.out.print(f"Repair: {output}: {does}.", markup=False)
+            console.out.print(f"Repair: {output}: {does}.")
         elif not within:
-            console.out.print(f"{output} was not written: no bead can be laid.", markup=False)
+            console.out.print(f"{output} was not written: no bead can be laid.")
         if older:
             said = f"The {output} that was there is removed: it was for another scan."
-            console.out.print(said, markup=False)
+            console.out.print(said)
         for line in _suggestion(plan, ranked):
             console.out.print(line)
         for line in late.told if late is not None else ():
-            console.out.print(f"Left open inside: {line}.", markup=False)
+            console.out.print(f"Left open inside: {line}.")
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
 
@@ -350,7 +343,7 @@ def where_the_job_prints_it(
         said = f"it stands at --part-pose {_typed(copies[0])}"
     else:
         said = "it lies in another way than its own file has it"
-    console.errors.print(f"{name} prints the part: {said}.", markup=False)
+    console.errors.print(f"{name} prints the part: {said}.")
     return stood(template, copies)
 
 

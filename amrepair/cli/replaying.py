@@ -16,18 +16,12 @@ if TYPE_CHECKING:
 DIFFERENT = 1
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "replay",
-        epilog=console.examples(
-            "amrepair replay out/demo",
-            "amrepair replay out/loop --json",
-            "amrepair replay out/loop --rule least_mm3=2.5 --rule sure=0.95",
-        ),
-    )(replay_command)
-
-
+@console.command(
+    "replay",
+    "amrepair replay out/demo",
+    "amrepair replay out/loop --json",
+    "amrepair replay out/loop --rule least_mm3=2.5 --rule sure=0.95",
+)
 def replay_command(
     run: Annotated[Path, typer.Argument(help="Folder of a run of 'loop' or 'simulate'.")],
     rule: Annotated[
@@ -65,7 +59,7 @@ def replay_command(
         )
     else:
         for look in looks:
-            console.out.print(_words(look), markup=False)
+            console.out.print(_words(look))
         count = sum(bool(look.differences) for look in looks)
         console.out.print(
             f"{len(looks)} looks, all decided as they were."

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from amrepair.cli.approval import AtDesk, Terminal
-from amrepair.cli.live import NoView, ShownRun, live_view
+from amrepair.cli.live import NoView, ShownRun, ViewPlace, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
 from amrepair.cli.telling import Begun, placed_solid, tell, written
 from amrepair.cli.thermal_log import ThermalLog
@@ -74,17 +74,6 @@ class Looks:
     marked: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Page:
-    """Whether and where the run is shown."""
-
-    view: bool
-    host: str
-    port: int
-    token: str | None
-    desk: Path | None = None
-
-
 def run(
     job_file: Path | None,
     template: Path | None,
@@ -92,7 +81,7 @@ def run(
     named: tuple[str | None, str | None, str],
     looks: Looks,
     calibration: Path | None,
-    shown: Page,
+    shown: ViewPlace,
     *,
     resume: Path | None,
     pose_confirmed: bool,
@@ -133,14 +122,7 @@ def run(
     polite = console.signals_end_it() if shown.desk is not None else nullcontext()
     with (
         polite,
-        live_view(
-            shown.view,
-            ask=ask,
-            title=begun.setting.title,
-            host=shown.host,
-            port=shown.port,
-            token=shown.token,
-        ) as page,
+        live_view(shown, ask=ask, title=begun.setting.title) as page,
     ):
         report, warmth = _printed(
             begun,
@@ -185,8 +167,7 @@ def _printed(
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "
-            f"amrepair loop --resume {begun.folder.path}",
-            markup=False,
+            f"amrepair loop --resume {begun.folder.path}"
         )
         raise
     finally:

@@ -137,7 +137,7 @@ def _probe(where: str, bed: Bed) -> Scanner:
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class ScannerKind:
     """A kind of scanner.
 
     Attributes
@@ -155,15 +155,15 @@ class Kind:
     alone: bool = False
 
 
-SCANNERS: dict[str, Kind] = {
-    "watch": Kind(_watched, Path.is_dir),
-    "simulated": Kind(_simulated, lambda _: True),  # the file comes with the first move
-    "python": Kind(_own, Path.is_file),
-    PROBE: Kind(_probe, lambda _: True, alone=True),
+SCANNERS: dict[str, ScannerKind] = {
+    "watch": ScannerKind(_watched, Path.is_dir),
+    "simulated": ScannerKind(_simulated, lambda _: True),  # the file comes with the first move
+    "python": ScannerKind(_own, Path.is_file),
+    PROBE: ScannerKind(_probe, lambda _: True, alone=True),
 }
 
 
-def known_scanner(typed: str) -> Kind:
+def known_scanner(typed: str) -> ScannerKind:
     """The kind of scanner that `--scanner` names; nothing is opened.
 
     Raises

@@ -9,10 +9,9 @@ from typing import Any
 from amrepair.agent.screens import Button, KlipperScreens, OctoPrintTab, Screens
 from amrepair.agent.talk import Talk
 from amrepair.cli.approval import AtDesk
-from amrepair.cli.live import NoView, ShownRun, live_view
+from amrepair.cli.live import NoView, ShownRun, ViewPlace, live_view
 from amrepair.cli.running import (
     Looks,
-    Page,
     gone_on_with,
     new_run,
     print_run,
@@ -54,7 +53,7 @@ class Served:
     out: Path
     named: tuple[str | None, str | None, str]
     calibration: Path | None
-    page: Page
+    page: ViewPlace
     once: bool
     pose_confirmed: bool
     said: dict[str, Any]
@@ -74,7 +73,7 @@ def serve(told: Served) -> None:
     machine, screens = _machine(told.address, told.key)
     touches = told.said["scanner"] == PROBE
     machine.connect()
-    talk = Talk(machine, screens, lambda text: console.errors.print(text, markup=False))
+    talk = Talk(machine, screens, console.errors.print)
     try:
         with console.signals_end_it():
             machine.require_partner()
@@ -86,8 +85,7 @@ def serve(told: Served) -> None:
     except KeyboardInterrupt:
         console.errors.print(
             "A print that rests at a look stays so, heaters off; one that goes on goes on. "
-            f"Started again with --out {told.out}, the agent goes on with it.",
-            markup=False,
+            f"Started again with --out {told.out}, the agent goes on with it."
         )
         raise
     finally:
@@ -154,7 +152,7 @@ class _Service:
                     self._pass_by()
             except LinkError as error:
                 if not away:
-                    console.errors.print(f"{error} Waiting for it.", markup=False)
+                    console.errors.print(f"{error} Waiting for it.")
                 away, job = True, None
             else:
                 away = False
@@ -235,10 +233,10 @@ class _Service:
     def _run(self, begun: Begun, going_on: bool, watch: Stopwatch) -> None:
         """The loop over one print, and what came of it."""
         page, bars = self._told.page, AtDesk(self._talk)
-        with live_view(
-            page.view, ask=False, title=begun.setting.title, host=page.host, port=page.port,
-            token=page.token,
-        ) as shown, self._machine.showing(shown.address, page.token):  # fmt: skip
+        with (
+            live_view(page, ask=False, title=begun.setting.title) as shown,
+            self._machine.showing(shown.address, page.token),
+        ):
             report, warmth = print_run(
                 begun, self._machine, shown, watch, bars, word=_Asked(shown, bars),
                 going_on=going_on, pose=self._told.pose_confirmed,

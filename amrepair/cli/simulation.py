@@ -15,6 +15,7 @@ from amrepair.cli.live import (
     PortOption,
     TokenOption,
     ViewOption,
+    ViewPlace,
     live_view,
 )
 from amrepair.cli.options import (
@@ -42,20 +43,14 @@ if TYPE_CHECKING:
 DEFAULT_DEFECTS = ("void", "under_extrusion", "chip")
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "simulate",
-        epilog=console.examples(
-            "amrepair simulate",
-            "amrepair simulate part.stl --defect void:diameter=8,layers=4 --defect chip "
-            "--seed 3 --out out/run",
-            "amrepair simulate part.stl --world world.toml --scanner laser-line",
-            "amrepair simulate part.stl --printer voron_2_4 --material petg --scale fit --json",
-        ),
-    )(simulate)
-
-
+@console.command(
+    "simulate",
+    "amrepair simulate",
+    "amrepair simulate part.stl --defect void:diameter=8,layers=4 --defect chip "
+    "--seed 3 --out out/run",
+    "amrepair simulate part.stl --world world.toml --scanner laser-line",
+    "amrepair simulate part.stl --printer voron_2_4 --material petg --scale fit --json",
+)
 def simulate(
     part: Annotated[
         Path | None,
@@ -142,7 +137,7 @@ def simulate(
         )
         folder.write_text("job.gcode", prepared.checked.program.text)
         with live_view(
-            view, ask=True, title=path.name, host=view_host, port=view_port, token=token
+            ViewPlace(view, view_host, view_port, token), ask=True, title=path.name
         ) as page:
             page.show_run(prepared.job, prepared.part)
 

@@ -83,7 +83,7 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
             console.out.print(line)
         for look in report.looks:
             for way in look.decision.ways:
-                console.out.print(f"{look.stop.label}, found late: {way.told}.", markup=False)
+                console.out.print(f"{look.stop.label}, found late: {way.told}.")
         for felt in begun.felt:
             console.out.print(f"{felt.stop}: {felt.told()}.")
         if report.calibration is not None:
@@ -92,8 +92,7 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
     if report.stopped:
         console.errors.print(
             f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
-            f"amrepair loop --resume {folder.path} --approve ask",
-            markup=False,
+            f"amrepair loop --resume {folder.path} --approve ask"
         )
         raise typer.Exit(LoopError.exit_code)
     if not within:

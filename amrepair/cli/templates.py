@@ -18,24 +18,15 @@ if TYPE_CHECKING:
     from amrepair.merge import ScanFit, SoundFit
     from amrepair.template import GridSdf, PaperSdf
 
-template_app = typer.Typer(help="Fit a template; extract its mesh.", no_args_is_help=True)
 
-
-def add_to(app: typer.Typer) -> None:
-    """Add the group."""
-    app.add_typer(template_app, name="template")
-
-
-@template_app.command(
+@console.command(
     "fit",
-    epilog=console.examples(
-        "amrepair template fit part.stl -o part.safetensors",
-        "amrepair template fit part.3mf -o part.safetensors --device cpu --seed 1",
-        "amrepair template fit part.stl sound*.ply -o part.safetensors",
-        "amrepair template fit view*.ply -o part.safetensors --sensor-at 0,0,400",
-        "amrepair template fit view*.ply -o part.safetensors --poses poses.json --json",
-        "amrepair template fit turn*.ply -o part.safetensors --turntable 36",
-    ),
+    "amrepair template fit part.stl -o part.safetensors",
+    "amrepair template fit part.3mf -o part.safetensors --device cpu --seed 1",
+    "amrepair template fit part.stl sound*.ply -o part.safetensors",
+    "amrepair template fit view*.ply -o part.safetensors --sensor-at 0,0,400",
+    "amrepair template fit view*.ply -o part.safetensors --poses poses.json --json",
+    "amrepair template fit turn*.ply -o part.safetensors --turntable 36",
 )
 def fit(
     inputs: Annotated[
@@ -172,12 +163,10 @@ def _from_scans(
     )
 
 
-@template_app.command(
+@console.command(
     "mesh",
-    epilog=console.examples(
-        "amrepair template mesh part.safetensors -o part.stl",
-        "amrepair template mesh part.safetensors -o half.stl --below-z-mm 12 --voxel-mm 0.15",
-    ),
+    "amrepair template mesh part.safetensors -o part.stl",
+    "amrepair template mesh part.safetensors -o half.stl --below-z-mm 12 --voxel-mm 0.15",
 )
 def mesh(
     file: Annotated[Path, typer.Argument(help="Template file.")],

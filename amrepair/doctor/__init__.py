@@ -1,8 +1,8 @@
 """Doctor: whether this machine can do what amrepair asks of it, and how to fix what it cannot.
 
 It looks and reports; it installs, changes and repairs nothing. Each check is one function that
-returns a `Finding`. Only the standard library is imported up here: the doctor must be able to speak
-where everything else fails to load.
+returns a `CheckFinding`. Only the standard library is imported up here: the doctor must be able to
+speak where everything else fails to load.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckFinding:
     """What one check found.
 
     Attributes
@@ -68,7 +68,7 @@ class SerialPort:
     description: str = ""
 
 
-def examine(progress: Callable[[str], None] = lambda name: None) -> tuple[Finding, ...]:
+def examine(progress: Callable[[str], None] = lambda name: None) -> tuple[CheckFinding, ...]:
     """Run every check.
 
     Parameters
@@ -76,7 +76,7 @@ def examine(progress: Callable[[str], None] = lambda name: None) -> tuple[Findin
     progress
         Told the name of each check before it runs: loading torch takes seconds.
     """
-    checks: dict[str, Callable[[], Finding]] = {
+    checks: dict[str, Callable[[], CheckFinding]] = {
         "python": check_python,
         "libraries": check_libraries,
         "torch": check_torch,
@@ -94,17 +94,17 @@ def examine(progress: Callable[[str], None] = lambda name: None) -> tuple[Findin
             found.append(check())
         except Exception as error:  # noqa: BLE001  what nobody thought of is a finding, too
             trouble = f"the check itself failed: {type(error).__name__}: {error}"
-            found.append(Finding(name, State.BAD, trouble, "report this as a bug"))
+            found.append(CheckFinding(name, State.BAD, trouble, "report this as a bug"))
     return tuple(found)
 
 
-def check_python(version: tuple[int, int, int] = sys.version_info[:3]) -> Finding:
+def check_python(version: tuple[int, int, int] = sys.version_info[:3]) -> CheckFinding:
     """Python's version."""
     found = f"{'.'.join(map(str, version))} on {platform.system()} {platform.machine()}"
     if version[:2] >= OLDEST_PYTHON:
-        return Finding("python", State.OK, found)
+        return CheckFinding("python", State.OK, found)
     wanted = ".".join(map(str, OLDEST_PYTHON))
-    return Finding(
+    return CheckFinding(
         "python",
         State.BAD,
         found,
@@ -112,7 +112,7 @@ def check_python(version: tuple[int, int, int] = sys.version_info[:3]) -> Findin
     )
 
 
-def check_libraries(requirements: Iterable[str] | None = None) -> Finding:
+def check_libraries(requirements: Iterable[str] | None = None) -> CheckFinding:
     """Every library that amrepair declares is installed, and the compiled ones load."""
     if requirements is None:
         try:
@@ -135,13 +135,15 @@ def check_libraries(requirements: Iterable[str] | None = None) -> Finding:
     if missing or broken:
         what = [f"missing: {', '.join(missing)}"] if missing else []
         what += [f"cannot be loaded: {', '.join(broken)}"] if broken else []
-        return Finding(
+        return CheckFinding(
             "libraries",
             State.BAD,
             "; ".join(what),
             "pip install --force-reinstall --constraint constraints.txt amrepair",
         )
-    return Finding("libraries", State.OK, f"all {len(names)} are installed, compiled ones load")
+    return CheckFinding(
+        "libraries", State.OK, f"all {len(names)} are installed, compiled ones load"
+    )
 
 
 def _name_of(requirement: str) -> str:
@@ -149,14 +151,14 @@ def _name_of(requirement: str) -> str:
     return found.group(0) if found else requirement
 
 
-def check_torch() -> Finding:
+def check_torch() -> CheckFinding:
     """Torch loads, and which device it will use."""
     try:
         import torch
 
         device = torch_device()
     except (ImportError, OSError, AmrepairError) as error:
-        return Finding(
+        return CheckFinding(
             "torch",
             State.BAD,
             f"cannot be loaded ({error})",
@@ -165,31 +167,31 @@ def check_torch() -> Finding:
         )
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
-        return Finding("torch", State.OK, f"{torch.__version__}, on {name}")
+        return CheckFinding("torch", State.OK, f"{torch.__version__}, on {name}")
     threads = torch.get_num_threads()
-    return Finding(
+    return CheckFinding(
         "torch",
         State.OK,
         f"{torch.__version__}, on the CPU with {threads} threads (a template takes about 15 s)",
     )
 
 
-def check_open3d(load: Callable[[], object] = open3d) -> Finding:
+def check_open3d(load: Callable[[], object] = open3d) -> CheckFinding:
     """open3d and the system libraries that its wheel links to."""
     try:
         module = load()
     except (AmrepairError, ImportError, OSError) as error:
-        return Finding(
+        return CheckFinding(
             "open3d",
             State.BAD,
             str(error),
             "install the system's libraries: 'apt-get install libusb-1.0-0 libgl1 libgomp1' "
             "(Debian, Ubuntu) or 'dnf install libusb1 mesa-libGL libgomp' (Fedora)",
         )
-    return Finding("open3d", State.OK, f"{getattr(module, '__version__', '?')}, loads")
+    return CheckFinding("open3d", State.OK, f"{getattr(module, '__version__', '?')}, loads")
 
 
-def check_profiles(folder: Path | None = None) -> Finding:
+def check_profiles(folder: Path | None = None) -> CheckFinding:
     """Every shipped profile loads, and the three defaults go together."""
     from gcode.errors import GcodeError
     from gcode.profiles import load_material, load_printer, load_process, load_setup, profile_dir
@@ -213,13 +215,13 @@ def check_profiles(folder: Path | None = None) -> Finding:
     except GcodeError as error:
         wrong.append(str(error))
     if wrong or not count:
-        return Finding(
+        return CheckFinding(
             "profiles",
             State.BAD,
             " ".join(wrong) or f"there is none in {where}",
             "undo changes in that folder, or install amrepair again",
         )
-    return Finding("profiles", State.OK, f"all {count} load from {where}")
+    return CheckFinding("profiles", State.OK, f"all {count} load from {where}")
 
 
 def _listed_ports() -> tuple[SerialPort, ...]:
@@ -236,11 +238,11 @@ def _listed_ports() -> tuple[SerialPort, ...]:
 def check_serial_ports(
     ports: Sequence[SerialPort] | None = None,
     access: Callable[[str, int], bool] = os.access,
-) -> Finding:
+) -> CheckFinding:
     """Printers on USB, and whether this user may open them."""
     listed = _listed_ports() if ports is None else tuple(ports)
     if not listed:
-        return Finding(
+        return CheckFinding(
             "serial ports",
             State.NOTE,
             "none is there",
@@ -253,9 +255,9 @@ def check_serial_ports(
         for port in listed
     )
     if not closed:
-        return Finding("serial ports", State.OK, names)
+        return CheckFinding("serial ports", State.OK, names)
     group = _group_of(closed[0].device)
-    return Finding(
+    return CheckFinding(
         "serial ports",
         State.BAD,
         f"{names}; no permission to open {', '.join(port.device for port in closed)}",
@@ -274,12 +276,12 @@ def _group_of(device: str) -> str:
     return "dialout"
 
 
-def check_terminals() -> Finding:
+def check_terminals() -> CheckFinding:
     """A pseudo-terminal can be opened: the emulated printer is one."""
     try:
         ends = os.openpty()
     except (OSError, AttributeError) as error:
-        return Finding(
+        return CheckFinding(
             "emulated printer",
             State.BAD,
             f"no pseudo-terminal can be opened ({error})",
@@ -288,19 +290,19 @@ def check_terminals() -> Finding:
         )
     for end in ends:
         os.close(end)
-    return Finding("emulated printer", State.OK, "pseudo-terminals can be opened")
+    return CheckFinding("emulated printer", State.OK, "pseudo-terminals can be opened")
 
 
 def check_disk(
     folder: Path | None = None, free_mb: Callable[[Path], float] | None = None
-) -> Finding:
+) -> CheckFinding:
     """Room for a run where commands write by default: the current folder."""
     where = (folder or Path.cwd()).resolve()
     free = (free_mb or _free_mb)(where)
     found = f"{free / 1000:.1f} GB are free in {where}"
     if free >= ENOUGH_DISK_MB:
-        return Finding("disk", State.OK, found)
-    return Finding(
+        return CheckFinding("disk", State.OK, found)
+    return CheckFinding(
         "disk",
         State.NOTE if free >= LEAST_DISK_MB else State.BAD,
         found,
@@ -313,7 +315,7 @@ def _free_mb(folder: Path) -> float:
     return shutil.disk_usage(folder).free / 1e6
 
 
-def check_cache(folder: Path | None = None) -> Finding:
+def check_cache(folder: Path | None = None) -> CheckFinding:
     """Fitted templates can be kept: a file is really written there and removed."""
     from amrepair.template import default_cache_dir
 
@@ -324,7 +326,7 @@ def check_cache(folder: Path | None = None) -> Finding:
             probe.write(b"amrepair")
             probe.flush()
     except OSError as error:
-        return Finding(
+        return CheckFinding(
             "cache",
             State.BAD,
             f"{where} cannot be written ({error.strerror}): every run would fit its template anew",
@@ -332,4 +334,4 @@ def check_cache(folder: Path | None = None) -> Finding:
         )
     kept = list(where.glob("*.safetensors"))
     size_mb = sum(path.stat().st_size for path in kept) / 1e6
-    return Finding("cache", State.OK, f"{where}, {len(kept)} templates, {size_mb:.0f} MB")
+    return CheckFinding("cache", State.OK, f"{where}, {len(kept)} templates, {size_mb:.0f} MB")

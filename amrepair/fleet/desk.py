@@ -40,15 +40,14 @@ class Desk:
         self,
         folder: Path,
         *,
-        clock: Callable[[], float] = time.time,
         sleep: Callable[[float], None] = time.sleep,
         parent: Callable[[], int] = os.getppid,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self.folder, self._clock, self._sleep, self._parent = folder, clock, sleep, parent
+        self.folder, self._sleep, self._parent = folder, sleep, parent
         self._asker = parent()
         self._said: dict[str, Any] = {"pid": os.getpid(), "stage": "starting", "question": None}
-        self._number = int(1000 * clock())  # never one of an earlier process
+        self._number = int(1000 * time.time())  # never one of an earlier process
         self._told_s = 0.0
         (folder / ANSWER).unlink(missing_ok=True)
         self._tell()
@@ -57,7 +56,7 @@ class Desk:
         """Say how far it is."""
         new_stage = stage != self._said["stage"]
         self._said |= {"stage": stage, "done": done, "total": total}
-        if new_stage or self._clock() - self._told_s >= TELL_S:
+        if new_stage or time.time() - self._told_s >= TELL_S:
             self._tell()
 
     def ask(self, question: str, lines: Sequence[str]) -> bool:
@@ -70,7 +69,7 @@ class Desk:
         """
         self._number += 1
         asked = {"number": self._number, "text": question, "lines": list(lines)}
-        self._said["question"] = {**asked, "since_s": self._clock()}
+        self._said["question"] = {**asked, "since_s": time.time()}
         self._tell()
         try:
             while True:
@@ -95,7 +94,7 @@ class Desk:
         self._tell()
 
     def _tell(self) -> None:
-        self._told_s = self._clock()
+        self._told_s = time.time()
         write_note(self.folder / STATUS, {**self._said, "time_s": self._told_s})
 
 

@@ -13,7 +13,7 @@ from urllib.parse import unquote, urlsplit
 
 from amrepair.errors import InputError
 from amrepair.fleet.history import History
-from amrepair.fleet.supervisor import Fleet, State
+from amrepair.fleet.supervisor import Fleet, RunState
 from amrepair.report.guarded import COOKIE, Guard, is_loopback
 
 PAGE_POLICY = (
@@ -167,7 +167,7 @@ def metrics(printers: Sequence[Mapping[str, Any]], history: Sequence[Mapping[str
         "# TYPE amrepair_printer_state gauge",
     ]
     for one in printers:
-        for state in State:
+        for state in RunState:
             lines.append(
                 f'amrepair_printer_state{{printer="{_label(one["name"])}",state="{state}"}} '
                 f"{int(one['state'] == state)}"

@@ -38,7 +38,7 @@ INTERRUPTED = 130
 OWN_ENDS = (0, 2, 3, 4, INTERRUPTED)
 
 
-class State(StrEnum):
+class RunState(StrEnum):
     """What a printer's row says."""
 
     RUNS = "runs"
@@ -51,7 +51,7 @@ class State(StrEnum):
     FAILED = "needs somebody"
 
 
-OVER = (State.DONE, State.BEYOND, State.STOPPED, State.FAILED)
+OVER = (RunState.DONE, RunState.BEYOND, RunState.STOPPED, RunState.FAILED)
 Command = Callable[[PrinterSpec, Path, bool], list[str]]
 
 
@@ -88,7 +88,7 @@ class Seat:
     folder: Path
     options: FleetOptions
     command: Command
-    state: State = State.WAITS
+    state: RunState = RunState.WAITS
     sentence: str = ""
     status: dict[str, Any] = field(default_factory=dict)
     process: subprocess.Popen[bytes] | None = None
@@ -104,15 +104,15 @@ class Seat:
         """Find out what its folder holds: nothing, a run to go on with, or a run that is over."""
         pid = int((read_note(self.folder / DESK / STATUS) or {}).get("pid", 0))
         if _is_ours(pid, self.folder):
-            self.orphan, self.state = pid, State.ORPHAN
+            self.orphan, self.state = pid, RunState.ORPHAN
             return
         events = read_events(self.folder)
         if events and events[-1].get("event") == "end":
             over = events[-1].get("stopped")
-            self.state = State.STOPPED if over else State.DONE
+            self.state = RunState.STOPPED if over else RunState.DONE
             self.sentence = str(over) if over else "printed before; empty its folder to print again"
             return
-        self.start_at_s, self.state = now_s, State.WAITS
+        self.start_at_s, self.state = now_s, RunState.WAITS
 
     def step(self, now_s: float) -> None:
         """Look at the process, and do what is due."""
@@ -129,7 +129,7 @@ class Seat:
             else:
                 self.process = None
                 self._ended(code, now_s)
-        elif self.state is State.WAITS and now_s >= self.start_at_s:
+        elif self.state is RunState.WAITS and now_s >= self.start_at_s:
             self._start()
 
     def _start(self) -> None:
@@ -145,13 +145,13 @@ class Seat:
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=log, start_new_session=True,
                 env={**os.environ, **one_thread()},  # as the shared judges: many on a few cores
             )  # fmt: skip
-        self.state, self.sentence, self.status = State.RUNS, "", {}
+        self.state, self.sentence, self.status = RunState.RUNS, "", {}
 
     def _watch(self, now_s: float) -> None:
         question = self.status.get("question")
-        self.state = State.ASKS if question else State.RUNS
+        self.state = RunState.ASKS if question else RunState.RUNS
         if self.stopping:
-            self.state = State.RUNS
+            self.state = RunState.RUNS
             if now_s >= self.killed_at_s + END_S:  # it does not end: its own supervisor makes safe
                 assert self.process is not None
                 self.process.kill()
@@ -166,10 +166,10 @@ class Seat:
         why = str(said.get("error") or said.get("stopped") or "").removeprefix("amrepair: ")
         if self.stopping or code == INTERRUPTED:
             self.stopping = False
-            self.state = State.STOPPED
+            self.state = RunState.STOPPED
             self.sentence = self.sentence or "stopped; heaters off"
         elif code in OWN_ENDS:
-            self.state = {0: State.DONE, 3: State.BEYOND}.get(code, State.FAILED)
+            self.state = {0: RunState.DONE, 3: RunState.BEYOND}.get(code, RunState.FAILED)
             self.sentence = why
         else:
             self._died(code, now_s)
@@ -179,7 +179,7 @@ class Seat:
         while self.restarts and now_s - self.restarts[0] > self.options.within_s:
             self.restarts.popleft()
         if len(self.restarts) >= self.options.restarts:
-            self.state = State.FAILED
+            self.state = RunState.FAILED
             self.sentence = (
                 f"its process ended {how}, after {len(self.restarts)} restarts in "
                 f"{self.options.within_s:.0f} s; its heaters were switched off"
@@ -187,13 +187,13 @@ class Seat:
             return
         self.restarts.append(now_s)
         self.restarted += 1
-        self.state, self.start_at_s = State.WAITS, now_s + BACK_OFF_S
+        self.state, self.start_at_s = RunState.WAITS, now_s + BACK_OFF_S
         self.sentence = f"its process ended {how}; it is gone on with"
 
     def answer(self, number: int, *, yes: bool) -> bool:
         """Answer a question; False where it is not asked any more."""
         question = self.status.get("question")
-        if self.state is not State.ASKS or not question or question["number"] != number:
+        if self.state is not RunState.ASKS or not question or question["number"] != number:
             return False
         if number == self.answered:  # the first word counts
             return False
@@ -208,8 +208,8 @@ class Seat:
                 os.kill(self.orphan, signal.SIGTERM)
             return True
         if self.process is None:
-            if self.state is State.WAITS:
-                self.state, self.sentence = State.STOPPED, "stopped before it was started again"
+            if self.state is RunState.WAITS:
+                self.state, self.sentence = RunState.STOPPED, "stopped before it was started again"
                 return True
             return False
         if not self.stopping:
@@ -219,10 +219,10 @@ class Seat:
 
     def go_on(self, now_s: float) -> bool:
         """Go on with a run that was stopped or failed; False where there is none."""
-        if self.state not in (State.STOPPED, State.FAILED):
+        if self.state not in (RunState.STOPPED, RunState.FAILED):
             return False
         self.restarts.clear()
-        self.state, self.sentence, self.start_at_s = State.WAITS, "", now_s
+        self.state, self.sentence, self.start_at_s = RunState.WAITS, "", now_s
         return True
 
 
@@ -360,7 +360,7 @@ def _row(seat: Seat) -> dict[str, Any]:
         "sentence": seat.sentence,
         "stage": status.get("stage", ""),
         "share": float(status.get("done") or 0.0) / total if total > 0 else 0.0,
-        "question": status.get("question") if seat.state is State.ASKS else None,
+        "question": status.get("question") if seat.state is RunState.ASKS else None,
         "restarts": seat.restarted,
         "judged": status.get("judged") or {"shared": 0, "itself": 0, "why": ""},
         "pid": seat.process.pid if seat.process is not None else seat.orphan,

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from amrepair.align.refine import refine
 from amrepair.align.thinning import thin_out
 from amrepair.errors import AlignmentError, InputError
-from amrepair.frames import Transform
+from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
@@ -31,7 +31,7 @@ TARGET_MM = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class PoseOptions:
+class CalibrateOptions:
     """How the scanner's pose is found.
 
     Attributes
@@ -67,12 +67,12 @@ class PoseOptions:
     least_apart_deg: float = 20.0
 
 
-USUAL_POSE = PoseOptions()
+USUAL_POSE = CalibrateOptions()
 """What `calibrate` goes by."""
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class PoseCalibration:
     """A scanner's pose, and how well it is known.
 
     Attributes
@@ -120,9 +120,9 @@ def calibrate(
     scan: Scan,
     standing: Template,
     *,
-    options: PoseOptions = USUAL_POSE,
+    options: CalibrateOptions = USUAL_POSE,
     rng: np.random.Generator | None = None,
-) -> Calibration:
+) -> PoseCalibration:
     """Find the scanner's pose from a scan of the bed and of what stands on it.
 
     Parameters
@@ -177,11 +177,11 @@ def calibrate(
             f"least {options.same_fit:g} is needed); use a target that looks like itself from one "
             "side only"
         )
-    return Calibration(pose, residual_mm, bed_mm, float(min(runner_up, 1e3)), len(cloud))
+    return PoseCalibration(pose, residual_mm, bed_mm, float(min(runner_up, 1e3)), len(cloud))
 
 
 def write_calibration(
-    path: Path, found: Calibration, about: Mapping[str, str] | None = None
+    path: Path, found: PoseCalibration, about: Mapping[str, str] | None = None
 ) -> None:
     """Write the file that `loop` reads, whole or not at all.
 
@@ -197,7 +197,9 @@ def write_calibration(
         raise InputError(f"the calibration {path} cannot be written ({error.strerror})") from error
 
 
-def _level(scan: Scan, options: PoseOptions, rng: np.random.Generator) -> tuple[Transform, float]:
+def _level(
+    scan: Scan, options: CalibrateOptions, rng: np.random.Generator
+) -> tuple[Transform, float]:
     """The bed as the plane of most points, up where the sensors or fewer points are."""
     points = thin_out(scan.points_mm, options.fit_points, rng)
     limit_mm = max(options.plane_mm, 3 * scan.sigma_mm)
@@ -250,8 +252,7 @@ def _turned(
     angle_rad: float, points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"]
 ) -> Transform:
     """Build from level: turned about the vertical, the middle of the points on the target's."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    rotation = rotation_from_vector(np.array([0.0, 0.0, angle_rad]))
     shift = centre - rotation @ points.mean(axis=0)
     shift[2] = 0.0
     return Transform.from_rotation_translation(

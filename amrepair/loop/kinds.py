@@ -52,7 +52,7 @@ class _Surface:
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class TypeGuess:
     """A type and how sure it is."""
 
     type: DefectType
@@ -162,7 +162,9 @@ def _surfaces(
     return top, seen.part(walls, options.most_points)
 
 
-def _came_off(plan: RepairPlan, build_from_scanner: Transform, options: KindOptions) -> Kind | None:
+def _came_off(
+    plan: RepairPlan, build_from_scanner: Transform, options: KindOptions
+) -> TypeGuess | None:
     """Whether the part lies somewhere else than where the calibration and the job have it."""
     moved = plan.build_from_scan @ build_from_scanner.inverse()
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
@@ -173,10 +175,10 @@ def _came_off(plan: RepairPlan, build_from_scanner: Transform, options: KindOpti
     cosine = float(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0))
     turned_rad = float(np.arccos(cosine))
     share = max(off_mm / options.moved_mm, turned_rad / np.deg2rad(options.moved_deg))
-    return Kind(DefectType.DETACHED, _sure(share, 1.0)) if share > 1.0 else None
+    return TypeGuess(DefectType.DETACHED, _sure(share, 1.0)) if share > 1.0 else None
 
 
-def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | None:
+def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> TypeGuess | None:
     """Walls above some height stand beside those below: two shifts tell them better than one."""
     z, dev, out = walls.place_mm[:, 2], walls.deviation_mm, walls.outward[:, :2]
     if len(walls) < 2 * options.least_points:
@@ -204,7 +206,9 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> Kind | N
     moved = bool(ways) and all(_moved_so(way * told, way * seen, bands, options) for way in ways)
     if moved and jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
         sure = _sure(jump_mm, options.shift_layers * layer_mm)
-        return Kind(DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share)))
+        return TypeGuess(
+            DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share))
+        )
     return None
 
 
@@ -230,7 +234,7 @@ def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"],
     return found, float(moments[3, 3] - found @ moments[:3, 3])
 
 
-def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> Kind | None:
+def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> TypeGuess | None:
     """The top bends up at its rim: a parabola explains what flow and place do not."""
     if len(top) < options.least_points:
         return None
@@ -256,11 +260,13 @@ def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> Kind | None
     bent = up and lifted_mm < most_mm and _moved_so(fitted, dev, options.warp_bands, options)
     if bent and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
         sure = _sure(lifted_mm, options.warp_layers * layer_mm)
-        return Kind(DefectType.WARP, sure * min(1.0, share / (1.5 * options.warp_share)))
+        return TypeGuess(DefectType.WARP, sure * min(1.0, share / (1.5 * options.warp_share)))
     return None
 
 
-def _flow(top: _Surface, job: Job, line: int, layer_mm: float, options: KindOptions) -> Kind | None:
+def _flow(
+    top: _Surface, job: Job, line: int, layer_mm: float, options: KindOptions
+) -> TypeGuess | None:
     """What the last layer's beads carry, in the order they were printed."""
     points = last_beads(job, line)
     if len(points) < 30 or len(top) < options.least_points:
@@ -273,7 +279,7 @@ def _flow(top: _Surface, job: Job, line: int, layer_mm: float, options: KindOpti
     low = -top.deviation_mm[nearest[seen]].mean(axis=1) / layer_mm
     short = low > options.short_layers
     if np.mean(low < -options.short_layers) > options.layer_share:
-        return Kind(DefectType.OVER_EXTRUSION, float(np.mean(low < -options.short_layers)))
+        return TypeGuess(DefectType.OVER_EXTRUSION, float(np.mean(low < -options.short_layers)))
     if not short.any():
         return None
     at, wrong = _since(short)
@@ -284,9 +290,9 @@ def _flow(top: _Surface, job: Job, line: int, layer_mm: float, options: KindOpti
         and np.percentile(low[at:], 75) < options.clog_layers
         and wrong <= _apart(points[seen, :2], short, distance[seen, -1], options)
     ):
-        return Kind(DefectType.CLOG, 1.0 - wrong)
+        return TypeGuess(DefectType.CLOG, 1.0 - wrong)
     if short.mean() > options.layer_share:
-        return Kind(DefectType.UNDER_EXTRUSION, float(short.mean()))
+        return TypeGuess(DefectType.UNDER_EXTRUSION, float(short.mean()))
     return None
 
 
@@ -327,14 +333,14 @@ def _apart(
 def _of_region(
     region: Region,
     pieces: list[manifold3d.Manifold],
-    flow: Kind | None,
+    flow: TypeGuess | None,
     job: Job,
     line: int,
     *,
     at_rim: bool,
     layer_mm: float,
     options: KindOptions,
-) -> Kind:
+) -> TypeGuess:
     """The type of one region, its place and shape considered."""
     piece = matching(pieces, np.asarray(region.box_mm))
     if region.label is Label.EXCESS:
@@ -344,21 +350,23 @@ def _of_region(
         long_mm, wide_mm, _ = spread(chain)
         lies = tall_mm(chain) < options.string_tall * long_mm  # what climbs a wall is its seam
         if lies and long_mm > options.string_aspect * wide_mm and wide_mm < options.string_width_mm:
-            return Kind(DefectType.STRING, _sure(long_mm / wide_mm, options.string_aspect))
-        return Kind(DefectType.BLOB, 0.95)
+            return TypeGuess(DefectType.STRING, _sure(long_mm / wide_mm, options.string_aspect))
+        return TypeGuess(DefectType.BLOB, 0.95)
     if flow is not None and flow.type is not DefectType.OVER_EXTRUSION:
         return flow
     long_mm, wide_mm, along = spread([piece] if piece is not None else [])
     if long_mm > options.skipped_aspect * wide_mm and not at_rim:
         way = bead_way(job, line, np.asarray(region.box_mm))
         if way is not None and abs(float(way @ along)) > options.along_cosine:
-            return Kind(DefectType.MISSING_BEADS, _sure(long_mm / wide_mm, options.skipped_aspect))
+            return TypeGuess(
+                DefectType.MISSING_BEADS, _sure(long_mm / wide_mm, options.skipped_aspect)
+            )
     whole_layers = piece is not None and (
         piece.volume() > options.whole_layers * layer_mm * float(piece.project().area())
     )
     if whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
-        return Kind(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
-    return Kind(region.type, 0.95)
+        return TypeGuess(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
+    return TypeGuess(region.type, 0.95)
 
 
 def _at_rim(
@@ -374,7 +382,7 @@ def _at_rim(
     return bool((inside > -min(options.layer_rim_mm, 0.8 * (z - foot_mm))).any())
 
 
-def _everywhere(plan: RepairPlan, site: Site, whole: Kind) -> Region:
+def _everywhere(plan: RepairPlan, site: Site, whole: TypeGuess) -> Region:
     """A region of no volume that stands for the whole part."""
     placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     box = placed.apply(site.template.bounds_mm)

@@ -21,6 +21,7 @@ from amrepair.template import StoodTemplate
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 from gcode.reader import Beads, Job
+from gcode.stretches import places_along
 from gcode.surfaces import raster_kernels
 
 # Names of the outermost bead: PrusaSlicer and SuperSlicer, OrcaSlicer and Bambu, Cura.
@@ -185,13 +186,8 @@ def _things(
 
 def _walls(beads: Beads, which: Int[np.ndarray, " w"]) -> Scan:
     """Points along the middles of some beads."""
-    start, end, height_mm = beads.start_mm[which], beads.end_mm[which], beads.height_mm[which]
-    lengths = np.linalg.norm(end - start, axis=1)
-    count = np.maximum(1, np.ceil(lengths / THING_STEP_MM).astype(np.int64))
-    owner = np.repeat(np.arange(len(count)), count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    points = start[owner] + (end - start)[owner] * ((step + 0.5) / count[owner])[:, None]
-    points[:, 2] -= 0.5 * height_mm[owner]
+    points, owner = places_along(beads.start_mm[which], beads.end_mm[which], THING_STEP_MM)
+    points[:, 2] -= 0.5 * beads.height_mm[which][owner]
     return Scan(points, 0.05, "build", source="the job's walls")
 
 

@@ -15,7 +15,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import travel
 from amrepair.loop.looks import Stop
@@ -23,17 +22,16 @@ from amrepair.loop.tape import FELT
 from amrepair.loop.touch_design import (
     USUAL_TOUCHES,
     Flats,
-    TouchOptions,
+    ProbeOptions,
     first_places,
     flats_of,
     next_places,
 )
 from amrepair.loop.touched import Touches, measured_sigma_mm, scan_of
-from amrepair.loop.wire import Wire
+from amrepair.loop.wire import Wire, touching
 from amrepair.scans import PROBE, Scan, ScanRequest
 from gcode.check import CheckedProgram
-from gcode.hosts.port import Printer, TellsTouches
-from gcode.hosts.serial import SerialPrinter
+from gcode.hosts.port import Printer
 from gcode.moves import ModalState
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
@@ -104,13 +102,8 @@ class PortFeeler:
     """
 
     def __init__(self, printer: Printer, setup: PrintSetup) -> None:
-        if not isinstance(printer, (SerialPrinter, TellsTouches)):
-            raise InputError(
-                "--scanner probe needs the printer's own port (--port /dev/ttyACM0, or Klipper's "
-                "/tmp/printer), or 'amrepair agent' beside its server: this server or file does "
-                "not tell where a touch ended"
-            )
-        self._wire, self._setup, self._probe = Wire(printer), setup, setup.printer.feeler
+        self._wire = Wire(touching(printer))  # refused early
+        self._setup, self._probe = setup, setup.printer.feeler
 
     def send_by(self, wire: Wire) -> None:
         """Send by this wire from now on."""
@@ -165,7 +158,7 @@ class ProbeScanner:
         job: Job,
         setup: PrintSetup,
         *,
-        options: TouchOptions = USUAL_TOUCHES,
+        options: ProbeOptions = USUAL_TOUCHES,
         clock: Callable[[], float] = time.monotonic,
         progress: Progress = silent,
     ) -> None:

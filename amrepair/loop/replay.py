@@ -5,7 +5,7 @@ Nothing is sent and nobody is asked: what was answered then is taken from the re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,8 @@ from amrepair.loop.setting import Recorded, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import Tape, read_events
 from amrepair.policy.again import changed, decided_again
-from amrepair.repair import Stopwatch
 from amrepair.scans import Scan, ScanRequest
-from gcode.check import CheckedProgram, check, policy_of
+from gcode.check import check, policy_of
 from gcode.hosts.file import FilePrinter
 from gcode.progress import Progress, silent
 
@@ -60,9 +59,7 @@ class _TapeScanner:
         raise LoopError(f"the record has no scan for {request.label}")
 
 
-def replay(
-    folder: Path, *, watch: Stopwatch | None = None, progress: Progress = silent
-) -> tuple[Replayed, ...]:
+def replay(folder: Path, *, progress: Progress = silent) -> tuple[Replayed, ...]:
     """Look at every recorded scan again.
 
     Raises
@@ -72,7 +69,7 @@ def replay(
     """
     run = open_run(folder)
     then = _recorded_looks(folder)
-    now = looks_of(run, Tape(folder, only_read=True), watch=watch, progress=progress)
+    now = looks_of(run, Tape(folder, only_read=True), progress=progress)
     return tuple(compare(event, look) for event, look in zip(then, now, strict=True))
 
 
@@ -105,19 +102,12 @@ def _recorded_looks(folder: Path) -> list[dict[str, Any]]:
     return found
 
 
-def looks_of(
-    run: Recorded,
-    tape: Tape,
-    *,
-    watch: Stopwatch | None = None,
-    progress: Progress = silent,
-    judge: Callable[..., CheckedProgram] = check,
-) -> tuple[Look, ...]:
+def looks_of(run: Recorded, tape: Tape, *, progress: Progress = silent) -> tuple[Look, ...]:
     """The looks of a tape, planned and decided anew."""
     setting = run.setting
     report = run_loop(
         run.job,
-        judge(
+        check(
             run.job.program,
             run.setup,
             policy=policy_of(run.job.program),
@@ -128,7 +118,7 @@ def looks_of(
         sites(run.job, run.template, setting.placed, run.setup, by_beads=setting.by_beads),
         stops=_looked_at(run, tape),
         options=replace(setting.options(run.setup.process), pace=None),
-        records=Records(tape=tape, watch=watch or Stopwatch()),
+        records=Records(tape=tape),
         progress=progress,
     )
     return report.looks

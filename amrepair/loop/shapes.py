@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.reader import Job
+from gcode.stretches import in_turn, places_along
 
 CHAIN_MM = 4.0
 """Pieces nearer than this are one thing that noise has cut."""
@@ -62,8 +63,7 @@ def _dense(ring: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     ends = np.roll(ring, -1, axis=0)
     length = np.linalg.norm(ends - ring, axis=1)
     count = np.maximum(1, np.ceil(length / 0.1).astype(np.int64))
-    owner = np.repeat(np.arange(len(ring)), count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    owner, step = in_turn(count)
     return np.asarray(ring[owner] + (ends - ring)[owner] * (step / count[owner])[:, None])
 
 
@@ -96,8 +96,4 @@ def last_beads(job: Job, line: int) -> Float[np.ndarray, "n 3"]:
     if not done.any() or beads.layer[done].max() < 0:
         return np.zeros((0, 3))
     pick = done & (beads.layer == beads.layer[done].max())
-    start, step = beads.start_mm[pick], beads.end_mm[pick] - beads.start_mm[pick]
-    count = np.maximum(1, np.ceil(np.linalg.norm(step, axis=1) / BEAD_STEP_MM).astype(np.int64))
-    owner = np.repeat(np.arange(len(count)), count)
-    along = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    return np.asarray(start[owner] + step[owner] * ((along + 0.5) / count[owner])[:, None])
+    return places_along(beads.start_mm[pick], beads.end_mm[pick], BEAD_STEP_MM)[0]

@@ -39,7 +39,7 @@ HEXAGON = np.array([[np.cos(a), np.sin(a)] for a in np.arange(6) * np.pi / 3])
 
 
 @dataclass(frozen=True, slots=True)
-class TouchOptions:
+class ProbeOptions:
     """How many touches, where they may be, and how far one speaks.
 
     Attributes
@@ -84,7 +84,7 @@ class TouchOptions:
     sure_sigmas: float = 4.0
 
 
-USUAL_TOUCHES = TouchOptions()
+USUAL_TOUCHES = ProbeOptions()
 """What a probe is told where nobody says otherwise."""
 
 
@@ -110,7 +110,7 @@ class Flats:
     top_mm: Float[np.ndarray, "ny nx"]
     worth_mm: Float[np.ndarray, "ny nx"]
     may: Bool[np.ndarray, "ny nx"]
-    options: TouchOptions = USUAL_TOUCHES
+    options: ProbeOptions = USUAL_TOUCHES
 
     def xy_mm(self, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "k 2"]:
         """(k, 2) middles of cells."""
@@ -128,7 +128,7 @@ def flats_of(
     stop: Stop,
     setup: PrintSetup,
     standing: HeightField,
-    options: TouchOptions = USUAL_TOUCHES,
+    options: ProbeOptions = USUAL_TOUCHES,
 ) -> Flats:
     """The last layer of a stop, or all tops of the finished part.
 
@@ -277,7 +277,7 @@ def _clear(flats: Flats, setup: PrintSetup, standing: HeightField) -> Bool[np.nd
     return clear
 
 
-def _density(laid: Bool[np.ndarray, "ny nx"], options: TouchOptions) -> Float[np.ndarray, "ny nx"]:
+def _density(laid: Bool[np.ndarray, "ny nx"], options: ProbeOptions) -> Float[np.ndarray, "ny nx"]:
     """(ny, nx) how much of the area around is laid, of what lies within the layer's outline."""
     wide = 2 * round(options.around_mm / options.cell_mm) + 1
     within = ndimage.minimum_filter(ndimage.maximum_filter(laid, wide), wide) | laid

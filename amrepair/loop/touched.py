@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from amrepair.loop.touch_design import USUAL_TOUCHES, Flats, TouchOptions
+from amrepair.loop.touch_design import USUAL_TOUCHES, Flats, ProbeOptions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import PROBE, Scan
 
@@ -41,7 +41,7 @@ class Touches:
     place_mm: Float[np.ndarray, "n 3"]
     planned_mm: Float[np.ndarray, " n"]
     sigma_mm: float
-    options: TouchOptions = USUAL_TOUCHES
+    options: ProbeOptions = USUAL_TOUCHES
 
     @property
     def off_mm(self) -> Float[np.ndarray, " n"]:
@@ -58,7 +58,7 @@ class Touches:
 
 
 def measured_sigma_mm(
-    repeated_mm: Float[np.ndarray, " r"], told_mm: float, options: TouchOptions = USUAL_TOUCHES
+    repeated_mm: Float[np.ndarray, " r"], told_mm: float, options: ProbeOptions = USUAL_TOUCHES
 ) -> float:
     """Standard deviation of one touch, from touches of one place and what the profile says.
 

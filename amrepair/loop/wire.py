@@ -14,7 +14,6 @@ from amrepair.errors import InputError, LoopError
 from amrepair.loop.tape import TOUCH, Sent, Tape, report_from_json, report_to_json
 from gcode.check import CheckedProgram
 from gcode.hosts.port import Printer, PrintReport, TellsTouches
-from gcode.hosts.serial import SerialPrinter
 from gcode.hosts.touching import felt
 from gcode.progress import Progress, silent
 
@@ -86,15 +85,14 @@ class Wire:
         gcode.errors.PrinterError
             If nothing is felt; the heaters are off then.
         """
-        if not isinstance(self._printer, (SerialPrinter, TellsTouches)):
-            raise InputError("this server or file does not tell where a touch ended")
+        printer = touching(self._printer)
         end = checked.program.text.count("\n")
         done, _ = self._begin(Sent(TOUCH, checked, 0, end, done=False))
         if done is not None:
             for _ in done["met_mm"]:
                 told()
             return [float(z_mm) for z_mm in done["met_mm"]]
-        met_mm = felt(self._printer, checked, at_contact=told)
+        met_mm = felt(printer, checked, at_contact=told)
         self._end(met_mm=met_mm)
         return met_mm
 
@@ -137,6 +135,23 @@ class Wire:
     def _end(self, **said: Any) -> None:
         self._sent[-1] = replace(self._sent[-1], done=True)
         self._tape.write("sent", **said)
+
+
+def touching(printer: Printer) -> TellsTouches:
+    """The printer, as one that tells where a touch ended.
+
+    Raises
+    ------
+    InputError
+        If it does not.
+    """
+    if not isinstance(printer, TellsTouches):
+        raise InputError(
+            "--scanner probe needs the printer's own port (--port /dev/ttyACM0, or Klipper's "
+            "/tmp/printer), or 'amrepair agent' beside its server: this server or file does not "
+            "tell where a touch ended"
+        )
+    return printer
 
 
 @runtime_checkable

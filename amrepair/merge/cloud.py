@@ -13,30 +13,13 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from amrepair.field.near import spacing_in
+from amrepair.frames import spread_directions
 from amrepair.merge import fuse_kernels as kernels
-
-# Points that planes are fitted to, on average: few where walls are thin, or more, by the tilt.
-CLOUD_PLANE_POINTS = (10, 25)
-# A plane's radius over the noise, at least: 4 of them tilt it by some 3°. And how often it grows.
-PLANE_NOISES, GROWTHS, GROWTH = 8.0, 3, 1.6
-NOISE_NOISES = 4.0  # radius over the noise from which on a plane tells the noise
-OPEN_DIRECTIONS = 256  # a deep hole is open in one direction of a hundred
-# So many points look around themselves; the others are told by those beside them. And so many
-# stand for the surface that hides others, each as a disc of so many spacings, which leaves one
-# place in a hundred bare.
-LOOKING_POINTS, HIDING_POINTS, DISC_SPACINGS = 8_000, 50_000, 1.2
-MOST_CELLS = 250  # along the longest side
-# Of two places on one sheet the height over the distance is less than so much, or chance. Discs
-# nearer than so many of their radii are not in the way if they are of the looker's own sheet.
-SHEET_SLOPE, SHEET_NOISES, OWN_DISCS = 0.2, 4.0, 2.5
-TELLS_SPACINGS, TOLD_BY = 2.2, 8
-TOLD_ENOUGH = 1.0  # neighbours on one's own sheet, that say the way of a normal
-NOISE_QUANTILE, LEAST_PLANE_POINTS = 0.1, 8
-AGREE_ROUNDS = 60  # places that a verdict travels
+from amrepair.merge.options import USUAL_CLOUD
 
 
 @dataclass(frozen=True, slots=True)
-class Cells:
+class SortedPoints:
     """Points sorted by cubic cells.
 
     Attributes
@@ -54,12 +37,12 @@ class Cells:
     start: Int[np.ndarray, " cells1"]
 
     @property
-    def grid(self) -> kernels.Grid:
+    def grid(self) -> kernels.PointGrid:
         """As the kernels take them."""
-        return kernels.Grid(self.low_mm, self.cell_mm, self.shape, self.start)
+        return kernels.PointGrid(self.low_mm, self.cell_mm, self.shape, self.start)
 
     @classmethod
-    def of(cls, points_mm: Float[np.ndarray, "n 3"], cell_mm: float) -> Cells:
+    def of(cls, points_mm: Float[np.ndarray, "n 3"], cell_mm: float) -> SortedPoints:
         """Sort points; two empty layers of cells lie around them."""
         low = points_mm.min(axis=0) - 2.0 * cell_mm
         shape = np.floor((points_mm.max(axis=0) - low) / cell_mm).astype(np.int64) + 3
@@ -115,48 +98,43 @@ def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
     least variance of m points is σ²/m χ² with m − 3 degrees of freedom; edges, curves and walls'
     other sides only add to it, so the noise is a low quantile, by the narrowest planes.
     """
-    narrow_mm, wide_mm = np.sqrt(np.array(CLOUD_PLANE_POINTS) / np.pi) * spacing_mm
+    narrow_mm, wide_mm = (
+        np.sqrt(np.array([USUAL_CLOUD.narrow_points, USUAL_CLOUD.wide_points]) / np.pi) * spacing_mm
+    )
     found = _planes(points_mm, narrow_mm, None)
     reached_mm, radius_mm = narrow_mm, wide_mm
-    for _ in range(GROWTHS):
+    for _ in range(USUAL_CLOUD.growths):
         # a ball not much wider than the noise cuts it off at its ends
-        told = found.sigma_mm if reached_mm >= NOISE_NOISES * found.sigma_mm else None
+        told = found.sigma_mm if reached_mm >= USUAL_CLOUD.noise_noises * found.sigma_mm else None
         found = _planes(points_mm, radius_mm, told).or_better(found)
-        if radius_mm >= PLANE_NOISES * found.sigma_mm:
+        if radius_mm >= USUAL_CLOUD.plane_noises * found.sigma_mm:
             break
         reached_mm = radius_mm
-        radius_mm = min(GROWTH * radius_mm, PLANE_NOISES * found.sigma_mm)
+        radius_mm = min(USUAL_CLOUD.growth * radius_mm, USUAL_CLOUD.plane_noises * found.sigma_mm)
     return found
 
 
 def _planes(
     points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sigma_mm: float | None
 ) -> Planes:
-    cells = Cells.of(points_mm, radius_mm)
+    cells = SortedPoints.of(points_mm, radius_mm)
     ordered = np.ascontiguousarray(points_mm[cells.order])
     found, least, count = kernels.local_planes(ordered, cells.grid, radius_mm)
     normals, variance, m = np.empty_like(found), np.empty(len(found)), np.empty(len(found))
     normals[cells.order], variance[cells.order], m[cells.order] = found, least, count
     variance = np.maximum(variance, 0.0)
     if sigma_mm is None:
-        enough = m >= LEAST_PLANE_POINTS
+        enough = m >= USUAL_CLOUD.least_plane_points
         freedom = m[enough] - 3
-        ratio = variance[enough] * m[enough] / chdtri(freedom, 1.0 - NOISE_QUANTILE)
-        sigma_mm = float(np.sqrt(np.quantile(ratio, NOISE_QUANTILE))) if enough.any() else 0.0
+        ratio = variance[enough] * m[enough] / chdtri(freedom, 1.0 - USUAL_CLOUD.noise_quantile)
+        sigma_mm = (
+            float(np.sqrt(np.quantile(ratio, USUAL_CLOUD.noise_quantile))) if enough.any() else 0.0
+        )
     # residuals over the points' lever: over a disc, each coordinate has a quarter of r² as variance
     freedom = np.maximum(m - 3, 0.5)
     off = np.maximum(variance * m / freedom, sigma_mm**2)
     tilt = np.sqrt(4.0 * off / m) / radius_mm
     return Planes(normals, sigma_mm, np.sqrt(np.maximum(variance - sigma_mm**2, 0.0)), tilt)
-
-
-def directions(count: int = OPEN_DIRECTIONS) -> Float[np.ndarray, "k 3"]:
-    """Directions spread evenly over the sphere (Fibonacci)."""
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    angle = np.pi * (1 + 5**0.5) * k
-    r = np.sqrt(1 - z**2)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
 def outward(
@@ -177,7 +155,7 @@ def outward(
         Which of them may turn; all where none are given.
     """
     whose = np.arange(len(points_mm)) if asked is None else asked
-    step = len(whose) // LOOKING_POINTS + 1
+    step = len(whose) // USUAL_CLOUD.looking_points + 1
     look, facing = (np.ascontiguousarray(each[whose[::step]]) for each in (points_mm, normals))
     votes = _seen_from(look, facing, points_mm, normals, spacing_mm, sigma_mm)
     side = _agreed(look, facing, (facing * votes).sum(axis=1), spacing_mm * np.sqrt(step), sigma_mm)
@@ -204,11 +182,11 @@ def outward_by(
     asked = np.flatnonzero(~known)
     told, by = _told_by(
         points_mm[asked], normals[asked], points_mm[known], normals[known], spacing_mm, sigma_mm,
-        within_mm=TELLS_SPACINGS * spacing_mm,
+        within_mm=USUAL_CLOUD.tells_spacings * spacing_mm,
     )  # fmt: skip
     found = normals.copy()
     found[asked] *= np.where(told < 0, -1.0, 1.0)[:, None]
-    rest = asked[by < TOLD_ENOUGH]
+    rest = asked[by < USUAL_CLOUD.told_enough]
     return outward(points_mm, found, spacing_mm, sigma_mm, rest) if len(rest) else found
 
 
@@ -225,7 +203,7 @@ def _told_by(
 
     Those on its own sheet: at its height, by the mean of both planes.
     """
-    near = min(TOLD_BY, len(look_mm))
+    near = min(USUAL_CLOUD.told_by, len(look_mm))
     if near == 0:
         return np.zeros(len(points_mm)), np.zeros(len(points_mm))
     away, index = cKDTree(look_mm).query(
@@ -237,7 +215,7 @@ def _told_by(
     offset = look_mm[index] - points_mm[:, None]
     mean = normals[:, None] + np.sign(cosine)[..., None] * facing[index]
     height = np.einsum("nka,nka->nk", offset, mean) / 2
-    slack = np.maximum(SHEET_SLOPE * away, SHEET_NOISES * sigma_mm) + 1e-9
+    slack = np.maximum(USUAL_CLOUD.sheet_slope * away, USUAL_CLOUD.sheet_noises * sigma_mm) + 1e-9
     beside = np.where(there, np.exp(-((height / slack) ** 2)) * np.abs(cosine), 0.0)
     said = beside * np.sign(cosine) / (away + 0.1 * spacing_mm) ** 2
     return said.sum(axis=1), beside.sum(axis=1)
@@ -252,21 +230,22 @@ def _seen_from(
     sigma_mm: float,
 ) -> Float[np.ndarray, "s 3"]:
     """(s, 3) sums of the directions in which places see far past the points' discs."""
-    step = len(points_mm) // HIDING_POINTS + 1
+    step = len(points_mm) // USUAL_CLOUD.hiding_points + 1
     place, plane = (np.ascontiguousarray(each[::step]) for each in (points_mm, normals))
-    disc_mm = DISC_SPACINGS * spacing_mm * float(np.sqrt(step))
+    disc_mm = USUAL_CLOUD.disc_spacings * spacing_mm * float(np.sqrt(step))
     extent_mm = float(np.ptp(place, axis=0).max())
-    cell_mm = max(disc_mm, extent_mm / MOST_CELLS)
+    cell_mm = max(disc_mm, extent_mm / USUAL_CLOUD.most_cells)
     low = place.min(axis=0) - 2.0 * cell_mm - disc_mm
     shape = np.floor((place.max(axis=0) + disc_mm - low) / cell_mm).astype(np.int64) + 3
     start, discs = kernels.discs_of_cells(place, plane, disc_mm, low, cell_mm, shape)
-    own_mm = max(OWN_DISCS * disc_mm, 2.0 * SHEET_NOISES * sigma_mm)
-    return np.asarray(
-        kernels.open_side(
-            look_mm, facing, directions(), place, plane, kernels.Grid(low, cell_mm, shape, start),
-            discs, kernels.Sheet(disc_mm, own_mm, SHEET_SLOPE, SHEET_NOISES * sigma_mm),
-        )
-    )  # fmt: skip
+    noise_mm = USUAL_CLOUD.sheet_noises * sigma_mm
+    own_mm = max(USUAL_CLOUD.own_discs * disc_mm, 2.0 * noise_mm)
+    ways, grid = (
+        spread_directions(USUAL_CLOUD.directions),
+        kernels.PointGrid(low, cell_mm, shape, start),
+    )
+    sheet = kernels.Sheet(disc_mm, own_mm, USUAL_CLOUD.sheet_slope, noise_mm)
+    return np.asarray(kernels.open_side(look_mm, facing, ways, place, plane, grid, discs, sheet))
 
 
 def _agreed(
@@ -279,20 +258,24 @@ def _agreed(
     """(s,) the sides, after places on one sheet have told each other: a face turns as a whole."""
     from scipy.sparse import coo_matrix
 
-    pairs = cKDTree(look_mm).query_pairs(TELLS_SPACINGS * spacing_mm, output_type="ndarray")
+    pairs = cKDTree(look_mm).query_pairs(
+        USUAL_CLOUD.tells_spacings * spacing_mm, output_type="ndarray"
+    )
     i, j = pairs[:, 0], pairs[:, 1]
     cosine = (plane[i] * plane[j]).sum(axis=1)
     offset = look_mm[j] - look_mm[i]
     reach = np.linalg.norm(offset, axis=1)
     height = np.abs((offset * (plane[i] + np.sign(cosine)[:, None] * plane[j])).sum(axis=1)) / 2
     together = np.abs(cosine) > 0.8
-    together &= height < np.maximum(SHEET_SLOPE * reach, SHEET_NOISES * sigma_mm)
+    together &= height < np.maximum(
+        USUAL_CLOUD.sheet_slope * reach, USUAL_CLOUD.sheet_noises * sigma_mm
+    )
     weight = np.where(together, cosine, 0.0)
     count = len(look_mm)
     graph = coo_matrix((weight, (i, j)), shape=(count, count)).tocsr()
     graph = graph + graph.T
     degree = np.maximum(np.asarray(np.abs(graph).sum(axis=1)).ravel(), 1.0)
     found = side
-    for _ in range(AGREE_ROUNDS):
+    for _ in range(USUAL_CLOUD.agree_rounds):
         found = 0.05 * side + 0.95 * (graph @ found) / degree
     return np.where(found == 0, side, found)

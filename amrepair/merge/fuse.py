@@ -17,12 +17,12 @@ from scipy import ndimage
 from amrepair.device import open3d
 from amrepair.errors import TemplateError
 from amrepair.merge import fuse_kernels as kernels
-from amrepair.merge.cloud import Cells
+from amrepair.merge.cloud import SortedPoints
 from amrepair.merge.options import USUAL_FUSE, FuseOptions
 from amrepair.template.extract import zero_level
 from amrepair.template.grid import Coverage, surface_elements
-from amrepair.template.mesh_file import manifold_arrays
 from amrepair.template.mesh_sdf import MeshSdf
+from gcode.meshes import mesh_of
 from gcode.solids import as_manifold, is_valid
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def fuse(
     radius_mm = reach_mm(cloud, options)
     edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
     low, shape, nodes, index = _band(points, edge, radius_mm)
-    cells = Cells.of(points, radius_mm)
+    cells = SortedPoints.of(points, radius_mm)
     field, excess, heard, overruled = kernels.fused_nodes(
         nodes, np.ascontiguousarray(points[cells.order]),
         np.ascontiguousarray(normals[cells.order]), np.ascontiguousarray(scan[cells.order]),
@@ -439,13 +439,13 @@ def solid_surface(
     if not is_valid(solid):
         raise TemplateError("the fused surface is no valid solid; scan the part more evenly")
     if solid.volume() < 0:
-        whole, turned = manifold_arrays(solid)
+        whole, turned = mesh_of(solid)
         solid = as_manifold(whole, turned[:, ::-1])
     pieces = solid.decompose()
     largest = max(abs(piece.volume()) for piece in pieces)
     kept = [piece for piece in pieces if abs(piece.volume()) >= dust_ratio * largest]
     solid = m3.Manifold.compose(kept) if len(kept) < len(pieces) else solid
-    vertices, faces = manifold_arrays(solid)
+    vertices, faces = mesh_of(solid)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.metadata["notes"] = ()
     return mesh

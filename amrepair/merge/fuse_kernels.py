@@ -23,7 +23,7 @@ LAST_BIT = 62
 RAY_STEP = 0.5  # of a cell
 
 
-class Grid(NamedTuple):
+class PointGrid(NamedTuple):
     """Cells that points are sorted by: corner, edge, how many, and where each one's begin."""
 
     low: Float[np.ndarray, " 3"]

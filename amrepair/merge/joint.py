@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 
 from amrepair.align.registration import bounded_inverse
 from amrepair.frames import motion_about, moved
-from amrepair.merge.kept import Kept
+from amrepair.merge.kept import KeptAnswers
 from amrepair.merge.options import USUAL_MERGE, JointOptions
 from amrepair.merge.threads import in_threads
 from amrepair.merge.views import View, loss_weight
@@ -92,7 +92,7 @@ class _Pairs:
     confidence: Float[np.ndarray, " q"]
 
 
-Answers = dict[tuple[int, int], Kept]
+Answers = dict[tuple[int, int], KeptAnswers]
 
 
 def together(
@@ -196,7 +196,7 @@ def _answers(
 ) -> Answers:
     """None yet, of each scan's sampled points by every other."""
     return {
-        (k, r): Kept.of(other.surface.tree, _reach_mm(view, other, options), len(sample[k]))
+        (k, r): KeptAnswers.of(other.surface.tree, _reach_mm(view, other, options), len(sample[k]))
         for k, view in enumerate(views)
         for r, other in enumerate(views)
         if r != k

@@ -17,7 +17,7 @@ WIDER = 1.25  # asked so much farther than wanted: what is beyond may move a whi
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class KeptAnswers:
     """What a tree answered for some places, and for how long it holds.
 
     Attributes
@@ -39,7 +39,7 @@ class Kept:
     holds_mm: Float[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, tree: cKDTree, reach_mm: float, count: int) -> Kept:
+    def of(cls, tree: cKDTree, reach_mm: float, count: int) -> KeptAnswers:
         """Nothing yet, of so many places."""
         return cls(
             tree, reach_mm, np.zeros((count, 3)), np.full(count, tree.n), np.full(count, -1.0)

@@ -354,3 +354,65 @@ class MergeOptions:
 
 USUAL_MERGE = MergeOptions()
 """What the command line goes by."""
+
+
+@dataclass(frozen=True, slots=True)
+class CloudOptions:
+    """Planes and sides of points that know neither normals nor sensors.
+
+    Attributes
+    ----------
+    narrow_points, wide_points
+        Points that planes are fitted to, on average: few where walls are thin, or more, by the
+        tilt.
+    plane_noises, growths, growth
+        A plane's radius over the noise, at least: 4 of them tilt it by some 3°. How often it
+        grows, and by how much.
+    noise_noises
+        Radius over the noise from which on a plane tells the noise.
+    noise_quantile, least_plane_points
+        Of the planes' scatter, that tells the noise; points of a plane that does.
+    directions
+        That a point looks in: a deep hole is open in one of a hundred.
+    looking_points
+        So many look around themselves; the others are told by those beside them.
+    hiding_points, disc_spacings
+        So many stand for the surface that hides others, each as a disc of so many spacings,
+        which leaves one place in a hundred bare.
+    most_cells
+        Of the grid that rays pass, along the longest side.
+    sheet_slope, sheet_noises
+        Of two places on one sheet the height over the distance is less than so much, or chance.
+    own_discs
+        Discs nearer than so many of their radii are not in the way if they are of the looker's
+        own sheet.
+    tells_spacings, told_by, told_enough
+        A point tells others of its side within; so many tell one; so many on one's own sheet
+        are enough.
+    agree_rounds
+        Places that a verdict travels.
+    """
+
+    narrow_points: int = 10
+    wide_points: int = 25
+    plane_noises: float = 8.0
+    growths: int = 3
+    growth: float = 1.6
+    noise_noises: float = 4.0
+    noise_quantile: float = 0.1
+    least_plane_points: int = 8
+    directions: int = 256
+    looking_points: int = 8_000
+    hiding_points: int = 50_000
+    disc_spacings: float = 1.2
+    most_cells: int = 250
+    sheet_slope: float = 0.2
+    sheet_noises: float = 4.0
+    own_discs: float = 2.5
+    tells_spacings: float = 2.2
+    told_by: int = 8
+    told_enough: float = 1.0
+    agree_rounds: int = 60
+
+
+USUAL_CLOUD = CloudOptions()

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from amrepair.frames import moved, ways_across
+from amrepair.frames import moved, spread_directions, ways_across
 from amrepair.merge import sight_kernels as kernels
-from amrepair.merge.cloud import directions, outward, planes, spacing_of
+from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.options import USUAL_MERGE, SightOptions
 
 
@@ -33,7 +33,7 @@ class Veil:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class DepthImage:
     """A range image.
 
     Attributes
@@ -63,7 +63,7 @@ class Look:
         way: Float[np.ndarray, " 3"] | None = None,
         guessed: bool = False,
         options: SightOptions = USUAL_MERGE.sight,
-    ) -> Look:
+    ) -> DepthImage:
         """The image of what a sensor saw, that stood still or moved along a way (unit vector)."""
         closing, edge_on = options.closing_px, options.edge_on
         if guessed:
@@ -136,7 +136,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
+class DepthImages:
     """Of one scan.
 
     Attributes
@@ -148,7 +148,7 @@ class Looks:
         They are such places: free is what is free for all of them.
     """
 
-    each: tuple[Look, ...]
+    each: tuple[DepthImage, ...]
     guessed: bool
 
     def free(
@@ -192,7 +192,7 @@ class Looks:
         return np.array([look.camera.sensor for look in self.each]).reshape(-1, 3)
 
 
-NOWHERE = Looks((), False)
+NOWHERE = DepthImages((), False)
 
 
 def told(
@@ -200,20 +200,22 @@ def told(
     sensors_mm: Float[np.ndarray, "k 3"],
     sensor_index: Int[np.ndarray, " n"],
     options: SightOptions = USUAL_MERGE.sight,
-) -> Looks:
+) -> DepthImages:
     """Looks of sensors whose places are known; many places on a line are one that moved along."""
     if len(sensors_mm) > 3:
         middle = sensors_mm.mean(axis=0)
         _, size, ways = np.linalg.svd(sensors_mm - middle, full_matrices=False)
         if size[1] <= options.way_ratio * size[0]:
-            return Looks((Look.of(points_mm, middle, way=ways[0], options=options),), False)
+            return DepthImages(
+                (DepthImage.of(points_mm, middle, way=ways[0], options=options),), False
+            )
     own = [points_mm[sensor_index == k] for k in range(len(sensors_mm))]
     each = [
-        Look.of(seen, place, options=options)
+        DepthImage.of(seen, place, options=options)
         for seen, place in zip(own, sensors_mm, strict=True)
         if len(seen) > options.least_seen
     ]
-    return Looks(tuple(each), False)
+    return DepthImages(tuple(each), False)
 
 
 def guess_directions(
@@ -227,7 +229,7 @@ def guess_directions(
     spacing_mm = spacing_of(points_mm)
     plane = planes(points_mm, spacing_mm)
     normals = plane.normals
-    ways = directions(options.places)
+    ways = spread_directions(options.places)
     hidden = np.array([_hidden(points_mm, normals, way, spacing_mm, options) for way in ways])
     if hidden.min() > options.view_ratio:
         return np.empty((0, 3))
@@ -245,13 +247,15 @@ def guessed(
     points_mm: Float[np.ndarray, "n 3"],
     towards: Float[np.ndarray, "k 3"],
     options: SightOptions = USUAL_MERGE.sight,
-) -> Looks:
+) -> DepthImages:
     """Looks from every place where the sensor may have stood."""
     centre = points_mm.mean(axis=0)
     diagonal_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
-    return Looks(
+    return DepthImages(
         tuple(
-            Look.of(points_mm, centre + ratio * diagonal_mm * way, guessed=True, options=options)
+            DepthImage.of(
+                points_mm, centre + ratio * diagonal_mm * way, guessed=True, options=options
+            )
             for way in towards
             for ratio in options.sensor_distances
         ),

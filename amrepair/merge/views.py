@@ -21,6 +21,8 @@ from amrepair.merge.options import USUAL_MERGE, JudgeOptions, MergeOptions
 from amrepair.merge.threads import in_threads
 from amrepair.scans import Scan
 
+STEP_DAMPING = 1e-6  # of the mean curvature of turns, and of shifts
+
 
 @dataclass(frozen=True, slots=True)
 class Surface:
@@ -75,7 +77,7 @@ class View:
     spacing_mm: float
     thin_spacing_mm: float
     sigma_mm: float
-    looks: sight.Looks
+    looks: sight.DepthImages
     clear: float
 
     @classmethod
@@ -142,7 +144,7 @@ def _looks(
     sensor_index: Int[np.ndarray, " n"] | None,
     rng: np.random.Generator,
     options: MergeOptions,
-) -> sight.Looks:
+) -> sight.DepthImages:
     few = rng.permutation(len(points_mm))[: options.view.image_points]
     image = np.ascontiguousarray(points_mm[few])
     if sensors_mm is not None and sensor_index is not None:
@@ -160,7 +162,7 @@ def _facing(
     sigma_mm: float,
     sensors_mm: Float[np.ndarray, "k 3"] | None,
     sensor_index: Int[np.ndarray, " n"] | None,
-    looks: sight.Looks,
+    looks: sight.DepthImages,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Normals to the sensor that saw each point, else to where more of the distance is in sight.
 
@@ -285,7 +287,6 @@ def _step(
     normals: Float[np.ndarray, "q 3"],
     height_mm: Float[np.ndarray, " q"],
     scale_mm: float,
-    damping: float = 1e-6,
 ) -> Float[np.ndarray, "4 4"]:
     """The (4, 4) motion of one Gauss–Newton step that brings points onto planes."""
     weight = loss_weight(height_mm, scale_mm)
@@ -293,7 +294,7 @@ def _step(
     jacobian = np.concatenate([np.cross(points_mm - centre, normals), normals], axis=1)
     weighted = jacobian * weight[:, None]
     matrix = weighted.T @ jacobian
-    matrix += damping * np.diag(np.diag(matrix).reshape(2, 3).mean(axis=1).repeat(3))
+    matrix += STEP_DAMPING * np.diag(np.diag(matrix).reshape(2, 3).mean(axis=1).repeat(3))
     step = -np.linalg.solve(matrix, weighted.T @ height_mm)
     return motion_about(centre, step[:3], step[3:])
 

@@ -4,7 +4,7 @@ It reads the job and adds lines; every line that was there stays as it is, byte 
 at nothing and repairs nothing: that is for whoever is told by the marks (`loop`, a host's macro).
 """
 
-from amrepair.postprocess.mark import Asked, Marked, mark
+from amrepair.postprocess.mark import LooksAsked, Marked, mark
 from amrepair.postprocess.words import TARGETS, Target, target_of
 
-__all__ = ["TARGETS", "Asked", "Marked", "Target", "mark", "target_of"]
+__all__ = ["TARGETS", "LooksAsked", "Marked", "Target", "mark", "target_of"]

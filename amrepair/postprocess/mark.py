@@ -22,7 +22,7 @@ HOST_DIALECTS = {"octoprint": "marlin"}  # whose modes a job follows, where a ho
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class LooksAsked:
     """When to look.
 
     Attributes
@@ -89,7 +89,7 @@ def decoded(data: bytes, name: str) -> str:
     return data.decode("utf-8", "surrogateescape")
 
 
-def mark(text: str, name: str, target: Target, asked: Asked) -> Marked:
+def mark(text: str, name: str, target: Target, asked: LooksAsked) -> Marked:
     """Put looks into a job.
 
     Parameters
@@ -132,7 +132,7 @@ def mark(text: str, name: str, target: Target, asked: Asked) -> Marked:
     )
 
 
-def _chosen(job: Job, places: Places, asked: Asked) -> tuple[tuple[Place, ...], int]:
+def _chosen(job: Job, places: Places, asked: LooksAsked) -> tuple[tuple[Place, ...], int]:
     """The looks in the job's order, and how many were moved to a later layer."""
     count = len(job.layers)
     room = max(asked.every // 2, 1)

@@ -23,11 +23,10 @@ from amrepair.report.collect import (
     wire_counters,
 )
 from amrepair.report.data import Figures, ReportData, TemperatureSeries
+from amrepair.report.options import USUAL_PAGE
 from amrepair.report.text import outcome_of
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
-
-LEFT_OUT_RATIO = 0.05  # of what is missing may stay out of reach
 
 
 def plan_is_enough(plan: RepairPlan) -> bool:
@@ -38,7 +37,7 @@ def plan_is_enough(plan: RepairPlan) -> bool:
         return False
     left_mm3 = sum(u.volume_mm3 for u in plan.patch.unreachable)
     left_mm3 += sum(u.volume_mm3 for u in plan.patch.unprintable)
-    return left_mm3 <= LEFT_OUT_RATIO * plan.deficit.missing_mm3
+    return left_mm3 <= USUAL_PAGE.left_out_ratio * plan.deficit.missing_mm3
 
 
 def report_of_plan(

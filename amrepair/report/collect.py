@@ -14,8 +14,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float
 
-from amrepair.loop import Action, LoopReport
-from amrepair.loop import Look as LoopLook
+from amrepair.loop import Action, Look, LoopReport
 from amrepair.loop.afterwards import Afterwards
 from amrepair.loop.buried import buried_mm3, pieces_of
 from amrepair.loop.findings import reach_of
@@ -27,21 +26,20 @@ from amrepair.repair import RepairPlan
 from amrepair.report.data import (
     BeadPath,
     Counter,
-    Decision,
     HeightMap,
-    Look,
     RegionRow,
-    Rule,
+    ReportDecision,
+    ReportLook,
+    ReportRule,
     SolidMesh,
 )
 from amrepair.report.left import left_parts
+from amrepair.report.options import USUAL_PAGE
 from amrepair.report.text import NEGLIGIBLE_MM3, kind_name, plan_lines, quantity
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
 
 DIGITS = 6  # of every figure in a result: beyond what any scan can tell
-STRAY_LIMITS = 3.0  # so many limits outside, and no excess: it hangs in the air
-OUTLINE_MM = 0.05  # finer than a pixel of the drawing
 _LIBRARIES = (
     "amrepair",
     "manifold3d",
@@ -202,7 +200,7 @@ def loop_result(
     return dict(rounded(result))
 
 
-def _stop_row(look: LoopLook) -> dict[str, Any]:
+def _stop_row(look: Look) -> dict[str, Any]:
     plan = look.plan
     return {
         "look": look.number,
@@ -252,7 +250,7 @@ def plan_result(
 
 def look_of(
     plan: RepairPlan, label: str, *, printed: bool, stop: str = "", scanned_points: int = 0
-) -> Look:
+) -> ReportLook:
     """What the page shows of one scan.
 
     Parameters
@@ -260,7 +258,7 @@ def look_of(
     printed
         Whether its repair was printed.
     stop, scanned_points
-        As in `Look`.
+        As in `ReportLook`.
     """
     build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
     scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
@@ -269,7 +267,7 @@ def look_of(
     beads = None
     if plan.patch is not None and (printed or plan.checked is not None):
         beads = BeadPath.from_toolpath(plan.patch.toolpath)
-    return Look(
+    return ReportLook(
         label=label,
         points_mm=build_from_template.apply(scan.points_mm[shown]),
         deviation_mm=anomaly.deviation_mm[shown],
@@ -312,7 +310,7 @@ def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
     )
     flat = plan.scan.points_mm[:, 2] < foot_mm + USUAL_BACKGROUND.band_mm
     outside = anomaly.deviation_mm > anomaly.threshold_mm
-    far = anomaly.deviation_mm > STRAY_LIMITS * anomaly.threshold_mm
+    far = anomaly.deviation_mm > USUAL_PAGE.stray_limits * anomaly.threshold_mm
     return ~(((flat & outside) | far) & (anomaly.label == int(Label.OK)))
 
 
@@ -321,7 +319,7 @@ def outlines_mm(plan: RepairPlan) -> tuple[Float[np.ndarray, "_ 2"], ...]:
     outlines = []
     for solid in (plan.deficit.missing, plan.deficit.excess):
         if not solid.is_empty():
-            smooth = solid.project().simplify(OUTLINE_MM)
+            smooth = solid.project().simplify(USUAL_PAGE.outline_mm)
             outlines += [np.asarray(ring, dtype=np.float64) for ring in smooth.to_polygons()]
     return tuple(outlines)
 
@@ -334,7 +332,7 @@ def solid_mesh(solid: Any) -> SolidMesh | None:
     return SolidMesh(vertices, faces)
 
 
-def decision_of(look: LoopLook) -> Decision:
+def decision_of(look: Look) -> ReportDecision:
     """What was decided at a look, and why: the rows of the table that fitted."""
     plan, decided = look.plan, look.decision
     choice = str(decided.action)
@@ -359,12 +357,12 @@ def decision_of(look: LoopLook) -> Decision:
         reasons.append(f"The nozzle cannot reach {quantity(plan.unreachable_mm3, 'mm³')}.")
     where = f"{look_label(look)}, z = {look.stop.z_mm:.2f} mm"
     rows = {decided.row, *(verdict.row for verdict in decided.verdicts)}
-    return Decision(
+    return ReportDecision(
         where, choice, tuple(reasons), tuple(r for r in _REPORTED_RULES if r.id in rows)
     )
 
 
-def look_label(look: LoopLook) -> str:
+def look_label(look: Look) -> str:
     """`Layer 44, scan 3`, or `Finished part, scan 5`: scans are counted over the whole run."""
     index = look.stop.layer_index
     where = "Finished part" if index is None else f"Layer {index}"
@@ -372,7 +370,7 @@ def look_label(look: LoopLook) -> str:
 
 
 _REPORTED_RULES = tuple(
-    Rule(
+    ReportRule(
         row.id,
         ", ".join(map(str, row.when)) or "in any other case",
         f"{row.action}: {row.reason}",
@@ -381,7 +379,9 @@ _REPORTED_RULES = tuple(
 )
 
 
-def decision_of_plan(plan: RepairPlan, *, enough: bool, late: Afterwards | None = None) -> Decision:
+def decision_of_plan(
+    plan: RepairPlan, *, enough: bool, late: Afterwards | None = None
+) -> ReportDecision:
     """What a single planned repair comes to, and why."""
     if plan.checked is None:
         choice = "nothing to print" if enough else "no repair"
@@ -395,7 +395,7 @@ def decision_of_plan(plan: RepairPlan, *, enough: bool, late: Afterwards | None 
     if plan.checked is not None:
         reasons.append("The program has passed the checker, against what stands there.")
     reasons += [_sentence(line) for line in (late.told if late is not None else ())]
-    return Decision("as scanned", choice, tuple(reasons))
+    return ReportDecision("as scanned", choice, tuple(reasons))
 
 
 def _sentence(text: str) -> str:

@@ -189,7 +189,7 @@ class RegionRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class ReportRule:
     """One row of the decision table: its name there, when it holds, what follows."""
 
     id: str
@@ -198,7 +198,7 @@ class Rule:
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class ReportDecision:
     """One decision with its reasons.
 
     Attributes
@@ -216,7 +216,7 @@ class Decision:
     where: str
     choice: str
     reasons: tuple[str, ...]
-    rules: tuple[Rule, ...] = ()
+    rules: tuple[ReportRule, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +247,7 @@ class TemperatureSeries:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class ReportLook:
     """One scan and what followed from it.
 
     Attributes
@@ -370,11 +370,11 @@ class ReportData:
     title: str
     outcome: Outcome
     figures: Figures
-    looks: tuple[Look, ...]
+    looks: tuple[ReportLook, ...]
     setup: Mapping[str, str] = field(default_factory=dict)
     expected: SolidMesh | None = None
     regions: tuple[RegionRow, ...] = ()
-    decisions: tuple[Decision, ...] = ()
+    decisions: tuple[ReportDecision, ...] = ()
     wire: tuple[Counter, ...] = ()
     temperatures: tuple[TemperatureSeries, ...] = ()
     compare: tuple[int, int] | None = None

@@ -13,15 +13,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.align.thinning_kernels import morton_keys
 from amrepair.report.data import SolidMesh
+from amrepair.report.options import USUAL_PAGE
+from amrepair.template.surface import triangle_areas_normals
 
-# Triangles that differ from the original by less than this look the same at any zoom that shows
-# the part whole; a bead is eight times as wide.
-SIMPLIFY_START_MM = 0.01
-SIMPLIFY_STEPS = 7
-# Sharper than this is an edge of the part, not the facet of a cylinder.
-FEATURE_ANGLE_RAD = np.deg2rad(28.0)
-SHADING_NEIGHBOURS = 10
 SHADE_LEVELS = 16
 # Head-high light from where the first view looks, as drawings have it.
 LIGHT = np.array([0.42, 0.54, 0.73])
@@ -33,21 +29,19 @@ MORTON_BITS = 16
 Encoded = dict[str, object]
 
 
-def quantised(values: np.ndarray, *, bits: int = 16) -> Encoded:
-    """An array of reals as unsigned integers with an offset and a scale per column.
+def quantised(values: np.ndarray) -> Encoded:
+    """An array of reals as unsigned integers of 16 bits with an offset and a scale per column.
 
-    The error is at most half a step, extent / (2ᵇ − 1) / 2: 1.9 µm over 250 mm.
+    The error is at most half a step, extent / (2¹⁶ − 1) / 2: 1.9 µm over 250 mm.
     """
     columns = np.asarray(values, dtype=np.float64)
     columns = columns.reshape(len(columns), -1) if columns.size else columns.reshape(0, 1)
     low = columns.min(axis=0) if len(columns) else np.zeros(columns.shape[1])
     high = columns.max(axis=0) if len(columns) else np.zeros(columns.shape[1])
-    top = 2**bits - 1
-    step = np.where(high > low, (high - low) / top, 1.0)
+    step = np.where(high > low, (high - low) / (2**16 - 1), 1.0)
     whole = np.rint((columns - low) / step)
-    kind = "<u2" if bits > 8 else "|u1"
     return _packed(
-        whole.astype(kind),
+        whole.astype("<u2"),
         offset=[float(f"{value:.9g}") for value in low],
         scale=[float(f"{value:.9g}") for value in step],
     )
@@ -105,10 +99,10 @@ def shading(
     side
         Signs of X and Y of the corner that the light stands at.
     """
-    if len(points_mm) < SHADING_NEIGHBOURS:
+    if len(points_mm) < USUAL_PAGE.shading_neighbours:
         return np.full(len(points_mm), SHADE_LEVELS - 1)
     if normals is None:
-        neighbours = cKDTree(points_mm).query(points_mm, k=SHADING_NEIGHBOURS)[1]
+        neighbours = cKDTree(points_mm).query(points_mm, k=USUAL_PAGE.shading_neighbours)[1]
         around = points_mm[neighbours] - points_mm[neighbours].mean(axis=1, keepdims=True)
         axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
         # which side is out is not known, so the two sides of a face must look the same
@@ -128,8 +122,8 @@ def simplified(mesh: SolidMesh, *, budget: int) -> SolidMesh:
         )
     )
     if solid.status() == manifold3d.Error.NoError and not solid.is_empty():
-        tolerance_mm = SIMPLIFY_START_MM
-        for _ in range(SIMPLIFY_STEPS):
+        tolerance_mm = USUAL_PAGE.simplify_mm
+        for _ in range(USUAL_PAGE.simplify_steps):
             reduced = solid.simplify(tolerance_mm)
             if reduced.num_tri() <= budget and not reduced.is_empty():
                 out = reduced.to_mesh()
@@ -143,10 +137,7 @@ def simplified(mesh: SolidMesh, *, budget: int) -> SolidMesh:
 
 def feature_edges(mesh: SolidMesh, *, budget: int) -> Int[np.ndarray, "e 2"]:
     """(e, 2) vertex pairs where two faces meet at an angle; none if they exceed `budget`."""
-    corners = mesh.vertices_mm[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    normal = normal / np.where(length > 0, length, 1.0)[:, None]
+    area_mm2, normal = triangle_areas_normals(mesh.vertices_mm, mesh.faces)
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(mesh.faces)), 3)
     order = np.lexsort((owner, edges[:, 1], edges[:, 0]))
@@ -154,8 +145,8 @@ def feature_edges(mesh: SolidMesh, *, budget: int) -> Int[np.ndarray, "e 2"]:
     pairs = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
     one, other = owner[pairs], owner[pairs + 1]
     cosine = np.einsum("ij,ij->i", normal[one], normal[other])
-    proper = (length[one] > 0) & (length[other] > 0)
-    sharp = edges[pairs[proper & (cosine < np.cos(FEATURE_ANGLE_RAD))]]
+    proper = (area_mm2[one] > 0) & (area_mm2[other] > 0)
+    sharp = edges[pairs[proper & (cosine < np.cos(np.deg2rad(USUAL_PAGE.feature_deg)))]]
     return sharp if len(sharp) <= budget else sharp[:0]
 
 
@@ -183,15 +174,10 @@ def _every(indices: np.ndarray, count: int) -> np.ndarray:
 
 def _morton_order(points_mm: np.ndarray) -> np.ndarray:
     """Order along the Z-curve: neighbours in space are near each other in the order."""
-    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
-    extent_mm = max(float((high - low).max()), 1e-9)
-    whole = ((points_mm - low) / extent_mm * (2**MORTON_BITS - 1)).astype(np.uint64)
-    code = np.zeros(len(points_mm), dtype=np.uint64)
-    for bit in range(MORTON_BITS):
-        for axis in range(3):
-            one = (whole[:, axis] >> np.uint64(bit)) & np.uint64(1)
-            code |= one << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    low = points_mm.min(axis=0)
+    extent_mm = max(float((points_mm.max(axis=0) - low).max()), 1e-9)
+    edge_mm = extent_mm / (2**MORTON_BITS - 1)
+    return np.argsort(morton_keys(points_mm, low, edge_mm, MORTON_BITS), kind="stable")
 
 
 def _clustered(mesh: SolidMesh, budget: int) -> SolidMesh:

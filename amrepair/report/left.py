@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.report.data import LeftPart, SolidMesh
+from amrepair.report.options import USUAL_PAGE
 from gcode.slicing.patch import LeftCause, LeftColumns
 
-MOST_BOXES = 4_000  # in the page 12 faces each
 LEFT_KEYS = {
     LeftCause.OUT_OF_REACH: "left_reach",
     LeftCause.NO_BEAD: "left_bead",
@@ -28,7 +28,7 @@ def left_parts(left: tuple[LeftColumns, ...]) -> tuple[LeftPart, ...]:
     return tuple(sorted(parts, key=lambda part: -part.volume_mm3))
 
 
-def shape_of(columns: LeftColumns, most: int = MOST_BOXES) -> SolidMesh:
+def shape_of(columns: LeftColumns, most: int = USUAL_PAGE.left_boxes) -> SolidMesh:
     """Boxes over columns; neighbours joined, as many as it takes, each as high as they are.
 
     A box lies about the mean of its columns' middles, and holds as much as they do.

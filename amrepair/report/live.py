@@ -15,7 +15,8 @@ from amrepair.loop import Decision, Look
 from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.collect import decision_of, look_label, of_the_part
-from amrepair.report.operator import Operator, Verdict
+from amrepair.report.operator import Operator, OperatorAnswer
+from amrepair.report.options import USUAL_LIVE
 from amrepair.report.text import plan_lines
 from gcode.errors import GcodeError
 from gcode.meshes import mesh_of
@@ -30,10 +31,6 @@ COLOUR_STOPS = np.array(
 )  # fmt: skip
 MISSING_RGB, EXCESS_RGB, BEADS = (10, 98, 180), (207, 82, 0), (18, 144, 111)
 PART_RGB, JOB_RGB = (125, 139, 152), (176, 186, 194)
-MOST_SHOWN_POINTS = 300_000
-MOST_SEGMENTS = 400_000
-JOB_STEPS = 60  # how many pieces the growing part is shown in
-POINT_MM, BEAD_MM = 0.25, 0.35
 
 
 def deviation_colours(deviation_mm: Float[np.ndarray, " n"], range_mm: float) -> np.ndarray:
@@ -92,8 +89,8 @@ class LiveView:
             self._approve = gui.add_button("Approve", color="green", disabled=True)
             self._skip = gui.add_button("Skip", disabled=True)
             self._pause = gui.add_button("Pause")
-            self._approve.on_click(lambda _: operator.decide(Verdict.APPROVE))
-            self._skip.on_click(lambda _: operator.decide(Verdict.SKIP))
+            self._approve.on_click(lambda _: operator.decide(OperatorAnswer.APPROVE))
+            self._skip.on_click(lambda _: operator.decide(OperatorAnswer.SKIP))
             self._pause.on_click(lambda _: self._toggle_pause(operator))
             operator.changed = self._show_operator
         self._folder = gui.add_folder("Shown", expand_by_default=False)  # a phone has no room
@@ -182,7 +179,7 @@ class LiveView:
     ) -> None:
         """Draw points, coloured by deviation where it is known; many are thinned."""
         self._look_at(points_mm)
-        step = max(1, -(-len(points_mm) // MOST_SHOWN_POINTS))
+        step = max(1, -(-len(points_mm) // USUAL_LIVE.points))
         colours: Any = (140, 146, 152)
         if deviation_mm is not None:
             colours = deviation_colours(np.asarray(deviation_mm[::step]), range_mm)
@@ -190,7 +187,7 @@ class LiveView:
             f"/{name}",
             self._local(points_mm[::step]),
             colours,
-            point_size=POINT_MM,
+            point_size=USUAL_LIVE.point_mm,
             precision="float32",
         )
         self._switch(name, handle)
@@ -206,13 +203,13 @@ class LiveView:
         if not len(start_mm):
             return None
         self._look_at(start_mm)
-        step = max(1, -(-len(start_mm) // MOST_SEGMENTS))
+        step = max(1, -(-len(start_mm) // USUAL_LIVE.segments))
         ends = np.stack([start_mm[::step], end_mm[::step]], axis=1)
         return self.server.scene.add_line_segments(
             f"/{name}",
             self._local(ends.reshape(-1, 3)).reshape(-1, 2, 3),
             colour,
-            thickness=BEAD_MM,
+            thickness=USUAL_LIVE.bead_mm,
         )
 
     def show_toolpath(self, name: str, toolpath: Toolpath) -> None:
@@ -229,7 +226,7 @@ class LiveView:
         """Hand over a job: its beads appear as they are printed, or at once (`grown`)."""
         beads = job.beads
         real = np.flatnonzero(beads.layer >= 0)
-        for k, part in enumerate(np.array_split(real, min(JOB_STEPS, len(real)))):
+        for k, part in enumerate(np.array_split(real, min(USUAL_LIVE.job_steps, len(real)))):
             handle = self.show_segments(
                 f"{name}/{k}", beads.start_mm[part], beads.end_mm[part], JOB_RGB
             )
@@ -296,7 +293,7 @@ class LiveView:
         if self._operator is None:
             return True
         self.show_plan(plan, "Print this repair?")
-        return self._operator.ask() is Verdict.APPROVE
+        return self._operator.ask() is OperatorAnswer.APPROVE
 
     def ask(self, decision: Decision) -> bool:
         """Show why the run rests and wait: Approve goes on all the same, Skip ends it."""
@@ -306,7 +303,7 @@ class LiveView:
         why = [f"- {v.finding.type}: {v.reason}" for v in own] or [f"- {decision.reason}"]
         why += [f"- {way.told}" for way in decision.ways]
         self._found.content = "\n".join(["**Go on all the same?** (Skip ends the run)", *why])
-        return self._operator.ask() is Verdict.APPROVE
+        return self._operator.ask() is OperatorAnswer.APPROVE
 
     def record(self, look: Look) -> None:
         """Show a look with its outcome (the `record` of `run_loop`)."""

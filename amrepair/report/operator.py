@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import StrEnum
 
 
-class Verdict(StrEnum):
+class OperatorAnswer(StrEnum):
     """What an operator says of a repair."""
 
     APPROVE = "approve"
@@ -40,7 +40,7 @@ class Operator:
         self._asked = False
         self._paused = False
         self._closed = False
-        self._verdict: Verdict | None = None
+        self._verdict: OperatorAnswer | None = None
 
     @property
     def asked(self) -> bool:
@@ -52,7 +52,7 @@ class Operator:
         """Whether the run rests."""
         return self._paused
 
-    def ask(self) -> Verdict:
+    def ask(self) -> OperatorAnswer:
         """Wait until somebody decides; a view that is closed means skip."""
         with self._state:
             self._asked, self._verdict = True, None
@@ -61,12 +61,12 @@ class Operator:
             self._state.wait_for(
                 lambda: self._closed or (self._verdict is not None and not self._paused)
             )
-            verdict = self._verdict or Verdict.SKIP
+            verdict = self._verdict or OperatorAnswer.SKIP
             self._asked, self._verdict = False, None
         self.changed()
         return verdict
 
-    def decide(self, verdict: Verdict) -> bool:
+    def decide(self, verdict: OperatorAnswer) -> bool:
         """Answer the question that waits; False where none does: a late click decides nothing."""
         with self._state:
             if not self._asked or self._verdict is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from amrepair.report.data import Look, Outcome, ReportData
+from amrepair.report.data import Outcome, ReportData, ReportLook
 from amrepair.report.payload import drawn_looks
 from amrepair.report.tables import DASH, LEFT_CAUSES, decisions, escape, left, regions, run
 from amrepair.report.text import (
@@ -283,7 +283,7 @@ def _volumes(data: ReportData) -> str:
     return f'<div class="pair">{"".join(charts)}</div>' if charts else ""
 
 
-def _volumes_in_words(looks: Sequence[Look]) -> str:
+def _volumes_in_words(looks: Sequence[ReportLook]) -> str:
     return "; ".join(
         f"{look.label}: {quantity(look.missing_mm3, 'mm³')} missing, "
         f"{quantity(look.excess_mm3, 'mm³')} too much"

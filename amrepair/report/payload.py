@@ -13,22 +13,9 @@ import numpy as np
 
 from amrepair.frames import in_box
 from amrepair.report import encode
-from amrepair.report.data import BeadPath, HeightMap, Look, ReportData, SolidMesh
+from amrepair.report.data import BeadPath, HeightMap, ReportData, ReportLook, SolidMesh
+from amrepair.report.options import USUAL_PAGE
 
-# Bytes in the page: 15 per point, 12 per face, 25 per bead, 3 per cell; with the plotting
-# library's 4.8 MB all of them used up stay under 15 MB.
-POINTS_TOTAL = 300_000
-POINTS_PER_LOOK = 80_000
-UNSEEN_PER_LOOK = 8_000
-FACES_EXPECTED = 40_000
-FACES_TOTAL = 100_000
-EDGES_EXPECTED = 12_000
-BEADS_TOTAL = 40_000
-CELLS_TOTAL = 400_000
-SAMPLES_PER_SERIES = 2_000
-LOOKS_DRAWN = 12
-HISTOGRAM_BINS = 80
-VIEW_ASIDE_RATIO = 0.15  # of the part's side: a defect so far off its middle is seen from there
 AGREES_LABEL, MISSING_LABEL, EXCESS_LABEL = 0, 1, 2
 
 Json = dict[str, object]
@@ -66,14 +53,14 @@ def payload(data: ReportData) -> Json:
 def drawn_looks(data: ReportData) -> tuple[int, ...]:
     """Indices of the looks that are drawn in 3D: all, or those where something happened."""
     count = len(data.looks)
-    if count <= LOOKS_DRAWN:
+    if count <= USUAL_PAGE.looks:
         return tuple(range(count))
     importance = [
         (look.beads is not None, look.missing_mm3 + look.excess_mm3, -index)
         for index, look in enumerate(data.looks)
     ]
     ranked = sorted(range(1, count - 1), key=lambda index: importance[index], reverse=True)
-    return tuple(sorted({0, count - 1, *ranked[: LOOKS_DRAWN - 2]}))
+    return tuple(sorted({0, count - 1, *ranked[: USUAL_PAGE.looks - 2]}))
 
 
 def compared(data: ReportData, drawn: tuple[int, ...]) -> tuple[int, int]:
@@ -102,7 +89,10 @@ def facing(data: ReportData, drawn: tuple[int, ...], box_mm: np.ndarray) -> tupl
     if defect is None or len(defect.vertices_mm) == 0:
         return -1, -1
     away = defect.vertices_mm.mean(axis=0) - box_mm.mean(axis=0)
-    x, y = (1 if away[axis] > VIEW_ASIDE_RATIO * np.ptp(box_mm[:, axis]) else -1 for axis in (0, 1))
+    x, y = (
+        1 if away[axis] > USUAL_PAGE.aside_ratio * np.ptp(box_mm[:, axis]) else -1
+        for axis in (0, 1)
+    )
     return x, y
 
 
@@ -121,7 +111,7 @@ def bounds(data: ReportData) -> np.ndarray:
     return np.stack([low - margin_mm, high + margin_mm])
 
 
-def near_part(look: Look, box_mm: np.ndarray) -> Look:
+def near_part(look: ReportLook, box_mm: np.ndarray) -> ReportLook:
     """The look without what lies outside the box: the bed around the part, clutter."""
     inside = in_box(look.points_mm, box_mm[0], box_mm[1])
     if inside.all():
@@ -161,12 +151,12 @@ def nice_ceiling(value: float) -> float:
     return float(f"{10 * power:.6g}")
 
 
-def _look(look: Look, index: int, share: int, scale_mm: float, side: tuple[int, int]) -> Json:
-    budget = min(POINTS_PER_LOOK, POINTS_TOTAL // share)
+def _look(look: ReportLook, index: int, share: int, scale_mm: float, side: tuple[int, int]) -> Json:
+    budget = min(USUAL_PAGE.points_per_look, USUAL_PAGE.points // share)
     kept = encode.thinned(look.points_mm, look.label_of_point != AGREES_LABEL, budget=budget)
     points_mm = look.points_mm[kept]
     normals = None if look.normals is None else look.normals[kept]
-    faces = FACES_TOTAL // (2 * share)
+    faces = USUAL_PAGE.faces // (2 * share)
     return {
         "index": index,
         "label": html.escape(look.label),
@@ -181,7 +171,7 @@ def _look(look: Look, index: int, share: int, scale_mm: float, side: tuple[int, 
         "excess": _solid(look.excess, faces),
         **{part.key: _boxes(part.shape) for part in look.left},
         "unseen": _unseen(look.unseen_mm),
-        "beads": None if look.beads is None else _beads(look.beads, BEADS_TOTAL // share),
+        "beads": None if look.beads is None else _beads(look.beads, USUAL_PAGE.beads // share),
         "histogram": _histogram(look, scale_mm),
         "noise": {
             "told": html.escape(look.noise),
@@ -197,7 +187,7 @@ def _unseen(points_mm: np.ndarray | None) -> Json | None:
         return None
     everything = np.zeros(len(points_mm), dtype=np.bool_)
     return encode.quantised(
-        points_mm[encode.thinned(points_mm, everything, budget=UNSEEN_PER_LOOK)]
+        points_mm[encode.thinned(points_mm, everything, budget=USUAL_PAGE.unseen_per_look)]
     )
 
 
@@ -215,11 +205,11 @@ def _boxes(mesh: SolidMesh) -> Json:
 def _expected(mesh: SolidMesh) -> Json | None:
     if len(mesh.faces) == 0:
         return None
-    small = encode.simplified(mesh, budget=FACES_EXPECTED)
+    small = encode.simplified(mesh, budget=USUAL_PAGE.expected_faces)
     return {
         "vertices": encode.quantised(small.vertices_mm),
         "faces": encode.integers(small.faces),
-        "edges": encode.integers(encode.feature_edges(small, budget=EDGES_EXPECTED)),
+        "edges": encode.integers(encode.feature_edges(small, budget=USUAL_PAGE.expected_edges)),
     }
 
 
@@ -245,14 +235,14 @@ def _beads(beads: BeadPath, budget: int) -> Json:
     }
 
 
-def _histogram(look: Look, scale_mm: float) -> Json:
+def _histogram(look: ReportLook, scale_mm: float) -> Json:
     """Counts of all points; what lies beyond the scale is in the outermost bins."""
-    edges_mm = np.linspace(-scale_mm, scale_mm, HISTOGRAM_BINS + 1)
+    edges_mm = np.linspace(-scale_mm, scale_mm, USUAL_PAGE.histogram_bins + 1)
     inside = np.clip(look.deviation_mm, -scale_mm * (1 - 1e-9), scale_mm * (1 - 1e-9))
     counts, _ = np.histogram(inside, bins=edges_mm)
     return {
         "low": -scale_mm,
-        "step": 2 * scale_mm / HISTOGRAM_BINS,
+        "step": 2 * scale_mm / USUAL_PAGE.histogram_bins,
         "counts": counts.tolist(),
         "beyond": int((np.abs(look.deviation_mm) > scale_mm).sum()),
     }
@@ -261,7 +251,7 @@ def _histogram(look: Look, scale_mm: float) -> Json:
 def _heights(heights: HeightMap, share: int) -> Json:
     """The map on a grid coarse enough for the budget: the highest cell of each block."""
     ny, nx = heights.z_mm.shape
-    block = max(1, math.ceil(math.sqrt(ny * nx * share / CELLS_TOTAL)))
+    block = max(1, math.ceil(math.sqrt(ny * nx * share / USUAL_PAGE.cells)))
     pad = ((0, -ny % block), (0, -nx % block))
     z_mm = np.pad(heights.z_mm, pad, mode="edge")
     seen = np.pad(heights.seen, pad, mode="edge")
@@ -286,7 +276,7 @@ def _heights(heights: HeightMap, share: int) -> Json:
 def _series(
     name: str, time_s: np.ndarray, measured_c: np.ndarray, target_c: np.ndarray | None
 ) -> Json:
-    step = max(1, math.ceil(len(time_s) / SAMPLES_PER_SERIES))
+    step = max(1, math.ceil(len(time_s) / USUAL_PAGE.samples))
     return {
         "name": html.escape(name),
         "time": [_rounded(float(v)) for v in time_s[::step]],

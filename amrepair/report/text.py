@@ -44,7 +44,7 @@ HEADLINES = {
 }
 
 
-def quantity(value: float, unit: str, *, digits: int = 3) -> str:
+def quantity(value: float, unit: str) -> str:
     """`1,234 mm³`, `12.3 mm³`, `0.04 mm³`: about three significant digits, no exponent.
 
     Examples
@@ -56,7 +56,6 @@ def quantity(value: float, unit: str, *, digits: int = 3) -> str:
         return NOT_KNOWN
     magnitude = abs(value)
     decimals = 0 if magnitude >= 100 else 1 if magnitude >= 10 else 2
-    decimals = min(decimals, max(digits - 1, 0))
     text = f"{value:,.{decimals}f}"
     if float(text.replace(",", "")) == 0:
         text = "0"

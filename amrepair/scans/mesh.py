@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.scans.scan import Scan
@@ -13,13 +14,21 @@ from gcode.surfaces.sizes import PARSER_ERRORS, in_words
 
 MESH_SPACING_MM = 0.2
 MAX_MESH_SAMPLES = 2_000_000
-# glTF 2.0, 3.4: lengths are metres, and Y is up.
-GLTF_SUFFIX, GLTF_UNIT_MM = ".glb", 1000.0
-Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def read_mesh(path: Path, frame: str, sigma_mm: float, *, unit_mm: float = 1.0) -> Scan:
+def read_mesh(
+    path: Path,
+    frame: str,
+    sigma_mm: float,
+    *,
+    mm_from_file: Float[np.ndarray, "3 3"],
+) -> Scan:
     """A scanned mesh, open ones too, as points spread evenly over it with its normals.
+
+    Parameters
+    ----------
+    mm_from_file
+        The file's unit and axes.
 
     Raises
     ------
@@ -29,13 +38,11 @@ def read_mesh(path: Path, frame: str, sigma_mm: float, *, unit_mm: float = 1.0) 
     """
     try:
         vertices, faces = read_triangles(path)
-        if path.suffix.lower() == GLTF_SUFFIX:
-            vertices, unit_mm = vertices @ Z_UP_FROM_Y_UP.T, GLTF_UNIT_MM
         if len(faces) == 0:
             raise InputError(f"{path}: the mesh has no faces; export it again")
         import trimesh  # half a second, which a file that is refused need not wait
 
-        mesh = trimesh.Trimesh(unit_mm * vertices, faces, process=False)
+        mesh = trimesh.Trimesh(vertices @ mm_from_file.T, faces, process=False)
         area_mm2 = float(mesh.area)
         if not 0 < area_mm2 < np.inf:
             raise InputError(f"{path}: the mesh has an area of {area_mm2:g} mm²; export it again")

@@ -20,7 +20,7 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans.range_grid import RangeGrid
 from amrepair.scans.scan import Scan
-from amrepair.scans.text import filled, read_table
+from gcode.clouds.text import filled, read_table
 from gcode.surfaces.sizes import refuse_short
 
 MM_PER_M = 1000.0

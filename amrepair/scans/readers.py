@@ -19,20 +19,14 @@ from amrepair.errors import InputError, refused_as_ours
 from amrepair.scans.arrays import is_map, load_npy, read_height_map, read_npz
 from amrepair.scans.depth_map import read_depth_map
 from amrepair.scans.mesh import read_mesh
-from amrepair.scans.pcd import PcdHeader, read_pcd
-from amrepair.scans.ply import (
-    millimetres_of,
-    read_grid,
-    read_header,
-    read_vertices,
-    sensors_of,
-    write_ply,
-)
+from amrepair.scans.ply import millimetres_of, read_grid, sensors_of, write_ply
 from amrepair.scans.ptx import read_ptx
 from amrepair.scans.range_grid import NO_POINT, RangeGrid, edge_flags
 from amrepair.scans.scan import DEFAULT_SIGMA_MM, Scan
-from amrepair.scans.text import read_table
 from amrepair.scans.viewpoint import viewpoint_of
+from gcode.clouds.pcd import PcdHeader, read_pcd
+from gcode.clouds.ply import read_header, read_vertices
+from gcode.clouds.text import read_rows
 from gcode.surfaces.depth_maps import is_depth_map
 
 POINT_SUFFIXES = frozenset(
@@ -40,6 +34,8 @@ POINT_SUFFIXES = frozenset(
 )
 MESH_SUFFIXES = frozenset({".stl", ".obj", ".3mf", ".off", ".glb"})
 UNIT_LENGTH_WITHIN, UNIT_LENGTH_SHARE = 0.05, 0.9  # two digits; some programs have gaps of 0 0 0
+# glTF 2.0, 3.4: lengths are metres, and Y is up.
+GLTF_MM = 1000.0 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 HEIGHT_SUFFIXES = frozenset({".tif", ".tiff"})
 
 __all__ = ["read_height_map", "read_scan", "write_ply"]
@@ -118,7 +114,8 @@ def _read(
     if suffix in POINT_SUFFIXES:
         return _read_table(path, frame)
     if suffix in MESH_SUFFIXES:
-        return read_mesh(path, frame, DEFAULT_SIGMA_MM)
+        unit = GLTF_MM if suffix == ".glb" else np.eye(3)
+        return read_mesh(path, frame, DEFAULT_SIGMA_MM, mm_from_file=unit)
     known = sorted(POINT_SUFFIXES | MESH_SUFFIXES | HEIGHT_SUFFIXES)
     raise InputError(f"{path}: a scan is one of {', '.join(known)}, not '{suffix}'")
 
@@ -198,7 +195,7 @@ def _read_ply(path: Path, frame: str) -> Scan:
     header = read_header(data, path)
     unit_mm = millimetres_of(header, path)
     if header.count_of("face") > 0:
-        return read_mesh(path, frame, DEFAULT_SIGMA_MM, unit_mm=unit_mm)
+        return read_mesh(path, frame, DEFAULT_SIGMA_MM, mm_from_file=unit_mm * np.eye(3))
     sigma_mm = DEFAULT_SIGMA_MM
     said = header.said("sigma_mm")
     if said is not None:
@@ -278,18 +275,7 @@ def _read_table(path: Path, frame: str) -> Scan:
 
     Six columns may be x y z and a colour, too: normals are as long as one another, colours are not.
     """
-    if path.suffix.lower() == ".npy":
-        table = load_npy(path)
-    else:
-        text = _bytes(path).decode("utf-8", "replace")
-        bare = (line.split("#", 1)[0].strip() for line in text.splitlines())
-        lines = [line for line in bare if line and line[0] not in "/;"]
-        if lines and (not _is_row(lines[0]) or lines[0].isdecimal()):
-            lines = lines[1:]
-        if not lines:
-            raise InputError(f"{path}: the file holds no points; check the export")
-        delimiter = next((d for d in (",", ";") if d in lines[0]), None)
-        table = read_table(lines, path, "the points", delimiter=delimiter)
+    table = load_npy(path) if path.suffix.lower() == ".npy" else read_rows(_bytes(path), path)
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: rows need at least x y z, the array has shape {table.shape}")
     names = ["x", "y", "z"]
@@ -302,15 +288,6 @@ def _are_unit(vectors: Float[np.ndarray, "n 3"]) -> bool:
     """Whether nearly all are of length 1, as files round it."""
     length = np.linalg.norm(vectors, axis=1)
     return bool((np.abs(length - 1.0) < UNIT_LENGTH_WITHIN).mean() > UNIT_LENGTH_SHARE)
-
-
-def _is_row(line: str) -> bool:
-    """Whether a line is numbers."""
-    try:
-        [float(word) for word in line.replace(",", " ").replace(";", " ").split()]
-    except ValueError:
-        return False
-    return True
 
 
 def _bytes(path: Path) -> bytes:

@@ -23,7 +23,7 @@ from gcode.reader.job import Beads
 __all__ = [
     "DEFECT_KINDS",
     "Defect",
-    "Kind",
+    "DefectKind",
     "Option",
     "PlacedDefect",
     "Printed",
@@ -35,7 +35,7 @@ _SMALLER = tuple(0.85**k for k in range(9))  # down to a quarter of the size ask
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class DefectKind:
     """A kind of defect.
 
     Attributes
@@ -53,8 +53,8 @@ class Kind:
 
 
 # A void of default size is some 50 mm³; a chip or blob a few dozen.
-DEFECT_KINDS: dict[str, Kind] = {
-    "void": Kind(
+DEFECT_KINDS: dict[str, DefectKind] = {
+    "void": DefectKind(
         {
             "diameter": Option(10.0, 2.0, 40.0, "mm across"),
             "layers": Option(4.0, 1.0, 40.0, "layers not extruded"),
@@ -63,7 +63,7 @@ DEFECT_KINDS: dict[str, Kind] = {
         },
         placement.void,
     ),
-    "missing_beads": Kind(
+    "missing_beads": DefectKind(
         {
             "beads": Option(4.0, 1.0, 40.0, "neighbouring lines skipped in every layer"),
             "length": Option(12.0, 2.0, 100.0, "mm of each line skipped, at most"),
@@ -72,7 +72,7 @@ DEFECT_KINDS: dict[str, Kind] = {
         },
         placement.missing_beads,
     ),
-    "under_extrusion": Kind(
+    "under_extrusion": DefectKind(
         {
             "flow": Option(0.5, 0.0, 0.95, "flow left, of 1"),
             "layers": Option(3.0, 1.0, 40.0, "layers affected"),
@@ -81,7 +81,7 @@ DEFECT_KINDS: dict[str, Kind] = {
         },
         placement.under_extrusion,
     ),
-    "chip": Kind(
+    "chip": DefectKind(
         {
             "size": Option(8.0, 1.5, 40.0, "mm across"),
             "depth": Option(1.4, 0.3, 20.0, "mm deep"),
@@ -89,14 +89,14 @@ DEFECT_KINDS: dict[str, Kind] = {
         },
         placement.chip,
     ),
-    "blob": Kind(
+    "blob": DefectKind(
         {
             "size": Option(4.0, 1.0, 20.0, "mm across"),
             "height": Option(1.0, 0.2, 10.0, "mm above the top"),
         },
         placement.blob,
     ),
-    "none": Kind({}, placement.nowhere),
+    "none": DefectKind({}, placement.nowhere),
 }
 
 

@@ -30,7 +30,7 @@ from amrepair.simulate.strand_kernels import (
     AT_END,
     AT_START,
     NO_ANCHOR,
-    Standing,
+    StandingColumns,
     drop_of,
     groove_columns,
     highest_below,
@@ -463,7 +463,7 @@ def deposit(world, head, path, window, state):
             state[RUN_LENGTH] = 0.0
         if not chained and state[CARRY] > 0.0:
             pool, pool_next = grown(pool, pool_next, meta, nodes)
-            world = Standing(Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp)
+            world = StandingColumns(Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp)
             if s == 0:  # of the strand before nothing is known
                 axis[4] = np.inf
             axis[0] = (state[LAST_X] - grid[0]) / cell
@@ -505,7 +505,9 @@ def deposit(world, head, path, window, state):
                 z -= lifted(head.thermal, x, y, z)
                 if meta[FRESH] + nodes > len(pool_next):
                     pool, pool_next = grown(pool, pool_next, meta, nodes)
-                    world = Standing(Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp)
+                    world = StandingColumns(
+                        Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp
+                    )
                 laid_z, gap = height_of_strand(world, head, path, state, s, k, x, y, z)
                 bead = Bead(int(state[LAYER]), thickness[s], gap)
                 lay(

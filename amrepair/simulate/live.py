@@ -53,22 +53,9 @@ class PrintedScanner:
     ) -> None:
         model = told.scanner(scanner)
         centre = printer.bed_middle_mm
-        self.world = World(
-            printer.bed_size_mm,
-            bed_min_mm=printer.bed_min_mm,
-            cell_mm=told.columns_mm,
-            nozzle_diameter_mm=printer.nozzle_diameter_mm,
-            filament_diameter_mm=printer.filament_diameter_mm,
-            bead=told.bead,
-            thermal=told.thermal,
-        )
+        self.world = World.of(printer, told)
         rng = np.random.default_rng([seed, 2])
-        error = calibration_error(
-            rng,
-            centre_mm=centre,
-            offset_mm=model.offset_mm,
-            tilt_rad=float(np.deg2rad(model.tilt_deg)),
-        )
+        error = calibration_error(rng, centre_mm=centre, model=model)
         self._motion = motion
         self._flow, self._flow_rng = told.flow, np.random.default_rng([seed, 3])
         self._looked: set[str] = set()

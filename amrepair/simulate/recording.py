@@ -22,13 +22,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from amrepair.errors import InputError
+from amrepair.simulate.options import USUAL_RECORDING
 
 RECORDING_VERSION = 1
-FARTHEST_MM = 5.0  # a residual beyond is another surface's point, or none
-STEEPEST_DEPTH = np.tan(np.deg2rad(80.0))  # depth that changes faster than this is an edge
 SIGMA_OF_MAD = 1.4826  # normal distribution
-CLIP_SIGMAS = 3.0  # pairs are compared within: a few points far off would say all
-LAGS_MM = 12.0  # how far apart pairs are compared
 LARGEST_BYTES = 2**30  # of an array: 200 views of a megapixel
 PITCH_MM = (0.02, 5.0)  # as a scanner's spacing_mm
 _KEYS = ("version", "pitch_mm", "residual_mm", "cosine", "edge_mm", "offset_mm", "source")
@@ -123,11 +120,11 @@ def noise_figures(residual_mm: Float[np.ndarray, "k ny nx"], pitch_mm: float) ->
         return NoiseFigures(0.0, 0.0, np.zeros(1), np.zeros(1), 0.0)
     middle = float(np.median(found))
     sigma = SIGMA_OF_MAD * float(np.median(np.abs(found - middle)))
-    limit = CLIP_SIGMAS * max(sigma, 1e-9)
+    limit = USUAL_RECORDING.clip_sigmas * max(sigma, 1e-9)
     clipped = np.clip(residual_mm.astype(np.float64) - middle, -limit, limit)
     variance = float(np.nanvar(clipped))
     lags, correlation = [0.0], [1.0]
-    for step in range(1, int(LAGS_MM / pitch_mm) + 1):
+    for step in range(1, int(USUAL_RECORDING.lags_mm / pitch_mm) + 1):
         squares, pairs = 0.0, 0
         for one, other in (
             (clipped[:, step:], clipped[:, :-step]),
@@ -170,8 +167,9 @@ def edge_distance_mm(
     depth = np.full(tuple(at.max(axis=0) + 2), np.nan)
     depth[at[:, 0], at[:, 1]] = depth_mm
     edge = ~np.isfinite(depth)
+    steep_mm = np.tan(np.deg2rad(USUAL_RECORDING.steepest_deg)) * cell_mm
     for axis in range(2):
-        step = np.abs(np.diff(depth, axis=axis)) > STEEPEST_DEPTH * cell_mm
+        step = np.abs(np.diff(depth, axis=axis)) > steep_mm
         before = [slice(None)] * 2
         after = [slice(None)] * 2
         before[axis], after[axis] = slice(None, -1), slice(1, None)
@@ -181,17 +179,13 @@ def edge_distance_mm(
     return np.asarray(np.maximum(away[at[:, 0], at[:, 1]], 0.0))
 
 
-def record(
-    views: Sequence[ViewResiduals], *, source: str, pitch_mm: float | None = None
-) -> Recording:
-    """Rasters of placed views.
+def record(views: Sequence[ViewResiduals], *, source: str) -> Recording:
+    """Rasters of placed views; a cell is as wide as neighbours are apart in the image planes.
 
     Parameters
     ----------
     source
         What was scanned, in words.
-    pitch_mm
-        Edge of a cell; the views' own distance of neighbours in their image planes.
 
     Raises
     ------
@@ -204,7 +198,7 @@ def record(
             "no view has a hundred points with a known deviation; nothing is recorded from so "
             "little: place more views, on a surface that they follow"
         )
-    pitch = pitch_mm or float(np.median([_spacing_mm(view.points_mm[:, :2]) for view in views]))
+    pitch = float(np.median([_spacing_mm(view.points_mm[:, :2]) for view in views]))
     if not PITCH_MM[0] <= pitch <= PITCH_MM[1]:
         raise InputError(
             f"neighbouring points are {pitch:.3g} mm apart, a recording takes {PITCH_MM[0]:g} to "
@@ -214,7 +208,7 @@ def record(
     for view in views:
         offset = view_offset_mm(view.normals, view.deviation_mm)
         residual = view.deviation_mm - view.normals @ offset
-        residual[np.abs(residual) > FARTHEST_MM] = np.nan
+        residual[np.abs(residual) > USUAL_RECORDING.farthest_mm] = np.nan
         edge = edge_distance_mm(view.points_mm[:, :2], view.points_mm[:, 2], 2.0 * pitch)
         cosine = np.clip(view.normals[:, 2], 0.0, 1.0)
         offsets.append(offset)
@@ -231,12 +225,12 @@ def view_offset_mm(
     normals: Float[np.ndarray, "n 3"], deviation_mm: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " 3"]:
     """(3,) the shift that explains most of a view's deviations: least squares, outliers cut."""
-    use = np.isfinite(deviation_mm) & (np.abs(deviation_mm) < FARTHEST_MM)
+    use = np.isfinite(deviation_mm) & (np.abs(deviation_mm) < USUAL_RECORDING.farthest_mm)
     shift = np.zeros(3)
     for _ in range(5):
         left = deviation_mm - normals @ shift
         spread = SIGMA_OF_MAD * float(np.median(np.abs(left[use])))
-        near = use & (np.abs(left) <= CLIP_SIGMAS * max(spread, 1e-6))
+        near = use & (np.abs(left) <= USUAL_RECORDING.clip_sigmas * max(spread, 1e-6))
         shift = np.linalg.lstsq(normals[near], deviation_mm[near], rcond=1e-3)[0]
     return np.asarray(shift)
 
@@ -339,8 +333,8 @@ def _wrong(content: dict[str, np.ndarray]) -> str:
     known = np.isfinite(content["residual_mm"])
     if not known.any():
         return "residual_mm has no finite value"
-    if float(np.abs(content["residual_mm"][known]).max()) > FARTHEST_MM:
-        return f"residual_mm goes beyond {FARTHEST_MM:g}"
+    if float(np.abs(content["residual_mm"][known]).max()) > USUAL_RECORDING.farthest_mm:
+        return f"residual_mm goes beyond {USUAL_RECORDING.farthest_mm:g}"
     cosine, edge = content["cosine"][known], content["edge_mm"][known]
     if not (np.isfinite(cosine).all() and cosine.min() >= 0.0 and cosine.max() <= 1.0):
         return "cosine is not 0 to 1 wherever there is a residual"

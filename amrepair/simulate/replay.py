@@ -15,15 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from amrepair.simulate.options import USUAL_REPLAY
 from amrepair.simulate.recording import Recording, edge_distance_mm
-
-BLOCK_MM = 12.0  # no piece is smaller: errors of the first recordings hang together over 6 mm
-SPOT_EDGE_MM = 1.5  # so near to an edge a surface is measured with part of a spot
-SIMILAR_COSINE = 0.2  # 0 to 37°, or 46 to 72°
-# A block meets cells away from edges, or by an edge, if the next is so near, on average over it.
-NEAR_EDGE_MM = (2.0, 4.0)
-LEAST_KIND_SHARE = 0.25  # of fewer points of a kind a block does not ask
-PIECE_TRIES = 24  # the piece that covers most, of so many
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +66,7 @@ class Replay:
         self._offset_mm = recording.offset_mm
         self._residual_mm = recording.residual_mm
         known = np.isfinite(recording.residual_mm)
-        by_edge = known & (recording.edge_mm < SPOT_EDGE_MM)
+        by_edge = known & (recording.edge_mm < USUAL_REPLAY.spot_edge_mm)
         away = known & ~by_edge
         found = [_kind(recording, mask) for mask in (away, by_edge)]
         # A recording without edges says nothing about them.
@@ -126,8 +119,8 @@ class Replay:
         rng: np.random.Generator,
     ) -> Float[np.ndarray, " n"]:
         """(n,) recorded residuals for points of an image plane, by incidence and edges."""
-        by_edge = (edge_mm < SPOT_EDGE_MM).astype(np.int64)
-        shifted = (plane_mm - plane_mm.min(axis=0)) / BLOCK_MM + rng.random(2)
+        by_edge = (edge_mm < USUAL_REPLAY.spot_edge_mm).astype(np.int64)
+        shifted = (plane_mm - plane_mm.min(axis=0)) / USUAL_REPLAY.block_mm + rng.random(2)
         _, block = np.unique(np.floor(shifted).astype(np.int64), axis=0, return_inverse=True)
         block = block.ravel()
         count = np.bincount(block)
@@ -147,7 +140,7 @@ class Replay:
                 _Piece(
                     _turned(rng), _like(kind, wanted.cosine[first], rng), wanted.middle_mm[first]
                 )
-                for _ in range(PIECE_TRIES)
+                for _ in range(USUAL_REPLAY.tries)
             ]
             fits = [self._met(piece, wanted, todo) for piece in pieces]
             best = int(np.argmax([count[todo[fit]].sum() for fit in fits]))
@@ -169,11 +162,13 @@ class Replay:
         fits = np.ones(len(todo), dtype=bool)
         for k, kind in enumerate(self._kinds):
             share = wanted.edge_share[todo] if k else 1.0 - wanted.edge_share[todo]
-            fits &= (kind.reach_mm[view, row, column] <= NEAR_EDGE_MM[k]) | (
-                share < LEAST_KIND_SHARE
+            fits &= (kind.reach_mm[view, row, column] <= USUAL_REPLAY.near_mm[k]) | (
+                share < USUAL_REPLAY.least_share
             )
         cosine = self._kinds[0].cosine[view, row, column]
-        return np.asarray(fits & (np.abs(cosine - wanted.cosine[todo]) <= SIMILAR_COSINE))
+        return np.asarray(
+            fits & (np.abs(cosine - wanted.cosine[todo]) <= USUAL_REPLAY.similar_cosine)
+        )
 
     def _cells(
         self, piece: _Piece, plane_mm: Float[np.ndarray, "n 2"]
@@ -192,7 +187,7 @@ def _kind(recording: Recording, mask: Bool[np.ndarray, "k ny nx"]) -> _Kind | No
     if not mask.any():
         return None
     pitch = recording.pitch_mm
-    size = max(1, round(BLOCK_MM / pitch))
+    size = max(1, round(USUAL_REPLAY.block_mm / pitch))
     nearest = np.zeros((2, *mask.shape), dtype=np.int32)
     reach = np.full(mask.shape, np.inf)
     cosine = np.zeros(mask.shape)
@@ -201,7 +196,9 @@ def _kind(recording: Recording, mask: Bool[np.ndarray, "k ny nx"]) -> _Kind | No
             continue
         away, nearest[:, k] = ndimage.distance_transform_edt(~there, return_indices=True)
         # Beyond the raster there is nothing: places clipped to its border hit nothing.
-        reach[k] = ndimage.uniform_filter(away * pitch, size, mode="constant", cval=BLOCK_MM)
+        reach[k] = ndimage.uniform_filter(
+            away * pitch, size, mode="constant", cval=USUAL_REPLAY.block_mm
+        )
         reach[k][[0, -1]], reach[k][:, [0, -1]] = np.inf, np.inf
         value = recording.cosine[k][nearest[0, k], nearest[1, k]]
         cosine[k] = ndimage.uniform_filter(value.astype(np.float64), size, mode="nearest")
@@ -213,7 +210,9 @@ def _kind(recording: Recording, mask: Bool[np.ndarray, "k ny nx"]) -> _Kind | No
 
 def _like(kind: _Kind, cosine: float, rng: np.random.Generator) -> Int[np.ndarray, " 3"]:
     """A recorded cell of a like angle of incidence; of the next where there is none."""
-    low, high = np.searchsorted(kind.ordered, [cosine - SIMILAR_COSINE, cosine + SIMILAR_COSINE])
+    low, high = np.searchsorted(
+        kind.ordered, [cosine - USUAL_REPLAY.similar_cosine, cosine + USUAL_REPLAY.similar_cosine]
+    )
     if low == high:
         low = min(max(int(low) - 1, 0), len(kind.ordered) - 1)
         high = low + 1

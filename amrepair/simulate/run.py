@@ -36,6 +36,7 @@ from amrepair.repair import Stopwatch
 from amrepair.scans import PROBE, Scanner
 from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
+from amrepair.simulate.options import USUAL_TRUTH
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
 from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
 from amrepair.simulate.stage import DefectTruth, FeltStage, Stage
@@ -49,12 +50,6 @@ from gcode.progress import Progress, silent
 from gcode.reader import Job, job_for
 from gcode.slicing.job import PartPlan, plan_part
 from gcode.writer import write
-
-# Below this share of infill a layer's inside is planned to be open: beads, not CAD, are expected.
-SOLID_RATIO = 0.999
-# Truth is compared this far around the part, so that ooze beside it counts too.
-TRUTH_MARGIN_MM = 3.0
-FIT_SHARE = 0.9  # of bed and height, for `scale_to_fit`
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +80,7 @@ class PreparedRun:
     @property
     def by_beads(self) -> bool:
         """Whether layers are judged by the job's beads: their inside is planned to be open."""
-        return self.setup.process.infill_ratio < SOLID_RATIO
+        return self.setup.process.infill_ratio < USUAL_TRUTH.solid_ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +145,7 @@ def scale_to_fit(bounds_mm: Float[np.ndarray, "2 3"], setup: PrintSetup) -> floa
     """Factor that makes a part fit the printer with a margin; never above 1."""
     size = bounds_mm[1] - bounds_mm[0]
     room = np.array([*setup.printer.bed_size_mm, setup.printer.max_z_mm])
-    return float(min(1.0, (FIT_SHARE * room / size).min()))
+    return float(min(1.0, (USUAL_TRUTH.fit_share * room / size).min()))
 
 
 def prepare_run(
@@ -220,22 +215,12 @@ def set_stage(
     world, scanner
         As for `simulate_run`.
     """
-    printer = run.setup.printer
     box = run.part.bounding_box()
     centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
     told = world or load_world()
     scanner = DEFAULT_SCANNER if scanner == PROBE else scanner  # it only touches
     model = told.scanner(scanner)
-    standing = World(
-        printer.bed_size_mm,
-        bed_min_mm=printer.bed_min_mm,
-        cell_mm=told.columns_mm,
-        nozzle_diameter_mm=printer.nozzle_diameter_mm,
-        filament_diameter_mm=printer.filament_diameter_mm,
-        bead=told.bead,
-        thermal=told.thermal,
-        middle_mm=centre,
-    )
+    standing = World.of(run.setup.printer, told, centre)
     rng = np.random.default_rng([run.seed, 2])
     flow_rng = np.random.default_rng([run.seed, 3])
     sensors_mm = default_sensors_mm(
@@ -243,12 +228,7 @@ def set_stage(
         distance_mm=max(300.0, 2.0 * float(box[5]) + 100.0),
         oblique=model.oblique_views,
     )
-    pose = seeded_pose(
-        rng,
-        centre_mm=centre,
-        offset_mm=model.offset_mm,
-        tilt_rad=float(np.deg2rad(model.tilt_deg)),
-    )
+    pose = seeded_pose(rng, centre_mm=centre, model=model)
     return Stage(
         standing,
         defects=run.defects,
@@ -264,10 +244,10 @@ def set_stage(
         layer_height_mm=run.setup.process.layer_height_mm,
         part=run.part,
         box_mm=(
-            box[0] - TRUTH_MARGIN_MM,
-            box[1] - TRUTH_MARGIN_MM,
-            box[3] + TRUTH_MARGIN_MM,
-            box[4] + TRUTH_MARGIN_MM,
+            box[0] - USUAL_TRUTH.margin_mm,
+            box[1] - USUAL_TRUTH.margin_mm,
+            box[3] + USUAL_TRUTH.margin_mm,
+            box[4] + USUAL_TRUTH.margin_mm,
         ),
     )
 

@@ -20,11 +20,14 @@ from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import ScanRequest
 from amrepair.simulate.columns import IntervalMap
+from amrepair.simulate.options import USUAL_TRUTH
 from amrepair.simulate.parameters import ScannerModel
 from amrepair.simulate.recording import Recording
 from amrepair.simulate.replay import Replay
 from amrepair.simulate.scanner_kernels import BED, cast, unhidden
 from amrepair.simulate.world import World
+
+USUAL_SCANNER = ScannerModel()
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +59,7 @@ def seeded_pose(
     rng: np.random.Generator,
     *,
     centre_mm: tuple[float, float],
-    offset_mm: float = 0.1,
-    tilt_rad: float = float(np.deg2rad(0.05)),
+    model: ScannerModel = USUAL_SCANNER,
 ) -> ScannerPose:
     """A scanner frame that is not the build frame, and a calibration slightly off.
 
@@ -66,9 +68,8 @@ def seeded_pose(
     rng
         Chooses both.
     centre_mm
-        XY of the build frame where the calibration error is `offset_mm`: where the target stood.
-    offset_mm, tilt_rad
-        Size of the calibration's error.
+        XY of the build frame where the calibration is off by the model's `offset_mm`: where the
+        target stood.
     """
     axis = rng.normal(size=3)
     turn = rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
@@ -79,29 +80,21 @@ def seeded_pose(
         rotation=turn @ tilt,
         translation_mm=np.array([*centre_mm, 0.0]) + rng.uniform(-50.0, 50.0, 3),
     )
-    off = calibration_error(rng, centre_mm=centre_mm, offset_mm=offset_mm, tilt_rad=tilt_rad)
+    off = calibration_error(rng, centre_mm=centre_mm, model=model)
     return ScannerPose(true, off @ true)
 
 
 def calibration_error(
-    rng: np.random.Generator,
-    *,
-    centre_mm: tuple[float, float],
-    offset_mm: float,
-    tilt_rad: float,
+    rng: np.random.Generator, *, centre_mm: tuple[float, float], model: ScannerModel
 ) -> Transform:
     """Build from build: by how much a calibration is off, as in `seeded_pose`."""
     direction, spin = rng.normal(size=3), rng.normal(size=3)
-    error = rotation_from_vector(tilt_rad * spin / np.linalg.norm(spin))
+    error = rotation_from_vector(np.deg2rad(model.tilt_deg) * spin / np.linalg.norm(spin))
     centre = np.array([*centre_mm, 0.0])
-    shift = offset_mm * direction / np.linalg.norm(direction) + centre - error @ centre
+    shift = model.offset_mm * direction / np.linalg.norm(direction) + centre - error @ centre
     return Transform.from_rotation_translation(
         "build", "build", rotation=error, translation_mm=shift
     )
-
-
-# A point is the middle of a spot, and may lie this far before the first solid on a ray to it.
-_HIDDEN_MM = 0.5
 
 
 class SimulatedScanner:
@@ -264,7 +257,7 @@ class SimulatedScanner:
                 self.world.cell_mm,
                 eye,
                 points,
-                _HIDDEN_MM,
+                USUAL_TRUTH.hidden_mm,
             )
         )
 

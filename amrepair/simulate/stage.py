@@ -21,15 +21,11 @@ from amrepair.loop.wire import Wire
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.defects import PlacedDefect
+from amrepair.simulate.options import USUAL_TRUTH
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
 from gcode.surfaces import HeightField
-
-# Beads of a repair spread, and crumble over a rim, no farther than this from the defect.
-REPAIR_SPREADS_MM = 3.0
-# A column lacks something where it lacks more than a bead's own roughness.
-LEAST_MISSING_MM = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,13 +254,13 @@ class Stage:
         if self._design is not None:
             extra = extra.minus(self._design)
         even = _even(standing, wanted, 0.5 * self._layer_height_mm)
-        around = np.array([[-1.0], [1.0]]) * REPAIR_SPREADS_MM
+        around = np.array([[-1.0], [1.0]]) * USUAL_TRUTH.spreads_mm
         for wound in wounds:
             wound.filled_mm3 = sum(m.common(standing).volume_mm3 for m in wound.missing)
             added = extra.minus(wound.standing_out).clipped(wound.defect.box_mm + around)
             wound.added_mm3 = added.volume_mm3
             thickness_mm = sum(missing.thickness_mm() for missing in wound.missing)
-            over = np.asarray(thickness_mm) > LEAST_MISSING_MM
+            over = np.asarray(thickness_mm) > USUAL_TRUTH.least_missing_mm
             wound.surface_ratio = float(even[over].mean()) if over.any() else 1.0
 
     def _window(self) -> Window:

@@ -24,7 +24,7 @@ LONGEST_MM = 150.0  # farther than this no end is looked for: nothing bridges so
 NO_ANCHOR, AT_START, AT_END, AT_BOTH = 0, 1, 2, 3
 
 
-class Standing(NamedTuple):
+class StandingColumns(NamedTuple):
     """The columns, and what the layer that is being laid found in each it has touched.
 
     `before` (ny, nx) is the column's top before the layer whose number is in `stamp` (ny, nx).

@@ -12,7 +12,7 @@ from amrepair.simulate.columns import IntervalMap, Window
 
 
 @runtime_checkable
-class Standing(Protocol):
+class StandingWorld(Protocol):
     """Anything that stands on the bed and can be looked into: a `World`."""
 
     def snapshot(self, window: Window | None = None) -> IntervalMap:
@@ -51,6 +51,6 @@ class Difference:
         """Only where it is taller than `length_mm`: what a bead could fill."""
         return Difference(self.missing.thicker_than(length_mm), self.excess.thicker_than(length_mm))
 
-    def filled_mm3(self, world: Standing) -> float:
+    def filled_mm3(self, world: StandingWorld) -> float:
         """Volume that was missing then and is solid in `world` now."""
         return self.missing.common(world.snapshot(self.missing.window)).volume_mm3

@@ -23,13 +23,15 @@ from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.columns_kernels import Stacks
 from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.deposit_kernels import LAYER, STATE_SIZE, deposit
-from amrepair.simulate.parameters import BeadModel, ThermalModel
-from amrepair.simulate.strand_kernels import Head, Path, Standing
+from amrepair.simulate.parameters import BeadModel, ThermalModel, WorldParameters
+from amrepair.simulate.strand_kernels import Head, Path, StandingColumns
 from amrepair.simulate.truth import Difference
 from gcode.firmware.motion import MotionBatch
+from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
 
 MAX_WORLD_CELL_MM = 0.15
+WORLD_MARGIN_MM, TOP_MARGIN_MM = 10.0, 2.0  # of the bed, and of what stands there
 _PHASES = 8  # sub-column positions of the nozzle that have a list of neighbours of their own
 
 
@@ -44,8 +46,6 @@ class World:
         Edge of a column, at most 0.15 mm.
     nozzle_diameter_mm, filament_diameter_mm
         Bore of the nozzle, and the filament that motion is told in.
-    margin_mm
-        How far the world goes beyond the bed (some printers prime there).
     bead, thermal
         How plastic lies, and how it cools; without `thermal` it neither shrinks nor curls.
     bed_min_mm
@@ -66,7 +66,6 @@ class World:
         cell_mm: float = 0.125,
         nozzle_diameter_mm: float = 0.4,
         filament_diameter_mm: float = 1.75,
-        margin_mm: float = 10.0,
         bead: BeadModel | None = None,
         thermal: ThermalModel | None = None,
         bed_min_mm: tuple[float, float] = (0.0, 0.0),
@@ -83,8 +82,8 @@ class World:
         self.nozzle_diameter_mm = nozzle_diameter_mm
         self.filament_mm2 = np.pi / 4 * filament_diameter_mm**2
         self.columns = Columns(
-            origin_mm=tuple(corner - margin_mm),
-            size_mm=tuple(size + 2 * margin_mm),
+            origin_mm=tuple(corner - WORLD_MARGIN_MM),
+            size_mm=tuple(size + 2 * WORLD_MARGIN_MM),
             cell_mm=cell_mm,
         )
         self._near, self._counts = _neighbours(cell_mm, nozzle_diameter_mm, self.bead)
@@ -95,6 +94,25 @@ class World:
         self._pulled_mm = 0.0  # filament retracted and not yet pushed back
         self._layer_tops_mm = np.zeros(0)  # heights extruded at so far, rising
         self.pushed_mm3 = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        printer: PrinterProfile,
+        told: WorldParameters,
+        middle_mm: tuple[float, float] | None = None,
+    ) -> World:
+        """An empty world over a printer's bed; `middle_mm` is where parts shrink to."""
+        return cls(
+            printer.bed_size_mm,
+            cell_mm=told.columns_mm,
+            nozzle_diameter_mm=printer.nozzle_diameter_mm,
+            filament_diameter_mm=printer.filament_diameter_mm,
+            bead=told.bead,
+            thermal=told.thermal,
+            bed_min_mm=printer.bed_min_mm,
+            middle_mm=middle_mm,
+        )
 
     @property
     def cell_mm(self) -> float:
@@ -150,7 +168,7 @@ class World:
             thickness_mm,
             np.ascontiguousarray(regions),
         )
-        world = Standing(Stacks(*self.columns.arrays), self._before, self._stamp)
+        world = StandingColumns(Stacks(*self.columns.arrays), self._before, self._stamp)
         lay_all: Any = deposit
         pool, pool_next, pushed = lay_all(
             world, self._head(onto_cold=onto_cold), path, self.columns.touched, self._state
@@ -229,19 +247,15 @@ class World:
         spread_mm = self.bead.spread_ratio * self.nozzle_diameter_mm
         return self.columns.window(margin_mm=spread_mm + self.cell_mm)
 
-    def missing_versus(
-        self, reference: World, box_mm: Float[np.ndarray, "2 3"] | None = None
-    ) -> Difference:
+    def missing_versus(self, reference: World) -> Difference:
         """What this world lacks, and has too much, against a reference without defects."""
         window = self.window().union(reference.window())
         mine, other = self.snapshot(window), reference.snapshot(window)
-        if box_mm is not None:
-            mine, other = mine.clipped(box_mm), other.clipped(box_mm)
         return Difference(missing=other.minus(mine), excess=mine.minus(other))
 
-    def top(self, margin_mm: float = 2.0) -> HeightField:
+    def top(self) -> HeightField:
         """The highest solid of every column in use, as a height field; all of it is seen."""
-        window = self.columns.window(margin_mm=margin_mm)
+        window = self.columns.window(margin_mm=TOP_MARGIN_MM)
         z_mm = self.snapshot(window).top_mm()
         return HeightField(
             origin_mm=np.array(window.corner_mm),

@@ -15,7 +15,7 @@ from amrepair.errors import TemplateError
 from amrepair.template.port import Template
 
 if TYPE_CHECKING:
-    import trimesh
+    pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +100,3 @@ class CutTemplate:
         """The whole's solid, trimmed by the plane exactly."""
         # manifold3d keeps the side that the normal points to
         return self.whole.solid().trim_by_plane((0.0, 0.0, -1.0), -self.z_mm)  # type: ignore[attr-defined]
-
-    def mesh(self, voxel_mm: float, *, level_mm: float = 0.0) -> trimesh.Trimesh:
-        """The level set as a closed mesh (`extract.extract_mesh`)."""
-        from amrepair.template.extract import extract_mesh
-
-        return extract_mesh(self, voxel_mm, level_mm=level_mm)

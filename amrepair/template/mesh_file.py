@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from amrepair.errors import InputError, TemplateError
 from amrepair.template.options import USUAL_MESH, MeshOptions
+from gcode.meshes import mesh_of
 from gcode.solids import (
     SOLID_SUFFIXES,
     are_closed,
@@ -140,13 +141,6 @@ def edge_census(faces: Int[np.ndarray, "f 3"]) -> EdgeCensus:
     )
 
 
-def manifold_arrays(solid: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """(v, 3) float64 vertices and (f, 3) int64 faces of a `manifold3d.Manifold`."""
-    mesh = solid.to_mesh64()
-    vertices = np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3]
-    return np.ascontiguousarray(vertices), np.asarray(mesh.tri_verts).astype(np.int64)
-
-
 def close_mesh(
     mesh: trimesh.Trimesh, *, source: str, options: MeshOptions = USUAL_MESH
 ) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
@@ -174,7 +168,7 @@ def close_mesh(
     if overlap_mm3 > 0:
         notes.append(f"bodies overlapped by {overlap_mm3:.3g} mm³ and were united")
     _refuse_flat(solid, extent_mm, source)
-    closed_vertices, closed_faces = manifold_arrays(solid)
+    closed_vertices, closed_faces = mesh_of(solid)
     return trimesh.Trimesh(closed_vertices, closed_faces, process=False), tuple(notes)
 
 
@@ -280,7 +274,7 @@ def _orient(solid: Any, notes: list[str]) -> Any:
     """Turn an inside-out solid around."""
     if solid.volume() >= 0:
         return solid
-    vertices, faces = manifold_arrays(solid)
+    vertices, faces = mesh_of(solid)
     notes.append("turned outside out: its triangles faced inwards")
     return as_manifold(vertices, faces[:, ::-1])
 

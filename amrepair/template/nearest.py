@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.template import nearest_kernels as kernels
+from amrepair.template.surface import triangle_areas_normals
 
 # A point starts from its neighbour's triangle: many are asked in an order in which they are near.
 SORTED, SORT_CELLS = 20_000, 64
@@ -83,9 +84,7 @@ class TriangleTree:
         corners = np.ascontiguousarray(corners[order])
         sure = np.ones(len(order), dtype=bool)
         tree = cls(corners, order, low, high, child, first, last, sure)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = normals / np.maximum(length, 1e-300)
+        _, normals = triangle_areas_normals(vertices_mm, faces[order])
         if not _has_folds(faces[order], normals):
             return tree
         aside = EDGE_ASIDE_RATIO * float(np.ptp(vertices_mm, axis=0).max()) * normals

@@ -62,7 +62,7 @@ class SoundOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Sites:
+class SoundSites:
     """Places on a template's surface and who lies near which.
 
     Attributes
@@ -79,7 +79,7 @@ class Sites:
     tree: cKDTree
 
     @classmethod
-    def on(cls, template: GridSdf, options: SoundOptions) -> Sites:
+    def on(cls, template: GridSdf, options: SoundOptions) -> SoundSites:
         """On a template's surface, `site_mm` apart."""
         place, normal = template.surface_points(options.site_mm)
         tree = cKDTree(np.column_stack([place, options.facing_mm * normal]))
@@ -121,7 +121,7 @@ class SoundParts:
         (k, 3) the middle of that area; NaN where there is none.
     """
 
-    sites: Sites
+    sites: SoundSites
     offset_mm: Float[np.ndarray, " s"]
     spread_mm: Float[np.ndarray, " s"]
     scans: Int[np.ndarray, " s"]
@@ -163,7 +163,7 @@ def learn(
     options = options or SoundOptions()
     if not scans_mm:
         raise InputError("nothing can be learned from no scan; name a scan of a sound part")
-    sites = Sites.on(template, options)
+    sites = SoundSites.on(template, options)
     means = np.stack([_means(points, template, sites, options) for points in scans_mm])
     for k, row in enumerate(means):
         if np.isnan(row).all():
@@ -178,7 +178,7 @@ def learn(
 def _means(
     points_mm: Float[np.ndarray, "n 3"],
     template: GridSdf,
-    sites: Sites,
+    sites: SoundSites,
     options: SoundOptions,
 ) -> Float[np.ndarray, " s"]:
     """(s,) mean deviation of a scan about each site; NaN where it has too few points."""
@@ -199,7 +199,9 @@ def _means(
     return np.asarray(np.where(count >= options.least_points, mean, np.nan))
 
 
-def _summary(means: Float[np.ndarray, "k s"], sites: Sites, options: SoundOptions) -> SoundParts:
+def _summary(
+    means: Float[np.ndarray, "k s"], sites: SoundSites, options: SoundOptions
+) -> SoundParts:
     """Offsets, spreads, and which scans depart from the others."""
     seen = np.isfinite(means)
     count = seen.sum(axis=0)

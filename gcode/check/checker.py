@@ -56,12 +56,9 @@ def find_refusals(
     as_built: HeightField | None = None,
     initial: ModalState | None = None,
     policy: Policy = Policy.STRICT,
-    progress: Progress = silent,
 ) -> tuple[Refusal, ...]:
     """Everything that speaks against printing a program, in its order; see `check`."""
-    return judge(
-        program, setup, as_built=as_built, initial=initial, policy=policy, progress=progress
-    ).refusals
+    return judge(program, setup, as_built=as_built, initial=initial, policy=policy).refusals
 
 
 def check(

@@ -64,7 +64,7 @@ class Motion:
         setup: PrintSetup,
         standing_top_mm: float | None,
         initial: ModalState | None,
-        policy: Policy = Policy.STRICT,
+        policy: Policy,
     ) -> None:
         self.refusals: list[Refusal] = []
         self.warnings = Warnings()
@@ -377,12 +377,10 @@ class Motion:
             told = (f"{self._pulled_mm:.1f} mm", f"{printer.max_extrude_only_mm:g} mm")
             self._refuse("pulls filament back and prints on", *told)
             self._pulled_mm = 0.0  # said once
-        back_mm = min(pushed_mm, self._pulled_mm)  # a wipe or an unretraction on the move
-        self._pulled_mm -= back_mm
+        fresh_mm3 = self._fresh_mm3(pushed_mm)
         if not known:  # from an end stop, which may lie a whole line away
             return
-        volume_mm3 = (pushed_mm - back_mm) * self._area_mm2
-        section_mm2 = volume_mm3 / length_mm
+        section_mm2 = fresh_mm3 / length_mm
         limit_mm2 = printer.max_bead_section_mm2
         if section_mm2 > SECTION_SLACK * limit_mm2:
             told = (f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²")
@@ -406,9 +404,7 @@ class Motion:
         if pushed_mm < 0:
             self._pull(pushed_mm)
             return
-        back_mm = min(pushed_mm, self._pulled_mm)
-        self._pulled_mm -= back_mm
-        fresh_mm3 = (pushed_mm - back_mm) * self._area_mm2
+        fresh_mm3 = self._fresh_mm3(pushed_mm)
         self._short_mm3 += fresh_mm3
         if fresh_mm3 > 0 and self._short_mm3 > MOLTEN_MM * self._area_mm2:
             self._melts(fresh_mm3 / (length_mm or pushed_mm))  # alone, F is the filament's own
@@ -424,6 +420,12 @@ class Motion:
             else:  # it loads filament
                 self._beyond(*told, self._short_mm3 / allowed_mm3)
             self._short_mm3 = 0.0
+
+    def _fresh_mm3(self, pushed_mm: float) -> float:
+        """What leaves the nozzle of what is pushed: first comes back what was pulled."""
+        back_mm = min(pushed_mm, self._pulled_mm)
+        self._pulled_mm -= back_mm
+        return (pushed_mm - back_mm) * self._area_mm2
 
     def _pull(self, pushed_mm: float) -> None:
         self._pulled_mm -= pushed_mm

@@ -32,19 +32,13 @@ if TYPE_CHECKING:
     from gcode.profiles import PrintSetup
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "check",
-        epilog=console.examples(
-            "gcode check job.gcode",
-            "gcode check job.gcode --printer ender_3",
-            "gcode check job.gcode --printer creality_k1_max --material petg",
-            "gcode check repair.gcode --as-built standing.stl --json",
-        ),
-    )(check)
-
-
+@console.command(
+    "check",
+    "gcode check job.gcode",
+    "gcode check job.gcode --printer ender_3",
+    "gcode check job.gcode --printer creality_k1_max --material petg",
+    "gcode check repair.gcode --as-built standing.stl --json",
+)
 def check(
     file: FileArgument,
     printer: JobPrinterOption = None,
@@ -105,20 +99,20 @@ def check(
             }
         )
     elif refusals and other is not None:
-        console.errors.print(f"{other}.", markup=False)
+        console.errors.print(f"{other}.")
     elif refusals:
         if contact is not None:
-            console.errors.print(f"First contact: {contact}.", markup=False)
+            console.errors.print(f"First contact: {contact}.")
         elif field is not None:
-            console.errors.print("The head touches nothing of what stands there.", markup=False)
+            console.errors.print("The head touches nothing of what stands there.")
         for refusal in refusals[:20]:
-            console.errors.print(str(refusal), markup=False)
+            console.errors.print(str(refusal))
         if len(refusals) > 20:
             console.errors.print(f"and {len(refusals) - 20} more")
     else:
         tell_warnings(file, verdict.report)
         if other is not None:
-            console.errors.print(f"{file}: warning: {other}.", markup=False)
+            console.errors.print(f"{file}: warning: {other}.")
         console.out.print(
             f"{file}: nothing {'else ' if verdict.report.warnings else ''}speaks against it on "
             f"{setup.printer.name}."

@@ -12,7 +12,8 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -54,8 +55,11 @@ class _Told(Console):
         raise ReaderGoneError
 
 
-errors = _Told(stderr=True, highlight=False, soft_wrap=True)
-out = _Told(highlight=False, soft_wrap=True)
+# What is told holds names of files and words of firmwares: brackets in it are no markup.
+errors = _Told(stderr=True, highlight=False, soft_wrap=True, markup=False)
+out = _Told(highlight=False, soft_wrap=True, markup=False)
+Command = TypeVar("Command", bound=Callable[..., Any])
+_commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 
 
@@ -149,9 +153,48 @@ def starting() -> Iterator[None]:
         yield
 
 
+def application(name: str, about: str, package: ModuleType) -> typer.Typer:
+    """A program with `--version`, which tells its help where nothing else is said."""
+    app = typer.Typer(name=name, help=about, no_args_is_help=True, pretty_exceptions_enable=False)
+
+    def told(asked: bool) -> bool:
+        if asked:
+            out.print(f"{name} {package.__version__}")
+            raise typer.Exit
+        return asked
+
+    said: bool = typer.Option(
+        False, "--version", callback=told, is_eager=True, help="Show the version."
+    )
+
+    @app.callback()
+    def root(version: bool = said) -> None:
+        """Options before a command."""
+
+    return app
+
+
 def examples(*lines: str) -> str:
     """The end of a command's help: lines that can be typed as they are."""
     return "\n\n".join(["Examples:", *(f"$ {line}" for line in lines)])
+
+
+def command(name: str, *lines: str) -> Callable[[Command], Command]:
+    """A function as the command of that name, with examples at the end of its help; see `add`."""
+
+    def kept(function: Command) -> Command:
+        of_module = _commands.setdefault(function.__module__, [])
+        of_module.append((name, examples(*lines), function))
+        return function
+
+    return kept
+
+
+def add(app: typer.Typer, *modules: ModuleType) -> None:
+    """Add the commands of some modules, in their order."""
+    for module in modules:
+        for name, epilog, function in _commands[module.__name__]:
+            app.command(name, epilog=epilog)(function)
 
 
 def profile_ids(kind: Kind) -> Callable[[str], list[str]]:
@@ -296,7 +339,7 @@ def _misused(error: Exception) -> int:
 
 def _failed(sentence: str, code: int, style: str | None = None) -> int:
     """Tell of a failure once for people and, where it was asked for, once for programs."""
-    errors.print(sentence, style=style, markup=False)
+    errors.print(sentence, style=style)
     if "--json" in sys.argv[1:] and not _json_shown:
         show_json({"error": sentence, "exit_code": code})
     return code

@@ -14,19 +14,12 @@ from gcode.errors import InputError
 from gcode.profiles import DEFAULT_PRINTER
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "emulate",
-        epilog=console.examples(
-            "gcode emulate",
-            "gcode emulate --firmware klipper --printer voron_2_4 --link /tmp/printer "
-            "--accelerated",
-            "gcode emulate --faults faults.txt --link /tmp/printer",
-        ),
-    )(emulate)
-
-
+@console.command(
+    "emulate",
+    "gcode emulate",
+    "gcode emulate --firmware klipper --printer voron_2_4 --link /tmp/printer --accelerated",
+    "gcode emulate --faults faults.txt --link /tmp/printer",
+)
 def emulate(
     firmware: Annotated[str, typer.Option(help="marlin, prusa, klipper or reprap.")] = "marlin",
     printer: PrinterOption = DEFAULT_PRINTER,

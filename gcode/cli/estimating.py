@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import typer
-
 from gcode.cli import console
 from gcode.cli.options import FileArgument, JsonOption, program_text
 from gcode.cli.owning import JobPrinterOption, job_setup
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "estimate",
-        epilog=console.examples(
-            "gcode estimate job.gcode",
-            "gcode estimate job.gcode --printer voron_2_4 --json",
-        ),
-    )(estimate)
-
-
+@console.command(
+    "estimate", "gcode estimate job.gcode", "gcode estimate job.gcode --printer voron_2_4 --json"
+)
 def estimate(
     file: FileArgument,
     printer: JobPrinterOption = None,

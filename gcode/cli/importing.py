@@ -19,22 +19,12 @@ if TYPE_CHECKING:
 SHOWN = 60
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "import",
-        epilog=console.examples(
-            "gcode profiles import job.gcode --out mine",
-            "gcode profiles import printer.cfg --out mine",
-            "gcode profiles import PrusaSlicer_config_bundle.ini --preset printer:NAME",
-        ),
-    )(import_)
-    app.command(
-        "find",
-        epilog=console.examples("gcode profiles find", "gcode profiles find --all --json"),
-    )(find)
-
-
+@console.command(
+    "import",
+    "gcode profiles import job.gcode --out mine",
+    "gcode profiles import printer.cfg --out mine",
+    "gcode profiles import PrusaSlicer_config_bundle.ini --preset printer:NAME",
+)
 def import_(
     file: Annotated[
         Path,
@@ -74,6 +64,7 @@ def import_(
         _show(found, paths)
 
 
+@console.command("find", "gcode profiles find", "gcode profiles find --all --json")
 def find(
     everything: Annotated[
         bool, typer.Option("--all", help="Those that came with the slicers, too.")
@@ -101,20 +92,17 @@ def find(
         return
     for p in shown:
         option = f" --preset {shlex.quote(p.preset)}" if p.preset else ""
-        console.out.print(f"{p.slicer} {p.kind}: {p.name}", markup=False)
-        console.out.print(
-            f"  gcode profiles import {shlex.quote(str(p.path))}{option}", markup=False
-        )
+        console.out.print(f"{p.slicer} {p.kind}: {p.name}")
+        console.out.print(f"  gcode profiles import {shlex.quote(str(p.path))}{option}")
     others = len(found) - len(shown)
     if not found:
         places = ", ".join(str(path) for _, path in configuration_folders()) or "none"
         console.out.print(
             f"No preset of PrusaSlicer, OrcaSlicer or a relative of theirs is installed here "
-            f"(configuration folders found: {places}).",
-            markup=False,
+            f"(configuration folders found: {places})."
         )
     elif others:
-        console.out.print(f"{others} came with the slicers: --all lists them.", markup=False)
+        console.out.print(f"{others} came with the slicers: --all lists them.")
 
 
 def _result(found: ImportedFile, paths: list[Path]) -> dict[str, Any]:
@@ -143,11 +131,9 @@ def _show(found: ImportedFile, paths: list[Path]) -> None:
     from gcode.profiles.importers.rules import NO_COUNTERPART
 
     for made, path in zip(found.profiles, paths, strict=True):
-        console.out.print(
-            f"{path}: {len(made.mapped)} keys, the rest from {made.inherits}.", markup=False
-        )
+        console.out.print(f"{path}: {len(made.mapped)} keys, the rest from {made.inherits}.")
     for note in found.notes:
-        console.out.print(f"note: {note}.", markup=False)
+        console.out.print(f"note: {note}.")
     if not found.left:
         console.out.print("Every key of the source is in them.")
         return
@@ -155,7 +141,7 @@ def _show(found: ImportedFile, paths: list[Path]) -> None:
     for row in found.left:
         if row.reason != NO_COUNTERPART:
             value = " ".join(row.source_value.split())[:SHOWN]
-            console.out.print(f"  {row.source_key} = {value}: {row.reason}", markup=False)
+            console.out.print(f"  {row.source_key} = {value}: {row.reason}")
     unlike = [row.source_key for row in found.left if row.reason == NO_COUNTERPART]
     if unlike:
-        console.out.print(f"  {NO_COUNTERPART}: {', '.join(unlike)}", markup=False)
+        console.out.print(f"  {NO_COUNTERPART}: {', '.join(unlike)}")

@@ -24,7 +24,7 @@ LeaveHeatersOption = Annotated[
 def tell_warnings(file: Path | str, report: CheckReport) -> None:
     """What a user's job does beyond the profiles' figures, on standard error."""
     for warned in report.warnings:
-        console.errors.print(f"{file}: warning: {warned}", markup=False)
+        console.errors.print(f"{file}: warning: {warned}")
 
 
 def warnings_json(report: CheckReport, key: str = "job_warnings") -> dict[str, Any]:

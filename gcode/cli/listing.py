@@ -12,24 +12,7 @@ from gcode.errors import InputError
 from gcode.profiles import list_profiles
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command(
-        "list",
-        epilog=console.examples(
-            "gcode profiles list",
-            "gcode profiles list --json",
-        ),
-    )(profiles_list)
-    app.command(
-        "show",
-        epilog=console.examples(
-            "gcode profiles show prusa_mk3s",
-            "gcode profiles show mine.toml",
-        ),
-    )(profiles_show)
-
-
+@console.command("list", "gcode profiles list", "gcode profiles list --json")
 def profiles_list(as_json: JsonOption = False) -> None:
     """List the shipped profiles."""
     found = {kind: list(list_profiles(kind)) for kind in ("printers", "materials", "processes")}
@@ -40,6 +23,7 @@ def profiles_list(as_json: JsonOption = False) -> None:
         console.out.print(f"{kind}: {', '.join(names)}")
 
 
+@console.command("show", "gcode profiles show prusa_mk3s", "gcode profiles show mine.toml")
 def profiles_show(
     profile: Annotated[str, typer.Argument(help="ID or TOML file.")],
     kind: Annotated[

@@ -28,6 +28,13 @@ AsBuiltOption = Annotated[
         "height map (.npz, .tif, .npy)."
     ),
 ]
+ProgramOutput = Annotated[Path, typer.Option("-o", "--output", help="Program to write.")]
+StandingHeightOption = Annotated[
+    float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
+]
+FirstLayerOption = Annotated[
+    int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
+]
 FileArgument = Annotated[Path, typer.Argument(help="G-code file.")]
 
 PrinterOption = Annotated[
@@ -61,6 +68,20 @@ ProcessOption = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")
 ]
+
+
+def refuse_standing(path: Path | None) -> None:
+    """Refuse a file that what stands there cannot be written to, before any work.
+
+    Raises
+    ------
+    InputError
+        If it is no .npz, or cannot be written.
+    """
+    if path is not None:
+        if path.suffix != ".npz":
+            raise InputError(f"{path}: what stands there is written as .npz; rename it.")
+        console.writable(path)
 
 
 def program_text(path: Path) -> str:
@@ -134,13 +155,14 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
     InputError
         If it cannot be read.
     """
+    from gcode import clouds
     from gcode.solids import SOLID_SUFFIXES, NotClosedError, read_solid, read_triangles
-    from gcode.surfaces import HeightField, clouds, depth_maps, scanned
+    from gcode.surfaces import HeightField, depth_maps, scanned
 
     suffix = path.suffix.lower()
     if path.is_file() and depth_maps.is_depth_map(path):
         seen = depth_maps.read_on_bed(path, None if printer is None else printer.reach_box_mm)
-        console.errors.print(seen.told, markup=False)
+        console.errors.print(seen.told)
         cell_mm = max(AS_BUILT_CELL_MM, PIXELS_IN_CELL * seen.spacing_mm)
         return scanned.from_points(seen.points_mm, cell_mm, what=str(path))
     if suffix in clouds.CLOUD_SUFFIXES and not (suffix == ".ply" and _has_faces(path)):

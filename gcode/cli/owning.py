@@ -62,12 +62,12 @@ def job_setup(
 
         printer = printer_of_words(text)
         told = f"{name}: no --printer is given and no slicer's settings are in it"
-        console.errors.print(f"{told}; {printer} is taken.", markup=False)
+        console.errors.print(f"{told}; {printer} is taken.")
     ids = (printer or DEFAULT_PRINTER, material or DEFAULT_MATERIAL, process or DEFAULT_PROCESS)
     if own is None:
         return load_setup(*ids), None
     setup = own.setup(material, process)
-    console.errors.print(f"{own.in_words(setup)}.", markup=False)
+    console.errors.print(f"{own.in_words(setup)}.")
     return setup, own
 
 

@@ -8,37 +8,33 @@ from typing import Annotated
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import JsonOption, program_text
+from gcode.cli.options import (
+    FirstLayerOption,
+    JsonOption,
+    ProgramOutput,
+    StandingHeightOption,
+    program_text,
+    refuse_standing,
+)
 from gcode.cli.owning import (
     JobMaterialOption,
     JobPrinterOption,
     job_setup,
     told_if_for_another,
 )
-from gcode.errors import InputError
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "resume-at",
-        epilog=console.examples(
-            "gcode resume-at job.gcode --layer 41 --printer prusa_mk3s -o rest.gcode",
-            "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
-            "gcode resume-at job.gcode --layer 41 --without lid_copy_2 -o rest.gcode",
-        ),
-    )(resume_at_command)
-
-
+@console.command(
+    "resume-at",
+    "gcode resume-at job.gcode --layer 41 --printer prusa_mk3s -o rest.gcode",
+    "gcode resume-at job.gcode --z-mm 8.4 -o rest.gcode",
+    "gcode resume-at job.gcode --layer 41 --without lid_copy_2 -o rest.gcode",
+)
 def resume_at_command(
     job: Annotated[Path, typer.Argument(help="The whole job's G-code, of any slicer.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
-    z_mm: Annotated[
-        float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
-    ] = None,
-    layer: Annotated[
-        int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
-    ] = None,
+    output: ProgramOutput,
+    z_mm: StandingHeightOption = None,
+    layer: FirstLayerOption = None,
     without: Annotated[
         str | None,
         typer.Option(help="An object of the job of which nothing more is printed."),
@@ -57,10 +53,7 @@ def resume_at_command(
         from gcode.resumption import resume_at
 
     console.writable(output)
-    if standing is not None:
-        if standing.suffix != ".npz":
-            raise InputError(f"{standing}: what stands there is written as .npz; rename it.")
-        console.writable(standing)
+    refuse_standing(standing)
     text = program_text(job)
     setup, _ = job_setup(text, job, printer, material)
     bars = console.Bars()

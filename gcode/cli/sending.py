@@ -28,18 +28,12 @@ if TYPE_CHECKING:
     from gcode.profiles import PrinterProfile
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "send",
-        epilog=console.examples(
-            "gcode send repair.gcode --port /dev/ttyACM0",
-            "gcode send job.gcode --port /dev/ttyUSB0 --printer ender_3 --wire-log wire.log "
-            "--journal job.journal",
-        ),
-    )(send)
-
-
+@console.command(
+    "send",
+    "gcode send repair.gcode --port /dev/ttyACM0",
+    "gcode send job.gcode --port /dev/ttyUSB0 --printer ender_3 --wire-log wire.log "
+    "--journal job.journal",
+)
 def send(
     file: FileArgument,
     port: Annotated[
@@ -105,9 +99,7 @@ def send(
                 leave_heaters=leave_heaters, progress=bars,
             )  # fmt: skip
     tell_warnings(file, checked.report)
-    console.errors.print(
-        f"{file} on {setup.printer.name}: {what_it_does(program, cost.result())}.", markup=False
-    )
+    console.errors.print(f"{file} on {setup.printer.name}: {what_it_does(program, cost.result())}.")
     machine = connect(
         port,
         dialect=setup.printer.dialect,
@@ -158,7 +150,7 @@ def _abort(machine: Printer) -> None:
     try:
         machine.abort()
     except GcodeError as error:
-        console.errors.print(f"gcode: the printer could not be made safe: {error}", markup=False)
+        console.errors.print(f"gcode: the printer could not be made safe: {error}")
 
 
 def _tell(report: PrintReport, judged: CheckReport, *, as_json: bool) -> None:

@@ -15,6 +15,7 @@ from gcode.cli.options import (
     MaterialOption,
     PrinterOption,
     ProcessOption,
+    ProgramOutput,
     grid_of,
     job_of,
     standing_on_bed,
@@ -31,22 +32,15 @@ if TYPE_CHECKING:
 CENTRE, KEEP = "centre", "keep"
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "slice",
-        epilog=console.examples(
-            "gcode slice solid.stl -o job.gcode --printer ender_3 --material petg "
-            "--process standard_0.20",
-            "gcode slice placed.stl -o job.gcode --place keep",
-            "gcode slice piece.stl -o patch.gcode --as-built standing.stl --job job.gcode",
-        ),
-    )(slice_solid)
-
-
+@console.command(
+    "slice",
+    "gcode slice solid.stl -o job.gcode --printer ender_3 --material petg --process standard_0.20",
+    "gcode slice placed.stl -o job.gcode --place keep",
+    "gcode slice piece.stl -o patch.gcode --as-built standing.stl --job job.gcode",
+)
 def slice_solid(
     solid: Annotated[Path, typer.Argument(help="Solid, mm.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
+    output: ProgramOutput,
     printer: PrinterOption = DEFAULT_PRINTER,
     material: MaterialOption = DEFAULT_MATERIAL,
     process: ProcessOption = DEFAULT_PROCESS,
@@ -197,13 +191,12 @@ def _tell(result: dict[str, Any], where: str | None) -> None:
     console.out.print(
         f"{result['gcode']}: {result['beads_mm3']} mm³ of {result['solid_mm3']} mm³ as beads, "
         f"{result['filament_mm'] / 1000:.2f} m of filament, "
-        f"{result['print_time_s'] / 60:.1f} min; checked.",
-        markup=False,
+        f"{result['print_time_s'] / 60:.1f} min; checked."
     )
     if where is not None:
-        console.out.print(where, markup=False)
+        console.out.print(where)
     if result["first_pass"] is not None:
-        console.out.print(result["first_pass"].replace(" C", " °C"), markup=False)
+        console.out.print(result["first_pass"].replace(" C", " °C"))
     for thing in result["left_out"]:
         console.out.print(f"left out: {thing['volume_mm3']:.3f} mm³: {thing['reason']}")
 

@@ -9,7 +9,7 @@ import typer
 
 from gcode.cli import console
 from gcode.cli.judging import tell_warnings, warnings_json
-from gcode.cli.options import JsonOption, program_text, standing_on_bed
+from gcode.cli.options import JsonOption, ProgramOutput, program_text, standing_on_bed
 from gcode.cli.owning import (
     JobMaterialOption,
     JobPrinterOption,
@@ -18,17 +18,11 @@ from gcode.cli.owning import (
 )
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "print-onto",
-        epilog=console.examples(
-            "gcode print-onto standing.stl lid.gcode -o lid-on-box.gcode",
-            "gcode print-onto scan.ply lid.gcode -o lid-on-box.gcode --printer ender_3",
-        ),
-    )(print_onto_command)
-
-
+@console.command(
+    "print-onto",
+    "gcode print-onto standing.stl lid.gcode -o lid-on-box.gcode",
+    "gcode print-onto scan.ply lid.gcode -o lid-on-box.gcode --printer ender_3",
+)
 def print_onto_command(
     part: Annotated[
         Path,
@@ -39,7 +33,7 @@ def print_onto_command(
     job: Annotated[
         Path, typer.Argument(help="The job, placed in X and Y where it is to stand on the part.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Program to write.")],
+    output: ProgramOutput,
     printer: JobPrinterOption = None,
     material: JobMaterialOption = None,
     as_json: JsonOption = False,
@@ -79,6 +73,5 @@ def print_onto_command(
     console.out.print(
         f"{output}: {job.name} raised by {made.raised_mm:g} mm onto {part.name}, which is uneven "
         f"by {made.uneven_mm:g} mm under it; Z must be true, and is not homed; primed "
-        f"{made.primed}; checked. Send it with --as-built {part}.",
-        markup=False,
+        f"{made.primed}; checked. Send it with --as-built {part}."
     )

@@ -8,21 +8,15 @@ from typing import Annotated, Any
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import JsonOption, MaterialOption, program_text
+from gcode.cli.options import (
+    FirstLayerOption,
+    JsonOption,
+    MaterialOption,
+    StandingHeightOption,
+    program_text,
+)
 from gcode.errors import InputError
 from gcode.profiles import DEFAULT_MATERIAL
-
-
-def add_to(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(
-        "touch",
-        epilog=console.examples(
-            "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin "
-            "--port /dev/ttyACM0",
-            "gcode touch --klipper-macro klipper_touch.cfg",
-        ),
-    )(touch_command)
 
 
 def _hand_out(path: Path) -> None:
@@ -39,6 +33,11 @@ def _given(value: Any, name: str) -> Any:
     return value
 
 
+@console.command(
+    "touch",
+    "gcode touch job.gcode --layer 41 --above-mm 4 --printer generic_marlin --port /dev/ttyACM0",
+    "gcode touch --klipper-macro klipper_touch.cfg",
+)
 def touch_command(
     job: Annotated[
         Path | None, typer.Argument(help="The whole job's G-code, of any slicer.")
@@ -51,12 +50,8 @@ def touch_command(
             "2 to 10. Turn Z by hand until it does."
         ),
     ] = None,
-    z_mm: Annotated[
-        float | None, typer.Option("--z-mm", help="Height of what stands there, mm.")
-    ] = None,
-    layer: Annotated[
-        int | None, typer.Option(help="Instead: the first layer to be printed, counted from 0.")
-    ] = None,
+    z_mm: StandingHeightOption = None,
+    layer: FirstLayerOption = None,
     printer: Annotated[
         str | None,
         typer.Option(

@@ -18,7 +18,7 @@ Xyz = tuple[float, float, float]
 
 
 @dataclass(slots=True)
-class Contact:
+class ProbeContact:
     """A probe that feels what it touches.
 
     Parameters
@@ -49,7 +49,7 @@ class Contact:
         self._rng = random.Random(self.seed)
 
     @classmethod
-    def of(cls, probe: ProbeProfile | None, surface: HeightField, *, seed: int = 0) -> Contact:
+    def of(cls, probe: ProbeProfile | None, surface: HeightField, *, seed: int = 0) -> ProbeContact:
         """The contact of a printer with this probe; of a point of a nozzle where it has none."""
         if probe is None:
             return cls(surface, seed=seed)

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gcode.firmware.contact import Contact
+from gcode.firmware.contact import ProbeContact
 from gcode.firmware.laid import Laid
 from gcode.firmware.motion import MotionBatch
 from gcode.firmware.planner import Planner
@@ -68,7 +68,7 @@ class Mechanics:
         self.clock_s = 0.0
         self.planner = self._new_planner()
         self.power_up()
-        self.contact: Contact | None = None  # where the nozzle feels what it touches
+        self.contact: ProbeContact | None = None  # where the nozzle feels what it touches
         self.dead_probe = False  # it never triggers
         self.laid: Laid | None = None
         self._laid_bytes = 0  # of what was executed and is not forgotten, so much is laid
@@ -78,7 +78,7 @@ class Mechanics:
     def stand(self, surface: HeightField, *, seed: int = 0) -> None:
         """Have this stand on the bed from now on, for what feels contact."""
         if self.contact is None:
-            self.contact = Contact.of(self.profile.probe, surface, seed=seed)
+            self.contact = ProbeContact.of(self.profile.probe, surface, seed=seed)
             self.contact.dead = self.dead_probe
         self.contact.surface = surface
 

@@ -22,7 +22,7 @@ Xyz = tuple[float, float, float]
 
 
 @dataclass(slots=True)
-class Block:
+class PlannedBlock:
     """A planned move; `entry` is the speed it will begin with, mm/s."""
 
     start: Xyz
@@ -67,7 +67,7 @@ class Planner:
         self.travel_acceleration = 1250.0
         self.retract_acceleration = 1250.0
         self.executed = array("d")
-        self.blocks: deque[Block] = deque()
+        self.blocks: deque[PlannedBlock] = deque()
         self.head_end_s = math.inf  # end of the block being executed, inf if none is
         self._unit = (0.0, 0.0, 0.0, 0.0)
         self._last_speed = 0.0
@@ -104,7 +104,9 @@ class Planner:
         blocks = self.blocks
         entry_max = min(jerk, speed, self._last_speed) if blocks else 0.0
         blocks.append(
-            Block(start, end, filament_mm, length, speed, acceleration, entry_max, 0.0, feed_mm_s)
+            PlannedBlock(
+                start, end, filament_mm, length, speed, acceleration, entry_max, 0.0, feed_mm_s
+            )
         )
         self._unit, self._last_speed = unit, speed
         self._plan_backwards()

@@ -46,8 +46,6 @@ class PtyServer:
         Socket of the parent, or None.
     motion
         File that executed moves are appended to, before anything is answered; or None.
-    clock
-        The host's time, s.
     """
 
     def __init__(
@@ -57,15 +55,13 @@ class PtyServer:
         *,
         control: socket.socket | None = None,
         motion: BinaryIO | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.core = core
         self.link = link
         self._control = control
         self._motion = motion
         self._control_in = b""
-        self._clock = clock
-        self._start_s = clock()
+        self._start_s = time.monotonic()
         self._idle_from_s = self._start_s
         self._stopping = False
         slow = core.faults.always.get("slow_reader")
@@ -128,12 +124,12 @@ class PtyServer:
             if error.errno != errno.EIO:
                 raise
             return
-        self.core.feed(data, self._clock())
+        self.core.feed(data, time.monotonic())
         if self._slow_s:
             time.sleep(self._slow_s * max(1, data.count(b"\n")))
 
     def _go_on(self, *, idle: bool) -> None:
-        core, now_s = self.core, self._clock()
+        core, now_s = self.core, time.monotonic()
         wall_s = now_s - self._start_s
         core.run(math.inf if core.accelerated else wall_s, now_s)
         machine = core.machine

@@ -28,6 +28,8 @@ class Variant:
     modes_follow_g90
         G90 and G91 set the extruder's mode too (Marlin); `relative_only`: G91 makes E relative
         while it lasts and M83 persists (Klipper); `independent`: they leave it alone.
+    motors_off_s
+        After the last move; infinity where they keep a part of their current.
     """
 
     name: str
@@ -37,15 +39,15 @@ class Variant:
     capabilities: tuple[tuple[str, bool], ...]
     numbers: Literal["verify", "checksum", "ignore"]
     modes_follow_g90: Literal["both", "relative_only", "independent"]
-    error_prefix: str
-    unhomed: str
-    unknown: str
-    echo_prefix: str
-    emergency_parser: bool
-    keepalive: bool
-    temperatures_in_ok: bool
-    advanced_ok: bool
-    motors_off_s: float  # after the last move; infinity where they keep a part of their current
+    error_prefix: str = "Error:"
+    unhomed: str = ""
+    unknown: str = 'echo:Unknown command: "{command}"'
+    echo_prefix: str = "echo:"
+    emergency_parser: bool = False
+    keepalive: bool = False
+    temperatures_in_ok: bool = True
+    advanced_ok: bool = False
+    motors_off_s: float = 120.0
 
 
 _MARLIN_CAPABILITIES = (
@@ -75,15 +77,8 @@ FIRMWARES: dict[str, Variant] = {
         capabilities=_MARLIN_CAPABILITIES,
         numbers="verify",
         modes_follow_g90="both",
-        error_prefix="Error:",
-        unhomed="",
-        unknown='echo:Unknown command: "{command}"',
-        echo_prefix="echo:",
         emergency_parser=True,
         keepalive=True,
-        temperatures_in_ok=True,
-        advanced_ok=False,
-        motors_off_s=120.0,
     ),
     # MK3S: Prusa-Firmware, where only M82 and M83 set the extruder's mode.
     "prusa": Variant(
@@ -99,15 +94,7 @@ FIRMWARES: dict[str, Variant] = {
         ),
         numbers="verify",
         modes_follow_g90="independent",
-        error_prefix="Error:",
-        unhomed="",
-        unknown='echo:Unknown command: "{command}"',
-        echo_prefix="echo:",
-        emergency_parser=False,
         keepalive=True,
-        temperatures_in_ok=True,
-        advanced_ok=False,
-        motors_off_s=120.0,
     ),
     "klipper": Variant(
         name="klipper",
@@ -121,10 +108,6 @@ FIRMWARES: dict[str, Variant] = {
         unhomed="!! Must home axis first",
         unknown='// Unknown command:"{command}"',
         echo_prefix="// ",
-        emergency_parser=False,
-        keepalive=False,
-        temperatures_in_ok=True,
-        advanced_ok=False,
         motors_off_s=600.0,
     ),
     "reprap": Variant(
@@ -140,10 +123,6 @@ FIRMWARES: dict[str, Variant] = {
         unhomed="Error: G0/G1: insufficient axes homed",
         unknown="Error: Bad command: {command}",
         echo_prefix="",
-        emergency_parser=False,
-        keepalive=False,
-        temperatures_in_ok=True,
-        advanced_ok=False,
         motors_off_s=float("inf"),
     ),
 }

@@ -14,12 +14,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
 import serial
 
 from gcode.errors import LinkError, LocalProtocolError
+from gcode.hosts.journal import Journal
 from gcode.hosts.port import Capabilities, LinkLostError, Temperatures
 from gcode.hosts.wirelog import WireLog
 from gcode.protocol import Link, LinkDialect, LinkTiming
@@ -34,29 +36,34 @@ PROOF_QUIET_S = 0.2
 """A printer that has said nothing for so long has nothing left to say."""
 
 
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A port and how it is spoken over; what each is for stands at `SerialPrinter`."""
+
+    port: str
+    baud: int
+    dialect: str
+    window: int
+    wire_log: Path | None
+    journal: Journal | None
+    timing: LinkTiming | None
+    clock: Callable[[], float]
+    supervise: bool
+    guard: bool
+
+
 class SerialConversation:
-    """A printer that can be asked things; see `SerialPrinter` for the parameters.
+    """A printer that can be asked things.
 
     Those who build on it are told of what it has no use for itself, by the methods that begin
     with `_on`, `_before`, `_fault` and `_lost_error`.
     """
 
-    def __init__(
-        self,
-        port: str,
-        *,
-        baud: int,
-        dialect: str,
-        window: int,
-        wire_log: Path | None,
-        timing: LinkTiming | None,
-        clock: Callable[[], float],
-    ) -> None:
-        self.port = port
-        self._baud = baud
-        self._clock = clock
-        self._link = Link(dialect, window=window, timing=timing)
-        self._wire_log = wire_log
+    def __init__(self, line: Line) -> None:
+        self._line = line
+        self.port = line.port
+        self._clock = line.clock
+        self._link = Link(line.dialect, window=line.window, timing=line.timing)
         self._log: WireLog | None = None
         self._serial: serial.Serial | None = None
         self._fd = -1
@@ -91,9 +98,9 @@ class SerialConversation:
     # ------------------------------------------------------------------ connection
 
     def _open_port(self) -> None:
-        if self._wire_log is not None:
-            self._log = WireLog(self._wire_log, epoch_s=time.time() - self._clock())
-        device = serial.Serial(baudrate=self._baud, timeout=0, exclusive=False)
+        if self._line.wire_log is not None:
+            self._log = WireLog(self._line.wire_log, epoch_s=time.time() - self._clock())
+        device = serial.Serial(baudrate=self._line.baud, timeout=0, exclusive=False)
         device.port = self.port
         device.dtr = False  # a rising DTR resets the board (pyserial#124)
         device.rts = False

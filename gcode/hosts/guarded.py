@@ -11,14 +11,13 @@ from pathlib import Path
 from types import TracebackType
 
 from gcode.errors import JournalError, LinkError, LocalProtocolError
-from gcode.hosts.conversation import SerialConversation
+from gcode.hosts.conversation import Line, SerialConversation
 from gcode.hosts.jobbook import JobBook
 from gcode.hosts.journal import Journal
 from gcode.hosts.line_query import last_number
 from gcode.hosts.lock import PortLock
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
 from gcode.hosts.supervisor import make_safe
-from gcode.protocol import LinkTiming
 from gcode.protocol import events as ev
 
 PAUSE_LIFT_MM = 5.0
@@ -27,37 +26,14 @@ REST_S = 2.0
 
 
 class GuardedConversation(SerialConversation):
-    """A printer that is left safe; see `SerialPrinter` for the parameters."""
+    """A printer that is left safe."""
 
-    def __init__(
-        self,
-        port: str,
-        *,
-        baud: int,
-        dialect: str,
-        window: int,
-        wire_log: Path | None,
-        journal: Journal | None,
-        timing: LinkTiming | None,
-        clock: Callable[[], float],
-        supervise: bool,
-        guard: bool,
-    ) -> None:
-        super().__init__(
-            port,
-            baud=baud,
-            dialect=dialect,
-            window=window,
-            wire_log=wire_log,
-            timing=timing,
-            clock=clock,
-        )
-        self._journal = journal
-        self._supervise = supervise
-        self._guard = guard
+    def __init__(self, line: Line) -> None:
+        super().__init__(line)
+        self._journal = line.journal
         self._supervisor: Supervisor | None = None
-        self._lock = PortLock(port)
-        self._book = JobBook(self._link, journal, clock)
+        self._lock = PortLock(line.port)
+        self._book = JobBook(self._link, line.journal, line.clock)
 
     def __exit__(
         self,
@@ -87,14 +63,14 @@ class GuardedConversation(SerialConversation):
                 self._ask_number(before_hello)
             counted = self._journal is not None and self._link.dialect.verifies
             self._greet(self._journal.open_session() if self._journal and counted else 0)
-            if self._guard and self._link.dialect.verifies:
+            if self._line.guard and self._link.dialect.verifies:
                 self._test_guard()
             self._learn()
             self._prove()  # from here on a silent reset cannot be taken for a resend request
         except BaseException:
             self.close()
             raise
-        if self._supervise:
+        if self._line.supervise:
             self._supervisor = Supervisor(self._fd, self._lock.fd, self._journal_path())
 
     def _journal_path(self) -> Path | None:

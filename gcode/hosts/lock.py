@@ -19,7 +19,6 @@ import hashlib
 import os
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from gcode.errors import LinkError, PortBusyError
@@ -38,12 +37,7 @@ class PortLock:
         self._path = (folder or Path(tempfile.gettempdir())) / f"gcode-port-{name}.lock"
         self.fd: int | None = None
 
-    def acquire(
-        self,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def acquire(self) -> None:
         """Take the lock.
 
         Raises
@@ -53,7 +47,7 @@ class PortLock:
         LinkError
             If the lock's file cannot be used.
         """
-        until_s = clock() + ORPHAN_S
+        until_s = time.monotonic() + ORPHAN_S
         while True:
             fd = self._open()
             try:
@@ -61,13 +55,13 @@ class PortLock:
             except OSError:
                 owner = _owner(fd)
                 os.close(fd)
-                if clock() >= until_s or (owner is not None and _alive(owner)):
+                if time.monotonic() >= until_s or (owner is not None and _alive(owner)):
                     who = f"process {owner}" if owner is not None else "another process"
                     raise PortBusyError(
                         f"{self._port} is held by {who}; one printer takes one sender: end it "
                         f"or choose another port."
                     ) from None
-                sleep(0.02)
+                time.sleep(0.02)
                 continue
             if self._is_named(fd):
                 break

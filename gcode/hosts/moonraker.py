@@ -15,7 +15,7 @@ from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker_session import MoonrakerSession
 from gcode.hosts.moonraker_state import MOONRAKER_ENDS
 from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
-from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter
+from gcode.hosts.server import Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
 from gcode.hosts.web import LIFT_COMMANDS, sentence
 from gcode.progress import Progress
@@ -31,8 +31,8 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         self.connect()
         return self
 
-    def _new_session(self) -> MoonrakerSession:
-        return MoonrakerSession(self.address, self._key, self._timing, self._clock, self._log)
+    def _new_session(self, reach: ServerReach) -> MoonrakerSession:
+        return MoonrakerSession(reach)
 
     def _greet(self, ready: Callable[[], None]) -> None:
         ready()
@@ -119,18 +119,15 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
 
     def _upload(self, job: JobFile) -> None:
         """Put the file on the server, which compares its checksum."""
-        answer = self._session.request(
+        self._session.expect(
+            201,
+            "take the file; is its disk full?",
             "POST",
             "/server/files/upload",
             files={"file": (job.name, job.data)},
             data={"root": "gcodes", "checksum": job.sha256},
             timeout_s=self._timing.upload_s,
         )
-        if answer.status_code != 201:
-            raise LinkError(
-                f"{self.address.name} does not take the file ({sentence(answer)}); is its disk "
-                f"full?"
-            )
 
     def _start(self, job: JobFile) -> None:
         self._aborted = False
@@ -153,25 +150,9 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         return True
 
     def _follow(self, job: JobFile, progress: Progress) -> bool:
-        """Wait for the print's end; False if it was cancelled."""
-        session, state = self._session, self._session.state
+        """Wait for the print's end, which may have come before we listened."""
         self._look(job)
-        looked_s = self._clock()
-        while True:
-            with session.news:
-                session.news.wait_for(
-                    lambda: state.ended or state.moved or state.stale or not session.listening,
-                    self._timing.poll_s,
-                )
-                state.moved = False
-                ended, fresh = state.ended, session.listening and not state.stale
-            progress("printing", float(state.file_position), float(len(job.data)))
-            if ended:
-                return self._outcome(job)
-            if fresh and self._clock() - looked_s < LOOK_EVERY * self._timing.poll_s:
-                continue
-            self._look(job)
-            looked_s = self._clock()
+        return super()._follow(job, progress)
 
     def _outcome(self, job: JobFile) -> bool:
         state = self._session.state

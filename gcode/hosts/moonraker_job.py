@@ -17,6 +17,7 @@ from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.moonraker_session import MoonrakerSession
 from gcode.hosts.port import NothingMetError, PrintableProgram
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
+from gcode.hosts.server import ServerReach
 from gcode.hosts.web import LIFT_COMMANDS
 from gcode.progress import Progress, silent
 
@@ -35,12 +36,9 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
 
     _unsure_s: float | None = None
 
-    def _new_session(self) -> MoonrakerSession:
+    def _new_session(self, reach: ServerReach) -> MoonrakerSession:
         self._held_back = threading.Event()
-        return MoonrakerSession(
-            self.address, self._key, self._timing, self._clock, self._log,
-            agent=AGENT, methods=(METHOD,),
-        )  # fmt: skip
+        return MoonrakerSession(reach, agent=AGENT, methods=(METHOD,))
 
     def _refuse_unless_ready(self) -> None:
         """It is there to be served while it prints, and when nothing is printed."""

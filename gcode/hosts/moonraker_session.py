@@ -5,15 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Callable
 from typing import Any
 
 import gcode
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.moonraker_state import MOONRAKER_SUBSCRIPTION, KlippyState
-from gcode.hosts.secret import ApiKey
-from gcode.hosts.server import ServerSession
-from gcode.hosts.web import Address, WebLog, WebTiming, json_object, refused_key, sentence
+from gcode.hosts.server import ServerReach, ServerSession
+from gcode.hosts.web import json_object, refused_key, sentence
 
 _MESSAGE = re.compile(r"""['"]message['"]:\s*(['"])(.*?)\1\s*[,}]""", re.DOTALL)
 
@@ -31,16 +29,12 @@ class MoonrakerSession(ServerSession[KlippyState]):
 
     def __init__(
         self,
-        address: Address,
-        key: ApiKey,
-        timing: WebTiming,
-        clock: Callable[[], float],
-        log: WebLog | None,
+        reach: ServerReach,
         *,
         agent: str = "",
         methods: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(address, key, timing, clock, log, KlippyState(methods=methods))
+        super().__init__(reach, KlippyState(methods=methods))
         self._numbers = itertools.count(1)
         self._agent, self._methods = agent, methods
 
@@ -65,6 +59,11 @@ class MoonrakerSession(ServerSession[KlippyState]):
                 f"another agent named {self._agent!r} serves the printer behind "
                 f"{self.address.name}; end that one first."
             ) from error
+
+    @property
+    def is_told(self) -> bool:
+        """Not by a Klipper that came back: it is asked anew what it prints."""
+        return self.listening and not self.state.stale
 
     def _logged(self, message: dict[str, Any]) -> str:
         return json.dumps({k: v for k, v in message.items() if k != "jsonrpc"})[:500]

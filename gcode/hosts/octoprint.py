@@ -14,10 +14,9 @@ from gcode.hosts.octoprint_session import OctoPrintSession
 from gcode.hosts.octoprint_state import BUSY_STATES, part_of
 from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
-from gcode.hosts.server import LOOK_EVERY, Left, ServerPrinter
+from gcode.hosts.server import Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
 from gcode.hosts.web import LIFT_COMMANDS, sentence
-from gcode.progress import Progress
 from gcode.protocol import events as ev
 
 
@@ -35,8 +34,8 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         self.connect()
         return self
 
-    def _new_session(self) -> OctoPrintSession:
-        return OctoPrintSession(self.address, self._key, self._timing, self._clock, self._log)
+    def _new_session(self, reach: ServerReach) -> OctoPrintSession:
+        return OctoPrintSession(reach)
 
     def _greet(self, ready: Callable[[], None]) -> None:
         if "Moonraker" in str(self._session.get("/api/version").get("text")):
@@ -140,17 +139,14 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def _upload(self, job: JobFile) -> None:
         """Put the file on the server and compare what lies there."""
-        answer = self._session.request(
+        self._session.expect(
+            201,
+            "take the file; is its disk full?",
             "POST",
             self.files,
             files={"file": (job.name, job.data)},
             timeout_s=self._timing.upload_s,
         )
-        if answer.status_code != 201:
-            raise LinkError(
-                f"{self.address.name} does not take the file ({sentence(answer)}); is its disk "
-                f"full?"
-            )
         there = self._session.get(f"{self.files}/{job.name}")
         size, digest = there.get("size"), there.get("hash")
         if size != len(job.data) or digest not in {None, job.sha1}:
@@ -176,28 +172,11 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         if answer.status_code != 204:
             raise LinkError(f"{self.address.name} does not start the print ({sentence(answer)}).")
 
-    def _follow(self, job: JobFile, progress: Progress) -> bool:
-        """Wait for the print's end; False if it was cancelled."""
-        session, state, looked_s = self._session, self._session.state, self._clock()
-        while True:
-            with session.news:
-                session.news.wait_for(
-                    lambda: state.ended or state.moved or not session.listening,
-                    self._timing.poll_s,
-                )
-                state.moved = False
-                ended, outcome = state.ended, state.outcome or "PrintFailed"
-            progress("printing", float(state.file_position), float(len(job.data)))
-            if ended:
-                return self._outcome(job, outcome)
-            if session.listening and self._clock() - looked_s < LOOK_EVERY * self._timing.poll_s:
-                continue
-            self._look(job)
-            looked_s = self._clock()
-
-    def _outcome(self, job: JobFile, outcome: str) -> bool:
+    def _outcome(self, job: JobFile) -> bool:
+        state = self._session.state
+        outcome = state.outcome or "PrintFailed"
         if outcome == "PrintFailed":
-            state, lines = self._session.state, self._uncertain(job)
+            lines = self._uncertain(job)
             if state.error:
                 raise PrinterError(
                     f"{self.address.name} reports a fault of its printer: {state.error}; {lines}."
@@ -206,7 +185,6 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         return outcome == "PrintDone"
 
     def _look(self, job: JobFile) -> None:
-        """Ask what became of the print, in case that its news did not reach us."""
         known = self._patiently(job, self._session.look)
         if not known:
             text = self._session.state.text
@@ -236,9 +214,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         self._job({"command": "pause", "action": "resume"}, "resume")
 
     def _job(self, command: dict[str, str], what: str) -> None:
-        answer = self._session.request("POST", "/api/job", json=command)
-        if answer.status_code != 204:
-            raise LinkError(f"{self.address.name} does not {what} ({sentence(answer)}).")
+        self._session.expect(204, what, "POST", "/api/job", json=command)
 
     def abort(self) -> None:
         """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""

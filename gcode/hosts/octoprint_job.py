@@ -29,6 +29,7 @@ from gcode.hosts.octoprint_state import part_of
 from gcode.hosts.port import NothingMetError, PrintableProgram
 from gcode.hosts.rewritten import Rewritten
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
+from gcode.hosts.server import ServerReach
 from gcode.hosts.web import LIFT_COMMANDS, json_object, sentence
 from gcode.progress import Progress, silent
 
@@ -42,15 +43,13 @@ BOM = b"\xef\xbb\xbf"
 class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
     """A printer whose job OctoPrint prints by itself; parameters of `ServerPrinter`."""
 
-    def _new_session(self) -> OctoPrintSession:
+    def _new_session(self, reach: ServerReach) -> OctoPrintSession:
         self._held_back = threading.Event()
         self._id = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:6]}"
         self._heard, self._here_s = 0, -HERE_EVERY_S
         self._page: dict[str, str] = {}
         self._asked_about: dict[str, Any] = {}
-        return OctoPrintSession(
-            self.address, self._key, self._timing, self._clock, self._log, plugin=AGENT
-        )
+        return OctoPrintSession(reach, plugin=AGENT)
 
     def _refuse_unless_ready(self) -> None:
         """It is there to be served while it prints, and when nothing is printed."""

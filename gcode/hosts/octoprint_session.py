@@ -16,9 +16,8 @@ import httpx
 
 from gcode.errors import LinkError
 from gcode.hosts.octoprint_state import ServerState, part_of
-from gcode.hosts.secret import ApiKey
-from gcode.hosts.server import ServerSession
-from gcode.hosts.web import Address, WebLog, WebTiming, json_object, sentence
+from gcode.hosts.server import ServerReach, ServerSession
+from gcode.hosts.web import json_object, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
@@ -37,15 +36,11 @@ class OctoPrintSession(ServerSession[ServerState]):
 
     def __init__(
         self,
-        address: Address,
-        key: ApiKey,
-        timing: WebTiming,
-        clock: Callable[[], float],
-        log: WebLog | None,
+        reach: ServerReach,
         *,
         plugin: str = "",
     ) -> None:
-        super().__init__(address, key, timing, clock, log, ServerState(plugin=plugin))
+        super().__init__(reach, ServerState(plugin=plugin))
         self._asking = threading.Lock()
 
     def get(self, path: str) -> dict[str, Any]:
@@ -171,14 +166,13 @@ class OctoPrintSession(ServerSession[ServerState]):
 
     def command(self, *commands: str) -> None:
         """Have commands sent, in turn with whatever else is sent; does not wait."""
-        answer = self._client.request(
-            "POST", "/api/printer/command", json={"commands": list(commands)}
+        self.expect(
+            204,
+            f"send {', '.join(commands)}; is its printer connected?",
+            "POST",
+            "/api/printer/command",
+            json={"commands": list(commands)},
         )
-        if answer.status_code != 204:
-            raise LinkError(
-                f"{self.address.name} does not send {', '.join(commands)} ({sentence(answer)}); "
-                f"is its printer connected?"
-            )
 
 
 def _sent_at(terminal: deque[str], command: str) -> int | None:

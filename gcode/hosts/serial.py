@@ -6,7 +6,9 @@ plain moves is `fast_path`'s; what may be sent and what an answer means is `prot
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 import threading
 import time
 from collections import deque
@@ -14,19 +16,27 @@ from collections.abc import Callable, Sequence
 from operator import sub
 from pathlib import Path
 
+from gcode.check.touches import TOUCH_COMMANDS
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.hosts.conversation import Line
 from gcode.hosts.fast_path import Exchange, waiting
 from gcode.hosts.guarded import GuardedConversation
 from gcode.hosts.jobbook import TEMPERATURE_EVERY_S
 from gcode.hosts.journal import Journal
 from gcode.hosts.modes import batches_of, modes_after
-from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport
+from gcode.hosts.port import LinkLostError, NothingMetError, PrintableProgram, PrintReport
 from gcode.hosts.proof import require_checked
 from gcode.hosts.telemetry import RoundTrips
 from gcode.progress import Progress, silent
 from gcode.protocol import PLAIN_OK, LinkTiming, WireLine
 from gcode.protocol import events as ev
 
+_TOUCHED = re.compile(r"(?://\s*)?amrepair: touched at z=(-?\d+\.\d+)")
+"""What the macro AMREPAIR_TOUCH says; Klipper's own answers differ by its version."""
+_TOUCHED_NOTHING = re.compile(r"(?://\s*)?amrepair: nothing was touched")
+"""What it says once it has put Z right after that."""
+HEARD_S = 0.1
+"""By then Klipper has carried out what was due when a touch had failed."""
 MOTORS_SURE = 0.8
 """Share of the firmware's own time after which its motors are not relied on: clocks differ, and
 the pause's last move ended before it was counted."""
@@ -71,16 +81,7 @@ class SerialPrinter(GuardedConversation):
         guard: bool = True,
     ) -> None:
         super().__init__(
-            port,
-            baud=baud,
-            dialect=dialect,
-            window=window,
-            wire_log=wire_log,
-            journal=journal,
-            timing=timing,
-            clock=clock,
-            supervise=supervise,
-            guard=guard,
+            Line(port, baud, dialect, window, wire_log, journal, timing, clock, supervise, guard)
         )
         self._round_trips = RoundTrips()
         self._pause_asked = threading.Event()
@@ -271,6 +272,58 @@ class SerialPrinter(GuardedConversation):
                 self._log.add(sent_s[index], b">", move)
                 if index < len(answered_s):
                     self._log.add(answered_s[index], b"<", PLAIN_OK)
+
+    # ------------------------------------------------------------------ touches
+
+    def require_touches(self) -> None:
+        """Any firmware will do: one that knows no touches says so when it is to touch."""
+
+    def touch(
+        self, checked: PrintableProgram, lines: range, *, progress: Progress = silent
+    ) -> float:
+        """Carry out lines, the last of them a touch; where it met something, mm in G-code's Z."""
+        command = TOUCH_COMMANDS[checked.program.dialect]
+        self.said.clear()
+        try:
+            report = self.print(checked, lines=lines, progress=progress)
+        except PrinterError as error:
+            self._forget_z(command)
+            raise NothingMetError(f"{error}") from error
+        if not report.ok:
+            raise PrinterError(
+                "The touches were stopped; the nozzle was lifted and the heaters are off."
+            )
+        if any(command in text for text in report.warnings):
+            self.make_safe()
+            how = (
+                "write its macro by 'gcode touch --klipper-macro FILE', include it in printer.cfg"
+                if command == TOUCH_COMMANDS["klipper"]
+                else "build it with G38_PROBE_TARGET, or set Z by hand, with paper below the nozzle"
+            )
+            raise PrinterError(
+                f"The printer's firmware does not know {command}, so nothing was touched; the "
+                f"nozzle was lifted and the heaters are off: {how}."
+            )
+        if command != TOUCH_COMMANDS["klipper"]:
+            return self.place().z_mm
+        said = [match for text in self.said if (match := _TOUCHED.fullmatch(text.strip()))]
+        if not said:
+            self.make_safe()
+            raise PrinterError(
+                "The printer does not say where the touch ended; is its macro AMREPAIR_TOUCH of "
+                "this version? The nozzle was lifted and the heaters are off."
+            )
+        return float(said[-1].group(1))
+
+    def _forget_z(self, command: str) -> None:
+        """Klipper's Z may still be the one that the macro lowered: then it must be homed first."""
+        if command != TOUCH_COMMANDS["klipper"]:
+            return
+        with contextlib.suppress(LinkError, LocalProtocolError):
+            self.command(f"G4 P{1000 * HEARD_S:.0f}")
+            self.command("M400")
+            if not any(_TOUCHED_NOTHING.fullmatch(text.strip()) for text in self.said):
+                self.command("SET_KINEMATIC_POSITION CLEAR_HOMED=Z")
 
     # ------------------------------------------------------------------ pause, abort, stop
 

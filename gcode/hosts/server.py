@@ -21,13 +21,7 @@ import httpx
 
 from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.lock import PortLock
-from gcode.hosts.port import (
-    Capabilities,
-    LinkLostError,
-    PrintableProgram,
-    PrintReport,
-    Temperatures,
-)
+from gcode.hosts.port import LinkLostError, PrintableProgram, Printer, PrintReport
 from gcode.hosts.proof import require_checked
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.upload import JobFile, part_prefix
@@ -42,8 +36,29 @@ LOOK_EVERY = 5
 class News(Protocol):
     """The state of a server, as its messages tell it."""
 
+    moved: bool
+    file_position: int
+
+    @property
+    def ended(self) -> bool:
+        """Whether the followed print is over."""
+
+    def follow(self, file: str) -> None:
+        """Follow the print of a file from now on."""
+
     def take(self, message: Any) -> None:
         """Take one message."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServerReach:
+    """A server and how it is reached; no log where none is kept."""
+
+    address: Address
+    key: ApiKey
+    timing: WebTiming
+    clock: Callable[[], float]
+    log: WebLog | None
 
 
 State = TypeVar("State", bound=News)
@@ -59,23 +74,13 @@ class ServerSession(ABC, Generic[State]):
         Notified whenever `state` may have changed; hold it to read several fields at once.
     """
 
-    def __init__(
-        self,
-        address: Address,
-        key: ApiKey,
-        timing: WebTiming,
-        clock: Callable[[], float],
-        log: WebLog | None,
-        state: State,
-    ) -> None:
-        self.address = address
+    def __init__(self, reach: ServerReach, state: State) -> None:
+        self.address = reach.address
         self.state = state
         self.news = threading.Condition()
-        self._key = key
-        self._timing = timing
-        self._clock = clock
-        self._log = log
-        self._client = WebClient(address, key, timing, log)
+        self._key, self._timing = reach.key, reach.timing
+        self._clock, self._log = reach.clock, reach.log
+        self._client = WebClient(reach.address, reach.key, reach.timing, reach.log)
         self._socket: PushSocket | None = None
 
     def close(self) -> None:
@@ -91,6 +96,17 @@ class ServerSession(ABC, Generic[State]):
     def request(self, method: str, path: str, **kwargs: Any) -> httpx.Response:
         """Send an HTTP request once; see `WebClient.request`."""
         return self._client.request(method, path, **kwargs)
+
+    def expect(
+        self, status: int, otherwise: str, method: str, path: str, **kwargs: Any
+    ) -> httpx.Response:
+        """Send an HTTP request that is not to be refused; see `WebClient.expect`."""
+        return self._client.expect(status, otherwise, method, path, **kwargs)
+
+    @property
+    def is_told(self) -> bool:
+        """Whether what is known of the print is kept up to date by news."""
+        return self.listening
 
     @abstractmethod
     def listen(self) -> None:
@@ -148,7 +164,7 @@ class Left:
     ended_s: float | None = None
 
 
-class ServerPrinter(ABC, Generic[Session]):
+class ServerPrinter(Printer, ABC, Generic[Session]):
     """A printer that a server drives.
 
     Parameters
@@ -208,7 +224,9 @@ class ServerPrinter(ABC, Generic[Session]):
         self._lock.acquire()
         try:
             self._log = WebLog(self._wire_log) if self._wire_log else None
-            self._open = self._new_session()
+            self._open = self._new_session(
+                ServerReach(self.address, self._key, self._timing, self._clock, self._log)
+            )
             self._greet(ready)
         except BaseException:
             self.close()
@@ -268,7 +286,7 @@ class ServerPrinter(ABC, Generic[Session]):
         return self._open
 
     @abstractmethod
-    def _new_session(self) -> Session:
+    def _new_session(self, reach: ServerReach) -> Session:
         """A session, not yet listening."""
 
     @abstractmethod
@@ -284,40 +302,8 @@ class ServerPrinter(ABC, Generic[Session]):
         """Whether the nozzle is where the firmware believes it is, as far as the server knows."""
 
     @abstractmethod
-    def position_mm(self) -> tuple[float, float, float]:
-        """Ask for the logical position."""
-
-    @abstractmethod
     def command(self, text: str) -> None:
         """Have one command of the host's own carried out."""
-
-    @abstractmethod
-    def __enter__(self) -> ServerPrinter[Session]:
-        """Connected."""
-
-    @abstractmethod
-    def capabilities(self) -> Capabilities:
-        """What firmware and server say of themselves."""
-
-    @abstractmethod
-    def finish_moves(self) -> None:
-        """Return when every buffered move has been made."""
-
-    @abstractmethod
-    def pause(self) -> None:
-        """Have the server pause."""
-
-    @abstractmethod
-    def resume(self) -> None:
-        """Have the server go on."""
-
-    @abstractmethod
-    def emergency_stop(self) -> None:
-        """Stop everything now."""
-
-    @abstractmethod
-    def heaters_off(self) -> None:
-        """Switch every heater and the fan off."""
 
     @abstractmethod
     def _refuse_unless_ready(self) -> None:
@@ -397,9 +383,32 @@ class ServerPrinter(ABC, Generic[Session]):
     def _start(self, job: JobFile) -> None:
         """Have the print begin."""
 
-    @abstractmethod
     def _follow(self, job: JobFile, progress: Progress) -> bool:
         """Wait for the print's end; False if it was cancelled."""
+        session, state = self._session, self._session.state
+        looked_s = self._clock()
+        while True:
+            with session.news:
+                session.news.wait_for(
+                    lambda: state.ended or state.moved or not session.is_told, self._timing.poll_s
+                )
+                state.moved = False
+                ended = state.ended
+            progress("printing", float(state.file_position), float(len(job.data)))
+            if ended:
+                return self._outcome(job)
+            if session.is_told and self._clock() - looked_s < LOOK_EVERY * self._timing.poll_s:
+                continue
+            self._look(job)
+            looked_s = self._clock()
+
+    @abstractmethod
+    def _outcome(self, job: JobFile) -> bool:
+        """How a print ended that is over; False if it was cancelled."""
+
+    @abstractmethod
+    def _look(self, job: JobFile) -> None:
+        """Ask what became of the print, in case that its news did not reach us."""
 
     @abstractmethod
     def _reached(
@@ -437,14 +446,6 @@ class ServerPrinter(ABC, Generic[Session]):
         )
 
     # ------------------------------------------------------------------ safety
-
-    @abstractmethod
-    def temperatures(self) -> Temperatures:
-        """Ask for temperatures."""
-
-    @abstractmethod
-    def abort(self) -> None:
-        """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""
 
     def _make_safe(self, error: BaseException) -> None:
         """Make safe what can be reached, and add to the error how that went."""

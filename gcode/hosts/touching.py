@@ -6,27 +6,19 @@ was felt has the height that the job gave it.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from gcode.check import CheckedProgram
-from gcode.check.touches import TOUCH_COMMANDS, touch_lines
+from gcode.check.touches import touch_lines
 from gcode.dialects import number
-from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.errors import PrinterError
 from gcode.hosts.port import NothingMetError, TellsTouches
 from gcode.hosts.serial import SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.resumption.touch import Touching
 
-_TOUCHED = re.compile(r"(?://\s*)?amrepair: touched at z=(-?\d+\.\d+)")
-"""What the macro AMREPAIR_TOUCH says; Klipper's own answers differ by its version."""
-_TOUCHED_NOTHING = re.compile(r"(?://\s*)?amrepair: nothing was touched")
-"""What it says once it has put Z right after that."""
-HEARD_S = 0.1
-"""By then Klipper has carried out what was due when a touch had failed."""
 REPORTED_MM = 0.01
 """Marlin tells a position in two digits."""
 
@@ -114,7 +106,7 @@ def tell_z(printer: SerialPrinter, z_mm: float) -> None:
 
 
 def felt(
-    printer: SerialPrinter | TellsTouches,
+    printer: TellsTouches,
     checked: CheckedProgram,
     *,
     at_contact: Callable[[], None] = lambda: None,
@@ -138,10 +130,7 @@ def felt(
     first = 0
     for index in touch_lines(checked.program):
         try:
-            if isinstance(printer, SerialPrinter):
-                met_mm = _met_mm(printer, checked, range(first, index + 1), progress)
-            else:
-                met_mm = printer.touch(checked, range(first, index + 1), progress=progress)
+            met_mm = printer.touch(checked, range(first, index + 1), progress=progress)
         except NothingMetError as error:
             raise PrinterError(
                 f"Nothing was felt {_how_deep(lines[index])}, where the touch was to end "
@@ -163,52 +152,3 @@ def _how_deep(line: str) -> str:
     if word.startswith("DEPTH="):
         return f"within {word.removeprefix('DEPTH=')} mm"
     return f"down to {word} mm"
-
-
-def _met_mm(
-    printer: SerialPrinter, checked: CheckedProgram, lines: range, progress: Progress
-) -> float:
-    """Carry out lines, the last of them a touch; where that ended."""
-    command = TOUCH_COMMANDS[checked.program.dialect]
-    printer.said.clear()
-    try:
-        report = printer.print(checked, lines=lines, progress=progress)
-    except PrinterError as error:
-        _forget_z(printer, command)
-        raise NothingMetError(f"{error}") from error
-    if not report.ok:
-        raise PrinterError(
-            "The touches were stopped; the nozzle was lifted and the heaters are off."
-        )
-    if any(command in text for text in report.warnings):
-        printer.make_safe()
-        how = (
-            "write its macro by 'gcode touch --klipper-macro FILE' and include it in printer.cfg"
-            if command == TOUCH_COMMANDS["klipper"]
-            else "build it with G38_PROBE_TARGET, or set Z by hand, with paper below the nozzle"
-        )
-        raise PrinterError(
-            f"The printer's firmware does not know {command}, so nothing was touched; the nozzle "
-            f"was lifted and the heaters are off: {how}."
-        )
-    if command != TOUCH_COMMANDS["klipper"]:
-        return printer.place().z_mm
-    said = [match for text in printer.said if (match := _TOUCHED.fullmatch(text.strip()))]
-    if not said:
-        printer.make_safe()
-        raise PrinterError(
-            "The printer does not say where the touch ended; is its macro AMREPAIR_TOUCH of this "
-            "version? The nozzle was lifted and the heaters are off."
-        )
-    return float(said[-1].group(1))
-
-
-def _forget_z(printer: SerialPrinter, command: str) -> None:
-    """Klipper's Z may still be the one that the macro lowered: then it must be homed to move."""
-    if command != TOUCH_COMMANDS["klipper"]:
-        return
-    with contextlib.suppress(LinkError, LocalProtocolError):
-        printer.command(f"G4 P{1000 * HEARD_S:.0f}")
-        printer.command("M400")
-        if not any(_TOUCHED_NOTHING.fullmatch(text.strip()) for text in printer.said):
-            printer.command("SET_KINEMATIC_POSITION CLEAR_HOMED=Z")

@@ -112,15 +112,14 @@ class Address:
 class WebLog:
     """The wire log of a server's adapter: one line for every request and piece of news."""
 
-    def __init__(self, path: Path, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, path: Path) -> None:
         self._log = WireLog(path)
-        self._clock = clock
         self._mutex = threading.Lock()  # news come in a thread of their own
 
     def add(self, direction: bytes, text: str) -> None:
         """Note a line; `>` to the server, `<` from it."""
         with self._mutex:
-            self._log.add(self._clock(), direction, text.encode("utf-8", "replace"))
+            self._log.add(time.time(), direction, text.encode("utf-8", "replace"))
 
     def close(self) -> None:
         """Write what is left and close."""
@@ -177,6 +176,30 @@ class WebClient:
             raise LinkError(
                 f"{where} failed with status {answer.status_code} ({sentence(answer)}); "
                 f"see its log."
+            )
+        return answer
+
+    def expect(
+        self, status: int, otherwise: str, method: str, path: str, **kwargs: Any
+    ) -> httpx.Response:
+        """Send a request that is answered with a status, or was refused.
+
+        Parameters
+        ----------
+        otherwise
+            What the server does not do then, such as 'pause'; a hint may follow after a `;`.
+
+        Raises
+        ------
+        LinkError
+            With the server's own words.
+        """
+        answer = self.request(method, path, **kwargs)
+        if answer.status_code != status:
+            what, _, hint = otherwise.partition("; ")
+            raise LinkError(
+                f"{self.address.name} does not {what} ({sentence(answer)})"
+                f"{f'; {hint}' if hint else '.'}"
             )
         return answer
 

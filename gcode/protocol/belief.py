@@ -15,7 +15,7 @@ from gcode.protocol.ledger import Ledger
 from gcode.protocol.timing import LinkTiming
 
 
-class Verdict(Enum):
+class ResendVerdict(Enum):
     """What is to be done about a resend request."""
 
     SERVE = "serve"
@@ -27,7 +27,7 @@ class Verdict(Enum):
 class Judgement(NamedTuple):
     """A verdict and its reason."""
 
-    verdict: Verdict
+    verdict: ResendVerdict
     why: str = ""
 
 
@@ -92,7 +92,7 @@ class Belief:
         """
         if not rewinding and number == self.stale and number < ledger.cursor:
             self.stale = None
-            return Judgement(Verdict.ECHO)
+            return Judgement(ResendVerdict.ECHO)
         if said_last is not None and said_last + 1 != number:
             return self._refusal(
                 f"the printer took line {said_last} last and asks for {number}", None, ledger
@@ -106,9 +106,10 @@ class Belief:
         self._last = number
         if self._same > self._timing.max_resends:
             return Judgement(
-                Verdict.END, f"the printer asked for line {number} {self._same} times in a row"
+                ResendVerdict.END,
+                f"the printer asked for line {number} {self._same} times in a row",
             )
-        return Judgement(Verdict.SERVE)
+        return Judgement(ResendVerdict.SERVE)
 
     def _why_impossible(self, number: int, ledger: Ledger) -> str | None:
         if number > ledger.last + 1:
@@ -131,7 +132,7 @@ class Belief:
             self._refused >= self._timing.max_refused
             or self._refused_same >= self._timing.max_refused_same
         )
-        return Judgement(Verdict.END if ends else Verdict.REFUSE, why)
+        return Judgement(ResendVerdict.END if ends else ResendVerdict.REFUSE, why)
 
     def of_ok(self, number: int | None, ledger: Ledger) -> int | None:
         """The line that an `ok` acknowledges; None if that was acknowledged before.

@@ -188,8 +188,6 @@ class Ok:
     """An `ok` as read from the wire; `link` turns it into `Acknowledged` or `SpareOk`."""
 
     number: int | None = None
-    planner_free: int | None = None
-    buffer_free: int | None = None
     more: tuple[object, ...] = field(default=())
 
 

@@ -23,7 +23,7 @@ import re
 from collections.abc import Sequence
 
 from gcode.errors import LocalProtocolError
-from gcode.protocol.belief import Verdict
+from gcode.protocol.belief import ResendVerdict
 from gcode.protocol.events import (
     Busy,
     CommandFailed,
@@ -378,15 +378,15 @@ class Link(Recovery):
         verdict, why = self._belief.of_resend(
             number, self._ledger, rewinding=rewinding, said_last=said_last
         )
-        if verdict is Verdict.SERVE:
+        if verdict is ResendVerdict.SERVE:
             self._serve(number, now_s)
-        elif verdict is Verdict.ECHO:
+        elif verdict is ResendVerdict.ECHO:
             self._events.append(ResendRequested(number, served=False))
         else:
             self._events.append(ResendRefused(number, why))
-        if verdict is Verdict.END:
+        if verdict is ResendVerdict.END:
             self._lose(why)
-        elif verdict is not Verdict.SERVE:
+        elif verdict is not ResendVerdict.SERVE:
             # The request itself may be garbled: ask again before believing it.
             self._swallow_until_s = now_s + self.timing.resend_grace_s
             self._doubt(now_s)

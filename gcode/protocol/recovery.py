@@ -7,7 +7,7 @@ It holds what one conversation has come to; what is said and what is sent is the
 from __future__ import annotations
 
 from gcode.errors import LocalProtocolError
-from gcode.protocol.belief import Belief, Verdict
+from gcode.protocol.belief import Belief, ResendVerdict
 from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
 from gcode.protocol.events import (
     Acknowledged,
@@ -125,12 +125,12 @@ class Recovery:
         certain = number == belief.told_place if said_last is None else said_last + 1 == number
         belief.told_place = number
         judgement = belief.of_resend(number, ledger, rewinding=True, said_last=said_last)
-        if judgement.verdict is Verdict.SERVE and certain:
+        if judgement.verdict is ResendVerdict.SERVE and certain:
             if number == ledger.last + 1:
                 belief.confirm(ledger.last)
                 self._events.append(Proved(ledger.last))
             self._serve(number, now_s)
-        elif judgement.verdict is Verdict.END:
+        elif judgement.verdict is ResendVerdict.END:
             self._events.append(ResendRefused(number, judgement.why))
             self._lose(judgement.why)
         else:

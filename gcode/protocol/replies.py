@@ -33,7 +33,7 @@ Reply = Ok | Resend | Said
 _REPLIED_NUMBER = r"[-+]?\d{1,9}(?:\.\d{0,9})?"
 _RESEND = re.compile(r"(?:resend|rs)\s*[: ]\s*N?(\d{1,9})\s*", re.IGNORECASE)
 _OK_REPLY = re.compile(r"ok(?:\s+(.*))?", re.DOTALL)
-_ADVANCED = re.compile(r"(?:N(\d{1,9})\s*)?(?:P(\d{1,4})\s+)?(?:B(\d{1,4}))?\s*")
+_ADVANCED = re.compile(r"(?:N(\d{1,9})\s*)?(?:P\d{1,4}\s+)?(?:B\d{1,4})?\s*")
 _BUSY_REPLY = re.compile(r"(?:echo:\s*)?busy:\s*(.+)", re.IGNORECASE)
 _HEATER = re.compile(rf"\b([TBCPA]\d?):\s?({_REPLIED_NUMBER})(?:\s*/\s*({_REPLIED_NUMBER}))?")
 _TEMPERATURES = re.compile(
@@ -128,8 +128,7 @@ def _parse_ok(rest: str, raw: bytes) -> Reply:
         return Ok()
     match = _ADVANCED.fullmatch(rest)
     if match:
-        number, planner, buffer = (int(group) if group else None for group in match.groups())
-        return Ok(number, planner, buffer)
+        return Ok(int(match[1]) if match[1] else None)
     if _TEMPERATURES.fullmatch(rest):
         return Ok(more=(_temperatures(rest),))
     if position := _position(rest):

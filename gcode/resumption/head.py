@@ -18,6 +18,7 @@ from gcode.resumption.settings import Settings
 from gcode.slicing.room import bare_place, room_for_line
 from gcode.surfaces import HeightField
 from gcode.units import filament_area_mm2, mm_min_from_mm_s
+from gcode.writer import modes_restored
 
 RESUME_LIFT_MM = 10.0
 LEAST_LIFT_MM = 2.0
@@ -155,14 +156,7 @@ class Head:
         state = self._state
         self.lines += settings.commands
         self.lines.append(fan_command(state.fan_ratio))
-        self.lines.append(f"G92 E{number(state.e_mm, 5)}")
-        if state.feed_mm_s > 0:
-            self.lines.append(f"G1 F{number(mm_min_from_mm_s(state.feed_mm_s), 1)}")
-        if not state.absolute_xyz:
-            self.lines.append("G91")
-        self.lines.append("M82" if state.absolute_e else "M83")  # after G90 and G91, always
-        if not state.units_mm:
-            self.lines.append("G20")
+        self.lines += modes_restored(state)
 
 
 def feed(speed_mm_s: float) -> str:

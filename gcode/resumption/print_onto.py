@@ -21,6 +21,7 @@ from gcode.reader import Job, read_job
 from gcode.resumption.head import Head, height_over, prime, pulled_back_mm, temperatures
 from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import over_reach
+from gcode.stretches import places_along
 from gcode.surfaces import HeightField
 
 ONTO_STEP_MM = 0.5  # along the first layer's beads
@@ -108,12 +109,7 @@ def _height_under(job: Job, standing: HeightField) -> tuple[float, float]:
     """How high the first layer is to be raised, and how uneven what is under it is."""
     beads = job.beads
     own = beads.layer == 0
-    start, end = beads.start_mm[own], beads.end_mm[own]
-    lengths = np.linalg.norm(end - start, axis=1)
-    count = np.maximum(1, np.ceil(lengths / ONTO_STEP_MM).astype(np.int64))
-    owner = np.repeat(np.arange(len(count)), count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    places = start[owner] + (end - start)[owner] * ((step + 0.5) / count[owner])[:, None]
+    places, _ = places_along(beads.start_mm[own], beads.end_mm[own], ONTO_STEP_MM)
     under_mm = standing.sample(places[:, :2])
     top_mm = float(np.percentile(under_mm, TOP_PERCENT))
     layer_mm = max(job.layers[0].height_mm, 0.05)

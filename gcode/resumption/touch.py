@@ -27,6 +27,7 @@ from gcode.resumption.head import RESUME_LIFT_MM, feed, height_over
 from gcode.resumption.resume_at import first_layer
 from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import standing_field
+from gcode.stretches import in_turn
 from gcode.surfaces import HeightField
 
 FLAT_CELL_MM = 0.2
@@ -235,8 +236,8 @@ def _solid(
     half_mm = 0.5 * float(np.median(beads.width_mm[pick]))
     steps = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / (0.5 * FLAT_CELL_MM)), 1.0)
     count = (steps + 1).astype(np.int64)
-    owner = np.repeat(np.arange(len(count)), count)
-    share = (np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)) / steps[owner]
+    owner, number = in_turn(count)
+    share = number / steps[owner]
     points = start[owner] + share[:, None] * (end - start)[owner]
     rim = 2 * math.ceil(half_mm / FLAT_CELL_MM) + 1
     origin = np.floor(points.min(axis=0) / FLAT_CELL_MM) * FLAT_CELL_MM - rim * FLAT_CELL_MM

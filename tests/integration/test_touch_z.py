@@ -110,7 +110,7 @@ def test_klipper_must_home_z_where_the_macro_does_not_say_that_it_is_right(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It has lowered the height that Klipper believes in: nothing may go by it."""
-    monkeypatch.setattr("gcode.hosts.touching._TOUCHED_NOTHING", re.compile("never said"))
+    monkeypatch.setattr("gcode.hosts.serial._TOUCHED_NOTHING", re.compile("never said"))
     setup = load_setup("generic_klipper", "pla")
     plan, standing = plan_for("generic_klipper", tmp_path)
     with (

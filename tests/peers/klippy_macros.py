@@ -25,8 +25,7 @@ from small_klipper import SmallKlipper
 
 from gcode.errors import PrinterError
 from gcode.hosts import connect
-from gcode.hosts.serial import SerialPrinter
-from gcode.hosts.touching import _TOUCHED
+from gcode.hosts.serial import _TOUCHED, SerialPrinter
 
 STEP_MM = 1.0  # a bead is cut into pieces so long, each laid or not
 COUNTED = ("gcode_macro _AMREPAIR_STEP", "gcode_macro AMREPAIR_TOUCH")

@@ -8,7 +8,7 @@ from pathlib import Path
 import klippy_batch
 import pytest
 
-from gcode.hosts.touching import _TOUCHED
+from gcode.hosts.serial import _TOUCHED
 from gcode.resumption.klipper import TOUCH_MACRO
 
 Z_OFFSET_MM, LOWEST_MM = -0.35, -3.0

@@ -16,7 +16,8 @@ import pytest
 import trimesh
 
 from amrepair.errors import AmrepairError
-from amrepair.postprocess import Asked, mark
+from amrepair.postprocess import LooksAsked, mark
+from gcode import clouds
 from gcode.check import Policy, judge
 from gcode.errors import GcodeError
 from gcode.estimate import estimate
@@ -26,7 +27,7 @@ from gcode.profiles.own_settings import own_settings
 from gcode.reader import read_job
 from gcode.resumption import resume_at
 from gcode.solids import read_solid
-from gcode.surfaces import HeightField, clouds, scanned
+from gcode.surfaces import HeightField, scanned
 from tests.mutations import mutated
 
 SETUP = load_setup("ender_3", "pla", "standard_0.20")
@@ -70,7 +71,7 @@ def read_program(path: Path) -> None:
         lambda: own_settings(text, str(path)),
         lambda: read_job(program),
         lambda: estimate(program, SETUP.printer),
-        lambda: mark(text, str(path), "klipper", Asked(every=1, adaptive=True)),
+        lambda: mark(text, str(path), "klipper", LooksAsked(every=1, adaptive=True)),
     ]
     if zlib.crc32(text.encode(errors="replace")) % 20 == 0:  # it costs as much as all the others
         steps.append(lambda: resume_at(program, SETUP, layer=1))

@@ -13,9 +13,9 @@ from loop_bench import PLACE_MM, SIZE_MM, Scripted, scan_of, solid_mesh
 from moonraker_fake import AgentsMoonraker
 
 from amrepair.cli import running, serving
-from amrepair.cli.running import Page
+from amrepair.cli.live import ViewPlace
 from amrepair.loop.tape import read_events
-from amrepair.postprocess import Asked, mark
+from amrepair.postprocess import LooksAsked, mark
 from amrepair.scans import Scan
 from amrepair.template import open_template
 from gcode.hosts.moonraker_session import MoonrakerSession
@@ -46,7 +46,7 @@ def made_ready(here: Path) -> Ready:
     setup = load_setup(*PRINTER)
     part = m3.Manifold.cube(SIZE_MM)
     plain = write(plan_part(part.translate(PLACE_MM), setup).toolpath, setup, title="small").text
-    marked = mark(plain, "job.gcode", "klipper", Asked(every=LOOK_LAYER + 1, final=False))
+    marked = mark(plain, "job.gcode", "klipper", LooksAsked(every=LOOK_LAYER + 1, final=False))
     assert [place.layer for place in marked.places] == [LOOK_LAYER]
     solid_mesh(part).export(here / "small.stl")
     open_template(here / "small.stl").save(here / "small.safetensors")  # type: ignore[attr-defined]
@@ -87,7 +87,7 @@ class Bench:
         said = {"scanner": f"watch:{self.folder}", "approve": approve, "scan_timeout_s": 1.0,
                 "sound": (), "seed": 0}  # fmt: skip
         told = {"template": self.ready.template, "out": self.folder / "runs", "named": PRINTER,
-                "calibration": None, "page": Page(False, "", 0, None), "once": True,
+                "calibration": None, "page": ViewPlace(False, "", 0, None), "once": True,
                 "pose_confirmed": False, "said": said}  # fmt: skip
         serving.serve(
             serving.Served(

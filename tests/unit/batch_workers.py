@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from multiprocessing.connection import Connection
 
-from amrepair.batch.options import Outcome, Task, Work
+from amrepair.batch.options import Task, TaskOutcome, Work
 
 
 def mortal(pipe: Connection, work: Work) -> None:
@@ -15,7 +15,7 @@ def mortal(pipe: Connection, work: Work) -> None:
         assert isinstance(task, Task)
         if task.uri == "bad":
             os._exit(9)
-        pipe.send(Outcome(task.scan_id, cost={"worker": os.getpid()}))
+        pipe.send(TaskOutcome(task.scan_id, cost={"worker": os.getpid()}))
 
 
 def stillborn(pipe: Connection, work: Work) -> None:

@@ -15,7 +15,7 @@ from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import ScanRequest
 from amrepair.simulate.run import PreparedRun, prepare_run
 from amrepair.template import MeshSdf
-from gcode.firmware.contact import Contact
+from gcode.firmware.contact import ProbeContact
 from gcode.moves import ModalState
 from gcode.profiles import load_setup
 from gcode.surfaces import HeightField
@@ -51,7 +51,7 @@ class FieldFeeler:
     """Touches answered by a height field; no program is sent (`Feeler`)."""
 
     def __init__(self, run: PreparedRun, field: HeightField, *, seed: int = 0) -> None:
-        self._contact = Contact.of(run.setup.printer.feeler, field, seed=seed)
+        self._contact = ProbeContact.of(run.setup.printer.feeler, field, seed=seed)
         self.asked_mm: list[np.ndarray] = []
 
     def send_by(self, wire: Wire) -> None:

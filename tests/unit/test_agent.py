@@ -28,7 +28,7 @@ from small_klipper import CommandError, SmallKlipper
 from amrepair.agent import MACROS, shipped
 from amrepair.loop.marks import marked_stops
 from amrepair.loop.travel import park
-from amrepair.postprocess import Asked, mark
+from amrepair.postprocess import LooksAsked, mark
 from gcode.check import check
 from gcode.errors import PortBusyError, PrinterError
 from gcode.hosts import PrintReport
@@ -190,7 +190,7 @@ def test_no_is_no(bench: Bench, ready: Ready) -> None:
 
 def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
     """Nothing goes on until somebody has decided; then its later looks hold nothing up."""
-    looks = Asked(at_z_mm=(TOP_MM, TOP_MM + LAYER_MM), final=False)
+    looks = LooksAsked(at_z_mm=(TOP_MM, TOP_MM + LAYER_MM), final=False)
     twice = mark(bench.ready.plain, "job.gcode", "klipper", looks)
     assert [place.layer for place in twice.places] == [LOOK_LAYER, LOOK_LAYER + 1]
     (bench.folder / "gcodes" / "small_pla.gcode").write_text(twice.text)

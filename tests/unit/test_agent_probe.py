@@ -14,7 +14,7 @@ from amrepair.cli import running
 from amrepair.cli.scanners import open_scanner
 from amrepair.errors import InputError
 from gcode.errors import GcodeError, LinkError
-from gcode.firmware.contact import Contact
+from gcode.firmware.contact import ProbeContact
 from gcode.profiles import load_setup
 from gcode.surfaces import HeightField
 
@@ -40,7 +40,7 @@ class ProbeBench(Bench):
         self.dead = False
         probe = load_setup(*PRINTER).printer.feeler
         self._contacts = [
-            Contact.of(probe, HeightField.from_manifold(solid, 0.1, margin_mm=2.0), seed=1)
+            ProbeContact.of(probe, HeightField.from_manifold(solid, 0.1, margin_mm=2.0), seed=1)
             for solid in (ready.broken, ready.whole)
         ]
 

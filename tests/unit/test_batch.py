@@ -34,21 +34,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from amrepair.batch import BatchOptions, Kind, run_batch
+from amrepair.batch import BatchKind, BatchOptions, run_batch
 from amrepair.batch import places as batch_places
 from amrepair.batch import pool as batch_pool
-from amrepair.batch.cells import Cells, CellSums
+from amrepair.batch.cells import CellSums, PartCells
 from amrepair.batch.entries import Entry, read_entries
 from amrepair.batch.executors import make_executor
 from amrepair.batch.on_ray import _joined
-from amrepair.batch.options import Outcome, Task, TemplateFile, Work
+from amrepair.batch.options import Task, TaskOutcome, TemplateFile, Work
 from amrepair.batch.pool import Pool
 from amrepair.batch.table import as_parquet, row_of
 from amrepair.errors import AmrepairError, InputError, MissingDependencyError
 from amrepair.template import open_template
 from gcode import whole
 
-DETECT = BatchOptions(Kind.DETECT)
+DETECT = BatchOptions(BatchKind.DETECT)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_ray_comes_to_the_same_with_a_worker_killed(ready: Path, serial: Path) -
     outcomes = OnRay.outcomes
     killed: list[int] = []
 
-    def kill_one(self: OnRay, tasks: Iterator[Task]) -> Iterator[Outcome]:
+    def kill_one(self: OnRay, tasks: Iterator[Task]) -> Iterator[TaskOutcome]:
         for outcome in outcomes(self, tasks):
             yield outcome
             if not killed:
@@ -184,7 +184,10 @@ def test_nothing_is_done_twice(ready: Path, serial: Path, tmp_path: Path) -> Non
 
 def test_other_options_are_other_results(ready: Path) -> None:
     template = TemplateFile("lug", "a", ready / "lug.safetensors")
-    one, other = Work(DETECT, (template,)), Work(BatchOptions(Kind.DETECT, seed=1), (template,))
+    one, other = (
+        Work(DETECT, (template,)),
+        Work(BatchOptions(BatchKind.DETECT, seed=1), (template,)),
+    )
     changed = Work(DETECT, (TemplateFile("lug", "b", ready / "lug.safetensors"),))
     assert len({work.fingerprint() for work in (one, other, changed)}) == 3
 
@@ -195,12 +198,12 @@ def test_align_and_repair(ready: Path, tmp_path: Path) -> None:
     folder.mkdir()
     shutil.copy(ready / "scans" / "00003.ply", folder)
     done = run_batch(
-        str(folder), options=BatchOptions(Kind.ALIGN), out=str(tmp_path / "a"), **common
+        str(folder), options=BatchOptions(BatchKind.ALIGN), out=str(tmp_path / "a"), **common
     )
     pose = np.array(json.loads(done.rows[0]["template_from_scan"]))
     assert pose[:3, 3] == pytest.approx([-50, -60, 0], abs=0.05)
     done = run_batch(
-        str(folder), options=BatchOptions(Kind.REPAIR), out=str(tmp_path / "r"), **common
+        str(folder), options=BatchOptions(BatchKind.REPAIR), out=str(tmp_path / "r"), **common
     )
     row = done.rows[0]
     assert row["status"] == "ok", row["sentence"]
@@ -224,7 +227,7 @@ def test_sums_are_the_same_in_any_order(serial: Path) -> None:
 
 
 def test_sums_hold_every_volume_where_it_is(ready: Path, serial: Path) -> None:
-    cells = Cells.of(open_template(ready / "lug.safetensors"))
+    cells = PartCells.of(open_template(ready / "lug.safetensors"))
     total = CellSums.zero(len(cells))
     for data in sums_files(serial).values():
         total += CellSums.from_bytes(data)
@@ -465,7 +468,7 @@ def test_a_cluster_that_cannot_be_used_is_one_sentence(error: Exception, said: s
 
 def test_parquet_is_the_table_or_a_word(serial: Path) -> None:
     rows = [row_of(Entry("a", "a"), "", {}, "{scan} is bad")]
-    data = as_parquet(rows, Kind.DETECT)
+    data = as_parquet(rows, BatchKind.DETECT)
     if data is None:
         assert "table.parquet is not written" in (serial / "batch.json").read_text()
         pytest.skip("the extra 'batch' is not installed")

@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+from gcode import clouds
 from gcode.check import find_refusals
 from gcode.cli.app import app
 from gcode.cli.options import standing_on_bed
@@ -22,7 +23,7 @@ from gcode.profiles import load_setup
 from gcode.reader import job_for
 from gcode.resumption import print_onto
 from gcode.slicing.job import slice_part
-from gcode.surfaces import HeightField, clouds, scanned
+from gcode.surfaces import HeightField, scanned
 from gcode.writer import write
 
 SETUP = load_setup("prusa_mk3s", "pla", "standard_0.20")
@@ -106,13 +107,13 @@ def test_a_cut_cloud_is_refused(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "data", "said"),
     [
-        ("a.ply", b"solid", "no header"),
-        ("a.pcd", b"VERSION 0.7\n", "no line 'DATA'"),
+        ("a.ply", b"solid", "not a PLY file"),
+        ("a.pcd", b"VERSION 0.7\n", "no DATA line"),
         ("a.xyz", b"1 2\n3 4\n", "three numbers"),
         ("a.pcd", pcd(POINTS[:200], "binary").replace(b"COUNT 1 1 1 2", b"COUNT 1 1 1 99999999"),
-         "COUNT or POINTS"),
+         "the file holds 0"),
         ("a.ply", ply(POINTS[:200], "ascii").replace(b"vertex 200", b"vertex 99999999999"),
-         "too short"),
+         "99999999999 of vertex"),
         ("a.xyz", b"1 2 3\n", "are the least"),
     ],
 )  # fmt: skip

@@ -12,7 +12,7 @@ import trimesh
 
 from amrepair.bench.dataset import open_dataset
 from amrepair.bench.synth import SynthOptions, synthesize
-from amrepair.bench.synth_defects import Defect, Part, Size, damage, make_part
+from amrepair.bench.synth_defects import Part, Size, SynthDefect, damage, make_part
 from amrepair.bench.synth_views import Rays, look, sample_shape, sensor_towards, sensors_around
 from amrepair.errors import InputError
 from gcode.solids import as_manifold
@@ -45,9 +45,11 @@ def box_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("defect", list(Defect))
+@pytest.mark.parametrize("defect", list(SynthDefect))
 @pytest.mark.parametrize("seed", [0, 1])
-def test_only_what_the_defect_moved_leaves_the_box(box: Part, defect: Defect, seed: int) -> None:
+def test_only_what_the_defect_moved_leaves_the_box(
+    box: Part, defect: SynthDefect, seed: int
+) -> None:
     shape = damage(box, defect, np.random.default_rng(seed))
     solid = as_manifold(np.array(shape.vertices_mm), shape.faces)
     assert str(solid.status()) == "Error.NoError"
@@ -58,17 +60,17 @@ def test_only_what_the_defect_moved_leaves_the_box(box: Part, defect: Defect, se
     # Embree-free and double precision: what is labelled normal lies on the box
     assert np.abs(off_mm[same]).max() < 1e-6
     moved = off_mm[~same]
-    if defect is Defect.BULGE:
+    if defect is SynthDefect.BULGE:
         assert moved.min() > -1e-6
         assert solid.volume() > SIZE_MM.prod()
-    elif defect is Defect.BEND:
+    elif defect is SynthDefect.BEND:
         # a point moved by d is at most d from where the box was
         assert (np.abs(moved) <= points.change_mm[~same] + 1e-6).all()
         assert np.abs(moved).max() > 0.5
     else:
         assert moved.max() < 1e-6
         assert solid.volume() < SIZE_MM.prod()
-    if defect is Defect.BREAK:
+    if defect is SynthDefect.BREAK:
         assert 0.85 < solid.volume() / SIZE_MM.prod() < 0.98
     assert 0.0005 < (~same).mean() < 0.6
 
@@ -148,8 +150,8 @@ def test_a_data_set_reads_back_with_poses_undone(
     assert np.linalg.matrix_rank(np.stack(turns).reshape(len(turns), 9)) > 5  # random turns
 
 
-@pytest.mark.parametrize("defect", [Defect.BULGE, Defect.CONCAVITY])
-def test_a_smooth_defect_has_no_edge(box: Part, defect: Defect) -> None:
+@pytest.mark.parametrize("defect", [SynthDefect.BULGE, SynthDefect.CONCAVITY])
+def test_a_smooth_defect_has_no_edge(box: Part, defect: SynthDefect) -> None:
     shape = damage(box, defect, np.random.default_rng(3), Size(smooth=True))
     points = sample_shape(shape, 40_000, np.random.default_rng(3))
     off_mm = np.abs(box_distance(points.points_mm))
@@ -162,8 +164,8 @@ def test_a_smooth_defect_has_no_edge(box: Part, defect: Defect) -> None:
     assert (points.change_mm[~same] < 0.1 * points.change_mm.max()).mean() > 0.1
 
 
-@pytest.mark.parametrize("defect", [d for d in Defect if d is not Defect.BEND])
-def test_smaller_defects_change_less_of_the_surface(box: Part, defect: Defect) -> None:
+@pytest.mark.parametrize("defect", [d for d in SynthDefect if d is not SynthDefect.BEND])
+def test_smaller_defects_change_less_of_the_surface(box: Part, defect: SynthDefect) -> None:
     shares = []
     for scale in (1.0, 0.4):
         shape = damage(box, defect, np.random.default_rng(2), Size(scale))

@@ -332,3 +332,11 @@ def test_a_program_that_lays_nothing_is_told_too() -> None:
     """Homing and heating are no print job; they are sent all the same."""
     said = what_it_does(Program("G28\nM140 S60\nG1 X10 F600\n", "prusa"), None)
     assert said == "heats the bed to 60 °C, homes X, Y and Z, lays no filament"
+
+
+@pytest.mark.parametrize("shown", [console.out, console.errors], ids=["out", "errors"])
+def test_brackets_are_told_as_they_are(shown: Console) -> None:
+    """A file part[left].gcode was told as part.gcode, where a command forgot to say so."""
+    with shown.capture() as told:
+        shown.print("part[left].gcode: nothing speaks against it")
+    assert told.get() == "part[left].gcode: nothing speaks against it\n"

@@ -60,6 +60,22 @@ def test_two_processes_that_compile_at_once_load_what_each_compiled(
     assert ours == "code for strided arrays"
 
 
+class Record:
+    """What a kernel takes, kept by its name."""
+
+
+def test_what_was_kept_of_records_that_are_gone_is_compiled_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Renamed, a record left every command with an AttributeError until its caches were removed."""
+    kept_in(tmp_path, safely=True).save(Record(), "code for records")
+    monkeypatch.delattr(f"{__name__}.Record")
+    again = kept_in(tmp_path, safely=True)
+    assert again.load("arrays") is None
+    again.save("arrays", "code for arrays")
+    assert kept_in(tmp_path, safely=True).load("arrays") == "code for arrays"
+
+
 def test_a_kernel_is_compiled_anew_when_another_has_changed(tmp_path: Path) -> None:
     before = kept_in(tmp_path, safely=True)
     before.save("contiguous", "code")

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from amrepair import doctor
 from amrepair.cli.app import app
-from amrepair.doctor import Finding, SerialPort, State
+from amrepair.doctor import CheckFinding, SerialPort, State
 from amrepair.doctor.options import tunables
 from amrepair.errors import MissingDependencyError
 from amrepair.policy import PolicyOptions
@@ -101,7 +101,7 @@ def test_a_cache_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_a_check_that_fails_itself_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fall() -> Finding:
+    def fall() -> CheckFinding:
         raise RuntimeError("what nobody thought of")
 
     for name in dir(doctor):
@@ -115,8 +115,8 @@ def test_a_check_that_fails_itself_is_a_finding(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("healthy", [True, False])
 def test_the_command(monkeypatch: pytest.MonkeyPatch, healthy: bool) -> None:
     findings = (
-        Finding("python", State.OK, "3.11.7"),
-        Finding("cache", State.NOTE if healthy else State.BAD, "[bold]read-only", "chmod it"),
+        CheckFinding("python", State.OK, "3.11.7"),
+        CheckFinding("cache", State.NOTE if healthy else State.BAD, "[bold]read-only", "chmod it"),
     )
     monkeypatch.setattr("amrepair.cli.health.examine", lambda progress: findings)
     shown = CliRunner().invoke(app, ["doctor"])

@@ -24,7 +24,7 @@ from amrepair.fleet.config import FleetConfig, FleetOptions, PrinterSpec, read_c
 from amrepair.fleet.desk import JUDGES, STATUS, Desk, answer, read_note
 from amrepair.fleet.history import SAME_HEIGHT_MM, History
 from amrepair.fleet.page import Page, metrics
-from amrepair.fleet.supervisor import DESK, Command, Fleet, State, loop_command
+from amrepair.fleet.supervisor import DESK, Command, Fleet, RunState, loop_command
 
 ENTRY = 'name = "{name}"\nport = "{port}"\nscanner = "watch:s"\njob = "j.gcode"\ntemplate = "t.stl"'
 
@@ -187,7 +187,13 @@ def test_ends_are_told_and_only_a_death_is_begun_again(tmp_path: Path, ended: li
     )  # fmt: skip
     ended.append(fleet)
     until(fleet, lambda: fleet.over)
-    assert states(fleet) == [State.DONE, State.BEYOND, State.FAILED, State.FAILED, State.DONE]
+    assert states(fleet) == [
+        RunState.DONE,
+        RunState.BEYOND,
+        RunState.FAILED,
+        RunState.FAILED,
+        RunState.DONE,
+    ]
     rows = {row["name"]: row for row in fleet.told()}
     assert rows["link"]["sentence"] == "the cable is out"
     assert "ended by signal 9, after 2 restarts" in rows["dies"]["sentence"]
@@ -203,7 +209,7 @@ def test_a_question_is_answered_once_and_a_run_is_stopped(
     body = "yes = desk.ask('Print?', ['a void'])\n(folder / 'said').write_text(str(yes))\n"
     fleet = fleet_of(tmp_path, "a b", fake(body + "time.sleep(60)"))
     ended.append(fleet)
-    until(fleet, lambda: states(fleet) == [State.ASKS, State.ASKS])
+    until(fleet, lambda: states(fleet) == [RunState.ASKS, RunState.ASKS])
     number = fleet.told()[0]["question"]["number"]
     assert not fleet.do("a", "approve", number - 1)
     assert not fleet.do("none", "stop")
@@ -213,10 +219,10 @@ def test_a_question_is_answered_once_and_a_run_is_stopped(
     assert said.read_text() == "True"
     assert not fleet.do("a", "skip", number)
     assert fleet.do("b", "stop")
-    until(fleet, lambda: fleet.told()[1]["state"] == State.STOPPED)
+    until(fleet, lambda: fleet.told()[1]["state"] == RunState.STOPPED)
     assert (tmp_path / "out" / "b" / "heaters").read_text() == "off"
     fleet.end()
-    assert states(fleet) == [State.STOPPED, State.STOPPED]
+    assert states(fleet) == [RunState.STOPPED, RunState.STOPPED]
     assert (tmp_path / "out" / "a" / "heaters").read_text() == "off"
 
 
@@ -224,7 +230,7 @@ def test_a_stuck_question_ends_its_run(tmp_path: Path, ended: list[Fleet]) -> No
     fleet = fleet_of(tmp_path, "a", fake("desk.ask('Print?', [])"), answer_within_s=0.5)
     ended.append(fleet)
     until(fleet, lambda: fleet.over)
-    assert states(fleet) == [State.STOPPED]
+    assert states(fleet) == [RunState.STOPPED]
     assert "nobody answered" in fleet.told()[0]["sentence"]
     assert (tmp_path / "out" / "a" / "heaters").read_text() == "off"
 
@@ -240,7 +246,7 @@ def test_what_a_killed_supervisor_left_running_is_not_begun_twice(
     second = fleet_of(tmp_path, "a", command)  # as after a kill of the first
     for _ in range(5):
         second.step()
-    assert states(second) == [State.ORPHAN]
+    assert states(second) == [RunState.ORPHAN]
     assert (tmp_path / "out" / "a" / "starts").read_text() == "begin\n"
     assert second.do("a", "stop")
     heaters = tmp_path / "out" / "a" / "heaters"
@@ -257,7 +263,7 @@ def test_a_run_that_is_over_is_not_printed_again(tmp_path: Path) -> None:
     fleet = fleet_of(tmp_path, "a", fake("sys.exit(0)"))
     for _ in range(3):
         fleet.step()
-    assert states(fleet) == [State.DONE]
+    assert states(fleet) == [RunState.DONE]
     assert not fleet.do("a", "resume")
     assert not (tape.parent / "starts").exists()
 
@@ -290,7 +296,7 @@ def test_printers_may_ask_judges_as_long_as_the_supervisor_is_there(
         until(fleet, lambda: fleet.notes)
         assert "each printer's process judges its own scans" in fleet.notes[0]
         assert not any(note.exists() for note in notes)
-        assert states(fleet) == [State.RUNS, State.RUNS]
+        assert states(fleet) == [RunState.RUNS, RunState.RUNS]
     again = fleet_of(tmp_path, "a b", fake(body), judges=1)
     with again.alone():
         assert all(note.exists() for note in notes)
@@ -341,7 +347,7 @@ def asked(url: str, *, body: object = None, headers: dict[str, str] | None = Non
 
 def test_the_page_answers_and_is_guarded(served: tuple[Page, Fleet]) -> None:
     page, fleet = served
-    until(fleet, lambda: states(fleet) == [State.ASKS])
+    until(fleet, lambda: states(fleet) == [RunState.ASKS])
     status, text = asked(page.url)
     assert status == 200
     assert "http://" not in text
@@ -358,7 +364,7 @@ def test_the_page_answers_and_is_guarded(served: tuple[Page, Fleet]) -> None:
     assert asked(button, body={"number": 1})[0] == 409
     assert asked(button, body=number)[0] == 200
     until(fleet, lambda: fleet.over)
-    assert states(fleet) == [State.DONE]
+    assert states(fleet) == [RunState.DONE]
     said = asked(page.url + "metrics")[1]
     assert 'amrepair_printer_state{printer="a",state="done"} 1' in said.splitlines()
 
@@ -378,7 +384,7 @@ def test_off_this_machine_a_token_is_needed(tmp_path: Path) -> None:
 
 
 def test_metrics_are_prometheus_text() -> None:
-    printers = [{"name": 'a"b\\', "state": State.ASKS, "question": {}, "restarts": 2,
+    printers = [{"name": 'a"b\\', "state": RunState.ASKS, "question": {}, "restarts": 2,
                  "judged": {"shared": 3, "itself": 1, "why": "it was late"}}]  # fmt: skip
     history = [
         {"printer": "a", "part": "p", "runs": 1, "looks": 2, "repairs": 1, "missing_mm3": 2.5,

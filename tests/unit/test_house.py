@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import functools
 from collections import defaultdict
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-LINES, PARAMETERS, KERNEL_PARAMETERS = 60, 10, 14
+LINES, PARAMETERS, KERNEL_PARAMETERS, SAME_LINES = 60, 10, 14, 12
 # Commands have a parameter an option. Every package that loads late has one table of that name.
 COMMANDS, LOADED_LATE = ("amrepair/cli/", "gcode/cli/"), "HOMES"
 # A table in the form of a function: a line each.
@@ -95,3 +96,63 @@ def test_a_call_fits_a_line(kernels: bool, most: int) -> None:
             if count > most:
                 too_many.append((path, function.name, count))
     assert too_many == []
+
+
+def test_a_class_s_name_has_one_meaning() -> None:
+    """Within a package; what two packages call alike is told apart by the import."""
+    found: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for path, module in modules():
+        for node in module.body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found[path.split("/")[0], node.name].append(path)
+    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}
+
+
+class _Shape(ast.NodeTransformer):
+    """Code without its names, strings and numbers."""
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        return ast.Name("_", node.ctx)
+
+    def visit_arg(self, node: ast.arg) -> ast.AST:
+        return ast.arg("_", None)
+
+    def visit_Constant(self, node: ast.Constant) -> ast.AST:
+        return ast.Constant(type(node.value).__name__)
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
+        self.generic_visit(node)
+        return ast.Attribute(node.value, "_", node.ctx)
+
+
+def is_text(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
+
+def runs(function: ast.FunctionDef | ast.AsyncFunctionDef) -> Iterator[list[ast.stmt]]:
+    """Statements one after the other, of so many lines, as short as may be."""
+    for node in ast.walk(function):
+        for part in ("body", "orelse", "finalbody"):
+            found = getattr(node, part, None)
+            block = [s for s in found if not is_text(s)] if isinstance(found, list) else []
+            for first in range(len(block)):
+                for last in range(first, len(block)):
+                    lines = (block[last].end_lineno or 0) - block[first].lineno + 1
+                    if lines >= SAME_LINES:
+                        yield block[first : last + 1]
+                        break
+
+
+def test_nothing_is_written_twice() -> None:
+    """No two places of functions have so many lines of the same shape."""
+    shapes: dict[ast.stmt, str] = {}
+    found: dict[tuple[str, ...], set[str]] = defaultdict(set)
+    for path, module in modules():
+        for function in functions(module):
+            for run in runs(function):
+                for one in run:
+                    if one not in shapes:
+                        shapes[one] = ast.dump(_Shape().visit(copy.deepcopy(one)))
+                found[tuple(shapes[one] for one in run)].add(f"{path}:{run[0].lineno}")
+    assert len(found) > 1000
+    assert [sorted(places) for places in found.values() if len(places) > 1] == []

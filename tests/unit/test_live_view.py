@@ -29,7 +29,7 @@ from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.guarded import Guard
 from amrepair.report.live import LiveView, deviation_colours
-from amrepair.report.operator import Operator, Verdict
+from amrepair.report.operator import Operator, OperatorAnswer
 from gcode.errors import LinkError
 
 TOKEN = "0123456789abcdef0123"
@@ -60,8 +60,8 @@ class Watcher:
             assert self._changed.wait_for(condition, timeout=WAIT_S)
 
 
-@pytest.mark.parametrize("verdict", list(Verdict))
-def test_an_answer_is_waited_for(verdict: Verdict) -> None:
+@pytest.mark.parametrize("verdict", list(OperatorAnswer))
+def test_an_answer_is_waited_for(verdict: OperatorAnswer) -> None:
     operator = Operator()
     watcher = Watcher(operator)
     assert operator.decide(verdict) is False  # nobody asked: an early click decides nothing
@@ -79,11 +79,11 @@ def test_the_first_click_counts() -> None:
     operator.toggle_pause()
     thread, found = answer_of(operator.ask)
     watcher.until(lambda: operator.asked)
-    assert operator.decide(Verdict.SKIP) is True
-    assert operator.decide(Verdict.APPROVE) is False
+    assert operator.decide(OperatorAnswer.SKIP) is True
+    assert operator.decide(OperatorAnswer.APPROVE) is False
     operator.toggle_pause()
     thread.join(WAIT_S)
-    assert found == [Verdict.SKIP]
+    assert found == [OperatorAnswer.SKIP]
 
 
 def test_a_pause_holds_the_answer_back_and_reaches_the_printer() -> None:
@@ -95,12 +95,12 @@ def test_a_pause_holds_the_answer_back_and_reaches_the_printer() -> None:
     assert operator.toggle_pause() is True
     thread, found = answer_of(operator.ask)
     watcher.until(lambda: operator.asked)
-    operator.decide(Verdict.APPROVE)
+    operator.decide(OperatorAnswer.APPROVE)
     assert found == []
     assert thread.is_alive()
     assert operator.toggle_pause() is False
     thread.join(WAIT_S)
-    assert (found, said) == ([Verdict.APPROVE], ["pause", "resume"])
+    assert (found, said) == ([OperatorAnswer.APPROVE], ["pause", "resume"])
 
 
 def test_closing_the_view_means_skip() -> None:
@@ -111,7 +111,7 @@ def test_closing_the_view_means_skip() -> None:
     watcher.until(lambda: operator.asked)
     operator.close()
     thread.join(WAIT_S)
-    assert found == [Verdict.SKIP]
+    assert found == [OperatorAnswer.SKIP]
     operator.wait_while_paused()  # returns, too
 
 
@@ -254,7 +254,7 @@ def test_buttons_are_dead_until_a_question_is_asked(view: LiveView, plan: Repair
     )
     assert re.search(r"left out: 1\d\.\d mm³: the nozzle would touch", view._found.content)
     assert {"scan", "missing", "repair"} <= set(view._handles)
-    operator.decide(Verdict.APPROVE)
+    operator.decide(OperatorAnswer.APPROVE)
     thread.join(WAIT_S)
     assert found == [True]
     assert view._approve.disabled

@@ -14,7 +14,7 @@ from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.loop.calibrate import (
     TARGET_MM,
-    Calibration,
+    PoseCalibration,
     calibrate,
     read_calibration,
     target_solid,
@@ -109,7 +109,7 @@ def test_a_bare_bed_and_a_cloud_without_a_bed_are_refused() -> None:
 def test_the_file_is_what_the_loop_reads(tmp_path: Path) -> None:
     pose = pose_of(np.random.default_rng(5))
     path = tmp_path / "calibration.json"
-    write_calibration(path, Calibration(pose, 0.04, 0.03, 2.0, 500), {"printer": "x"})
+    write_calibration(path, PoseCalibration(pose, 0.04, 0.03, 2.0, 500), {"printer": "x"})
     assert np.abs(read_calibration(path).matrix - pose.matrix).max() < 1e-12
     assert json.loads(path.read_text())["residual_mm"] == 0.04
     assert np.array_equal(read_calibration(None).matrix, np.eye(4))

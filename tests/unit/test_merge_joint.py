@@ -14,7 +14,7 @@ from amrepair.frames import moved, rotation_from_vector, ways_across
 from amrepair.merge.fit import _said_weak
 from amrepair.merge.fuse import Cloud, Spread
 from amrepair.merge.joint import slacks, together
-from amrepair.merge.kept import Kept
+from amrepair.merge.kept import KeptAnswers
 from amrepair.merge.views import Surface, View
 from amrepair.scans import Scan
 from tests.analytic import box, difference, sample_surface
@@ -144,7 +144,7 @@ def test_what_a_tree_answered_is_kept_as_long_as_it_holds() -> None:
     rng = np.random.default_rng(0)
     tree = cKDTree(rng.uniform(0.0, 10.0, (400, 3)))
     places = rng.uniform(-2.0, 12.0, (500, 3))
-    kept = Kept.of(tree, 0.8, len(places))
+    kept = KeptAnswers.of(tree, 0.8, len(places))
     for step_mm in (0.0, 0.5, 0.1, 0.02, 0.02, 0.3, 0.004, 0.02):
         places = places + step_mm * rng.normal(size=places.shape)
         distance, index = tree.query(places, distance_upper_bound=0.8)

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from amrepair.cli.app import app
 from amrepair.errors import InputError
-from amrepair.postprocess import Asked, mark, target_of
+from amrepair.postprocess import LooksAsked, mark, target_of
 from amrepair.postprocess.mark import decoded
 from gcode.check import Policy, find_refusals
 from gcode.cli.app import app as gcode_app
@@ -80,7 +80,7 @@ def where(text: str) -> list[tuple[float, float, bool]]:
 
 
 def test_all_but_the_looks_stays_as_it_was() -> None:
-    marked = mark(JOB, "job.gcode", "marlin", Asked(every=4))
+    marked = mark(JOB, "job.gcode", "marlin", LooksAsked(every=4))
     assert [place.layer for place in marked.places] == [3, 7, 11, 15, 19]
     assert without_looks(marked.text, ("M400", "M0")) == without_looks(JOB, ("M400", "M0"))
     looks = re.findall(r"^;AMREPAIR_LOOK LAYER=(\d+) Z=(\S+)$", marked.text, re.MULTILINE)
@@ -105,7 +105,7 @@ def test_line_ends_and_odd_bytes_stay(tmp_path: Path) -> None:
 
 
 def test_looks_are_off_the_outer_walls_with_the_plastic_pulled_back() -> None:
-    marked = mark(JOB, "job.gcode", "klipper", Asked(every=2, final=False))
+    marked = mark(JOB, "job.gcode", "klipper", LooksAsked(every=2, final=False))
     assert marked.on_walls == 0
     for x_mm, y_mm, pulled in where(marked.text):
         # the middle of the outer bead lies half a bead within the box
@@ -115,15 +115,15 @@ def test_looks_are_off_the_outer_walls_with_the_plastic_pulled_back() -> None:
 
 
 def test_nothing_is_marked_in_a_spiral() -> None:
-    marked = mark(spiral(), "vase.gcode", "marlin", Asked(every=1, final=False))
+    marked = mark(spiral(), "vase.gcode", "marlin", LooksAsked(every=1, final=False))
     assert [place.layer for place in marked.places] == [0]
     assert marked.spiral == 12
-    whole = mark(spiral(), "vase.gcode", "marlin", Asked(every=1))
+    whole = mark(spiral(), "vase.gcode", "marlin", LooksAsked(every=1))
     assert [place.layer for place in whole.places] == [0], "the spiral's own end is none, either"
 
 
 def test_adaptive_looks_come_before_what_closes_the_infill() -> None:
-    marked = mark(JOB, "job.gcode", "klipper", Asked(adaptive=True, final=False))
+    marked = mark(JOB, "job.gcode", "klipper", LooksAsked(adaptive=True, final=False))
     layers = round(HIGH_MM / LAYER_MM)
     first_top = layers - SETUP.process.top_layers
     assert first_top - 1 in {place.layer for place in marked.places}
@@ -133,15 +133,15 @@ def test_adaptive_looks_come_before_what_closes_the_infill() -> None:
 
 
 def test_a_height_is_looked_at_when_it_is_reached() -> None:
-    marked = mark(JOB, "job.gcode", "reprap", Asked(at_z_mm=(1.05,), final=False))
+    marked = mark(JOB, "job.gcode", "reprap", LooksAsked(at_z_mm=(1.05,), final=False))
     assert [place.z_mm for place in marked.places] == [pytest.approx(1.2)]
     with pytest.raises(InputError, match="no layer at z = 9 mm"):
-        mark(JOB, "job.gcode", "reprap", Asked(at_z_mm=(9.0,)))
+        mark(JOB, "job.gcode", "reprap", LooksAsked(at_z_mm=(9.0,)))
 
 
 def test_a_job_is_marked_once() -> None:
-    once = mark(JOB, "job.gcode", "marlin", Asked(every=4)).text
-    again = mark(once, "job.gcode", "marlin", Asked(every=3))
+    once = mark(JOB, "job.gcode", "marlin", LooksAsked(every=4)).text
+    again = mark(once, "job.gcode", "marlin", LooksAsked(every=3))
     assert again.text == once
     assert again.marked_before
 
@@ -155,7 +155,7 @@ def test_the_checker_passes_what_was_marked(target: str, printer: str) -> None:
     setup = load_setup(printer, "pla", "standard_0.20")
     small = m3.Manifold.cube((8.0, 8.0, 0.8)).translate((90.0, 90.0, 0.0))
     job = write(slice_part(small, setup), setup, title="box").text
-    marked = mark(job, "job.gcode", target, Asked(every=2))  # type: ignore[arg-type]
+    marked = mark(job, "job.gcode", target, LooksAsked(every=2))  # type: ignore[arg-type]
     assert len(marked.places) >= 2
     program = Program(marked.text, setup.printer.dialect)
     assert find_refusals(program, setup, policy=Policy.DANGER) == ()
@@ -213,10 +213,10 @@ def test_a_failure_leaves_the_job_and_ends_with_one_line(tmp_path: Path) -> None
 
 
 def test_a_command_of_ones_own() -> None:
-    marked = mark(JOB, "job.gcode", "marlin", Asked(every=10, command="M117 z {z}\\nM600"))
+    marked = mark(JOB, "job.gcode", "marlin", LooksAsked(every=10, command="M117 z {z}\\nM600"))
     assert "\nM117 z 2.000\nM600\n" in marked.text
     with pytest.raises(InputError, match="may name"):
-        mark(JOB, "job.gcode", "marlin", Asked(every=10, command="M117 {height}"))
+        mark(JOB, "job.gcode", "marlin", LooksAsked(every=10, command="M117 {height}"))
 
 
 PRUSA_SLICER = shutil.which("prusa-slicer")

@@ -18,10 +18,10 @@ from amrepair.errors import InputError
 from amrepair.repair import RepairPlan
 from amrepair.report import (
     Counter,
-    Decision,
     Figures,
     Outcome,
     ReportData,
+    ReportDecision,
     SolidMesh,
     encode,
     outcome_of,
@@ -32,9 +32,10 @@ from amrepair.report import (
 from amrepair.report import document as document_module
 from amrepair.report.assemble import report_of_plan
 from amrepair.report.collect import look_of, of_the_part, plan_result, together_mm3
-from amrepair.report.data import Rule
+from amrepair.report.data import ReportRule
 from amrepair.report.document import render_report
 from amrepair.report.live import COLOUR_STOPS
+from amrepair.report.options import USUAL_PAGE
 from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
 
@@ -130,7 +131,7 @@ def test_the_drawing_holds_the_data(data: ReportData, page: str) -> None:
     for shown, look in zip(values["looks"], data.looks, strict=True):
         inside = payload.near_part(look, payload.bounds(data))
         kept = encode.thinned(
-            inside.points_mm, inside.label_of_point != 0, budget=payload.POINTS_PER_LOOK
+            inside.points_mm, inside.label_of_point != 0, budget=USUAL_PAGE.points_per_look
         )
         points = encode.decoded(shown["points"])
         assert np.abs(points - inside.points_mm[kept]).max() < 0.001
@@ -229,8 +230,8 @@ def test_missing_and_too_much_are_told_apart_by_every_eye(eye: str) -> None:
 
 
 def test_a_rule_that_decided_is_told_in_words(data: ReportData) -> None:
-    rule = Rule("S9", "gravest is fill now", "fill now: the patch has passed the checker")
-    decision = Decision("Layer 16, scan 1", "fill now", ("It fits.",), (rule,))
+    rule = ReportRule("S9", "gravest is fill now", "fill now: the patch has passed the checker")
+    decision = ReportDecision("Layer 16, scan 1", "fill now", ("It fits.",), (rule,))
     page = render_report(replace(data, decisions=(decision, decision)))
     seen = " ".join(Elements(page).visible)
     assert "By rule S9." in seen
@@ -256,7 +257,7 @@ def test_half_a_million_points_stay_in_budget_and_it_is_said() -> None:
     page = render_report(example(500_000))
     assert len(page.encode()) < 15e6
     for look in values_of(page)["looks"]:
-        assert look["shown"] <= payload.POINTS_PER_LOOK < look["total"]
+        assert look["shown"] <= USUAL_PAGE.points_per_look < look["total"]
     seen = " ".join(Elements(page).visible)
     assert "use every point" in seen  # the counts themselves: the script's caption
 

@@ -11,7 +11,7 @@ from amrepair.loop import Stop
 from amrepair.loop.marks import marked_stops
 from amrepair.loop.objects import Course
 from amrepair.loop.travel import park
-from amrepair.postprocess import Asked, mark
+from amrepair.postprocess import LooksAsked, mark
 from gcode.hosts.job_text import JobText
 from gcode.hosts.rewritten import Edit, Rewritten
 from gcode.moves import Program
@@ -29,7 +29,7 @@ BLOCKS = [Block(14.0 * k, 0.0, (8.0, 8.0, 1.6)) for k in range(3)]
 @pytest.fixture(scope="module")
 def job() -> Job:
     plain = labelled(BLOCKS, SETUP)
-    text = mark(plain.text, "job.gcode", "octoprint", Asked(every=2, final=False)).text
+    text = mark(plain.text, "job.gcode", "octoprint", LooksAsked(every=2, final=False)).text
     return read_job(Program(text, plain.dialect), dialect=plain.dialect)
 
 

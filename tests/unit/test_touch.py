@@ -15,7 +15,7 @@ from gcode.check import Touch, find_refusals
 from gcode.check.checker import judge
 from gcode.errors import InputError, ProfileError
 from gcode.firmware import FirmwareCore
-from gcode.firmware.contact import Contact
+from gcode.firmware.contact import ProbeContact
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.resumption.touch import TouchOptions, plan_touch
@@ -139,7 +139,7 @@ def test_the_emulated_nozzle_stops_at_what_it_feels(
 ) -> None:
     core = FirmwareCore(setup.printer, "marlin")
     core.power_up()
-    core.machine.contact = Contact(standing(), lost_mm=7.0, sigma_mm=0.0, dead=dead)
+    core.machine.contact = ProbeContact(standing(), lost_mm=7.0, sigma_mm=0.0, dead=dead)
     core.take_output()
     for line in (b"G92 Z7", b"G28 X Y", b"G1 X100 Y100 F6000", b"G38.2 Z1.5 F120", b"M114"):
         core.feed(line + b"\n")
@@ -184,9 +184,9 @@ def test_a_flat_rests_on_the_highest_place_below_it() -> None:
         field = HeightField(
             np.zeros(2), 0.1, np.where(away_mm < pit_mm, 2.0, z_mm), np.ones_like(z_mm, bool)
         )
-        contact = Contact(field, sigma_mm=0.0, tip_radius_mm=0.5)
+        contact = ProbeContact(field, sigma_mm=0.0, tip_radius_mm=0.5)
         assert contact.met_at_mm(5.0, 5.0) == felt_mm
-        beside = Contact(field, sigma_mm=0.0, tip_radius_mm=0.5, offset_mm=(2.0, 0.0, -1.5))
+        beside = ProbeContact(field, sigma_mm=0.0, tip_radius_mm=0.5, offset_mm=(2.0, 0.0, -1.5))
         assert beside.met_at_mm(3.0, 5.0) == felt_mm + 1.5  # the nozzle stays above
 
 

@@ -21,7 +21,7 @@ from amrepair.loop.sites import sites
 from amrepair.loop.touch_design import (
     USUAL_TOUCHES,
     Flats,
-    TouchOptions,
+    ProbeOptions,
     first_places,
     flats_of,
     next_places,
@@ -220,7 +220,7 @@ def test_a_void_is_found_by_sixty_touches_and_measured(
     field = standing(run, stop, (x_mm, y_mm, radius_mm, depth_mm), rough_mm=0.005, seed=1)
     scanner, _ = prober(run, field)
     plan = judged(scanner, run, site, stop)
-    assert scanner.felt[0].touches <= TouchOptions().most
+    assert scanner.felt[0].touches <= ProbeOptions().most
     (region,) = plan.to_fill
     truth_mm3 = np.pi * radius_mm**2 * depth_mm
     assert region.label is Label.MISSING

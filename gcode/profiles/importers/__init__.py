@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
-from gcode.profiles.importers.rules import Imported, Left, Mapped, Rule, Source, apply
+from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
 from gcode.profiles.names import Kind, list_profiles
@@ -32,7 +32,7 @@ from gcode.profiles.store import MODELS, content_of
 __all__ = [
     "Imported",
     "ImportedFile",
-    "Left",
+    "LeftOut",
     "Mapped",
     "import_job",
     "import_profiles",
@@ -77,7 +77,7 @@ class ImportedFile:
 
     source: str
     profiles: tuple[Imported, ...]
-    left: tuple[Left, ...]
+    left: tuple[LeftOut, ...]
     notes: tuple[str, ...]
 
 
@@ -252,9 +252,9 @@ def _validate(path: Path, made: Imported) -> None:
         ) from error
 
 
-def _within_range(made: Imported) -> list[Left]:
+def _within_range(made: Imported) -> list[LeftOut]:
     """Drop what the schema, or a printer's own limits, do not allow; it is inherited then."""
-    dropped: list[Left] = []
+    dropped: list[LeftOut] = []
     while (fault := _fault(made)) is not None:
         key, why = fault
         if key not in made.values:
@@ -262,7 +262,7 @@ def _within_range(made: Imported) -> list[Left]:
         del made.values[key]
         gone = [row for row in made.mapped if row.key.partition(".")[0] == key]
         made.mapped = [row for row in made.mapped if row not in gone]
-        dropped += [Left(row.source_key, row.source_value, why) for row in gone]
+        dropped += [LeftOut(row.source_key, row.source_value, why) for row in gone]
     return dropped
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from gcode.errors import InputError
 from gcode.profiles.importers.rules import (
     Imported,
-    Left,
+    LeftOut,
     Mapped,
     NotMappedError,
     Rule,
@@ -142,7 +142,7 @@ def bed_note(made: Imported) -> str | None:
     )
 
 
-def finish(made: Imported, left: tuple[Left, ...], source: Source) -> tuple[Left, ...]:
+def finish(made: Imported, left: tuple[LeftOut, ...], source: Source) -> tuple[LeftOut, ...]:
     """Put together what Klipper gives by axis, and what is true of every Klipper machine.
 
     Returns
@@ -165,7 +165,7 @@ def finish(made: Imported, left: tuple[Left, ...], source: Source) -> tuple[Left
             lost = [m for m in made.mapped if m.key.startswith(name)]
             made.mapped[:] = [m for m in made.mapped if m not in lost]
             halves += [
-                Left(m.source_key, m.source_value, "the other axis is missing") for m in lost
+                LeftOut(m.source_key, m.source_value, "the other axis is missing") for m in lost
             ]
     names = [key for key in source.values if key.startswith(_MACRO_SECTION)]
     if names:

@@ -51,7 +51,7 @@ class Mapped:
 
 
 @dataclass(frozen=True, slots=True)
-class Left:
+class LeftOut:
     """A key of another program that has no counterpart here, and the reason."""
 
     source_key: str
@@ -104,7 +104,7 @@ NO_COUNTERPART = "our profiles have nothing like it"
 
 def apply(
     source: Source, rules: Mapping[str, Rule], parents: Mapping[Kind, str]
-) -> tuple[tuple[Imported, ...], tuple[Left, ...]]:
+) -> tuple[tuple[Imported, ...], tuple[LeftOut, ...]]:
     """Apply rules to a source.
 
     Parameters
@@ -113,7 +113,7 @@ def apply(
         The shipped profile to inherit from, by kind.
     """
     made = {kind: Imported(kind, source.name, parents[kind]) for kind in source.kinds}
-    left: list[Left] = []
+    left: list[LeftOut] = []
     for key, text in source.values.items():
         rule = rules.get(key)
         if source.name_keys.get(key) in made and (name := first(text).strip('"')):
@@ -121,14 +121,14 @@ def apply(
             profile.name = name
             profile.mapped.append(Mapped(key, text, "name", name))
         elif rule is None:
-            left.append(Left(key, text, source.missing.get(key, NO_COUNTERPART)))
+            left.append(LeftOut(key, text, source.missing.get(key, NO_COUNTERPART)))
         elif rule.kind not in made:
-            left.append(Left(key, text, f"it belongs to {rule.kind}, which this file is not"))
+            left.append(LeftOut(key, text, f"it belongs to {rule.kind}, which this file is not"))
         else:
             try:
                 value = rule.convert(text, source)
             except NotMappedError as reason:
-                left.append(Left(key, text, str(reason)))
+                left.append(LeftOut(key, text, str(reason)))
                 continue
             for ours, one in {rule.key: value}.items() if rule.key else value.items():
                 made[rule.kind].put(key, text, ours, one)

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.errors import InputError
-from amrepair.scans.lzf_kernels import lzf_decompress
-from amrepair.scans.text import filled, read_table
+from gcode.clouds.lzf_kernels import lzf_decompress
+from gcode.clouds.text import filled, read_table
+from gcode.errors import InputError
 from gcode.surfaces.sizes import UnpackLimit, refuse_short
 
 NUMBER_KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -71,9 +71,9 @@ def read_pcd(data: bytes, path: Path) -> tuple[dict[str, Float[np.ndarray, " n"]
     """
     header = _header(data, path)
     if not {"x", "y", "z"} <= set(header.names):
-        raise InputError(f"{path}: the PCD file has no x, y, z fields but {list(header.names)}")
+        raise InputError(f"{path}: the PCD file has no x, y, z fields but {list(header.names)}.")
     if header.points == 0:
-        raise InputError(f"{path}: the PCD file has no points; scan again or check the export")
+        raise InputError(f"{path}: the PCD file has no points; scan again or check the export.")
     body = memoryview(data)[header.end :]
     if header.data == "ascii":
         return _ascii(body, header, path), header
@@ -94,14 +94,14 @@ def count_of_pcd(path: Path) -> int:
         with path.open("rb") as file:
             head = file.read(HEADER_BYTES)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
     return _header(head, path).points
 
 
 def _header(data: bytes, path: Path) -> PcdHeader:
     match = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data[:HEADER_BYTES], re.MULTILINE)
     if match is None:
-        raise InputError(f"{path}: not a PCD file (no DATA line); export it again")
+        raise InputError(f"{path}: not a PCD file (no DATA line); export it again.")
     said: dict[str, list[str]] = {}
     for line in data[: match.start()].decode("ascii", "replace").splitlines():
         words = line.split()
@@ -109,7 +109,7 @@ def _header(data: bytes, path: Path) -> PcdHeader:
             said[words[0].upper()] = words[1:]
     mode = match.group(1).decode()
     if mode not in {"ascii", "binary", "binary_compressed"}:
-        raise InputError(f"{path}: PCD data of kind '{mode}' are unknown; export as binary")
+        raise InputError(f"{path}: PCD data of kind '{mode}' are unknown; export as binary.")
     try:
         names, dtype, columns, values = _layout(said)
         points, shape = _extent(said)
@@ -118,7 +118,7 @@ def _header(data: bytes, path: Path) -> PcdHeader:
             raise ValueError(f"VIEWPOINT has {len(view)} values instead of 7")
         turn = view[3:] or [1.0, 0.0, 0.0, 0.0]
     except (KeyError, IndexError, ValueError, TypeError, OverflowError) as e:
-        raise InputError(f"{path}: the PCD header cannot be understood ({e})") from e
+        raise InputError(f"{path}: the PCD header cannot be understood ({e}).") from e
     return PcdHeader(
         names=names,
         dtype=dtype,
@@ -180,7 +180,7 @@ def _ascii(body: memoryview, header: PcdHeader, path: Path) -> dict[str, Float[n
     if table.shape != (header.points, header.values):
         raise InputError(
             f"{path}: the PCD header promises {header.points} points of {header.values} "
-            f"values, the file holds {table.shape[0]} of {table.shape[1]}; it is damaged"
+            f"values, the file holds {table.shape[0]} of {table.shape[1]}; it is damaged."
         )
     return {name: table[:, i].copy() for name, i in zip(header.names, header.columns, strict=True)}
 
@@ -190,7 +190,7 @@ def _rows(body: memoryview, header: PcdHeader, path: Path) -> dict[str, Float[np
     if have < header.points:
         raise InputError(
             f"{path}: the PCD header promises {header.points} points, the file holds {have}; "
-            "it is cut off"
+            "it is cut off."
         )
     rows = np.frombuffer(body, header.dtype, header.points)
     return {name: rows[name].astype(np.float64) for name in header.names}
@@ -205,13 +205,13 @@ def _compressed(
     if size != want or len(body) < 8 + packed:
         raise InputError(
             f"{path}: the compressed PCD data should unpack to {want} bytes, the file says {size} "
-            f"from {packed} of which {max(len(body) - 8, 0)} are there; it is damaged"
+            f"from {packed} of which {max(len(body) - 8, 0)} are there; it is damaged."
         )
     LZF_MOST.refuse(path, size, packed)
     flat = lzf_decompress(np.frombuffer(body, np.uint8, packed, 8), size)
     if len(flat) != want:
         raise InputError(
-            f"{path}: the compressed PCD data unpack to {len(flat)} of {want} bytes; it is damaged"
+            f"{path}: the compressed PCD data unpack to {len(flat)} of {want} bytes; it is damaged."
         )
     columns = {}
     assert header.dtype.fields is not None
