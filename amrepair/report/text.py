@@ -209,7 +209,7 @@ def _found(figures: Figures, regions: Sequence[RegionRow]) -> str:
 
 def _done(figures: Figures) -> str:
     if figures.filament_mm <= 0:
-        return "Nothing was printed, and no repair G-code was made."
+        return "No repair was made or printed."
     cost = f"{length(figures.filament_mm)} of filament"
     if math.isfinite(figures.print_time_s):
         cost += f" in {duration(figures.print_time_s)}"

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import PrinterOption, plain_text
+from gcode.cli.options import plain_text
 from gcode.errors import InputError
 from gcode.profiles import DEFAULT_PRINTER
 
@@ -21,8 +21,19 @@ from gcode.profiles import DEFAULT_PRINTER
     "gcode emulate --faults faults.txt --link /tmp/printer",
 )
 def emulate(
-    firmware: Annotated[str, typer.Option(help="marlin, prusa, klipper or reprap.")] = "marlin",
-    printer: PrinterOption = DEFAULT_PRINTER,
+    firmware: Annotated[
+        str | None,
+        typer.Option(
+            help="marlin, prusa, klipper or reprap. Left out: that of --printer; marlin without.",
+        ),
+    ] = None,
+    printer: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Printer profile: an ID or a TOML file. Left out: {DEFAULT_PRINTER}.",
+            autocompletion=console.profile_ids("printers"),
+        ),
+    ] = None,
     faults: Annotated[
         Path | None,
         typer.Option(help="Fault script, such as 'every 37 corrupt_in'; one fault a line."),
@@ -44,10 +55,11 @@ def emulate(
     from gcode.firmware.variants import FIRMWARES
     from gcode.profiles import load_printer
 
+    machine = load_printer(printer or DEFAULT_PRINTER)
+    firmware = firmware or ("marlin" if printer is None else machine.dialect)
     if firmware not in FIRMWARES:
         raise InputError(f"--firmware is {firmware!r}; it is one of {', '.join(FIRMWARES)}.")
     script = parse_faults(plain_text(faults)) if faults is not None else None
-    machine = load_printer(printer)
     with tempfile.TemporaryDirectory(prefix="gcode-emulate-") as folder:
         serve_forever(
             machine,

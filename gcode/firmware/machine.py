@@ -27,6 +27,8 @@ class Machine(Mechanics):
     def execute(self, command: bytes) -> bool:
         """Carry out one command; False if it is not known. Replies go to `replies`."""
         name, _, rest = command.partition(b" ")
+        if self.variant.family == "klipper":
+            name = name.upper()
         handler = self._commands.get(name)
         if handler is None:
             match = re.match(rb"([GM])\s*0*(\d+)(?:\.\d+)?", command)
@@ -58,6 +60,10 @@ class Machine(Mechanics):
             table[b"AMREPAIR_TOUCH"] = self._amrepair_touch
             table[b"TEMPERATURE_WAIT"] = self._temperature_wait
             table[b"SET_KINEMATIC_POSITION"] = self._set_kinematic_position
+            for name in ("PRINT_START", "START_PRINT"):
+                table[name.encode()] = self._start_print
+            for name in ("PRINT_END", "END_PRINT"):
+                table[name.encode()] = self._end_print
         for name in _IGNORED:
             table.setdefault(name.encode(), self._ignore)
         if not self.variant.emergency_parser and self.variant.family == "klipper":
@@ -117,6 +123,10 @@ class Machine(Mechanics):
 
     def _g28(self, rest: bytes) -> None:
         axes = {chr(token[0]) for token in rest.split()} & {"X", "Y", "Z"} or {"X", "Y", "Z"}
+        self._home(axes)
+
+    def _home(self, axes: set[str], *, until_s: float = 0.0) -> None:
+        """Home some axes, and be done at `until_s` at the earliest."""
         if self.profile.delta:  # its carriages know no axis alone
             axes = {"X", "Y", "Z"}
         ends = (0.0, 0.0, self.profile.max_z_mm if self.profile.delta else 0.0)
@@ -139,7 +149,26 @@ class Machine(Mechanics):
                 self.homed = True
             self.record_jump(here)
 
-        self.wait_for(drained_s + 2.0 + distance / HOMING_MM_S, then=homed)
+        self.wait_for(
+            max(until_s, drained_s + 2.0 + distance / HOMING_MM_S),
+            heating=until_s > 0,
+            then=homed,
+        )
+
+    def _start_print(self, rest: bytes) -> None:
+        """Home and heat, as macros of this name do by convention."""
+        until_s = 0.0
+        for key, value in re.findall(r"(\w+)=(\d+(?:\.\d+)?)", rest.decode("latin-1").upper()):
+            bed = "BED" in key
+            if bed or any(word in key for word in ("EXTRUDER", "HOTEND", "NOZZLE")):
+                heater = self.bed if bed else self.hotend
+                heater.set_target(float(value), self.clock_s)
+                until_s = max(until_s, heater.reached_s(cooling=False))
+        self._home({"X", "Y", "Z"}, until_s=until_s)
+
+    def _end_print(self, rest: bytes) -> None:
+        for heater in (self.hotend, self.bed):
+            heater.set_target(0.0, self.clock_s)
 
     def _g29(self, rest: bytes) -> None:
         def probed() -> None:

@@ -18,23 +18,23 @@ import numpy as np
 from gcode.errors import InputError
 from gcode.reader import binary_kernels
 
-MAGIC = b"GCDE"
-FILE_HEAD = struct.Struct("<4sIH")
-BLOCK_HEAD = struct.Struct("<HHI")
-VERSIONS = (1,)
-CHECKSUMS = {0: 0, 1: 4}  # none, CRC32: bytes behind a block
-METADATA, GCODE, SLICER, THUMBNAIL = 0, 1, 2, 5
-PARAMETER_BYTES = {THUMBNAIL: 6}  # of all others: an encoding of two
-HEATSHRINK_WINDOWS = {2: 11, 3: 12}  # by compression; both look ahead 4
-MOST_BYTES = 1 << 31  # of one block: a longer one is damage
-PACKED = frozenset({1, 2})
+_MAGIC = b"GCDE"
+_FILE = struct.Struct("<4sIH")
+_BLOCK = struct.Struct("<HHI")
+_VERSIONS = (1,)
+_SUM_BYTES = {0: 0, 1: 4}  # none, CRC32: bytes behind a block
+_METADATA, _GCODE, _SLICER, _THUMBNAIL = 0, 1, 2, 5
+_PARAMETER_BYTES = {_THUMBNAIL: 6}  # of all others: an encoding of two
+_WINDOWS = {2: 11, 3: 12}  # by compression; both look ahead 4
+_MOST = 1 << 31  # of one block: a longer one is damage
+_PACKED = frozenset({1, 2})
 # A nibble's character (MeatPack); 15 says that the next byte is one. 11 is E once spaces are left
 # out, which they are within lines of G-codes.
 _NIBBLES = np.frombuffer(b"0123456789. \nGX\0", np.uint8)
 _PARAMETERS = np.isin(np.arange(256), np.frombuffer(b"XYZEFIJRSGPWHCA", np.uint8))
 
 
-class Block(NamedTuple):
+class BinaryBlock(NamedTuple):
     """One block, its data as they were before they were compressed."""
 
     kind: int
@@ -44,7 +44,7 @@ class Block(NamedTuple):
 
 def is_binary(data: bytes) -> bool:
     """Whether a file's first bytes are those of binary G-code."""
-    return data.startswith(MAGIC)
+    return data.startswith(_MAGIC)
 
 
 def text_of(data: bytes, name: str) -> str:
@@ -62,11 +62,11 @@ def text_of(data: bytes, name: str) -> str:
     """
     lines, told, head = [], [], []
     for block in _blocks(data, name):
-        if block.kind == GCODE:
-            lines.append(_unpacked(block.data) if block.encoding in PACKED else block.data)
-        elif block.kind == SLICER:
+        if block.kind == _GCODE:
+            lines.append(_unpacked(block.data) if block.encoding in _PACKED else block.data)
+        elif block.kind == _SLICER:
             told += block.data.decode("utf-8", "replace").splitlines()
-        elif block.kind == METADATA:
+        elif block.kind == _METADATA:
             rows = block.data.decode("utf-8", "replace").splitlines()
             head += [row.partition("=")[2] for row in rows if row.startswith("Producer=")]
     text = b"".join(lines).decode("utf-8", "replace")
@@ -78,37 +78,37 @@ def text_of(data: bytes, name: str) -> str:
     return f"{made}{text}\n{marks[0]}{settings}{marks[1]}"
 
 
-def _blocks(data: bytes, name: str) -> Iterator[Block]:
-    if len(data) < FILE_HEAD.size:
+def _blocks(data: bytes, name: str) -> Iterator[BinaryBlock]:
+    if len(data) < _FILE.size:
         raise _cut(name, len(data))
-    _, version, checksum = FILE_HEAD.unpack_from(data)
-    if version not in VERSIONS or checksum not in CHECKSUMS:
+    _, version, checksum = _FILE.unpack_from(data)
+    if version not in _VERSIONS or checksum not in _SUM_BYTES:
         raise InputError(
             f"{name} is binary G-code of version {version} with checksum {checksum}; version 1 "
             "with none or CRC32 is read. Let the slicer write plain G-code (Print Settings, or "
             "Printer Settings, 'Binary G-code')."
         )
-    at = FILE_HEAD.size
+    at = _FILE.size
     while at < len(data):
-        at, block = _block(data, at, CHECKSUMS[checksum], name)
+        at, block = _block(data, at, _SUM_BYTES[checksum], name)
         if block is not None:
             yield block
 
 
-def _block(data: bytes, at: int, sum_bytes: int, name: str) -> tuple[int, Block | None]:
+def _block(data: bytes, at: int, sum_bytes: int, name: str) -> tuple[int, BinaryBlock | None]:
     """Where the next block begins, and this one if anything of it is wanted."""
     first = at
-    if at + BLOCK_HEAD.size + 4 > len(data):
+    if at + _BLOCK.size + 4 > len(data):
         raise _cut(name, at)
-    kind, compression, size = BLOCK_HEAD.unpack_from(data, at)
-    at += BLOCK_HEAD.size
+    kind, compression, size = _BLOCK.unpack_from(data, at)
+    at += _BLOCK.size
     packed = size
     if compression:
         (packed,) = struct.unpack_from("<I", data, at)
         at += 4
-    body = at + PARAMETER_BYTES.get(kind, 2)
+    body = at + _PARAMETER_BYTES.get(kind, 2)
     end = body + packed
-    if end + sum_bytes > len(data) or size > MOST_BYTES:
+    if end + sum_bytes > len(data) or size > _MOST:
         raise _cut(name, first)
     if sum_bytes:
         (told,) = struct.unpack_from("<I", data, end)
@@ -117,20 +117,20 @@ def _block(data: bytes, at: int, sum_bytes: int, name: str) -> tuple[int, Block 
                 f"{name} is damaged: its block at byte {first} does not have its checksum "
                 f"({told:08x}); slice the part again, or copy the file again."
             )
-    if kind == THUMBNAIL:
+    if kind == _THUMBNAIL:
         return end + sum_bytes, None
     (encoding,) = struct.unpack_from("<H", data, at)
     found = _expanded(data[body:end], compression, name)
     if len(found) != size:
         raise _cut(name, first)
-    return end + sum_bytes, Block(kind, encoding, found)
+    return end + sum_bytes, BinaryBlock(kind, encoding, found)
 
 
 def _expanded(data: bytes, compression: int, name: str) -> bytes:
     if compression == 0:
         return data
-    if compression in HEATSHRINK_WINDOWS:
-        window = HEATSHRINK_WINDOWS[compression]
+    if compression in _WINDOWS:
+        window = _WINDOWS[compression]
         return bytes(heatshrink2.decompress(data, window_sz2=window, lookahead_sz2=4))
     try:
         return zlib.decompress(data)

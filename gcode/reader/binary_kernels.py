@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from gcode.compiled import njit
 
-SIGNAL, PACK, PLAIN, RESET, NO_SPACES, SPACES = 255, 251, 250, 249, 247, 246
+SIGNAL, PACK, UNPACK, RESET, NO_SPACES, SPACES = 255, 251, 250, 249, 247, 246
 
 
 @njit(cache=True, nogil=True)
@@ -39,7 +39,7 @@ def unpack(source, nibbles, parameters, out):
             signals = 0
             if byte == PACK:
                 packing = True
-            elif byte in (PLAIN, RESET):
+            elif byte in (UNPACK, RESET):
                 packing = False
             elif byte in (NO_SPACES, SPACES):
                 no_spaces = byte == NO_SPACES

@@ -168,6 +168,18 @@ def test_an_emulated_delta_homes_to_the_tops_of_its_towers() -> None:
     assert (core.machine.x, core.machine.y, core.machine.z) == (0.0, 0.0, 200.0)
 
 
+def test_an_emulated_klipper_starts_a_print_by_its_macro_s_name() -> None:
+    core = FirmwareCore(load_setup("generic_klipper").printer, "klipper")
+    core.feed(b"print_start BED_TEMP=60 EXTRUDER_TEMP=210\nG1 X20 Y20 Z1 F6000\nM105\n")
+    core.run(2000.0)
+    assert (core.machine.hotend.target_c, core.machine.bed.target_c) == (210.0, 60.0)
+    assert (core.machine.x, core.machine.y) == (20.0, 20.0), "homed, and hot before it moves"
+    assert b"!!" not in core.take_output()
+    core.feed(b"PRINT_END\n")
+    core.run(3000.0)
+    assert (core.machine.hotend.target_c, core.machine.bed.target_c) == (0.0, 0.0)
+
+
 def test_a_delta_s_job_is_checked_with_its_limits() -> None:
     text = job(START, part=PART.replace("80", "-20"), bed_shape=ROUND)
     setup = own_setup(text).melting_all()
