@@ -73,9 +73,11 @@ def runtime_when_asked() -> None:
     the start of every command. A kernel that was kept on disk has them in its own code; what they
     call is made known to it all the same.
     """
-    compile_now: Any = nrtdynmod.compile_nrt_functions
+    compile_now: Any = getattr(nrtdynmod, "compile_nrt_functions", None)
     kind: Any = type(nrt.rtsys)
-    asked = kind.library.fget
+    asked = getattr(getattr(kind, "library", None), "fget", None)
+    if compile_now is None or asked is None:
+        return  # a numba that does it otherwise: then at once, as it would
 
     def library(runtime: Any) -> Any:
         found = asked(runtime)
