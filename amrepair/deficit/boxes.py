@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
+from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.deficit.options import DeficitOptions
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
@@ -50,30 +51,28 @@ class Sought:
         return 1.0 if self.is_excess else -1.0
 
     @property
-    def labelled(self) -> Bool[np.ndarray, " s"]:
+    def labelled(self) -> Mask:
         """(s,) surfels that the test found."""
         return np.asarray(np.asarray(self.anomaly.surfel_label) == int(self.label))
 
     @property
-    def surface_mm(self) -> Float[np.ndarray, "g 3"]:
+    def surface_mm(self) -> Points:
         """(g, 3) places of the template's surface that the test found."""
         return self.anomaly.template_points_mm[self.anomaly.template_label == int(self.label)]
 
-    def told_mm(self, inside: Bool[np.ndarray, " s"]) -> Float[np.ndarray, "p 3"]:
+    def told_mm(self, inside: Mask) -> Float[np.ndarray, "p 3"]:
         """(p, 3) places that are known to be missing: some surfels, surface, lines of the job."""
         told = [self.evidence.surfels.place_mm[inside], self.surface_mm]
         if self.gone is not None:
             told.append(self.gone.samples_mm(self.options.skipped.look_step_mm))
         return np.concatenate(told)
 
-    def nearest_is_labelled(self, samples_mm: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
+    def nearest_is_labelled(self, samples_mm: Points) -> Mask:
         """(k,) whether the test found the surfel nearest to each place."""
         nearest = self.evidence.surfels.tree.query(samples_mm, workers=2)[1]
         return np.asarray(self.labelled[nearest])
 
-    def allowed_mm(
-        self, samples_mm: Float[np.ndarray, "k 3"], asked: Bool[np.ndarray, " k"]
-    ) -> Float[np.ndarray, " k"]:
+    def allowed_mm(self, samples_mm: Points, asked: Mask) -> Values:
         """(k,) how far out of the template nothing is too much, by the nearest surfel."""
         allowed_mm = np.zeros(len(samples_mm))
         higher_mm = self.anomaly.surfel_higher_mm
@@ -82,7 +81,7 @@ class Sought:
             allowed_mm[asked] = higher_mm[nearest]
         return allowed_mm
 
-    def in_lines_that_hung(self, samples_mm: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
+    def in_lines_that_hung(self, samples_mm: Points) -> Mask:
         """(k,) places in lines that are gone and hung over a floor.
 
         The floor under such a line is as designed, and says nothing of the line.
@@ -104,7 +103,7 @@ class Box:
     depth_mm: float
 
     @classmethod
-    def around(cls, places_mm: Float[np.ndarray, "k 3"], margin_mm: float, depth_mm: float) -> Box:
+    def around(cls, places_mm: Points, margin_mm: float, depth_mm: float) -> Box:
         """With a margin."""
         return cls(places_mm.min(axis=0) - margin_mm, places_mm.max(axis=0) + margin_mm, depth_mm)
 
@@ -154,7 +153,7 @@ def boxes_of(sought: Sought) -> list[Box]:
     return _merged(found)
 
 
-def _films(sought: Sought, which: Int[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
+def _films(sought: Sought, which: Numbers) -> Mask:
     """Cells of an even surface over which a film is missing: no deeper, and it faces out of it.
 
     What is left of a thin roof lies as near to the template's surface, but to its other side.
@@ -168,7 +167,7 @@ def _films(sought: Sought, which: Int[np.ndarray, " q"]) -> Bool[np.ndarray, " q
     return film
 
 
-def _paths_out(sought: Sought, which: Int[np.ndarray, " q"]) -> Float[np.ndarray, "p 3"]:
+def _paths_out(sought: Sought, which: Numbers) -> Float[np.ndarray, "p 3"]:
     """Points through the empty space from a void's floor to where it leaves the template.
 
     They tie the floor to the mouth where nobody sampled the walls between.

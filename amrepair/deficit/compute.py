@@ -19,11 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.deficit.boxes import Sought
-from amrepair.deficit.heights import (
-    as_built_heights,
-    standing_heights,
-    with_what_stands_out,
-)
+from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.options import USUAL_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import (

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import ndimage
 
+from amrepair.arrays import Mask, Points, Values, VoxelMask
 from amrepair.deficit.boxes import Box, Sought, boxes_of
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.field.as_built import SOLID_MM
@@ -80,9 +81,7 @@ def _solid_in_box(sought: Sought, place: Box) -> manifold3d.Manifold:
     return _grown_back(sought, box, core, clip, f)
 
 
-def _shown(
-    sought: Sought, samples_mm: Float[np.ndarray, "k 3"], f_mm: Float[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def _shown(sought: Sought, samples_mm: Points, f_mm: Values) -> tuple[Values, Values]:
     """(k,) how far samples lie in what is sought, empty or solid, best known and cautiously."""
     evidence = sought.evidence
     if not sought.is_excess:
@@ -101,11 +100,8 @@ def _shown(
 
 
 def _limits(
-    sought: Sought,
-    samples_mm: Float[np.ndarray, "v 3"],
-    f_mm: Float[np.ndarray, " v"],
-    depth_mm: float,
-) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
+    sought: Sought, samples_mm: Points, f_mm: Values, depth_mm: float
+) -> tuple[Values, Values]:
     """(v,) τ, and the depth from which on a label counts.
 
     Under the plane of the layer just printed both are smaller: detection used a smaller limit,
@@ -123,11 +119,7 @@ def _limits(
 
 
 def _grown_back(
-    sought: Sought,
-    box: VoxelBox,
-    core: Bool[np.ndarray, " v"],
-    clip: Float[np.ndarray, " v"],
-    f_mm: Float[np.ndarray, " v"],
+    sought: Sought, box: VoxelBox, core: Mask, clip: Values, f_mm: Values
 ) -> manifold3d.Manifold:
     """The core, grown by what the erosion took and clipped to template minus as-built."""
     grow_mm = GROW_FACTOR * sought.tau_mm + float(box.step_mm.max())
@@ -141,11 +133,8 @@ def _grown_back(
 
 
 def _of_a_region(
-    core: Bool[np.ndarray, " v"],
-    box: VoxelBox,
-    labelled_mm: Float[np.ndarray, "p 3"],
-    reach_mm: float,
-) -> Bool[np.ndarray, " v"]:
+    core: Mask, box: VoxelBox, labelled_mm: Float[np.ndarray, "p 3"], reach_mm: float
+) -> Mask:
     """(v,) what of the samples hangs together with a place that the test found: noise does not."""
     high_mm = box.low_mm + box.step_mm * (np.array(box.shape) - 1)
     near = in_box(labelled_mm, box.low_mm, high_mm)
@@ -159,11 +148,7 @@ def _of_a_region(
     return np.asarray(kept[groups].ravel())
 
 
-def _hangs_free(
-    wanted: Bool[np.ndarray, "x y z"],
-    may_be_gone: Bool[np.ndarray, "x y z"],
-    gone: Bool[np.ndarray, "x y z"],
-) -> Bool[np.ndarray, "x y z"]:
+def _hangs_free(wanted: VoxelMask, may_be_gone: VoxelMask, gone: VoxelMask) -> VoxelMask:
     """What is left between what is gone and the air, with nothing that was seen to hold it.
 
     The roof of a hollow, an edge: thinner than what the erosion leaves, so no growing gets there.
