@@ -1,14 +1,17 @@
 """Where solids are to be made: boxes around what detection labelled, and how deep it lies.
 
-They hold a void's walls and mouth too, which nobody sampled; what is solid there `compute` says.
+They hold a void's walls and mouth too, which nobody sampled; what is solid there `solids` says.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Bool, Float, Int
+from dataclasses import dataclass
 
-from amrepair.deficit.options import VoxelOptions
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.arrays import Mask, Numbers, Points, Values
+from amrepair.deficit.options import DeficitOptions
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.frames import diagonal
@@ -17,116 +20,182 @@ from amrepair.regions.skipped import PlannedBeads
 from amrepair.template.port import Template
 
 
-def boxes_of(
-    anomaly: AnomalyMap,
-    evidence: Evidence,
-    template: Template,
-    label: Label,
-    lines: PlannedBeads | None,
-    options: VoxelOptions,
-) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
-    """Low corner, high corner and depth of each group of labelled cells and template points."""
-    s = evidence.surfels
-    which = np.flatnonzero(np.asarray(anomaly.surfel_label) == int(label))
-    points, depth = s.place_mm[which], np.abs(s.deviation_mm[which])
-    film = np.zeros(len(which), dtype=bool)
-    if label is Label.MISSING:
-        film = _films(template, evidence, which, options)
-        gone = anomaly.template_points_mm[anomaly.template_label == int(Label.MISSING)]
-        gone = np.concatenate([gone, _paths_out(template, evidence, which, options)])
-        points = np.concatenate([points, gone])
-        depth = np.concatenate([depth, np.full(len(gone), np.nan)])
+@dataclass(frozen=True, slots=True)
+class Sought:
+    """What solids of one label are made from, template frame.
+
+    Attributes
+    ----------
+    tau_mm
+        What is no farther from the template counts only by its label.
+    gone
+        Lines of the job that are not there; None where there are none, and for excess.
+    """
+
+    template: Template
+    evidence: Evidence
+    anomaly: AnomalyMap
+    label: Label
+    tau_mm: float
+    gone: PlannedBeads | None
+    options: DeficitOptions
+
+    @property
+    def is_excess(self) -> bool:
+        """Too much, not missing."""
+        return self.label is Label.EXCESS
+
+    @property
+    def sign(self) -> float:
+        """Of the template's distance where there may be any: negative inside."""
+        return 1.0 if self.is_excess else -1.0
+
+    @property
+    def labelled(self) -> Mask:
+        """(s,) surfels that the test found."""
+        return np.asarray(np.asarray(self.anomaly.surfel_label) == int(self.label))
+
+    @property
+    def surface_mm(self) -> Points:
+        """(g, 3) places of the template's surface that the test found."""
+        return self.anomaly.template_points_mm[self.anomaly.template_label == int(self.label)]
+
+    def told_mm(self, inside: Mask) -> Float[np.ndarray, "p 3"]:
+        """(p, 3) places that are known to be missing: some surfels, surface, lines of the job."""
+        told = [self.evidence.surfels.place_mm[inside], self.surface_mm]
+        if self.gone is not None:
+            told.append(self.gone.samples_mm(self.options.skipped.look_step_mm))
+        return np.concatenate(told)
+
+    def nearest_is_labelled(self, samples_mm: Points) -> Mask:
+        """(k,) whether the test found the surfel nearest to each place."""
+        nearest = self.evidence.surfels.tree.query(samples_mm, workers=2)[1]
+        return np.asarray(self.labelled[nearest])
+
+    def allowed_mm(self, samples_mm: Points, asked: Mask) -> Values:
+        """(k,) how far out of the template nothing is too much, by the nearest surfel."""
+        allowed_mm = np.zeros(len(samples_mm))
+        higher_mm = self.anomaly.surfel_higher_mm
+        if self.is_excess and higher_mm is not None and (higher_mm > 0).any():
+            nearest = self.evidence.surfels.tree.query(samples_mm[asked], workers=2)[1]
+            allowed_mm[asked] = higher_mm[nearest]
+        return allowed_mm
+
+    def in_lines_that_hung(self, samples_mm: Points) -> Mask:
+        """(k,) places in lines that are gone and hung over a floor.
+
+        The floor under such a line is as designed, and says nothing of the line.
+        """
+        if self.gone is None:
+            return np.zeros(len(samples_mm), bool)
+        held = self.gone.holds(samples_mm)
+        down_mm = np.array([0.0, 0.0, float(np.median(self.gone.height_mm))])
+        held[held] = self.template.distance(samples_mm[held] - down_mm) > 0
+        return held
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Corners (3,) each, and how thick what lies in it is."""
+
+    low_mm: Float[np.ndarray, " 3"]
+    high_mm: Float[np.ndarray, " 3"]
+    depth_mm: float
+
+    @classmethod
+    def around(cls, places_mm: Points, margin_mm: float, depth_mm: float) -> Box:
+        """With a margin."""
+        return cls(places_mm.min(axis=0) - margin_mm, places_mm.max(axis=0) + margin_mm, depth_mm)
+
+    def overlaps(self, other: Box) -> bool:
+        """Whether two boxes have a place in common."""
+        return bool((self.low_mm <= other.high_mm).all() and (other.low_mm <= self.high_mm).all())
+
+    def joined(self, other: Box) -> Box:
+        """One around both, as fine as the finer of them needs."""
+        return Box(
+            np.minimum(self.low_mm, other.low_mm),
+            np.maximum(self.high_mm, other.high_mm),
+            min(self.depth_mm, other.depth_mm),
+        )
+
+
+def boxes_of(sought: Sought) -> list[Box]:
+    """Around each group of labelled cells and template points, and around lines that are gone."""
+    s, options = sought.evidence.surfels, sought.options.voxels
+    which = np.flatnonzero(sought.labelled)
+    if sought.is_excess:
+        # where excess surfels stand on the template: along their planes, back by their height
+        film, normal = np.zeros(len(which), bool), sought.evidence.normal[which]
+        beside = s.place_mm[which] - s.deviation_mm[which, None] * normal
     else:
-        points = np.concatenate([points, _feet(evidence, which)])
-        depth = np.concatenate([depth, np.full(len(which), np.nan)])
-    film = np.pad(film, (0, len(points) - len(film)))
+        film = _films(sought, which)
+        beside = np.concatenate([sought.surface_mm, _paths_out(sought, which)])
+    points = np.concatenate([s.place_mm[which], beside])
+    depth = np.append(np.abs(s.deviation_mm[which]), np.full(len(beside), np.nan))
+    film = np.append(film, np.zeros(len(beside), bool))
     group = group_points(points, reach_mm=touching_mm(s.cell_mm))
-    found = []
-    for g in range(int(group.max()) + 1 if len(group) else 0):
-        mine = points[group == g]
-        deep = depth[group == g]
-        known = deep[~np.isnan(deep)]
+    found: list[Box] = []
+    for g in range(int(group.max(initial=-1)) + 1):
+        mine = group == g
+        known = depth[mine & ~np.isnan(depth)]
         # cells with a handful of template points and nothing else are pixels, not defects
-        if len(known) == 0 and (len(mine) < 4 or label is Label.EXCESS):
+        if len(known) == 0 and (mine.sum() < 4 or sought.is_excess):
             continue  # nor is where something would stand what stands
         thick = float(np.percentile(known, 90)) if len(known) else 2.0
-        thin = deep[film[group == g]]
+        thin = depth[mine & film]
         if len(thin) * s.cell_mm**2 > options.least_film_mm2:
             thick = min(thick, float(np.median(thin)))  # so that samples lie in its lower half
-        low, high = mine.min(axis=0), mine.max(axis=0)
-        found.append((low - options.margin_mm, high + options.margin_mm, thick))
-    if lines is not None:
-        for a, b, thick in zip(lines.start_mm, lines.end_mm, lines.height_mm, strict=True):
-            low, top = np.minimum(a, b) - options.margin_mm, np.maximum(a, b) + options.margin_mm
-            found.append((low, top, float(thick)))
-    return _merge(found)
+        found.append(Box.around(points[mine], options.margin_mm, thick))
+    if (gone := sought.gone) is not None:
+        for *ends, thick in zip(gone.start_mm, gone.end_mm, gone.height_mm, strict=True):
+            found.append(Box.around(np.stack(ends), options.margin_mm, float(thick)))
+    return _merged(found)
 
 
-def _films(
-    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"], options: VoxelOptions
-) -> Bool[np.ndarray, " q"]:
+def _films(sought: Sought, which: Numbers) -> Mask:
     """Cells of an even surface over which a film is missing: no deeper, and it faces out of it.
 
     What is left of a thin roof lies as near to the template's surface, but to its other side.
     """
-    s = evidence.surfels
+    s, options = sought.evidence.surfels, sought.options.voxels
     depth_mm, wide_mm = np.abs(s.deviation_mm[which]), np.abs(s.wide_deviation_mm[which])
     film = (depth_mm < options.film_mm) & (np.abs(depth_mm - wide_mm) < options.even_mm)
     some = which[film]
-    outward = template.distance_and_gradient(s.place_mm[some])[1]
-    film[film] = (outward * evidence.normal[some]).sum(axis=1) > options.facing
+    outward = sought.template.distance_and_gradient(s.place_mm[some])[1]
+    film[film] = (outward * sought.evidence.normal[some]).sum(axis=1) > options.facing
     return film
 
 
-def _paths_out(
-    template: Template, evidence: Evidence, which: Int[np.ndarray, " q"], options: VoxelOptions
-) -> Float[np.ndarray, "p 3"]:
+def _paths_out(sought: Sought, which: Numbers) -> Float[np.ndarray, "p 3"]:
     """Points through the empty space from a void's floor to where it leaves the template.
 
     They tie the floor to the mouth where nobody sampled the walls between.
     """
-    s, step_mm = evidence.surfels, options.path_step_mm
-    if len(which) == 0:
-        return np.zeros((0, 3))
-    _, first = np.unique(
-        np.floor(s.place_mm[which] / step_mm).astype(np.int64), axis=0, return_index=True
-    )
-    front, along = s.place_mm[which[first]], evidence.normal[which[first]]
-    found = []
-    reach_mm = diagonal(template.bounds_mm)
+    s, step_mm = sought.evidence.surfels, sought.options.voxels.path_step_mm
+    cell = np.floor(s.place_mm[which] / step_mm).astype(np.int64)
+    first = np.unique(cell, axis=0, return_index=True)[1]
+    front, along = s.place_mm[which[first]], sought.evidence.normal[which[first]]
+    found = [front[:0]]
+    reach_mm = diagonal(sought.template.bounds_mm)
     for _ in range(int(reach_mm / step_mm) + 1):
         front = front + step_mm * along
-        f = template.distance(front)
-        go_on = (f < 0) & (evidence.clearance(front, f)[0] > 0)
+        f = sought.template.distance(front)
+        go_on = (f < 0) & (sought.evidence.clearance(front, f)[0] > 0)
         if not go_on.any():
             break
         front, along = front[go_on], along[go_on]
         found.append(front)
-    return np.concatenate(found) if found else np.zeros((0, 3))
+    return np.concatenate(found)
 
 
-def _feet(evidence: Evidence, which: Int[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
-    """Where excess surfels stand on the template: along their planes, back by their height."""
-    s = evidence.surfels
-    return np.asarray(s.place_mm[which] - s.deviation_mm[which, None] * evidence.normal[which])
-
-
-def _merge(
-    boxes: list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]],
-) -> list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float]]:
+def _merged(boxes: list[Box]) -> list[Box]:
     """Boxes that overlap become one, so that no volume is made twice."""
-    merged = list(boxes)
-    changed = True
-    while changed:
-        changed = False
-        for i in range(len(merged)):
-            for j in range(i + 1, len(merged)):
-                (a_low, a_high, a), (b_low, b_high, b) = merged[i], merged[j]
-                if (a_low <= b_high).all() and (b_low <= a_high).all():
-                    joined = (np.minimum(a_low, b_low), np.maximum(a_high, b_high), min(a, b))
-                    merged = [m for k, m in enumerate(merged) if k not in {i, j}] + [joined]
-                    changed = True
-                    break
-            if changed:
-                break
-    return merged
+    apart: list[Box] = []
+    for box in boxes:
+        whole = box
+        while beside := [other for other in apart if other.overlaps(whole)]:
+            apart.remove(beside[0])
+            whole = whole.joined(beside[0])
+        apart.append(whole)
+    return apart

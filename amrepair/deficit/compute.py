@@ -16,12 +16,10 @@ from typing import Any
 
 import manifold3d
 import numpy as np
+from jaxtyping import Float
 
-from amrepair.deficit.heights import (
-    as_built_heights,
-    standing_heights,
-    with_what_stands_out,
-)
+from amrepair.deficit.boxes import Sought
+from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.options import USUAL_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import (
@@ -180,20 +178,20 @@ def compute_deficit(
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
         options=options.heights,
     )  # fmt: skip
-    of_label = {Label.MISSING: lines, Label.EXCESS: None}
+    sought = [
+        Sought(template, evidence, anomaly, label, tau_mm, gone, options)
+        for label, gone in ((Label.MISSING, lines), (Label.EXCESS, None))
+    ]
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
         many = _roughly_missing(anomaly, evidence) > options.early_mm3
         early = beside.submit(look) if many else None
-        solids = {
-            label: pieces_of(template, evidence, anomaly, label, tau_mm, gone, options, progress)
-            for label, gone in of_label.items()
-        }
+        solids = [pieces_of(each, progress) for each in sought]
     regions = [
-        _region(piece, label, template, build_from_template, of_label[label], options)
-        for label, pieces in solids.items()
+        _region(piece, each, build_from_template)
+        for each, pieces in zip(sought, solids, strict=True)
         for piece in pieces
     ]
-    missing, excess = (_in_build_frame(found, build_from_template) for found in solids.values())
+    missing, excess = (_in_build_frame(pieces, build_from_template) for pieces in solids)
 
     def stands() -> HeightField:
         seen = look() if early is None else early.result()
@@ -226,7 +224,9 @@ def _evidence_of(
     if evidence is None:
         raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
     lines = None if beads is None else skipped(beads, evidence, template, options)
-    if lines is not None and len(lines.width_mm):
+    if lines is not None and not len(lines.width_mm):
+        lines = None
+    if lines is not None:
         labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
         evidence = with_stubs(evidence, scan, lines.samples_mm(options.look_step_mm), labelled)
     return evidence, lines
@@ -315,15 +315,9 @@ def _roughly_missing(anomaly: AnomalyMap, evidence: Evidence) -> float:
     return float(np.abs(s.deviation_mm[mine]).sum()) * s.cell_mm**2
 
 
-def _region(
-    piece: manifold3d.Manifold,
-    label: Label,
-    template: Template,
-    build_from_template: Transform,
-    gone: PlannedBeads | None,
-    options: DeficitOptions,
-) -> Region:
+def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Transform) -> Region:
     """Measures of one piece; its box in the build frame."""
+    label, template = sought.label, sought.template
     bounds = np.asarray(piece.bounding_box()).reshape(2, 3)
     volume = float(piece.volume())
     area = float(piece.surface_area()) / 2
@@ -337,19 +331,18 @@ def _region(
         area_mm2=area,
         depth_mm=depth,
         box_mm=np.asarray(moved.bounding_box()).reshape(2, 3),
-        below_bead=volume < options.bead_mm3,
-        skipped=_is_skipped(piece, gone),
+        below_bead=volume < sought.options.bead_mm3,
+        skipped=_is_skipped(bounds, sought.gone),
     )
 
 
-def _is_skipped(piece: manifold3d.Manifold, gone: PlannedBeads | None) -> bool:
+def _is_skipped(box_mm: Float[np.ndarray, "2 3"], gone: PlannedBeads | None) -> bool:
     """Whether the middle of a line that is gone lies in a piece's box, template frame."""
     if gone is None:
         return False
-    box = np.asarray(piece.bounding_box()).reshape(2, 3)
     middle = 0.5 * (gone.start_mm + gone.end_mm)
     middle[:, 2] -= 0.5 * gone.height_mm
-    return bool(in_box(middle, box[0], box[1]).any())
+    return bool(in_box(middle, *box_mm).any())
 
 
 def _unseen_area(anomaly: AnomalyMap) -> float:

@@ -12,9 +12,10 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
+from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points
 from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
@@ -85,14 +86,14 @@ def as_built_heights(
 
 
 def _crossed(
-    solid_z_mm: Float[np.ndarray, "ny nx"],
-    unseen: Bool[np.ndarray, "ny nx"],
+    solid_z_mm: HeightMap,
+    unseen: ColumnMask,
     low_mm: Float[np.ndarray, " 3"],
     cell_mm: float,
     template_from_build: Transform,
     images: tuple[RangeImage, ...],
     options: HeightOptions,
-) -> Float[np.ndarray, "ny nx"]:
+) -> HeightMap:
     """Heights lowered, column by column from above, as far as rays went through them."""
     iy, ix = unseen.nonzero()
     z_mm = solid_z_mm.copy()
@@ -116,7 +117,7 @@ def standing_heights(
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
     options: HeightOptions = USUAL_DEFICIT.heights,
-) -> tuple[HeightField, Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"]]:
+) -> tuple[HeightField, HeightMap, HeightMap]:
     """The as-built field with sharp walls; what is missing from each column; what was wanted.
 
     What was expected, less what is missing, with what is too much, gives heights on a fine grid.
@@ -174,11 +175,7 @@ def fine_over(seen: HeightField, options: HeightOptions) -> HeightField:
 
 
 def _sharpened(
-    seen: HeightField,
-    fine: HeightField,
-    z_mm: Float[np.ndarray, "ny nx"],
-    gone: Bool[np.ndarray, "ny nx"],
-    options: HeightOptions,
+    seen: HeightField, fine: HeightField, z_mm: HeightMap, gone: ColumnMask, options: HeightOptions
 ) -> HeightField:
     """Heights of the scan on a fine grid, beside walls those of what was planned (`z_mm`)."""
     at = cells_over(seen, fine)
@@ -207,11 +204,8 @@ def around_walls(seen: HeightField, fine: HeightField, options: HeightOptions) -
 
 
 def beside_walls(
-    planned_mm: Float[np.ndarray, "ny nx"],
-    seen_mm: Float[np.ndarray, "ny nx"],
-    around: int,
-    options: HeightOptions,
-) -> Bool[np.ndarray, "ny nx"]:
+    planned_mm: HeightMap, seen_mm: HeightMap, around: int, options: HeightOptions
+) -> ColumnMask:
     """Cells beside a planned step, but for those in which something higher than it was seen."""
     highest, lowest = (
         of(planned_mm, around) for of in (ndimage.maximum_filter, ndimage.minimum_filter)
@@ -233,7 +227,7 @@ def cells_over(
 
 def with_what_stands_out(
     field: HeightField,
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     sigma_mm: float,
     spacing_mm: float,
     options: HeightOptions,
@@ -275,11 +269,8 @@ def with_what_stands_out(
 
 
 def _without_rims_fins(
-    z_mm: Float[np.ndarray, "ny nx"],
-    gone: Bool[np.ndarray, "ny nx"],
-    seen_mm: Float[np.ndarray, "ny nx"],
-    options: HeightOptions,
-) -> Float[np.ndarray, "ny nx"]:
+    z_mm: HeightMap, gone: ColumnMask, seen_mm: HeightMap, options: HeightOptions
+) -> HeightMap:
     """Lower what is too thin to be there beside what is missing; `seen_mm` is the highest seen."""
     # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
     beside = ndimage.maximum_filter(gone, 3)
@@ -290,15 +281,13 @@ def _without_rims_fins(
     return np.where(unseen, _without_fins(z_mm, options.unseen_fin_cells), z_mm)
 
 
-def _without_fins(z_mm: Float[np.ndarray, "ny nx"], cells: int) -> Float[np.ndarray, "ny nx"]:
+def _without_fins(z_mm: HeightMap, cells: int) -> HeightMap:
     """Lower what is thinner than so many cells; corners of what is thicker stay."""
     thick_mm = ndimage.grey_opening(z_mm, cells)
     return np.asarray(np.minimum(z_mm, ndimage.maximum_filter(thick_mm, 3)))
 
 
-def _by_chance(
-    off_mm: Float[np.ndarray, "ny nx"], around: int, options: HeightOptions
-) -> Bool[np.ndarray, "ny nx"]:
+def _by_chance(off_mm: HeightMap, around: int, options: HeightOptions) -> ColumnMask:
     """Cells of few points: off by more than noise of many, but not off with those around them."""
     bounded = np.clip(off_mm, -options.chance_mm, options.chance_mm)
     together = ndimage.uniform_filter(bounded, around)
@@ -327,7 +316,7 @@ def without_missing(
 
 def columns_of(
     solid: manifold3d.Manifold, field: HeightField
-) -> tuple[Int[np.ndarray, " cells1"], Float[np.ndarray, " crossings"]]:
+) -> tuple[Numbers, Float[np.ndarray, " crossings"]]:
     """Crossings of a solid with the field's columns: where each column's begin, and heights."""
     vertices, faces = mesh_of(solid)
     ny, nx = field.shape
@@ -344,12 +333,12 @@ def columns_of(
 
 
 def _tops(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     low_mm: Float[np.ndarray, " 2"],
     cell_mm: float,
     shape: tuple[int, int],
     options: HeightOptions,
-) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+) -> tuple[HeightMap, ColumnMask]:
     """Mean height of each cell's topmost surface.
 
     A point alone above the others of its cell, which no neighbouring cell has anything as high as,
@@ -372,11 +361,8 @@ def _tops(
 
 
 def _close_gaps(
-    z_mm: Float[np.ndarray, "ny nx"],
-    seen: Bool[np.ndarray, "ny nx"],
-    cell_mm: float,
-    options: HeightOptions,
-) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+    z_mm: HeightMap, seen: ColumnMask, cell_mm: float, options: HeightOptions
+) -> tuple[HeightMap, ColumnMask]:
     """A few cells that sampling left empty among seen ones take their highest seen neighbour.
 
     Each its own: chance links such cells by their corners, and a wall beside one is none beside
@@ -404,7 +390,7 @@ def _designed(
     low_mm: Float[np.ndarray, " 2"],
     cell_mm: float,
     shape: tuple[int, int],
-) -> Float[np.ndarray, "ny nx"]:
+) -> HeightMap:
     """Top of the template by cell; 0 where it has nothing."""
     solid: Any = template.solid()
     high_mm = low_mm + cell_mm * np.array(shape[::-1])

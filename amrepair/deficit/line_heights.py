@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from amrepair.arrays import ColumnMask, HeightMap
 from amrepair.deficit.heights import (
     around_walls,
     beside_walls,
@@ -97,13 +97,13 @@ def standing_lines(
 
 
 def _steps_of_plan(
-    seen_mm: Float[np.ndarray, "ny nx"],
-    told: Bool[np.ndarray, "ny nx"],
-    planned_mm: Float[np.ndarray, "ny nx"],
-    gone: Bool[np.ndarray, "ny nx"],
+    seen_mm: HeightMap,
+    told: ColumnMask,
+    planned_mm: HeightMap,
+    gone: ColumnMask,
     around: int,
     options: HeightOptions,
-) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+) -> tuple[HeightMap, ColumnMask]:
     """Heights as seen, whose steps lie where the plan has them; and which are known.
 
     A cell reads as high as the highest thing in it: what it is too high by beside a wall is the
@@ -124,7 +124,7 @@ def _steps_of_plan(
 
 def _planned(
     near: HeightField, lines: JobLines, missing: manifold3d.Manifold
-) -> tuple[Float[np.ndarray, "ny nx"], Bool[np.ndarray, "ny nx"]]:
+) -> tuple[HeightMap, ColumnMask]:
     """How high the lines stand that are not missing, and where something is.
 
     A layer of a column stands where more of it is there than not.
@@ -137,11 +137,11 @@ def _planned(
     offsets, z, up = raster_kernels.column_crossings(vertices, faces, x0, y0, near.cell_mm, nx, ny)
     column = np.repeat(np.arange(nx * ny), np.diff(offsets))
 
-    def lost_below(level_mm: float) -> Float[np.ndarray, "ny nx"]:
+    def lost_below(level_mm: float) -> HeightMap:
         below = np.bincount(column, up * np.minimum(z, level_mm), minlength=nx * ny)
         return below.reshape(ny, nx)
 
-    def over(some: JobLines) -> Float[np.ndarray, "ny nx"]:
+    def over(some: JobLines) -> HeightMap:
         within = 0.5 * some.section_mm2 / np.maximum(some.height_mm, SAME_LEVEL_MM)
         found = raster_kernels.beside_lines(
             some.start_mm[:, :2], some.end_mm[:, :2], within, some.end_mm[:, 2],

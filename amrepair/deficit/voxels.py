@@ -7,10 +7,11 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import ndimage
 from skimage import measure
 
+from amrepair.arrays import Points, VoxelMask, Voxels
 from amrepair.deficit.options import USUAL_DEFICIT, VoxelOptions
 from amrepair.errors import DeficitError
 
@@ -66,19 +67,19 @@ class VoxelBox:
         size = np.ceil(extent / step).astype(int) + 1
         return cls(low_mm, step, (int(size[0]), int(size[1]), int(size[2])))
 
-    def samples_mm(self) -> Float[np.ndarray, "v 3"]:
+    def samples_mm(self) -> Points:
         """(v, 3) all sample points, last axis fastest."""
         axes = [self.low_mm[i] + self.step_mm[i] * np.arange(self.shape[i]) for i in range(3)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
-    def distance_to(self, mask: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
+    def distance_to(self, mask: VoxelMask) -> Voxels:
         """Distance of every sample to the nearest one in `mask`, mm; inf where it is empty."""
         if not mask.any():
             return np.full(self.shape, np.inf)
         return np.asarray(ndimage.distance_transform_edt(~mask, sampling=tuple(self.step_mm)))
 
 
-def solid_from_field(box: VoxelBox, field_mm: Float[np.ndarray, "x y z"]) -> manifold3d.Manifold:
+def solid_from_field(box: VoxelBox, field_mm: Voxels) -> manifold3d.Manifold:
     """The solid where the field is negative, closed at the box's faces.
 
     Raises
@@ -107,7 +108,7 @@ def solid_from_field(box: VoxelBox, field_mm: Float[np.ndarray, "x y z"]) -> man
     return solid if solid.volume() > 0 else solid.mirror((0, 0, 0))
 
 
-def _manifold(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray) -> manifold3d.Manifold:
+def _manifold(vertices: Points, faces: np.ndarray) -> manifold3d.Manifold:
     """A solid from marching cubes' output, turned outward."""
     corners = vertices[faces]
     signed = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))

@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
+from amrepair.arrays import ColumnMask, HeightMap, Points
 from amrepair.deficit import walls_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, WallOptions
 from amrepair.frames import in_box
@@ -22,8 +23,8 @@ from gcode.surfaces import HeightField
 
 def with_sharp_walls(
     field: HeightField,
-    gone: Bool[np.ndarray, "ny nx"],
-    points_mm: Float[np.ndarray, "n 3"],
+    gone: ColumnMask,
+    points_mm: Points,
     sigma_mm: float,
     options: WallOptions = USUAL_DEFICIT.walls,
 ) -> HeightField:
@@ -58,8 +59,8 @@ def with_sharp_walls(
 
 def with_even_crests(
     field: HeightField,
-    lost_mm: Float[np.ndarray, "ny nx"],
-    designed_mm: Float[np.ndarray, "ny nx"],
+    lost_mm: HeightMap,
+    designed_mm: HeightMap,
     points_mm: Float[np.ndarray, "n 3"],
     spacing_mm: float,
     options: WallOptions = USUAL_DEFICIT.walls,
@@ -108,7 +109,7 @@ def with_even_crests(
 
 def _tops_near(
     field: HeightField, points_mm: Float[np.ndarray, "n 3"], within_mm: float
-) -> Float[np.ndarray, "ny nx"]:
+) -> HeightMap:
     """Height of the highest point that lies over each cell or as near to it; −inf: none does."""
     index = field.cells_of(points_mm[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
@@ -119,8 +120,8 @@ def _tops_near(
 
 def with_rising_rims(
     field: HeightField,
-    lost_mm: Float[np.ndarray, "ny nx"],
-    designed_mm: Float[np.ndarray, "ny nx"],
+    lost_mm: HeightMap,
+    designed_mm: HeightMap,
     spacing_mm: float,
     options: WallOptions = USUAL_DEFICIT.walls,
 ) -> HeightField:
@@ -160,8 +161,8 @@ def with_rising_rims(
 
 def with_whole_rims(
     field: HeightField,
-    lost_mm: Float[np.ndarray, "ny nx"],
-    designed_mm: Float[np.ndarray, "ny nx"],
+    lost_mm: HeightMap,
+    designed_mm: HeightMap,
     options: WallOptions = USUAL_DEFICIT.walls,
 ) -> HeightField:
     """The as-built field, tops beside a steep face of what is missing as designed up to the face.
@@ -192,7 +193,7 @@ def with_whole_rims(
     return field.raised(z_mm)
 
 
-def window_around(gone: Bool[np.ndarray, "ny nx"], margin: int) -> tuple[slice, slice]:
+def window_around(gone: ColumnMask, margin: int) -> tuple[slice, slice]:
     """Rows and columns of the window around those that something is missing from."""
     rows, columns = (
         slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in gone.nonzero()
@@ -201,10 +202,7 @@ def window_around(gone: Bool[np.ndarray, "ny nx"], margin: int) -> tuple[slice, 
 
 
 def _by_cell(
-    points_mm: Float[np.ndarray, "n 3"],
-    corner_mm: Float[np.ndarray, " 2"],
-    cell_mm: float,
-    shape: tuple[int, int],
+    points_mm: Points, corner_mm: Float[np.ndarray, " 2"], cell_mm: float, shape: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "kept 3"], Int[np.ndarray, "ny nx1"]]:
     """Points over a grid sorted by its cells, and where those of each cell begin, by row."""
     ny, nx = shape

@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 
-from amrepair.field.faces import Faces, find_faces, nearest_planes
+from amrepair.arrays import Mask, Numbers, Points, Values
+from amrepair.field.faces import Faces, SurfacePlanes, find_faces
 from amrepair.field.fused import Surfels
 from amrepair.field.near import has_near
 from amrepair.field.options import EvidenceOptions
@@ -45,8 +46,8 @@ class Evidence:
     """
 
     surfels: Surfels
-    off: Bool[np.ndarray, " s"]
-    normal: Float[np.ndarray, "s 3"]
+    off: Mask
+    normal: Points
     images: tuple[RangeImage, ...]
     options: EvidenceOptions
     faces: Faces | None = None
@@ -61,9 +62,7 @@ class Evidence:
         """Whether sensors are known."""
         return bool(self.images)
 
-    def clearance(
-        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def clearance(self, points_mm: Points, f_mm: Values) -> tuple[Values, Values]:
         """How far each point lies outside the as-built part: best estimate, and a cautious one.
 
         Positive is empty. `f_mm` is the template's distance at the points.
@@ -71,41 +70,26 @@ class Evidence:
         if not self.has_rays:
             near = self._by_surface(points_mm, f_mm)
             return near, near
-        best, least = self._by_rays(points_mm)
+        best, least = clearances(self.images, points_mm, SOLID_MM)
         return self._sharpened(points_mm, f_mm, best), least
 
-    def cautious(
-        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
+    def cautious(self, points_mm: Points, f_mm: Values) -> Values:
         """The cautious half of `clearance`, which costs the less."""
         if not self.has_rays:
             return self._by_surface(points_mm, f_mm)
-        return self._by_rays(points_mm)[1]
+        return clearances(self.images, points_mm, SOLID_MM)[1]
 
-    def rays_say(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def rays_say(self, points_mm: Points) -> Values:
         """The best estimate of `clearance` by rays alone; cheap, and noisy by a pixel."""
-        return self._by_rays(points_mm)[0]
+        return clearances(self.images, points_mm, SOLID_MM)[0]
 
-    def _by_surface(
-        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
+    def _by_surface(self, points_mm: Points, f_mm: Values) -> Values:
         """What the scanned surface says where there are no rays."""
         if self.faces is not None:
             return self.faces.clearance(points_mm, f_mm)
         return self.surface_clearance(points_mm, f_mm)
 
-    def _by_rays(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """The emptiest of what the range images say, and of their cautious answers."""
-        return clearances(self.images, points_mm, SOLID_MM)
-
-    def _sharpened(
-        self,
-        points_mm: Float[np.ndarray, "n 3"],
-        f_mm: Float[np.ndarray, " n"],
-        best_mm: Float[np.ndarray, " n"],
-    ) -> Float[np.ndarray, " n"]:
+    def _sharpened(self, points_mm: Points, f_mm: Values, best_mm: Values) -> Values:
         """What the rays say, as far as a pixel allows corrected by the scanned surface.
 
         The emptiest of several noisy images lies too deep, and beside a silhouette every pixel is
@@ -124,24 +108,13 @@ class Evidence:
         sharp[ask[known]] = np.clip(surface, low, high)[known]
         return sharp
 
-    def surface_clearance(
-        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
+    def surface_clearance(self, points_mm: Points, f_mm: Values) -> Values:
         """Signed distance to the scanned surface itself (no rays), positive outside."""
         s, options = self.surfels, self.options
         if len(s) == 0:
             return np.full(len(points_mm), SOLID_MM)
-        near = nearest_planes(
-            points_mm,
-            f_mm,
-            s.tree,
-            place_mm=s.place_mm,
-            deviation_mm=s.deviation_mm,
-            off=self.off,
-            normal=self.normal,
-            count=options.neighbours,
-            blur_mm=s.cell_mm,
-        )
+        planes = SurfacePlanes(s.place_mm, s.deviation_mm, self.off, self.normal, s.tree)
+        near = planes.nearest(points_mm, f_mm, options.neighbours, s.cell_mm)
         # beside, not above: the nearest plane does not reach there
         reach_mm = options.sideways_cells * s.cell_mm + options.sideways_per_height * near.height_mm
         beside = self.off[near.index] & (near.sideways_mm > reach_mm)
@@ -152,7 +125,7 @@ def gather(
     scan: Scan,
     template: Template,
     surfels: Surfels,
-    off: Bool[np.ndarray, " s"],
+    off: Mask,
     images: tuple[RangeImage, ...],
     *,
     threshold_mm: float,
@@ -174,16 +147,13 @@ def gather(
         faces = find_faces(
             scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=options
         )
-        nearest = faces.tree.query(surfels.place_mm[which], workers=2)[1]
-        normal[which] = _toward(surfels.planes(which), faces.normal[nearest])
+        nearest = faces.planes.tree.query(surfels.place_mm[which], workers=2)[1]
+        normal[which] = _toward(surfels.planes(which), faces.planes.normal[nearest])
     return Evidence(surfels, off, normal, images, options, faces)
 
 
 def with_stubs(
-    evidence: Evidence,
-    scan: Scan,
-    gone_mm: Float[np.ndarray, "g 3"],
-    labelled: Bool[np.ndarray, " s"],
+    evidence: Evidence, scan: Scan, gone_mm: Points, labelled: Bool[np.ndarray, " s"]
 ) -> Evidence:
     """The same evidence, knowing the tops of what is left of walls one bead wide.
 
@@ -208,21 +178,15 @@ def with_stubs(
     return replace(evidence, off=off, normal=normal)
 
 
-def _toward(
-    planes: Float[np.ndarray, "q 3"], guide: Float[np.ndarray, "q 3"]
-) -> Float[np.ndarray, "q 3"]:
+def _toward(planes: Points, guide: Points) -> Points:
     """Planes turned to the side of their guides."""
     sign = np.where((planes * guide).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(planes * sign[:, None])
 
 
 def _seen_from_within(
-    scan: Scan,
-    template: Template,
-    surfels: Surfels,
-    off: Bool[np.ndarray, " s"],
-    options: EvidenceOptions,
-) -> Bool[np.ndarray, " s"]:
+    scan: Scan, template: Template, surfels: Surfels, off: Mask, options: EvidenceOptions
+) -> Mask:
     """Surfels along the template's surface that were seen through the template.
 
     A sheet that is left on the bed lies within noise of the template's underside, yet its upper
@@ -238,9 +202,7 @@ def _seen_from_within(
     return found
 
 
-def _strips(
-    template: Template, surfels: Surfels, off: Bool[np.ndarray, " s"], options: EvidenceOptions
-) -> Bool[np.ndarray, " s"]:
+def _strips(template: Template, surfels: Surfels, off: Mask, options: EvidenceOptions) -> Mask:
     """Surfels beside off-template ones whose plane crosses the template's surface.
 
     The broken end of a thin wall lies at f ≈ 0 along both rims, yet it is no part of the
@@ -258,9 +220,7 @@ def _strips(
     return strips
 
 
-def _beside_template(
-    template: Template, surfels: Surfels, which: Int[np.ndarray, " q"]
-) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
+def _beside_template(template: Template, surfels: Surfels, which: Numbers) -> tuple[Points, Values]:
     """Which way the template's surface faces there, and how much the surfels' planes lie along it.
 
     The second is the cosine between them: 1 along the surface, 0 across it.

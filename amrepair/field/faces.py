@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import faces_kernels as kernels
 from amrepair.field.fused import Surfels
 from amrepair.field.near import has_near
@@ -37,39 +38,52 @@ class NearestPlanes:
         (n,) the nearest place.
     """
 
-    value_mm: Float[np.ndarray, " n"]
-    distance_mm: Float[np.ndarray, " n"]
-    height_mm: Float[np.ndarray, " n"]
-    sideways_mm: Float[np.ndarray, " n"]
-    index: Int[np.ndarray, " n"]
+    value_mm: Values
+    distance_mm: Values
+    height_mm: Values
+    sideways_mm: Values
+    index: Numbers
 
 
-def nearest_planes(
-    points_mm: Float[np.ndarray, "n 3"],
-    f_mm: Float[np.ndarray, " n"],
-    tree: cKDTree,
-    *,
-    place_mm: Float[np.ndarray, "k 3"],
-    deviation_mm: Float[np.ndarray, " k"],
-    off: Bool[np.ndarray, " k"],
-    normal: Float[np.ndarray, "k 3"],
-    count: int,
-    blur_mm: float,
-) -> NearestPlanes:
-    """Ask the nearest places of a surface on which side of it points lie.
+@dataclass(frozen=True, slots=True)
+class SurfacePlanes:
+    """Places of a scanned surface, template frame.
 
-    A place on the template answers f(x) − f(place): exact on curves and edges. One off it answers
-    with its own plane. `blur_mm` says how fast farther ones count less.
+    Attributes
+    ----------
+    place_mm, deviation_mm
+        (n, 3) and (n,) places and the template's distance there.
+    off
+        (n,) whether a place is none of the template's surface.
+    normal
+        (n, 3) outward unit normals where `off`.
+    tree
+        Of the places.
     """
-    k = min(count, len(place_mm))
-    distance, index = tree.query(points_mm, k=k, workers=2)
-    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    value, height = kernels.plane_values(
-        np.ascontiguousarray(points_mm), f_mm, distance, index,
-        place_mm, deviation_mm, off, normal, blur_mm,
-    )  # fmt: skip
-    sideways = np.sqrt(np.maximum(distance[:, 0] ** 2 - height**2, 0.0))
-    return NearestPlanes(value, distance[:, 0].copy(), height, sideways, index[:, 0].copy())
+
+    place_mm: Points
+    deviation_mm: Values
+    off: Mask
+    normal: Points
+    tree: cKDTree
+
+    def nearest(
+        self, points_mm: Float[np.ndarray, "m 3"], f_mm: Values, count: int, blur_mm: float
+    ) -> NearestPlanes:
+        """Ask as many nearest places on which side of the surface points lie.
+
+        A place on the template answers f(x) − f(place): exact on curves and edges. One off it
+        answers with its own plane. `blur_mm` says how fast farther ones count less.
+        """
+        k = min(count, len(self.place_mm))
+        distance, index = self.tree.query(points_mm, k=k, workers=2)
+        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+        value, height = kernels.plane_values(
+            np.ascontiguousarray(points_mm), f_mm, distance, index,
+            self.place_mm, self.deviation_mm, self.off, self.normal, blur_mm,
+        )  # fmt: skip
+        sideways = np.sqrt(np.maximum(distance[:, 0] ** 2 - height**2, 0.0))
+        return NearestPlanes(value, distance[:, 0].copy(), height, sideways, index[:, 0].copy())
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,13 +92,8 @@ class Faces:
 
     Attributes
     ----------
-    place_mm, deviation_mm
-        (k, 3) and (k,) places and the template's distance there; around defects moved onto the
-        plane through their neighbours, elsewhere the surfels.
-    off
-        (k,) on a broken face.
-    normal
-        (k, 3) outward unit normals where `off`, else zero.
+    planes
+        Around defects points moved onto the planes through their neighbours, elsewhere the surfels.
     spacing_mm
         Of the scan.
     occupancy
@@ -93,37 +102,20 @@ class Faces:
         That it was made with.
     """
 
-    place_mm: Float[np.ndarray, "k 3"]
-    deviation_mm: Float[np.ndarray, " k"]
-    off: Bool[np.ndarray, " k"]
-    normal: Float[np.ndarray, "k 3"]
+    planes: SurfacePlanes
     spacing_mm: float
-    tree: cKDTree
     occupancy: Occupancy
     options: FaceOptions
 
-    def clearance(
-        self, points_mm: Float[np.ndarray, "n 3"], f_mm: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
+    def clearance(self, points_mm: Points, f_mm: Values) -> Values:
         """Signed distance to what stands there, positive outside.
 
-        The nearest places answer (`nearest_planes`). Where none lies over the point, the occupancy
-        says the side and the nearest place how far; beyond its box it is as designed.
+        The nearest places answer. Where none lies over the point, the occupancy says the side and
+        the nearest place how far; beyond its box it is as designed.
         """
-        options = self.options
-        near = nearest_planes(
-            points_mm,
-            f_mm,
-            self.tree,
-            place_mm=self.place_mm,
-            deviation_mm=self.deviation_mm,
-            off=self.off,
-            normal=self.normal,
-            count=options.neighbours,
-            blur_mm=2 * self.spacing_mm,
-        )
+        options, s = self.options, self.spacing_mm
+        near = self.planes.nearest(points_mm, f_mm, options.neighbours, 2 * s)
         best, distance = near.value_mm, near.distance_mm
-        s = self.spacing_mm
         beside_mm = options.beside_spacings * s + options.beside_per_height * near.height_mm
         far = (distance > options.near_spacings * s) | (near.sideways_mm > beside_mm)
         ask = np.flatnonzero(far | (distance > self.occupancy.voxel_mm))
@@ -151,47 +143,76 @@ class _Places:
         (n,) on a surface that is not the template's.
     """
 
-    place_mm: Float[np.ndarray, "n 3"]
-    plane: Float[np.ndarray, "n 3"]
-    area_mm2: Float[np.ndarray, " n"]
+    place_mm: Points
+    plane: Points
+    area_mm2: Values
     neighbours: Int[np.ndarray, "n k"]
-    deviation_mm: Float[np.ndarray, " n"]
-    outward: Float[np.ndarray, "n 3"]
-    is_broken: Bool[np.ndarray, " n"]
+    deviation_mm: Values
+    outward: Points
+    is_broken: Mask
 
     @classmethod
     def of(
-        cls,
-        points_mm: Float[np.ndarray, "n 3"],
-        template: Template,
-        *,
-        spacing_mm: float,
-        sigma_mm: float,
-        threshold_mm: float,
-        options: FaceOptions,
-    ) -> _Places:
-        """Planes through the points, and which are none of the template's."""
-        place, plane, area_mm2, neighbours = _planes(
-            points_mm, spacing_mm=spacing_mm, sigma_mm=sigma_mm, options=options
+        cls, points_mm: Points, template: Template, sigma_mm: float, threshold_mm: float,
+        spacing_mm: float, options: FaceOptions,
+    ) -> _Places:  # fmt: skip
+        """Points moved onto the planes through their neighbours, and which are broken."""
+        k = min(options.plane_points, len(points_mm))
+        distance, index = cKDTree(points_mm).query(points_mm, k=k, workers=2)
+        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+        place, plane = kernels.smoothed(
+            points_mm, index, options.plane_rounds, spacing_mm, 2 * sigma_mm
         )
+        area_mm2 = np.pi * distance[:, -1] ** 2 / max(k - 1, 1)
         deviation, gradient = template.distance_and_gradient(place)
         outward = unit_vectors(gradient)
         along = np.abs((outward * plane).sum(axis=1))
         is_broken = np.abs(deviation) > threshold_mm
         is_broken |= (along < options.strip_cosine) & (deviation < -options.strip_mm)
         # a lone point among others is noise, as are crumbs along the rim of what nobody saw
-        is_broken &= is_broken[neighbours].mean(axis=1) > options.lone_ratio
-        return cls(place, plane, area_mm2, neighbours, deviation, outward, is_broken)
+        is_broken &= is_broken[index].mean(axis=1) > options.lone_ratio
+        return cls(place, plane, area_mm2, index, deviation, outward, is_broken)
+
+    @property
+    def broken(self) -> Broken:
+        """Those that are."""
+        at = self.is_broken
+        return Broken(self.place_mm[at], self.plane[at], self.deviation_mm[at], self.outward[at])
+
+    def given(self, normals: Points | None, least_agreement: float) -> Points | None:
+        """The file's normals, all turned outward; None where they contradict the template."""
+        on = ~self.is_broken
+        if normals is None or not on.any():
+            return normals
+        agreement = float(np.median((self.outward[on] * normals[on]).sum(axis=1)))
+        return None if abs(agreement) < least_agreement else normals * np.sign(agreement)
+
+    def outward_planes(self, occupancy: Occupancy, given: Points | None) -> Points:
+        """(n, 3) the planes of what is broken, turned outward; zero elsewhere.
+
+        As the file's own normals say, or the occupancy of neighbours together; where that says
+        nothing, as the template faces.
+        """
+        which, normal = np.flatnonzero(self.is_broken), np.zeros_like(self.plane)
+        plane = self.plane[which]
+        if given is not None:
+            side = (plane * given[which]).sum(axis=1)
+        else:
+            normal[which] = occupancy.open_side(self.broken)[:, None] * plane
+            vote = (normal[self.neighbours[which]].sum(axis=1) * plane).sum(axis=1)
+            side = np.where(np.abs(vote) > 1e-6, vote, (plane * self.outward[which]).sum(axis=1))
+        normal[which] = np.where(side[:, None] < 0, -plane, plane)
+        return normal
 
 
 def _looked_at(
     scan: Scan,
     template: Template,
     surfels: Surfels,
-    off: Bool[np.ndarray, " s"],
+    off: Mask,
     threshold_mm: float,
     options: FaceOptions,
-) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " n"], _Places]:
+) -> tuple[Mask, Bool[np.ndarray, " m"], _Places]:
     """Which cells and points are looked at, and what they say: around what lies off, and from
     what is broken there on, as far as that goes.
     """
@@ -203,13 +224,9 @@ def _looked_at(
         chosen = np.zeros(len(scan.points_mm), bool)
         chosen[kept] = near_cell[surfels.of_point[kept]]
         found = _Places.of(
-            scan.points_mm[chosen],
-            template,
-            spacing_mm=surfels.spacing_mm,
-            sigma_mm=max(scan.sigma_mm, surfels.spread_mm),
-            threshold_mm=threshold_mm,
-            options=options,
-        )
+            scan.points_mm[chosen], template, max(scan.sigma_mm, surfels.spread_mm), threshold_mm,
+            surfels.spacing_mm, options,
+        )  # fmt: skip
         broken_mm = found.place_mm[found.is_broken]
         beside = has_near(surfels.place_mm, broken_mm, options.around_mm) & ~near_cell
         # a film's cell has both its sides, and lies off as a whole only where one of them does
@@ -223,7 +240,7 @@ def find_faces(
     template: Template,
     surfels: Surfels,
     off: Bool[np.ndarray, " s"],
-    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
+    surface: tuple[Points, Points],
     *,
     threshold_mm: float,
     options: EvidenceOptions,
@@ -238,85 +255,21 @@ def find_faces(
         Deviation from the template that is more than noise for a mean of a plane's points.
     """
     near_cell, chosen, at = _looked_at(scan, template, surfels, off, threshold_mm, options.faces)
-    place, plane, deviation, is_broken = at.place_mm, at.plane, at.deviation_mm, at.is_broken
-    which = np.flatnonzero(is_broken)
-    broken = Broken(place[which], plane[which], deviation[which], at.outward[which])
     spacing_mm = float(np.sqrt(np.median(at.area_mm2))) or surfels.spacing_mm  # 0: all in one place
-    on_mm = np.concatenate([place[~is_broken], scan.points_mm[(surfels.of_point >= 0) & ~chosen]])
+    other_mm = scan.points_mm[(surfels.of_point >= 0) & ~chosen]
+    on_mm = np.concatenate([at.place_mm[~at.is_broken], other_mm])
     occupancy = find_occupancy(
-        template, broken, on_mm, surface, spacing_mm=spacing_mm, options=options.occupancy
+        template, at.broken, on_mm, surface, spacing_mm=spacing_mm, options=options.occupancy
     )
-    given = None
-    if scan.normals is not None:
-        given = _given(scan.normals[chosen], at.outward, ~is_broken, options.faces)
-    if given is not None:
-        side = (plane[which] * given[which]).sum(axis=1)
-    else:
-        side = _voted(occupancy.open_side(broken), plane, at.outward, which, at.neighbours)
+    own = None if scan.normals is None else scan.normals[chosen]
+    normal = at.outward_planes(occupancy, at.given(own, options.faces.normal_agreement))
     rest = ~near_cell
-    places = np.concatenate([place, surfels.place_mm[rest]])
-    normal = np.zeros_like(places)
-    normal[which] = np.where(side[:, None] < 0, -plane[which], plane[which])
-    return Faces(
-        place_mm=places,
-        deviation_mm=np.concatenate([deviation, surfels.deviation_mm[rest]]),
-        off=np.append(is_broken, np.zeros(int(rest.sum()), bool)),
-        normal=normal,
-        spacing_mm=spacing_mm,
-        tree=cKDTree(places, compact_nodes=False, balanced_tree=False),
-        occupancy=occupancy,
-        options=options.faces,
+    places = np.concatenate([at.place_mm, surfels.place_mm[rest]])
+    planes = SurfacePlanes(
+        places,
+        np.concatenate([at.deviation_mm, surfels.deviation_mm[rest]]),
+        np.append(at.is_broken, np.zeros(int(rest.sum()), bool)),
+        np.concatenate([normal, np.zeros((int(rest.sum()), 3))]),
+        cKDTree(places, compact_nodes=False, balanced_tree=False),
     )
-
-
-def _voted(
-    side: Float[np.ndarray, " q"],
-    plane: Float[np.ndarray, "n 3"],
-    gradient: Float[np.ndarray, "n 3"],
-    which: Int[np.ndarray, " q"],
-    neighbours: Int[np.ndarray, "n k"],
-) -> Float[np.ndarray, " q"]:
-    """(q,) sides as neighbours say together; where they say nothing, as the template faces."""
-    falls = np.zeros_like(plane)
-    falls[which] = side[:, None] * plane[which]
-    vote = (falls[neighbours[which]].sum(axis=1) * plane[which]).sum(axis=1)
-    by_template = (plane[which] * gradient[which]).sum(axis=1)
-    return np.asarray(np.where(np.abs(vote) > 1e-6, vote, by_template))
-
-
-def _planes(
-    points_mm: Float[np.ndarray, "n 3"],
-    *,
-    spacing_mm: float,
-    sigma_mm: float,
-    options: FaceOptions,
-) -> tuple[
-    Float[np.ndarray, "n 3"],
-    Float[np.ndarray, "n 3"],
-    Float[np.ndarray, " n"],
-    Int[np.ndarray, "n k"],
-]:
-    """Points moved onto the planes through their neighbours, those planes' normals, and areas."""
-    k = min(options.plane_points, len(points_mm))
-    distance, index = cKDTree(points_mm).query(points_mm, k=k, workers=2)
-    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    place, normal = kernels.smoothed(
-        points_mm, index, options.plane_rounds, spacing_mm, 2 * sigma_mm
-    )
-    area = np.pi * distance[:, -1] ** 2 / max(k - 1, 1)
-    return place, normal, area, index
-
-
-def _given(
-    normals: Float[np.ndarray, "n 3"],
-    gradient: Float[np.ndarray, "n 3"],
-    on: Bool[np.ndarray, " n"],
-    options: FaceOptions,
-) -> Float[np.ndarray, "n 3"] | None:
-    """The file's normals, turned outward as a whole; None where they contradict the template."""
-    if not on.any():
-        return normals
-    agreement = float(np.median((gradient[on] * normals[on]).sum(axis=1)))
-    if abs(agreement) < options.normal_agreement:
-        return None
-    return np.asarray(normals * np.sign(agreement))
+    return Faces(planes, spacing_mm, occupancy, options.faces)

@@ -47,112 +47,49 @@ def neighbour_sums(table, values):
 
 
 @njit(cache=True, nogil=True)
-def occupied(points, keep, low, cell, shape):
-    """How many cells of a grid hold a kept point."""
-    filled = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
-    found = 0
-    for i in range(len(points)):
-        if keep[i]:
-            x = int((points[i, 0] - low[0]) / cell)
-            y = int((points[i, 1] - low[1]) / cell)
-            z = int((points[i, 2] - low[2]) / cell)
-            at = (x * shape[1] + y) * shape[2] + z
-            if not filled[at]:
-                filled[at] = True
-                found += 1
-    return found
+def numbered(points, keep, low, cell, shape):
+    """(n,) which occupied cell each kept point lies in, −1 for the others; (s,) keys of those.
 
-
-@njit(cache=True, nogil=True)
-def sort_by_cell(points, keep, low, cell, shape):
-    """Kept points in the order of their cells, and as they came within each.
-
-    Returns the order, where each occupied cell begins in it, their numbers in a grid of `shape`
-    (one empty layer around), and the occupied cell of each point, −1 for those left out.
+    Cells are numbered x-major in a grid of `shape` cells, one empty layer around.
     """
-    n = len(points)
-    at = np.full(n, -1, np.int32)
-    count = np.zeros(shape[0] * shape[1] * shape[2], np.int32)
-    for i in range(n):
+    at = np.full(len(points), -1, np.int64)
+    number = np.zeros(shape[0] * shape[1] * shape[2], np.int32)
+    for i in range(len(points)):
         if keep[i]:
             x = int((points[i, 0] - low[0]) / cell) + 1
             y = int((points[i, 1] - low[1]) / cell) + 1
             z = int((points[i, 2] - low[2]) / cell) + 1
             at[i] = (x * shape[1] + y) * shape[2] + z
-            count[at[i]] += 1
-    cells = 0
-    for c in range(len(count)):
-        cells += count[c] > 0
-    keys = np.empty(cells, np.int64)
-    start = np.zeros(cells + 1, np.int64)
-    k = 0
-    for c in range(len(count)):
-        if count[c] > 0:
-            keys[k] = c
-            start[k + 1] = start[k] + count[c]
-            count[c] = k  # from here on: which occupied cell it is
-            k += 1
-    order = np.empty(start[cells], np.int64)
-    of_point = np.full(n, -1, np.int64)
-    filled = start[:-1].copy()
-    for i in range(n):
-        if at[i] >= 0:
-            k = count[at[i]]
-            order[filled[k]] = i
-            filled[k] += 1
-            of_point[i] = k
-    return order, start, keys, of_point
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def cell_sums(order, start, points, origin, deviation):
-    """(s, 11) per cell: Σx Σy Σz Σf Σxx Σyy Σzz Σxy Σxz Σyz Σff about one origin."""
-    n = start.shape[0] - 1
-    out = np.zeros((n, 11))
-    for i in prange(n):
-        for k in range(start[i], start[i + 1]):
-            p = order[k]
-            x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
-            f = deviation[p]
-            out[i, 0] += x
-            out[i, 1] += y
-            out[i, 2] += z
-            out[i, 3] += f
-            out[i, 4] += x * x
-            out[i, 5] += y * y
-            out[i, 6] += z * z
-            out[i, 7] += x * y
-            out[i, 8] += x * z
-            out[i, 9] += y * z
-            out[i, 10] += f * f
-    return out
-
-
-@njit(cache=True, nogil=True)
-def mean_to_sensor(which, order, start, points, sensors, index):
-    """(q, 3) mean over some cells of the way from their points to the sensors that saw them."""
-    out = np.zeros((len(which), 3))
-    for q in range(len(which)):
-        first, end = start[which[q]], start[which[q] + 1]
-        for k in range(first, end):
-            p = order[k]
-            for a in range(3):
-                out[q, a] += sensors[index[p], a] - points[p, a]
-        out[q] /= end - first
-    return out
-
-
-@njit(cache=True, nogil=True)
-def kept_box(points, keep):
-    """(2, 3) box of the kept points, and how many there are."""
-    out = np.empty((2, 3))
-    out[0], out[1] = np.inf, -np.inf
-    n = 0
+            number[at[i]] = 1
+    keys = np.flatnonzero(number)
+    for k in range(len(keys)):
+        number[keys[k]] = k
     for i in range(len(points)):
-        if keep[i]:
-            n += 1
-            for a in range(3):
-                v = points[i, a]
-                out[0, a] = min(out[0, a], v)
-                out[1, a] = max(out[1, a], v)
-    return out, n
+        if at[i] >= 0:
+            at[i] = number[at[i]]
+    return at, keys
+
+
+@njit(cache=True, nogil=True)
+def cell_sums(of_point, points, origin, deviation, cells):
+    """(s, 12) per cell: Σx Σy Σz Σf Σxx Σyy Σzz Σxy Σxz Σyz Σff about one origin, and points."""
+    out = np.zeros((cells, 12))
+    for p in range(len(of_point)):
+        i = of_point[p]
+        if i < 0:
+            continue
+        x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
+        f = deviation[p]
+        out[i, 0] += x
+        out[i, 1] += y
+        out[i, 2] += z
+        out[i, 3] += f
+        out[i, 4] += x * x
+        out[i, 5] += y * y
+        out[i, 6] += z * z
+        out[i, 7] += x * y
+        out[i, 8] += x * z
+        out[i, 9] += y * z
+        out[i, 10] += f * f
+        out[i, 11] += 1.0
+    return out

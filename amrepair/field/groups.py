@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy import ndimage
 
+from amrepair.arrays import Numbers, Points
 from amrepair.field.options import USUAL_SURFELS
 
 # Pieces nearer than this are one defect, and so are cells of a field that touch at a corner.
@@ -13,9 +14,7 @@ GROUP_MM, CELLS_APART = 1.2, 1.8
 AREA_CELL_MM = 2.0  # the area of points is counted in cells of this edge
 
 
-def group_points(
-    points_mm: Float[np.ndarray, "n 3"], *, reach_mm: float = GROUP_MM
-) -> Int[np.ndarray, " n"]:
+def group_points(points_mm: Points, *, reach_mm: float = GROUP_MM) -> Numbers:
     """(n,) group number of each point: those in touching cells of `reach_mm` belong together."""
     if len(points_mm) == 0:
         return np.zeros(0, np.int64)
@@ -26,17 +25,25 @@ def group_points(
     return numbered[tuple(index.T)].astype(np.int64) - 1
 
 
+def cell_numbers(index: Int[np.ndarray, "n k"]) -> Numbers:
+    """(n,) a number from 0 for each row of whole numbers, the same for rows that are alike.
+
+    As `numpy.unique` has it for rows, in a tenth of the time.
+    """
+    low = index.min(axis=0, initial=0)
+    shape = index.max(axis=0, initial=0) - low + 1
+    key = np.ravel_multi_index(tuple((index - low).T), tuple(shape))
+    return np.unique(key, return_inverse=True)[1]
+
+
 def touching_mm(cell_mm: float) -> float:
     """How far apart pieces of one defect may lie in a field of such cells, mm."""
     return max(GROUP_MM, CELLS_APART * cell_mm)
 
 
-def area_per_point(surface_mm: Float[np.ndarray, "m 3"]) -> float:
+def area_per_point(surface_mm: Points) -> float:
     """Rough area per template point, mm², from how many cells they fill."""
     if len(surface_mm) == 0:
         return 0.0
-    index = np.floor(surface_mm / AREA_CELL_MM).astype(np.int64)
-    index -= index.min(axis=0)
-    size = index.max(axis=0) + 1
-    cells = len(np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]))
+    cells = int(cell_numbers(np.floor(surface_mm / AREA_CELL_MM).astype(np.int64)).max()) + 1
     return USUAL_SURFELS.area_per_cell * AREA_CELL_MM**2 * cells / len(surface_mm)

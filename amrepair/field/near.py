@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Mask, Numbers, Points
 from amrepair.field import near_kernels as kernels
 from amrepair.frames import box_of
 
@@ -26,29 +27,22 @@ def spacing_in(tree: cKDTree) -> float:
 
 
 def has_near(
-    asked_mm: Float[np.ndarray, "k 3"],
-    points_mm: Float[np.ndarray, "n 3"],
-    within_mm: float,
-    *,
-    enough: int = 1,
-) -> Bool[np.ndarray, " k"]:
+    asked_mm: Points, points_mm: Float[np.ndarray, "m 3"], within_mm: float, *, enough: int = 1
+) -> Mask:
     """(k,) whether at least so many of the points lie within a distance of each place."""
     return _beside(asked_mm, points_mm, within_mm, enough)[1] >= enough
 
 
 def nearest_within(
-    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "n 3"], within_mm: float
-) -> Int[np.ndarray, " k"]:
+    asked_mm: Points, points_mm: Float[np.ndarray, "m 3"], within_mm: float
+) -> Numbers:
     """(k,) number of the point nearest to each place, −1 where none is nearer than a distance."""
     return _beside(asked_mm, points_mm, within_mm, len(points_mm) + 1)[0]
 
 
 def _beside(
-    asked_mm: Float[np.ndarray, "k 3"],
-    points_mm: Float[np.ndarray, "n 3"],
-    within_mm: float,
-    enough: int,
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    asked_mm: Points, points_mm: Float[np.ndarray, "m 3"], within_mm: float, enough: int
+) -> tuple[Numbers, Numbers]:
     """(k,) the nearest within a distance, or −1, and (k,) how many are, up to `enough`."""
     if len(asked_mm) == 0 or len(points_mm) == 0:
         return np.full(len(asked_mm), -1, dtype=np.int32), np.zeros(len(asked_mm), dtype=np.int32)
@@ -60,14 +54,9 @@ def _beside(
 
 
 def cells_of(
-    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "n 3"], within_mm: float
+    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "m 3"], within_mm: float
 ) -> tuple[
-    Int[np.ndarray, " c"],
-    Float[np.ndarray, "m 3"],
-    Int[np.ndarray, " m"],
-    Float[np.ndarray, " 3"],
-    float,
-    Int[np.ndarray, " 3"],
+    Int[np.ndarray, " c"], Points, Numbers, Float[np.ndarray, " 3"], float, Int[np.ndarray, " 3"]
 ]:
     """Points near places by cells at least as wide as a distance: what the kernels walk through.
 

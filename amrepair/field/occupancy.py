@@ -8,14 +8,16 @@ Kobbelt 2006; Labatut, Pons & Keriven 2009). It needs neither rays nor normals.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from amrepair.field.cut_kernels import least_cut
+from amrepair.arrays import Mask, Numbers, Points, Values, VoxelMask, Voxels
 from amrepair.field.groups import group_points
 from amrepair.field.near import has_near, nearest_within
 from amrepair.field.options import OccupancyOptions
@@ -43,10 +45,10 @@ class Broken:
         (q,) the template's distance there, and (q, 3) its unit gradient.
     """
 
-    place_mm: Float[np.ndarray, "q 3"]
-    plane: Float[np.ndarray, "q 3"]
-    f_mm: Float[np.ndarray, " q"]
-    outward: Float[np.ndarray, "q 3"]
+    place_mm: Points
+    plane: Points
+    f_mm: Values
+    outward: Points
 
 
 @dataclass(frozen=True)
@@ -65,10 +67,10 @@ class Occupancy:
 
     low_mm: Float[np.ndarray, " 3"]
     voxel_mm: float
-    solid: Bool[np.ndarray, "x y z"]
-    designed: Bool[np.ndarray, "x y z"]
+    solid: VoxelMask
+    designed: VoxelMask
 
-    def at(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def at(self, points_mm: Points) -> Values:
         """Of points in the template: positive where solid, negative where empty, 0 unknown."""
         index, ok = _cells(points_mm, self.low_mm, self.voxel_mm, self.solid.shape)
         said = np.zeros(len(points_mm))
@@ -76,13 +78,13 @@ class Occupancy:
         return said
 
     @cached_property
-    def _told(self) -> Float[np.ndarray, "x y z"]:
+    def _told(self) -> Voxels:
         """As voxels say; one that the template's surface cuts off, as those beside it in there."""
         told = np.where(self.solid, np.float32(1.0), np.float32(-1.0))
         beside = ndimage.uniform_filter(np.where(self.designed, told, np.float32(0.0)), 3)
         return np.asarray(np.where(self.designed, told, np.where(np.abs(beside) > 1e-3, beside, 0)))
 
-    def open_side(self, faces: Broken) -> Float[np.ndarray, " q"]:
+    def open_side(self, faces: Broken) -> Values:
         """(q,) positive where space ahead of a plane is empty, negative behind, 0 unknown.
 
         Only on the same side of the template's surface: beyond that one surface more may lie.
@@ -104,15 +106,15 @@ class _Grid:
 
     low_mm: Float[np.ndarray, " 3"]
     voxel_mm: float
-    f_mm: Float[np.ndarray, "x y z"]
+    f_mm: Voxels
     number: Int[np.ndarray, "x y z"]
 
     @property
-    def is_inside(self) -> Bool[np.ndarray, " v"]:
+    def is_inside(self) -> Mask:
         """(v,) whether the voxels to be labelled lie in the template."""
         return np.asarray(self.f_mm[self.number >= 0] < 0)
 
-    def numbers_at(self, points_mm: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
+    def numbers_at(self, points_mm: Points) -> Numbers:
         """(k,) number of the voxel that holds each point, −1 where none does."""
         index, ok = _cells(points_mm, self.low_mm, self.voxel_mm, self.number.shape)
         found = np.full(len(points_mm), -1, np.int64)
@@ -127,18 +129,38 @@ class _Facets:
     `one` lies before `other` on the axis; −1 is a voxel that is known to be empty.
     """
 
-    one: Int[np.ndarray, " k"]
-    other: Int[np.ndarray, " k"]
-    axis: Int[np.ndarray, " k"]
-    middle_mm: Float[np.ndarray, "k 3"]
-    on_template: Bool[np.ndarray, " k"]
+    one: Numbers
+    other: Numbers
+    axis: Numbers
+    middle_mm: Points
+    on_template: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class _Scanned:
+    """A scan around broken surface: what of it is broken, points on the template, its spacing."""
+
+    template: Template
+    broken: Broken
+    on_mm: Points
+    spacing_mm: float
+    options: OccupancyOptions
+
+    def sees(self, asked_mm: Points) -> Mask:
+        """Whether at least half as many points lie around each place as on surface that was seen.
+
+        Half, so that along a straight rim of what was seen neither side gains.
+        """
+        within_mm = self.options.seen_spacings * self.spacing_mm
+        half = int(0.5 * np.pi * self.options.seen_spacings**2)
+        return has_near(asked_mm, self.on_mm, within_mm, enough=half)
 
 
 def find_occupancy(
     template: Template,
     broken: Broken,
-    on_mm: Float[np.ndarray, "n 3"],
-    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
+    on_mm: Float[np.ndarray, "m 3"],
+    surface: tuple[Points, Points],
     *,
     spacing_mm: float,
     options: OccupancyOptions,
@@ -158,51 +180,25 @@ def find_occupancy(
         none = np.zeros((0, 0, 0), bool)
         return Occupancy(np.zeros(3), spacing_mm, none, none)
     places_mm, normals = surface
+    scan = _Scanned(template, broken, on_mm, spacing_mm, options)
     bare = ~has_near(places_mm, on_mm, options.gap_spacings * spacing_mm)
-    box_mm = _box(template, broken, places_mm[bare], spacing_mm, options)
-    grid = _grid(template, box_mm, float(broken.f_mm.max()), spacing_mm, options)
-    seen = _is_seen(places_mm, on_mm, spacing_mm, options)
-    unseen = _nats_unseen(normals, seen, (grid.voxel_mm / spacing_mm) ** 2, options)
-    here_mm = on_mm[in_box(on_mm, *box_mm)]
+    box_mm = _box(scan, places_mm[bare])
+    grid = _grid(scan, box_mm)
+    unseen = _nats_unseen(normals, scan.sees(places_mm), (grid.voxel_mm / spacing_mm) ** 2, options)
+    scan = replace(scan, on_mm=on_mm[in_box(on_mm, *box_mm)])
     facets = _facets(grid)
-    nats = unseen[facets.axis]
-    nats *= _unexplained(facets, template, broken, here_mm, spacing_mm, grid.voxel_mm, options)
-    told = _told(grid, template, here_mm, spacing_mm, options)
-    empty = _labelled(facets, nats, told)
-    sides = _Sides.of(grid, broken, spacing_mm, options)
-    scan_mm = np.concatenate([broken.place_mm, here_mm])
-    least = np.pi * (options.bead_mm / spacing_mm) ** 2  # around less no bead fits
-    empty = _with_open_sides(empty, facets, nats, told, grid, sides, scan_mm, least)
-    designed = grid.f_mm < 0
-    solid = np.zeros(designed.shape, bool)
+    nats = unseen[facets.axis] * _unexplained(scan, facets, grid.voxel_mm)[:, None]
+    told = _told(scan, grid)
+    empty = _with_open_sides(_labelled(facets, nats, told), scan, facets, nats, told, grid)
+    solid = np.zeros(grid.number.shape, bool)
     solid[grid.number >= 0] = ~empty
-    solid = _as_seen(solid, designed, grid, broken, spacing_mm, options)
-    return Occupancy(grid.low_mm, grid.voxel_mm, solid, designed)
+    return Occupancy(grid.low_mm, grid.voxel_mm, _as_seen(solid, scan, grid), grid.f_mm < 0)
 
 
-def _is_seen(
-    asked_mm: Float[np.ndarray, "k 3"],
-    on_mm: Float[np.ndarray, "n 3"],
-    spacing_mm: float,
-    options: OccupancyOptions,
-) -> Bool[np.ndarray, " k"]:
-    """Whether at least half as many points lie around each place as on surface that was seen.
-
-    Half, so that along a straight rim of what was seen neither side gains.
-    """
-    half = int(0.5 * np.pi * options.seen_spacings**2)
-    return has_near(asked_mm, on_mm, options.seen_spacings * spacing_mm, enough=half)
-
-
-def _box(
-    template: Template,
-    broken: Broken,
-    bare_mm: Float[np.ndarray, "h 3"],
-    spacing_mm: float,
-    options: OccupancyOptions,
-) -> Float[np.ndarray, "2 3"]:
+def _box(scan: _Scanned, bare_mm: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "2 3"]:
     """What is broken, holes in the seen surface that touch it, and where it looks out of others."""
-    reach_mm = max(options.hole_mm, 3.0 * spacing_mm)
+    broken, options = scan.broken, scan.options
+    reach_mm = max(options.hole_mm, 3.0 * scan.spacing_mm)
     # a bare place among covered ones is chance
     holes_mm = bare_mm[has_near(bare_mm, bare_mm, reach_mm, enough=options.hole_places)]
     marked_mm = np.concatenate([broken.place_mm, holes_mm])
@@ -210,52 +206,49 @@ def _box(
     touching = np.isin(group, np.unique(group[: len(broken.f_mm)]))
     places = [marked_mm[touching]]
     if len(holes_mm):
-        out_mm = _ways_out(template, broken, options)
+        out_mm = _ways_out(scan.template, broken, options)
         places.append(out_mm[has_near(out_mm, holes_mm, reach_mm)])
     box_mm = box_of(np.concatenate(places)) + options.margin_mm * np.array([[-1.0], [1.0]])
-    over_mm = max(float(broken.f_mm.max()), 0.0) + 2.0 * spacing_mm
-    low_mm, high_mm = template.bounds_mm + over_mm * np.array([[-1.0], [1.0]])
+    over_mm = max(float(broken.f_mm.max()), 0.0) + 2.0 * scan.spacing_mm
+    low_mm, high_mm = scan.template.bounds_mm + over_mm * np.array([[-1.0], [1.0]])
     return np.clip(box_mm, low_mm, high_mm)
 
 
-def _ways_out(
-    template: Template, broken: Broken, options: OccupancyOptions
-) -> Float[np.ndarray, "e 3"]:
-    """Where lines from broken surface along its planes' normals first leave the template."""
+def _ways_out(template: Template, broken: Broken, options: OccupancyOptions) -> Points:
+    """Where lines from broken surface along its planes' normals first leave the template.
+
+    No surface is nearer than the template's distance: so far each step goes (Hart 1996).
+    """
     some = slice(None, None, max(1, len(broken.f_mm) // options.looking_places))
     front_mm = np.concatenate([broken.place_mm[some]] * 2)
     along = np.concatenate([broken.plane[some], -broken.plane[some]])
+    f_mm = np.concatenate([broken.f_mm[some]] * 2)
     step_mm = 0.5 * options.hole_mm
     out = []
     for _ in range(int(diagonal(template.bounds_mm) / step_mm) + 1):
-        front_mm = front_mm + step_mm * along
+        front_mm = front_mm + np.maximum(-f_mm, step_mm)[:, None] * along
         f_mm = template.distance(front_mm)
         left = f_mm >= 0
         out.append(front_mm[left] - f_mm[left, None] * along[left])
-        front_mm, along = front_mm[~left], along[~left]
+        front_mm, along, f_mm = front_mm[~left], along[~left], f_mm[~left]
         if len(front_mm) == 0:
             break
     return np.concatenate(out)
 
 
-def _grid(
-    template: Template,
-    box_mm: Float[np.ndarray, "2 3"],
-    highest_mm: float,
-    spacing_mm: float,
-    options: OccupancyOptions,
-) -> _Grid:
+def _grid(scan: _Scanned, box_mm: Float[np.ndarray, "2 3"]) -> _Grid:
     """Voxels of a box, as fine as their number allows.
 
     Those to be labelled lie in the template, or no farther outside it than the scan does.
     """
+    options, highest_mm = scan.options, float(scan.broken.f_mm.max())
     extent_mm = np.maximum(np.ptp(box_mm, axis=0), 1e-6)
-    voxel_mm = options.voxel_spacings * spacing_mm
+    voxel_mm = options.voxel_spacings * scan.spacing_mm
     most = options.box_ratio * options.most_voxels
     voxel_mm = max(voxel_mm, float(np.cbrt(np.prod(extent_mm) / most)))
     while True:
         shape = np.ceil(extent_mm / voxel_mm).astype(np.int64)
-        f_mm = _distances(template, box_mm[0], voxel_mm, shape)
+        f_mm = _distances(scan.template, box_mm[0], voxel_mm, shape)
         asked = f_mm < (highest_mm + voxel_mm if highest_mm > 0 else 0.0)
         count = int(asked.sum())
         if count <= options.most_voxels:
@@ -271,7 +264,7 @@ def _distances(
     low_mm: Float[np.ndarray, " 3"],
     voxel_mm: float,
     shape: Int[np.ndarray, " 3"],
-) -> Float[np.ndarray, "x y z"]:
+) -> Voxels:
     """The template's distance at each voxel's middle; far from its surface that of a block's."""
     blocks = -(-shape // TRACED_BLOCK)
     middles = TRACED_BLOCK * (np.argwhere(np.ones(blocks, bool)) + 0.5)
@@ -302,10 +295,7 @@ def _facets(grid: _Grid) -> _Facets:
 
 
 def _nats_unseen(
-    normals: Float[np.ndarray, "m 3"],
-    seen: Bool[np.ndarray, " m"],
-    points: float,
-    options: OccupancyOptions,
+    normals: Points, seen: Mask, points: float, options: OccupancyOptions
 ) -> Float[np.ndarray, "3 2"]:
     """How improbable a facet is that nobody saw, by axis and by the way it faces (+, −), nats.
 
@@ -323,58 +313,43 @@ def _nats_unseen(
     return nats
 
 
-def _unexplained(
-    facets: _Facets,
-    template: Template,
-    broken: Broken,
-    on_mm: Float[np.ndarray, "n 3"],
-    spacing_mm: float,
-    voxel_mm: float,
-    options: OccupancyOptions,
-) -> Float[np.ndarray, "k 1"]:
-    """(k, 1) 0 where scanned points lie on a facet, 1 where none does.
+def _unexplained(scan: _Scanned, facets: _Facets, voxel_mm: float) -> Values:
+    """(k,) 0 where scanned points lie on a facet, 1 where none does.
 
     On the template's surface its own points count, elsewhere those of what is broken.
     """
     share = np.ones(len(facets.one))
     on, off = np.flatnonzero(facets.on_template), np.flatnonzero(~facets.on_template)
-    f_mm, gradient = template.distance_and_gradient(facets.middle_mm[on])
+    f_mm, gradient = scan.template.distance_and_gradient(facets.middle_mm[on])
     feet_mm = facets.middle_mm[on] - f_mm[:, None] * unit_vectors(gradient)
-    share[on] = ~_is_seen(feet_mm, on_mm, spacing_mm, options)
+    share[on] = ~scan.sees(feet_mm)
     # steps of voxels lie beside the surface by up to about half of one
-    width_mm = options.gap_spacings * spacing_mm + 0.6 * voxel_mm
+    width_mm = scan.options.gap_spacings * scan.spacing_mm + 0.6 * voxel_mm
     middle_mm = facets.middle_mm[off]
-    nearest = nearest_within(middle_mm, broken.place_mm, 1.4 * width_mm)
+    nearest = nearest_within(middle_mm, scan.broken.place_mm, 1.4 * width_mm)
     found = nearest >= 0
-    apart_mm = np.linalg.norm(middle_mm[found] - broken.place_mm[nearest[found]], axis=1)
+    apart_mm = np.linalg.norm(middle_mm[found] - scan.broken.place_mm[nearest[found]], axis=1)
     share[off[found]] = -np.expm1(-((apart_mm / width_mm) ** 4))
-    return share[:, None]
+    return share
 
 
-def _told(
-    grid: _Grid,
-    template: Template,
-    on_mm: Float[np.ndarray, "p 3"],
-    spacing_mm: float,
-    options: OccupancyOptions,
-) -> Float[np.ndarray, " v"]:
+def _told(scan: _Scanned, grid: _Grid) -> Float[np.ndarray, " v"]:
     """(v,) what is known of each voxel by itself, nats: positive solid, negative empty.
 
     As designed, a little; behind a point on the template's surface solid and before it empty, but
     for strays; and beyond the box as designed.
     """
     inside = grid.is_inside
-    facet = (grid.voxel_mm / spacing_mm) ** 2
-    told = np.where(inside, 1.0, -1.0) * facet * grid.voxel_mm / options.deep_mm
-    f_mm, gradient = template.distance_and_gradient(on_mm)
+    facet = (grid.voxel_mm / scan.spacing_mm) ** 2
+    told = np.where(inside, 1.0, -1.0) * facet * grid.voxel_mm / scan.options.deep_mm
+    f_mm, gradient = scan.template.distance_and_gradient(scan.on_mm)
     outward = unit_vectors(gradient)
     for way in (-0.5, 0.5):
-        at_mm = on_mm + (way * grid.voxel_mm - f_mm)[:, None] * outward
-        number = grid.numbers_at(at_mm)
+        number = grid.numbers_at(scan.on_mm + (way * grid.voxel_mm - f_mm)[:, None] * outward)
         number = number[number >= 0]
         number = number[inside[number] == (way < 0)]
         count = np.bincount(number, minlength=len(told))
-        told += np.sign(way) * count * np.log(options.stray)
+        told += np.sign(way) * count * np.log(scan.options.stray)
     for axis in range(3):
         for end in (0, -1):
             face = np.take(grid.number, end, axis=axis)
@@ -383,23 +358,30 @@ def _told(
     return told
 
 
-def _labelled(
-    facets: _Facets, nats: Float[np.ndarray, "k 2"], told: Float[np.ndarray, " v"]
-) -> Bool[np.ndarray, " v"]:
-    """(v,) whether each voxel is empty in the cheapest labelling."""
+def _labelled(facets: _Facets, nats: Float[np.ndarray, "k 2"], told: Values) -> Mask:
+    """(v,) whether each voxel is empty in the cheapest labelling: a minimum cut.
+
+    Of equally cheap ones that with the most solid: empty is what still reaches what is empty for
+    certain once no more flow fits (Ford & Fulkerson 1956).
+    """
     count = len(told)
     for mine, none, k in ((facets.one, facets.other, 0), (facets.other, facets.one, 1)):
         edge = (mine >= 0) & (none < 0)  # what lies beyond is empty: solid ends here
         told = told - np.bincount(mine[edge], nats[edge, k], minlength=count)
-    room = np.zeros((count, 6), np.int32)
-    neighbour = np.full((count, 6), -1, np.int32)
-    whole = np.round(nats / UNIT_NATS).astype(np.int32)
     both = (facets.one >= 0) & (facets.other >= 0)
-    one, other, axis = facets.one[both], facets.other[both], facets.axis[both]
-    neighbour[one, 2 * axis], neighbour[other, 2 * axis + 1] = other, one
-    room[one, 2 * axis], room[other, 2 * axis + 1] = whole[both].T
-    rest = np.round(np.clip(told, -MOST_NATS, MOST_NATS) / UNIT_NATS).astype(np.int32)
-    return np.asarray(least_cut(neighbour, room, rest))
+    one, other, every = facets.one[both], facets.other[both], np.arange(count)
+    solid, empty = np.full(count, count), np.full(count, count + 1)
+    rows = np.concatenate([one, other, solid, every])
+    columns = np.concatenate([other, one, every, empty])
+    costs = np.concatenate([*nats[both].T, np.maximum(told, 0.0), np.maximum(-told, 0.0)])
+    fits = np.round(np.minimum(costs, MOST_NATS) / UNIT_NATS).astype(np.int32)
+    graph = coo_array((fits, (rows, columns)), shape=(count + 2, count + 2)).tocsr()
+    left = graph - maximum_flow(graph, count, count + 1).flow
+    left.eliminate_zeros()
+    reaching = breadth_first_order(left.T.tocsr(), count + 1, return_predecessors=False)
+    is_empty = np.zeros(count + 2, bool)
+    is_empty[reaching] = True
+    return is_empty[:count]
 
 
 @dataclass(frozen=True, slots=True)
@@ -422,17 +404,16 @@ class _Sides:
         Of a place with material on both sides, nats.
     """
 
-    toward: Int[np.ndarray, " q"]
-    away: Int[np.ndarray, " q"]
-    askew: Bool[np.ndarray, " q"]
+    toward: Numbers
+    away: Numbers
+    askew: Mask
     beyond: Int[np.ndarray, "2 q"]
     price: float
 
     @classmethod
-    def of(
-        cls, grid: _Grid, broken: Broken, spacing_mm: float, options: OccupancyOptions
-    ) -> _Sides:
+    def of(cls, scan: _Scanned, grid: _Grid) -> _Sides:
         """Of broken surface, a voxel's edge before and behind it."""
+        broken, options = scan.broken, scan.options
         along = (broken.outward * broken.plane).sum(axis=1)
         step_mm = grid.voxel_mm * np.sign(along)[:, None] * broken.plane
         toward, away, *beyond = (
@@ -441,22 +422,16 @@ class _Sides:
         )
         askew = np.abs(along) < options.way_cosine
         # of a wide facet's many places together no more is known than of a facet that nobody saw
-        most = -np.log1p(-options.largest_cover) / (grid.voxel_mm / spacing_mm) ** 2
+        most = -np.log1p(-options.largest_cover) / (grid.voxel_mm / scan.spacing_mm) ** 2
         price = float(min(-np.log(options.stray), most))
         return cls(toward, away, askew, np.stack(beyond), price)
 
-    def is_shut(self, empty: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, " q"]:
+    def is_shut(self, empty: Mask) -> Bool[np.ndarray, " q"]:
         """(q,) whether both sides are solid."""
         solid = np.append(~empty, False)
         return np.asarray(solid[self.toward] & solid[self.away])
 
-    def proposed(
-        self,
-        empty: Bool[np.ndarray, " v"],
-        room: Int[np.ndarray, " v"],
-        told: Float[np.ndarray, " v"],
-        least: float,
-    ) -> Iterator[Float[np.ndarray, " v"]]:
+    def proposed(self, empty: Mask, room: Numbers, told: Values, least: float) -> Iterator[Values]:
         """What voxels would say were shut places open towards the surface; away from it, as in a
         hollow under a film too thin to be told from it; or were a room empty that they bound.
 
@@ -473,21 +448,21 @@ class _Sides:
 
 
 def _with_open_sides(
-    empty: Bool[np.ndarray, " v"],
+    empty: Mask,
+    scan: _Scanned,
     facets: _Facets,
     nats: Float[np.ndarray, "k 2"],
-    told: Float[np.ndarray, " v"],
+    told: Values,
     grid: _Grid,
-    sides: _Sides,
-    scan_mm: Float[np.ndarray, "p 3"],
-    least: float,
-) -> Bool[np.ndarray, " v"]:
+) -> Mask:
     """The same, or a cheaper labelling in which broken surface has an open side.
 
-    `least` of the broken places must have none, or it stays.
+    As much of it as is around a bead must have none, or it stays.
     """
+    sides = _Sides.of(scan, grid)
+    least = np.pi * (scan.options.bead_mm / scan.spacing_mm) ** 2
 
-    def cost(labels: Bool[np.ndarray, " v"]) -> float:
+    def cost(labels: Mask) -> float:
         solid = np.append(~labels, False)
         one, other = solid[facets.one], solid[facets.other]
         surface = nats[one & ~other, 0].sum() + nats[other & ~one, 1].sum()
@@ -498,6 +473,7 @@ def _with_open_sides(
     within = grid.number >= 0
     uncut = within.copy()
     uncut[within] = ~empty
+    scan_mm = np.concatenate([scan.broken.place_mm, scan.on_mm])
     index, ok = _cells(scan_mm, grid.low_mm, grid.voxel_mm, uncut.shape)
     scanned = np.zeros(uncut.shape, bool)
     scanned[tuple(index[ok].T)] = True
@@ -512,29 +488,22 @@ def _with_open_sides(
     return best
 
 
-def _as_seen(
-    solid: Bool[np.ndarray, "x y z"],
-    designed: Bool[np.ndarray, "x y z"],
-    grid: _Grid,
-    broken: Broken,
-    spacing_mm: float,
-    options: OccupancyOptions,
-) -> Bool[np.ndarray, "x y z"]:
+def _as_seen(solid: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
     """The same, but as designed where too little that is broken bounds what differs.
 
     What hides a part of the surface hides all of it at once, so that no number of unseen places is
     evidence of a void. A void that takes an area M of the template's surface has a broken edge: if
     it goes right through, around M/2, at least as long as a circle's and a bead thick.
     """
-    found = solid.copy()
-    index, ok = _cells(broken.place_mm, grid.low_mm, grid.voxel_mm, solid.shape)
+    found, designed = solid.copy(), grid.f_mm < 0
+    index, ok = _cells(scan.broken.place_mm, grid.low_mm, grid.voxel_mm, solid.shape)
     at = tuple(index[ok].T)
     cross = ndimage.generate_binary_structure(3, 1)
     for differs in (designed & ~solid, solid & ~designed):
         groups, count = ndimage.label(differs)
         # a broken place lies in what differs or in a voxel beside it
         beside = ndimage.grey_dilation(groups, footprint=cross)
-        broken_mm2 = np.bincount(beside[at], minlength=count + 1) * spacing_mm**2
+        broken_mm2 = np.bincount(beside[at], minlength=count + 1) * scan.spacing_mm**2
         least_mm2 = np.zeros(count + 1)
         if differs[designed].any():
             mouth = np.zeros(solid.shape, np.int64)
@@ -543,18 +512,15 @@ def _as_seen(
                     mouth += ~np.roll(designed, way, axis=axis)
             mouth_mm2 = np.bincount(groups[differs], mouth[differs], count + 1) * grid.voxel_mm**2
             around_mm = 2.0 * np.sqrt(np.pi * 0.5 * mouth_mm2)
-            least_mm2 = options.least_seen * options.bead_mm * around_mm
+            least_mm2 = scan.options.least_seen * scan.options.bead_mm * around_mm
         alone = differs & ~((broken_mm2 > 0) & (broken_mm2 >= least_mm2))[groups]
         found[alone] = designed[alone]
     return found
 
 
 def _cells(
-    points_mm: Float[np.ndarray, "n 3"],
-    low_mm: Float[np.ndarray, " 3"],
-    voxel_mm: float,
-    shape: tuple[int, ...],
-) -> tuple[Int[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    points_mm: Points, low_mm: Float[np.ndarray, " 3"], voxel_mm: float, shape: tuple[int, ...]
+) -> tuple[Int[np.ndarray, "n 3"], Mask]:
     """Voxel of each point, and whether it lies in the box."""
     index = np.floor((points_mm - low_mm) / voxel_mm).astype(np.int64)
     return index, np.asarray(((index >= 0) & (index < np.array(shape))).all(axis=1))

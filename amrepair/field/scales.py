@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
+from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import scales_kernels as kernels
 from amrepair.frames import unit_vectors
 
@@ -50,23 +51,29 @@ class Scale:
 
     cell_mm: float
     of_base: Int[np.ndarray, " b"]
-    place_mm: Float[np.ndarray, "s 3"]
-    normal: Float[np.ndarray, "s 3"]
-    value_mm: Float[np.ndarray, " s"]
-    weight: Float[np.ndarray, " s"]
+    place_mm: Points
+    normal: Points
+    value_mm: Values
+    weight: Values
     table: Int[np.ndarray, "s k"]
-    count: Int[np.ndarray, " s"]
-    median_mm: Float[np.ndarray, " s"]
-    low_mm: Float[np.ndarray, " s"]
-    high_mm: Float[np.ndarray, " s"]
-    noise_mm: Float[np.ndarray, " s"]
-    window_weight: Float[np.ndarray, " s"]
+    count: Numbers
+    median_mm: Values
+    low_mm: Values
+    high_mm: Values
+    noise_mm: Values
+    window_weight: Values
 
     def __len__(self) -> int:
         return len(self.value_mm)
 
+    def cells_of(self, chosen: Mask) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+        """(p,) windows that are chosen, and (p,) the cells in each: a pair for each cell."""
+        which = np.flatnonzero(chosen)
+        inside = np.arange(self.table.shape[1]) < self.count[which, None]
+        return which[np.nonzero(inside)[0]], self.table[which][inside]
+
     @property
-    def is_surface(self) -> Bool[np.ndarray, " s"]:
+    def is_surface(self) -> Mask:
         """(s,) windows of as many cells as a surface has, most of them of more than one point.
 
         Points that stray in the air fall into one window by and by, each in a cell of its own.
@@ -75,10 +82,10 @@ class Scale:
 
 
 def scales_of(
-    place_mm: Float[np.ndarray, "b 3"],
-    normal: Float[np.ndarray, "b 3"],
-    value_mm: Float[np.ndarray, " b"],
-    weight: Float[np.ndarray, " b"],
+    place_mm: Points,
+    normal: Points,
+    value_mm: Values,
+    weight: Values,
     *,
     cell_mm: float,
     widest_mm: float,
@@ -117,10 +124,10 @@ def scales_of(
 
 def _scale(
     of_base: Int[np.ndarray, " b"],
-    place_mm: Float[np.ndarray, "c 3"],
-    normal: Float[np.ndarray, "c 3"],
-    value_mm: Float[np.ndarray, " c"],
-    weight: Float[np.ndarray, " c"],
+    place_mm: Points,
+    normal: Points,
+    value_mm: Values,
+    weight: Values,
     cell_mm: float,
     *,
     medians: bool,
@@ -160,7 +167,7 @@ def _scale(
     )
 
 
-def ways_of(normal: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " c"]:
+def ways_of(normal: Points) -> Numbers:
     """(c,) which of the six ways along the axes normals face most: −x, x, −y, y, −z, z; 6: none."""
     axis = np.abs(normal).argmax(axis=1)
     most = normal[np.arange(len(normal)), axis]
@@ -168,8 +175,8 @@ def ways_of(normal: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " c"]:
 
 
 def _grouped(
-    place_mm: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, "c 3"], cell_mm: float
-) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
+    place_mm: Points, normal: Points, cell_mm: float
+) -> tuple[Numbers, Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
     """Order of the cells by the wider cell that holds them, where each begins, keys, strides."""
     low = place_mm.min(axis=0)
     index = np.floor((place_mm - low) / cell_mm).astype(np.int64) + 1

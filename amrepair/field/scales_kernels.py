@@ -202,44 +202,6 @@ def pairs_apart(place, normal, which, least, most, cosine):
     return found[:n].copy()
 
 
-@njit(cache=True, nogil=True)
-def components(table, count, chosen):
-    """(s,) number of the connected group of each chosen cell, −1 for the others; how many."""
-    n = len(chosen)
-    group = np.full(n, -1, np.int32)
-    front = np.empty(n, np.int32)
-    groups = 0
-    for seed in range(n):
-        if not chosen[seed] or group[seed] >= 0:
-            continue
-        group[seed] = groups
-        front[0] = seed
-        waiting = 1
-        while waiting:
-            waiting -= 1
-            i = front[waiting]
-            for k in range(count[i]):
-                j = table[i, k]
-                if chosen[j] and group[j] < 0:
-                    group[j] = groups
-                    front[waiting] = j
-                    waiting += 1
-        groups += 1
-    return group, groups
-
-
-@njit(cache=True, nogil=True)
-def surest(table, count, chosen, log_p):
-    """(s,) the least `log_p` of the chosen windows that a cell lies in; 0 where it is in none."""
-    out = np.zeros(len(chosen))
-    for i in range(len(chosen)):
-        if chosen[i]:
-            for k in range(count[i]):
-                j = table[i, k]
-                out[j] = min(out[j], log_p[i])
-    return out
-
-
 @njit(cache=True, nogil=True, parallel=True)
 def window_farthest(table, count, value):
     """(s,) the cell of each window whose value is farthest from zero."""

@@ -64,7 +64,7 @@ def _as_normal(seen: list[tuple[Level, ...]]) -> bool:
     """Whether windows wander by no more than normal noise and the process leave, at any width."""
     widths = zip(*(levels[1:] for levels in seen), strict=False)
     return all(
-        float(np.median(np.concatenate([level.common_mm for level in one]))) == 0.0
+        float(np.median(np.concatenate([level.errors.common_mm for level in one]))) == 0.0
         for one in widths
     )
 

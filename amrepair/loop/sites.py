@@ -16,7 +16,7 @@ from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Detector, Site
-from amrepair.template import LaidBeads, PlannedSdf
+from amrepair.template import KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
@@ -71,6 +71,7 @@ def sites(
         [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
     )
     template_from_build = build_from_template.inverse()
+    kept = KeptFills()
 
     def at(stop: Stop) -> Site:
         if stop.layer_index is None:
@@ -83,7 +84,7 @@ def sites(
                 calibration=NORMAL_NOISE,
                 lines=lines_of_job(job, every),
                 beside=_beside(job, every),
-                laid=_laid(job, every),
+                laid=_laid(job, every, kept),
             )
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
@@ -107,13 +108,13 @@ def sites(
             lines=lines_of_job(job, done),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
             beside=None if by_beads else _beside(job, done),
-            laid=_laid(job, done),
+            laid=_laid(job, done, kept),
         )
 
     return Expected(template, build_from_template, setup, by_beads, detector, at)
 
 
-def _laid(job: Job, which: Bool[np.ndarray, " n"]) -> LaidBeads | None:
+def _laid(job: Job, which: Bool[np.ndarray, " n"], kept: KeptFills) -> LaidBeads | None:
     """Some of a job's beads, by layer, without what it lays beside the part."""
     beads = job.beads
     pick = which & ~of_roles(beads, BESIDE_THE_PART)
@@ -125,6 +126,7 @@ def _laid(job: Job, which: Bool[np.ndarray, " n"]) -> LaidBeads | None:
         beads.section_mm2[pick],
         beads.height_mm[pick],
         beads.layer[pick],
+        kept=kept,
     )
 
 

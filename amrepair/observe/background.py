@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from amrepair.arrays import Mask, Points, Values
 from amrepair.errors import InputError
 from amrepair.frames import diagonal
 from amrepair.observe.options import USUAL_BACKGROUND, BackgroundOptions
@@ -37,10 +38,10 @@ def refuse_wrong_scale(scan: Scan, template: Template) -> None:
 def background(
     scan: Scan,
     template: Template,
-    f_mm: Float[np.ndarray, " n"],
+    f_mm: Values,
     surface_mm: Float[np.ndarray, "m 3"],
     options: BackgroundOptions = USUAL_BACKGROUND,
-) -> Bool[np.ndarray, " n"]:
+) -> Mask:
     """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
     low_z = float(template.bounds_mm[0, 2])
     if _shows_underside(scan, template, f_mm, surface_mm, options):
@@ -64,7 +65,7 @@ def _rim_mm(scan: Scan, options: BackgroundOptions) -> float:
 def _shows_underside(
     scan: Scan,
     template: Template,
-    f_mm: Float[np.ndarray, " n"],
+    f_mm: Values,
     surface_mm: Float[np.ndarray, "m 3"],
     options: BackgroundOptions,
 ) -> bool:
@@ -73,7 +74,7 @@ def _shows_underside(
     rim_mm = _rim_mm(scan, options)
     near = np.flatnonzero((np.abs(f_mm) < rim_mm) & (scan.points_mm[:, 2] < low_z + rim_mm))
 
-    def cells_within(points_mm: Float[np.ndarray, "k 3"]) -> set[tuple[int, int]]:
+    def cells_within(points_mm: Points) -> set[tuple[int, int]]:
         above = points_mm.copy()
         above[:, 2] = low_z + rim_mm + options.underside_rim_mm
         under = above[template.distance(above) < -rim_mm, :2] if len(above) else above[:, :2]

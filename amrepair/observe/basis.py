@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import helmert
 
+from amrepair.arrays import Points
 from amrepair.errors import InputError
 
 BOWS = ((0, 1), (0, 2), (1, 2))  # (along, towards): a long axis bends towards a shorter one
@@ -68,7 +69,7 @@ class Frame:
     half_extent_mm: Float[np.ndarray, " 3"]
 
     @classmethod
-    def of(cls, place_mm: Float[np.ndarray, "n 3"]) -> Frame:
+    def of(cls, place_mm: Points) -> Frame:
         """Return the frame of places that cover the surface evenly."""
         centre_mm = place_mm.mean(axis=0)
         axes = np.linalg.eigh(np.cov((place_mm - centre_mm).T, bias=True))[1].T[::-1]
@@ -85,9 +86,7 @@ class Frame:
         return frame
 
 
-def shape_columns(
-    place_mm: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], frame: Frame
-) -> Float[np.ndarray, "n 11"]:
+def shape_columns(place_mm: Points, normal: Points, frame: Frame) -> Float[np.ndarray, "n 11"]:
     """How pose, scale and bow move each place along its normal.
 
     A bend along i towards j by the sag a moves a body by a xi²/hi² along j and, since sections

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.frames import unit_vectors
 
 REACH_LENGTHS = 3.0  # exp(-3): what lies farther shares 5 % of its error and is left out
@@ -32,19 +32,19 @@ class Cells:
         (n,) how many independent observations it is worth, 0 to 1.
     """
 
-    place_mm: Float[np.ndarray, "n 3"]
-    normal: Float[np.ndarray, "n 3"]
-    deviation_mm: Float[np.ndarray, " n"]
-    view: Int[np.ndarray, " n"]
-    share: Float[np.ndarray, " n"]
+    place_mm: Points
+    normal: Points
+    deviation_mm: Values
+    view: Numbers
+    share: Values
 
 
 def gather(
-    place_mm: Float[np.ndarray, "s 3"],
-    normal: Float[np.ndarray, "s 3"],
-    deviation_mm: Float[np.ndarray, " s"],
-    weight: Float[np.ndarray, " s"],
-    view: Int[np.ndarray, " s"],
+    place_mm: Points,
+    normal: Points,
+    deviation_mm: Values,
+    weight: Values,
+    view: Numbers,
     *,
     side_mm: float,
     correlation_mm: float,
@@ -78,9 +78,7 @@ def gather(
     )
 
 
-def independent_share(
-    place_mm: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], correlation_mm: float
-) -> Float[np.ndarray, " n"]:
+def independent_share(place_mm: Points, view: Numbers, correlation_mm: float) -> Values:
     """Say how many independent observations each is worth among its neighbours.
 
     Errors of one view correlate by exp(−r / correlation_mm); a crowd whose correlations sum up
@@ -98,7 +96,7 @@ def independent_share(
     return 1 / together
 
 
-def blocks(place_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+def blocks(place_mm: Points) -> Numbers:
     """Return 2⁴ blocks of about as many places each, by halving the longest side."""
     block = np.zeros(len(place_mm), np.int64)
     for _ in range(SPLITS):

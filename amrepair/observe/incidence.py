@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Points, Values
 from amrepair.frames import unit_vectors
 from amrepair.observe.rays import MIN_COSINE
 
@@ -13,9 +14,7 @@ TURNED_AWAY = 0.03
 DIRECTIONS, FEW_PLACES = 1000, 1200  # 6° apart; so many places tell the way that they face
 
 
-def incidence(
-    normal: Float[np.ndarray, "n 3"], to_sensor: Float[np.ndarray, "n 3"] | None
-) -> Float[np.ndarray, " n"]:
+def incidence(normal: Points, to_sensor: Points | None) -> Values:
     """(n,) cosine of the angle of incidence, at least that of a grazing ray; 1 where nobody knows.
 
     Parameters
@@ -33,7 +32,7 @@ def incidence(
     return np.maximum((unit_vectors(to_sensor) * normal).sum(axis=1), MIN_COSINE)
 
 
-def _way_of_one_view(normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"] | None:
+def _way_of_one_view(normal: Points) -> Float[np.ndarray, " 3"] | None:
     """(3,) the way that all but a few places face; None where they were seen from more sides."""
     if not len(normal):
         return None

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import f as f_distribution
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import InputError
 from amrepair.observe.basis import (
     BOW_AT,
@@ -69,7 +70,7 @@ class Nuisance:
     twist: Float[np.ndarray, " 6"]
     scale_ratio: float
     bow_mm: Float[np.ndarray, " 4"]
-    view_offset_mm: Float[np.ndarray, " v"]
+    view_offset_mm: Values
     covariance: Float[np.ndarray, "p p"]
     sigma_mm: float
     supported: tuple[str, ...]
@@ -77,12 +78,7 @@ class Nuisance:
     independent: float
     options: NuisanceOptions
 
-    def removed_mm(
-        self,
-        place_mm: Float[np.ndarray, "s 3"],
-        normal: Float[np.ndarray, "s 3"],
-        view: Int[np.ndarray, " s"] | None = None,
-    ) -> Float[np.ndarray, " s"]:
+    def removed_mm(self, place_mm: Points, normal: Points, view: Numbers | None = None) -> Values:
         """Return the part of the deviation that is nuisance, to be subtracted.
 
         Parameters
@@ -99,9 +95,7 @@ class Nuisance:
             removed_mm = removed_mm + known
         return np.asarray(removed_mm)
 
-    def error_mm(
-        self, place_mm: Float[np.ndarray, "s 3"], normal: Float[np.ndarray, "s 3"]
-    ) -> Float[np.ndarray, " s"]:
+    def error_mm(self, place_mm: Points, normal: Points) -> Values:
         """(s,) standard error of `removed_mm` by pose, scale and bow: √(J Σ Jᵀ)."""
         shape = shape_columns(place_mm, normal, self.frame)
         sigma = self.covariance[:VIEWS_AT, :VIEWS_AT]
@@ -197,12 +191,12 @@ class Nuisance:
 
 
 def fit_nuisance(
-    place_mm: Float[np.ndarray, "s 3"],
-    normal: Float[np.ndarray, "s 3"],
-    deviation_mm: Float[np.ndarray, " s"],
-    weight: Float[np.ndarray, " s"],
+    place_mm: Points,
+    normal: Points,
+    deviation_mm: Values,
+    weight: Values,
     *,
-    view: Int[np.ndarray, " s"] | None = None,
+    view: Numbers | None = None,
     tolerance_mm: float,
     correlation_mm: float,
     options: NuisanceOptions = USUAL_NUISANCE,
@@ -309,12 +303,7 @@ def _supported(
         problem = Problem(design[:, kept], cells.deviation_mm, cells.share, tolerance_mm)
 
 
-def _chance(
-    value: Float[np.ndarray, " k"],
-    spread: Float[np.ndarray, "q q"],
-    at: Int[np.ndarray, " k"],
-    spare: int,
-) -> float:
+def _chance(value: Values, spread: Float[np.ndarray, "q q"], at: Numbers, spare: int) -> float:
     """How probable so large a value is where the truth is zero (Hotelling's test)."""
     within = spread[np.ix_(at, at)]
     size = float(value @ np.linalg.solve(within, value)) / len(value)

@@ -41,21 +41,6 @@ def directions(points, index, sensor, origin, axes, count):
 
 
 @njit(cache=True, nogil=True)
-def box(values):
-    """(2, c) least and greatest of each column."""
-    n, c = values.shape
-    out = np.empty((2, c))
-    for k in range(c):
-        out[0, k], out[1, k] = np.inf, -np.inf
-    for i in range(n):
-        for k in range(c):
-            v = values[i, k]
-            out[0, k] = min(out[0, k], v)
-            out[1, k] = max(out[1, k], v)
-    return out
-
-
-@njit(cache=True, nogil=True)
 def cells_filled(directions, low, cell, columns, rows):
     """How many cells of a coarse grid hold a direction."""
     filled = np.zeros((rows, columns), np.bool_)

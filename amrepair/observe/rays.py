@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from amrepair.frames import Transform, unit_vectors
+from amrepair.arrays import Numbers, Points, Values
+from amrepair.frames import Transform, box_of, unit_vectors
 from amrepair.observe import range_kernels as kernels
 from amrepair.scans import Scan
 from gcode.compiled import get_num_threads
@@ -64,9 +65,7 @@ class RangeImage:
             axes=target_from_source.rotate(self.axes),
         )
 
-    def passing_error(
-        self, points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, " n"]:
+    def passing_error(self, points_mm: Points, normals: Points) -> Values:
         """(n,) standard error of how deep rays pass below surface with such normals, mm.
 
         A ray is known to its pixel, sideways. Where it grazes the surface all of that is depth,
@@ -77,12 +76,7 @@ class RangeImage:
         sideways_mm = PIXEL_SIGMA * self.pixel * np.linalg.norm(ways, axis=1)
         return np.asarray(sideways_mm * np.sqrt(np.maximum(1.0 - along**2, 0.0)))
 
-    def raise_clearance(
-        self,
-        points_mm: Float[np.ndarray, "n 3"],
-        best_mm: Float[np.ndarray, " n"],
-        least_mm: Float[np.ndarray, " n"],
-    ) -> None:
+    def raise_clearance(self, points_mm: Points, best_mm: Values, least_mm: Values) -> None:
         """Raise to how far points lie in front of what was seen: best estimate, least around it.
 
         Measured across the seen surface, mm; where the sensor saw nothing along that line both
@@ -114,8 +108,8 @@ def range_images(scan: Scan) -> tuple[RangeImage, ...]:
 
 
 def clearances(
-    images: tuple[RangeImage, ...], points_mm: Float[np.ndarray, "n 3"], unseen_mm: float
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    images: tuple[RangeImage, ...], points_mm: Points, unseen_mm: float
+) -> tuple[Values, Values]:
     """The emptiest of what the range images say of points, and of their cautious answers, mm.
 
     `unseen_mm` is the answer where none of them saw anything.
@@ -138,16 +132,12 @@ class Passed:
         (c,) how deep below them rays still pass, and its standard error.
     """
 
-    which: Int[np.ndarray, " c"]
-    depth_mm: Float[np.ndarray, " c"]
-    error_mm: Float[np.ndarray, " c"]
+    which: Numbers
+    depth_mm: Values
+    error_mm: Values
 
 
-def passed(
-    images: tuple[RangeImage, ...],
-    surface_mm: Float[np.ndarray, "m 3"],
-    normals: Float[np.ndarray, "m 3"],
-) -> Passed:
+def passed(images: tuple[RangeImage, ...], surface_mm: Points, normals: Points) -> Passed:
     """Which places of a surface rays passed, and how deep below it they do without a gap.
 
     A ray that grazes an edge sees far beyond it, whatever hair's breadth it passed inside: what
@@ -158,13 +148,13 @@ def passed(
     which = np.flatnonzero(beyond_mm > 0)
     surface_mm, normals, most_mm = surface_mm[which], normals[which], 2.0 * beyond_mm[which]
 
-    def passes(among: Int[np.ndarray, " k"], deep_mm: Float[np.ndarray, " k"]) -> Any:
+    def passes(among: Numbers, deep_mm: Values) -> Any:
         below_mm = surface_mm[among] - deep_mm[:, None] * normals[among]
         return clearances(images, below_mm, -np.inf)[1] > 0
 
     every = np.arange(len(which))
     passed_mm = np.zeros(len(which))
-    stopped_mm = np.full(len(which), min(image.step_mm for image in images))
+    stopped_mm = np.full(len(which), min((image.step_mm for image in images), default=0.0))
     going = every
     while len(going):
         going = going[passes(going, stopped_mm[going]) & (stopped_mm[going] < most_mm[going])]
@@ -193,7 +183,7 @@ def _image(scan: Scan, k: int) -> RangeImage | None:
         return None
     axes = _facing(mean - sensor_mm)
     rays = kernels.directions(scan.points_mm, scan.sensor_index, k, sensor_mm, axes, count)
-    low, high = kernels.box(rays)[:, :2]
+    low, high = box_of(rays[:, :2])
     # the pixel holds one to two points on average: spacing measured in the image itself
     pixel = _image_spacing(rays, low, high) * 1.15
     extent = high - low
@@ -218,7 +208,7 @@ def _image(scan: Scan, k: int) -> RangeImage | None:
 
 
 def _image_spacing(
-    rays: Float[np.ndarray, "n 3"], low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
+    rays: Points, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
 ) -> float:
     """Mean spacing of directions from the share of a coarse grid that they fill."""
     extent = np.maximum(high - low, 1e-9)

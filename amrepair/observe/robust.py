@@ -15,7 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
+
+from amrepair.arrays import Numbers, Values
 
 BIWEIGHT_EFFICIENT = 4.685  # Tukey's constant: 95 % efficient where the noise is Gaussian
 MAD_TO_SIGMA = 1.4826  # of a Gaussian
@@ -45,15 +47,15 @@ class Problem:
     """
 
     design: Float[np.ndarray, "n p"]
-    observed_mm: Float[np.ndarray, " n"]
-    share: Float[np.ndarray, " n"]
+    observed_mm: Values
+    share: Values
     allowed_mm: float
 
-    def residual_mm(self, unknown: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+    def residual_mm(self, unknown: Float[np.ndarray, " p"]) -> Values:
         """Observed minus modelled."""
         return self.observed_mm - self.design @ unknown
 
-    def noise_mm(self, unknown: Float[np.ndarray, " p"]) -> float:
+    def noise_mm(self, unknown: Values) -> float:
         """Standard deviation of one observation, by those that the loss would count."""
         off = np.abs(self.residual_mm(unknown))
         order = np.argsort(off, kind="stable")
@@ -87,11 +89,11 @@ class Solution:
     """
 
     unknown: Float[np.ndarray, " p"]
-    weight: Float[np.ndarray, " n"]
+    weight: Values
     sigma_mm: float
 
 
-def solve(problem: Problem, starts: tuple[Float[np.ndarray, " p"], ...] = ()) -> Solution:
+def solve(problem: Problem, starts: tuple[Values, ...] = ()) -> Solution:
     """Return the best of descents from a graduated answer, from zero and from `starts`.
 
     The best is judged by the noise alone, without what a sound part is allowed: that most lies
@@ -110,9 +112,7 @@ def solve(problem: Problem, starts: tuple[Float[np.ndarray, " p"], ...] = ()) ->
     return Solution(best, weight, width_mm / BIWEIGHT_EFFICIENT)
 
 
-def starts_by_block(
-    problem: Problem, block: Int[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " p"], ...]:
+def starts_by_block(problem: Problem, block: Numbers) -> tuple[Float[np.ndarray, " p"], ...]:
     """Answers of plain least squares that leave out a half, a quarter or an eighth of the blocks.
 
     Blocks are numbered by halving, so that those of one part of the surface share their first
@@ -126,7 +126,7 @@ def starts_by_block(
     return tuple(_step(problem, (~left).astype(float), sigma_mm) for left in out)
 
 
-def _graduated(problem: Problem) -> Float[np.ndarray, " p"]:
+def _graduated(problem: Problem) -> Values:
     unknown = np.zeros(problem.design.shape[1])
     width_mm = 2.0 * float(np.abs(problem.observed_mm).max())
     final_mm = problem.width_mm(problem.noise_mm(unknown))
@@ -137,9 +137,7 @@ def _graduated(problem: Problem) -> Float[np.ndarray, " p"]:
     return unknown
 
 
-def _descend(
-    problem: Problem, unknown: Float[np.ndarray, " p"], width_mm: float, steps: int
-) -> Float[np.ndarray, " p"]:
+def _descend(problem: Problem, unknown: Values, width_mm: float, steps: int) -> Values:
     for _ in range(steps):
         weight = biweight(problem.residual_mm(unknown), width_mm)
         before, unknown = unknown, _step(problem, weight, width_mm / BIWEIGHT_EFFICIENT)
@@ -148,28 +146,24 @@ def _descend(
     return unknown
 
 
-def _cost(problem: Problem, unknown: Float[np.ndarray, " p"], width_mm: float) -> float:
+def _cost(problem: Problem, unknown: Values, width_mm: float) -> float:
     inside = np.minimum((problem.residual_mm(unknown) / width_mm) ** 2, 1.0)
     loss = BIWEIGHT_EFFICIENT**2 / 3 * (1 - (1 - inside) ** 3)  # (r / sigma)² near zero
     return float(problem.share @ loss + unknown @ unknown)
 
 
-def biweight(residual_mm: Float[np.ndarray, " n"], width_mm: float) -> Float[np.ndarray, " n"]:
+def biweight(residual_mm: Values, width_mm: float) -> Values:
     """Tukey's weight: 1 at zero, 0 from `width_mm` on."""
     return np.maximum(1 - (residual_mm / width_mm) ** 2, 0.0) ** 2
 
 
-def _step(
-    problem: Problem, weight: Float[np.ndarray, " n"], sigma_mm: float
-) -> Float[np.ndarray, " p"]:
+def _step(problem: Problem, weight: Values, sigma_mm: float) -> Float[np.ndarray, " p"]:
     weighted = problem.design.T * (weight * problem.share / sigma_mm**2)
     normal = weighted @ problem.design + np.eye(problem.design.shape[1])
     return np.linalg.solve(normal, weighted @ problem.observed_mm)
 
 
-def covariance(
-    problem: Problem, solution: Solution, block: Int[np.ndarray, " n"]
-) -> Float[np.ndarray, "p p"]:
+def covariance(problem: Problem, solution: Solution, block: Numbers) -> Float[np.ndarray, "p p"]:
     """Covariance of the unknowns: by the noise, and by what leaving out a block changes.
 
     The second part sees what the noise does not: an unknown that one place alone asks for moves

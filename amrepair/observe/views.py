@@ -5,14 +5,37 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from amrepair.arrays import Mask, Numbers, Values
 from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.robust import MAD_TO_SIGMA
 
 LEAST_PLACES = 30  # that a view shares with others: fewer tell nothing of it
 # Two views contradict each other alike, within so much: the template says which of them is off.
 CONTRADICT_ALIKE = 1.1
+
+
+@dataclass(frozen=True, slots=True)
+class Shares:
+    """Which view says what of which place: (n,) places, views, deviations, numbers of points."""
+
+    place: Numbers
+    view: Numbers
+    value_mm: Values
+    count: Numbers
+
+    def gathered(self) -> Shares:
+        """What a view says several times of one place as one, the places rising."""
+        views = int(self.view.max(initial=0)) + 1
+        key = self.place * views + self.view
+        count = np.bincount(key, self.count)
+        keys = np.flatnonzero(count)
+        mean_mm = np.bincount(key, self.count * self.value_mm)[keys] / count[keys]
+        return Shares(keys // views, keys % views, mean_mm, count[keys].astype(np.int64))
+
+    def some(self, which: Mask) -> Shares:
+        """Some of them."""
+        return Shares(self.place[which], self.view[which], self.value_mm[which], self.count[which])
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,56 +69,41 @@ class Contradiction:
 
 
 def contradictions(
-    cell: Int[np.ndarray, " k"],
-    view: Int[np.ndarray, " k"],
-    value_mm: Float[np.ndarray, " k"],
-    count: Int[np.ndarray, " k"],
-    *,
-    point_sigma_mm: float,
-    options: NuisanceOptions,
+    shares: Shares, *, point_sigma_mm: float, options: NuisanceOptions
 ) -> tuple[Contradiction, ...]:
     """Views to leave out, the worst first, until the rest agree.
 
     Parameters
     ----------
-    cell, view, value_mm, count
-        (k,) each: which view says what of which place, by how many points, without what belongs
-        to the whole part or to a whole view. A view may say several things of a place.
+    shares
+        Without what belongs to the whole part or to a whole view.
     point_sigma_mm
         Standard deviation of one point about its neighbours.
     options
         Beyond `told_sigma` times what views differ by, and the noise, they contradict each other.
     """
     found: list[Contradiction] = []
-    views = int(view.max(initial=0)) + 1
-    key = cell * views + view
-    summed, points = np.bincount(key, count * value_mm), np.bincount(key, count)
-    key = np.flatnonzero(points)
-    cell, view = key // views, key % views
-    points = points[key]
-    value_mm = summed[key] / points
+    told = shares.gathered()
     while True:
-        total = np.bincount(cell, points * value_mm)[cell] - points * value_mm
-        others = np.bincount(cell, points)[cell] - points
+        points, place = told.count, told.place
+        total = np.bincount(place, points * told.value_mm)[place] - points * told.value_mm
+        others = np.bincount(place, points)[place] - points
         shared = others > 0
-        apart_mm = value_mm[shared] - total[shared] / others[shared]
+        apart_mm = told.value_mm[shared] - total[shared] / others[shared]
         noise_mm = point_sigma_mm * np.sqrt(1.0 / points[shared] + 1.0 / others[shared])
         table = []
-        for k in np.unique(view):
-            own = view[shared] == k
+        for k in np.unique(told.view):
+            own = told.view[shared] == k
             if own.sum() < LEAST_PLACES:
                 continue
             spread_mm = MAD_TO_SIGMA * float(np.median(np.abs(apart_mm[own])))
             usual_mm = np.hypot(options.view_offset_sigma_mm, float(np.median(noise_mm[own])))
             if spread_mm > options.told_sigma * usual_mm:
-                off_mm = float(np.median(np.abs(value_mm[shared][own])))
+                off_mm = float(np.median(np.abs(told.value_mm[shared][own])))
                 table.append((spread_mm, off_mm, Contradiction(int(k), spread_mm, int(own.sum()))))
         if not table:
             return tuple(found)
         most_mm = max(row[0] for row in table)
-        worst = max(
-            (row for row in table if CONTRADICT_ALIKE * row[0] >= most_mm), key=lambda row: row[1]
-        )[2]
-        found.append(worst)
-        stays = view != worst.view
-        cell, view, value_mm, points = cell[stays], view[stays], value_mm[stays], points[stays]
+        alike = [row for row in table if CONTRADICT_ALIKE * row[0] >= most_mm]
+        found.append(max(alike, key=lambda row: row[1])[2])
+        told = told.some(told.view != found[-1].view)

@@ -8,6 +8,7 @@ from enum import IntEnum, StrEnum
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.field.as_built import Evidence
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
@@ -115,10 +116,10 @@ class AnomalyMap:
         What stood in for the scan's own word on its errors, and what the test was set to.
     """
 
-    points_mm: Float[np.ndarray, "n 3"]
-    deviation_mm: Float[np.ndarray, " n"]
-    score: Float[np.ndarray, " n"]
-    label: Int[np.ndarray, " n"]
+    points_mm: Points
+    deviation_mm: Values
+    score: Values
+    label: Numbers
     template_points_mm: Float[np.ndarray, "m 3"]
     template_label: Int[np.ndarray, " m"]
     threshold_mm: float

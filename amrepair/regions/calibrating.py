@@ -26,7 +26,7 @@ def calibrated(name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
     for levels in scans:
         for level in levels[1:]:
             width_mm = round(3.0 * level.scale.cell_mm, 1)
-            widths.setdefault(width_mm, []).append(level.wander_mm)
+            widths.setdefault(width_mm, []).append(level.errors.wander_mm)
     wander = []
     for found in (widths[width] for width in sorted(widths)):
         classes = max(len(table) for table in found)

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Values
 from amrepair.errors import InputError
 from gcode.whole import put_in_place
 
@@ -39,7 +39,7 @@ class Tail:
     peaks: float
     told_by: float
 
-    def log_expected(self, z: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+    def log_expected(self, z: Values) -> Values:
         """(s,) logarithm of how many peaks of sound places a scan has beyond each value.
 
         An exponential whose mean is itself told by `told_by` peaks predicts a Lomax tail.
@@ -77,7 +77,7 @@ class Calibration:
     wander_mm: tuple[tuple[float, ...], ...] = ()
     tails: tuple[tuple[float, float, float, float], ...] = ()
 
-    def wander(self, width_mm: float, classes: int) -> Float[np.ndarray, " c"]:
+    def wander(self, width_mm: float, classes: int) -> Values:
         """(c,) standard deviation of means of windows so wide, by class; 0 where none is known."""
         if not self.width_mm:
             return np.zeros(classes)

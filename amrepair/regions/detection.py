@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.stats import norm
 
+from amrepair.arrays import Mask, Numbers, Points
 from amrepair.field.as_built import Evidence, gather, with_stubs
-from amrepair.field.fused import Surfels
 from amrepair.field.groups import group_points, touching_mm
-from amrepair.field.near import nearest_within
-from amrepair.field.scales import scales_of
 from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration
@@ -22,7 +20,6 @@ from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import find_regions
 from amrepair.regions.significance import Level, as_student, tested
 from amrepair.regions.sites import (
-    PRESENT_CELLS,
     Observed,
     RoundedUp,
     Sites,
@@ -45,7 +42,7 @@ def detect(
     calibration: Calibration | None = None,
     top_z_mm: float | None = None,
     images: tuple[RangeImage, ...] | None = None,
-    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
+    surface: tuple[Points, Points] | None = None,
     rounded_up: RoundedUp | None = None,
     pose_is_known: bool = False,
     progress: Progress = silent,
@@ -94,15 +91,15 @@ def detect(
 
     def observe(without: tuple[int, ...]) -> tuple[Observed, Sites]:
         seen = observed(scan, template, options, images, surface, without)
-        return seen, sites_of(seen, scan, template, options, top_z_mm, rounded_up)
+        return seen, sites_of(seen, options, top_z_mm, rounded_up)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
     whole_part = top_z_mm is None and calibration != NORMAL_NOISE and not pose_is_known
-    seen, sites, nuisance, contradicting = agreed(observe, scan, options, whole_part)
+    seen, sites, nuisance, contradicting = agreed(observe, whole_part, options)
     progress("detect", 1.0, 4.0)
-    test = _tested(seen, sites, scan, template, options, calibration)
+    test = _tested(seen, sites, options, calibration)
     progress("detect", 2.0, 4.0)
-    evidence, surface_label = _bounded(seen, test, scan, template, options, calibration)
+    evidence, surface_label = _bounded(seen, test, options, calibration)
     progress("detect", 3.0, 4.0)
     regions = find_regions(
         evidence, test.missing, test.excess, seen.surface_mm, surface_label, template,
@@ -154,8 +151,8 @@ class _Tested:
 
     levels: tuple[Level, ...]
     noise: Noise
-    missing: Bool[np.ndarray, " s"]
-    excess: Bool[np.ndarray, " s"]
+    missing: Mask
+    excess: Mask
     gone: Bool[np.ndarray, " m"]
     gone_p_value: Float[np.ndarray, " m"]
     log_p: Float[np.ndarray, "2 all"]
@@ -164,56 +161,55 @@ class _Tested:
 
 
 def _tested(
-    seen: Observed,
-    sites: Sites,
-    scan: Scan,
-    template: Template,
-    options: RegionOptions,
-    calibration: Calibration | None,
+    seen: Observed, sites: Sites, options: RegionOptions, calibration: Calibration | None
 ) -> _Tested:
     """Test every scale, and grow regions from where it is significant."""
-    surfels = seen.surfels
-    levels = _levels(sites, options, calibration)
-    strands = _strands(surfels, template, levels, options, calibration)
-    tolerances_mm = tolerances(options, template)
+    cells, crossed = slice(len(seen.surfels)), slice(len(seen.surfels), None)
+    levels = tested(sites, options, calibration)
+    # what errors leave in strips neither a scan nor a calibration tells: only where they are known
+    # to be normal is there any
+    strands = np.zeros(len(seen.surfels), bool)
+    if calibration == NORMAL_NOISE:
+        strands = _strands(seen, levels, options)
+    tolerances_mm = tolerances(options, seen.template)
     labels, log_p = grown(
         levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
     )
-    missing, excess = labels[:, : len(surfels)]
     gone = np.zeros(len(seen.surface_mm), bool)
-    gone[seen.crossed.which] = labels[0, len(surfels) :]
+    gone[seen.crossed.which] = labels[0, crossed]
     gone_p_value = np.ones(len(seen.surface_mm))
-    gone_p_value[seen.crossed.which] = np.exp(log_p[0, len(surfels) :])
+    gone_p_value[seen.crossed.which] = np.exp(log_p[0, crossed])
     errors = as_student(levels[1].quantile, levels[1].freedom)
     noise_mm = float(np.median(errors * levels[1].error_mm))
-    limit_mm, top_mm = (t + noise_mm for t in tolerances_mm)
-    noise = noise_of(levels, surfels, scan, options)
     return _Tested(
-        levels, noise, missing, excess, gone, gone_p_value, log_p, limit_mm, top_mm
-    )  # fmt: skip
+        levels,
+        noise=noise_of(levels, seen.shares, seen.scan.sigma_mm, options),
+        missing=labels[0, cells],
+        excess=labels[1, cells],
+        gone=gone,
+        gone_p_value=gone_p_value,
+        log_p=log_p,
+        limit_mm=tolerances_mm[0] + noise_mm,
+        top_mm=tolerances_mm[1] + noise_mm,
+    )
 
 
 def _bounded(
-    seen: Observed,
-    test: _Tested,
-    scan: Scan,
-    template: Template,
-    options: RegionOptions,
-    calibration: Calibration | None,
-) -> tuple[Evidence, Int[np.ndarray, " m"]]:
+    seen: Observed, test: _Tested, options: RegionOptions, calibration: Calibration | None
+) -> tuple[Evidence, Numbers]:
     """What is known of the space around regions, and of each place of the template's surface."""
     labelled = test.missing | test.excess
     evidence = gather(
-        scan,
-        template,
+        seen.scan,
+        seen.template,
         seen.surfels,
         labelled,
         seen.images,
         threshold_mm=min(_stray_limit_mm(test.levels[0], options, calibration), test.limit_mm),
         options=options.evidence,
     )
-    surface_label = _label_surface(seen, template, evidence, test)
-    return with_stubs(evidence, scan, seen.surface_mm[test.gone], labelled), surface_label
+    surface_label = _label_surface(seen, evidence, test)
+    return with_stubs(evidence, seen.scan, seen.surface_mm[test.gone], labelled), surface_label
 
 
 def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
@@ -223,45 +219,12 @@ def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
     """
     assert anomaly.sites is not None
     assert anomaly.options is not None
-    return _levels(anomaly.sites, anomaly.options, None)
+    return tested(anomaly.sites, anomaly.options, None)
 
 
-def _levels(
-    sites: Sites, options: RegionOptions, calibration: Calibration | None
-) -> tuple[Level, ...]:
-    """The test of every scale."""
-    scales = scales_of(
-        sites.place_mm,
-        sites.normal,
-        sites.value_mm,
-        sites.weight,
-        cell_mm=sites.cell_mm,
-        widest_mm=options.widest_mm,
-    )
-    return tested(
-        scales,
-        sites.tolerance_mm,
-        options,
-        facing=sites.facing,
-        pose_mm=sites.pose_mm,
-        calibration=calibration,
-    )
-
-
-def _strands(
-    surfels: Surfels,
-    template: Template,
-    levels: tuple[Level, ...],
-    options: RegionOptions,
-    calibration: Calibration | None,
-) -> Bool[np.ndarray, " s"]:
-    """(s,) cells of strips narrower than any window that stand out along their length.
-
-    What errors leave in strips neither a scan nor a calibration tells: only where they are known to
-    be normal is there any.
-    """
-    if calibration != NORMAL_NOISE:
-        return np.zeros(len(surfels), bool)
+def _strands(seen: Observed, levels: tuple[Level, ...], options: RegionOptions) -> Mask:
+    """(n,) cells of strips narrower than any window that stand out along their length."""
+    surfels = seen.surfels
     first = levels[1]
     at = first.scale.of_base[: len(surfels)]
     low_mm = options.grow_share * first.tolerance_mm[1]
@@ -270,9 +233,9 @@ def _strands(
     critical = float(max(first.critical[1], levels[0].critical[1]))
     return on_strands(
         surfels,
-        template,
+        seen.template,
         surfels.wide_deviation_mm > low_mm[at],  # a mean: a median tells nothing of a strip
-        systematic_mm=float(np.median(first.tolerance_mm[1] + critical * first.common_mm)),
+        systematic_mm=float(np.median(first.tolerance_mm[1] + critical * first.errors.common_mm)),
         noise_mm=critical * per_point_mm,
     )
 
@@ -306,17 +269,11 @@ def _source(options: RegionOptions, template: Template, noise: Noise) -> str:
     )
 
 
-def _label_surface(
-    seen: Observed,
-    template: Template,
-    evidence: Evidence,
-    test: _Tested,
-) -> Int[np.ndarray, " m"]:
+def _label_surface(seen: Observed, evidence: Evidence, test: _Tested) -> Numbers:
     """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
     surfels, surface_mm = evidence.surfels, seen.surface_mm
     missing, limit_mm = test.missing, test.limit_mm
-    nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
-    present = (nearest >= 0) & ~missing[nearest]
+    present = (seen.nearest >= 0) & ~missing[seen.nearest]
     label = np.where(present, int(Label.OK), int(Label.UNSEEN))
     if evidence.has_rays:
         label[test.gone] = int(Label.MISSING)
@@ -324,7 +281,7 @@ def _label_surface(
         open_ = np.flatnonzero(~present)
         # just inside the surface, as deep as the limit: empty there is more than noise
         inside = surface_mm[open_] - limit_mm * seen.normals[open_]
-        f_mm = template.distance(inside)
+        f_mm = seen.template.distance(inside)
         empty = (evidence.cautious(inside, f_mm) > limit_mm / 2) & (f_mm < -limit_mm / 2)
         # what nobody saw is missing only as part of what was seen to be
         places_mm = np.concatenate([surfels.place_mm[missing], surface_mm[open_[empty]]])

@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from amrepair.field import scales_kernels
+from amrepair.arrays import Mask
 from amrepair.field.groups import CELLS_APART
 from amrepair.field.near import has_near
 from amrepair.field.scales import Scale
@@ -22,7 +22,7 @@ def grown(
     options: RegionOptions,
     *,
     anywhere_mm: float,
-    strands: Bool[np.ndarray, " s"],
+    strands: Mask,
 ) -> tuple[Bool[np.ndarray, "2 b"], Float[np.ndarray, "2 b"]]:
     """(2, b) cells of missing and of excess regions, and how sure the windows over each are.
 
@@ -48,9 +48,10 @@ def grown(
         seeds, small = np.zeros((2, len(value_mm)), bool)
         for level in levels:
             if level.rejected[side].any():
-                surest = scales_kernels.surest(
-                    level.scale.table, level.scale.count, level.rejected[side], level.log_p[side]
-                )[level.scale.of_base]
+                window, cell = level.scale.cells_of(level.rejected[side])
+                surest = np.zeros(len(level.scale))  # of the windows that each cell lies in
+                np.minimum.at(surest, cell, level.log_p[side][window])
+                surest = surest[level.scale.of_base]
                 seeds |= surest < 0
                 if level.scale is scale:
                     small |= surest < 0
@@ -67,7 +68,7 @@ def grown(
     return labels, np.minimum(log_p, 0.0)
 
 
-def _beside(scale: Scale, chosen: Bool[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
+def _beside(scale: Scale, chosen: Mask) -> Mask:
     """(b,) whether a cell is chosen, or one that touches it."""
     if not chosen.any():
         return chosen
@@ -75,9 +76,7 @@ def _beside(scale: Scale, chosen: Bool[np.ndarray, " b"]) -> Bool[np.ndarray, " 
     return has_near(scale.place_mm, cells_mm, CELLS_APART * scale.cell_mm)[scale.of_base]
 
 
-def _reached(
-    scale: Scale, seeds: Bool[np.ndarray, " b"], through: Bool[np.ndarray, " b"]
-) -> Bool[np.ndarray, " b"]:
+def _reached(scale: Scale, seeds: Mask, through: Mask) -> Mask:
     """(b,) cells in `through` that hang together with a seed, whichever way they face."""
     reached = np.zeros(len(through), bool)
     if not seeds.any():

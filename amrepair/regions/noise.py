@@ -6,16 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amrepair.field.fused import Surfels
 from amrepair.field.scales import Scale
 from amrepair.field.scales_kernels import NORMAL_MEDIAN
+from amrepair.observe.views import Shares
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import (
-    OUTLIER_SIGMAS,
-    Level,
-    point_sigma_mm,
-)
-from amrepair.scans import Scan
+from amrepair.regions.significance import OUTLIER_SIGMAS, Level, point_sigma_mm
 
 # Errors hang together over the distance at which their variogram has reached this share (1 − 1/e).
 SILL_SHARE = 0.632
@@ -73,7 +68,7 @@ class Noise:
 
 
 def noise_of(
-    levels: tuple[Level, ...], surfels: Surfels, scan: Scan, options: RegionOptions
+    levels: tuple[Level, ...], shares: Shares | None, profile_mm: float, options: RegionOptions
 ) -> Noise:
     """Tell the noise of a scan from its tested scales.
 
@@ -81,10 +76,14 @@ def noise_of(
     ----------
     levels
         The first scale's third deviations and medians, then every wider scale's medians.
+    shares
+        What each view says; None where views are not known.
+    profile_mm
+        The scanner's own word on its noise, where the scan has too few cells to tell.
     """
     first = levels[0].scale
     told = len(first) >= options.least_cells
-    sigma_mm = point_sigma_mm(first) if told else scan.sigma_mm
+    sigma_mm = point_sigma_mm(first) if told else profile_mm
     off = np.abs(first.value_mm - first.median_mm) > OUTLIER_SIGMAS * np.maximum(
         first.noise_mm, 1e-9
     )
@@ -92,7 +91,7 @@ def noise_of(
         sigma_mm=float(sigma_mm),
         tail_share=float(off.mean()),
         correlation_mm=_correlation_mm([level.scale for level in levels[1:]]),
-        view_disagreement_mm=_between_views(surfels, scan),
+        view_disagreement_mm=_between_views(shares),
         smallest_mm=tuple(
             (9.0 * level.scale.cell_mm**2, level.smallest_mm) for level in levels[1:]
         ),
@@ -116,13 +115,12 @@ def _correlation_mm(scales: list[Scale]) -> float:
     return float(3.0 * scales[max(last - 1, 0)].cell_mm)
 
 
-def _between_views(surfels: Surfels, scan: Scan) -> float | None:
+def _between_views(shares: Shares | None) -> float | None:
     """Standard deviation between views' means of one cell, of the cells that several saw."""
-    if scan.view_index is None:
+    if shares is None:
         return None
-    cell, _, mean, _ = surfels.by_view(scan.view_index)
-    beside = np.flatnonzero(cell[1:] == cell[:-1])
+    beside = np.flatnonzero(shares.place[1:] == shares.place[:-1])
     if not len(beside):
         return None
-    apart = np.abs(mean[beside + 1] - mean[beside])
+    apart = np.abs(shares.value_mm[beside + 1] - shares.value_mm[beside])
     return float(np.median(apart) / NORMAL_MEDIAN / np.sqrt(2.0))

@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import area_per_point, group_points, touching_mm
 from amrepair.regions.anomaly import DefectType, Label, Region
@@ -23,12 +24,12 @@ def find_regions(
     evidence: Evidence,
     missing: Bool[np.ndarray, " s"],
     excess: Bool[np.ndarray, " s"],
-    surface_mm: Float[np.ndarray, "m 3"],
-    surface_label: Int[np.ndarray, " m"],
+    surface_mm: Points,
+    surface_label: Numbers,
     template: Template,
     *,
     p_value: Float[np.ndarray, "2 b"],
-    gone_p_value: Float[np.ndarray, " m"],
+    gone_p_value: Values,
 ) -> tuple[Region, ...]:
     """Regions of both kinds, largest first.
 
@@ -60,7 +61,7 @@ def find_regions(
 
 def _region(
     label: Label,
-    deviation_mm: Float[np.ndarray, " q"],
+    deviation_mm: Values,
     points_mm: Float[np.ndarray, "p 3"],
     cell_mm: float,
     template: Template,

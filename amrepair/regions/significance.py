@@ -18,13 +18,18 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.special import comb
 from scipy.stats import norm
 
+from amrepair.arrays import Numbers, Values
 from amrepair.field import scales_kernels
-from amrepair.field.scales import RANK, WINDOW_FACING, Scale, ways_of
+from amrepair.field.groups import cell_numbers
+from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
 from amrepair.regions.calibration import Calibration, Tail
 from amrepair.regions.options import RegionOptions
+from amrepair.regions.sites import Sites
 
 # A quarter of the differences of two standard normal values are smaller: √2 Φ⁻¹(5/8).
 PAIR_QUARTILE = float(np.sqrt(2.0) * norm.ppf(0.625))
@@ -39,134 +44,6 @@ MOST_ERRORS = 1e3
 # The first quartile of the differences of all pairs, as an estimate of a normal standard deviation,
 # is worth this share of the places (Rousseeuw and Croux 1993, section 4).
 PAIRS_EFFICIENCY = 0.82
-
-
-@dataclass(frozen=True, slots=True)
-class Level:
-    """One statistic at one scale, and what is significant of it.
-
-    Attributes
-    ----------
-    scale
-        The scale.
-    tolerance_mm, error_mm
-        (2, s) δ for missing and excess, and (s,) the standard error of the statistic.
-    common_mm
-        (s,) the part of it that averaging over a window does not lessen.
-    usual_mm
-        (s,) median standard error of the windows that were seen as well.
-    freedom
-        (s,) degrees of freedom of the standard error.
-    z
-        (2, s) how far beyond the tolerance, missing, excess: the normal value as rare as so many
-        standard errors are with so few degrees of freedom.
-    critical
-        (2,) from which on they are significant.
-    quantile
-        From which on they would be if errors were normal.
-    log_p
-        (2, s) natural logarithm of the expected number of false regions as high or higher.
-    wander_mm
-        (c,) standard deviation of window means by how well they were seen, the best first.
-    tails, peaks
-        For missing and excess: how peaks of sound places fall off, and the peaks themselves.
-    """
-
-    scale: Scale
-    tolerance_mm: Float[np.ndarray, "2 s"]
-    error_mm: Float[np.ndarray, " s"]
-    common_mm: Float[np.ndarray, " s"]
-    usual_mm: Float[np.ndarray, " s"]
-    freedom: Float[np.ndarray, " s"]
-    z: Float[np.ndarray, "2 s"]
-    critical: Float[np.ndarray, " 2"]
-    quantile: float
-    log_p: Float[np.ndarray, "2 s"]
-    wander_mm: Float[np.ndarray, " c"]
-    tails: tuple[Tail, Tail]
-    peaks: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]
-
-    @property
-    def rejected(self) -> Bool[np.ndarray, "2 s"]:
-        """(2, s) windows whose deviation is significant."""
-        return np.asarray(self.z > self.critical[:, None])
-
-    @property
-    def smallest_mm(self) -> float:
-        """The deviation that half of the places would show as significant."""
-        errors = as_student(self.critical[0], self.freedom)
-        return float(np.median(self.tolerance_mm[0] + errors * self.error_mm))
-
-
-def as_normal(t: Float[np.ndarray, "*n"], freedom: Float[np.ndarray, " s"]) -> Any:
-    """(*n,) the normal values as rare as Student's t of so many degrees of freedom, the last axis.
-
-    References
-    ----------
-    Wallace, "Bounds on normal approximations to Student's and the chi-square distributions", 1959.
-    """
-    some = np.isfinite(freedom)
-    few = np.where(some, freedom, 1.0)
-    length = np.sqrt(few * np.log1p(np.square(np.where(np.isfinite(t), t, 0.0)) / few))
-    found = np.sign(t) * (8.0 * few + 1.0) / (8.0 * few + 3.0) * length
-    return np.where(some & np.isfinite(t), found, t)
-
-
-def as_student(z: float, freedom: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
-    """(s,) the inverse of `as_normal`; as far as a float goes."""
-    some = np.isfinite(freedom) & np.isfinite(z)
-    few = np.where(some, freedom, 1.0)
-    length = (8.0 * few + 3.0) / (8.0 * few + 1.0) * (z if np.isfinite(z) else 0.0)
-    found = np.sign(length) * np.sqrt(few * np.expm1(np.minimum(length**2 / few, 700.0)))
-    return np.where(some, np.minimum(found, MOST_ERRORS), z)
-
-
-def tested(
-    scales: tuple[Scale, ...],
-    tolerance_mm: Float[np.ndarray, "2 b"],
-    options: RegionOptions,
-    *,
-    facing: Float[np.ndarray, " b"],
-    pose_mm: Float[np.ndarray, " b"],
-    calibration: Calibration | None,
-) -> tuple[Level, ...]:
-    """Test every scale's medians, and the third deepest and highest cells of the first.
-
-    Parameters
-    ----------
-    tolerance_mm
-        (2, b) δ of each cell of the field: for missing, for excess.
-    facing
-        (b,) cosine of the angle of incidence.
-    pose_mm
-        (b,) standard error of the deviation by what is left open of the pose and of the part's
-        size and bow, and by what views say differently.
-    calibration
-        What sound parts look like to this scanner; None: as the scan itself tells.
-    """
-    share = options.false_regions / (2 * (len(scales) + 1))
-    levels = []
-    for k, scale in enumerate(scales):
-        size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
-        cells = (
-            np.bincount(scale.of_base, told, len(scale)) / size
-            for told in (*tolerance_mm, facing, pose_mm)
-        )
-        *delta, faced, pose = (
-            scales_kernels.window_means(scale.table, scale.count, told) for told in cells
-        )
-        group = seen_class(scale, faced, options.seen_step)
-        most_mm = options.most_wander * point_sigma_mm(scales[0])
-        errors = _errors(scale, group, pose, options, calibration, most_mm)
-        means = np.stack([-scale.median_mm, scale.median_mm])
-        thirds = np.stack([-scale.low_mm, scale.high_mm])
-        for statistic, sides in ((0, thirds), (1, means))[0 if k == 0 else 1 :]:
-            levels.append(
-                _level(
-                    scale, sides, np.stack(delta), errors, share, options, calibration, statistic
-                )
-            )
-    return tuple(levels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,12 +64,12 @@ class Errors:
         (s,) class of how well each window was seen.
     """
 
-    cell_mm: Float[np.ndarray, " s"]
-    window_mm: Float[np.ndarray, " s"]
-    common_mm: Float[np.ndarray, " s"]
+    cell_mm: Values
+    window_mm: Values
+    common_mm: Values
     wander_mm: Float[np.ndarray, " c"]
     freedom: Float[np.ndarray, " c"]
-    group: Int[np.ndarray, " s"]
+    group: Numbers
 
     @property
     def independent(self) -> float:
@@ -205,7 +82,7 @@ class Errors:
         ratio = float(np.median(self.window_mm)) / float(np.median(whole))
         return 1.0 + (RANK - 1) * ratio**2
 
-    def freedom_of(self, error_mm: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+    def freedom_of(self, error_mm: Values) -> Values:
         """(s,) degrees of freedom of a standard error that holds what windows have in common.
 
         Of its variances that of the wander alone is uncertain (Satterthwaite 1946); where it adds
@@ -217,6 +94,124 @@ class Errors:
         return np.divide(self.freedom[self.group], share, out=known, where=share > 0.0)
 
 
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One statistic at one scale, and what is significant of it.
+
+    Attributes
+    ----------
+    scale, errors
+        The scale, and its standard errors.
+    tolerance_mm, error_mm
+        (2, s) δ for missing and excess, and (s,) the standard error of the statistic.
+    usual_mm
+        (s,) median standard error of the windows that were seen as well.
+    freedom
+        (s,) degrees of freedom of the standard error.
+    z
+        (2, s) how far beyond the tolerance, missing, excess: the normal value as rare as so many
+        standard errors are with so few degrees of freedom.
+    critical
+        (2,) from which on they are significant.
+    quantile
+        From which on they would be if errors were normal.
+    log_p
+        (2, s) natural logarithm of the expected number of false regions as high or higher.
+    tails, peaks
+        For missing and excess: how peaks of sound places fall off, and the peaks themselves.
+    """
+
+    scale: Scale
+    errors: Errors
+    tolerance_mm: Float[np.ndarray, "2 s"]
+    error_mm: Values
+    usual_mm: Values
+    freedom: Values
+    z: Float[np.ndarray, "2 s"]
+    critical: Float[np.ndarray, " 2"]
+    quantile: float
+    log_p: Float[np.ndarray, "2 s"]
+    tails: tuple[Tail, Tail]
+    peaks: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]
+
+    @property
+    def rejected(self) -> Bool[np.ndarray, "2 s"]:
+        """(2, s) windows whose deviation is significant."""
+        return np.asarray(self.z > self.critical[:, None])
+
+    @property
+    def smallest_mm(self) -> float:
+        """The deviation that half of the places would show as significant."""
+        errors = as_student(self.critical[0], self.freedom)
+        return float(np.median(self.tolerance_mm[0] + errors * self.error_mm))
+
+
+def as_normal(t: Float[np.ndarray, "*n"], freedom: Values) -> Any:
+    """(*n,) the normal values as rare as Student's t of so many degrees of freedom, the last axis.
+
+    References
+    ----------
+    Wallace, "Bounds on normal approximations to Student's and the chi-square distributions", 1959.
+    """
+    some = np.isfinite(freedom)
+    few = np.where(some, freedom, 1.0)
+    length = np.sqrt(few * np.log1p(np.square(np.where(np.isfinite(t), t, 0.0)) / few))
+    found = np.sign(t) * (8.0 * few + 1.0) / (8.0 * few + 3.0) * length
+    return np.where(some & np.isfinite(t), found, t)
+
+
+def as_student(z: float, freedom: Values) -> Values:
+    """(s,) the inverse of `as_normal`; as far as a float goes."""
+    some = np.isfinite(freedom) & np.isfinite(z)
+    few = np.where(some, freedom, 1.0)
+    length = (8.0 * few + 3.0) / (8.0 * few + 1.0) * (z if np.isfinite(z) else 0.0)
+    found = np.sign(length) * np.sqrt(few * np.expm1(np.minimum(length**2 / few, 700.0)))
+    return np.where(some, np.minimum(found, MOST_ERRORS), z)
+
+
+def tested(
+    sites: Sites, options: RegionOptions, calibration: Calibration | None
+) -> tuple[Level, ...]:
+    """Test every scale's medians, and the third deepest and highest cells of the first.
+
+    Parameters
+    ----------
+    calibration
+        What sound parts look like to this scanner; None: as the scan itself tells.
+    """
+    scales = scales_of(
+        sites.place_mm,
+        sites.normal,
+        sites.value_mm,
+        sites.weight,
+        cell_mm=sites.cell_mm,
+        widest_mm=options.widest_mm,
+    )
+    share = options.false_regions / (2 * (len(scales) + 1))
+    levels = []
+    for k, scale in enumerate(scales):
+        size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
+        cells = (
+            np.bincount(scale.of_base, told, len(scale)) / size
+            for told in (*sites.tolerance_mm, sites.facing, sites.pose_mm)
+        )
+        *delta, faced, pose = (
+            scales_kernels.window_means(scale.table, scale.count, told) for told in cells
+        )
+        group = seen_class(scale, faced, options.seen_step)
+        most_mm = options.most_wander * point_sigma_mm(scales[0])
+        errors = _errors(scale, group, pose, options, calibration, most_mm)
+        means = np.stack([-scale.median_mm, scale.median_mm])
+        thirds = np.stack([-scale.low_mm, scale.high_mm])
+        for statistic, sides in ((0, thirds), (1, means))[0 if k == 0 else 1 :]:
+            levels.append(
+                _level(
+                    scale, sides, np.stack(delta), errors, share, options, calibration, statistic
+                )
+            )
+    return tuple(levels)
+
+
 def point_sigma_mm(first: Scale) -> float:
     """Standard deviation of one point about its neighbours, from the field's own cells."""
     return float(np.median(first.noise_mm) * np.sqrt(max(float(np.median(first.weight)), 1.0)))
@@ -224,8 +219,8 @@ def point_sigma_mm(first: Scale) -> float:
 
 def _errors(
     scale: Scale,
-    group: Int[np.ndarray, " s"],
-    pose_mm: Float[np.ndarray, " s"],
+    group: Numbers,
+    pose_mm: Values,
     options: RegionOptions,
     calibration: Calibration | None,
     most_mm: float,
@@ -246,7 +241,7 @@ def _errors(
     return Errors(cell, window, common, wander, freedom, group)
 
 
-def seen_class(scale: Scale, facing: Float[np.ndarray, " s"], step: float) -> Int[np.ndarray, " s"]:
+def seen_class(scale: Scale, facing: Values, step: float) -> Numbers:
     """(s,) how well each window was seen: octaves over `step` below the better half, which is 0.
 
     By how many points saw it or how squarely, whichever is the worse: aslant, at edges and at the
@@ -260,11 +255,7 @@ def seen_class(scale: Scale, facing: Float[np.ndarray, " s"], step: float) -> In
 
 
 def _by_class(
-    group: Int[np.ndarray, " n"],
-    value: Float[np.ndarray, " n"],
-    classes: int,
-    options: RegionOptions,
-    share: float = 0.5,
+    group: Numbers, value: Values, classes: int, options: RegionOptions, share: float = 0.5
 ) -> Float[np.ndarray, " c"]:
     """(c,) of a value in each class, what a share of them is below: the median, unless said.
 
@@ -281,12 +272,8 @@ def _by_class(
 
 
 def _wander(
-    scale: Scale,
-    group: Int[np.ndarray, " s"],
-    classes: int,
-    options: RegionOptions,
-    most_mm: float,
-) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    scale: Scale, group: Int[np.ndarray, " s"], classes: int, options: RegionOptions, most_mm: float
+) -> tuple[Values, Values]:
     """(c,) standard deviation of window means about what is normal some way off, by class.
 
     And (c,) its degrees of freedom. From the differences of windows that face the same way, farther
@@ -308,8 +295,8 @@ def _wander(
 
 def _freedom(
     scale: Scale,
-    of_pair: Int[np.ndarray, " q"],
-    pairs: tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q"]],
+    of_pair: Numbers,
+    pairs: tuple[Numbers, Numbers],
     classes: int,
     options: RegionOptions,
 ) -> Float[np.ndarray, " c"]:
@@ -320,7 +307,7 @@ def _freedom(
     edge_mm = 0.5 * options.far_mm
     cell = np.floor(scale.place_mm / edge_mm).astype(np.int64)
     patch = np.column_stack([cell, ways_of(scale.normal)])
-    _, patch_of = np.unique(patch, axis=0, return_inverse=True)
+    patch_of = cell_numbers(patch)
     freedom = np.empty(classes)
     last = 1.0
     for k in range(classes):
@@ -380,22 +367,25 @@ def _level(
             critical[side] = max(quantile, tail.exceeded_by(share))
     usual_mm = _by_class(errors.group, error_mm, int(errors.group.max()) + 1, options)
     return Level(
-        scale, tolerance_mm, error_mm, errors.common_mm, usual_mm[errors.group],
-        freedom, z, critical,
-        quantile, log_p, errors.wander_mm, (tails[0], tails[1]), (peaks[0], peaks[1]),
+        scale, errors, tolerance_mm, error_mm, usual_mm[errors.group], freedom, z, critical,
+        quantile, log_p, (tails[0], tails[1]), (peaks[0], peaks[1]),
     )  # fmt: skip
 
 
-def _peaks(scale: Scale, z: Float[np.ndarray, " s"], start: float) -> Float[np.ndarray, " p"]:
+def _peaks(scale: Scale, z: Values, start: float) -> Float[np.ndarray, " p"]:
     """(p,) the highest of each connected group of windows that exceed `start`, rising."""
     over = z > start
-    group, groups = scales_kernels.components(scale.table, scale.count, over)
-    peak = np.full(groups, -np.inf)
+    window, cell = scale.cells_of(over)
+    beside = over[cell]
+    touching = window[beside], cell[beside]
+    graph = coo_array((np.ones(len(touching[0]), bool), touching), shape=(len(z), len(z)))
+    group = connected_components(graph, directed=False)[1]
+    peak = np.full(len(z), -np.inf)
     np.maximum.at(peak, group[over], z[over])
-    return np.sort(peak)
+    return np.sort(peak[peak > start])
 
 
-def _tail(peaks: Float[np.ndarray, " p"], options: RegionOptions) -> Tail:
+def _tail(peaks: Values, options: RegionOptions) -> Tail:
     """The exponential tail of the peaks over the tolerance that belong together.
 
     The lower half of the peaks is taken for errors; from there upwards each is, too, for as long

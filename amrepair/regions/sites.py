@@ -7,23 +7,21 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from amrepair.arrays import Mask, Points, Values
 from amrepair.errors import InputError
 from amrepair.field.fused import Surfels, make_surfels
+from amrepair.field.groups import cell_numbers
 from amrepair.field.near import nearest_within
 from amrepair.frames import diagonal, unit_vectors
-from amrepair.observe.background import (
-    ON_PLANE_MM,
-    background,
-    refuse_wrong_scale,
-)
+from amrepair.observe.background import ON_PLANE_MM, background, refuse_wrong_scale
 from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import Passed, RangeImage, passed, range_images
 from amrepair.observe.robust import MAD_TO_SIGMA
-from amrepair.observe.views import Contradiction, contradictions
+from amrepair.observe.views import Contradiction, Shares, contradictions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
@@ -32,10 +30,6 @@ from amrepair.template.port import Template
 
 # Of places in the template's frame and their deviations: a length for each.
 RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
-# Which view says what of which cell, by how many points (`Surfels.by_view`).
-ByView = tuple[
-    Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, " k"], Int[np.ndarray, " k"]
-]
 # A template point is present where scanned surface lies within so many cells of it.
 PRESENT_CELLS = 1.8
 
@@ -63,13 +57,13 @@ class Sites:
 
     cells: int
     cell_mm: float
-    place_mm: Float[np.ndarray, "b 3"]
-    normal: Float[np.ndarray, "b 3"]
-    value_mm: Float[np.ndarray, " b"]
-    weight: Float[np.ndarray, " b"]
+    place_mm: Points
+    normal: Points
+    value_mm: Values
+    weight: Values
     tolerance_mm: Float[np.ndarray, "2 b"]
-    facing: Float[np.ndarray, " b"]
-    pose_mm: Float[np.ndarray, " b"]
+    facing: Values
+    pose_mm: Values
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +72,8 @@ class Observed:
 
     Attributes
     ----------
+    scan, template
+        In the template's frame.
     f_mm, keep
         (n,) deviation of each point, and whether it is one of the part.
     surfels
@@ -86,17 +82,25 @@ class Observed:
         What rays saw.
     surface_mm, normals
         (m, 3) each: the template's surface.
+    nearest
+        (m,) the surfel that lies on each place of it, −1 where none does.
     crossed
-        Surface points with no scanned surface near that rays passed.
+        Places with none that rays passed.
+    shares
+        What each view says; None where views are not known.
     """
 
-    f_mm: Float[np.ndarray, " n"]
-    keep: Bool[np.ndarray, " n"]
+    scan: Scan
+    template: Template
+    f_mm: Values
+    keep: Mask
     surfels: Surfels
     images: tuple[RangeImage, ...]
     surface_mm: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
+    nearest: Int[np.ndarray, " m"]
     crossed: Passed
+    shares: Shares | None
 
 
 def observed(
@@ -104,7 +108,7 @@ def observed(
     template: Template,
     options: RegionOptions,
     images: tuple[RangeImage, ...] | None,
-    surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None,
+    surface: tuple[Points, Points] | None,
     without: tuple[int, ...],
 ) -> Observed:
     """Deviations, rays, and what of the template they speak of; some views may be left out."""
@@ -130,8 +134,15 @@ def observed(
             seen = tuple(i for i in seen if np.isclose(sensors_mm, i.sensor_mm).all(axis=1).any())
     if surfels.spacing_mm > options.spacing_mm:
         surface_mm, normals = template.surface_points(surfels.spacing_mm)
-    crossed = _crossed(surface_mm, normals, surfels, seen)
-    return Observed(f_mm, keep, surfels, seen, surface_mm, normals, crossed)
+    nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
+    # what is gone leaves no points of its own: the ray that should have ended there says so
+    absent = np.flatnonzero(nearest < 0)
+    found = passed(seen, surface_mm[absent], normals[absent])
+    crossed = replace(found, which=absent[found.which])
+    shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
+    return Observed(
+        scan, template, f_mm, keep, surfels, seen, surface_mm, normals, nearest, crossed, shares
+    )
 
 
 def _refuse_other_frame(scan: Scan) -> None:
@@ -141,7 +152,7 @@ def _refuse_other_frame(scan: Scan) -> None:
         )
 
 
-def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"], within_mm: float) -> None:
+def _refuse_nothing_near(scan: Scan, keep: Mask, within_mm: float) -> None:
     if not keep.any():
         raise InputError(
             f"no point of the scan {scan.source} lies within {within_mm:g} mm of the "
@@ -149,34 +160,14 @@ def _refuse_nothing_near(scan: Scan, keep: Bool[np.ndarray, " n"], within_mm: fl
         )
 
 
-def _crossed(
-    surface_mm: Float[np.ndarray, "m 3"],
-    normals: Float[np.ndarray, "m 3"],
-    surfels: Surfels,
-    images: tuple[RangeImage, ...],
-) -> Passed:
-    """Template points with no scanned surface near that rays passed.
-
-    What is gone leaves no points of its own: the ray that should have ended there says so.
-    """
-    if not images:
-        return Passed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
-    near = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
-    absent = np.flatnonzero(near < 0)
-    found = passed(images, surface_mm[absent], normals[absent])
-    return replace(found, which=absent[found.which])
-
-
 def sites_of(
     seen: Observed,
-    scan: Scan,
-    template: Template,
     options: RegionOptions,
     top_z_mm: float | None,
     rounded_up: RoundedUp | None,
 ) -> Sites:
     """Cells and crossed template points, each with what a sound part may depart there."""
-    surfels = seen.surfels
+    surfels, template = seen.surfels, seen.template
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
     # cells that noise alone put one above the other are one place; no more: at a broken rim of a
     # thin wall the sound surface beside would outvote the break
@@ -187,7 +178,7 @@ def sites_of(
     crossed_mm = seen.surface_mm[crossed.which]
     value_mm = np.concatenate([surfels.deviation_mm, -crossed.depth_mm])
     # what rays passed has no points of its own: it was seen as most places were
-    facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels)), scan))
+    facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels)), seen.scan))
     typical, faced = (
         np.full(len(crossed_mm), float(np.median(told))) for told in (surfels.count, facing)
     )
@@ -201,7 +192,7 @@ def sites_of(
     place_mm = np.concatenate([surfels.place_mm, crossed_mm])
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
-    unknown = _behind_what_stands(surfels, outward, template, anywhere_mm, options)
+    unknown = _behind_what_stands(seen, outward, anywhere_mm, options)
     tolerance_mm[:, : len(surfels)][:, unknown] += diagonal(template.bounds_mm)
     if rounded_up is not None:
         tolerance_mm[1] += rounded_up(place_mm, value_mm)
@@ -219,20 +210,17 @@ def sites_of(
 
 
 def _behind_what_stands(
-    surfels: Surfels,
-    outward: Float[np.ndarray, "n 3"],
-    template: Template,
-    tolerance_mm: float,
-    options: RegionOptions,
-) -> Bool[np.ndarray, " n"]:
+    seen: Observed, outward: Points, tolerance_mm: float, options: RegionOptions
+) -> Mask:
     """(n,) whether a cell lies behind surface that stands, where nobody knows how thick it is.
 
     A template of scans is closed by a guess where no scan looked, as over the floor of a cup. What
     a later scan sees in there has the cup's outer wall for its nearest known surface; but that was
     seen to stand, so that nothing can be missing from that side.
     """
+    surfels = seen.surfels
     found = np.zeros(len(surfels), bool)
-    coverage = getattr(template, "coverage", None)
+    coverage = getattr(seen.template, "coverage", None)
     if coverage is None:
         return found
     deep = np.flatnonzero(surfels.deviation_mm < -tolerance_mm)
@@ -247,9 +235,8 @@ def _behind_what_stands(
 
 def agreed(
     observe: Callable[[tuple[int, ...]], tuple[Observed, Sites]],
-    scan: Scan,
-    options: RegionOptions,
     whole_part: bool,
+    options: RegionOptions,
 ) -> tuple[Observed, Sites, Nuisance | None, tuple[Contradiction, ...]]:
     """What was observed without views that contradict the others, and without nuisance.
 
@@ -258,20 +245,15 @@ def agreed(
     out: tuple[Contradiction, ...] = ()
     while True:
         seen, sites = observe(tuple(one.view for one in out))
-        by_view = None if scan.view_index is None else seen.surfels.by_view(scan.view_index)
-        nuisance, sites, by_view = _without_nuisance(
-            sites, by_view, options, whole_part, seen.surfels.spread_mm
-        )
-        if out or by_view is None:
+        nuisance, shares = None, seen.shares
+        if whole_part:
+            nuisance, sites, shares = _without_nuisance(seen, sites, options)
+        if out or shares is None:
             return seen, sites, nuisance, out
-        cell, view, value_mm, count = by_view
-        feet = np.floor(sites.place_mm[: sites.cells] / seen.surfels.cell_mm).astype(np.int64)
-        place = np.unique(feet, axis=0, return_inverse=True)[1].ravel()
+        feet_mm = sites.place_mm[: sites.cells]
+        place = cell_numbers(np.floor(feet_mm / sites.cell_mm).astype(np.int64))[shares.place]
         out = contradictions(
-            place[cell],
-            view,
-            value_mm,
-            count,
+            replace(shares, place=place),
             point_sigma_mm=seen.surfels.spread_mm,
             options=NuisanceOptions(),
         )
@@ -280,67 +262,52 @@ def agreed(
 
 
 def _without_nuisance(
-    sites: Sites,
-    by_view: ByView | None,
-    options: RegionOptions,
-    whole_part: bool,
-    point_sigma_mm: float,
-) -> tuple[Nuisance | None, Sites, ByView | None]:
+    seen: Observed, sites: Sites, options: RegionOptions
+) -> tuple[Nuisance, Sites, Shares | None]:
     """What belongs to the whole part or to whole views, and what was seen without it."""
-    if not whole_part:
-        return None, sites, by_view
-    n = sites.cells
-    cell, view, value_mm, count = by_view or (
-        np.arange(n),
-        None,
-        sites.value_mm[:n],
-        sites.weight[:n],
-    )
+    n, views_known = sites.cells, seen.shares is not None
+    every = np.arange(n)
+    told = seen.shares or Shares(every, 0 * every, sites.value_mm[:n], seen.surfels.count)
+    view = told.view if views_known else None
+    place_mm, normal = sites.place_mm[told.place], sites.normal[told.place]
     found = fit_nuisance(
-        sites.place_mm[cell],
-        sites.normal[cell],
-        value_mm,
-        count.astype(np.float64),
+        place_mm,
+        normal,
+        told.value_mm,
+        told.count.astype(np.float64),
         view=view,
         tolerance_mm=float(np.median(sites.tolerance_mm)),
         correlation_mm=options.correlation_mm,
     )
-    share_mm = found.removed_mm(sites.place_mm[cell], sites.normal[cell], view)
-    removed_mm = np.bincount(cell, count * share_mm, n) / np.bincount(cell, count, n)
+    share_mm = found.removed_mm(place_mm, normal, view)
+    left = replace(told, value_mm=told.value_mm - share_mm)
+    points = np.bincount(told.place, told.count, n)
     whole_mm = sites.value_mm.copy()
-    whole_mm[:n] -= removed_mm
+    whole_mm[:n] -= np.bincount(told.place, told.count * share_mm, n) / points
     pose_mm = np.hypot(sites.pose_mm, found.error_mm(sites.place_mm, sites.normal))
-    told = None
-    if view is not None:
-        told = cell, view, value_mm - share_mm, count
-        one_mm, views = _between_views_mm(cell, value_mm - share_mm, count, n, point_sigma_mm)
-        # what rays passed one view says
-        views = np.append(views, np.ones(len(pose_mm) - n))
-        pose_mm = np.hypot(pose_mm, one_mm / np.sqrt(views))
-    return found, replace(sites, value_mm=whole_mm, pose_mm=pose_mm), told
+    if views_known:
+        pose_mm = np.hypot(pose_mm, _between_views_mm(left, len(pose_mm), seen.surfels.spread_mm))
+    sites = replace(sites, value_mm=whole_mm, pose_mm=pose_mm)
+    return found, sites, left if views_known else None
 
 
-def _between_views_mm(
-    cell: Int[np.ndarray, " k"],
-    value_mm: Float[np.ndarray, " k"],
-    count: Int[np.ndarray, " k"],
-    cells: int,
-    point_sigma_mm: float,
-) -> tuple[float, Int[np.ndarray, " s"]]:
-    """Standard error of one view by what several say differently of one place; views a cell.
+def _between_views_mm(shares: Shares, sites: int, point_sigma_mm: float) -> Values:
+    """(n,) standard error of each site by what several views say differently of one place.
 
-    The views' own component of the variance, without the points' noise.
+    The views' own component of the variance, without the points' noise, over the root of how many
+    saw it: one, of what rays passed.
     """
-    views = np.bincount(cell, minlength=cells)
+    cell = shares.place
+    views = np.maximum(np.bincount(cell, minlength=sites), 1)
     several = views[cell] > 1
     if not several.any():
-        return 0.0, np.maximum(views, 1)
-    mean_mm = np.bincount(cell, value_mm, cells) / np.maximum(views, 1)
+        return np.zeros(sites)
+    mean_mm = np.bincount(cell, shares.value_mm, sites) / views
     number = views[cell][several]
-    off_mm = (value_mm - mean_mm[cell])[several] * np.sqrt(number / (number - 1.0))
+    off_mm = (shares.value_mm - mean_mm[cell])[several] * np.sqrt(number / (number - 1.0))
     spread_mm = MAD_TO_SIGMA * float(np.median(np.abs(off_mm)))
-    noise_mm = point_sigma_mm * float(np.median(1.0 / np.sqrt(count[several])))
-    return float(np.sqrt(max(spread_mm**2 - noise_mm**2, 0.0))), np.maximum(views, 1)
+    noise_mm = point_sigma_mm * float(np.median(1.0 / np.sqrt(shares.count[several])))
+    return np.asarray(np.sqrt(max(spread_mm**2 - noise_mm**2, 0.0) / views))
 
 
 def tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.as_built import SOLID_MM, Evidence
-from amrepair.frames import unit_vectors
-from amrepair.regions import skipped_kernels as kernels
+from amrepair.frames import in_box, unit_vectors
 from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
 from amrepair.template.port import Template
 
@@ -34,18 +34,14 @@ class PlannedBeads:
         (n,) of its section, a rectangle.
     """
 
-    start_mm: Float[np.ndarray, "n 3"]
-    end_mm: Float[np.ndarray, "n 3"]
-    width_mm: Float[np.ndarray, " n"]
-    height_mm: Float[np.ndarray, " n"]
+    start_mm: Points
+    end_mm: Points
+    width_mm: Values
+    height_mm: Values
 
     @classmethod
     def recent(
-        cls,
-        start_mm: Float[np.ndarray, "n 3"],
-        end_mm: Float[np.ndarray, "n 3"],
-        section_mm2: Float[np.ndarray, " n"],
-        height_mm: Float[np.ndarray, " n"],
+        cls, start_mm: Points, end_mm: Points, section_mm2: Values, height_mm: Values
     ) -> PlannedBeads:
         """Those near the highest, of beads as a job tells them: as wide as section over height."""
         high_mm = np.maximum(start_mm[:, 2], end_mm[:, 2])
@@ -53,13 +49,13 @@ class PlannedBeads:
         every = cls(start_mm, end_mm, width_mm, height_mm)
         return every.some(high_mm > high_mm.max(initial=-np.inf) - RECENT_MM)
 
-    def some(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> PlannedBeads:
+    def some(self, which: Mask | Int[np.ndarray, " k"]) -> PlannedBeads:
         """Some of them."""
         return PlannedBeads(
             self.start_mm[which], self.end_mm[which], self.width_mm[which], self.height_mm[which]
         )
 
-    def samples_mm(self, step_mm: float) -> Float[np.ndarray, "p 3"]:
+    def samples_mm(self, step_mm: float) -> Points:
         """(p, 3) places along the middles of their tops, at most so far apart."""
         length_mm = np.linalg.norm(self.end_mm - self.start_mm, axis=1)
         count = np.ceil(length_mm / step_mm).astype(np.int64) + 1
@@ -70,17 +66,21 @@ class PlannedBeads:
             self.start_mm[line] + share[:, None] * (self.end_mm - self.start_mm)[line]
         )
 
-    def holds(self, points_mm: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
-        """Which points lie in any of them."""
-        return np.asarray(
-            kernels.in_beads(
-                np.ascontiguousarray(points_mm),
-                self.start_mm,
-                self.end_mm,
-                self.width_mm,
-                self.height_mm,
-            )
-        )
+    def holds(self, points_mm: Points) -> Mask:
+        """Which points lie in any of them: beside its line no farther than half its width."""
+        found = np.zeros(len(points_mm), bool)
+        for start, end, width_mm, height_mm in zip(
+            self.start_mm, self.end_mm, self.width_mm, self.height_mm, strict=True
+        ):
+            low_mm, high_mm = np.minimum(start, end), np.maximum(start, end)
+            low_mm, high_mm = low_mm - 0.5 * width_mm, high_mm + 0.5 * width_mm
+            low_mm[2], high_mm[2] = min(start[2], end[2]) - height_mm, max(start[2], end[2])
+            near = np.flatnonzero(~found & in_box(points_mm, low_mm, high_mm))
+            along, off_mm = (end - start)[:2], points_mm[near, :2] - start[:2]
+            share = np.clip(off_mm @ along / max(float(along @ along), LEVEL), 0.0, 1.0)
+            aside_mm = np.linalg.norm(off_mm - share[:, None] * along, axis=1)
+            found[near] = aside_mm <= 0.5 * width_mm
+        return found
 
 
 def skipped(
@@ -148,11 +148,11 @@ class _Paths:
 
     lines: PlannedBeads
     ends_mm: Float[np.ndarray, " _k"]
-    path: Int[np.ndarray, " m"]
-    at_mm: Float[np.ndarray, " m"]
-    step_mm: Float[np.ndarray, " m"]
-    line: Int[np.ndarray, " m"]
-    share: Float[np.ndarray, " m"]
+    path: Numbers
+    at_mm: Values
+    step_mm: Values
+    line: Numbers
+    share: Values
 
     @classmethod
     def of(cls, beads: PlannedBeads, options: SkippedOptions) -> _Paths:
@@ -179,12 +179,7 @@ class _Paths:
         share = (at_mm - ends_mm[line]) / length_mm[line]
         return cls(lines, ends_mm, of, at_mm, step_mm, line, share)
 
-    def kept(
-        self,
-        gone: Bool[np.ndarray, " m"],
-        sure: Bool[np.ndarray, " m"],
-        least_mm: Float[np.ndarray, " m"],
-    ) -> Bool[np.ndarray, " m"]:
+    def kept(self, gone: Mask, sure: Mask, least_mm: Values) -> Mask:
         """Neighbouring looks that say so, over a length, of which one is sure."""
         a, b = self._runs(gone, self.path)
         surely = np.concatenate([[0], np.cumsum(sure)])
@@ -194,9 +189,7 @@ class _Paths:
             found[first : last + 1] = True
         return found
 
-    def grown(
-        self, kept: Bool[np.ndarray, " m"], gone: Float[np.ndarray, " m"], options: SkippedOptions
-    ) -> Bool[np.ndarray, " m"]:
+    def grown(self, kept: Mask, gone: Values, options: SkippedOptions) -> Mask:
         """Stretches go on, round corners too, as long as the next looks on the whole say so.
 
         `gone` is above 0 where less than half of a bead is there. Where a stretch is known to have
@@ -214,16 +207,14 @@ class _Paths:
         return found
 
     @staticmethod
-    def _runs(
-        pick: Bool[np.ndarray, " m"], of: Int[np.ndarray, " m"]
-    ) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
+    def _runs(pick: Mask, of: Numbers) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
         """First and last of neighbouring looks that are picked, of one path or chain."""
         at = np.flatnonzero(pick)
         begins = np.ones(len(at), dtype=bool)
         begins[1:] = (np.diff(at) > 1) | (np.diff(of[at]) != 0)
         return at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
 
-    def stretches(self, gone: Bool[np.ndarray, " m"]) -> PlannedBeads:
+    def stretches(self, gone: Mask) -> PlannedBeads:
         """Neighbouring looks that say so, as one bead for each line of theirs."""
         a, b = self._runs(gone, self.path)
         from_mm, to_mm = (
@@ -246,11 +237,8 @@ class _Paths:
 
 
 def _wall_shift(
-    middle_mm: Float[np.ndarray, "m 3"],
-    evidence: Evidence,
-    template: Template,
-    options: SkippedOptions,
-) -> Float[np.ndarray, "m 3"]:
+    middle_mm: Points, evidence: Evidence, template: Template, options: SkippedOptions
+) -> Points:
     """How much farther in than planned the walls below and beside each look stand.
 
     A part that has shrunk, or is laid a little aside, shows each wall farther in: its outermost
@@ -287,15 +275,15 @@ def _wall_shift(
 
 
 def _shares(
-    middle_mm: Float[np.ndarray, "m 3"],
-    half_mm: Float[np.ndarray, " m"],
+    middle_mm: Points,
+    half_mm: Values,
     ask: Int[np.ndarray, " a"],
-    rays_mm: Float[np.ndarray, " m"],
+    rays_mm: Values,
     paths: _Paths,
     evidence: Evidence,
     template: Template,
     options: SkippedOptions,
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+) -> tuple[Values, Values]:
     """(m,) how open each look is by surfaces, in halves of a line, and by rays and surfaces both.
 
     Where a line hangs, the floor below it is where it should be whether the line is there or not:
@@ -325,12 +313,12 @@ def _shares(
 
 
 def _seen_below(
-    middle_mm: Float[np.ndarray, "m 3"],
-    half_mm: Float[np.ndarray, " m"],
-    width_mm: Float[np.ndarray, " m"],
+    middle_mm: Points,
+    half_mm: Values,
+    width_mm: Values,
     evidence: Evidence,
     options: SkippedOptions,
-) -> Int[np.ndarray, " m"]:
+) -> Numbers:
     """(m,) 1 where something was seen right under a line that would have hidden it, 0 where not.
 
     −1 where it was seen as high as the line, or as it hangs when it has sagged. Not deeper than
@@ -355,12 +343,12 @@ def _seen_below(
 
 
 def _topped(
-    middle_mm: Float[np.ndarray, "m 3"],
-    half_mm: Float[np.ndarray, " m"],
-    width_mm: Float[np.ndarray, " m"],
+    middle_mm: Points,
+    half_mm: Values,
+    width_mm: Values,
     evidence: Evidence,
     options: SkippedOptions,
-) -> Bool[np.ndarray, " m"]:
+) -> Mask:
     """Looks at which something was seen at the line's own top: there it is, however rounded."""
     top_mm = middle_mm + half_mm[:, None] * np.array([0.0, 0.0, 1.0])
     distance, near = evidence.surfels.tree.query(top_mm, k=options.about)
@@ -370,16 +358,12 @@ def _topped(
     return np.asarray(at_top.any(axis=1))
 
 
-def _together(
-    value: Float[np.ndarray, " m"], path: Int[np.ndarray, " m"], together: int
-) -> Float[np.ndarray, " m"]:
+def _together(value: Values, path: Numbers, together: int) -> Values:
     """(m,) `_best_mean` where a look says "gone" itself: an end that is there does not belong."""
     return np.where(value > 0, _best_mean(value, path, together), -np.inf)
 
 
-def _best_mean(
-    value: Float[np.ndarray, " m"], of: Int[np.ndarray, " m"], together: int
-) -> Float[np.ndarray, " m"]:
+def _best_mean(value: Values, of: Numbers, together: int) -> Values:
     """(m,) the best mean of so many neighbours of one path that each belongs to."""
     m = len(value)
     whole = np.full(m, -np.inf)

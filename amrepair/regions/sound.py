@@ -13,10 +13,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
+from amrepair.arrays import Mask, Points, Values
 from amrepair.errors import InputError
 from amrepair.field import scales_kernels
 from amrepair.field.fused import estimate_spacing
@@ -80,8 +81,8 @@ class Judged:
     """
 
     log_expected: float
-    off_mm: Float[np.ndarray, " n"]
-    sigma_mm: Float[np.ndarray, " n"]
+    off_mm: Values
+    sigma_mm: Values
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,18 +93,14 @@ class _Known:
     """
 
     tree: cKDTree
-    f_mm: Float[np.ndarray, " n"]
+    f_mm: Values
     spacing_mm: float
     within_mm: float
     unseen: cKDTree | None
 
     @classmethod
     def of(
-        cls,
-        points_mm: Float[np.ndarray, "n 3"],
-        f_mm: Float[np.ndarray, " n"],
-        template: Template,
-        options: SoundTestOptions,
+        cls, points_mm: Points, f_mm: Values, template: Template, options: SoundTestOptions
     ) -> _Known:
         """By points of sound scans, and their deviations."""
         tree = cKDTree(points_mm)
@@ -114,9 +111,7 @@ class _Known:
         far = surface[np.isinf(away)]
         return cls(tree, f_mm, spacing_mm, within_mm, cKDTree(far) if len(far) else None)
 
-    def looked(
-        self, feet_mm: Float[np.ndarray, "q 3"], f_mm: Float[np.ndarray, " q"]
-    ) -> Bool[np.ndarray, " q"]:
+    def looked(self, feet_mm: Points, f_mm: Values) -> Mask:
         """(q,) whether a sound scan looked at the surface that a point's deviation is told by.
 
         At its foot, and beside it as far as the point lies off: where the template's surface is a
@@ -130,9 +125,7 @@ class _Known:
             looked &= beside > np.abs(f_mm)
         return looked
 
-    def at(
-        self, points_mm: Float[np.ndarray, "q 3"], looked: Bool[np.ndarray, " q"], count: int
-    ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+    def at(self, points_mm: Points, looked: Mask, count: int) -> tuple[Values, Values, Values]:
         """(q,) mean deviation of the nearest sound points, their standard deviation, and `shared`.
 
         Nearest in space, not over the surface: where a template closed a hollow by a guess, the
@@ -163,20 +156,16 @@ class Seen:
         (n,) whether a sound scan looked at the surface that tells the deviation.
     """
 
-    f_mm: Float[np.ndarray, " n"]
-    normals: Float[np.ndarray, "n 3"]
-    expected_mm: Float[np.ndarray, " n"]
-    spread_mm: Float[np.ndarray, " n"]
-    shared: Float[np.ndarray, " n"]
-    looked: Bool[np.ndarray, " n"]
+    f_mm: Values
+    normals: Points
+    expected_mm: Values
+    spread_mm: Values
+    shared: Values
+    looked: Mask
 
     @classmethod
     def of(
-        cls,
-        points_mm: Float[np.ndarray, "n 3"],
-        template: Template,
-        known: _Known | None,
-        options: SoundTestOptions,
+        cls, points_mm: Points, template: Template, known: _Known | None, options: SoundTestOptions
     ) -> Seen:
         """Of points, (n, 3) template frame; `known` is None where one sound scan is alone."""
         f_mm, gradient = template.distance_and_gradient(points_mm)
@@ -190,7 +179,7 @@ class Seen:
             expected_mm, spread_mm, shared = known.at(points_mm, looked, options.neighbours)
         return cls(f_mm, normals, expected_mm, spread_mm, shared, looked)
 
-    def followed(self, within_mm: float) -> Bool[np.ndarray, " n"]:
+    def followed(self, within_mm: float) -> Mask:
         """(n,) whether sound scans lie on the template there, within so much.
 
         Elsewhere it is a guess, or wrong, and poses should not follow it.
@@ -260,11 +249,11 @@ class SoundTest:
             options,
         )
 
-    def look(self, points_mm: Float[np.ndarray, "n 3"]) -> Seen:
+    def look(self, points_mm: Points) -> Seen:
         """Ask template and sound scans of a scan's points, (n, 3) in the template's frame."""
         return Seen.of(points_mm, self.template, self.known, self.options)
 
-    def judge(self, points_mm: Float[np.ndarray, "n 3"], seen: Seen | None = None) -> Judged:
+    def judge(self, points_mm: Points, seen: Seen | None = None) -> Judged:
         """Test a scan, (n, 3) in the template's frame, against what sound ones leave.
 
         `seen` is what `look` said of the same points.
@@ -294,8 +283,8 @@ def _joined(
 
 
 def _observed(
-    points_mm: Float[np.ndarray, "n 3"], seen: Seen, options: SoundTestOptions
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], tuple[Scale, ...]]:
+    points_mm: Points, seen: Seen, options: SoundTestOptions
+) -> tuple[Values, Values, tuple[Scale, ...]]:
     """Deviation of each point from what is normal there, its standard error, and the windows."""
     off_mm = np.clip(seen.f_mm - seen.expected_mm, -options.most_off_mm, options.most_off_mm)
     scales = scales_of(
@@ -313,12 +302,8 @@ def _observed(
 
 
 def _looked(
-    points_mm: Float[np.ndarray, "n 3"],
-    f_mm: Float[np.ndarray, " n"],
-    normals: Float[np.ndarray, "n 3"],
-    template: Template,
-    known: _Known | None,
-) -> Bool[np.ndarray, " n"]:
+    points_mm: Points, f_mm: Values, normals: Points, template: Template, known: _Known | None
+) -> Mask:
     """(n,) whether what lies there was looked at: what was not is unknown, and speaks for nothing.
 
     A hollow that the template closed by a guess has no sound point on the guess.
@@ -331,7 +316,7 @@ def _looked(
     return np.asarray(~told.unknown_at(points_mm, f_mm, normals))
 
 
-def _noise_mm(off_mm: Float[np.ndarray, " n"], scale: Scale) -> float:
+def _noise_mm(off_mm: Values, scale: Scale) -> float:
     """Standard deviation of one point, by what neighbours within a cell differ by."""
     order = np.argsort(scale.of_base, kind="stable")
     cell, value = scale.of_base[order], off_mm[order]
@@ -342,9 +327,9 @@ def _noise_mm(off_mm: Float[np.ndarray, " n"], scale: Scale) -> float:
 
 
 def _standardised(
-    off_mm: Float[np.ndarray, " n"],
-    sigma_mm: Float[np.ndarray, " n"],
-    shared: Float[np.ndarray, " n"],
+    off_mm: Values,
+    sigma_mm: Values,
+    shared: Values,
     scales: tuple[Scale, ...],
     options: SoundTestOptions,
 ) -> Iterator[Float[np.ndarray, " w"]]:
@@ -371,11 +356,7 @@ def _standardised(
 
 
 def _beyond_one(
-    total: Float[np.ndarray, " w"],
-    variance: Float[np.ndarray, " w"],
-    far: Float[np.ndarray, " w"],
-    its: Float[np.ndarray, " w"],
-    alone: float,
+    total: Values, variance: Values, far: Values, its: Values, alone: float
 ) -> Float[np.ndarray, " s"]:
     """(s,) |sum| in standard deviations, where something was looked at.
 
@@ -387,7 +368,7 @@ def _beyond_one(
     return np.asarray(np.minimum(np.abs(total[seen]) / np.sqrt(variance[seen]), without + alone))
 
 
-def _null(z: Float[np.ndarray, " w"], options: SoundTestOptions) -> tuple[float, Tail]:
+def _null(z: Values, options: SoundTestOptions) -> tuple[float, Tail]:
     """By what factor means of sound places spread, and their tail in units of that."""
     spread = max(float(np.median(z)) / float(norm.ppf(0.75)), 1e-9)
     start = float(np.quantile(z / spread, 1.0 - options.tail_share))

@@ -7,13 +7,12 @@ along it there are points enough.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Mask
 from amrepair.field.fused import Surfels
-from amrepair.field.near import cells_of
+from amrepair.field.near import has_near
 from amrepair.frames import unit_vectors, ways_across
-from amrepair.regions import strands_kernels as kernels
 from amrepair.template.port import Template
 
 # To each side of a place: along a strand, across it, and off the surface.
@@ -28,12 +27,12 @@ SEEN = 0.5
 def on_strands(
     surfels: Surfels,
     template: Template,
-    maybe: Bool[np.ndarray, " s"],
+    maybe: Mask,
     *,
     systematic_mm: float,
     noise_mm: float,
-) -> Bool[np.ndarray, " s"]:
-    """(s,) cells that lie on a strip whose mean deviation outwards is over its limit.
+) -> Mask:
+    """(n,) cells that lie on a strip whose mean deviation outwards is over its limit.
 
     Parameters
     ----------
@@ -46,22 +45,26 @@ def on_strands(
     asked = np.flatnonzero(maybe)
     if len(asked) == 0:
         return on
-    places = np.ascontiguousarray(surfels.place_mm[asked])
+    places = surfels.place_mm[asked]
     outward = unit_vectors(template.distance_and_gradient(places)[1])
+    reach_mm = float(np.hypot(LONG_MM, TALL_MM))
+    near = np.flatnonzero(has_near(surfels.place_mm, places, reach_mm))
+    tree = cKDTree(surfels.place_mm[near])
     enough = SEEN * 4 * LONG_MM * WIDE_MM / surfels.spacing_mm**2
-    reach = np.array([LONG_MM, WIDE_MM, TALL_MM])
-    cells = cells_of(places, surfels.place_mm, float(np.linalg.norm(reach)))
-    over_mm, way = kernels.best_strips(
-        places, np.stack([outward, *ways_across(outward)]), cells,
-        surfels.deviation_mm, surfels.count, reach, WAYS,
-        np.array([systematic_mm, noise_mm, LEAST_RIDGE_MM, enough]),
-    )  # fmt: skip
-    # as all cells of a window are part of a region, all of a strip that `maybe` belong to it are
-    found = over_mm > 0
-    tree = cKDTree(places)
-    for place, along, up in zip(places[found], way[found], outward[found], strict=True):
-        beside = np.array(tree.query_ball_point(place, LONG_MM))
-        off = places[beside] - place
-        across = np.linalg.norm(np.cross(off - np.outer(off @ up, up), along), axis=1)
-        on[asked[beside[(across < WIDE_MM) & (np.abs(off @ up) < TALL_MM)]]] = True
+    turn = np.pi * np.arange(WAYS)[:, None] / WAYS
+    for place, up, one, other in zip(places, outward, *ways_across(outward), strict=True):
+        beside = near[tree.query_ball_point(place, reach_mm)]
+        off_mm = surfels.place_mm[beside] - place
+        a, b = off_mm @ one, off_mm @ other
+        around = (np.abs(off_mm @ up) <= TALL_MM) & (np.hypot(a, b) <= LONG_MM)
+        strips = around & (np.abs(b * np.cos(turn) - a * np.sin(turn)) < WIDE_MM)
+        points = surfels.count[beside]
+        seen, total_mm = strips @ points, strips @ (points * surfels.deviation_mm[beside])
+        seen = np.where(seen > enough, seen, np.inf)  # of too few the mean says nothing
+        limit_mm = np.maximum(systematic_mm + noise_mm / np.sqrt(seen), LEAST_RIDGE_MM)
+        over_mm = total_mm / seen - limit_mm
+        if over_mm.max() > 0:
+            # as all cells of a window are part of a region, all that `maybe` belong to it are
+            own = beside[strips[over_mm.argmax()]]
+            on[own[maybe[own]]] = True
     return on

@@ -16,7 +16,7 @@ from amrepair.template.fitting import (
     load_template,
 )
 from amrepair.template.grid import GridSdf
-from amrepair.template.laid import LaidBeads, LaidOptions
+from amrepair.template.laid import KeptFills, LaidBeads, LaidOptions
 from amrepair.template.learned import LearnedSdf
 from amrepair.template.mesh_file import load_mesh
 from amrepair.template.mesh_sdf import MeshSdf
@@ -29,6 +29,7 @@ from amrepair.template.stood import StoodTemplate
 __all__ = [
     "CutTemplate",
     "GridSdf",
+    "KeptFills",
     "LaidBeads",
     "LaidOptions",
     "LearnedSdf",

@@ -9,10 +9,11 @@ nothing is pushed to where they stand if all of it is pushed there. Nothing is j
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from scipy.ndimage import uniform_filter
 
 from amrepair.errors import TemplateError
@@ -69,13 +70,43 @@ class LaidOptions:
 class _Fill:
     """Plastic over room of one layer, by cells; the widest bead's width there; their corner."""
 
-    ratio: Float[np.ndarray, "ny nx"]
-    widest_mm: Float[np.ndarray, "ny nx"]
+    ratio: Float32[np.ndarray, "ny nx"]
+    widest_mm: Float32[np.ndarray, "ny nx"]
     corner_mm: Float[np.ndarray, " 2"]
+
+    @property
+    def bytes(self) -> int:
+        """What it takes of memory."""
+        return self.ratio.nbytes + self.widest_mm.nbytes
 
     def at(self, place_mm: Float[np.ndarray, "q d"], cell_mm: float) -> Float[np.ndarray, " q"]:
         """(q,) the ratio at places."""
         return np.asarray(kernels.at(self.ratio, self.corner_mm, cell_mm, place_mm))
+
+
+class KeptFills:
+    """Plastic of a job's layers, made once for all looks at it: what is laid stays as it is.
+
+    What does not fit into so much memory is made anew at each look, and so is what another process
+    asks for.
+    """
+
+    def __init__(self, most_bytes: int = 256 * 1024**2) -> None:
+        self._room = self._most = most_bytes
+        self._found: dict[tuple[int, int], _Fill] = {}
+
+    def __reduce__(self) -> tuple[type[KeptFills], tuple[int]]:
+        return KeptFills, (self._most,)
+
+    def get(self, layer: tuple[int, int], make: Callable[[], _Fill]) -> _Fill:
+        """Of a layer by its index and its number of beads; made where it is not there yet."""
+        found = self._found.get(layer)
+        if found is None:
+            found = make()
+            if found.bytes <= self._room:
+                self._room -= found.bytes
+                self._found[layer] = found
+        return found
 
 
 class _Found:
@@ -104,6 +135,10 @@ class LaidBeads:
         (k + 1,) where each layer's beads begin.
     top_mm, layer_mm
         (k,) height of each layer's top, and of the layer; rising.
+    index
+        (k,) of each layer in the job.
+    kept
+        Plastic of layers that earlier looks at the same job asked for.
     """
 
     start_mm: Float[np.ndarray, "n 3"]
@@ -113,7 +148,9 @@ class LaidBeads:
     first: Int[np.ndarray, " k1"]
     top_mm: Float[np.ndarray, " k"]
     layer_mm: Float[np.ndarray, " k"]
+    index: Int[np.ndarray, " k"]
     options: LaidOptions = LaidOptions()
+    kept: KeptFills = field(default_factory=KeptFills, compare=False)
 
     @classmethod
     def from_beads(
@@ -125,6 +162,7 @@ class LaidBeads:
         layer: Int[np.ndarray, " n"],
         *,
         options: LaidOptions = LaidOptions(),
+        kept: KeptFills | None = None,
     ) -> LaidBeads:
         """Sort beads into layers.
 
@@ -132,6 +170,8 @@ class LaidBeads:
         ----------
         layer
             (n,) index of each bead's layer; its top is the height of most of its plastic.
+        kept
+            Of an earlier look at the same job; None keeps what this one asks for.
 
         Raises
         ------
@@ -141,7 +181,7 @@ class LaidBeads:
         if len(layer) == 0:
             raise TemplateError("there are no beads to say what a job lays; give at least one")
         order = np.argsort(layer, kind="stable")
-        _, begins = np.unique(layer[order], return_index=True)
+        index, begins = np.unique(layer[order], return_index=True)
         start, end = (np.ascontiguousarray(xyz[order], dtype=np.float64) for xyz in
                       (start_mm, end_mm))  # fmt: skip
         top = np.array([np.median(z) for z in np.split(end[:, 2], begins[1:])])
@@ -161,7 +201,9 @@ class LaidBeads:
             np.concatenate([[0], np.cumsum(counts)]),
             top[rising],
             layer_mm,
+            index[rising],
             options,
+            kept or KeptFills(),
         )
 
     def interval(
@@ -268,7 +310,12 @@ class LaidBeads:
 
     def _fill(self, k: int) -> _Fill:
         """A layer's plastic over its room, averaged."""
-        o, which = self.options, slice(int(self.first[k]), int(self.first[k + 1]))
+        beads = slice(int(self.first[k]), int(self.first[k + 1]))
+        name = int(self.index[k]), beads.stop - beads.start
+        return self.kept.get(name, lambda: self._filled(k, beads))
+
+    def _filled(self, k: int, which: slice) -> _Fill:
+        o = self.options
         start, end, section = self.start_mm[which], self.end_mm[which], self.section_mm2[which]
         h = float(self.layer_mm[k])
         wide = section / h
@@ -279,4 +326,4 @@ class LaidBeads:
         volume, widest = kernels.plastic(start, end, section, wide, low, o.cell_mm, ny, nx)
         over = 2 * int(0.5 * o.blur_mm / o.cell_mm) + 1
         ratio = uniform_filter(volume / (o.cell_mm**2 * h), over, mode="constant")
-        return _Fill(ratio, widest, low)
+        return _Fill(ratio.astype(np.float32), widest.astype(np.float32), low)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import manifold3d as m3
@@ -10,12 +11,9 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from amrepair.deficit import compute_deficit
-from amrepair.field.cut_kernels import least_cut
-from amrepair.field.occupancy import Broken, find_occupancy
+from amrepair.field.occupancy import Broken, _facets, _Grid, _labelled, find_occupancy
 from amrepair.field.options import OccupancyOptions
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -25,46 +23,30 @@ from tests import analytic
 PLACED = Transform.identity("build", "template")
 
 
-def neighbours_of(shape: tuple[int, int, int]) -> np.ndarray:
-    """(n, 6) voxels beside each of a box, −1 beyond it."""
-    number = np.pad(np.arange(int(np.prod(shape))).reshape(shape), 1, constant_values=-1)
-    beside = [np.roll(number, -way, axis) for axis in range(3) for way in (1, -1)]
-    return np.stack([b[1:-1, 1:-1, 1:-1].ravel() for b in beside], axis=1).astype(np.int32)
-
-
-def by_maximum_flow(neighbour: np.ndarray, room: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The same by another algorithm: what reaches the sink in the residual graph."""
-    n = len(rest)
-    one, face = np.nonzero(neighbour >= 0)
-    source, sink = np.flatnonzero(rest > 0), np.flatnonzero(rest < 0)
-    rows = np.concatenate([one, np.full(len(source), n), sink])
-    columns = np.concatenate([neighbour[one, face], source, np.full(len(sink), n + 1)])
-    fits = np.concatenate([room[one, face], rest[source], -rest[sink]])
-    graph = coo_matrix((fits, (rows, columns)), shape=(n + 2, n + 2)).tocsr()
-    graph.eliminate_zeros()
-    left = (graph - maximum_flow(graph, n, n + 1).flow).tocsr()
-    left.eliminate_zeros()
-    reaches = np.zeros(n + 2, bool)
-    reaches[breadth_first_order(left.T.tocsr(), n + 1, return_predecessors=False)] = True
-    return reaches[:n]
-
-
 @settings(max_examples=60, deadline=None)
-@given(
-    shape=st.tuples(*[st.integers(1, 7)] * 3),
-    sparse=st.floats(0.05, 1.0),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_the_cut_is_that_of_a_maximum_flow(
-    shape: tuple[int, int, int], sparse: float, seed: int
+@given(shape=st.tuples(*[st.integers(1, 3)] * 2), seed=st.integers(0, 2**32 - 1))
+def test_the_labelling_is_the_cheapest_of_all_and_of_those_has_the_most_solid(
+    shape: tuple[int, int], seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    neighbour = neighbours_of(shape)
-    n = len(neighbour)
-    room = rng.integers(0, 12, (n, 6)).astype(np.int32)
-    rest = np.where(rng.random(n) < sparse, rng.integers(-20, 21, n), 0).astype(np.int32)
-    expected = by_maximum_flow(neighbour, room, rest)
-    assert np.array_equal(least_cut(neighbour, room.copy(), rest.copy()), expected)
+    number = np.arange(int(np.prod(shape))).reshape(1, *shape)
+    number[rng.random(number.shape) < 0.2] = -1  # known to be empty
+    number[number >= 0] = np.arange((number >= 0).sum())
+    count = int(number.max(initial=-1)) + 1
+    f_mm = np.where(number < 0, 1.0, -1.0)
+    facets = _facets(_Grid(np.zeros(3), 1.0, f_mm, number))
+    nats = rng.integers(0, 4, (len(facets.one), 2)).astype(float)
+    told = rng.integers(-5, 6, count).astype(float)
+
+    def cost(empty: tuple[bool, ...]) -> float:
+        solid = np.append(~np.array(empty, bool), False)
+        one, other = solid[facets.one], solid[facets.other]
+        surface = nats[one & ~other, 0].sum() + nats[other & ~one, 1].sum()
+        return float(told[~solid[:-1]].sum() + surface)
+
+    every = list(itertools.product([False, True], repeat=count))
+    best = min(every, key=lambda empty: (cost(empty), sum(empty)))
+    assert _labelled(facets, nats, told).tolist() == list(best)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from jaxtyping import Float
 
 from amrepair.errors import TemplateError
 from amrepair.frames import rotation_from_vector
-from amrepair.template import LaidBeads, LaidOptions
+from amrepair.template import KeptFills, LaidBeads, LaidOptions, laid_kernels
 
 LAYER_MM, SPACING_MM, LONG_MM = 0.2, 0.45, 30.0
 # Cells of 0.2 mm, and grooves averaged over three of them, tell an edge to a tenth of a cell.
@@ -141,3 +144,27 @@ def test_no_beads_are_refused() -> None:
     none = np.empty((0, 3))
     with pytest.raises(TemplateError, match="no beads"):
         LaidBeads.from_beads(none, none, np.empty(0), np.empty(0), np.empty(0, np.int64))
+
+
+def test_layers_that_are_laid_are_counted_once_for_all_looks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What earlier looks counted is not counted again, and says the same; memory has its bound."""
+    counted: list[int] = []
+    count = laid_kernels.plastic
+    monkeypatch.setattr(laid_kernels, "plastic", lambda *told: counted.append(1) or count(*told))
+    place = along_wall(8 * SPACING_MM, 1.0, z=0.9)
+    five, ten = laid(8, fill=1.1), laid(8, fill=1.1, layers=10)
+    fresh = ten.interval(*place)
+    five.interval(*place)
+    before = len(counted)
+    again = replace(ten, kept=five.kept).interval(*place)
+    assert len(counted) - before == 1  # the layer over the place, which the first look lacked
+    assert np.array_equal(fresh, again)
+    elsewhere = pickle.loads(pickle.dumps(replace(ten, kept=five.kept)))
+    assert np.array_equal(fresh, elsewhere.interval(*place))
+    small = replace(ten, kept=KeptFills(most_bytes=0))
+    assert np.array_equal(fresh, small.interval(*place))
+    before = len(counted)
+    small.interval(*place)
+    assert len(counted) > before
