@@ -16,6 +16,7 @@ from scipy import ndimage
 from amrepair.align import align
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, box_of, rotation_from_vector
+from amrepair.loop.outlines import outermost
 from amrepair.scans import Scan
 from amrepair.template import StoodTemplate
 from amrepair.template.port import Template
@@ -24,17 +25,25 @@ from gcode.reader import Beads, Job
 from gcode.stretches import places_along
 from gcode.surfaces import raster_kernels
 
-# Names of the outermost bead: PrusaSlicer and SuperSlicer, OrcaSlicer and Bambu, Cura.
-OUTER_WALLS = frozenset({"external perimeter", "overhang perimeter", "outer wall", "wall-outer"})
+# Names of the outermost bead: PrusaSlicer and SuperSlicer, OrcaSlicer and Bambu, Cura and
+# ideaMaker, Simplify3D, KISSlicer.
+OUTER_WALLS = frozenset(
+    {
+        "external perimeter", "overhang perimeter", "outer wall", "wall-outer", "outer perimeter",
+        "perimeter path",
+    }
+)  # fmt: skip
 # What lies beside a part, and is none of it; the same slicers' names.
 BESIDE_THE_PART = frozenset(
     {
         "skirt", "brim", "skirt/brim", "support material", "support material interface", "support",
         "support interface", "support transition", "support-interface", "wipe tower",
-        "prime tower", "prime-tower", "custom",
+        "prime tower", "prime-tower", "custom", "prime pillar", "skirt path", "support path",
+        "brim path", "pillar path",
     }
 )  # fmt: skip
 THING_STEP_MM, THING_CELL_MM = 0.8, 0.2
+RAFT_LAYERS = 1.5  # a raft has two layers at least, and walls tell the height to about one
 UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
 
@@ -94,7 +103,8 @@ def locate_parts(
 ) -> tuple[Transform, ...]:
     """Where the part stands in a job, every copy of it: registered to the job's own beads.
 
-    What is connected as seen from above is one thing, skirts, brims and supports left aside. The
+    What is connected as seen from above is one thing, skirts, brims and supports left aside, and
+    in jobs that name no roles what is one layer high beside what is higher. The
     centre lines of the outer walls lie half a bead inside the part, so they are registered to that
     level of its field. Of poses that fit alike the part is turned least.
 
@@ -119,6 +129,11 @@ def locate_parts(
     )
     inset = _Inset(template, half_mm)
     thing = _things(beads.start_mm[ours, :2], beads.end_mm[ours, :2], half_mm)
+    if not outer.any():
+        higher = _of_what_rises(beads.layer[ours], thing)
+        ours[ours] = higher
+        thing = np.unique(thing[higher], return_inverse=True)[1]
+        pick = outermost(beads, ours, half_mm)
     count = int(thing.max(initial=-1)) + 1
     bodies: Any = template.solid()
     if len(bodies.decompose()) > 1:  # one part seems to be several things
@@ -182,6 +197,15 @@ def _things(
     mine = groups[y, x]
     _, first, number = np.unique(mine, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[number]
+
+
+def _of_what_rises(
+    layer: Int[np.ndarray, " n"], thing: Int[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Whose thing has more than one layer, or all where none has: a skirt and a priming line not."""
+    count = int(thing.max(initial=-1)) + 1
+    rises = ndimage.maximum(layer, thing, range(count)) > ndimage.minimum(layer, thing, range(count))
+    return rises[thing] if rises.any() else np.ones(len(thing), bool)
 
 
 def _walls(beads: Beads, which: Int[np.ndarray, " w"]) -> Scan:
@@ -249,10 +273,11 @@ def _on_bed(placed: Transform, template: Template, layer_height_mm: float) -> Tr
     """The pose with the part's lowest point on the bed: walls tell height the least."""
     surface, _ = template.surface_points(1.0)
     low_mm = float(placed.apply(surface)[:, 2].min())
-    if abs(low_mm) > layer_height_mm:
+    limit_mm = RAFT_LAYERS * layer_height_mm
+    if abs(low_mm) > limit_mm:
         raise AlignmentError(
-            f"the part found in the job stands {low_mm:.2f} mm off the bed, the limit is a layer "
-            f"({layer_height_mm:g} mm); jobs with a raft cannot be repaired yet"
+            f"the part found in the job stands {low_mm:.2f} mm off the bed, the limit is "
+            f"{limit_mm:g} mm; jobs with a raft cannot be repaired yet"
         )
     matrix = placed.matrix.copy()
     matrix[2, 3] -= low_mm

@@ -24,7 +24,9 @@ _CURA_LAYER = re.compile(r"LAYER:\s*(-?\d+)")
 _JOB_NUMBER = r"([-+]?\d*\.?\d+)"
 _HEIGHT = re.compile(r"(?:HEIGHT|LAYER_HEIGHT):\s*" + _JOB_NUMBER)
 _WIDTH = re.compile(r"(?:WIDTH|LINE_WIDTH):\s*" + _JOB_NUMBER)
-_ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$")
+# PrusaSlicer's kin, Cura and ideaMaker; Simplify3D ("feature outer perimeter"); KISSlicer
+# ("'Perimeter Path', 12.0 [feed mm/s]").
+_ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$|^\W*feature (\w.*?)\s*$|^\W*'(\w+ Path)',")
 _LEAST_LAYER_MM = 0.015
 _SQUARE_LOSS = 1.0 - math.pi / 4.0
 UNKNOWN_ROLE = "unknown"
@@ -344,10 +346,11 @@ def _roles(
     for line, text in comments:
         match = _ROLE.search(text)
         if match is not None:
-            if match.group(1) not in names:
-                names.append(match.group(1))
+            name = next(filter(None, match.groups()))
+            if name not in names:
+                names.append(name)
             at.append(line)
-            which.append(names.index(match.group(1)))
+            which.append(names.index(name))
     index = np.searchsorted(np.array(at), owner, side="right") - 1
     return np.array(which)[index], tuple(names)
 

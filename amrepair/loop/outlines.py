@@ -1,0 +1,93 @@
+"""Which beads of a job lie at the outside of the part, where its slicer names no roles.
+
+Slic3r, IceSL and Kiri:Moto write none, and some hosts strip comments. Seen from above, a bead of a
+layer is outermost where nothing is laid beside it: the outside, or a hole. A hole is bounded by
+closed loops alone; a void of sparse infill has a line of it, which is open, at some side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from gcode.reader import Beads
+from gcode.surfaces import raster_kernels
+
+OUTLINE_CELL_MM = 0.15
+OUTLINE_LAYERS = 40  # evenly spread: enough walls to register by
+CLOSED_MM = 0.8  # a loop ends so near to where it began: slicers leave a gap at the seam
+_BESIDE = np.ones((3, 3), bool)
+
+
+def outermost(beads: Beads, ours: Bool[np.ndarray, " n"], half_mm: float) -> Bool[np.ndarray, " n"]:
+    """Which of a job's beads bound the part, of up to `OUTLINE_LAYERS` of its layers.
+
+    Parameters
+    ----------
+    ours
+        (n,) beads of the part.
+    half_mm
+        Half of what a bead is wide.
+    """
+    which = np.flatnonzero(ours)
+    layers = np.unique(beads.layer[which])
+    steps = np.linspace(0, len(layers) - 1, min(len(layers), OUTLINE_LAYERS)).round().astype(int)
+    closed = _closed(beads)
+    found = np.zeros(len(ours), bool)
+    for layer in layers[steps]:
+        own = which[beads.layer[which] == layer]
+        found[own] = _at_the_edge(
+            beads.start_mm[own, :2], beads.end_mm[own, :2], closed[own], half_mm
+        )
+    return found
+
+
+def _closed(beads: Beads) -> Bool[np.ndarray, " n"]:
+    """Whether each bead belongs to a path without a travel in it that ends where it began."""
+    breaks = (np.linalg.norm(beads.start_mm[1:] - beads.end_mm[:-1], axis=1) > 1e-3) | (
+        beads.layer[1:] != beads.layer[:-1]
+    )
+    first = np.flatnonzero(np.r_[True, breaks])
+    last = np.r_[first[1:], len(beads.layer)] - 1
+    apart_mm = np.linalg.norm(beads.end_mm[last] - beads.start_mm[first], axis=1)
+    return np.repeat((apart_mm < CLOSED_MM) & (last > first + 1), last - first + 1)
+
+
+def _at_the_edge(
+    start_mm: Float[np.ndarray, "n 2"],
+    end_mm: Float[np.ndarray, "n 2"],
+    closed: Bool[np.ndarray, " n"],
+    half_mm: float,
+) -> Bool[np.ndarray, " n"]:
+    cell = OUTLINE_CELL_MM
+    low = np.minimum(start_mm, end_mm).min(axis=0) - 2.0
+    high = np.maximum(start_mm, end_mm).max(axis=0) + 2.0
+    nx, ny = (int(v) for v in np.ceil((high - low) / cell))
+
+    def covered(pick: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "ny nx"]:
+        count = int(pick.sum())
+        return (
+            raster_kernels.beside_lines(
+                np.ascontiguousarray(start_mm[pick]), np.ascontiguousarray(end_mm[pick]),
+                np.full(count, half_mm + 0.5 * cell), np.zeros(count), low, cell, ny, nx,
+            )
+            > -np.inf
+        )  # fmt: skip
+
+    voids, count = ndimage.label(~covered(np.ones(len(closed), bool)))
+    infill = ndimage.binary_dilation(covered(~closed), _BESIDE, iterations=2)
+    of_infill = ndimage.maximum(infill, voids, range(count + 1)) > 0
+    of_infill[[0, voids[0, 0]]] = [True, False]  # the beads themselves; the outside
+    away_mm = cell * ndimage.distance_transform_edt(of_infill[voids])
+    return np.asarray(_at(away_mm, 0.5 * (start_mm + end_mm), low) < half_mm + 2 * cell)
+
+
+def _at(
+    values: Float[np.ndarray, "ny nx"],
+    points_mm: Float[np.ndarray, "n 2"],
+    low_mm: Float[np.ndarray, " 2"],
+) -> Float[np.ndarray, " n"]:
+    x, y = np.floor((points_mm - low_mm) / OUTLINE_CELL_MM).astype(np.int64).T
+    picked: Int[np.ndarray, " n"] = np.ravel_multi_index((y, x), values.shape)
+    return values.ravel()[picked]
