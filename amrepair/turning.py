@@ -16,6 +16,7 @@ from shapely.geometry import MultiPoint, Point
 
 from amrepair.errors import InputError
 from amrepair.repair import RepairPlan, Site
+from gcode.meshes import box_of_solid
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.layers import LayerGrid
@@ -83,7 +84,7 @@ def turns_of(
     """`rank_turns` of what a plan says is missing."""
     if plan.deficit.missing.is_empty():
         return ()
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     expected: manifold3d.Manifold = site.template.solid()
     standing = expected.transform(placed.matrix[:3]) - plan.deficit.missing + plan.deficit.excess
     return rank_turns(
@@ -127,7 +128,7 @@ def _tried(
     turn = NAMED_TURNS[name]
     printer = setup.printer
     rest = standing.rotate(turn)
-    low, high = np.array(rest.bounding_box()).reshape(2, 3)
+    low, high = box_of_solid(rest)
     bed = np.array(printer.bed_size_mm)
     size = high - low
     if (size[:2] > bed).any() or size[2] > printer.max_z_mm:
