@@ -16,7 +16,6 @@ from shapely.geometry import MultiPoint, Point
 
 from amrepair.errors import InputError
 from amrepair.repair import RepairPlan, Site
-from gcode.meshes import box_of_solid
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.layers import LayerGrid
@@ -128,7 +127,7 @@ def _tried(
     turn = NAMED_TURNS[name]
     printer = setup.printer
     rest = standing.rotate(turn)
-    low, high = box_of_solid(rest)
+    low, high = np.array(rest.bounding_box()).reshape(2, 3)
     bed = np.array(printer.bed_size_mm)
     size = high - low
     if (size[:2] > bed).any() or size[2] > printer.max_z_mm:

@@ -80,7 +80,7 @@ def slice_solid(
         program = made.program
         gives_back(check_program)(program, setup, as_built=made.field, progress=bars)
         cost = estimate_program(program, setup.printer, progress=bars)
-    console.write_text(output, program.text)
+    console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
     result = {
         "gcode": str(output),
         "placed": place,

@@ -66,17 +66,6 @@ def _axes(machine_speed: str) -> dict[str, Rule]:
     }
 
 
-_BOTH: dict[str, Rule] = {
-    "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
-    "filament_diameter": Rule("printers", "filament_diameter_mm", number),
-    "gcode_flavor": Rule("printers", "dialect", _dialect),
-    "travel_speed": Rule("printers", "travel_speed_mm_s", number),
-    "filament_density": Rule("materials", "density_g_cm3", limit),
-    "filament_max_volumetric_speed": Rule("materials", "max_volumetric_mm3_s", limit),
-    "layer_height": Rule("processes", "layer_height_mm", number),
-    "skirt_distance": Rule("processes", "skirt_distance_mm", number),
-    "default_acceleration": Rule("processes", "acceleration_mm_s2", limit),
-}
 _PRUSA_SCRIPT = script(
     {
         "first_layer_temperature": "first_layer_hotend_c",
@@ -87,19 +76,25 @@ _PRUSA_SCRIPT = script(
 )
 PRUSA: dict[str, Rule] = {
     **_axes("feedrate"),
-    **_BOTH,
     "bed_shape": Rule("printers", "bed_size_mm", corners),
     "max_print_height": Rule("printers", "max_z_mm", number),
+    "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
+    "filament_diameter": Rule("printers", "filament_diameter_mm", number),
+    "gcode_flavor": Rule("printers", "dialect", _dialect),
     "retract_length": Rule("printers", "retraction_mm", number),
     "retract_speed": Rule("printers", "retraction_speed_mm_s", number),
     "retract_lift": Rule("printers", "z_hop_mm", number),
+    "travel_speed": Rule("printers", "travel_speed_mm_s", number),
     "start_gcode": Rule("printers", "start_gcode", _PRUSA_SCRIPT),
     "end_gcode": Rule("printers", "end_gcode", _PRUSA_SCRIPT),
     "temperature": Rule("materials", "hotend_c", number),
     "first_layer_temperature": Rule("materials", "first_layer_hotend_c", number),
     "bed_temperature": Rule("materials", "bed_c", number),
+    "filament_density": Rule("materials", "density_g_cm3", limit),
     "max_fan_speed": Rule("materials", "fan_ratio", percent),
     "extrusion_multiplier": Rule("materials", "flow_ratio", number),
+    "filament_max_volumetric_speed": Rule("materials", "max_volumetric_mm3_s", limit),
+    "layer_height": Rule("processes", "layer_height_mm", number),
     "first_layer_height": Rule("processes", "first_layer_height_mm", of_key("layer_height")),
     "extrusion_width": Rule("processes", "line_width_mm", of_key("layer_height")),
     "perimeters": Rule("processes", "perimeters", whole),
@@ -108,6 +103,7 @@ PRUSA: dict[str, Rule] = {
     "top_solid_layers": Rule("processes", "top_layers", whole),
     "bottom_solid_layers": Rule("processes", "bottom_layers", whole),
     "skirts": Rule("processes", "skirt_loops", whole),
+    "skirt_distance": Rule("processes", "skirt_distance_mm", number),
     "perimeter_speed": Rule("processes", "perimeter_speed_mm_s", limit),
     "external_perimeter_speed": Rule(
         "processes", "external_perimeter_speed_mm_s", of_key("perimeter_speed")
@@ -115,6 +111,7 @@ PRUSA: dict[str, Rule] = {
     "infill_speed": Rule("processes", "infill_speed_mm_s", limit),
     "solid_infill_speed": Rule("processes", "solid_infill_speed_mm_s", of_key("infill_speed")),
     "first_layer_speed": Rule("processes", "first_layer_speed_mm_s", of_key("perimeter_speed")),
+    "default_acceleration": Rule("processes", "acceleration_mm_s2", limit),
     "infill_overlap": Rule("processes", "infill_overlap_ratio", share),
 }
 
@@ -134,20 +131,26 @@ _ORCA_SCRIPT = script(
 )
 ORCA: dict[str, Rule] = {
     **_axes("speed"),
-    **_BOTH,
     "printable_area": Rule("printers", "bed_size_mm", corners),
     "printable_height": Rule("printers", "max_z_mm", number),
+    "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
+    "filament_diameter": Rule("printers", "filament_diameter_mm", number),
+    "gcode_flavor": Rule("printers", "dialect", _dialect),
     "retraction_length": Rule("printers", "retraction_mm", number),
     "retraction_speed": Rule("printers", "retraction_speed_mm_s", number),
     "z_hop": Rule("printers", "z_hop_mm", number),
+    "travel_speed": Rule("printers", "travel_speed_mm_s", number),
     "machine_start_gcode": Rule("printers", "start_gcode", _ORCA_SCRIPT),
     "machine_end_gcode": Rule("printers", "end_gcode", _ORCA_SCRIPT),
     "nozzle_temperature": Rule("materials", "hotend_c", number),
     "nozzle_temperature_initial_layer": Rule("materials", "first_layer_hotend_c", number),
     "hot_plate_temp": Rule("materials", "bed_c", number),
+    "filament_density": Rule("materials", "density_g_cm3", limit),
     "fan_max_speed": Rule("materials", "fan_ratio", percent),
     "filament_flow_ratio": Rule("materials", "flow_ratio", number),
+    "filament_max_volumetric_speed": Rule("materials", "max_volumetric_mm3_s", limit),
     "filament_shrink": Rule("materials", "shrinkage_ratio", _shrink),
+    "layer_height": Rule("processes", "layer_height_mm", number),
     "initial_layer_print_height": Rule("processes", "first_layer_height_mm", number),
     "line_width": Rule("processes", "line_width_mm", of_key("nozzle_diameter")),
     "wall_loops": Rule("processes", "perimeters", whole),
@@ -156,11 +159,13 @@ ORCA: dict[str, Rule] = {
     "top_shell_layers": Rule("processes", "top_layers", whole),
     "bottom_shell_layers": Rule("processes", "bottom_layers", whole),
     "skirt_loops": Rule("processes", "skirt_loops", whole),
+    "skirt_distance": Rule("processes", "skirt_distance_mm", number),
     "inner_wall_speed": Rule("processes", "perimeter_speed_mm_s", limit),
     "outer_wall_speed": Rule("processes", "external_perimeter_speed_mm_s", limit),
     "sparse_infill_speed": Rule("processes", "infill_speed_mm_s", limit),
     "internal_solid_infill_speed": Rule("processes", "solid_infill_speed_mm_s", limit),
     "initial_layer_speed": Rule("processes", "first_layer_speed_mm_s", limit),
+    "default_acceleration": Rule("processes", "acceleration_mm_s2", limit),
     "infill_wall_overlap": Rule("processes", "infill_overlap_ratio", share),
 }
 _PRUSA_KINDS: dict[str, Kind] = {
