@@ -212,9 +212,9 @@ def spread_directions(count: int) -> Float[np.ndarray, "k 3"]:
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
-def diagonal(bounds_mm: Float[np.ndarray, "2 3"]) -> float:
-    """Length of a box from its lowest to its highest corner."""
-    return float(np.linalg.norm(np.ptp(bounds_mm, axis=0)))
+def diagonal(points_mm: Float[np.ndarray, "n 3"]) -> float:
+    """Length, from its lowest to its highest corner, of the box of some points; or of a box's."""
+    return float(np.linalg.norm(np.ptp(points_mm, axis=0)))
 
 
 def box_corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:

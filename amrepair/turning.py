@@ -83,7 +83,7 @@ def turns_of(
     """`rank_turns` of what a plan says is missing."""
     if plan.deficit.missing.is_empty():
         return ()
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     expected: manifold3d.Manifold = site.template.solid()
     standing = expected.transform(placed.matrix[:3]) - plan.deficit.missing + plan.deficit.excess
     return rank_turns(

@@ -101,6 +101,11 @@ def mesh_of(solid: Any) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"
     return vertices, np.ascontiguousarray(np.asarray(mesh.tri_verts, np.int64))
 
 
+def box_of_solid(solid: Any) -> Float[np.ndarray, "2 3"]:
+    """(2, 3) lowest and highest corner of a `Manifold` or a `ClosedMesh`."""
+    return np.array(solid.bounding_box()).reshape(2, 3)
+
+
 def closed_mesh(solid: Any) -> ClosedMesh:
     """The mesh of a `manifold3d.Manifold`."""
     if isinstance(solid, ClosedMesh):

@@ -299,7 +299,7 @@ def _part_only(
 
 def _other_size(scan: Scan, template: Template, told_jump: float) -> str:
     """What to add to a refusal, where the sizes differ much."""
-    size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
+    size = diagonal(scan.points_mm)
     other = diagonal(template.bounds_mm)
     if 1.0 / told_jump < size / max(other, 1e-12) < told_jump:
         return ""
@@ -307,7 +307,7 @@ def _other_size(scan: Scan, template: Template, told_jump: float) -> str:
 
 
 def _refuse_other_size(scan: Scan, template: Template, options: AlignOptions) -> None:
-    size = float(np.linalg.norm(np.ptp(scan.points_mm, axis=0)))
+    size = diagonal(scan.points_mm)
     other = diagonal(template.bounds_mm)
     ratio, slack = size / max(other, 1e-12), options.unit_slack
     if options.smallest_ratio <= ratio <= options.largest_ratio:

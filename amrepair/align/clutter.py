@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from amrepair.align.options import USUAL_ALIGN, ClutterOptions
+from amrepair.frames import diagonal
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +130,7 @@ def _bed(
     """(n,) points of the plane that holds most of the surface, if all the rest is on one side."""
     here = np.flatnonzero(surface)
     kept = cloud[here]
-    diagonal_mm = float(np.linalg.norm(np.ptp(kept, axis=0)))
+    diagonal_mm = diagonal(kept)
     last_mm = max(options.plane_sigmas * sigma_mm, options.last_tolerance_ratio * diagonal_mm)
     first_mm = options.first_tolerance_ratio * diagonal_mm
     few = kept[rng.permutation(len(kept))[: options.plane_points]]

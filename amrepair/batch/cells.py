@@ -180,7 +180,7 @@ def _add_volumes(
     tree = cells.tree
     for region, centre_mm in zip(regions, centres_mm, strict=True):
         name = "missing" if region.label is Label.MISSING else "excess"
-        half_mm = 0.5 * float(np.linalg.norm(np.ptp(region.box_mm, axis=0)))
+        half_mm = 0.5 * diagonal(np.asarray(region.box_mm))
         around = np.array(tree.query_ball_point(centre_mm, half_mm + cells.spacing_mm), np.int64)
         held = np.sort(around[sums.column(name)[around] > 0]) if len(around) else around
         if not len(held):

@@ -153,7 +153,7 @@ class Bench:
             title=f"repair of scan {task.sha256[:12]}",  # its bytes may have several names
             rng=np.random.default_rng(options.seed),
         )
-        template_from_build = plan.registration.template_from_scan @ plan.build_from_scan.inverse()
+        template_from_build = plan.build_from_template.inverse()
         regions = plan.deficit.regions
         centres_mm = np.array([np.mean(r.box_mm, axis=0) for r in regions]).reshape(-1, 3)
         centres_mm = template_from_build.apply(centres_mm)

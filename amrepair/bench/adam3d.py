@@ -19,6 +19,7 @@ from PIL import Image
 
 from amrepair.bench.samples import GOOD, BenchClass, Points, Sample, SampleCloud
 from amrepair.errors import InputError, refused_as_ours
+from amrepair.frames import diagonal
 from amrepair.observe.robust import MAD_TO_SIGMA
 from gcode.surfaces.sizes import (
     PARSER_ERRORS,
@@ -148,7 +149,7 @@ def _plane(points: Points) -> tuple[Float[np.ndarray, " 3"], float, float] | Non
     median = np.median(away, axis=0)
     best = int(np.argmin(median))
     sigma = MAD_TO_SIGMA * float(median[best])
-    if sigma > FLAT_RATIO * float(np.linalg.norm(np.ptp(some, axis=0))):
+    if sigma > FLAT_RATIO * diagonal(some):
         return None
     near = some[away[:, best] <= TABLE_SIGMAS * sigma]
     middle = near.mean(axis=0)

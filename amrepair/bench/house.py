@@ -25,7 +25,7 @@ from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.bench.options import USUAL_HOUSE
 from amrepair.errors import AlignmentError
-from amrepair.frames import moved
+from amrepair.frames import diagonal, moved
 from amrepair.merge import fit_from_scans
 from amrepair.regions.sound import SoundTest, SoundTestOptions
 from amrepair.scans.scan import Scan
@@ -159,7 +159,7 @@ def smoothed_score(
 
     In standard deviations `sigma_mm` of what sound parts leave there.
     """
-    limit_mm = USUAL_HOUSE.most_offset_ratio * float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    limit_mm = USUAL_HOUSE.most_offset_ratio * diagonal(points_mm)
     order = order_of(points_mm)  # near points in a row are found sooner
     points = points_mm[order]
     offset = (np.clip(offset_mm, -limit_mm, limit_mm) / sigma_mm)[order]

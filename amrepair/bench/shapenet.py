@@ -30,6 +30,7 @@ from amrepair.bench.samples import (
     without_labels,
 )
 from amrepair.errors import InputError
+from amrepair.frames import diagonal
 
 _log = logging.getLogger(__name__)
 
@@ -139,13 +140,13 @@ def match_labels(
         If half the points are far from every row: the truth is another shape's.
     """
     gap, nearest = cKDTree(rows).query(points)
-    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    across = diagonal(points)
     typical = float(np.median(gap))
-    if typical > MAX_GAP_RATIO * diagonal:
+    if typical > MAX_GAP_RATIO * across:
         raise InputError(
             f"{path}: the truth belongs to another cloud: half the points are {typical:.3g} or "
             f"more from any of its {len(rows)} rows (limit {MAX_GAP_RATIO:.0%} of the shape, "
-            f"{MAX_GAP_RATIO * diagonal:.3g})"
+            f"{MAX_GAP_RATIO * across:.3g})"
         )
     strangers = int((gap > 2 * 10.0**-decimals).sum())
     if strangers or len(rows) != len(points):

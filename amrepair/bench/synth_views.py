@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from amrepair.bench.options import USUAL_VIEWING
 from amrepair.device import open3d
 from amrepair.errors import InputError
-from amrepair.frames import spread_directions
+from amrepair.frames import diagonal, spread_directions
 from amrepair.template.surface import triangle_areas_normals
 
 
@@ -39,7 +39,7 @@ class Shape:
     @property
     def diagonal_mm(self) -> float:
         """Diagonal of the bounding box."""
-        return float(np.linalg.norm(np.ptp(self.vertices_mm, axis=0)))
+        return diagonal(self.vertices_mm)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import astuple
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -172,6 +171,5 @@ def _hand_out(macros: Path | None, unit: Path | None) -> None:
         if str(path) == "-":
             console.out.print(shipped(name), end="", highlight=False, soft_wrap=True)
             continue
-        write = partial(Path.write_text, data=shipped(name), encoding="utf-8")
-        console.write_whole(path, write)
+        console.write_text(path, shipped(name))
         console.errors.print(f"{path} is written; it says at its head where it belongs.")

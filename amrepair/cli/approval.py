@@ -34,14 +34,13 @@ class Terminal:
     def to_go_on(self, decision: Decision) -> bool:
         """Say why the run rests, and wait for a word."""
         with self._bars.paused():
-            for verdict in decision.verdicts:
-                if verdict.action is decision.action:
-                    one = verdict.finding
-                    low, high = one.box_mm
-                    console.errors.print(
-                        f"  {one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
-                        f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}."
-                    )
+            for verdict in decision.own:
+                one = verdict.finding
+                low, high = one.box_mm
+                console.errors.print(
+                    f"  {one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
+                    f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}."
+                )
             for way in decision.ways:
                 console.errors.print(f"  {way.told}")
             return confirmed("Go on all the same (no ends the run)?")
@@ -81,10 +80,7 @@ class AtDesk(console.Bars):
 
     def to_go_on(self, decision: Decision) -> bool:
         """Tell why the run rests, and wait for a word."""
-        own = [v for v in decision.verdicts if v.action is decision.action]
-        lines = [f"{v.finding.type}: {v.reason}" for v in own] or [decision.reason]
-        lines += [way.told for way in decision.ways]
-        return self._desk.ask("Go on all the same (no ends the run)?", lines)
+        return self._desk.ask("Go on all the same (no ends the run)?", decision.told)
 
 
 def confirmed(question: str) -> bool:

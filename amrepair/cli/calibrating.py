@@ -42,7 +42,7 @@ def write_target(path: Path, ids: tuple[str, str, str], *, as_json: bool) -> Non
     setup = load_setup(*ids)
     console.writable(path)
     text = _target(setup).program.text
-    console.write_whole(path, lambda whole: whole.write_text(text, encoding="utf-8"))
+    console.write_text(path, text)
     if as_json:
         console.show_json({"gcode": str(path)})
     else:

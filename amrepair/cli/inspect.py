@@ -263,7 +263,7 @@ def detect(
         ],
         **_told(anomaly, calibration),
         **_pose_figures(found),
-        "seconds": {stage: round(spent, 3) for stage, spent in watch.seconds.items()},
+        "seconds": watch.rounded_s(),
         **chosen,
     }
     result = dict(rounded(result))

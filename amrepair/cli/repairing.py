@@ -195,13 +195,13 @@ def repair(
     program = plan.checked.program if plan.checked is not None else None
     if program is not None:
         text = program.text
-        console.write_whole(output, lambda path: path.write_text(text, encoding="utf-8"))
+        console.write_text(output, text)
     older = program is None and output.exists()
     if older:  # `repair && send` must not send what another scan asked for
         output.unlink()
     if standing is not None:
         console.write_whole(standing, plan.deficit.as_built.write)
-    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
+    seconds = watch.rounded_s()
     result = plan_result(
         plan,
         gcode=str(output) if program is not None else None,
@@ -271,7 +271,7 @@ def _foot_z_mm(template: Template, plan: RepairPlan) -> float:
     """Height of the part's lowest point, build frame."""
     from amrepair.align.standing import box_on_bed
 
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     return float(box_on_bed(template, placed)[0, 2])
 
 

@@ -42,7 +42,7 @@ from amrepair.report import TemperatureSeries
 from amrepair.report.folder import RunFolder
 from amrepair.scans import PROBE
 from amrepair.template import open_template
-from gcode.check import CheckedProgram, check, policy_of
+from gcode.check import check, policy_of
 from gcode.cli import console
 from gcode.cli.judging import tell_warnings
 from gcode.cli.options import program_text
@@ -51,9 +51,8 @@ from gcode.errors import JournalError
 from gcode.hosts import connect
 from gcode.hosts.journal import Journal, default_path
 from gcode.hosts.port import Printer
-from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, PrintSetup
-from gcode.progress import Progress, silent
-from gcode.reader import Job, job_for
+from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
+from gcode.reader import job_for
 
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
 PROFILES = "profiles"  # in the run's folder: those of the job's own settings
@@ -217,7 +216,10 @@ def new_run(
     )
     with bars.shown():
         with told_if_for_another(text, job_file, setup.printer):
-            checked = _judged(job, setup, leave_heaters=said["leave_heaters"], progress=bars)
+            checked = check(
+                job.program, setup, policy=policy_of(job.program),
+                leave_heaters=said["leave_heaters"], progress=bars,
+            )  # fmt: skip
         with watch("template"):
             field = open_template(template, progress=bars)
         with watch("locate"):
@@ -241,17 +243,7 @@ def new_run(
     )  # fmt: skip
     forget(out)
     keep(out, setting, job.program.text, field)
-    return Begun(folder, setting, setup, job, checked, expected, stops, Tape(out))
-
-
-def _judged(
-    job: Job, setup: PrintSetup, *, leave_heaters: bool, progress: Progress = silent
-) -> CheckedProgram:
-    """A job of the user's own is refused what can hurt; one of ours keeps every figure."""
-    return check(
-        job.program, setup, policy=policy_of(job.program), leave_heaters=leave_heaters,
-        progress=progress,
-    )  # fmt: skip
+    return Begun(setting, setup, job, expected, stops, folder, checked, Tape(out))
 
 
 def _how_it_stands(placed: tuple[Transform, ...]) -> str:
@@ -271,9 +263,8 @@ def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: s
         raise InputError(f"the run in {folder} was simulated; there is no printer to go on with")
     tape = Tape(folder)
     tape.reopen()
-    checked = _judged(run.job, run.setup, leave_heaters=setting.leave_heaters)
     return Begun(
-        RunFolder(folder), setting, run.setup, run.job, checked, run.template, run.stops, tape
+        setting, run.setup, run.job, run.template, run.stops, RunFolder(folder), run.judged(), tape
     )
 
 

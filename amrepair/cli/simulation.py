@@ -157,7 +157,7 @@ def simulate(
                 watch=watch,
                 progress=page.watching(bars),
             )
-    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
+    seconds = watch.rounded_s()
     result = _result(run, folder, seed, seconds)
     result["world"] = {"file": world and str(world), "sha256": told.sha256, "scanner": scanner}
     folder.write_json("result.json", result)

@@ -9,10 +9,10 @@ import typer
 
 from amrepair.errors import LoopError
 from amrepair.frames import Transform
-from amrepair.loop import LoopReport, Stop, Tape
+from amrepair.loop import LoopReport, Tape
 from amrepair.loop.learning import told
 from amrepair.loop.probing import Felt
-from amrepair.loop.setting import Setting
+from amrepair.loop.setting import Recorded
 from amrepair.repair import Stopwatch
 from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result, rounded
@@ -21,21 +21,14 @@ from amrepair.template.port import Template
 from gcode.check import CheckedProgram
 from gcode.cli import console
 from gcode.cli.judging import warnings_json
-from gcode.profiles import PrintSetup
-from gcode.reader import Job
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
+class Begun(Recorded):
     """All that a run needs, new or gone on with."""
 
     folder: RunFolder
-    setting: Setting
-    setup: PrintSetup
-    job: Job
     checked: CheckedProgram
-    template: Template
-    stops: tuple[Stop, ...]
     tape: Tape
     felt: list[Felt] = field(default_factory=list)  # what each look by touches cost
 
@@ -49,7 +42,7 @@ def written(
 ) -> dict[str, Any]:
     """Result and report, in the run's folder; the result."""
     folder, setting, setup = begun.folder, begun.setting, begun.setup
-    seconds = {stage: round(spent, 3) for stage, spent in watch.seconds.items()}
+    seconds = watch.rounded_s()
     printed = [look for look in report.looks if look.printed]
     last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
     result = loop_result(

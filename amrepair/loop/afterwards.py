@@ -71,7 +71,7 @@ def afterwards(
     if open_mm3 < plan.policy.buried_mm3:
         return Afterwards(open_mm3)
     offered = ways(left, job, end, setup, command=command)
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     not_again = "it begins in the first layer, and nothing would stand there"
     if len(offered) > 1:
         not_again = _why_not_again(job, template, placed, setup)

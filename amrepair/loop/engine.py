@@ -434,7 +434,7 @@ class Run:
 
 def _why(decision: Decision) -> str:
     """One line on why a run was ended."""
-    own = [v for v in decision.verdicts if v.action is decision.action]
+    own = decision.own
     kinds = ", ".join(sorted({str(v.finding.type) for v in own}))
     reason = own[0].reason if own else decision.situation.beyond or decision.reason
     reason = "; ".join([reason, *(way.told for way in decision.ways if way.layer is not None)])

@@ -7,6 +7,7 @@ the head would run into what stands out. Types and confidence are `kinds`'.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import manifold3d
 import numpy as np
@@ -21,6 +22,7 @@ from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals
 from gcode.errors import ReadError
+from gcode.meshes import box_of_solid
 from gcode.moves import Program
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
@@ -154,20 +156,13 @@ def findings(
             if piece is not None:
                 hit = hit_mm(job, setup, piece, line=line, end_line=end_line)
         found.append(
-            Finding(
-                kind="missing" if region.label is Label.MISSING else "excess",
-                type=region.type,
+            replace(
+                _alone(region, job, layer_index, plan.layer_height_mm),
                 confidence=float(region.confidence),
-                volume_mm3=float(region.volume_mm3),
                 defect_mm3=float(whole_mm3),
-                thickness_layers=thickness_mm(region) / plan.layer_height_mm,
-                height_layers=float(height_mm(region) / plan.layer_height_mm),
                 reachable_ratio=reach,
-                cover=cover_of(job, layer_index, np.asarray(region.box_mm)),
                 hit_mm=hit,
-                box_mm=_corners(region.box_mm),
                 seen_twice=seen_twice,
-                skipped=region.skipped,
                 layer_off=is_off,
                 object=owner[0],
                 lost_ratio=owner[1],
@@ -221,9 +216,13 @@ def early_action(
     policy: PolicyOptions = USUAL_POLICY,
 ) -> Action:
     """What the table says of a missing region before anybody knows what can be reached of it."""
-    layer_mm = setup.process.layer_height_mm
-    finding = Finding(
-        kind="missing",
+    return judge(_alone(region, job, layer_index, setup.process.layer_height_mm), policy).action
+
+
+def _alone(region: Region, job: Job, layer_index: int | None, layer_mm: float) -> Finding:
+    """What a region tells by itself: there for sure, all of its defect, and within reach."""
+    return Finding(
+        kind="missing" if region.label is Label.MISSING else "excess",
         type=region.type,
         confidence=1.0,
         volume_mm3=float(region.volume_mm3),
@@ -236,7 +235,6 @@ def early_action(
         box_mm=_corners(region.box_mm),
         skipped=region.skipped,
     )
-    return judge(finding, policy).action
 
 
 def thickness_mm(region: Region) -> float:
@@ -255,7 +253,7 @@ def matching(
     """The piece whose box is nearest to a region's."""
     if not pieces:
         return None
-    boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
+    boxes = [box_of_solid(piece) for piece in pieces]
     return pieces[int(np.argmin([np.abs(box - box_mm).max() for box in boxes]))]
 
 

@@ -140,7 +140,7 @@ def _surfaces(
         return None
     every = max(1, len(plan.anomaly.points_mm) // (12 * options.most_points))
     points, deviation = plan.anomaly.points_mm[::every], plan.anomaly.deviation_mm[::every]
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     height = placed.apply(points)[:, 2]
     beside = np.flatnonzero((deviation > options.beside_layer_mm) & (np.abs(height) < 0.5))
     bed_mm = float(np.median(height[beside])) if len(beside) >= options.least_points else 0.0
@@ -167,7 +167,7 @@ def _came_off(
 ) -> TypeGuess | None:
     """Whether the part lies somewhere else than where the calibration and the job have it."""
     moved = plan.build_from_scan @ build_from_scanner.inverse()
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     points = plan.scan.points_mm
     some = points[:: max(1, len(points) // options.most_points)]
     centre = placed.apply(some).mean(axis=0, keepdims=True)
@@ -373,7 +373,7 @@ def _at_rim(
     plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"], options: KindOptions
 ) -> bool:
     """Whether a region reaches the part's outline seen from above, a little below its floor."""
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     z = max(float(box_mm[0, 2]) - options.below_layer_mm, 0.5 * float(box_mm[0, 2]))
     around = np.array([[box_mm[i, 0], box_mm[j, 1], z] for i in (0, 1) for j in (0, 1)])
     inside = site.template.distance(placed.inverse().apply(around))
@@ -384,7 +384,7 @@ def _at_rim(
 
 def _everywhere(plan: RepairPlan, site: Site, whole: TypeGuess) -> Region:
     """A region of no volume that stands for the whole part."""
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     box = placed.apply(site.template.bounds_mm)
     return Region(
         label=Label.EXCESS,

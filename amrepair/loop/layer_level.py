@@ -86,7 +86,7 @@ class LayerLevel:
         """
         if z_mm is None:
             return None
-        placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+        placed = plan.build_from_template
         return cls.of_points(
             placed.apply(plan.anomaly.points_mm),
             plan.anomaly.deviation_mm,

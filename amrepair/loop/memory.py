@@ -74,7 +74,7 @@ def _heights_later(
     """How what stood on the bed can be made of a thinned scan."""
     template, printed_z_mm = site.template, site.printed_z_mm
     options = site.options.deficit.heights
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     return lambda: as_built_heights(
         scan,
         template,

@@ -20,7 +20,6 @@ from amrepair.loop.sites import sites
 from amrepair.loop.tape import Tape, read_events
 from amrepair.policy.again import changed, decided_again
 from amrepair.scans import Scan, ScanRequest
-from gcode.check import check, policy_of
 from gcode.hosts.file import FilePrinter
 from gcode.progress import Progress, silent
 
@@ -107,12 +106,7 @@ def looks_of(run: Recorded, tape: Tape, *, progress: Progress = silent) -> tuple
     setting = run.setting
     report = run_loop(
         run.job,
-        check(
-            run.job.program,
-            run.setup,
-            policy=policy_of(run.job.program),
-            leave_heaters=setting.leave_heaters,
-        ),
+        run.judged(),
         FilePrinter(Path("/dev/null")),
         _TapeScanner(setting.scanner_pose),
         sites(run.job, run.template, setting.placed, run.setup, by_beads=setting.by_beads),

@@ -27,6 +27,7 @@ from amrepair.regions.calibration import Calibration
 from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
+from gcode.check import CheckedProgram, check, policy_of
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup, ProcessProfile, load_setup
 from gcode.reader import Job, job_for
@@ -176,6 +177,12 @@ class Recorded:
     job: Job
     template: Template
     stops: tuple[Stop, ...]
+
+    def judged(self) -> CheckedProgram:
+        """The job, by the policy that it was judged by as the run began."""
+        program = self.job.program
+        policy, leave = policy_of(program), self.setting.leave_heaters
+        return check(program, self.setup, policy=policy, leave_heaters=leave)
 
 
 def keep(folder: Path, setting: Setting, job_text: str, template: Template) -> None:

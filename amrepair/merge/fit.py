@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 import amrepair
 from amrepair.errors import InputError
+from amrepair.frames import diagonal
 from amrepair.merge.cloud import outward_by, planes, spacing_of
 from amrepair.merge.fuse import Cloud, Fused, fuse
 from amrepair.merge.joint import Slack
@@ -149,7 +150,7 @@ def fit_from_scans(
 
 def _in_millimetres(scans: Sequence[Scan]) -> tuple[list[Scan], float]:
     """The scans in mm, and what their unit is."""
-    sizes = [float(np.linalg.norm(np.ptp(scan.points_mm, axis=0))) for scan in scans]
+    sizes = [diagonal(scan.points_mm) for scan in scans]
     if not scans or max(sizes) >= LEAST_PART_MM:
         return list(scans), 1.0
     return [
@@ -171,7 +172,7 @@ def _refuse(scans: Sequence[Scan], options: MergeOptions) -> None:
                 f"the scan {scan.source} has {len(scan)} points; a template needs at least "
                 f"{options.view.least_points:,} of each scan"
             )
-    sizes = [float(np.linalg.norm(np.ptp(scan.points_mm, axis=0))) for scan in scans]
+    sizes = [diagonal(scan.points_mm) for scan in scans]
     usual = float(np.median(sizes))
     for scan, size in zip(scans, sizes, strict=True):
         if not usual / options.unit_size_jump < size < usual * options.unit_size_jump:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.align.registration import bounded_inverse
-from amrepair.frames import motion_about, moved
+from amrepair.frames import diagonal, motion_about, moved
 from amrepair.merge.kept import KeptAnswers
 from amrepair.merge.options import USUAL_MERGE, JointOptions
 from amrepair.merge.threads import in_threads
@@ -300,7 +300,7 @@ def _scatter(
     sigma = np.array([p.sigma_mm for p in views])
     first, second = np.minimum(pairs.of, pairs.other), np.maximum(pairs.of, pairs.other)
     low = pairs.points_mm.min(axis=0)
-    edge_mm = options.patch_ratio * float(np.linalg.norm(np.ptp(pairs.points_mm, axis=0)))
+    edge_mm = options.patch_ratio * diagonal(pairs.points_mm)
     axis = np.argmax(np.abs(pairs.planes), axis=1)
     side = np.take_along_axis(pairs.planes, axis[:, None], axis=1)[:, 0] > 0.0
     cell = np.floor((pairs.points_mm - low) / edge_mm).astype(np.int64)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from amrepair.frames import moved, spread_directions, ways_across
+from amrepair.frames import diagonal, moved, spread_directions, ways_across
 from amrepair.merge import sight_kernels as kernels
 from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.options import USUAL_MERGE, SightOptions
@@ -250,7 +250,7 @@ def guessed(
 ) -> DepthImages:
     """Looks from every place where the sensor may have stood."""
     centre = points_mm.mean(axis=0)
-    diagonal_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    diagonal_mm = diagonal(points_mm)
     return DepthImages(
         tuple(
             DepthImage.of(

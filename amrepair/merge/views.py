@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.thinning import thin_out
 from amrepair.errors import InputError
-from amrepair.frames import motion_about, moved
+from amrepair.frames import diagonal, motion_about, moved
 from amrepair.merge import sight
 from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.options import USUAL_MERGE, JudgeOptions, MergeOptions
@@ -122,7 +122,7 @@ class View:
     @property
     def size_mm(self) -> float:
         """Its diagonal."""
-        return float(np.linalg.norm(np.ptp(self.thin.points_mm, axis=0)))
+        return diagonal(self.thin.points_mm)
 
     @property
     def sure(self) -> Bool[np.ndarray, " n"]:

@@ -360,6 +360,17 @@ class Decision:
         wanted = {Action.FILL_WITH_NEXT, Action.LOWER_NEXT}
         return tuple(verdict for verdict in self.verdicts if verdict.action in wanted)
 
+    @property
+    def own(self) -> tuple[Verdict, ...]:
+        """Findings that led to it."""
+        return tuple(verdict for verdict in self.verdicts if verdict.action is self.action)
+
+    @property
+    def told(self) -> list[str]:
+        """What it rests on and what can be done, in lines, for whoever is asked."""
+        own = [f"{verdict.finding.type}: {verdict.reason}" for verdict in self.own]
+        return (own or [self.reason]) + [way.told for way in self.ways]
+
     def to_json(self) -> dict[str, Any]:
         """As it stands in the run's record."""
         return {

@@ -14,6 +14,7 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.repair.site import Site
 from amrepair.scans import Scan
+from gcode.meshes import box_of_solid
 
 TOLD_PLACES = 6  # a message is read by a person
 
@@ -100,7 +101,7 @@ def _repairs(site: Site, registration: Registration, deficit: Deficit) -> list[_
     """Of the best pose, then of the others: the same scanned hole, seen through each of them."""
     assert site.build_from_template is not None
     largest = max(deficit.missing.decompose(), key=lambda piece: piece.volume())
-    centre_mm = np.asarray(largest.bounding_box()).reshape(2, 3).mean(axis=0)[None]
+    centre_mm = box_of_solid(largest).mean(axis=0)[None]
     build, template = site.build_from_template, registration.template_from_scan
     repairs = []
     for pose in (template, *registration.symmetric_alternatives):

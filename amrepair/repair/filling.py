@@ -13,6 +13,7 @@ from amrepair.frames import Transform
 from amrepair.policy import PolicyOptions, worth
 from amrepair.regions import Label, Region
 from amrepair.repair.site import Site
+from gcode.meshes import box_of_solid
 from gcode.slicing.job_lines import JobLines
 
 
@@ -21,7 +22,7 @@ def fillable(
 ) -> manifold3d.Manifold:
     """The missing pieces that are worth a repair, and wanted in it."""
     pieces = deficit.missing.decompose()
-    boxes = [np.asarray(piece.bounding_box()).reshape(2, 3) for piece in pieces]
+    boxes = [box_of_solid(piece) for piece in pieces]
     regions = [region for region in deficit.regions if region.label is Label.MISSING]
     of_piece = [_region_of(piece, regions) if regions else None for piece in pieces]
     lines = [region is not None and region.skipped for region in of_piece]
@@ -46,6 +47,6 @@ def lines_of(site: Site, deficit: Deficit, placed: Transform) -> JobLines | None
 
 def _region_of(piece: manifold3d.Manifold, regions: list[Region]) -> Region:
     """The region that a piece is: the one whose box is nearest to its own."""
-    box = np.asarray(piece.bounding_box()).reshape(2, 3)
+    box = box_of_solid(piece)
     off_mm = [float(np.abs(np.asarray(region.box_mm) - box).max()) for region in regions]
     return regions[int(np.argmin(off_mm))]

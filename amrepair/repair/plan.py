@@ -58,6 +58,11 @@ class RepairPlan:
     refused: str = ""
 
     @property
+    def build_from_template(self) -> Transform:
+        """Where the part stands on the bed, as this scan shows it."""
+        return self.build_from_scan @ self.registration.template_from_scan.inverse()
+
+    @property
     def to_fill(self) -> tuple[Region, ...]:
         """Missing regions that are worth a repair: alone, or with those beside them."""
         return worth.to_fill(self.deficit.regions, self.policy)
@@ -76,3 +81,8 @@ class RepairPlan:
     def unreachable_mm3(self) -> float:
         """Missing volume that the nozzle cannot get to."""
         return float(sum(u.volume_mm3 for u in self.patch.unreachable)) if self.patch else 0.0
+
+    @property
+    def unprintable_mm3(self) -> float:
+        """Missing volume that no bead fits, or that holds none."""
+        return float(sum(u.volume_mm3 for u in self.patch.unprintable)) if self.patch else 0.0

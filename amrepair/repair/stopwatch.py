@@ -22,3 +22,7 @@ class Stopwatch:
         finally:
             spent_s = time.monotonic() - start_s
             self.seconds[stage] = self.seconds.get(stage, 0.0) + spent_s
+
+    def rounded_s(self) -> dict[str, float]:
+        """The seconds as a result tells them, to a thousandth."""
+        return {stage: round(spent_s, 3) for stage, spent_s in self.seconds.items()}

@@ -35,8 +35,7 @@ def plan_is_enough(plan: RepairPlan) -> bool:
         return True
     if plan.checked is None or plan.patch is None or plan.too_much:
         return False
-    left_mm3 = sum(u.volume_mm3 for u in plan.patch.unreachable)
-    left_mm3 += sum(u.volume_mm3 for u in plan.patch.unprintable)
+    left_mm3 = plan.unreachable_mm3 + plan.unprintable_mm3
     return left_mm3 <= USUAL_PAGE.left_out_ratio * plan.deficit.missing_mm3
 
 
@@ -59,7 +58,7 @@ def report_of_plan(
     late
         What stays open inside, where the part's job is at hand.
     """
-    placed = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    placed = plan.build_from_template
     enough = plan_is_enough(plan)
     solid: Any = template.solid()
     return ReportData(

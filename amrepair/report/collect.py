@@ -114,9 +114,7 @@ def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None)
         "excess_mm3_before": together_mm3(p.deficit.excess for p in first),
         "excess_mm3_after": None if last is None else together_mm3(p.deficit.excess for p in last),
         "unreachable_mm3": sum(p.unreachable_mm3 for p in ends),
-        "unprintable_mm3": float(
-            sum(piece.volume_mm3 for p in ends if p.patch for piece in p.patch.unprintable)
-        ),
+        "unprintable_mm3": float(sum(p.unprintable_mm3 for p in ends)),
         "unseen_area_mm2": ends[-1].deficit.unseen_area_mm2 if ends else 0.0,
         "regions": [
             {
@@ -260,7 +258,7 @@ def look_of(
     stop, scanned_points
         As in `ReportLook`.
     """
-    build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+    build_from_template = plan.build_from_template
     scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
     shown = of_the_part(plan)
     unseen = anomaly.template_points_mm[anomaly.template_label == int(Label.UNSEEN)]

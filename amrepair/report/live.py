@@ -270,7 +270,7 @@ class LiveView:
         """Draw a scan with its deviations, what is missing, what is too much, and the patch."""
         if not self._open:
             return
-        build_from_template = plan.build_from_scan @ plan.registration.template_from_scan.inverse()
+        build_from_template = plan.build_from_template
         anomaly = plan.anomaly
         near = of_the_part(plan)
         self.show_cloud(
@@ -299,9 +299,7 @@ class LiveView:
         """Show why the run rests and wait: Approve goes on all the same, Skip ends it."""
         if self._operator is None:
             return False
-        own = [v for v in decision.verdicts if v.action is decision.action]
-        why = [f"- {v.finding.type}: {v.reason}" for v in own] or [f"- {decision.reason}"]
-        why += [f"- {way.told}" for way in decision.ways]
+        why = [f"- {line}" for line in decision.told]
         self._found.content = "\n".join(["**Go on all the same?** (Skip ends the run)", *why])
         return self._operator.ask() is OperatorAnswer.APPROVE
 

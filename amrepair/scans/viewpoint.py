@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.frames import diagonal
 from amrepair.scans import range_grid_kernels as kernels
 from amrepair.scans.range_grid import EdgeOptions, Kind, RangeGrid, depths_of
 
@@ -275,7 +276,7 @@ def straight_from(
     """A sensor so far away that its rays are parallel to `towards`, to a pixel over the depth."""
     middle = points_mm.mean(axis=0)
     depth_mm = float(np.ptp(points_mm @ towards))
-    wide_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    wide_mm = diagonal(points_mm)
     far_mm = max(INFINITY_MM, wide_mm * depth_mm / pixel_mm)
     sensor = middle + towards * far_mm
     return Viewpoint("orthographic", sensor[None], np.zeros(len(points_mm), np.int64))

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from amrepair.errors import InputError
 from amrepair.simulate.options import USUAL_PLACEMENT
 from amrepair.simulate.placed import Defect, PlacedDefect, Printed
+from gcode.meshes import box_of_solid
 from gcode.reader.job import Beads
 
 _EVERYWHERE_MM = 1e9
@@ -267,7 +268,7 @@ def chip(
         # A piece that falls off with the bite would lie loose on the bed: that is no chip.
         if sum(abs(piece.volume()) > USUAL_PLACEMENT.least_piece_mm3 for piece in pieces) > whole:
             continue
-        box = np.array(broken.bounding_box()).reshape(2, 3)
+        box = box_of_solid(broken)
         grow_mm = np.array([0.5, 0.5, 0.5])  # the print stands a little off the CAD
         box = np.stack([box[0] - grow_mm, box[1] + grow_mm])
         return PlacedDefect(defect.kind, (), np.zeros((0, 9)), bite, None, box)
@@ -287,5 +288,5 @@ def blob(
         return None
     dome = m3.Manifold.sphere(1.0, 48).scale((radius_mm, radius_mm, height_mm))
     dome = dome.trim_by_plane((0.0, 0.0, 1.0), -0.05).translate((*centre, top_mm))
-    box = np.array(dome.bounding_box()).reshape(2, 3)
+    box = box_of_solid(dome)
     return PlacedDefect(defect.kind, (), np.zeros((0, 9)), None, dome, box)

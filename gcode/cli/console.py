@@ -236,6 +236,11 @@ def writable(path: Path) -> None:
     raise InputError(f"{path} cannot be written: {why}.")
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text, as `write_whole` does."""
+    write_whole(path, lambda draft: draft.write_text(text, encoding="utf-8"))
+
+
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file under another name, then put it in place.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,7 +56,7 @@ def import_(
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{path.parent} cannot be made ({error.strerror}).") from error
-        console.write_whole(path, partial(Path.write_text, data=text, encoding="utf-8"))
+        console.write_text(path, text)
     if as_json:
         console.show_json(_result(found, paths))
     else:

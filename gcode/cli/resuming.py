@@ -68,7 +68,7 @@ def resume_at_command(
             progress=bars,
         )
     program = made.checked.program
-    console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
+    console.write_text(output, program.text)
     if standing is not None:
         console.write_whole(standing, made.standing.write)
     if as_json:

@@ -53,7 +53,7 @@ def print_onto_command(
             Program(text, setup.printer.dialect), setup, field, title=job.name, progress=bars
         )
     program = made.checked.program
-    console.write_whole(output, lambda path: path.write_text(program.text, encoding="utf-8"))
+    console.write_text(output, program.text)
     tell_warnings(job, made.checked.report)
     if as_json:
         console.show_json(

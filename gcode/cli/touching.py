@@ -23,7 +23,7 @@ def _hand_out(path: Path) -> None:
     """Write the macro that touches need on Klipper."""
     from gcode.resumption.klipper import TOUCH_MACRO
 
-    console.write_whole(path, lambda draft: draft.write_text(TOUCH_MACRO, encoding="utf-8"))
+    console.write_text(path, TOUCH_MACRO)
     console.errors.print(f"Written: {path}; include it in printer.cfg.")
 
 

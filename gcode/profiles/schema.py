@@ -29,18 +29,18 @@ _ROUND_SIDES = 48  # 0.2 % beyond the circle
 _CONE_STEP_MM = 0.1
 
 
-class _Profile(BaseModel):
+class _Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+
+class _Profile(_Strict):
     id: str
     name: str
     sha256: str = ""
 
 
-class AxisLimits(BaseModel):
+class AxisLimits(_Strict):
     """A limit by axis."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     x: Positive
     y: Positive
@@ -48,7 +48,7 @@ class AxisLimits(BaseModel):
     e: Positive
 
 
-class EnvelopeSlice(BaseModel):
+class EnvelopeSlice(_Strict):
     """A height range of the tool head as a convex polygon around the nozzle's axis.
 
     `polygon_mm` is relative to the nozzle tip, counter-clockwise; the slice occupies
@@ -64,8 +64,6 @@ class EnvelopeSlice(BaseModel):
     z_to_mm
         Height of that rim above the tip.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     part: Literal["nozzle", "block", "duct", "carriage", "gantry"]
     z_from_mm: Annotated[float, Field(ge=0)]
@@ -143,20 +141,18 @@ class EnvelopeSlice(BaseModel):
         return tuple(found)
 
 
-class StartMacro(BaseModel):
+class StartMacro(_Strict):
     """A macro of the machine's own that homes all axes, heats, and waits for both heaters.
 
     `hotend` and `bed` are the parameters that tell it how hot.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     hotend: str
     bed: str
 
 
-class ProbeProfile(BaseModel):
+class ProbeProfile(_Strict):
     """A probe that feels plastic, for whoever touches what stands on the bed.
 
     What senses metal or a sheet (inductive, optical) feels no part: a printer with such a one has
@@ -182,8 +178,6 @@ class ProbeProfile(BaseModel):
     cold_c
         A nozzle that feels is no warmer: plastic gives way, and what oozes is felt for the part.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     kind: Literal["nozzle", "pin"]
     command: Literal["G38.2", "AMREPAIR_TOUCH"]
