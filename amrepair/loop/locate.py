@@ -202,9 +202,9 @@ def _things(
 def _of_what_rises(
     layer: Int[np.ndarray, " n"], thing: Int[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Whose thing has more than one layer, or all where none has: a skirt and a priming line not."""
-    count = int(thing.max(initial=-1)) + 1
-    rises = ndimage.maximum(layer, thing, range(count)) > ndimage.minimum(layer, thing, range(count))
+    """Whose thing has more than one layer: a skirt has one; all, where none has more."""
+    every = range(int(thing.max(initial=-1)) + 1)
+    rises = ndimage.maximum(layer, thing, every) > ndimage.minimum(layer, thing, every)
     return rises[thing] if rises.any() else np.ones(len(thing), bool)
 
 

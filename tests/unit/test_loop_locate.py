@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import manifold3d as m3
@@ -109,6 +110,24 @@ def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
         assert min(off_mm(one, truth) for one in placed) < 0.1
     with pytest.raises(AlignmentError, match="prints 3 copies"):
         locate_part(job_of(plate), template, layer_height_mm=LAYER_MM)
+
+
+@pytest.mark.parametrize("hole", [False, True])
+def test_a_job_without_roles_is_placed_by_what_bounds_its_layers(*, hole: bool) -> None:
+    """regression: Slic3r's jobs name no roles; infill was taken for walls, a skirt for a part."""
+    part = wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0))
+    if hole:
+        part -= m3.Manifold.cylinder(20.0, 2.5, 2.5, 32).translate((65.0, 65.0, -1.0))
+    told = write(plan_part(part, SETUP).toolpath, SETUP, title="job").text
+    assert ";TYPE:Skirt" in told
+    bare = re.sub(r"^;TYPE:.*\n", "", told, flags=re.MULTILINE)
+    assert set(job_for(bare, SETUP.printer).beads.roles) == {"unknown"}
+    template = MeshSdf.from_mesh(solid_mesh(part.translate((-60.0, -60.0, 0.0))))
+    placed = locate_part(job_for(bare, SETUP.printer), template, layer_height_mm=LAYER_MM)
+    assert (
+        np.abs(placed.matrix[:3] - np.eye(4)[:3] - [[0, 0, 0, 60], [0, 0, 0, 60], [0] * 4]).max()
+        < 0.05
+    )
 
 
 @pytest.mark.slow

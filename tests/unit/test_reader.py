@@ -126,3 +126,18 @@ def test_blocks_are_what_the_whole_is(chars: int) -> None:
         together = np.concatenate([getattr(block, of) for block in blocks])
         np.testing.assert_array_equal(together, getattr(whole.block, of))
     assert [each for block in blocks for each in block.comments] == whole.block.comments
+
+
+@pytest.mark.parametrize(
+    ("mark", "role"),
+    [
+        (";TYPE:External perimeter", "External perimeter"),
+        ("; FEATURE: Outer wall", "Outer wall"),  # Bambu Studio
+        (";TYPE:WALL-OUTER", "WALL-OUTER"),  # Cura, ideaMaker
+        ("; feature outer perimeter", "outer perimeter"),  # Simplify3D
+        ("; 'Perimeter Path', 12.3 [feed mm/s], 40.0 [head mm/s]", "Perimeter Path"),  # KISSlicer
+    ],
+)
+def test_roles_are_read_as_each_slicer_names_them(mark: str, role: str) -> None:
+    text = f"M83\nG1 X0 Y0 Z0.2 F600\n{mark}\nG1 X20 E1\n"
+    assert read_job(text).beads.roles[-1] == role
