@@ -299,7 +299,7 @@ class Judge(Motion):
         elif name == "M302":
             if words.get("P") or (words.get("S") or 0.0) < LEAST_COLD_C:
                 told = " ".join(f"{letter}{value or 0:g}" for letter, value in words.items())
-                self._refuse("cold extrusion allowed", told, f"S{LEAST_COLD_C:g} and more")
+                self._refuse("cold extrusion allowed", told or name, f"S{LEAST_COLD_C:g} and more")
         elif name == "M200" and (words.get("D") or words.get("S")):
             self._refuse("extrusion told as a volume", name, "D0")
         elif name == "G27":

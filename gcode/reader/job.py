@@ -26,7 +26,7 @@ _HEIGHT = re.compile(r"(?:HEIGHT|LAYER_HEIGHT):\s*" + _JOB_NUMBER)
 _WIDTH = re.compile(r"(?:WIDTH|LINE_WIDTH):\s*" + _JOB_NUMBER)
 # PrusaSlicer's kin, Cura and ideaMaker; Simplify3D ("feature outer perimeter"); KISSlicer
 # ("'Perimeter Path', 12.0 [feed mm/s]").
-_ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$|^\W*feature (\w.*?)\s*$|^\W*'(\w+ Path)',")
+_ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$|^\W*feature (\w.*?)\s*$|^\W*'([\w/ ]+ Path)',")
 _LEAST_LAYER_MM = 0.015
 _SQUARE_LOSS = 1.0 - math.pi / 4.0
 UNKNOWN_ROLE = "unknown"

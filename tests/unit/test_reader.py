@@ -136,6 +136,7 @@ def test_blocks_are_what_the_whole_is(chars: int) -> None:
         (";TYPE:WALL-OUTER", "WALL-OUTER"),  # Cura, ideaMaker
         ("; feature outer perimeter", "outer perimeter"),  # Simplify3D
         ("; 'Perimeter Path', 12.3 [feed mm/s], 40.0 [head mm/s]", "Perimeter Path"),  # KISSlicer
+        ("; 'Stacked Sparse Infill Path', 2.1 [feed mm/s]", "Stacked Sparse Infill Path"),
     ],
 )
 def test_roles_are_read_as_each_slicer_names_them(mark: str, role: str) -> None:
