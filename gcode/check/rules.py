@@ -14,6 +14,7 @@ from gcode.check.words import (
     LENIENT_OF_TOOLS,
     LINE_LIMIT,
     NO_INCHES,
+    PASSES_OVER,
     PROBES,
     STARTS,
     parameters,
@@ -38,6 +39,8 @@ _NUMBERED_LINE = re.compile(r"N\s*\d")
 FREE_TEXT = frozenset({"M117", "M118", "M486", "M708", "M862.3", "M862.6", "M115"})
 _TOOL = re.compile(r"T\d+")
 _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
+# A letter and a number, or a name and named words: some firmware's command.
+_OF_SOME_FIRMWARE = re.compile(r"[A-Z]\s*-?\d.*|[A-Z_]\w*(?: +\w+=\S+)*")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
 KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
 # Factors on flow (M221) and speed (M220), per cent.
@@ -157,7 +160,11 @@ class Judge(Motion):
         match = _NAMED.match(command)
         name = match.group(1) if match else command.split(maxsplit=1)[0]
         given = parameters(command)
-        if name not in self._known:
+        known = name in self._known
+        stray = not known and _OF_SOME_FIRMWARE.fullmatch(command) is None
+        if stray and self._dialect in PASSES_OVER:
+            self._beyond("no command, which the firmware passes over", name, "none", 1.0)
+        elif not known:
             own = "; a macro of the printer's own is told in its profile's 'macros'"
             limit = f"those of {self._dialect}{own if self._dialect == 'klipper' else ''}"
             self._refuse("command unknown or not allowed", name, limit)

@@ -69,6 +69,8 @@ G90_SETS_E = frozenset({"marlin"})
 CLAMPS = frozenset({"marlin", "prusa"})
 # What they take before homing; Klipper refuses it ("Must home axis first").
 MOVES_UNHOMED = frozenset({"marlin", "prusa"})
+# They answer that a line without a letter and a number is no command, and go on.
+PASSES_OVER = frozenset({"marlin", "prusa"})
 # Klipper refuses G20 (klippy/extras/gcode_move.py), the MK3's firmware passes over it; both go on
 # in millimetres.
 NO_INCHES = frozenset({"klipper", "prusa"})

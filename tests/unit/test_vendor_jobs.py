@@ -58,6 +58,7 @@ def refused(text: str) -> list[str]:
         pytest.param('M862.3 P "MINI"\nM862.5 P2\nM862.6 P"Input shaper"', id="Buddy's checks"),
         pytest.param("M403 E0 F0\nTx\nTc\nG1 X55 E29 F1073\nG1 X5 E29 F1800", id="MMU2S"),
         pytest.param("M84\nG1 Z5\nG28", id="up before homing, Chiron"),
+        pytest.param("Start GCode begin\n1 @ 0.2mm/nG92 E0", id="stray words, Kobra 2"),
         pytest.param("M75\nM200 D0\nM413 S0\nM355 S1", id="timer and light"),
     ],
 )
@@ -91,6 +92,8 @@ def test_what_makers_scripts_end_with_is_printed(end: str) -> None:
         (job(START, f"G33\n{END}"), "probing over a standing part"),
         (job(f"{START}\nT1"), "another tool"),
         (job(f"{START}\nG1 X10\nG1 X-40 E1"), "out of reach"),
+        (job(f"{KLIPPER}\nStart GCode begin"), "command unknown"),
+        (job(f"{START}\nM9999"), "command unknown"),
         (job(KLIPPER, "G1 X-40\nprint_end"), "out of reach"),
         (job(START, f"G28\n{END}"), "homing Z onto a standing part"),
         (job(START, f"M84\nG1 Z5\n{END}"), "before homing"),
