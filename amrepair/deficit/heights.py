@@ -8,6 +8,7 @@ part stands as it was designed, and that margin; where it was designed open, not
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import manifold3d
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
-from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points
+from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points, Values
 from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
@@ -59,13 +60,16 @@ def as_built_heights(
     low, high = box.min(axis=0) - options.beside_part_mm, box.max(axis=0) + options.beside_part_mm
     cell_mm = max(options.cell_mm, 1.2 * spacing_mm)
     nx, ny = (math.ceil(v) for v in (high[:2] - low[:2]) / cell_mm)
-    shape = (ny, nx)
+    grid = HeightField(low[:2].copy(), cell_mm, np.zeros((ny, nx)), np.zeros((ny, nx), bool))
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
-    solid_z = np.full(shape, top_z + options.unseen_margin_mm)
-    z, seen = _tops(points, low[:2], cell_mm, shape, options)
+    solid_z = np.full(grid.shape, top_z + options.unseen_margin_mm)
+    z, seen = _tops(points, grid, options)
     known = seen
     if scan.sensors_mm is None:
-        designed_z = _designed(template, build_from_template, low[:2], cell_mm, shape)
+        solid: Any = template.solid()
+        placed = solid.transform(build_from_template.matrix[:3])
+        designed_z = HeightField.from_manifold(placed, cell_mm, box_mm=grid.box_mm).z_mm
+        designed_z = designed_z[:ny, :nx].astype(np.float64)
         bare = ~seen & (designed_z <= 0)
         z = np.where(bare, 0.0, z)
         known = seen | bare
@@ -74,35 +78,26 @@ def as_built_heights(
     seen = seen | (closed & ~known)
     known = closed
     if images:
-        solid_z = _crossed(
-            solid_z, ~known, low, cell_mm, build_from_template.inverse(), images, options
-        )
-    return HeightField(
-        origin_mm=low[:2].copy(),
-        cell_mm=cell_mm,
-        z_mm=np.where(known, np.maximum(z, 0.0), solid_z),
-        seen=seen,
-    )
+        solid = replace(grid, z_mm=solid_z, seen=known)
+        solid_z = _crossed(solid, float(low[2]), build_from_template.inverse(), images, options)
+    return replace(grid, z_mm=np.where(known, np.maximum(z, 0.0), solid_z), seen=seen)
 
 
 def _crossed(
-    solid_z_mm: HeightMap,
-    unseen: ColumnMask,
-    low_mm: Float[np.ndarray, " 3"],
-    cell_mm: float,
+    solid: HeightField,
+    low_mm: float,
     template_from_build: Transform,
     images: tuple[RangeImage, ...],
     options: HeightOptions,
 ) -> HeightMap:
     """Heights lowered, column by column from above, as far as rays went through them."""
-    iy, ix = unseen.nonzero()
-    z_mm = solid_z_mm.copy()
-    high_mm = float(z_mm.max()) - max(float(low_mm[2]), 0.0)
-    step_mm = max(cell_mm, high_mm / options.most_steps_down)
+    iy, ix = np.nonzero(~solid.seen)
+    z_mm, (x_mm, y_mm) = solid.z_mm.copy(), solid.centres_mm()
+    high_mm = float(z_mm.max()) - max(low_mm, 0.0)
+    step_mm = max(solid.cell_mm, high_mm / options.most_steps_down)
     while len(iy):
         down_mm = np.maximum(z_mm[iy, ix] - step_mm, 0.0)
-        xy_mm = low_mm[:2] + (np.stack([ix, iy], axis=1) + 0.5) * cell_mm
-        points = template_from_build.apply(np.column_stack([xy_mm, down_mm]))
+        points = template_from_build.apply(np.column_stack([x_mm[ix], y_mm[iy], down_mm]))
         empty = clearances(images, points, -np.inf)[1] > options.noise_mm
         iy, ix = iy[empty], ix[empty]
         z_mm[iy, ix] = down_mm[empty]
@@ -333,31 +328,38 @@ def columns_of(
 
 
 def _tops(
-    points_mm: Points,
-    low_mm: Float[np.ndarray, " 2"],
-    cell_mm: float,
-    shape: tuple[int, int],
-    options: HeightOptions,
+    points_mm: Points, grid: HeightField, options: HeightOptions
 ) -> tuple[HeightMap, ColumnMask]:
     """Mean height of each cell's topmost surface.
 
     A point alone above the others of its cell, which no neighbouring cell has anything as high as,
     is none: a scanner's stray would keep the nozzle away from all around it.
     """
-    points_mm = np.ascontiguousarray(points_mm)
-    at = kernels.cells_under(points_mm, low_mm, cell_mm, *shape)
-    top, mean, count, among = kernels.topmost(
-        at, points_mm, options.top_band_mm, shape[0] * shape[1]
-    )
-    around = ndimage.maximum_filter(
-        top.reshape(shape), footprint=AROUND_CELL, mode="constant", cval=-np.inf
-    )
-    alone = (count == 1) & (among > 1) & (around.ravel() < top - options.top_band_mm)
+    index = grid.cells_of(points_mm[:, :2])
+    inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
+    cell, z_mm = index[inside] @ (grid.shape[1], 1), points_mm[inside, 2]
+    band_mm = options.top_band_mm
+    top_mm, mean_mm, count = _topmost(cell, z_mm, grid.z_mm.size, band_mm)
+    around_mm = ndimage.maximum_filter(
+        top_mm.reshape(grid.shape), footprint=AROUND_CELL, mode="constant", cval=-np.inf
+    ).ravel()
+    among = np.bincount(cell, minlength=grid.z_mm.size)
+    alone = (count == 1) & (among > 1) & (around_mm < top_mm - band_mm)
     if alone.any():
-        stray = (at >= 0) & alone[at] & (points_mm[:, 2] == top[at])
-        at = np.where(stray, -1, at)
-        _, mean, count, _ = kernels.topmost(at, points_mm, options.top_band_mm, shape[0] * shape[1])
-    return mean.reshape(shape), count.reshape(shape) > 0
+        kept = ~alone[cell] | (z_mm < top_mm[cell])
+        _, mean_mm, count = _topmost(cell[kept], z_mm[kept], grid.z_mm.size, band_mm)
+    return mean_mm.reshape(grid.shape), count.reshape(grid.shape) > 0
+
+
+def _topmost(
+    cell: Numbers, z_mm: Values, cells: int, band_mm: float
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Int[np.ndarray, " c"]]:
+    """(c,) by cell: the highest point, and the mean and number of those within a band of it."""
+    top_mm = np.full(cells, -np.inf)
+    np.maximum.at(top_mm, cell, z_mm)
+    near = z_mm >= top_mm[cell] - band_mm
+    count = np.bincount(cell[near], minlength=cells)
+    return top_mm, np.bincount(cell[near], z_mm[near], cells) / np.maximum(count, 1), count
 
 
 def _close_gaps(
@@ -382,24 +384,3 @@ def _close_gaps(
         z_mm[new] = highest[new]
         known |= new
     return z_mm, known
-
-
-def _designed(
-    template: Template,
-    build_from_template: Transform,
-    low_mm: Float[np.ndarray, " 2"],
-    cell_mm: float,
-    shape: tuple[int, int],
-) -> HeightMap:
-    """Top of the template by cell; 0 where it has nothing."""
-    solid: Any = template.solid()
-    high_mm = low_mm + cell_mm * np.array(shape[::-1])
-    return (
-        HeightField.from_manifold(
-            solid.transform(build_from_template.matrix[:3]),
-            cell_mm,
-            box_mm=(float(low_mm[0]), float(low_mm[1]), float(high_mm[0]), float(high_mm[1])),
-        )
-        .z_mm[: shape[0], : shape[1]]
-        .astype(np.float64)
-    )

@@ -1,4 +1,4 @@
-"""Heights of a cloud by column, and points that stand out of them; compiled, for `heights`."""
+"""Points that stand out of a field; compiled, for `heights`."""
 
 from __future__ import annotations
 
@@ -7,43 +7,6 @@ from typing import Any
 import numpy as np
 
 from gcode.compiled import njit
-
-
-@njit(cache=True, nogil=True)
-def cells_under(points: Any, low: Any, cell: float, ny: int, nx: int) -> Any:
-    """(n,) number of the column that holds each point, by rows; −1 outside."""
-    out = np.full(len(points), -1, np.int64)
-    for p in range(len(points)):
-        ix = int(np.floor((points[p, 0] - low[0]) / cell))
-        iy = int(np.floor((points[p, 1] - low[1]) / cell))
-        if 0 <= ix < nx and 0 <= iy < ny:
-            out[p] = iy * nx + ix
-    return out
-
-
-@njit(cache=True, nogil=True)
-def topmost(at: Any, points: Any, band: float, cells: int) -> Any:
-    """By column: the highest point, the mean and number of those within a band of it, and of all.
-
-    `at` (n,) are columns of points, −1 for those left out.
-    """
-    top = np.full(cells, -np.inf)
-    for p in range(len(at)):
-        if at[p] >= 0:
-            top[at[p]] = max(top[at[p]], points[p, 2])
-    mean = np.zeros(cells)
-    count, among = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
-    for p in range(len(at)):
-        c = at[p]
-        if c >= 0:
-            among[c] += 1
-            if points[p, 2] >= top[c] - band:
-                count[c] += 1
-                mean[c] += points[p, 2]
-    for c in range(cells):
-        if count[c] > 0:
-            mean[c] /= count[c]
-    return top, mean, count, among
 
 
 @njit(cache=True, nogil=True)

@@ -160,17 +160,11 @@ def with_stubs(
     Such a top lies inside the template, yet nearer to its side than any limit: where template
     beside it is gone it is a surface of its own, and faces the sensors.
     """
-    s = evidence.surfels
-    if len(gone_mm) == 0 or not evidence.has_rays:
-        return evidence
-    options = evidence.options
-    reach_mm = options.stub_cells * s.cell_mm
-    near = has_near(s.place_mm, gone_mm, reach_mm)
+    s, options = evidence.surfels, evidence.options
+    near = has_near(s.place_mm, gone_mm, options.stub_cells * s.cell_mm)
     which = np.flatnonzero(near & ~labelled & ~evidence.off & (s.deviation_mm < -options.stub_mm))
-    if len(which) == 0:
-        return evidence
     facing = s.toward_sensors(which, scan)
-    if facing is None:
+    if facing is None or not len(which):
         return evidence
     off, normal = evidence.off.copy(), evidence.normal.copy()
     off[which] = True
@@ -194,7 +188,7 @@ def _seen_from_within(
     """
     found = np.zeros_like(off)
     facing = surfels.toward_sensors(which := np.flatnonzero(~off), scan)
-    if facing is None or len(which) == 0:
+    if facing is None:
         return found
     gradient, along = _beside_template(template, surfels, which)
     back = (unit_vectors(facing) * gradient).sum(axis=1) < options.back_cosine
@@ -212,11 +206,9 @@ def _strips(template: Template, surfels: Surfels, off: Mask, options: EvidenceOp
     for _ in range(2):
         touched = surfels.table[near]
         near[touched[touched >= 0]] = True
-    which = np.flatnonzero(near & ~off)
+    which = np.flatnonzero(near & ~off & (surfels.deviation_mm < 0))
     strips = np.zeros_like(off)
-    if len(which):
-        along = _beside_template(template, surfels, which)[1]
-        strips[which] = (along < options.faces.strip_cosine) & (surfels.deviation_mm[which] < 0)
+    strips[which] = _beside_template(template, surfels, which)[1] < options.faces.strip_cosine
     return strips
 
 

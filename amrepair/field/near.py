@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points
@@ -43,31 +43,19 @@ def nearest_within(
 def _beside(
     asked_mm: Points, points_mm: Float[np.ndarray, "m 3"], within_mm: float, enough: int
 ) -> tuple[Numbers, Numbers]:
-    """(k,) the nearest within a distance, or −1, and (k,) how many are, up to `enough`."""
+    """(n,) the nearest within a distance, or −1, and (n,) how many are, up to `enough`.
+
+    The points lie in cells at least as wide as the distance, an empty layer about the places.
+    """
     if len(asked_mm) == 0 or len(points_mm) == 0:
         return np.full(len(asked_mm), -1, dtype=np.int32), np.zeros(len(asked_mm), dtype=np.int32)
-    asked = np.ascontiguousarray(asked_mm)
-    nearest, count = kernels.beside(
-        asked, *cells_of(asked, points_mm, within_mm), within_mm, enough
-    )
-    return nearest, count
-
-
-def cells_of(
-    asked_mm: Float[np.ndarray, "k 3"], points_mm: Float[np.ndarray, "m 3"], within_mm: float
-) -> tuple[
-    Int[np.ndarray, " c"], Points, Numbers, Float[np.ndarray, " 3"], float, Int[np.ndarray, " 3"]
-]:
-    """Points near places by cells at least as wide as a distance: what the kernels walk through.
-
-    Where each cell's points begin; the points and their numbers, so ordered; corner, edge and
-    shape of the cells, of which one empty layer lies about the places.
-    """
-    low, high = box_of(asked_mm)
+    asked, points = (np.ascontiguousarray(places) for places in (asked_mm, points_mm))
+    low, high = box_of(asked)
     size_mm = high - low + 3.0 * within_mm
     # by a hair wider: what rounding puts into the next cell is looked for there
     cell_mm = max(1.0001 * within_mm, float(np.cbrt(np.prod(size_mm) / MOST_NEAR_CELLS)))
     corner = low - 1.0001 * cell_mm  # the lowest place must not round into the empty layer
     shape = np.floor((high - corner) / cell_mm).astype(np.int64) + 2
-    points = np.ascontiguousarray(points_mm)
-    return *kernels.by_cell(asked_mm, points, corner, cell_mm, shape), corner, cell_mm, shape
+    ordered = kernels.by_cell(asked, points, corner, cell_mm, shape)
+    nearest, count = kernels.beside(asked, *ordered, corner, cell_mm, shape, within_mm, enough)
+    return nearest, count

@@ -146,8 +146,10 @@ def _scale(
         else np.add.reduceat((value_mm * weight)[order], first) / total
     )
     table, count = kernels.neighbours(keys, *strides, facing, value, WINDOW_FACING, 0.5 * cell_mm)
-    seen = kernels.window_statistics(table, count, place, value, total, RANK)
-    noise = kernels.window_medians(table, count, np.ascontiguousarray(seen[:, 3]))
+    median, low, high, noise, around = kernels.window_statistics(
+        table, count, place, value, total, RANK
+    )
+    noise = kernels.window_medians(table, count, noise)
     known = noise[np.isfinite(noise)]
     noise[~np.isfinite(noise)] = float(np.median(known)) if len(known) else 0.0
     return Scale(
@@ -159,11 +161,11 @@ def _scale(
         weight=total,
         table=table,
         count=count,
-        median_mm=np.ascontiguousarray(seen[:, 0]),
-        low_mm=np.ascontiguousarray(seen[:, 1]),
-        high_mm=np.ascontiguousarray(seen[:, 2]),
+        median_mm=median,
+        low_mm=low,
+        high_mm=high,
         noise_mm=noise,
-        window_weight=np.ascontiguousarray(seen[:, 4]),
+        window_weight=around,
     )
 
 

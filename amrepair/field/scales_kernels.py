@@ -99,13 +99,13 @@ def _off_plane(place, value, table, count, i):
 
 @njit(cache=True, nogil=True, parallel=True)
 def window_statistics(table, count, place, value, weight, rank):
-    """(s, 5): median, `rank`-th lowest and highest, noise, summed weight of a window.
+    """(5, s): median, `rank`-th lowest and highest, noise, summed weight of a window.
 
     The noise is what the values differ by from a plane, the side of a dent being none; by pairs
     where cells are too few for a plane; NaN where a cell has fewer than `rank` others beside it.
     """
     n = table.shape[0]
-    out = np.empty((n, 5))
+    out = np.empty((5, n))
     for i in prange(n):
         here, apart = np.empty(MOST_NEIGHBOURS), np.empty(MOST_NEIGHBOURS)
         others, total = 0, 0.0
@@ -118,16 +118,16 @@ def window_statistics(table, count, place, value, weight, rank):
                 others += 1
         ranked = np.sort(here[: count[i]])
         half = count[i] // 2
-        out[i, 0] = ranked[half] if count[i] % 2 else 0.5 * (ranked[half - 1] + ranked[half])
+        out[0, i] = ranked[half] if count[i] % 2 else 0.5 * (ranked[half - 1] + ranked[half])
         at = min(rank, count[i]) - 1
-        out[i, 1], out[i, 2] = ranked[at], ranked[count[i] - 1 - at]
-        out[i, 3] = _median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
+        out[1, i], out[2, i] = ranked[at], ranked[count[i] - 1 - at]
+        out[3, i] = _median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
         if count[i] >= 2 * TREND_TERMS:
             off = _off_plane(place, value, table, count, i)
             # a plane on a surface takes three of the n degrees of freedom
             spread = _median(off, count[i]) / NORMAL_MEDIAN * np.sqrt(count[i] / (count[i] - 3.0))
-            out[i, 3] = min(out[i, 3], spread)
-        out[i, 4] = total
+            out[3, i] = min(out[3, i], spread)
+        out[4, i] = total
     return out
 
 

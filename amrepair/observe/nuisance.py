@@ -232,7 +232,8 @@ def fit_nuisance(
     InputError
         If the arrays do not belong together or a number cannot be used.
     """
-    _refuse(place_mm, normal, deviation_mm, weight, view, tolerance_mm, correlation_mm)
+    named = {"place": place_mm, "normal": normal, "deviation": deviation_mm, "weight": weight}
+    _refuse(named, view, tolerance_mm, correlation_mm)
     views = 0 if view is None else int(view.max(initial=-1)) + 1
     used = weight > 0
     if not used.any():
@@ -333,19 +334,16 @@ def _nothing(views: int, options: NuisanceOptions) -> Nuisance:
 
 
 def _refuse(
-    place_mm: np.ndarray,
-    normal: np.ndarray,
-    deviation_mm: np.ndarray,
-    weight: np.ndarray,
+    named: dict[str, np.ndarray],
     view: np.ndarray | None,
     tolerance_mm: float,
     correlation_mm: float,
 ) -> None:
-    for name, array in (("place", place_mm), ("normal", normal), ("deviation", deviation_mm),
-                        ("weight", weight)):  # fmt: skip
+    for name, array in named.items():
         bad = int(np.size(array) - np.isfinite(array).sum())
         if bad:
             raise InputError(f"{bad} numbers of the {name}s are not finite; leave those sites out")
+    weight = named["weight"]
     if len(weight) and weight.min() < 0:
         raise InputError(f"a weight is {weight.min():.3g}; weights must not be negative")
     if view is not None and len(view) and view.min() < 0:

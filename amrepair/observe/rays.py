@@ -76,27 +76,6 @@ class RangeImage:
         sideways_mm = PIXEL_SIGMA * self.pixel * np.linalg.norm(ways, axis=1)
         return np.asarray(sideways_mm * np.sqrt(np.maximum(1.0 - along**2, 0.0)))
 
-    def raise_clearance(self, points_mm: Points, best_mm: Values, least_mm: Values) -> None:
-        """Raise to how far points lie in front of what was seen: best estimate, least around it.
-
-        Measured across the seen surface, mm; where the sensor saw nothing along that line both
-        stay as they are.
-        """
-        kernels.look_up(
-            points_mm,
-            self.sensor_mm,
-            self.axes,
-            self.low,
-            self.pixel,
-            self.depth_mm,
-            self.least_mm,
-            self.cosine,
-            self.blend_mm,
-            MIN_COSINE,
-            best_mm,
-            least_mm,
-        )
-
 
 def range_images(scan: Scan) -> tuple[RangeImage, ...]:
     """One range image per sensor that saw points; none where the sensors are unknown."""
@@ -110,13 +89,17 @@ def range_images(scan: Scan) -> tuple[RangeImage, ...]:
 def clearances(
     images: tuple[RangeImage, ...], points_mm: Points, unseen_mm: float
 ) -> tuple[Values, Values]:
-    """The emptiest of what the range images say of points, and of their cautious answers, mm.
+    """How far points lie in front of what was seen, mm: the emptiest of what range images say.
 
+    And of their cautious answers, the least around a pixel. Measured across the seen surface;
     `unseen_mm` is the answer where none of them saw anything.
     """
     best, least = (np.full(len(points_mm), unseen_mm) for _ in range(2))
     for image in images:
-        image.raise_clearance(points_mm, best, least)
+        kernels.look_up(
+            points_mm, image.sensor_mm, image.axes, image.low, image.pixel, image.depth_mm,
+            image.least_mm, image.cosine, image.blend_mm, MIN_COSINE, best, least,
+        )  # fmt: skip
     return best, least
 
 

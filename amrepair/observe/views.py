@@ -33,6 +33,21 @@ class Shares:
         mean_mm = np.bincount(key, self.count * self.value_mm)[keys] / count[keys]
         return Shares(keys // views, keys % views, mean_mm, count[keys].astype(np.int64))
 
+    @property
+    def views(self) -> Numbers:
+        """(n,) how many views saw the place of each."""
+        return np.bincount(self.place)[self.place]
+
+    @property
+    def apart_mm(self) -> float | None:
+        """Standard deviation of what views say of one place; None where no place had several."""
+        several = self.views > 1
+        if not several.any():
+            return None
+        mean_mm = np.bincount(self.place, self.value_mm) / np.maximum(np.bincount(self.place), 1)
+        off_mm, views = (self.value_mm - mean_mm[self.place])[several], self.views[several]
+        return MAD_TO_SIGMA * float(np.median(np.abs(off_mm) * np.sqrt(views / (views - 1.0))))
+
     def some(self, which: Mask) -> Shares:
         """Some of them."""
         return Shares(self.place[which], self.view[which], self.value_mm[which], self.count[which])

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy.stats import norm
 
 from amrepair.arrays import Mask, Numbers, Points
@@ -17,7 +14,7 @@ from amrepair.regions.calibration import NORMAL_NOISE, Calibration
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.regions import find_regions
+from amrepair.regions.regions import Tested, find_regions
 from amrepair.regions.significance import Level, as_student, tested
 from amrepair.regions.sites import (
     Observed,
@@ -101,10 +98,7 @@ def detect(
     progress("detect", 2.0, 4.0)
     evidence, surface_label = _bounded(seen, test, options, calibration)
     progress("detect", 3.0, 4.0)
-    regions = find_regions(
-        evidence, test.missing, test.excess, seen.surface_mm, surface_label, template,
-        p_value=np.exp(test.log_p), gone_p_value=test.gone_p_value,
-    )  # fmt: skip
+    regions = find_regions(evidence, test, seen.surface_mm, surface_label, template)
     score = np.abs(seen.f_mm)
     k = min(options.top_k, int(seen.keep.sum()))
     surfel_label = np.where(test.missing, int(Label.MISSING), test.excess * int(Label.EXCESS))
@@ -135,34 +129,9 @@ def detect(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Tested:
-    """What the test says of a scan.
-
-    Attributes
-    ----------
-    missing, excess
-        (s,) cells of scanned surface that belong to a region.
-    gone, gone_p_value
-        (m,) template surface that rays went through and that belongs to one, and how sure it is.
-    limit_mm, top_mm
-        The depth that half of the places would show over a few cells; under a layer's top.
-    """
-
-    levels: tuple[Level, ...]
-    noise: Noise
-    missing: Mask
-    excess: Mask
-    gone: Bool[np.ndarray, " m"]
-    gone_p_value: Float[np.ndarray, " m"]
-    log_p: Float[np.ndarray, "2 all"]
-    limit_mm: float
-    top_mm: float
-
-
 def _tested(
     seen: Observed, sites: Sites, options: RegionOptions, calibration: Calibration | None
-) -> _Tested:
+) -> Tested:
     """Test every scale, and grow regions from where it is significant."""
     cells, crossed = slice(len(seen.surfels)), slice(len(seen.surfels), None)
     levels = tested(sites, options, calibration)
@@ -181,7 +150,7 @@ def _tested(
     gone_p_value[seen.crossed.which] = np.exp(log_p[0, crossed])
     errors = as_student(levels[1].quantile, levels[1].freedom)
     noise_mm = float(np.median(errors * levels[1].error_mm))
-    return _Tested(
+    return Tested(
         levels,
         noise=noise_of(levels, seen.shares, seen.scan.sigma_mm, options),
         missing=labels[0, cells],
@@ -195,7 +164,7 @@ def _tested(
 
 
 def _bounded(
-    seen: Observed, test: _Tested, options: RegionOptions, calibration: Calibration | None
+    seen: Observed, test: Tested, options: RegionOptions, calibration: Calibration | None
 ) -> tuple[Evidence, Numbers]:
     """What is known of the space around regions, and of each place of the template's surface."""
     labelled = test.missing | test.excess
@@ -269,7 +238,7 @@ def _source(options: RegionOptions, template: Template, noise: Noise) -> str:
     )
 
 
-def _label_surface(seen: Observed, evidence: Evidence, test: _Tested) -> Numbers:
+def _label_surface(seen: Observed, evidence: Evidence, test: Tested) -> Numbers:
     """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
     surfels, surface_mm = evidence.surfels, seen.surface_mm
     missing, limit_mm = test.missing, test.limit_mm

@@ -91,7 +91,7 @@ def noise_of(
         sigma_mm=float(sigma_mm),
         tail_share=float(off.mean()),
         correlation_mm=_correlation_mm([level.scale for level in levels[1:]]),
-        view_disagreement_mm=_between_views(shares),
+        view_disagreement_mm=None if shares is None else shares.apart_mm,
         smallest_mm=tuple(
             (9.0 * level.scale.cell_mm**2, level.smallest_mm) for level in levels[1:]
         ),
@@ -113,14 +113,3 @@ def _correlation_mm(scales: list[Scale]) -> float:
     together = common >= (1.0 - SILL_SHARE) * common[0]
     last = int(np.argmin(together)) if not together.all() else len(scales)
     return float(3.0 * scales[max(last - 1, 0)].cell_mm)
-
-
-def _between_views(shares: Shares | None) -> float | None:
-    """Standard deviation between views' means of one cell, of the cells that several saw."""
-    if shares is None:
-        return None
-    beside = np.flatnonzero(shares.place[1:] == shares.place[:-1])
-    if not len(beside):
-        return None
-    apart = np.abs(shares.value_mm[beside + 1] - shares.value_mm[beside])
-    return float(np.median(apart) / NORMAL_MEDIAN / np.sqrt(2.0))

@@ -5,44 +5,65 @@ Figures here come from the surface alone (area × depth); `deficit` measures vol
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from amrepair.arrays import Numbers, Points, Values
+from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import area_per_point, group_points, touching_mm
 from amrepair.regions.anomaly import DefectType, Label, Region
+from amrepair.regions.noise import Noise
+from amrepair.regions.significance import Level
 from amrepair.template.port import Template
 
 # Template points alone (seen through by rays) need this much surface to be a region.
 MIN_AREA_MM2 = 2.0
 
 
+@dataclass(frozen=True, slots=True)
+class Tested:
+    """What the test says of a scan.
+
+    Attributes
+    ----------
+    missing, excess
+        (s,) cells of scanned surface that belong to a region.
+    gone, gone_p_value
+        (m,) template surface that rays went through and that belongs to one, and how sure it is.
+    log_p
+        (2, b) logarithm of how many false regions are expected that are as sure, by side and site.
+    limit_mm, top_mm
+        The depth that half of the places would show over a few cells; under a layer's top.
+    """
+
+    levels: tuple[Level, ...]
+    noise: Noise
+    missing: Mask
+    excess: Mask
+    gone: Bool[np.ndarray, " m"]
+    gone_p_value: Float[np.ndarray, " m"]
+    log_p: Float[np.ndarray, "2 all"]
+    limit_mm: float
+    top_mm: float
+
+
 def find_regions(
     evidence: Evidence,
-    missing: Bool[np.ndarray, " s"],
-    excess: Bool[np.ndarray, " s"],
+    test: Tested,
     surface_mm: Points,
     surface_label: Numbers,
     template: Template,
-    *,
-    p_value: Float[np.ndarray, "2 b"],
-    gone_p_value: Values,
 ) -> tuple[Region, ...]:
-    """Regions of both kinds, largest first.
-
-    `p_value` is of each cell (and crossed template point), for missing and for excess;
-    `gone_p_value` of each surface point, 1 where no ray passed it.
-    """
+    """Regions of both kinds, largest first."""
     s = evidence.surfels
     labelled = surface_label == int(Label.MISSING)
-    gone, gone_p = surface_mm[labelled], gone_p_value[labelled]
+    gone, gone_p = surface_mm[labelled], test.gone_p_value[labelled]
     area_each = area_per_point(surface_mm)
     found: list[Region] = []
     for side, (label, cells, extra) in enumerate(
-        ((Label.MISSING, missing, gone), (Label.EXCESS, excess, gone[:0]))
+        ((Label.MISSING, test.missing, gone), (Label.EXCESS, test.excess, gone[:0]))
     ):
         which = np.flatnonzero(cells)
         points = np.concatenate([s.place_mm[which], extra])
@@ -54,7 +75,9 @@ def find_regions(
             if len(own) == 0 and n_gone * area_each < MIN_AREA_MM2:
                 continue
             region = _region(label, s.deviation_mm[own], points[mine], s.cell_mm, template)
-            sure = np.append(p_value[side, own], gone_p[: len(extra)][mine[len(which) :]])
+            sure = np.append(
+                np.exp(test.log_p[side, own]), gone_p[: len(extra)][mine[len(which) :]]
+            )
             found.append(replace(region, p_value=float(sure.min(initial=1.0))))
     return tuple(sorted(found, key=lambda r: -r.volume_mm3))
 

@@ -20,7 +20,6 @@ from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import Passed, RangeImage, passed, range_images
-from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.observe.views import Contradiction, Shares, contradictions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
@@ -112,7 +111,10 @@ def observed(
     without: tuple[int, ...],
 ) -> Observed:
     """Deviations, rays, and what of the template they speak of; some views may be left out."""
-    _refuse_other_frame(scan)
+    if scan.frame != "template":
+        raise InputError(
+            f"the scan {scan.source} is in frame '{scan.frame}'; align it to the template first"
+        )
     refuse_wrong_scale(scan, template)
     with ThreadPoolExecutor(1) as beside:  # what rays saw needs no distances, nor they it
         asked = None if images is not None else beside.submit(range_images, scan)
@@ -124,7 +126,12 @@ def observed(
         if without:
             assert scan.view_index is not None
             keep &= ~np.isin(scan.view_index, without)
-        _refuse_nothing_near(scan, keep, options.background.most_excess_mm)
+        if not keep.any():
+            raise InputError(
+                f"no point of the scan {scan.source} lies within "
+                f"{options.background.most_excess_mm:g} mm of the template; check its frame, its "
+                "unit and that it shows this part"
+            )
         surfels = make_surfels(scan.points_mm, f_mm, keep, options.surfels)
         seen = images or () if asked is None else asked.result()
         if without and seen:
@@ -143,21 +150,6 @@ def observed(
     return Observed(
         scan, template, f_mm, keep, surfels, seen, surface_mm, normals, nearest, crossed, shares
     )
-
-
-def _refuse_other_frame(scan: Scan) -> None:
-    if scan.frame != "template":
-        raise InputError(
-            f"the scan {scan.source} is in frame '{scan.frame}'; align it to the template first"
-        )
-
-
-def _refuse_nothing_near(scan: Scan, keep: Mask, within_mm: float) -> None:
-    if not keep.any():
-        raise InputError(
-            f"no point of the scan {scan.source} lies within {within_mm:g} mm of the "
-            "template; check its frame, its unit and that it shows this part"
-        )
 
 
 def sites_of(
@@ -297,17 +289,12 @@ def _between_views_mm(shares: Shares, sites: int, point_sigma_mm: float) -> Valu
     The views' own component of the variance, without the points' noise, over the root of how many
     saw it: one, of what rays passed.
     """
-    cell = shares.place
-    views = np.maximum(np.bincount(cell, minlength=sites), 1)
-    several = views[cell] > 1
-    if not several.any():
+    apart_mm = shares.apart_mm
+    if apart_mm is None:
         return np.zeros(sites)
-    mean_mm = np.bincount(cell, shares.value_mm, sites) / views
-    number = views[cell][several]
-    off_mm = (shares.value_mm - mean_mm[cell])[several] * np.sqrt(number / (number - 1.0))
-    spread_mm = MAD_TO_SIGMA * float(np.median(np.abs(off_mm)))
-    noise_mm = point_sigma_mm * float(np.median(1.0 / np.sqrt(shares.count[several])))
-    return np.asarray(np.sqrt(max(spread_mm**2 - noise_mm**2, 0.0) / views))
+    noise_mm = point_sigma_mm * float(np.median(1.0 / np.sqrt(shares.count[shares.views > 1])))
+    views = np.maximum(np.bincount(shares.place, minlength=sites), 1)
+    return np.asarray(np.sqrt(max(apart_mm**2 - noise_mm**2, 0.0) / views))
 
 
 def tolerances(options: RegionOptions, template: Template) -> tuple[float, float]:

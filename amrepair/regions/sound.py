@@ -9,7 +9,7 @@ others. Means find what fills a fraction of a window, and windows go down to sin
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -230,22 +230,26 @@ class SoundTest:
             raise InputError("the test needs a sound scan at least; name one")
         options = options or SoundTestOptions()
         f_mm = [template.distance(points) for points in scans_mm]
-        found: list[list[Float[np.ndarray, " w"]]] = []
-        for k, points in enumerate(scans_mm):
+
+        def known_by(which: Sequence[int]) -> _Known:
+            points_mm, told_mm = (
+                np.concatenate([each[k] for k in which]) for each in (scans_mm, f_mm)
+            )
+            return _Known.of(points_mm, told_mm, template, options)
+
+        found = []
+        for k, points_mm in enumerate(scans_mm):
             others = [m for m in range(len(scans_mm)) if m != k]
-            known = _joined(scans_mm, f_mm, others, template, options) if others else None
-            seen = Seen.of(points, template, known, options)
-            off_mm, sigma_mm, scales = _observed(points, seen, options)
-            for level, z in enumerate(
-                _standardised(off_mm, sigma_mm, seen.shared, scales, options)
-            ):
-                if level == len(found):
-                    found.append([])
-                found[level].append(z)
+            seen = Seen.of(points_mm, template, known_by(others) if others else None, options)
+            found.append(_observed(points_mm, seen, options)[2])
+        statistics = (
+            np.concatenate([z[level] for z in found if level < len(z)])
+            for level in range(max(len(z) for z in found))
+        )
         return cls(
             template,
-            _joined(scans_mm, f_mm, range(len(scans_mm)), template, options),
-            tuple(_null(np.concatenate(each), options) for each in found),
+            known_by(range(len(scans_mm))),
+            tuple(_null(z, options) for z in statistics),
             options,
         )
 
@@ -259,8 +263,7 @@ class SoundTest:
         `seen` is what `look` said of the same points.
         """
         seen = seen or self.look(points_mm)
-        off_mm, sigma_mm, scales = _observed(points_mm, seen, self.options)
-        found = list(_standardised(off_mm, sigma_mm, seen.shared, scales, self.options))
+        off_mm, sigma_mm, found = _observed(points_mm, seen, self.options)
         found = found[: len(self.statistics)]
         least = 0.0
         for z, (spread, tail) in zip(found, self.statistics, strict=False):
@@ -271,21 +274,14 @@ class SoundTest:
         return Judged(least + float(np.log(max(len(found), 1))), off_mm, sigma_mm)
 
 
-def _joined(
-    scans_mm: Sequence[Float[np.ndarray, "_ 3"]],
-    f_mm: Sequence[Float[np.ndarray, " _"]],
-    which: Sequence[int],
-    template: Template,
-    options: SoundTestOptions,
-) -> _Known:
-    points = np.concatenate([scans_mm[k] for k in which])
-    return _Known.of(points, np.concatenate([f_mm[k] for k in which]), template, options)
-
-
 def _observed(
     points_mm: Points, seen: Seen, options: SoundTestOptions
-) -> tuple[Values, Values, tuple[Scale, ...]]:
-    """Deviation of each point from what is normal there, its standard error, and the windows."""
+) -> tuple[Values, Values, list[Float[np.ndarray, " w"]]]:
+    """Deviation of each point from what is normal there, its standard error, and the statistics.
+
+    These are |mean| over cells and windows of each scale, the finest first, in its standard errors.
+    Of which a single point makes up no more than chance gives to what strays.
+    """
     off_mm = np.clip(seen.f_mm - seen.expected_mm, -options.most_off_mm, options.most_off_mm)
     scales = scales_of(
         points_mm,
@@ -295,10 +291,26 @@ def _observed(
         cell_mm=estimate_spacing(points_mm),
         widest_mm=options.widest_mm,
     )
-    noise_mm = _noise_mm(off_mm, scales[-1])
-    sigma_mm = np.maximum(noise_mm, seen.spread_mm)
+    sigma_mm = np.maximum(_noise_mm(off_mm, scales[-1]), seen.spread_mm)
     sigma_mm[~seen.looked] = np.inf
-    return off_mm, sigma_mm, scales
+    value = off_mm / sigma_mm
+    variance = np.where(seen.looked, 1.0 + seen.shared, 0.0)
+    alone = float(norm.isf(0.5 * options.stray))
+    rising = np.argsort(np.abs(value), kind="stable")
+    found = []
+    for scale in scales:
+        total, spread = (np.bincount(scale.of_base, each, len(scale)) for each in (value, variance))
+        last = np.zeros(len(scale), np.int64)
+        last[scale.of_base[rising]] = rising  # of a cell's points the farthest off is written last
+        far, its = value[last], variance[last]
+        around, its_spread = (
+            scales_kernels.window_means(scale.table, scale.count, each) * scale.count
+            for each in (total, spread)
+        )
+        most = scales_kernels.window_farthest(scale.table, scale.count, far)
+        found.append(_beyond_one(total, spread, far, its, alone))
+        found.append(_beyond_one(around, its_spread, far[most], its[most], alone))
+    return off_mm, sigma_mm, found
 
 
 def _looked(
@@ -324,35 +336,6 @@ def _noise_mm(off_mm: Values, scale: Scale) -> float:
     if not len(apart):
         return LEAST_SIGMA_MM
     return max(float(np.median(apart)) / scales_kernels.PAIR_MEDIAN, LEAST_SIGMA_MM)
-
-
-def _standardised(
-    off_mm: Values,
-    sigma_mm: Values,
-    shared: Values,
-    scales: tuple[Scale, ...],
-    options: SoundTestOptions,
-) -> Iterator[Float[np.ndarray, " w"]]:
-    """|Mean| over cells and windows of each scale, the finest first, in its standard errors.
-
-    Of which a single point makes up no more than chance gives to what strays.
-    """
-    value = off_mm / sigma_mm
-    variance = np.where(np.isfinite(sigma_mm), 1.0 + shared, 0.0)
-    alone = float(norm.isf(0.5 * options.stray))
-    rising = np.argsort(np.abs(value), kind="stable")
-    for scale in scales:
-        total, spread = (np.bincount(scale.of_base, each, len(scale)) for each in (value, variance))
-        last = np.zeros(len(scale), np.int64)
-        last[scale.of_base[rising]] = rising  # of a cell's points the farthest off is written last
-        far, its = value[last], variance[last]
-        yield _beyond_one(total, spread, far, its, alone)
-        around, its_spread = (
-            scales_kernels.window_means(scale.table, scale.count, each) * scale.count
-            for each in (total, spread)
-        )
-        most = scales_kernels.window_farthest(scale.table, scale.count, far)
-        yield _beyond_one(around, its_spread, far[most], its[most], alone)
 
 
 def _beyond_one(
