@@ -94,7 +94,7 @@ class Sought:
         return held
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Box:
     """Corners (3,) each, and how thick what lies in it is."""
 

@@ -34,14 +34,11 @@ BACKWARDS_RATIO, BACKWARDS_MOVES = 0.25, 10
 # Klipper's `[idle_timeout]` gives a hot machine that stands still ten minutes.
 STILL_S = 600.0
 # What stands molten in a hotend (the melt zone of a V6 is 10 mm long) is pushed out at any speed: a
-# drop that a job primes with after a retraction, or rams with before the filament is pulled out.
-MOLTEN_MM = 10.0
+# drop that a job primes with after a retraction.
+MOLTEN_MM = 5.0
 # Between a bead and a blob that the nozzle drags along, and between what a bowden tube loads and a
 # slip of E, lies a factor of three: what a user's job asks beyond it is no other taste.
 GROSS = 3.0
-# How far off the bed that a slicer knows its printers' own scripts go to purge, wipe and park:
-# 12.6 mm at most, of 118 presets of 19 makers (PrusaSlicer's bundles).
-OFF_BED_MM = 15.0
 LEAST_BEAD_Z_MM = 0.02  # the thinnest layer that a process profile may have
 
 
@@ -89,6 +86,7 @@ class Motion:
         self._hotend_c = state.hotend_c if state else 0.0
         self._ready_c = self._hotend_c  # what the hotend was waited for
         self._bed_c = state.bed_c if state else 0.0
+        self._risen_mm = 0.0  # by moves of Z before it was homed
         self._heats_unsaid = False  # whether a macro ran that may have heated something
         self._chamber_c = 0.0
         self._pulled_mm = 0.0 if state is None else state.pulled_mm
@@ -252,15 +250,17 @@ class Motion:
         self._go(target, self._pushed(words), moved=bool(moved))
 
     def _unhomed(self, axis: int, words: dict[str, float | None]) -> None:
-        """Up and away from the bed is told in a user's job, where firmwares do it; said once."""
-        value = words["XYZ"[axis]] or 0.0
-        rises = axis == 2 and value > 0 and not (self._absolute and self._occupied)
+        """Up and away from the bed is told in a user's job, where firmwares do it."""
+        value = (words["XYZ"[axis]] or 0.0) * self._unit
+        to_mm = value if self._absolute else self._risen_mm + value
+        rises = axis == 2 and to_mm > self._risen_mm and not (self._absolute and self._occupied)
         told = ("move before homing", "XYZ"[axis], "home first")
-        if rises and self._dialect in MOVES_UNHOMED:
-            self._beyond(*told, 1.0)
+        if rises and self._dialect in MOVES_UNHOMED and self.policy is Policy.DANGER:
+            self._risen_mm = to_mm
+            self._warn(*told)
         else:
             self._refuse(*told)
-        self._homed[axis] = True
+            self._homed[axis] = True  # said once
 
     def _arc(self, words: dict[str, float | None], *, clockwise: bool) -> None:
         self._feed(words)
@@ -339,20 +339,21 @@ class Motion:
     def _bounded(self, target: list[float | None], *, lays: bool) -> list[float | None]:
         """Where the head comes to.
 
-        Off a bed of which the profile tells no more, a user's job may know its way; what is far off
-        the firmware cuts short, at a place that nobody has told.
+        Off a bed that a slicer has told, and no more, its job may know its way; what is far off the
+        firmware cuts short, at a place that nobody has told.
         """
         printer, reached = self._setup.printer, list(target)
         x0, y0, x1, y1 = printer.reach_box_mm
-        cuts = self._dialect in CLAMPS and not lays
+        untold_mm = printer.off_bed_mm
+        cuts = untold_mm > 0 and self._dialect in CLAMPS and not lays
         for axis, low, high in ((0, x0, x1), (1, y0, y1), (2, 0.0, printer.max_z_mm)):
             value = target[axis]
             if value is None or low - PLACE_SLACK_MM <= value <= high + PLACE_SLACK_MM:
                 continue
             told = (f"{'XYZ'[axis]} out of reach", f"{value:g} mm", f"{low:g} to {high:g} mm")
             into_the_bed = axis == 2 and value < low
-            near = max(low - value, value - high) <= OFF_BED_MM
-            if into_the_bed or printer.reach_is_told or not (near or cuts):
+            near = max(low - value, value - high) <= untold_mm
+            if into_the_bed or not (near or cuts):
                 self._refuse(*told)
             elif not self._beyond(*told, 1.0) and not near:
                 reached[axis] = None

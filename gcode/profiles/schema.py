@@ -206,6 +206,7 @@ class PrinterProfile(_Profile):
     max_z_mm: Positive
     reach_min_mm: Xy | None = None  # where the nozzle may go off the bed (purge, wiper); the bed
     reach_max_mm: Xy | None = None  # itself where left out
+    off_bed_mm: Annotated[float, Field(ge=0, le=100)] = 0.0  # a user's job may, where nobody knows
     nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=2.0)]
     filament_diameter_mm: Annotated[float, Field(ge=1.0, le=3.5)] = 1.75
     max_speed_mm_s: AxisLimits
@@ -286,11 +287,6 @@ class PrinterProfile(_Profile):
         """X and Y of the bed's middle."""
         x0, y0, x1, y1 = self.bed_box_mm
         return 0.5 * (x0 + x1), 0.5 * (y0 + y1)
-
-    @property
-    def reach_is_told(self) -> bool:
-        """Whether somebody has said how far the nozzle goes; else the bed alone is known."""
-        return self.reach_min_mm is not None or self.reach_max_mm is not None
 
     @property
     def reach_box_mm(self) -> tuple[float, float, float, float]:

@@ -97,6 +97,7 @@ def test_what_makers_scripts_end_with_is_printed(end: str) -> None:
         (job(KLIPPER, "G1 X-40\nprint_end"), "out of reach"),
         (job(START, f"G28\n{END}"), "homing Z onto a standing part"),
         (job(START, f"M84\nG1 Z5\n{END}"), "before homing"),
+        (job(f"G90\nM83\nG1 Z12\nG28 X Y\n{HOT}\nG1 Z0.3"), "before homing"),  # no Z yet
         (job(START, f"M84\nG1 X5\n{END}"), "before homing"),
         (job(f"{START}\nG1 Z-0.2"), "out of reach"),
         (job(START, f"G1 E80 F300\n{END}"), "standing still"),
@@ -181,6 +182,14 @@ def test_an_emulated_klipper_starts_a_print_by_its_macro_s_name() -> None:
     core.feed(b"PRINT_END\n")
     core.run(3000.0)
     assert (core.machine.hotend.target_c, core.machine.bed.target_c) == (0.0, 0.0)
+
+
+def test_off_a_bed_that_somebody_has_told_nothing_goes() -> None:
+    text = job(f"{START}\nG1 X-10 Y-10")
+    assert refused(text) == []
+    told = load_setup("generic_marlin").melting_all()
+    found = find_refusals(Program(text, "marlin"), told, policy=Policy.DANGER)
+    assert {one.what for one in found} == {"X out of reach", "Y out of reach"}
 
 
 def test_a_delta_s_job_is_checked_with_its_limits() -> None:

@@ -59,6 +59,9 @@ ASK_FOR = (
     "end_gcode",
 )
 """Keys of a printer that are another machine's until somebody measures or writes them."""
+# How far off the bed that a slicer knows its printers' own scripts go to purge, wipe and park:
+# 12.6 mm at most, of 118 presets of 19 makers (PrusaSlicer's bundles).
+OFF_BED_MM = 15.0
 BED_EDGE_MM = 5.0
 """How far from the bed's edge an inherited place is kept."""
 
@@ -211,6 +214,8 @@ def _settle(made: Imported) -> list[str]:
         # Slicers call Prusa's firmware Marlin; older ones, and Cura, call Klipper so, too.
         made.values["dialect"] = above["dialect"]
     merged = {"bed_min_mm": (0.0, 0.0), "delta": False, **above, **made.values}
+    if not ({"reach_min_mm", "reach_max_mm"} & merged.keys()):
+        made.values["off_bed_mm"] = OFF_BED_MM
     notes = []
     for key in ("park_mm", "prime_mm"):
         kept = _on_the_bed(merged[key], merged) if key not in made.values else list(merged[key])
