@@ -357,7 +357,7 @@ class Judge(Motion):
             else:
                 self._shift(f"{name} {letter}", words.get(letter))
         if "L" not in words:
-            self._temperature("standby", words.get("R"))
+            self._temperature("standby", waits.switched_c(words.get("R"), self._dialect))
             if "S" in words:
                 self._heat("M104", {"S": words["S"]})
 

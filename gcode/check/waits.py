@@ -14,13 +14,20 @@ from gcode.profiles import PrinterProfile
 Finding = tuple[str, str, str]
 
 ROOM_C = 30.0  # on a hot day: what is colder nothing cools down to
+OFF_C = -273.0
 LONGEST_S = 86_400.0
 WAIT_FOR = frozenset({"M109", "M190", "M191"})
 
 
 def told_c(words: Mapping[str, float | None], dialect: str) -> float | None:
     """The temperature that a command sets: Klipper passes over R."""
-    return words.get("S") if dialect == "klipper" else words.get("S", words.get("R"))
+    value_c = words.get("S") if dialect == "klipper" else words.get("S", words.get("R"))
+    return switched_c(value_c, dialect)
+
+
+def switched_c(value_c: float | None, dialect: str) -> float | None:
+    """RepRapFirmware switches a heater off by absolute zero (G-code dictionary, M104 and G10)."""
+    return 0.0 if value_c is not None and dialect == "reprap" and value_c <= OFF_C else value_c
 
 
 def for_cooling(

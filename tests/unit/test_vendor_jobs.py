@@ -158,6 +158,12 @@ def test_a_job_with_words_of_reprapfirmware_is_its_own(line: str) -> None:
     assert own_setup(job("set global.a = 3\nvar b=5\necho c=1")).printer.dialect == "marlin"
 
 
+def test_absolute_zero_switches_a_reprapfirmware_s_heaters_off() -> None:
+    start = START.replace("M104 S210", "G10 P0 S210 R160")
+    assert refused(job(start, "G1 Z20\nG10 P0 S-273 R-273\nM140 S-273.1\nM84")) == []
+    assert any("hotend temperature" in one for one in refused(job(start, "G10 P0 S-100")))
+
+
 def test_a_macro_of_klipper_s_that_is_not_known_is_told_with_where_to_name_it() -> None:
     (said,) = refused(job(f"{KLIPPER}\nCLEAN_THE_NOZZLE"))
     assert "CLEAN_THE_NOZZLE" in said
