@@ -5,11 +5,11 @@
     python benchmarks/bench_clean_jobs.py --table      # what there is so far
 
 Seven small parts, made here (or any STL: `--jobs part.stl:two`), are cut by the installed
-PrusaSlicer in four ways, printed into the simulated world of `world.toml` (wandering flow,
-shrinkage, curl, noise, dropouts, outliers), and looked at after a few layers and at the end. Every
-look goes the loop's own way: `sites` says what is expected, `plan_repair`, `typed` and
-`decide_look` what is to be done, `rewritten_layer` how the next layer's flow changes. Nothing is
-wrong with any of them, so whatever is done is a false alarm.
+PrusaSlicer in four ways, and by CuraEngine and Slic3r (whose jobs name no roles), printed into the
+simulated world of `world.toml` (wandering flow, shrinkage, curl, noise, dropouts, outliers), and
+looked at after a few layers and at the end. Every look goes the loop's own way: `sites` says what
+is expected, `plan_repair`, `typed` and `decide_look` what is to be done, `rewritten_layer` how the
+next layer's flow changes. Nothing is wrong with any of them, so whatever is done is a false alarm.
 
 Counted are repairs, looks that claim more than 10 mm³ of excess (so many millimetres cubed of
 regions, of whatever size each), changed layers and halts. Lines of JSON in `--results`, one a job,
@@ -72,7 +72,20 @@ WAYS: dict[str, tuple[str, ...]] = {
     "two": ("--perimeters", "2", "--fill-density", "15%", "--fill-pattern", "grid"),
     "gyroid": ("--perimeters", "2", "--fill-density", "15%", "--fill-pattern", "gyroid"),
     "solid": ("--perimeters", "3", "--fill-density", "100%", "--fill-pattern", "rectilinear"),
+    "cura": (),
+    "slic3r": (),
 }
+CURA_DEFINITIONS = Path("/usr/share/cura/resources/definitions")
+# What Cura itself would reckon from others, and where the part is to lie.
+CURA_SETTINGS = {
+    "layer_height": "0.2", "layer_height_0": "0.2", "center_object": "true",
+    "machine_width": f"{2 * CENTRE_MM[0]:g}", "machine_depth": f"{2 * CENTRE_MM[1]:g}",
+    "machine_start_gcode": "G28", "wall_line_count": "2", "wall_thickness": "0.8",
+    "top_layers": "4", "bottom_layers": "4", "initial_bottom_layers": "4",
+    "roofing_layer_count": "0", "infill_pattern": "grid", "infill_line_distance": "4",
+    "infill_overlap_mm": "0.1", "skin_overlap_mm": "0.05", "material_diameter": "1.75",
+    "retraction_amount": "1", "speed_print": "50", "adhesion_type": "none",
+}  # fmt: skip
 
 
 def _box(size_mm: tuple[float, float, float], at_mm: tuple[float, float, float]) -> m3.Manifold:
@@ -152,19 +165,32 @@ def sliced(part: str, way: str, folder: Path) -> Job:
     name = Path(part).stem
     gcode = folder / f"{name}-{way}.gcode"
     if not gcode.is_file():
-        program = shutil.which("prusa-slicer")
-        if program is None:
-            raise SystemExit("prusa-slicer is not on the path; install it, or judge kept scans")
         folder.mkdir(parents=True, exist_ok=True)
         stl = folder / f"{name}.stl"
         mesh_called(part).export(stl)
-        subprocess.run(
-            [program, "-g", *COMMON, *WAYS[way], "-o", str(gcode), str(stl)],
-            check=True,
-            capture_output=True,
-        )
+        subprocess.run(slicing(way, stl, gcode), check=True, capture_output=True)
     text = Program(gcode.read_text(errors="replace"), "marlin")
     return read_job(text, filament_diameter_mm=1.75, dialect="marlin")
+
+
+def slicing(way: str, stl: Path, gcode: Path) -> list[str]:
+    """The slicer's command line."""
+    name = {"cura": "CuraEngine", "slic3r": "slic3r"}.get(way, "prusa-slicer")
+    program = shutil.which(name)
+    if program is None:
+        raise SystemExit(f"{name} is not on the path; install it, or judge kept scans")
+    if way == "cura":
+        settings = [
+            word for key, value in CURA_SETTINGS.items() for word in ("-s", f"{key}={value}")
+        ]
+        machine = str(CURA_DEFINITIONS / "fdmprinter.def.json")
+        files = ["-l", str(stl), "-o", str(gcode)]
+        return [program, "slice", "-j", machine, *settings, "-e0", *settings, *files]
+    if way == "slic3r":
+        middle = f"{CENTRE_MM[0]:g},{CENTRE_MM[1]:g}"
+        own = ["--no-gui", *COMMON[:8], "--print-center", middle]
+        return [program, *own, "-o", str(gcode), str(stl)]
+    return [program, "-g", *COMMON, *WAYS[way], "-o", str(gcode), str(stl)]
 
 
 def stops_of(job: Job, looks: int) -> tuple[Stop, ...]:
