@@ -112,12 +112,10 @@ def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
         locate_part(job_of(plate), template, layer_height_mm=LAYER_MM)
 
 
-@pytest.mark.parametrize("hole", [False, True])
-def test_a_job_without_roles_is_placed_by_what_bounds_its_layers(*, hole: bool) -> None:
+def test_a_job_without_roles_is_placed_by_what_bounds_its_layers() -> None:
     """regression: Slic3r's jobs name no roles; infill was taken for walls, a skirt for a part."""
     part = wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0))
-    if hole:
-        part -= m3.Manifold.cylinder(20.0, 2.5, 2.5, 32).translate((65.0, 65.0, -1.0))
+    part -= m3.Manifold.cylinder(20.0, 2.5, 2.5, 32).translate((65.0, 65.0, -1.0))
     told = write(plan_part(part, SETUP).toolpath, SETUP, title="job").text
     assert ";TYPE:Skirt" in told
     bare = re.sub(r"^;TYPE:.*\n", "", told, flags=re.MULTILINE)
