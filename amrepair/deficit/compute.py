@@ -259,9 +259,7 @@ def _standing(
     known = with_what_stands_out(
         sharp, points_mm, scan.sigma_mm, evidence.spacing_mm, options.heights
     )
-    even = with_even_crests(
-        known, lost_mm, designed_mm, points_mm, evidence.spacing_mm, options.walls
-    )
+    even = with_even_crests(known, lost_mm, designed_mm, options.walls)
     rising = with_rising_rims(even, lost_mm, designed_mm, evidence.spacing_mm, options.walls)
     return with_whole_rims(rising, lost_mm, designed_mm, options.walls)
 

@@ -28,7 +28,6 @@ from amrepair.template.port import Template
 from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
-_SIDES = (-1.0, 0.0, 1.0)
 AROUND_CELL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
 
 
@@ -231,9 +230,8 @@ def with_what_stands_out(
 
     Solids round off lips, and cells average what is in them: a crest, a splinter or a burr thinner
     than the scan's spacing reads low, by up to its height. No bead can be laid on it, but the head
-    may run into it. A point is explained if the field is as high as near to it as noise moves
-    points aside, and as walls lie beside where their columns end. Of the many points of a wall some
-    lie farther out all the same: what stands there has several that do, side by side.
+    may run into it. A point is explained if the field, as near to it as noise moves points aside,
+    is as high. One that is alone is a reflection in mid-air.
 
     Parameters
     ----------
@@ -246,16 +244,11 @@ def with_what_stands_out(
     points_mm = np.ascontiguousarray(points_mm)
     higher = kernels.standing_out(points_mm, field.z_mm, field.origin_mm, field.cell_mm, off_mm)
     out = points_mm[higher]
-    aside_mm = off_mm + 0.5 * field.cell_mm
-    around = [
-        field.sample(out[:, :2] + (x * aside_mm, y * aside_mm)) for x in _SIDES for y in _SIDES
-    ]
-    out = out[out[:, 2] - off_mm > np.max(around, axis=0)]
     if len(out) == 0:
         return field
     # itself is one of them
     within_mm = options.beside_spacings * spacing_mm
-    out = out[has_near(out, out, within_mm, enough=options.others_near + 1)]
+    out = out[has_near(out, points_mm, within_mm, enough=options.others_near + 1)]
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)

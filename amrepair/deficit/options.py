@@ -96,8 +96,7 @@ class HeightOptions:
     off_sigma
         In the scan's noise: how far a point is off upwards or aside, and tells of nothing.
     others_near, beside_spacings
-        Of what stands there so many others are off within so many spacings: of a flat surface's
-        points there, 4 π, noise takes 0.3 as far.
+        On any surface so many others lie within so many spacings: 4 π are expected on a flat one.
     """
 
     cell_mm: float = 0.25

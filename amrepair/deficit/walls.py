@@ -61,23 +61,18 @@ def with_even_crests(
     field: HeightField,
     lost_mm: HeightMap,
     designed_mm: HeightMap,
-    points_mm: Float[np.ndarray, "n 3"],
-    spacing_mm: float,
     options: WallOptions = USUAL_DEFICIT.walls,
 ) -> HeightField:
     """The as-built field, what is thinner than a bead beside what is missing as high as near by.
 
     A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
-    what lies between two of its columns that were seen is no lower than the lower of them, and
-    where that is a little lower than designed, beside a steep face, it is as designed. What solids
-    leave standing at a cut's rim is no higher than what was seen of it.
+    what lies between two of its columns that were seen is no lower than the higher of them, and
+    where that is a little lower than designed, beside a steep face, it is as designed.
 
     Parameters
     ----------
     lost_mm, designed_mm
         How much is missing from each column, from end to end, and the top of what was expected.
-    points_mm, spacing_mm
-        What was seen, build frame, and the mean distance between neighbouring points.
     """
     gone = lost_mm > 0
     if not gone.any():
@@ -94,28 +89,12 @@ def with_even_crests(
     # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
     thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, options.crest_cells), reach)
     crest = beside & (near - thick_mm > options.step_mm)
-    tops_mm = _tops_near(field, points_mm, spacing_mm)[rows, columns]
-    seen_mm = np.where(np.isfinite(tops_mm), np.minimum(near, tops_mm), near)
-    highest_mm = ndimage.maximum_filter(np.where(crest, seen_mm, -np.inf), reach)
-    # on a slope that goes on upwards it is no higher for that
-    between_mm = ndimage.minimum_filter(np.where(crest, highest_mm, np.inf), reach)
-    between_mm = np.where(crest, between_mm, -np.inf)
+    highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
     # the tip of a worn edge falls off on its outside alone
-    cut = between_mm - foot_mm > options.steep_mm
-    whole = cut & (designed > between_mm) & (designed < between_mm + options.splinter_mm)
-    near[crest] = np.where(whole, designed, np.maximum(seen_mm, between_mm))[crest]
-    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
-
-
-def _tops_near(
-    field: HeightField, points_mm: Float[np.ndarray, "n 3"], within_mm: float
-) -> HeightMap:
-    """Height of the highest point that lies over each cell or as near to it; −inf: none does."""
-    index = field.cells_of(points_mm[:, :2])
-    inside = ((index >= 0) & (index < field.shape)).all(axis=1)
-    tops_mm = np.full(field.shape, -np.inf)
-    np.maximum.at(tops_mm, tuple(index[inside].T), points_mm[inside, 2])
-    return np.asarray(ndimage.maximum_filter(tops_mm, 2 * math.ceil(within_mm / field.cell_mm) + 1))
+    cut = highest_mm - foot_mm > options.steep_mm
+    whole = cut & (designed > highest_mm) & (designed < highest_mm + options.splinter_mm)
+    near[crest] = np.where(whole, designed, highest_mm)[crest]
+    return field.raised(z_mm)
 
 
 def with_rising_rims(

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from scipy import ndimage
 
-from amrepair.deficit.heights import as_built_heights, columns_of, with_what_stands_out
-from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
+from amrepair.deficit.heights import as_built_heights, columns_of
+from amrepair.deficit.options import HeightOptions
 from amrepair.deficit.walls import (
     with_even_crests,
     with_rising_rims,
@@ -27,7 +27,6 @@ CELL_MM, SIGMA_MM, SPACING_MM = 0.1, 0.04, 0.2
 # A column whose middle is so near to a wall may go either way: three standard deviations of the
 # mean of some twenty points.
 UNDECIDED_MM = 0.03
-UNSEEN = np.zeros((0, 3)), SPACING_MM  # no points there that say otherwise
 
 
 def scanned(solid: manifold3d.Manifold, seed: int) -> np.ndarray:
@@ -127,9 +126,7 @@ def test_a_crest_between_two_columns_that_were_seen_is_as_high_as_they() -> None
     z_mm[low] -= 0.8
     rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
     designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
-    even = with_even_crests(
-        rough, np.where(gone_from(truth, piece), 2.0, 0.0), designed.z_mm, *UNSEEN
-    )
+    even = with_even_crests(rough, np.where(gone_from(truth, piece), 2.0, 0.0), designed.z_mm)
     assert (even.z_mm[fin] > 5.9).mean() > 0.99
     assert (even.z_mm[~fin] == z_mm[~fin]).all()
 
@@ -146,14 +143,14 @@ def test_a_splinter_a_little_lower_than_designed_is_as_designed() -> None:
     z_mm = np.array(truth.z_mm, dtype=np.float64)
     z_mm[crest] -= np.random.default_rng(4).uniform(0.1, 0.45, int(crest.sum()))
     low = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
-    even = with_even_crests(low, lost_mm, designed.z_mm, *UNSEEN)
+    even = with_even_crests(low, lost_mm, designed.z_mm)
     assert crest.sum() > 100
     assert np.abs(even.z_mm[crest] - 6.0).max() < 1e-6
     # beside a line that was skipped nothing was cut: an idler's was filled to 0.83 instead of 0.92
-    skipped = with_even_crests(low, np.minimum(lost_mm, 0.4), designed.z_mm, *UNSEEN)
+    skipped = with_even_crests(low, np.minimum(lost_mm, 0.4), designed.z_mm)
     assert skipped.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.95
     z_mm[crest] -= 1.0  # that is no rounding: it broke off lower
-    broken_off = with_even_crests(low, lost_mm, designed.z_mm, *UNSEEN)
+    broken_off = with_even_crests(low, lost_mm, designed.z_mm)
     assert broken_off.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.0
 
 
@@ -193,7 +190,7 @@ def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
     z_mm[beside] += 0.9
     rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
     even = with_even_crests(
-        rough, np.where(gone_from(truth, piece), 2.0, 0.0), np.full(z_mm.shape, 6.0), *UNSEEN
+        rough, np.where(gone_from(truth, piece), 2.0, 0.0), np.full(z_mm.shape, 6.0)
     )
     assert beside.sum() > 300
     assert (even.z_mm == z_mm).all()
@@ -271,56 +268,3 @@ def test_cells_that_chance_left_empty_are_as_high_as_what_is_next_to_them() -> N
     beside = column[empty] == 29
     assert told[~beside] == pytest.approx(2.0)
     assert told[beside] == pytest.approx(6.0)  # it may be the wall's
-
-
-@pytest.mark.parametrize("turned", [0.0, 23.0])
-def test_of_a_walls_many_points_those_that_noise_takes_farthest_are_no_burr(turned: float) -> None:
-    """A strip of two columns as high as the wall stood along all of it: the head was kept off."""
-    wall = Solid.cube((12.0, 4.05, 16.0)).translate((4.0, 4.0, 0.0)).rotate((0.0, 0.0, turned))
-    truth = HeightField.from_manifold(wall, CELL_MM, margin_mm=2.0)
-    points = scanned(wall, 5)
-    found = with_what_stands_out(truth, points, SIGMA_MM, SPACING_MM, USUAL_DEFICIT.heights)
-    assert (found.z_mm > truth.z_mm + 0.2).sum() < 10
-    # a lip thinner than a column's chance to be met stays what stands out
-    lip = Solid.cube((6.0, 0.12, 0.6)).translate((7.0, 5.0, 16.0)).rotate((0.0, 0.0, turned))
-    points = np.concatenate([points, scanned(lip, 6)])
-    found = with_what_stands_out(truth, points, SIGMA_MM, SPACING_MM, USUAL_DEFICIT.heights)
-    burr = HeightField.from_manifold(lip, CELL_MM, box_mm=truth.box_mm).z_mm > 16.0
-    assert (ndimage.maximum_filter(found.z_mm, 3)[burr] > 16.4).mean() > 0.95
-
-
-def test_what_solids_leave_at_a_rim_is_no_higher_than_what_was_seen_of_it() -> None:
-    """Fins of three columns beside worn edges stood 0.5 mm too high, and kept the cone away."""
-    block = Solid.cube((24.0, 20.0, 6.0))
-    piece = Solid.cube((24.0, 12.0, 2.0)).translate((0.0, 8.0, 4.0))
-    rest = block - piece
-    truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
-    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
-    x, y = truth.centres_mm()
-    fin = ((y > 19.7) & (y < 20.0))[:, None] & ((x > 2.0) & (x < 22.0))[None, :]
-    z_mm = np.array(truth.z_mm, dtype=np.float64)
-    z_mm[fin] += 0.6
-    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
-    lost_mm = np.where(gone_from(truth, piece), 2.0, 0.0)
-    even = with_even_crests(rough, lost_mm, designed.z_mm, scanned(rest, 8), SPACING_MM)
-    assert np.abs(even.z_mm - truth.z_mm)[fin].max() < 4 * SIGMA_MM
-    assert (even.z_mm[~fin] == z_mm[~fin]).all()
-    # where nobody saw anything it stays
-    unseen = with_even_crests(rough, lost_mm, designed.z_mm, *UNSEEN)
-    assert (unseen.z_mm >= z_mm).all()
-
-
-def test_a_crest_that_rises_is_no_higher_for_what_it_rises_to() -> None:
-    """Each column was raised to the highest two columns uphill: by 0.5 mm at 70 degrees."""
-    z_mm = np.full((40, 60), 2.0)
-    crest = np.zeros(z_mm.shape, dtype=bool)
-    crest[18:21, 10:50] = True
-    rising = 3.0 + 0.2 * np.arange(60.0)
-    z_mm[crest] = np.broadcast_to(rising, z_mm.shape)[crest]
-    lost_mm = np.where(crest, 0.0, 2.0)
-    z_mm[19, 30] -= 0.5  # a point that was lost
-    field = HeightField(np.zeros(2), CELL_MM, z_mm, np.ones(z_mm.shape, dtype=bool))
-    even = with_even_crests(field, lost_mm, np.full(z_mm.shape, 20.0), *UNSEEN)
-    wanted = np.broadcast_to(rising, z_mm.shape)
-    inside = crest & (np.arange(60) > 12) & (np.arange(60) < 47)
-    assert np.abs(even.z_mm - wanted)[inside].max() < 0.05
