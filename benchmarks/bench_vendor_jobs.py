@@ -19,65 +19,41 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import trimesh
 
 from gcode.check import Policy, find_refusals
+from gcode.errors import InputError
 from gcode.moves import Program
+from gcode.profiles.finding import BUNDLES, find_presets
+from gcode.profiles.importers.slicers import read_prusa
 from gcode.profiles.own_settings import own_settings
 
-BUNDLES = Path("/usr/share/PrusaSlicer/profiles")
 NOZZLE = "0.4"
 BLOCK_MM = (12.0, 12.0, 4.0)
 # What the command line does not take, or draws pictures.
 LEFT_OUT = re.compile(r"compatible_|inherits|default_(print|filament)_profile|thumbnails")
 SEVERAL_HEADS = re.compile(r"another tool|change of tool|hotend of another tool")
-Presets = dict[str, dict[str, str]]
-
-
-def presets_of(path: Path) -> Presets:
-    """A bundle's sections."""
-    found: Presets = {}
-    values: dict[str, str] = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        if head := re.match(r"\[(.+)\]\s*$", line):
-            values = found.setdefault(head[1], {})
-        elif "=" in line and not line.lstrip().startswith("#"):
-            key, _, value = line.partition("=")
-            values[key.strip()] = value.strip()
-    return found
-
-
-def whole(presets: Presets, kind: str, name: str) -> dict[str, str]:
-    """A preset with all it inherits."""
-    own = presets.get(f"{kind}:{name}", {})
-    values: dict[str, str] = {}
-    for parent in filter(None, (p.strip() for p in own.get("inherits", "").split(";"))):
-        values |= whole(presets, kind, parent)
-    return values | own
 
 
 def configurations(bundles: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Every printer's name, and all settings of a job for it."""
-    for path in sorted(bundles.glob("*.ini")):
-        presets = presets_of(path)
-        for section in presets:
-            kind, _, name = section.partition(":")
-            if kind != "printer" or name.startswith("*"):
-                continue
-            printer = whole(presets, "printer", name)
-            if printer.get("nozzle_diameter", NOZZLE).split(",")[0] != NOZZLE:
-                continue
-            defaults = (
-                printer.get(f"default_{what}_profile", "").split(";")[0].strip('"')
-                for what in ("print", "filament")
-            )
-            made: dict[str, str] = {}
-            for what, default in zip(("print", "filament"), defaults, strict=True):
-                made |= whole(presets, what, default)
-            made |= printer
-            yield name, {key: v for key, v in made.items() if not LEFT_OUT.match(key)}
+    for preset in find_presets():
+        if preset.kind != "printers" or preset.path.parent != bundles:
+            continue
+        text = preset.path.read_text(encoding="utf-8", errors="replace")
+        printer = read_prusa(preset.path, text, preset.preset).values
+        if printer.get("nozzle_diameter", NOZZLE).split(",")[0] != NOZZLE:
+            continue
+        made: dict[str, str] = {}
+        for what in ("print", "filament"):
+            name = printer.get(f"default_{what}_profile", "").split(";")[0].strip('"')
+            with suppress(InputError):  # a printer of resin has neither
+                made |= read_prusa(preset.path, text, f"{what}:{name}").values
+        made |= printer
+        yield preset.name, {key: v for key, v in made.items() if not LEFT_OUT.match(key)}
 
 
 def cut(config: dict[str, str], folder: Path, number: int) -> str | None:
@@ -107,7 +83,7 @@ def refusals(name: str, text: str) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bundles", type=Path, default=BUNDLES)
+    parser.add_argument("--bundles", type=Path, default=Path(BUNDLES[0]))
     parser.add_argument("--each", action="store_true", help="what speaks against each other one")
     args = parser.parse_args()
     jobs = list(configurations(args.bundles))

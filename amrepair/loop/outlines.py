@@ -8,7 +8,7 @@ closed loops alone; a void of sparse infill has a line of it, which is open, at 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from gcode.reader import Beads
@@ -80,14 +80,5 @@ def _at_the_edge(
     of_infill = ndimage.maximum(infill, voids, range(count + 1)) > 0
     of_infill[[0, voids[0, 0]]] = [True, False]  # the beads themselves; the outside
     away_mm = cell * ndimage.distance_transform_edt(of_infill[voids])
-    return np.asarray(_at(away_mm, 0.5 * (start_mm + end_mm), low) < half_mm + 2 * cell)
-
-
-def _at(
-    values: Float[np.ndarray, "ny nx"],
-    points_mm: Float[np.ndarray, "n 2"],
-    low_mm: Float[np.ndarray, " 2"],
-) -> Float[np.ndarray, " n"]:
-    x, y = np.floor((points_mm - low_mm) / OUTLINE_CELL_MM).astype(np.int64).T
-    picked: Int[np.ndarray, " n"] = np.ravel_multi_index((y, x), values.shape)
-    return values.ravel()[picked]
+    x, y = np.floor((0.5 * (start_mm + end_mm) - low) / cell).astype(np.int64).T
+    return np.asarray(away_mm[y, x] < half_mm + 2 * cell)

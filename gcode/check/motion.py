@@ -13,7 +13,7 @@ from jaxtyping import Float
 from gcode.check import plain_kernels as plain
 from gcode.check.arcs import points_of_arc
 from gcode.check.findings import Moves, Policy, Refusal, Text, Warnings
-from gcode.check.words import CLAMPS, G91_MOVES_E, LINE_LIMIT, MOVES_UNHOMED
+from gcode.check.words import G91_MOVES_E, LENIENT_OF_MOVES, LINE_LIMIT
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader.text_kernels import INCH_MM
@@ -148,7 +148,8 @@ class Motion:
     @property
     def _occupied(self) -> bool:
         """Whether something stands on the bed: from before, or laid by the program itself."""
-        return self._stood or self.moves.sums.laid
+        self._stood = self._stood or self.moves.sums.laid  # what is laid stays
+        return self._stood
 
     @property
     def _top_mm(self) -> float | None:
@@ -255,7 +256,7 @@ class Motion:
         to_mm = value if self._absolute else self._risen_mm + value
         rises = axis == 2 and to_mm > self._risen_mm and not (self._absolute and self._occupied)
         told = ("move before homing", "XYZ"[axis], "home first")
-        if rises and self._dialect in MOVES_UNHOMED and self.policy is Policy.DANGER:
+        if rises and self._dialect in LENIENT_OF_MOVES and self.policy is Policy.DANGER:
             self._risen_mm = to_mm
             self._warn(*told)
         else:
@@ -345,7 +346,7 @@ class Motion:
         printer, reached = self._setup.printer, list(target)
         x0, y0, x1, y1 = printer.reach_box_mm
         untold_mm = printer.off_bed_mm
-        cuts = untold_mm > 0 and self._dialect in CLAMPS and not lays
+        cuts = untold_mm > 0 and self._dialect in LENIENT_OF_MOVES and not lays
         for axis, low, high in ((0, x0, x1), (1, y0, y1), (2, 0.0, printer.max_z_mm)):
             value = target[axis]
             if value is None or low - PLACE_SLACK_MM <= value <= high + PLACE_SLACK_MM:

@@ -11,10 +11,10 @@ from gcode.check.motion import PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
     G90_SETS_E,
     KNOWN_COMMANDS,
+    LENIENT_OF_MOVES,
     LENIENT_OF_TOOLS,
     LINE_LIMIT,
     NO_INCHES,
-    PASSES_OVER,
     PROBES,
     STARTS,
     parameters,
@@ -108,11 +108,11 @@ class Judge(Motion):
             return
         name = head.group(1) + head.group(2) + (f".{head.group(3)}" if head.group(3) else "")
         tool = _TOOL.fullmatch(name) is not None
-        if tool and name not in self._known and self._dialect not in LENIENT_OF_TOOLS:
-            self._refuse("another tool", name, "the only one, T0")
-            return
-        if name not in self._known and not tool:
-            self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
+        if name not in self._known and not (tool and self._dialect in LENIENT_OF_TOOLS):
+            if tool:
+                self._refuse("another tool", name, "the only one, T0")
+            else:
+                self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
             return
         if name in FREE_TEXT:
             return
@@ -160,14 +160,8 @@ class Judge(Motion):
         match = _NAMED.match(command)
         name = match.group(1) if match else command.split(maxsplit=1)[0]
         given = parameters(command)
-        known = name in self._known
-        stray = not known and _OF_SOME_FIRMWARE.fullmatch(command) is None
-        if stray and self._dialect in PASSES_OVER:
-            self._beyond("no command, which the firmware passes over", name, "none", 1.0)
-        elif not known:
-            own = "; a macro of the printer's own is told in its profile's 'macros'"
-            limit = f"those of {self._dialect}{own if self._dialect == 'klipper' else ''}"
-            self._refuse("command unknown or not allowed", name, limit)
+        if name not in self._known:
+            self._unknown(name, command)
         elif name == self._feels:
             told = {key: self._number(value) for key, value in given.items()}
             self._touch(touches.words_of_macro(told, self._place[2]))
@@ -203,6 +197,15 @@ class Judge(Motion):
         if name in self._macros:
             self._heats_unsaid = True
 
+    def _unknown(self, name: str, command: str) -> None:
+        stray = _OF_SOME_FIRMWARE.fullmatch(command) is None
+        if stray and self._dialect in LENIENT_OF_MOVES:
+            self._beyond("no command, which the firmware passes over", name, "none", 1.0)
+            return
+        own = "; a macro of the printer's own is told in its profile's 'macros'"
+        limit = f"those of {self._dialect}{own if self._dialect == 'klipper' else ''}"
+        self._refuse("command unknown or not allowed", name, limit)
+
     def _wait_for_sensor(self, given: dict[str, str]) -> None:
         sensor = given.get("SENSOR", "").strip("\"'")
         low_c, high_c = (self._number(given.get(key)) for key in ("MINIMUM", "MAXIMUM"))
@@ -231,8 +234,7 @@ class Judge(Motion):
 
     def _choose(self, tool: str) -> None:
         """The only tool may have any number, but another one later would be another colour."""
-        used = self.moves.sums.pushed
-        before = self._tool or ("T0" if used else tool)
+        before = self._tool or ("T0" if self.moves.sums.pushed else tool)
         if tool != before:
             self._refuse("change of tool", tool, f"one tool: {before}")
         self._tool = before

@@ -65,12 +65,10 @@ _START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
-# Marlin's software end stops cut a move short at the machine's own; Klipper gives the job up.
-CLAMPS = frozenset({"marlin", "prusa"})
-# What they take before homing; Klipper refuses it ("Must home axis first").
-MOVES_UNHOMED = frozenset({"marlin", "prusa"})
-# They answer that a line without a letter and a number is no command, and go on.
-PASSES_OVER = frozenset({"marlin", "prusa"})
+# Marlin's software end stops cut a move short at the machine's own, it moves axes that are not
+# homed, and it answers that stray words are no command and goes on; Klipper gives the job up at the
+# first, and refuses the second ("Must home axis first").
+LENIENT_OF_MOVES = frozenset({"marlin", "prusa"})
 # Klipper refuses G20 (klippy/extras/gcode_move.py), the MK3's firmware passes over it; both go on
 # in millimetres.
 NO_INCHES = frozenset({"klipper", "prusa"})

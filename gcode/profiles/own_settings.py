@@ -116,17 +116,9 @@ class OwnSettings:
         values = self.found.profiles[0].values
         why = []
         corner_mm = values.get("bed_min_mm", (0.0, 0.0)) if self.bed_size_mm else None
-        if self.bed_size_mm is not None and any(
-            abs(job - own) > SAME_BED_RATIO * own
-            for job, own in zip(self.bed_size_mm, printer.bed_size_mm, strict=True)
-        ):
+        if self.bed_size_mm is not None and _apart(self.bed_size_mm, printer.bed_size_mm, printer):
             why.append(f"a bed of {_bed(self.bed_size_mm)}, not {_bed(printer.bed_size_mm)}")
-        elif corner_mm is not None and any(
-            abs(job - own) > SAME_BED_RATIO * side
-            for job, own, side in zip(
-                corner_mm, printer.bed_min_mm, printer.bed_size_mm, strict=True
-            )
-        ):
+        elif corner_mm is not None and _apart(corner_mm, printer.bed_min_mm, printer):
             why.append(f"a bed from {_corner(corner_mm)} on, not {_corner(printer.bed_min_mm)}")
         nozzle_mm = values.get("nozzle_diameter_mm")
         if nozzle_mm is not None and abs(nozzle_mm - printer.nozzle_diameter_mm) > SAME_NOZZLE_MM:
@@ -263,6 +255,12 @@ def _described(printer: PrinterProfile) -> str:
         f"{printer.name}, bed {_bed(printer.bed_size_mm)}, {printer.max_z_mm:g} mm high, nozzle "
         f"{printer.nozzle_diameter_mm:g} mm, {printer.dialect}"
     )
+
+
+def _apart(job_mm: Sequence[float], own_mm: Sequence[float], printer: PrinterProfile) -> bool:
+    """Whether X or Y of a job's bed and of the printer's differ by more than makers round."""
+    rows = zip(job_mm, own_mm, printer.bed_size_mm, strict=True)
+    return any(abs(job - own) > SAME_BED_RATIO * side for job, own, side in rows)
 
 
 def _corner(at_mm: Sequence[float]) -> str:
