@@ -181,3 +181,5 @@ def _tell(report: PrintReport, judged: CheckReport, *, as_json: bool) -> None:
             f"{1000 * report.round_trip_s[0]:.2f} ms, 99 % within "
             f"{1000 * report.round_trip_s[2]:.2f} ms."
         )
+        for warning in report.warnings if report.ok else ():  # a safe exit has told
+            console.errors.print(f"printer: {warning}")

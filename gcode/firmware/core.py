@@ -16,7 +16,7 @@ from gcode.firmware.damage import Wire
 from gcode.firmware.faults import Fault, FaultScript
 from gcode.firmware.framing import RENUMBERED, unframed
 from gcode.firmware.machine import Machine
-from gcode.firmware.variants import FIRMWARES, Variant
+from gcode.firmware.variants import BUILT_WITHOUT, FIRMWARES, Variant
 from gcode.profiles import PrinterProfile
 
 MAX_CMD_SIZE = 96
@@ -46,11 +46,12 @@ class FirmwareCore:
         seed: int = 0,
         record: Callable[[bytes], None] | None = None,
     ) -> None:
-        self.variant = FIRMWARES[variant] if isinstance(variant, str) else variant
+        self.faults = faults or FaultScript()
+        built = FIRMWARES[variant] if isinstance(variant, str) else variant
+        self.variant = built.without(*(BUILT_WITHOUT.keys() & self.faults.always))
         self.machine = Machine(profile, self.variant)
         self.accelerated = accelerated
         self.record = record
-        self.faults = faults or FaultScript()
         self._rng = random.Random(seed)
         self._advanced_ok = self.variant.advanced_ok
         self._has_faults = bool(self.faults.faults)
@@ -70,6 +71,7 @@ class FirmwareCore:
         self.hang_up_s: float | None = None
         self._wall_s = 0.0
         self._pending_ok: dict[str, Fault] = {}
+        self._waits_since_s = math.inf  # for room among the moves; of the printer's clock
         self._wait_number: int | None = None
         self._next_temperature_s = self._next_position_s = math.inf
 
@@ -108,7 +110,9 @@ class FirmwareCore:
             if machine.wait is not None and not self._run_wait(limit_s):
                 return
             if machine.clock_s > limit_s or machine.killed:
+                self._wait_for_room(limit_s)
                 return
+            self._waits_since_s = math.inf
             end = rx.find(b"\n")
             if end < 0:
                 if len(rx) > 4 * MAX_CMD_SIZE and self.variant.family != "klipper":
@@ -117,6 +121,15 @@ class FirmwareCore:
             line = bytes(rx[:end])
             del rx[: end + 1]
             self._line(line)
+
+    def _wait_for_room(self, now_s: float) -> None:
+        """Say that it is busy while a line waits for moves to end (`idle()` of Marlin)."""
+        if not self.variant.keepalive or self.machine.killed or b"\n" not in self._rx:
+            return
+        self._waits_since_s = min(self._waits_since_s, now_s)
+        if now_s >= self._waits_since_s + _BUSY_EVERY_S:
+            self._waits_since_s += _BUSY_EVERY_S
+            self._say("echo:busy: processing")
 
     def pass_time(self, until_s: float) -> None:
         """Nothing comes in: let the printer go on by itself until `until_s` of its clock."""

@@ -42,6 +42,8 @@ FAULT_KINDS: dict[str, str] = {
     "damage": "each byte is damaged on its way, in both directions, with probability s (default "
     "0.005); never so that neither side could notice",
     "ignore_checksums": "number and checksum are stripped unread",
+    "no_arcs": "the firmware was built without arcs (G2, G3)",
+    "no_inches": "the firmware was built without inches (G20), as Marlin is where nobody asks",
 }
 
 

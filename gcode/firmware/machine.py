@@ -56,6 +56,8 @@ class Machine(Mechanics):
                 table[name[1:].upper().encode()] = getattr(self, name)
         if self.variant.family not in ("marlin", "reprap"):
             table.pop(b"G38")  # neither Prusa's firmware nor Klipper has it
+        for unbuilt in self.variant.unbuilt:
+            table.pop(unbuilt)
         if self.variant.family == "klipper":
             table[b"AMREPAIR_TOUCH"] = self._amrepair_touch
             table[b"TEMPERATURE_WAIT"] = self._temperature_wait
@@ -195,7 +197,11 @@ class Machine(Mechanics):
     def _amrepair_touch(self, rest: bytes) -> None:
         """Do what our macro around Klipper's PROBE does (`gcode/resumption/klipper_touch.cfg`)."""
         said = dict(word.partition(b"=")[::2] for word in rest.upper().split())
-        depth_mm, speed_mm_s = float(said[b"DEPTH"]), float(said[b"SPEED"])
+        try:
+            depth_mm, speed_mm_s = float(said[b"DEPTH"]), float(said[b"SPEED"])
+        except (KeyError, ValueError):
+            self.replies.append("!! Error evaluating 'gcode_macro AMREPAIR_TOUCH:gcode'")
+            return
 
         def stopped(touched: bool) -> None:
             if touched:

@@ -309,7 +309,10 @@ class Mechanics:
             native + offset
             for native, offset in zip((self.x, self.y, self.z), self.offset, strict=True)
         ]
-        text = f"X:{x:.3f} Y:{y:.3f} Z:{z:.3f} E:{self.e:.4f}"
+        digits = self.variant.place_digits
+        text = " ".join(
+            f"{axis}:{mm:.{digits}f}" for axis, mm in zip("XYZE", (x, y, z, self.e), strict=True)
+        )
         if self.variant.family in ("marlin", "prusa"):
             steps = (int(self.x * 80), int(self.y * 80), int(self.z * 400))
             text += f" Count X:{steps[0]} Y:{steps[1]} Z:{steps[2]}"

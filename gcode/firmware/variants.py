@@ -5,7 +5,7 @@ Facts from the firmwares' sources and documentation; where one is a choice of ou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 Family = Literal["marlin", "prusa", "klipper", "reprap"]
@@ -28,8 +28,12 @@ class Variant:
     modes_follow_g90
         G90 and G91 set the extruder's mode too (Marlin); `relative_only`: G91 makes E relative
         while it lasts and M83 persists (Klipper); `independent`: they leave it alone.
+    place_digits
+        Decimals of the answer to M114, mm.
     motors_off_s
         After the last move; infinity where they keep a part of their current.
+    unbuilt
+        Commands that this build of the firmware does not know.
     """
 
     name: str
@@ -47,8 +51,26 @@ class Variant:
     keepalive: bool = False
     temperatures_in_ok: bool = True
     advanced_ok: bool = False
+    place_digits: int = 2
     motors_off_s: float = 120.0
+    unbuilt: frozenset[bytes] = frozenset()
 
+    def without(self, *options: str) -> Variant:
+        """The firmware as it is built without some of `BUILT_WITHOUT`; it says so, where it can."""
+        missing = [BUILT_WITHOUT[option] for option in options]
+        said = {capability for _, capability in missing}
+        return replace(
+            self,
+            unbuilt=self.unbuilt.union(*(commands for commands, _ in missing)),
+            capabilities=tuple((cap, has and cap not in said) for cap, has in self.capabilities),
+        )
+
+
+BUILT_WITHOUT: dict[str, tuple[frozenset[bytes], str]] = {
+    "no_arcs": (frozenset({b"G2", b"G3"}), "ARCS"),
+    "no_inches": (frozenset({b"G20"}), ""),
+}
+"""Parts that not everybody builds: their commands, and the capability that says so."""
 
 _MARLIN_CAPABILITIES = (
     ("SERIAL_XON_XOFF", False),
@@ -99,6 +121,7 @@ FIRMWARES: dict[str, Variant] = {
     "klipper": Variant(
         name="klipper",
         family="klipper",
+        place_digits=3,
         banner=("// Klipper state: Ready",),
         firmware_line="FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12.0-emulated",
         capabilities=(),
@@ -113,6 +136,7 @@ FIRMWARES: dict[str, Variant] = {
     "reprap": Variant(
         name="reprap",
         family="reprap",
+        place_digits=3,
         banner=("RepRapFirmware for emulated boards is up and running.",),
         firmware_line="FIRMWARE_NAME: RepRapFirmware for emulated boards FIRMWARE_VERSION: 3.6.0 "
         "ELECTRONICS: emulated",

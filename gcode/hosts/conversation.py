@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
 import select
 import threading
 import time
@@ -20,7 +21,7 @@ from typing import NoReturn, TypeVar
 
 import serial
 
-from gcode.errors import LinkError, LocalProtocolError
+from gcode.errors import LinkError, LocalProtocolError, PrinterError
 from gcode.hosts.journal import Journal
 from gcode.hosts.port import Capabilities, LinkLostError, Temperatures
 from gcode.hosts.wirelog import WireLog
@@ -29,6 +30,11 @@ from gcode.protocol import events as ev
 from gcode.protocol.lines import numbered
 
 Answer = TypeVar("Answer")
+_NEEDED = re.compile(
+    r'command: ?"?(G0*(?:[0-3]|20|28|9[0-2])|M(?:82|83|104|109))(?![\d.])[^*]*$', re.IGNORECASE
+)
+"""A command that moves, says how words are meant, or melts, as it stood in the program: what has a
+checksum in it is a line that lost its number, and is sent again."""
 REPORT_TRIES = 10
 """At one damaged byte in 200 a report is damaged every fourth time: ten in a row, one in 10^6."""
 MOST_WAIT_S = 0.5
@@ -397,6 +403,11 @@ class SerialConversation:
             self._stalls += 1
         elif isinstance(event, ev.UnknownCommand):
             self._warnings.append(event.text)
+            if self._failure is None and (needed := _NEEDED.search(event.text)):
+                self._failure = PrinterError(
+                    f"The printer's firmware does not know {needed.group(1)} ({event.text}): what "
+                    f"follows it would be printed wrong."
+                )
         elif self._failure is not None:
             pass  # the first fault is the cause, the rest its consequences
         elif isinstance(event, ev.CommandFailed):

@@ -6,6 +6,7 @@ It owns the lock, the supervisor, the journal and the safe exits; what is printe
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +21,7 @@ from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
 from gcode.hosts.supervisor import make_safe
 from gcode.protocol import events as ev
 
+_log = logging.getLogger(__name__)
 PAUSE_LIFT_MM = 5.0
 REST_S = 2.0
 """Longest wait for the answers under way before a safe exit goes past them."""
@@ -91,7 +93,7 @@ class GuardedConversation(SerialConversation):
         try:
             before_hello(number)
         except LinkError:
-            self._note(make_safe(self._fd))
+            self._told_safe(make_safe(self._fd))
             raise
 
     def close(self) -> None:
@@ -141,7 +143,7 @@ class GuardedConversation(SerialConversation):
             else:
                 self._go_past()
         except (LinkError, LocalProtocolError, OSError) as error:
-            self._note(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
+            self._told_safe(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
         finally:
             if ours:
                 self._mutex.release()
@@ -164,15 +166,22 @@ class GuardedConversation(SerialConversation):
         if lift:
             self._ended_by = "the printer was made safe"
             self._link.give_up(self._ended_by)
-        self._note(make_safe(self._fd, lift=lift))
+        waits = self._link.slow_under_way
+        word = make_safe(self._fd, lift=lift)
+        if waits and word.endswith("NO ANSWER"):
+            word += (
+                ": the printer is at a command that takes long, heats on until that is done, and "
+                "obeys then; switch it off if that must not be"
+            )
+        self._told_safe(word)
 
     def _switch_off(self) -> None:
         try:
             self.heaters_off()
             self._lift()
-            self._note(f"{self._heaters_now()}, nozzle lifted")
+            self._told_safe(f"{self._heaters_now()}, nozzle lifted")
         except JournalError:  # numbered lines must be written down first, these need not
-            self._note(make_safe(self._fd))
+            self._told_safe(make_safe(self._fd))
 
     def _heaters_now(self) -> str:
         """What the printer says of its heaters; an `ok` alone confirms nothing."""
@@ -187,6 +196,11 @@ class GuardedConversation(SerialConversation):
     def notes(self) -> tuple[str, ...]:
         """What the host did of its own accord since the last `print` began."""
         return tuple(self._warnings)
+
+    def _told_safe(self, text: str) -> None:
+        """Note how a safe exit went, and say it: an interrupt has no words of its own."""
+        self._note(text)
+        _log.warning("printer: %s", text)
 
     def _note(self, text: str) -> None:
         self._warnings.append(text)

@@ -82,6 +82,9 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         found = self._session.call("printer.objects.list")
         objects = found.get("objects", ()) if isinstance(found, dict) else ()
         caps = {name.upper(): name in objects for name in ("virtual_sdcard", "pause_resume")}
+        configured = self._session.query({"configfile": ["settings"]}).get("configfile", {})
+        if settings := configured.get("settings"):
+            caps["ARCS"] = "gcode_arcs" in settings
         return Capabilities(f"Klipper {version}".strip(), {**caps, "EMERGENCY_STOP": True})
 
     def temperatures(self) -> Temperatures:

@@ -25,7 +25,7 @@ from gcode.hosts.jobbook import TEMPERATURE_EVERY_S
 from gcode.hosts.journal import Journal
 from gcode.hosts.modes import batches_of, modes_after
 from gcode.hosts.port import LinkLostError, NothingMetError, PrintableProgram, PrintReport
-from gcode.hosts.proof import require_checked
+from gcode.hosts.proof import require_arcs, require_checked
 from gcode.hosts.telemetry import RoundTrips
 from gcode.progress import Progress, silent
 from gcode.protocol import PLAIN_OK, LinkTiming, WireLine
@@ -110,6 +110,7 @@ class SerialPrinter(GuardedConversation):
         require_checked(checked)
         if self._serial is None:
             raise LocalProtocolError("The printer is not connected; call connect() first.")
+        require_arcs(checked, self.capabilities)
         total = checked.program.text.count("\n") + 1
         first, end = (0, total) if lines is None else (lines.start, lines.stop)
         start_s = self._clock()

@@ -8,6 +8,7 @@ where that goes wrong. How a server is asked, and what its news mean, is in `oct
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -22,12 +23,13 @@ import httpx
 from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.lock import PortLock
 from gcode.hosts.port import LinkLostError, PrintableProgram, Printer, PrintReport
-from gcode.hosts.proof import require_checked
+from gcode.hosts.proof import require_arcs, require_checked
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.upload import JobFile, part_prefix
 from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, heaters_word
 from gcode.progress import Progress, silent
 
+_log = logging.getLogger(__name__)
 LOOK_EVERY = 5
 """Waits without an end after which the job is asked for, in case that its news did not come."""
 
@@ -322,6 +324,7 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         require_checked(checked)
         start_s, self._tried_safety = self._clock(), False
         self._refuse_unless_ready()
+        require_arcs(checked, self.capabilities)
         job = JobFile.of(checked, lines)
         self._upload(job)
         self._delete(self._spent)
@@ -458,4 +461,4 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         if isinstance(error, LinkError):
             error.args = (f"{error.args[0]} {word}", *error.args[1:])
         else:
-            error.add_note(word)
+            _log.warning("printer: %s", word)  # an interrupt has no words of its own

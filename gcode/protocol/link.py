@@ -289,6 +289,7 @@ class Link(Recovery):
             self._on_resend(reply.number, now_s)
         elif isinstance(reply, Busy):
             self._events.append(reply)
+            self._says_busy = True
             self._listen_anew(now_s)
         elif isinstance(reply, Waiting):
             self._events.append(reply)

@@ -62,6 +62,7 @@ class Recovery:
         self._rewind_until_s = 0.0
         self._rewind_at_once = False
         self._heard_s = 0.0
+        self._says_busy = False
         self._deadline_s = self._half_line_s = NEVER_S
         self._probing_since_s: float | None = None
         self._said_last: int | None = None
@@ -232,7 +233,8 @@ class Recovery:
 
     def _silence_s(self) -> float:
         slow = self._ledger.slow_under_way
-        return self.timing.slow_silence_s if slow else self.timing.silence_s
+        usual_s = self.timing.slow_silence_s if slow else self.timing.silence_s
+        return min(usual_s, self.timing.busy_silence_s) if self._says_busy else usual_s
 
     def _listen_anew(self, now_s: float) -> None:
         self._heard_s = now_s

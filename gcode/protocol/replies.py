@@ -7,6 +7,7 @@ an `ok`, and "hours" is not a resend (OctoPrint#205). State is `link`'s business
 from __future__ import annotations
 
 import re
+from difflib import SequenceMatcher
 
 from gcode.protocol.events import (
     Busy,
@@ -60,6 +61,15 @@ _BANNER = re.compile(
 _LINE_ERROR = re.compile(
     r"checksum|line number|expected line|last line|format error", re.IGNORECASE
 )
+_LINE_ERRORS = (
+    "checksum mismatch, last line: ",
+    "no checksum with line number, last line: ",
+    "no line number with checksum, last line: ",
+    "line number is not last line number+1, last line: ",
+)
+"""Marlin's own (`queue.cpp`), for those that arrive with some letters damaged."""
+_ALIKE = 0.75
+"""Of the letters of two texts, in order; no other error of Marlin's comes near."""
 _LAST_LINE = re.compile(r"last line: ?(\d{1,9})", re.IGNORECASE)
 # Errors that no command of ours caused and that hurt no print (Marlin, SD card).
 _HARMLESS_ERROR = re.compile(r"volume\.init|openRoot|SD card|workDir|no media", re.IGNORECASE)
@@ -169,4 +179,7 @@ def _error(text: str) -> Reply:
         return Echo(f"Error:{text}")
     if text.lower().startswith("unknown command"):
         return UnknownCommand(text)
+    said = text.lower().rstrip("0123456789")
+    if any(SequenceMatcher(None, said, one).ratio() >= _ALIKE for one in _LINE_ERRORS):
+        return LineError(text, None)
     return CommandFailed(text, fatal=False)

@@ -16,6 +16,9 @@ class LinkTiming:
         then forces the *next* line, which loses one; a probe loses nothing).
     slow_silence_s
         The same for commands that take long.
+    busy_silence_s
+        The same, of any command, on a firmware that has said that it is busy: Marlin repeats that
+        every 2 s, so an answer is lost (OctoPrint's `communicationBusy`).
     resend_grace_s
         How long after a resend request an `ok` may still belong to it.
     doubt_s
@@ -40,6 +43,7 @@ class LinkTiming:
 
     silence_s: float = 8.0
     slow_silence_s: float = 60.0
+    busy_silence_s: float = 3.0
     resend_grace_s: float = 0.1
     doubt_s: float = 0.4
     give_up_s: float = 60.0

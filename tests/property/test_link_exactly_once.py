@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
@@ -244,6 +244,7 @@ def test_any_bytes_to_the_host_make_events(chunks: list[bytes], window: int) -> 
 
 
 @settings(max_examples=60)
+@example(chunks=[b"AMREPAIR_TOUCH"], firmware="klipper")
 @given(
     chunks=st.lists(st.binary(max_size=60), max_size=20),
     firmware=st.sampled_from(["marlin", "prusa", "klipper", "reprap"]),

@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
 from link_helpers import profile
@@ -228,3 +230,25 @@ def test_a_million_inputs_make_events_and_nothing_else(part: int) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+@settings(max_examples=200)
+@example(at=[6, 18], letters=[None, None], which=0)
+@given(
+    at=st.lists(st.integers(0, 34), min_size=2, max_size=2, unique=True),
+    letters=st.lists(st.one_of(st.none(), st.sampled_from("aZ0 ;:")), min_size=2, max_size=2),
+    which=st.integers(0, 2),
+)
+def test_a_transmission_error_that_arrives_damaged_ends_no_job(
+    at: list[int], letters: list[str | None], which: int
+) -> None:
+    # regression: "hecksum mismatch, ast Line: 348" of a native Marlin was taken for a fault
+    said = (
+        "Error:checksum mismatch, Last Line: 348",
+        "Error:No Checksum with line number, Last Line: 348",
+        "Error:Line Number is not Last Line Number+1, Last Line: 348",
+    )[which]
+    damaged = list(said)
+    for place, letter in zip(at, letters, strict=True):
+        damaged[place] = letter or ""
+    assert not isinstance(parse_reply("".join(damaged).encode()), ev.CommandFailed)

@@ -176,6 +176,18 @@ def test_questions(fake: FakeMoonraker) -> None:
     assert fake.scripts == ["M400"]
 
 
+def test_arcs_go_only_to_a_klipper_that_has_them(fake: FakeMoonraker) -> None:
+    # regression: without [gcode_arcs] Klipper says "unknown command" and prints on without them
+    arcs = program(["G28", "G2 X60 Y50 I5 J0 E1"])
+    with printer_at(fake) as printer:
+        fake.objects["configfile"] = {"settings": {"extruder": {}}}
+        with pytest.raises(PrinterError, match=r"first in line 2.*gcode_arcs"):
+            printer.print(arcs)
+        assert not fake.uploads
+        fake.objects["configfile"] = {"settings": {"gcode_arcs": {"resolution": 1.0}}}
+        assert printer.print(arcs).ok
+
+
 def test_a_long_script_is_waited_for(fake: FakeMoonraker) -> None:
     """Moonraker#437: a script takes as long as its moves; no request time-out ends it."""
     fake.on_script = lambda script: {}

@@ -122,6 +122,18 @@ def test_bug_06_temperature_reports_are_no_sign_of_life_of_a_line() -> None:
     assert link.take_output() == b"\n" + line
 
 
+def test_bug_06_a_firmware_that_says_busy_is_asked_again_sooner() -> None:
+    """A native Marlin, behind a wire that lost an ok, had the nozzle stand for 8 s."""
+    link = greeted()
+    link.send("G28", 0.0)
+    assert link.next_deadline_s() == link.timing.slow_silence_s
+    link.receive(b"echo:busy: processing\n", 2.0)
+    assert link.next_deadline_s() == 2.0 + link.timing.busy_silence_s
+    link.receive(b"ok\n", 4.0)
+    link.send("G1 X1", 4.0)
+    assert link.next_deadline_s() == 4.0 + link.timing.busy_silence_s
+
+
 def test_bug_07_pause_abort_and_resend_cannot_deadlock() -> None:
     """OctoPrint#2524: pause and resume from another thread while lines are resent."""
     with EmulatedPrinterProcess(printer=profile(), faults="every 9 corrupt_in") as emulator:

@@ -18,7 +18,7 @@ from link_forks import until
 from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
-from gcode.errors import LinkError, LocalProtocolError
+from gcode.errors import LinkError, LocalProtocolError, PrinterError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import LinkLostError, supervisor
 from gcode.hosts.fast_path import waiting
@@ -92,7 +92,11 @@ def test_an_interrupt_in_the_middle_of_a_line_lifts_the_nozzle(tmp_path: Path) -
     ("firmware", "said"), [("marlin", "heaters off"), ("prusa", "told to switch off")]
 )
 def test_an_interrupt_while_it_heats_waits_for_no_heater(
-    firmware: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    firmware: str,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """In real time; a firmware without emergency parser reads nothing before M190 has ended."""
     monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.2)
@@ -103,6 +107,7 @@ def test_an_interrupt_while_it_heats_waits_for_no_heater(
             printer.print(program(["M104 S200", "M190 S60", "G28"]))
         thread.join(10)
         assert said in printer.notes[-1]
+        assert ("heats on until that is done" in caplog.text) == (firmware == "prusa")
         assert it.targets_c() == ((0, 0) if firmware == "marlin" else (200, 60))
         assert "G28" not in it.told()
 
@@ -250,3 +255,39 @@ def test_nothing_is_waited_for_on_a_port_that_was_never_opened() -> None:
     for ask in (printer.heaters_off, printer.temperatures):
         with pytest.raises(LocalProtocolError, match="not connected"):
             ask()
+
+
+def test_who_interrupts_is_told_what_became_of_the_heaters(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    # regression: the command line said "interrupted", and what was noted of the heaters was lost
+    lines = [*HEAD, *moves(400)]
+    with bench(tmp_path, faults="always slow_reader s=0.004") as it:
+        printer = SerialPrinter(it.emulator.port, supervise=False)
+        it.once(lines[50], interrupt)
+        with pytest.raises(KeyboardInterrupt), printer:
+            printer.print(program(lines))
+    assert "printer: heaters off (the printer reports targets of 0), nozzle lifted" in caplog.text
+
+
+@pytest.mark.parametrize("fault", ["no_arcs", "no_inches"])
+def test_a_command_that_the_firmware_lacks_ends_the_job_where_it_matters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    # regression: Marlin without arcs answers "unknown command" and goes on from where it was
+    word = {"no_arcs": "G2 X60 Y50 I5 J0 E0.4", "no_inches": "G20"}[fault]
+    monkeypatch.setattr(serial_host, "require_arcs", lambda checked, ask: None)  # it may not say
+    with bench(tmp_path, faults=f"always {fault}") as it:
+        printer = SerialPrinter(it.emulator.port, supervise=False)
+        with pytest.raises(PrinterError, match=rf"does not know {word.split()[0]}"), printer:
+            printer.print(program([*HEAD, "M73 P5", "G1 X50 Y50", word, "G1 X70 Y50"]))
+        assert it.targets_c() == (0, 0)
+    assert "G1 X70 Y50" not in it.told()
+
+
+def test_arcs_are_refused_before_anything_moves_where_the_firmware_has_none(tmp_path: Path) -> None:
+    with bench(tmp_path, faults="always no_arcs") as it, SerialPrinter(it.emulator.port) as printer:
+        with pytest.raises(PrinterError, match=r"arcs .*first in line 8\b"):
+            printer.print(program([*HEAD, "G28 ; home", "; G2 is none", " g02 X1 Y1 I1 J0"]))
+        assert printer.print(program([*HEAD, "G20", "G28", "G21", "G200"])).ok
+    assert "G28 ; home" not in it.told()
