@@ -13,7 +13,7 @@ from jaxtyping import Float
 from gcode.check import plain_kernels as plain
 from gcode.check.arcs import points_of_arc
 from gcode.check.findings import Moves, Policy, Refusal, Text, Warnings
-from gcode.check.words import G91_MOVES_E, LENIENT_OF_MOVES, LINE_LIMIT
+from gcode.check.words import G91_MOVES_E, GIVES_UP_UNHOMED, LENIENT_OF_MOVES, LINE_LIMIT
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader.text_kernels import INCH_MM
@@ -146,6 +146,10 @@ class Motion:
         return self._ready_c < self._setup.printer.min_extrude_c and not may_be_hot
 
     @property
+    def _lenient(self) -> bool:
+        return self.policy is Policy.DANGER
+
+    @property
     def _occupied(self) -> bool:
         """Whether something stands on the bed: from before, or laid by the program itself."""
         self._stood = self._stood or self.moves.sums.laid  # what is laid stays
@@ -251,14 +255,21 @@ class Motion:
         self._go(target, self._pushed(words), moved=bool(moved))
 
     def _unhomed(self, axis: int, words: dict[str, float | None]) -> None:
-        """Up and away from the bed is told in a user's job, where firmwares do it."""
+        """Up and away from the bed is told in a user's job, where firmwares do it.
+
+        So is any move where the firmware knows better: it has homed and heated by itself before the
+        job, or goes nowhere.
+        """
         value = (words["XYZ"[axis]] or 0.0) * self._unit
         to_mm = value if self._absolute else self._risen_mm + value
         rises = axis == 2 and to_mm > self._risen_mm and not (self._absolute and self._occupied)
         told = ("move before homing", "XYZ"[axis], "home first")
-        if rises and self._dialect in LENIENT_OF_MOVES and self.policy is Policy.DANGER:
+        if rises and self._dialect in LENIENT_OF_MOVES and self._lenient:
             self._risen_mm = to_mm
             self._warn(*told)
+        elif self._dialect in GIVES_UP_UNHOMED and not self._occupied and self._lenient:
+            self._warn("move before homing, unless the machine has begun by itself", *told[1:])
+            self._homed, self._heats_unsaid = [True] * 3, True
         else:
             self._refuse(*told)
             self._homed[axis] = True  # said once

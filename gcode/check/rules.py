@@ -19,6 +19,7 @@ from gcode.check.words import (
     STARTS,
     parameters,
     start_heats,
+    without_lists,
     words_of,
 )
 from gcode.moves import ModalState, Program
@@ -45,6 +46,7 @@ _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
 KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
 # Factors on flow (M221) and speed (M220), per cent.
 FACTOR_LIMITS = {"M221": ("flow factor", 50.0, 150.0), "M220": ("speed factor", 10.0, 200.0)}
+TO_PLACES = frozenset({"G0", "G1", "G2", "G3"})
 MOTORS_OFF = frozenset({"M18", "M84"})
 # Axes that no profile has, of idlers, turntables and second carriages.
 OTHER_AXES = frozenset("ABCUVW")
@@ -56,6 +58,10 @@ MOST_ADVANCE_S = 2.0
 # PLA melts at 150 to 160 °C.
 LEAST_COLD_C = 150.0
 FULL_FAN = 255.0
+# Sailfish's homing, of axes by name: to their least place, and to their greatest, which is Z's away
+# from the bed.
+TO_THE_FAR_END = "G162"
+TO_AN_END = frozenset({"G161", TO_THE_FAR_END})
 HOMING_SLACK_MM = 0.2  # as much as the tip may press into what it prints on
 
 
@@ -108,6 +114,9 @@ class Judge(Motion):
             return
         name = head.group(1) + head.group(2) + (f".{head.group(3)}" if head.group(3) else "")
         tool = _TOOL.fullmatch(name) is not None
+        if name in self._macros - KNOWN_COMMANDS[self._dialect]:
+            self._heats_unsaid = True
+            return
         if name not in self._known and not (tool and self._dialect in LENIENT_OF_TOOLS):
             if tool:
                 self._refuse("another tool", name, "the only one, T0")
@@ -119,7 +128,10 @@ class Judge(Motion):
         if "*" in upper:
             self._numbered("checksum of its own", upper[upper.index("*") :])
             return
-        words, wrong = words_of(upper[head.end() :])
+        rest = upper[head.end() :]
+        if self._dialect == "reprap" and name not in TO_PLACES:
+            rest = without_lists(rest)
+        words, wrong = words_of(rest)
         if wrong is not None:
             self._refuse(*wrong)
         else:
@@ -174,7 +186,8 @@ class Judge(Motion):
         elif name in STARTS:
             self._home({}, name)
             for heat, key in start_heats(given):
-                self._heat(heat, {"S": self._number(given[key])})
+                several = [self._number(value) for value in given[key].split(",")]
+                self._heat(heat, {"S": max(several, key=lambda value: value or 0.0)})
         elif name == "TURN_OFF_HEATERS" or (self._ends and name == self._ends.upper()):
             self._hotend_c = self._ready_c = self._bed_c = self._chamber_c = 0.0
             if name != "TURN_OFF_HEATERS":
@@ -242,7 +255,7 @@ class Judge(Motion):
     # ------------------------------------------------------------------ commands
 
     def _act(self, name: str, words: dict[str, float | None]) -> None:
-        if name in {"G0", "G1", "G2", "G3"}:
+        if name in TO_PLACES:
             self._other_axes(words)
         if name in {"G0", "G1"}:
             self._move(words)
@@ -250,8 +263,8 @@ class Judge(Motion):
             self._arc(words, clockwise=name == "G2")
         elif name == "G4":
             self._dwell(words)
-        elif name == "G28":
-            self._home(words)
+        elif name == "G28" or name in TO_AN_END:
+            self._home(words, name)
         elif name == self._feels:
             self._touch({letter: v and v * self._unit for letter, v in words.items()})
         elif name in PROBES and self._occupied:
@@ -271,7 +284,7 @@ class Judge(Motion):
             self._set_place(words)
         elif name in HEATER_COMMANDS:
             self._heat(name, words)
-        elif name == "M116":  # waits for all heaters
+        elif name in {"M116", "M6"}:  # wait for all heaters, and for the nozzle's
             self._ready_c = self._hotend_c
         elif name in {"G10", "M568"} and self._dialect == "reprap" and {"P", "L"} & words.keys():
             self._tool_settings(name, words)
@@ -311,8 +324,12 @@ class Judge(Motion):
                 self._refuse("cold extrusion allowed", told or name, f"S{LEAST_COLD_C:g} and more")
         elif name == "M200" and (words.get("D") or words.get("S")):
             self._refuse("extrusion told as a volume", name, "D0")
-        elif name == "G27":
-            self._place = [None] * 3  # up, and to where it parks
+        elif name in {"G27", "M132"}:
+            self._place = [None] * 3  # where it parks, and where its end stops are
+        elif name == "M211" and 0.0 in words.values():
+            self._refuse("end stops in software off", name, "S1")
+        elif name == "M108" and "T" not in words:  # Marlin's, which ends a wait for heat
+            self._refuse("end of a wait for heat", name, "the wait")
         elif name == "M558" and "P" in words:
             self._refuse("type of the probe that homes Z", name, "the machine's own")
         elif name == "M862.1":
@@ -409,13 +426,14 @@ class Judge(Motion):
         if value_c is not None and not 0 <= value_c <= limit_c:
             self._refuse(f"{what} temperature", f"{value_c:g} °C", f"{limit_c:g} °C")
 
-    def _home(self, words: dict[str, float | None], by: str = "G28 with Z") -> None:
+    def _home(self, words: dict[str, float | None], by: str) -> None:
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
         printer = self._setup.printer
         if self._occupied and not (printer.delta or printer.homes_up):
-            if 2 in axes:
+            if 2 in axes and by != TO_THE_FAR_END:
                 unless = "" if self.policy is Policy.STRICT else ", or 'homes_up' in the profile"
-                self._refuse("homing Z onto a standing part", by, f"G28 X Y only{unless}")
+                told = f"{by} with Z" if by in {"G28", *TO_AN_END} else by
+                self._refuse("homing Z onto a standing part", told, f"G28 X Y only{unless}")
             else:
                 self._homes_above(self._place[2])
         for axis in axes:

@@ -21,6 +21,7 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
+from gcode.profiles.importers.macros import macros_named
 from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
@@ -62,6 +63,8 @@ ASK_FOR = (
 # How far off the bed that a slicer knows its printers' own scripts go to purge, wipe and park:
 # 12.6 mm at most, of 118 presets of 19 makers (PrusaSlicer's bundles).
 OFF_BED_MM = 15.0
+# All-metal hotends are sold up to 300 °C, beds up to 120 °C (E3D's V6, Prusa's and Voron's).
+MOST_HOTEND_C, MOST_BED_C = 300.0, 120.0
 BED_EDGE_MM = 5.0
 """How far from the bed's edge an inherited place is kept."""
 
@@ -130,6 +133,7 @@ def import_profiles(
         notes += filter(None, [bed_note(made[0])])
     for profile in made:
         notes += _settle(profile)
+        _add_macros(profile, source)
         _validate(path, profile)
     return ImportedFile(str(path), made, left, tuple(notes))
 
@@ -161,7 +165,9 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
     notes, more = [], list(left)
     for profile in made:
         notes += _settle(profile)
+        _add_macros(profile, source)
         more += _within_range(profile)
+    _as_hot_as_told(*made[:2])
     return ImportedFile(name, made, tuple(more), tuple(notes))
 
 
@@ -228,6 +234,31 @@ def _settle(made: Imported) -> list[str]:
         f"before printing on a part"
     )
     return notes
+
+
+def _add_macros(made: Imported, source: Source) -> None:
+    """What the scripts of a Klipper machine's preset call by name are its macros."""
+    if made.kind != "printers":
+        return
+    content = {**content_of(made.kind, made.inherits), **made.values}
+    named = macros_named(source.values) if content["dialect"] == "klipper" else ()
+    known = {macro.split(maxsplit=1)[0].upper() for macro in content.get("macros", ())}
+    if set(named) - known:
+        made.values["macros"] = [*content.get("macros", ()), *sorted(set(named) - known)]
+
+
+def _as_hot_as_told(printer: Imported, material: Imported) -> None:
+    """A limit that is nobody's measurement yields to what the job's own filament is printed at."""
+    if printer.inherits not in _GENERIC_IDS:
+        return
+    above = content_of(printer.kind, printer.inherits)
+    for key, asked, most_c in (
+        ("max_hotend_c", ("hotend_c", "first_layer_hotend_c"), MOST_HOTEND_C),
+        ("max_bed_c", ("bed_c",), MOST_BED_C),
+    ):
+        told_c = max(material.values.get(one, 0.0) for one in asked)
+        if key not in printer.values and above[key] < told_c <= most_c:
+            printer.values[key] = told_c
 
 
 def _on_the_bed(place_mm: Sequence[float], bed: Mapping[str, Any]) -> list[float]:
