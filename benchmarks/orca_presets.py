@@ -255,6 +255,7 @@ class Scripts:
             "max_layer_z": block[2],
             "plate_name": "",
             "input_filename_base": "block",
+            "zhop": 0.2,
             "print_preset": "Somebody's",
             "printer_preset": printer.name,
         }

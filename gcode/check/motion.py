@@ -264,12 +264,13 @@ class Motion:
         to_mm = value if self._absolute else self._risen_mm + value
         rises = axis == 2 and to_mm > self._risen_mm and not (self._absolute and self._occupied)
         told = ("move before homing", "XYZ"[axis], "home first")
-        if rises and self._dialect in LENIENT_OF_MOVES and self._lenient:
-            self._risen_mm = to_mm
-            self._warn(*told)
-        elif self._dialect in GIVES_UP_UNHOMED and not self._occupied and self._lenient:
+        gives_up = self._dialect in GIVES_UP_UNHOMED
+        if gives_up and not self._occupied and self._lenient:
             self._warn("move before homing, unless the machine has begun by itself", *told[1:])
             self._homed, self._heats_unsaid = [True] * 3, True
+        elif rises and not gives_up and self._lenient:
+            self._risen_mm = to_mm
+            self._warn(*told)
         else:
             self._refuse(*told)
             self._homed[axis] = True  # said once

@@ -15,6 +15,7 @@ from gcode.check.words import (
     LENIENT_OF_TOOLS,
     LINE_LIMIT,
     NO_INCHES,
+    PARKS,
     PROBES,
     STARTS,
     parameters,
@@ -34,7 +35,7 @@ HEATER_COMMANDS = {
 }
 # Marlin's AUTOTEMP (B, F) and presets (I) set what no number here says.
 UNSAID_HEATS = frozenset("BFI")
-_COMMAND_HEAD = re.compile(r"([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+_COMMAND_HEAD = re.compile(r"([GMTP])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
 _NUMBERED_LINE = re.compile(r"N\s*\d")
 # M486 A tells an object's name
 FREE_TEXT = frozenset({"M117", "M118", "M486", "M708", "M862.3", "M862.6", "M115"})
@@ -43,6 +44,7 @@ _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 # A letter and a number, or a name and named words: some firmware's command.
 _OF_SOME_FIRMWARE = re.compile(r"[A-Z]\s*-?\d.*|[A-Z_]\w*(?: +\w+=\S+)*")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
+_OTHER_EXTRUDER = re.compile(r"EXTRUDER(\d+)")
 KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
 # Factors on flow (M221) and speed (M220), per cent.
 FACTOR_LIMITS = {"M221": ("flow factor", 50.0, 150.0), "M220": ("speed factor", 10.0, 200.0)}
@@ -90,6 +92,11 @@ class Judge(Motion):
         if self._feels:
             self._known |= {self._feels}
         self._tool: str | None = None
+        # The temperatures of heads that do not print: told, and waited for.
+        self._parked_c: dict[str, tuple[float, float]] = {}
+        if setup.printer.heads > 1:
+            self._known |= {f"T{k}" for k in range(setup.printer.heads)}
+            self._known |= PARKS.get(program.dialect, frozenset())
 
     def read(self, number: int, raw: str) -> None:
         """Judge one line."""
@@ -108,6 +115,8 @@ class Judge(Motion):
         if _NUMBERED_LINE.match(upper):
             self._numbered("line number of its own", upper)
             return
+        if self._dialect == "reprap" and upper.startswith("T-1"):
+            upper = f"P0 {upper[3:]}"
         head = _COMMAND_HEAD.match(upper)
         if head is None:
             self._named(upper)
@@ -119,7 +128,7 @@ class Judge(Motion):
             return
         if name not in self._known and not (tool and self._dialect in LENIENT_OF_TOOLS):
             if tool:
-                self._refuse("another tool", name, "the only one, T0")
+                self._refuse("another tool", name, _heads_told(self._setup.printer.heads))
             else:
                 self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
             return
@@ -155,6 +164,7 @@ class Judge(Motion):
             ("hotend", self._hotend_c, "M104 S0"),
             ("bed", self._bed_c, "M140 S0"),
             ("chamber", self._chamber_c, "M141 S0"),
+            *((f"hotend of {k}", c, f"M104 {k} S0") for k, (c, _) in self._parked_c.items()),
         )
         for what, value_c, off in heaters:
             if value_c <= 0:
@@ -190,12 +200,16 @@ class Judge(Motion):
                 self._heat(heat, {"S": max(several, key=lambda value: value or 0.0)})
         elif name == "TURN_OFF_HEATERS" or (self._ends and name == self._ends.upper()):
             self._hotend_c = self._ready_c = self._bed_c = self._chamber_c = 0.0
+            self._parked_c.clear()
             if name != "TURN_OFF_HEATERS":
                 self._place = [None] * 3  # it goes where it parks
         elif name == "SET_HEATER_TEMPERATURE":
             # Where no target is given, Klipper takes 0.
             target_c = self._number(given.get("TARGET", "0"))
-            self._heat(KLIPPER_HEATERS.get(given.get("HEATER", ""), "M141"), {"S": target_c})
+            heater = given.get("HEATER", "")
+            tool = _OTHER_EXTRUDER.fullmatch(heater)
+            which = "M104" if tool else KLIPPER_HEATERS.get(heater, "M141")
+            self._heat(which, {"S": target_c} | ({"T": float(tool[1])} if tool else {}))
         elif name == "SET_PRESSURE_ADVANCE":
             self._advance(self._number(given.get("ADVANCE")))
         elif name == "SET_GCODE_OFFSET":
@@ -246,11 +260,21 @@ class Judge(Motion):
             return None
 
     def _choose(self, tool: str) -> None:
-        """The only tool may have any number, but another one later would be another colour."""
-        before = self._tool or ("T0" if self.moves.sums.pushed else tool)
-        if tool != before:
+        """The only tool may have any number, but another one later would be another colour.
+
+        Of several heads one prints, and until it does another may be chosen.
+        """
+        several, pushed = self._setup.printer.heads > 1, self.moves.sums.pushed
+        before = self._tool or ("T0" if pushed or several else tool)
+        if tool != before and (pushed or not several):
             self._refuse("change of tool", tool, f"one tool: {before}")
-        self._tool = before
+            self._tool = before
+            return
+        if several:
+            self._parked_c[before] = (self._hotend_c, self._ready_c)
+            self._hotend_c, self._ready_c = self._parked_c.pop(tool, (0.0, 0.0))
+            self._place = [None] * 3  # where it is picked up
+        self._tool = tool
 
     # ------------------------------------------------------------------ commands
 
@@ -324,7 +348,7 @@ class Judge(Motion):
                 self._refuse("cold extrusion allowed", told or name, f"S{LEAST_COLD_C:g} and more")
         elif name == "M200" and (words.get("D") or words.get("S")):
             self._refuse("extrusion told as a volume", name, "D0")
-        elif name in {"G27", "M132"}:
+        elif name in {"G27", "M132", "P0"}:
             self._place = [None] * 3  # where it parks, and where its end stops are
         elif name == "M211" and 0.0 in words.values():
             self._refuse("end stops in software off", name, "S1")
@@ -378,7 +402,8 @@ class Judge(Motion):
         if "L" not in words:
             self._temperature("standby", waits.switched_c(words.get("R"), self._dialect))
             if "S" in words:
-                self._heat("M104", {"S": words["S"]})
+                tool = {"T": words["P"]} if self._setup.printer.heads > 1 else {}
+                self._heat("M104", {"S": words["S"]} | tool)
 
     def _shift(self, what: str, value_mm: float | None) -> None:
         if value_mm is not None and abs(value_mm) > PLACE_SLACK_MM:
@@ -403,16 +428,21 @@ class Judge(Motion):
         for letter in sorted(UNSAID_HEATS & words.keys()):
             self._refuse("temperature that the firmware chooses", f"{name} {letter}", "S alone")
         if what == "hotend":
-            tool = f"T{words.get('T') or 0.0:g}"
-            if tool not in {"T0", self._tool}:  # firmwares pass over one that is not there
-                if value_c != 0:
-                    self._refuse("hotend of another tool", tool, "the only one, T0")
+            heads, prints = self._setup.printer.heads, self._tool or "T0"
+            told = words.get("T")
+            tool = f"T{told or 0.0:g}" if told is not None or heads == 1 else prints
+            if not (0 <= (told or 0.0) < heads or tool in {"T0", prints}):
+                if value_c != 0:  # firmwares pass over one that is not there
+                    self._refuse("hotend of another tool", tool, _heads_told(heads))
                 return
         self._temperature(what, value_c)
         if what == "bed":
             self._bed_c = value_c
         elif what == "chamber":
             self._chamber_c = value_c
+        elif heads > 1 and tool != prints:
+            _, ready_c = self._parked_c.get(tool, (0.0, 0.0))
+            self._parked_c[tool] = value_c, value_c if name == "M109" else min(ready_c, value_c)
         else:
             self._hotend_c = value_c
             # The heater was waited for, or cools from now on.
@@ -474,3 +504,7 @@ class Judge(Motion):
         elif not {"X", "Y", "Z"} & words.keys():
             # Klipper, and older firmwares too, take all axes to be at 0 then
             self._refuse("shift of the coordinate system", "G92 without an axis", "only G92 E")
+
+
+def _heads_told(count: int) -> str:
+    return "the only one, T0" if count == 1 else f"those of {count} heads, from T0 on"

@@ -2,7 +2,7 @@
 
 What changes the machine lastingly, or switches a protection off, is left out on purpose: EEPROM
 (M500, M502), steps per mm (M92), homing offsets (M206, M428), PID tuning, the numbers of lines
-(M110). So are curves whose course nothing here follows (G5), and tools that are picked up (P0).
+(M110). So are curves whose course nothing here follows (G5).
 
 Sources: marlinfw.org/docs/gcode; klipper3d.org/G-Codes.html; Duet's G-code dictionary; Prusa's
 `lib/Marlin` and `src/common/marlin_server` of Prusa-Firmware-Buddy, whose jobs slicers call Marlin;
@@ -67,6 +67,9 @@ PROBES = frozenset(
 STARTS = frozenset({"START_PRINT", "PRINT_START"})
 # What names those parameters: EXTRUDER, EXTRUDER_TEMP, HOTEND, NOZZLE_TEMP; BED, BED_TEMP.
 _START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
+# Of a machine with several heads: what lays the present one down (Prusa's XL; RepRapFirmware's
+# `T-1`, which is read as this).
+PARKS = {"marlin": frozenset({"P0"}), "prusa": frozenset({"P0"}), "reprap": frozenset({"P0"})}
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})

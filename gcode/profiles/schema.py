@@ -207,7 +207,8 @@ class PrinterProfile(_Profile):
     reach_min_mm: Xy | None = None  # where the nozzle may go off the bed (purge, wiper); the bed
     reach_max_mm: Xy | None = None  # itself where left out
     off_bed_mm: Annotated[float, Field(ge=0, le=100)] = 0.0  # a user's job may, where nobody knows
-    nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=2.0)]
+    nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=10.0)]  # pellets' are wide
+    heads: Annotated[int, Field(ge=1, le=64)] = 1  # or filaments to one nozzle; a job uses one
     filament_diameter_mm: Annotated[float, Field(ge=1.0, le=3.5)] = 1.75
     max_speed_mm_s: AxisLimits
     max_acceleration_mm_s2: AxisLimits
@@ -220,7 +221,7 @@ class PrinterProfile(_Profile):
     max_extrude_only_mm: Positive
     travel_speed_mm_s: Positive
     z_speed_mm_s: Positive
-    retraction_mm: Annotated[float, Field(ge=0, le=15)]
+    retraction_mm: Annotated[float, Field(ge=0, le=30)]
     retraction_speed_mm_s: Positive
     z_hop_mm: Annotated[float, Field(ge=0, le=5)]
     park_mm: Xyz

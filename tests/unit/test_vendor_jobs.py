@@ -174,9 +174,9 @@ def test_a_start_macro_may_be_told_a_temperature_for_each_head() -> None:
 
 
 def test_a_list_of_reprapfirmware_s_is_judged_by_its_largest_value() -> None:
-    rrf = {"gcode_flavor": "reprapfirmware"}
-    assert refused(orca_job(f"{START}\nM557 P5 X10:90 Y20:80\nM568 P0 S210:200", END, **rrf)) == []
-    hot = refused(orca_job(f"{START}\nM568 P0 S210:900", END, **rrf))
+
+    assert refused(orca_job(f"{START}\nM557 P5 X10:90 Y20:80\nM568 P0 S210:200", END, **RRF)) == []
+    hot = refused(orca_job(f"{START}\nM568 P0 S210:900", END, **RRF))
     assert any("hotend temperature" in one for one in hot)
 
 
@@ -192,6 +192,81 @@ def test_a_job_s_own_filament_may_be_hotter_than_a_generic_printer_s_limit() -> 
     )
     unsaid = orca_job(hot, END, gcode_flavor="marlin")
     assert any("hotend temperature" in one for one in refused(unsaid))
+
+
+XL = """M17
+M862.1 T0 P0.4
+M104 T1 S0
+G0 Z5
+M109 T0 S170
+G28 XY
+T0 S1 L0 D0
+M84 E
+G28 Z
+P0 S1 L1 D0; park the tool
+M104 T0 S215
+M109 T0 S215
+T0 S1 L0 D0; pick the tool
+G92 E0
+G0 X30 Y-7 Z10 F9000
+G0 E10 X40 Z0.2 F500
+M83"""
+HEADS = {"nozzle_diameter": "0.4,0.4", "gcode_flavor": "marlin"}
+RRF = {"gcode_flavor": "reprapfirmware"}
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "settings"),
+    [
+        pytest.param(XL, "G1 Z20\nP0 S1\nM104 T0 S0\nM104 T1 S0\nM140 S0", HEADS, id="Prusa XL"),
+        pytest.param(
+            f"{START}\nM104 T1 S150\nT1\nM109 S210", f"M104 T0 S0\n{END}", HEADS, id="IDEX"
+        ),
+        pytest.param(
+            "G28\nM568 P1 S210 R160\nT1\nM116\nG90\nM83",
+            "G1 Z20\nG10 P1 S-273 R-273\nT-1",
+            HEADS | RRF,
+            id="a tool changer by RepRapFirmware",
+        ),
+        pytest.param(f"{KLIPPER}\nT1\nM104 T1 S210", "print_end", {}, id="told by its own scripts"),
+    ],
+)
+def test_a_job_that_uses_one_of_several_heads_is_judged(
+    start: str, end: str, settings: dict[str, str]
+) -> None:
+    """regression: each such job was told that its head is not the only one."""
+    text = orca_job(start, end, **settings)
+    assert own_setup(text).printer.heads == 2
+    assert refused(text) == []
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "said"),
+    [
+        (f"{START}\nT2", END, "another tool: T2, limit those of 2 heads"),
+        (f"{START}\nM104 T1 S900", END, "hotend temperature: 900 °C"),
+        (f"{START}\nM104 T4 S200", END, "hotend of another tool: T4"),
+        (f"{START}\nT1", END, "cold extrusion"),  # the first was heated, the second prints
+        (f"{START}\nM109 T1 S210\nM104 T1 S20\nT1", END, "cold extrusion"),
+        (START, f"T1\n{END}", "change of tool: T1, limit one tool: T0"),
+    ],
+)
+def test_heads_that_do_not_print_are_watched_too(start: str, end: str, said: str) -> None:
+    text = orca_job(start, end, **HEADS, machine_start_gcode="G28")
+    assert any(said in one for one in refused(text))
+
+
+def test_a_head_that_a_job_leaves_hot_is_switched_off() -> None:
+    text = orca_job(f"{START}\nM104 T1 S180", END, **HEADS)
+    setup = own_setup(text).melting_all()
+    checked = check(Program(text, "marlin"), setup, policy=Policy.DANGER)
+    assert checked.report.added == ("M104 T1 S0",)
+
+
+def test_a_number_that_reprapfirmware_finds_on_its_card_is_a_macro() -> None:
+    assert refused(orca_job(f"{START}\nG1009 ; purge", END, **RRF)) == []
+    (said,) = refused(orca_job(f"{START}\nM564 S0", END, **RRF))
+    assert "command unknown" in said
 
 
 BOX = "-100x-100,100x-100,100x100,-100x100"

@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
-from gcode.profiles.importers.macros import macros_named
+from gcode.profiles.importers.macros import heads_named, macros_named
 from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
@@ -133,7 +133,7 @@ def import_profiles(
         notes += filter(None, [bed_note(made[0])])
     for profile in made:
         notes += _settle(profile)
-        _add_macros(profile, source)
+        _add_named(profile, source)
         _validate(path, profile)
     return ImportedFile(str(path), made, left, tuple(notes))
 
@@ -165,7 +165,7 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
     notes, more = [], list(left)
     for profile in made:
         notes += _settle(profile)
-        _add_macros(profile, source)
+        _add_named(profile, source)
         more += _within_range(profile)
     _as_hot_as_told(*made[:2])
     return ImportedFile(name, made, tuple(more), tuple(notes))
@@ -236,12 +236,15 @@ def _settle(made: Imported) -> list[str]:
     return notes
 
 
-def _add_macros(made: Imported, source: Source) -> None:
-    """What the scripts of a Klipper machine's preset call by name are its macros."""
+def _add_named(made: Imported, source: Source) -> None:
+    """What a preset's scripts name is the machine's: its heads, and its macros."""
     if made.kind != "printers":
         return
+    heads = heads_named(source.values)
+    if heads > made.values.get("heads", 1):
+        made.values["heads"] = heads
     content = {**content_of(made.kind, made.inherits), **made.values}
-    named = macros_named(source.values) if content["dialect"] == "klipper" else ()
+    named = macros_named(source.values, content["dialect"])
     known = {macro.split(maxsplit=1)[0].upper() for macro in content.get("macros", ())}
     if set(named) - known:
         made.values["macros"] = [*content.get("macros", ()), *sorted(set(named) - known)]
