@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gcode.errors import InputError
 from gcode.profiles.importers.slicers import read_orca
 
@@ -25,6 +27,7 @@ _DEFAULTS: dict[str, Any] = {
     "curr_bed_type": "High Temp Plate",
     "layer_height": "0.2",
     "initial_layer_print_height": "0.2",
+    "different_settings_to_system": ";;",
     "line_width": "0.42",
     "nozzle_temperature": "210",
     "nozzle_temperature_initial_layer": "215",
@@ -226,6 +229,7 @@ class Scripts:
             **dict.fromkeys(("filament_extruder_id", "output_filename_format"), 0.0),
             "position": [*middle, block[2]],
             **dict.fromkeys(("has_wipe_tower", "in_head_wrap_detect_zone", "e_retracted"), 0.0),
+            "first_layer_height": float(told["initial_layer_print_height"]),
             "bed_temperature": _read("", bed_c),
             "first_layer_bed_temperature": _read("", bed_first_c),
             "bed_temperature_initial_layer": _read("", bed_first_c),
@@ -293,7 +297,14 @@ _FUNCTIONS = {
     "digits": lambda v, wide, dots=0.0: f"{v:{int(wide)}.{int(dots)}f}",
     "random": lambda low, high: 0.5 * (low + high),
     "is_nil": lambda v: 0.0,
+    "interpolate_table": lambda v, *rows: _between(v, [*map(tuple, rows)]),
 }
+
+
+def _between(value: float, rows: list[tuple[float, float]]) -> float:
+    return float(np.interp(value, *zip(*rows, strict=True)))
+
+
 _BINARY = {
     "+": lambda a, b: f"{_shown(a)}{_shown(b)}" if isinstance(a, str) or isinstance(b, str)
     else a + b,
@@ -393,9 +404,10 @@ class _Expression:
         if word in {"-", "+"}:
             return -_one(self._unary()) if word == "-" else _one(self._unary())
         if word == "(":
-            found = self._choice()
-            self._take()
-            return found
+            several = [self._choice()]
+            while self._take()[1] == ",":
+                several.append(_one(self._choice()))
+            return several if len(several) > 1 else several[0]
         if word in {"true", "false"}:
             return float(word == "true")
         if word in _FUNCTIONS and self._next() == "(":
@@ -405,9 +417,10 @@ class _Expression:
     def _called(self, name: str) -> Any:
         given, sign = [], self._take()[1]
         while sign != ")":
-            given.append(_one(self._choice()))
+            given.append(self._choice())
             sign = self._take()[1]
-        return _FUNCTIONS[name](*given)
+        table = name == "interpolate_table"
+        return _FUNCTIONS[name](*(one if table else _one(one) for one in given))
 
     def _named(self, name: str) -> Any:
         if name not in self._told:
@@ -427,6 +440,7 @@ def _one(value: Any) -> Any:
 
 
 _MACRO = re.compile(r"\{((?:\"[^\"]*\"|[^{}\"])*)\}|\[(\w+(?:\[\w+\])?)\]")
+_ASSIGNS = re.compile(r"\s*\w+(?:\[[^\]]*\])?\s*=[^=~].*", re.DOTALL)  # what the slicer keeps
 _WORD = re.compile(r"\s*(if|elsif|else|endif)\b(.*)", re.DOTALL)
 
 
@@ -454,7 +468,7 @@ def _fill(text: str, told: Mapping[str, Any]) -> str:
             asked = taken() and not was
             yes = asked and (word[1] == "else" or bool(_one(_Expression(word[2], told).value())))
             open_ifs.append((yes, was or yes))
-        elif taken() and inner.strip():
+        elif taken() and inner.strip() and not _ASSIGNS.fullmatch(inner):
             made.append(_shown(_legacy(inner, told) if match[1] is None
                                else _Expression(inner, told).value()))  # fmt: skip
     return "".join([*made, text[at:]])

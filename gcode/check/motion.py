@@ -24,7 +24,8 @@ SHORT_MM = 0.05
 SECTION_SLACK = 1.05
 FLOW_SLACK = 1.05
 PLACE_SLACK_MM = 0.011
-UNIT_SLIP_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
+# A feed beyond this is a slip of units, whatever the firmware clamps (FLSun's S1: 1,200 mm/s).
+UNIT_SLIP_MM_S = 1500.0
 # Firmwares clamp a feed to their own limit, and slicers ask for more (300 mm/s in Voron's own
 # printer.cfg, 350 to 500 in OrcaSlicer's profiles): far beyond it a file is another machine's.
 # Along Z and E slicers write the travel speed, whatever the axis does.
@@ -293,8 +294,11 @@ class Motion:
         centre = tuple((words.get(letter) or 0.0) * self._unit for letter in "IJ")
         start, end = (x0, y0, z0), (x1, y1, z1)
         apart_mm, points = points_of_arc(start, end, (centre[0], centre[1]), clockwise=clockwise)
-        if not points:
-            self._refuse("arc whose ends lie on two circles", f"{apart_mm:.3f} mm", "0.05 mm")
+        told = ("arc whose ends lie on two circles", f"{apart_mm:.3f} mm", "0.05 mm")
+        priming = (
+            1.0 if points and not self._occupied else math.inf
+        )  # FLSun's, along the bed's edge
+        if apart_mm > 0 and self._beyond(*told, priming):
             return
         for k, point in enumerate(points, 1):
             last = k == len(points)

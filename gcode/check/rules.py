@@ -34,7 +34,11 @@ HEATER_COMMANDS = {
     **dict.fromkeys(("M141", "M191"), "chamber"),
 }
 # Marlin's AUTOTEMP (B, F) and presets (I) set what no number here says.
-UNSAID_HEATS = frozenset("BFI")
+UNSAID_HEATS = {
+    (dialect, what): letters
+    for dialect in ("marlin", "prusa")
+    for what, letters in (("hotend", "BFI"), ("bed", "I"))
+}
 _COMMAND_HEAD = re.compile(r"([GMTP])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
 _NUMBERED_LINE = re.compile(r"N\s*\d")
 # M486 A tells an object's name
@@ -59,6 +63,7 @@ MOST_ADVANCE_S = 2.0
 # Prusa's scripts let filament be pushed from 155 °C on, to probe with a nozzle that does not ooze;
 # PLA melts at 150 to 160 °C.
 LEAST_COLD_C = 150.0
+MOST_CURRENT_A = 2.0  # as much as the drivers bear that printers mostly have (TMC2209)
 FULL_FAN = 255.0
 # Sailfish's homing, of axes by name: to their least place, and to their greatest, which is Z's away
 # from the bed.
@@ -92,6 +97,8 @@ class Judge(Motion):
         if self._feels:
             self._known |= {self._feels}
         self._tool: str | None = None
+        # The line that homed Z at the end, and how far E had gone by then.
+        self._end_homed: tuple[int, float] | None = None
         # The temperatures of heads that do not print: told, and waited for.
         self._parked_c: dict[str, tuple[float, float]] = {}
         if setup.printer.heads > 1:
@@ -125,6 +132,8 @@ class Judge(Motion):
         tool = _TOOL.fullmatch(name) is not None
         if name in self._macros - KNOWN_COMMANDS[self._dialect]:
             self._heats_unsaid = True
+            if name == "M98" and not self._occupied:  # it begins the job, as Klipper's START_PRINT
+                self._home({}, name)
             return
         if name not in self._known and not (tool and self._dialect in LENIENT_OF_TOOLS):
             if tool:
@@ -157,6 +166,9 @@ class Judge(Motion):
         somebody asked to leave them.
         """
         self._backwards(text)
+        if self._end_homed and self.moves.sums.way_mm > self._end_homed[1]:
+            self._line, self._text = self._end_homed[0], text.line(self._end_homed[0])
+            self._refuse("homing Z onto a standing part", "printing goes on", "at the end alone")
         self._line, self._text = len(text), text.line(len(text))
         if not self._alone:
             return
@@ -212,6 +224,10 @@ class Judge(Motion):
             self._heat(which, {"S": target_c} | ({"T": float(tool[1])} if tool else {}))
         elif name == "SET_PRESSURE_ADVANCE":
             self._advance(self._number(given.get("ADVANCE")))
+        elif name == "SET_TMC_CURRENT":
+            for key in ("CURRENT", "HOLDCURRENT"):
+                current_a = self._number(given.get(key))
+                self._within(f"motor's {key.lower()}", current_a, 0.0, MOST_CURRENT_A, " A")
         elif name == "SET_GCODE_OFFSET":
             self._offset(given)
         elif name == "TEMPERATURE_WAIT":
@@ -425,7 +441,9 @@ class Judge(Motion):
         if value_c is None:
             self._refuse(f"{what} temperature missing", "no S", "a temperature")
             return
-        for letter in sorted(UNSAID_HEATS & words.keys()):
+        for letter in UNSAID_HEATS.get((self._dialect, what), ""):
+            if words.get(letter) is None:
+                continue
             self._refuse("temperature that the firmware chooses", f"{name} {letter}", "S alone")
         if what == "hotend":
             heads, prints = self._setup.printer.heads, self._tool or "T0"
@@ -460,7 +478,10 @@ class Judge(Motion):
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
         printer = self._setup.printer
         if self._occupied and not (printer.delta or printer.homes_up):
-            if 2 in axes and by != TO_THE_FAR_END:
+            if 2 in axes and printer.ends_homing and self._lenient:
+                self._end_homed = self._line, self.moves.sums.way_mm
+                self._warn("homing Z over the part, as the maker's end script does", by, "none")
+            elif 2 in axes and by != TO_THE_FAR_END:
                 unless = "" if self.policy is Policy.STRICT else ", or 'homes_up' in the profile"
                 told = f"{by} with Z" if by in {"G28", *TO_AN_END} else by
                 self._refuse("homing Z onto a standing part", told, f"G28 X Y only{unless}")

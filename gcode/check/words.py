@@ -29,8 +29,8 @@ _MARLINS = (
 )
 # Of Sailfish, and its heirs in Flashforge's and Dremel's printers: homing to the least and the
 # greatest end stop, waits for nozzle and bed, the tool's number, places kept of end stops, motor
-# currents, a fan of the housing; AnkerMake's curve of acceleration; and end stops in software on.
-_MARLINS_HEIRS = "G161 G162 M6 M7 M108 M132 M907 M651 M652 M4899 M211"
+# currents, a fan of the housing; and end stops in software on.
+_MARLINS_HEIRS = "G161 G162 M6 M7 M108 M132 M907 M651 M652 M211"
 # Checks of printer, nozzle and firmware; the mass of the part, the area that is probed, pressure
 # advance; a stuck filament; a multi-material unit's own commands.
 _PRUSAS = (
@@ -46,7 +46,8 @@ KNOWN_COMMANDS: dict[str, frozenset[str]] = {
         f"{_MOTION} {_COMMON} {_PROBING} SET_VELOCITY_LIMIT SET_PRESSURE_ADVANCE "
         "BED_MESH_CALIBRATE BED_MESH_PROFILE BED_MESH_CLEAR SET_HEATER_TEMPERATURE "
         "TEMPERATURE_WAIT TURN_OFF_HEATERS "
-        "QUAD_GANTRY_LEVEL PROBE SET_GCODE_OFFSET EXCLUDE_OBJECT_DEFINE EXCLUDE_OBJECT_START "
+        "QUAD_GANTRY_LEVEL PROBE SET_TMC_CURRENT SET_GCODE_OFFSET EXCLUDE_OBJECT_DEFINE "
+        "EXCLUDE_OBJECT_START "
         "EXCLUDE_OBJECT_END SET_PRINT_STATS_INFO CLEAR_PAUSE PRINT_START PRINT_END START_PRINT "
         "END_PRINT PAUSE AMREPAIR_SCAN Z_TILT_ADJUST SET_FILAMENT_SENSOR SET_INPUT_SHAPER "
         "SET_DISPLAY_TEXT SET_LED SET_FAN_SPEED RESPOND TIMELAPSE_TAKE_FRAME "
@@ -120,7 +121,7 @@ def words_of(rest: str) -> tuple[dict[str, float | None], tuple[str, str, str] |
         if match is None or (match.end() < len(rest) and rest[match.end()] in ".0123456789"):
             return words, ("word that is no number", rest.strip(), "a letter and one number")
         letter, text = match.groups()
-        if letter in words:
+        if letter in words and (text, words[letter]) != (None, None):  # flags, of stray words
             return words, ("word given twice", letter, "once")
         words[letter] = None if text is None else float(text)
         at = match.end()

@@ -203,6 +203,7 @@ class PrinterProfile(_Profile):
     bed_min_mm: Xy = (0.0, 0.0)  # its corner of least X and Y; beds about the origin have one below
     delta: bool = False  # three towers: the bed is round, homing lifts the head to their tops
     homes_up: bool = False  # homing Z takes the nozzle away from the bed
+    ends_homing: bool = False  # so its maker's end script does over the part, which shows no more
     max_z_mm: Positive
     reach_min_mm: Xy | None = None  # where the nozzle may go off the bed (purge, wiper); the bed
     reach_max_mm: Xy | None = None  # itself where left out

@@ -61,7 +61,7 @@ def refused(text: str) -> list[str]:
         pytest.param("M84\nG1 Z5\nG28", id="up before homing, Chiron"),
         pytest.param("Start GCode begin\n1 @ 0.2mm/nG92 E0", id="stray words, Kobra 2"),
         pytest.param("M75\nM200 D0\nM413 S0\nM355 S1", id="timer and light"),
-        pytest.param("M4899 T3\nM211 S1", id="curve of acceleration, AnkerMake"),
+        pytest.param("M211 S1\nG1 X40 Y40 Z9\nG2 X80 I30 E9", id="arc of two circles, FLSun"),
         pytest.param(
             "M104 S0\nM104 S215 T0\nG28\nM132 X Y Z A B\nG1 Z50 F420\nG161 X Y F3300\nM7 T0\n"
             "M6 T0\nM651 S255\nM907 X100 A100\nM108 T0\nG1 X40 Y-9 Z5\nG1 X50 E5 F600",
@@ -263,8 +263,53 @@ def test_a_head_that_a_job_leaves_hot_is_switched_off() -> None:
     assert checked.report.added == ("M104 T1 S0",)
 
 
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ("M4899 T3\nG1 X20", None),
+        ("M140 S60 Heatbed on", None),
+        ("M1000 S", "command unknown"),
+        ("M104 S210 B250", "temperature that the firmware chooses"),
+        ("M104 S200 S210", "word given twice"),
+    ],
+)
+def test_what_a_marlin_of_a_maker_s_own_passes_over_is_printed(
+    lines: str, said: str | None
+) -> None:
+    found = refused(orca_job(f"{START}\n{lines}", END, gcode_flavor="marlin"))
+    assert [said is not None and said in one for one in found] == [True] * (said is not None)
+
+
+@pytest.mark.parametrize(
+    ("changed", "more", "passes"),
+    [
+        (";;", "", True),
+        (";;", "G1 X80 Y80 Z0.2\nG1 X100 E0.7", False),  # it prints on
+        (";;machine_end_gcode", "", False),  # of the user's own making
+        (None, "", False),  # nobody tells
+    ],
+)
+def test_a_maker_s_end_script_may_home_a_machine_that_is_made_so(
+    changed: str | None, more: str, passes: bool
+) -> None:
+    """regression: 21 machines of Snapmaker and Qidi, which home Z away from the bed."""
+    told = {} if changed is None else {"different_settings_to_system": changed}
+    end = f"G0 Z6\nG28\n{more}\nM104 S0\nM140 S0"
+    found = refused(orca_job(START, end, gcode_flavor="marlin", **told))
+    assert [one for one in found if "homing Z onto a standing part" in one] == found
+    assert (not found) is passes
+
+
+def test_what_a_klipper_machine_s_motors_are_given_is_within_what_drivers_bear() -> None:
+    current = "SET_TMC_CURRENT STEPPER=extruder CURRENT="
+    assert refused(orca_job(f"{KLIPPER}\n{current}0.8", "print_end")) == []
+    assert any("current: 8 A" in one for one in refused(orca_job(f"{KLIPPER}\n{current}8", END)))
+
+
 def test_a_number_that_reprapfirmware_finds_on_its_card_is_a_macro() -> None:
     assert refused(orca_job(f"{START}\nG1009 ; purge", END, **RRF)) == []
+    begins = 'M98 P"start_print.g" A105 C260\nG90\nM83'
+    assert refused(orca_job(begins, END, **RRF)) == []
     (said,) = refused(orca_job(f"{START}\nM564 S0", END, **RRF))
     assert "command unknown" in said
 

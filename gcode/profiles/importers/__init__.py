@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
-from gcode.profiles.importers.macros import heads_named, macros_named
+from gcode.profiles.importers.macros import ends_homing, heads_named, macros_named
 from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
@@ -61,8 +61,8 @@ ASK_FOR = (
 )
 """Keys of a printer that are another machine's until somebody measures or writes them."""
 # How far off the bed that a slicer knows its printers' own scripts go to purge, wipe and park:
-# 12.6 mm at most, of 118 presets of 19 makers (PrusaSlicer's bundles).
-OFF_BED_MM = 15.0
+# 20 mm at most, of 118 presets of PrusaSlicer's and 329 of OrcaSlicer's (Bambu Lab's left out).
+OFF_BED_MM = 20.0
 # All-metal hotends are sold up to 300 °C, beds up to 120 °C (E3D's V6, Prusa's and Voron's).
 MOST_HOTEND_C, MOST_BED_C = 300.0, 120.0
 BED_EDGE_MM = 5.0
@@ -240,6 +240,8 @@ def _add_named(made: Imported, source: Source) -> None:
     """What a preset's scripts name is the machine's: its heads, and its macros."""
     if made.kind != "printers":
         return
+    if ends_homing(source.values):
+        made.values["ends_homing"] = True
     heads = heads_named(source.values)
     if heads > made.values.get("heads", 1):
         made.values["heads"] = heads

@@ -15,30 +15,57 @@ _SCRIPT_KEY = re.compile(r"^(?!post_process)\w*gcode\w*$")
 _LOGIC = re.compile(r"\{ *(?:if|elsif|else|endif)\b[^}]*\}")
 _FIRST_WORD = re.compile(r"[A-Za-z_]\w*")
 # Klipper: names, and numbered commands that it passes over unless there is a macro for them.
-# RepRapFirmware looks on its card for numbers that it does not know, and knows none of four digits.
-_MACROS_OF = {"klipper": re.compile(r"[A-Z_]\w{2,}|[GM]\d+"), "reprap": re.compile(r"[GM]\d{4,}")}
+# RepRapFirmware looks on its card for numbers that it does not know. Neither it nor Marlin knows
+# one of four digits, but for M1000 and M1001, which resume and end a job: what a preset has of them
+# are its maker's (AnkerMake's M4899, a curve of acceleration; Geeetech's M2012, a light).
+_FOUR_DIGITS = r"[GM]\d{4,}"
+_MACROS_OF = {
+    "klipper": re.compile(r"[A-Z_]\w{2,}|[GMP]\d+"),
+    "reprap": re.compile(rf"{_FOUR_DIGITS}|M98"),
+    "marlin": re.compile(_FOUR_DIGITS),
+}
 # klipper3d.org/G-Codes.html, and `[gcode_shell_command]`, which many add to it; and what changes a
 # machine lastingly in other firmwares.
 KLIPPERS_OWN = re.compile(
-    r"ACCELEROMETER_\w+|ACTIVATE_EXTRUDER|ANGLE_\w+|AXIS_TWIST_\w+|BED_\w+|BLTOUCH_\w+|"
-    r"CALC_MEASURED_SKEW|CLEAR_PAUSE|CANCEL_PRINT|DELTA_\w+|DUMP_\w+|ENDSTOP_PHASE_\w+|"
-    r"EXCLUDE_OBJECT\w*|FIRMWARE_RESTART|FORCE_MOVE|GET_\w+|HELP|INIT_TMC|LDC_\w+|"
-    r"LOAD_CELL_\w+|MANUAL_PROBE|MANUAL_STEPPER|MEASURE_AXES_NOISE|PALETTE_\w+|PAUSE|"
-    r"PID_CALIBRATE|PROBE(?:_\w+)?|QUAD_GANTRY_LEVEL|QUERY_\w+|RESPOND|RESTART|"
-    r"RESTORE_GCODE_STATE|RESUME|RUN_SHELL_COMMAND|SAVE_\w+|SCREWS_TILT_\w+|SDCARD_\w+|"
-    r"SET_(?!GCODE_VARIABLE|PIN|IDLE_TIMEOUT|SERVO)\w+|SHAPER_CALIBRATE|STATUS|STEPPER_BUZZ|"
-    r"M(?:92|110|112|206|30[1-5]|428|50[0-4]|66[56]|851|999)|SYNC_\w+|"
-    r"TEMPERATURE_\w+|TEST_RESONANCES|TUNING_TOWER|TURN_OFF_HEATERS|UPDATE_\w+|Z_\w+"
+    r"ACCELEROMETER_\w+|ACTIVATE_EXTRUDER|ANGLE_(?:\w+_)?CALIBRATE|ANGLE_DEBUG_\w+|"
+    r"AXIS_TWIST_COMPENSATION_CALIBRATE|BED_MESH_\w+|BED_SCREWS_ADJUST|BED_TILT_CALIBRATE|"
+    r"BLTOUCH_\w+|CALC_MEASURED_SKEW|CANCEL_PRINT|CLEAR_PAUSE|DELTA_(?:ANALYZE|CALIBRATE)|"
+    r"ENDSTOP_PHASE_CALIBRATE|EXCLUDE_OBJECT\w*|FIRMWARE_RESTART|FORCE_MOVE|GET_POSITION|"
+    r"INIT_TMC|LOAD_CELL_\w+|MANUAL_PROBE|MANUAL_STEPPER|MEASURE_AXES_NOISE|PAUSE|"
+    r"PID_CALIBRATE|PROBE|PROBE_(?:ACCURACY|CALIBRATE)|QUAD_GANTRY_LEVEL|RESPOND|RESTART|"
+    r"RESTORE_(?:GCODE|DUAL_CARRIAGE)_STATE|RESUME|RUN_SHELL_COMMAND|SAVE_CONFIG|"
+    r"SCREWS_TILT_CALCULATE|SDCARD_\w+|SET_(?:DIGIPOT|DISPLAY_\w+|DUAL_CARRIAGE|"
+    r"EXTRUDER_ROTATION_DISTANCE|FAN_SPEED|FILAMENT_SENSOR|GCODE_OFFSET|HEATER_TEMPERATURE|"
+    r"INPUT_SHAPER|KINEMATIC_POSITION|LED|LED_TEMPLATE|PRESSURE_ADVANCE|PRINT_STATS_INFO|"
+    r"RETRACTION|SKEW|STEPPER_\w+|TEMPERATURE_FAN_TARGET|TMC_\w+|VELOCITY_LIMIT|"
+    r"Z_THERMAL_ADJUST)|SHAPER_CALIBRATE|STEPPER_BUZZ|SYNC_EXTRUDER_MOTION|TEMPERATURE_WAIT|"
+    r"TEST_RESONANCES|TUNING_TOWER|TURN_OFF_HEATERS|Z_END_SCRIPTSTOP_CALIBRATE|Z_OFFSET_APPLY_\w+|"
+    r"Z_TILT_ADJUST|M(?:92|110|112|206|30[1-5]|428|50[0-4]|66[56]|851|999|100[01])"
 )
 
 
 _CHOSEN = re.compile(r"^[ \t]*(?:T|M10[49] .*?\bT)(\d+)\b", re.MULTILINE)
 
 
+_END_SCRIPT = "machine_end_gcode"
+_HOMES_Z = re.compile(r"^[ \t]*G28[ \t]*(?:;.*)?$|^[ \t]*G28\b[^;\n]*Z", re.MULTILINE)
+
+
 def heads_named(settings: Mapping[str, str]) -> int:
     """How many heads, or filaments, the scripts choose among or heat by number."""
     tools = (int(tool) for text in _scripts(settings) for tool in _CHOSEN.findall(text))
     return 1 + max(tools, default=0)
+
+
+def ends_homing(settings: Mapping[str, str]) -> bool:
+    """Whether the end script that came with OrcaSlicer homes Z, the part still standing there.
+
+    What a user has changed of a preset its jobs list; of that nothing is taken.
+    """
+    changed = settings.get("different_settings_to_system")
+    if changed is None or _END_SCRIPT in re.split(r"[;,\"]", changed):
+        return False
+    return _HOMES_Z.search(settings.get(_END_SCRIPT, "").replace("\\n", "\n")) is not None
 
 
 def macros_named(settings: Mapping[str, str], dialect: str) -> tuple[str, ...]:
