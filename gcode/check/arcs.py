@@ -10,6 +10,25 @@ CENTRE_MM, CENTRE_RATIO = 0.05, 0.002  # the ends' distances from the centre, wh
 PIECE_MM = 0.3  # at a radius of 1 mm
 
 
+def centre_by_radius(
+    start_mm: Point, end_mm: Point, radius_mm: float, *, clockwise: bool
+) -> tuple[float, float] | None:
+    """A centre relative to the start, as Marlin's G2_G3.cpp finds it; None where none fits.
+
+    A radius below 0 is that of the longer arc.
+    """
+    dx, dy = end_mm[0] - start_mm[0], end_mm[1] - start_mm[1]
+    along_mm = math.hypot(dx, dy)
+    if along_mm < LEAST_RADIUS_MM or along_mm > 2 * abs(radius_mm):
+        return None
+    aside_mm = math.sqrt(radius_mm**2 - 0.25 * along_mm**2)
+    side = -1.0 if clockwise != (radius_mm < 0) else 1.0
+    return (
+        0.5 * dx - side * aside_mm * dy / along_mm,
+        0.5 * dy + side * aside_mm * dx / along_mm,
+    )
+
+
 def points_of_arc(
     start_mm: Point, end_mm: Point, centre_mm: tuple[float, float], *, clockwise: bool
 ) -> tuple[float, list[Point]]:

@@ -132,6 +132,8 @@ class Judge(Motion):
         tool = _TOOL.fullmatch(name) is not None
         if name in self._macros - KNOWN_COMMANDS[self._dialect]:
             self._heats_unsaid = True
+            if self._occupied and name.partition(".")[0] in PROBES:
+                self._refuse("probing over a standing part", name, "nothing may stand there")
             if name == "M98" and not self._occupied:  # it begins the job, as Klipper's START_PRINT
                 self._home({}, name)
             return
@@ -366,6 +368,8 @@ class Judge(Motion):
             self._refuse("extrusion told as a volume", name, "D0")
         elif name in {"G27", "M132", "P0"}:
             self._place = [None] * 3  # where it parks, and where its end stops are
+        elif name == "G5" and words:
+            self._refuse("curve that nothing here follows", name, "G1, G2 and G3")
         elif name == "M211" and 0.0 in words.values():
             self._refuse("end stops in software off", name, "S1")
         elif name == "M108" and "T" not in words:  # Marlin's, which ends a wait for heat

@@ -2,7 +2,8 @@
 
 What changes the machine lastingly, or switches a protection off, is left out on purpose: EEPROM
 (M500, M502), steps per mm (M92), homing offsets (M206, M428), PID tuning, the numbers of lines
-(M110). So are curves whose course nothing here follows (G5).
+(M110). So are curves whose course nothing here follows (G5 with
+words; without, some makers' Marlins are told to resume after a power failure by it).
 
 Sources: marlinfw.org/docs/gcode; klipper3d.org/G-Codes.html; Duet's G-code dictionary; Prusa's
 `lib/Marlin` and `src/common/marlin_server` of Prusa-Firmware-Buddy, whose jobs slicers call Marlin;
@@ -15,6 +16,7 @@ import re
 from collections.abc import Iterator
 
 _OPTIONAL_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
+_GIVEN = re.compile(r"""(?<=\s)([^\s=]+)(?:=("[^"]*"|'[^']*'|\S*))?""")
 _LIST = re.compile(r"[-+]?[\d.]+(?::[-+]?[\d.]+)+")
 _MOTION = "G0 G1 G2 G3 G4 G10 G11 G17 G20 G21 G28 G90 G91 G92"
 _COMMON = (
@@ -40,7 +42,7 @@ _PRUSAS = (
 
 KNOWN_COMMANDS: dict[str, frozenset[str]] = {
     "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} {_MARLINS} {_PRUSAS} {_MARLINS_HEIRS} "
-                        "M217 M420 G12 G27 G33".split()),
+                        "M217 M420 G5 G12 G27 G30 G33".split()),
     "prusa": frozenset(f"{_MOTION} {_COMMON} {_PROBING} {_MARLINS} {_PRUSAS} M907 G76".split()),
     "klipper": frozenset(
         f"{_MOTION} {_COMMON} {_PROBING} SET_VELOCITY_LIMIT SET_PRESSURE_ADVANCE "
@@ -80,6 +82,8 @@ G90_SETS_E = frozenset({"marlin"})
 LENIENT_OF_MOVES = frozenset({"marlin", "prusa"})
 # Whatever is configured ("Must home axis first").
 GIVES_UP_UNHOMED = frozenset({"klipper"})
+# Klipper's gcode_arcs.py: "G2/G3 does not support R moves"; the MK3's firmware reads I and J alone.
+NO_ARCS_BY_RADIUS = frozenset({"klipper", "prusa"})
 # Klipper refuses G20 (klippy/extras/gcode_move.py), the MK3's firmware passes over it; both go on
 # in millimetres.
 NO_INCHES = frozenset({"klipper", "prusa"})
@@ -90,15 +94,16 @@ LENIENT_OF_TOOLS = frozenset({"klipper"})
 
 
 def parameters(command: str) -> dict[str, str]:
-    """KEY=VALUE pairs of a named command, keys and values in capitals."""
-    pairs = (word.partition("=") for word in command.upper().split()[1:])
-    return {key: value for key, _, value in pairs}
+    """KEY=VALUE pairs of a named command, keys and values in capitals; quotes are kept."""
+    return {key: value or "" for key, value in _GIVEN.findall(command.upper())}
 
 
 def start_heats(given: dict[str, str]) -> Iterator[tuple[str, str]]:
     """The heaters that a macro of `STARTS` waits for: the command, and the parameter's key."""
     for command, names in _START_HEATS.items():
-        yield from ((command, key) for key in given if any(name in key for name in names))
+        for key, value in given.items():  # what is quoted is a plate's name
+            if any(name in key for name in names) and value[:1] not in {'"', "'"}:
+                yield command, key
 
 
 def without_lists(rest: str) -> str:

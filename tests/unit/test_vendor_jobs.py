@@ -67,6 +67,10 @@ def refused(text: str) -> list[str]:
             "M6 T0\nM651 S255\nM907 X100 A100\nM108 T0\nG1 X40 Y-9 Z5\nG1 X50 E5 F600",
             id="Sailfish's, Flashforge and Dremel",
         ),
+        pytest.param("G0 X0 Y0 Z9\nG0 E30 X10 Z0.2 F170\nG0 X40 E9", id="purged coming down, U1"),
+        pytest.param(
+            "G1 X30 Y9 Z0.3\nG3 X130 Y9 R139 E20 F600\nG5", id="arc by its radius, SeeMeCNC"
+        ),
     ],
 )
 def test_what_makers_scripts_begin_with_is_printed(start: str) -> None:
@@ -77,7 +81,7 @@ def test_what_makers_scripts_begin_with_is_printed(start: str) -> None:
 @pytest.mark.parametrize(
     "end",
     [
-        pytest.param("G1 E-80 F2000\nG1 Z150\nM104 S0\nM140 S0", id="filament unloaded, Elegoo"),
+        pytest.param("G1 E-800 F2000\nG1 Z150\nM104 S0\nM140 S0", id="filament unloaded, Elegoo"),
         pytest.param("G0 Z205\nM104 S0\nM140 S0", id="above the print's room, Jubilee"),
         pytest.param("G1 E2 F6000\nG1 E2\nG1 E2\nG1 E-15\nM702 C\nM104 S0\nM140 S0", id="MMU2S"),
         pytest.param("M104 S0\nM140 S0\nG27 P2\nM77", id="parked by its firmware"),
@@ -105,6 +109,9 @@ def test_what_makers_scripts_end_with_is_printed(end: str) -> None:
         (job(KLIPPER, "G1 X-40\nprint_end"), "out of reach"),
         (job(START, f"G28\n{END}"), "homing Z onto a standing part"),
         (job(START, f"G161 Z F600\n{END}"), "homing Z onto a standing part"),
+        (job(f"{START}\nG1 X9 Y9 Z1\nG2 X99 R30 E9"), "arc told by its radius"),  # too small
+        (job(KLIPPER, f"G2 X60 R90\n{END}"), "arc told by its radius"),
+        (job(f"{START}\nG5 X9 Y9 I1 P1"), "curve that nothing here follows"),
         (job(f"{START}\nM211 S0"), "end stops in software off"),
         (job(f"{START}\nM108"), "end of a wait for heat"),
         (job(f"{KLIPPER}\nSET_KINEMATIC_POSITION Y=0"), "command unknown"),
@@ -169,7 +176,7 @@ def test_a_klipper_machine_that_begins_by_itself_may_be_homed_and_hot() -> None:
 
 
 def test_a_start_macro_may_be_told_a_temperature_for_each_head() -> None:
-    heads = "START_PRINT EXTRUDER_TEMP=210,205 BED_TEMP=60\nG90\nM83"
+    heads = 'START_PRINT EXTRUDER_TEMP=210,205 BED_TEMP=60 BED_TYPE="High Temp"\nG90\nM83'
     assert refused(orca_job(heads, "END_PRINT")) == []
 
 

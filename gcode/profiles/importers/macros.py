@@ -13,14 +13,14 @@ from collections.abc import Iterator, Mapping
 # PrusaSlicer's and OrcaSlicer's keys of scripts.
 _SCRIPT_KEY = re.compile(r"^(?!post_process)\w*gcode\w*$")
 _LOGIC = re.compile(r"\{ *(?:if|elsif|else|endif)\b[^}]*\}")
-_FIRST_WORD = re.compile(r"[A-Za-z_]\w*")
+_FIRST_WORD = re.compile(r"[A-Za-z_]\w*(?:\.\d+)?")
 # Klipper: names, and numbered commands that it passes over unless there is a macro for them.
 # RepRapFirmware looks on its card for numbers that it does not know. Neither it nor Marlin knows
 # one of four digits, but for M1000 and M1001, which resume and end a job: what a preset has of them
 # are its maker's (AnkerMake's M4899, a curve of acceleration; Geeetech's M2012, a light).
 _FOUR_DIGITS = r"[GM]\d{4,}"
 _MACROS_OF = {
-    "klipper": re.compile(r"[A-Z_]\w{2,}|[GMP]\d+"),
+    "klipper": re.compile(r"[A-Z_]\w{2,}|[GMP]\d+(?:\.\d+)?"),
     "reprap": re.compile(rf"{_FOUR_DIGITS}|M98"),
     "marlin": re.compile(_FOUR_DIGITS),
 }
