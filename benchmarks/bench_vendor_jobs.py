@@ -9,8 +9,7 @@ preset's own print and filament, and judged by its own settings (`gcode check JO
 such jobs every day must not be told that they are wrong. Presets for several heads at once, and
 what the slicer itself refuses, are counted apart.
 
-OrcaSlicer's machines are written as its jobs (`orca_presets`). The checker was tuned on every
-other vendor of them, by name; the rest is told apart.
+OrcaSlicer's machines are written as its jobs (`orca_presets`).
 """
 
 from __future__ import annotations
@@ -35,10 +34,9 @@ from gcode.errors import GcodeError, InputError
 from gcode.moves import Program
 from gcode.profiles.finding import BUNDLES, find_presets
 from gcode.profiles.importers.slicers import read_prusa
-from gcode.profiles.own_settings import own_settings
+from gcode.profiles.own_settings import NO_HOSTS, own_settings
 
 NOZZLE = "0.4"
-HALVES = ("OrcaSlicer's, tuned on", "OrcaSlicer's, held back")
 BLOCK_MM = (12.0, 12.0, 4.0)
 # What the command line does not take, or draws pictures.
 LEFT_OUT = re.compile(r"compatible_|inherits|default_(print|filament)_profile|thumbnails")
@@ -76,11 +74,9 @@ def prusas(bundles: Path) -> Iterator[Case]:
 
 
 def orcas(profiles: Path) -> Iterator[Case]:
-    """Every machine of OrcaSlicer's, by halves."""
-    printers = list(orca_printers(profiles))
-    vendors = sorted({printer.vendor for printer in printers})
-    for printer in printers:
-        row = HALVES[vendors.index(printer.vendor) % 2]
+    """Every machine of OrcaSlicer's; Bambu Lab's, which no host drives, apart."""
+    for printer in orca_printers(profiles):
+        row = "Bambu Lab's" if printer.name.startswith(NO_HOSTS) else "OrcaSlicer's"
         name = f"{printer.vendor}: {printer.name}"
         try:
             yield Case(row, name, prusa_settings(printer, BLOCK_MM), printer)
@@ -132,12 +128,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bundles", type=Path, default=Path(BUNDLES[0]))
     parser.add_argument("--orca", type=Path, help="OrcaSlicer's resources/profiles")
-    parser.add_argument("--row", default="", help="only rows that begin so")
+    parser.add_argument("--rows", default="", help="only rows that begin so")
     parser.add_argument("--each", action="store_true", help="what speaks against each other one")
     parser.add_argument("--keep", type=Path, help="write the jobs into this folder")
     args = parser.parse_args()
     cases = list(prusas(args.bundles) if args.orca is None else orcas(args.orca))
-    cases = [case for case in cases if case.row.startswith(args.row)]
+    cases = [case for case in cases if case.row.startswith(args.rows)]
     counts: Counter[tuple[str, str]] = Counter()
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(2) as pool:
         folder = Path(name)

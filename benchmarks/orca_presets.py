@@ -137,7 +137,8 @@ def orca_printers(profiles: Path) -> Iterator[OrcaPrinter]:
                 key = {"process": "default_print_profile"}.get(what, "default_filament_profile")
                 found = _named(vendor, what, machine.get(key, "").split(",")[0].split(";")[0])
                 made |= {} if found is None else _preset(found)
-            yield OrcaPrinter(vendor.name, path.stem, {**_DEFAULTS, **made, **machine})
+            named = {"printer_settings_id": path.stem}
+            yield OrcaPrinter(vendor.name, path.stem, {**_DEFAULTS, **made, **machine, **named})
 
 
 def _preset(path: Path) -> dict[str, str]:

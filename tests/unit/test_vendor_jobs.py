@@ -236,6 +236,16 @@ RRF = {"gcode_flavor": "reprapfirmware"}
             id="a tool changer by RepRapFirmware",
         ),
         pytest.param(f"{KLIPPER}\nT1\nM104 T1 S210", "print_end", {}, id="told by its own scripts"),
+        pytest.param(
+            f"{START}\nT1",
+            END,
+            {
+                "gcode_flavor": "marlin",
+                "filament_type": "PLA;PETG",
+                "machine_start_gcode": "T[initial_extruder]",
+            },
+            id="the second of two filaments to one nozzle",
+        ),
     ],
 )
 def test_a_job_that_uses_one_of_several_heads_is_judged(

@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
-from gcode.profiles.importers.macros import ends_homing, heads_named, macros_named
+from gcode.profiles.importers.macros import ends_homing, heads_of, macros_named
 from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
@@ -242,9 +242,9 @@ def _add_named(made: Imported, source: Source) -> None:
         return
     if ends_homing(source.values):
         made.values["ends_homing"] = True
-    heads = heads_named(source.values)
-    if heads > made.values.get("heads", 1):
-        made.values["heads"] = heads
+    heads, one_nozzle = heads_of(source.values)
+    if heads > 1:
+        made.values |= {"heads": heads, "one_nozzle": one_nozzle}
     content = {**content_of(made.kind, made.inherits), **made.values}
     named = macros_named(source.values, content["dialect"])
     known = {macro.split(maxsplit=1)[0].upper() for macro in content.get("macros", ())}

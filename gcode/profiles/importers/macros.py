@@ -44,6 +44,7 @@ KLIPPERS_OWN = re.compile(
 )
 
 
+_HEATED = re.compile(r"^[ \t]*M10[49] .*?\bT[1-9]", re.MULTILINE)
 _CHOSEN = re.compile(r"^[ \t]*(?:T|M10[49] .*?\bT)(\d+)\b", re.MULTILINE)
 
 
@@ -51,10 +52,18 @@ _END_SCRIPT = "machine_end_gcode"
 _HOMES_Z = re.compile(r"^[ \t]*G28[ \t]*(?:;.*)?$|^[ \t]*G28\b[^;\n]*Z", re.MULTILINE)
 
 
-def heads_named(settings: Mapping[str, str]) -> int:
-    """How many heads, or filaments, the scripts choose among or heat by number."""
-    tools = (int(tool) for text in _scripts(settings) for tool in _CHOSEN.findall(text))
-    return 1 + max(tools, default=0)
+def heads_of(settings: Mapping[str, str]) -> tuple[int, bool]:
+    """How many heads there are, and whether they are filaments to one nozzle.
+
+    There are as many as nozzles, as scripts name, and as filaments were loaded.
+    """
+    nozzles = len(settings.get("nozzle_diameter", "").split(","))
+    texts = list(_scripts(settings))
+    tools = (int(tool) for text in texts for tool in _CHOSEN.findall(text))
+    loaded = len(settings.get("filament_type", "").split(";"))
+    shared = settings.get("single_extruder_multi_material", "0") == "1"
+    heated = any(_HEATED.search(text) for text in texts)
+    return max(nozzles, loaded, 1 + max(tools, default=0)), shared or (nozzles == 1 and not heated)
 
 
 def ends_homing(settings: Mapping[str, str]) -> bool:

@@ -29,15 +29,6 @@ from gcode.profiles.importers.rules import (
 )
 from gcode.profiles.names import Kind
 
-
-def _nozzles(text: str, source: Source) -> dict[str, Any]:
-    """The first's diameter; and how many there are, where there are several."""
-    several = len(text.split(","))
-    return {"nozzle_diameter_mm": number(text, source)} | (
-        {"heads": several} if several > 1 else {}
-    )
-
-
 _KNOWN_DIALECT = choice(
     marlin="marlin",
     marlin2="marlin",
@@ -88,7 +79,7 @@ PRUSA: dict[str, Rule] = {
     **_axes("feedrate"),
     "bed_shape": Rule("printers", "", outline),
     "max_print_height": Rule("printers", "max_z_mm", number),
-    "nozzle_diameter": Rule("printers", "", _nozzles),
+    "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
     "filament_diameter": Rule("printers", "filament_diameter_mm", number),
     "gcode_flavor": Rule("printers", "dialect", _dialect),
     "retract_length": Rule("printers", "retraction_mm", number),
@@ -143,7 +134,7 @@ ORCA: dict[str, Rule] = {
     **_axes("speed"),
     "printable_area": Rule("printers", "", outline),
     "printable_height": Rule("printers", "max_z_mm", number),
-    "nozzle_diameter": Rule("printers", "", _nozzles),
+    "nozzle_diameter": Rule("printers", "nozzle_diameter_mm", number),
     "filament_diameter": Rule("printers", "filament_diameter_mm", number),
     "gcode_flavor": Rule("printers", "dialect", _dialect),
     "retraction_length": Rule("printers", "retraction_mm", number),
