@@ -27,6 +27,7 @@ from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
 from gcode.profiles.names import Kind, list_profiles
 from gcode.profiles.own_limits import own_fault
+from gcode.profiles.round_beds import kept_on
 from gcode.profiles.schema import PrinterProfile
 from gcode.profiles.store import MODELS, content_of
 
@@ -88,12 +89,18 @@ class ImportedFile:
 
 
 def import_profiles(
-    path: Path, *, preset: str | None = None, inherits: str | None = None
+    path: Path,
+    *,
+    preset: str | None = None,
+    inherits: str | None = None,
+    text: str | None = None,
 ) -> ImportedFile:
     """Read another program's profile.
 
     Parameters
     ----------
+    text
+        The file's, where it is known: a binary job's (`gcode.reader.binary`).
     preset
         Which preset of a PrusaSlicer bundle, as `print:NAME`.
     inherits
@@ -107,11 +114,12 @@ def import_profiles(
     ProfileError
         If a value is outside what our profiles allow.
     """
-    try:
-        kind = "replace" if path.suffix.lower() in JOB_SUFFIXES else "strict"
-        text = path.read_text(encoding="utf-8-sig", errors=kind)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text ({error}).") from error
+    if text is None:
+        try:
+            kind = "replace" if path.suffix.lower() in JOB_SUFFIXES else "strict"
+            text = path.read_text(encoding="utf-8-sig", errors=kind)
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path} cannot be read as text ({error}).") from error
     if path.suffix.lower() in JOB_SUFFIXES:
         found = import_job(str(path), text, inherits=inherits)
         if found is None:
@@ -270,10 +278,8 @@ def _on_the_bed(place_mm: Sequence[float], bed: Mapping[str, Any]) -> list[float
     """A place that was told from the corner of another machine's bed, kept on this one."""
     corner, size = np.array(bed["bed_min_mm"]), np.array(bed["bed_size_mm"])
     at = corner + np.minimum(place_mm[:2], size - BED_EDGE_MM)
-    middle, radii = corner + 0.5 * size, 0.5 * size - BED_EDGE_MM
-    out = float(np.linalg.norm((at - middle) / radii))
-    if bed["delta"] and out > 1.0:
-        at = middle + (at - middle) / out
+    if bed["delta"]:
+        at = np.array(kept_on(at.tolist(), corner.tolist(), size.tolist(), BED_EDGE_MM))
     x_mm, y_mm = at.round(3).tolist()
     return [x_mm, y_mm, min(place_mm[2], bed["max_z_mm"])]
 

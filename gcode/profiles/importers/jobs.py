@@ -17,7 +17,7 @@ from gcode.profiles.importers.rules import Rule, Source, number
 from gcode.profiles.importers.slicers import ORCA, PROFILE_NAMES, PRUSA, REASONS
 from gcode.profiles.names import Kind
 
-JOB_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".gc", ".ngc"})
+JOB_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".gc", ".ngc", ".bgcode"})
 BLOCK_MARKS = (
     ("; prusaslicer_config = begin", "; prusaslicer_config = end"),
     ("; SuperSlicer_config = begin", "; SuperSlicer_config = end"),

@@ -63,7 +63,8 @@ def heads_of(settings: Mapping[str, str]) -> tuple[int, bool]:
     loaded = len(settings.get("filament_type", "").split(";"))
     shared = settings.get("single_extruder_multi_material", "0") == "1"
     heated = any(_HEATED.search(text) for text in texts)
-    return max(nozzles, loaded, 1 + max(tools, default=0)), shared or (nozzles == 1 and not heated)
+    one_nozzle = not heated and (shared or nozzles == 1)
+    return max(nozzles, loaded, 1 + max(tools, default=0)), one_nozzle
 
 
 def ends_homing(settings: Mapping[str, str]) -> bool:
