@@ -14,6 +14,7 @@ from gcode.firmware import FirmwareCore
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.profiles.own_settings import own_settings, printer_of_words
+from gcode.resumption import resume_at
 
 SETTINGS = {
     "printer_settings_id": "Somebody's",
@@ -271,6 +272,24 @@ def test_a_job_that_uses_one_of_several_heads_is_judged(
 def test_heads_that_do_not_print_are_watched_too(start: str, end: str, said: str) -> None:
     text = orca_job(start, end, **HEADS, machine_start_gcode="G28")
     assert any(said in one for one in refused(text))
+
+
+@pytest.mark.parametrize("tool", ["T0", "T1"])
+def test_a_job_goes_on_with_the_head_that_printed(tool: str) -> None:
+    """regression: T0 was not taken, which lies in its dock after a power loss; others were heated
+    last."""
+    start = f"G28\nM190 S60\nM109 {tool} S210\n{tool}\nG90\nM83\nG92 E0"
+    beads = "G1 X100 E0.7 F1200\nG1 Y100 E0.7\nG1 X80 E0.7\nG1 Y80 E0.7"
+    part = "\n".join(
+        f";LAYER_CHANGE\n;Z:{0.2 * k:.1f}\nG1 X80 Y80 Z{0.2 * k:.1f} F6000\n{beads}"
+        for k in range(1, 11)
+    )
+    text = orca_job(start, END, part, **HEADS)
+    setup = own_setup(text).melting_all()
+    made = resume_at(Program(text, "marlin"), setup, z_mm=1.0)
+    lines = made.checked.program.text.split("\n")
+    taken, heated = lines.index(tool), lines.index("M109 S210")
+    assert lines.index("G28 X Y") < taken < heated
 
 
 def test_a_head_that_a_job_leaves_hot_is_switched_off() -> None:
