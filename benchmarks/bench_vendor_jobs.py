@@ -9,7 +9,9 @@ preset's own print and filament, and judged by its own settings (`gcode check JO
 such jobs every day must not be told that they are wrong. Presets for several heads at once, and
 what the slicer itself refuses, are counted apart.
 
-OrcaSlicer's machines are written as its jobs (`orca_presets`).
+OrcaSlicer's machines are written as its jobs (`orca_presets`; its profiles of January 2026). Before
+anybody looked at them, 126 of 191 of every other vendor passed after the checker was tuned on the
+rest, and then 44 of 69 of the machines that came by August.
 """
 
 from __future__ import annotations
