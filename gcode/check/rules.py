@@ -483,7 +483,7 @@ class Judge(Motion):
         printer = self._setup.printer
         if self._occupied and not (printer.delta or printer.homes_up):
             if 2 in axes and printer.ends_homing and self._lenient:
-                self._end_homed = self._line, self.moves.sums.way_mm
+                self._end_homed = self._end_homed or (self._line, self.moves.sums.way_mm)
                 self._warn("homing Z over the part, as the maker's end script does", by, "none")
             elif 2 in axes and by != TO_THE_FAR_END:
                 unless = "" if self.policy is Policy.STRICT else ", or 'homes_up' in the profile"

@@ -321,6 +321,7 @@ def test_what_a_marlin_of_a_maker_s_own_passes_over_is_printed(
     [
         (";;", "", True),
         (";;", "G1 X80 Y80 Z0.2\nG1 X100 E0.7", False),  # it prints on
+        (";;", "G1 X80 Y80 Z0.2\nG1 X100 E0.7\nG28", False),
         (";;machine_end_gcode", "", False),  # of the user's own making
         (None, "", False),  # nobody tells
     ],
