@@ -243,6 +243,23 @@ def test_an_orca_preset_s_parent_is_its_vendor_s_own_before_another_s(tmp_path: 
     assert height_mm() == 200.0
 
 
+@pytest.mark.parametrize(
+    ("settings", "heads"),
+    [
+        ({"machine_end_gcode": "T1000\nT255"}, None),
+        ({"machine_start_gcode": "M104 S200 T2"}, (3, False)),
+        ({"nozzle_diameter": ["0.4", "0.4"]}, (2, False)),
+        ({"nozzle_diameter": ["0.4"] * 5, "single_extruder_multi_material": "1"}, (5, True)),
+    ],
+)
+def test_heads_and_filaments_to_one_nozzle_are_told_apart(
+    tmp_path: Path, settings: dict[str, object], heads: tuple[int, bool] | None
+) -> None:
+    (made,) = read(tmp_path, "x.json", json.dumps({"type": "machine"} | settings)).profiles
+    found = made.values.get("heads"), made.values.get("one_nozzle")
+    assert found == (heads or (None, None))
+
+
 def test_a_limit_of_zero_is_none(tmp_path: Path) -> None:
     """regression: 49 of Orca's machines were not read, whose makers leave limits at 0."""
     content = {"type": "machine", "name": "x", "machine_max_speed_e": ["0", "0"]}

@@ -46,6 +46,7 @@ KLIPPERS_OWN = re.compile(
 
 _HEATED = re.compile(r"^[ \t]*M10[49] .*?\bT[1-9]", re.MULTILINE)
 _CHOSEN = re.compile(r"^[ \t]*(?:T|M10[49] .*?\bT)(\d+)\b", re.MULTILINE)
+MOST_HEADS = 64  # beyond are Bambu Lab's signs, T255 and T1000
 
 
 _END_SCRIPT = "machine_end_gcode"
@@ -60,11 +61,12 @@ def heads_of(settings: Mapping[str, str]) -> tuple[int, bool]:
     nozzles = len(settings.get("nozzle_diameter", "").split(","))
     texts = list(_scripts(settings))
     tools = (int(tool) for text in texts for tool in _CHOSEN.findall(text))
+    named = [1 + tool for tool in tools if tool < MOST_HEADS]
     loaded = len(settings.get("filament_type", "").split(";"))
     shared = settings.get("single_extruder_multi_material", "0") == "1"
     heated = any(_HEATED.search(text) for text in texts)
     one_nozzle = not heated and (shared or nozzles == 1)
-    return max(nozzles, loaded, 1 + max(tools, default=0)), one_nozzle
+    return max(nozzles, loaded, *named), one_nozzle
 
 
 def ends_homing(settings: Mapping[str, str]) -> bool:
