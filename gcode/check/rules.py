@@ -288,7 +288,7 @@ class Judge(Motion):
             self._refuse("change of tool", tool, f"one tool: {before}")
             self._tool = before
             return
-        if several and not self._setup.printer.one_nozzle:
+        if self._setup.printer.docks:
             self._parked_c[before] = (self._hotend_c, self._ready_c)
             self._hotend_c, self._ready_c = self._parked_c.pop(tool, (0.0, 0.0))
             self._place = [None] * 3  # where it is picked up
@@ -462,7 +462,7 @@ class Judge(Motion):
             self._bed_c = value_c
         elif what == "chamber":
             self._chamber_c = value_c
-        elif heads > 1 and tool != prints and not self._setup.printer.one_nozzle:
+        elif self._setup.printer.docks and tool != prints:
             _, ready_c = self._parked_c.get(tool, (0.0, 0.0))
             self._parked_c[tool] = value_c, value_c if name == "M109" else min(ready_c, value_c)
         else:

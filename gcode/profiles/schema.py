@@ -210,6 +210,7 @@ class PrinterProfile(_Profile):
     off_bed_mm: Annotated[float, Field(ge=0, le=100)] = 0.0  # a user's job may, where nobody knows
     nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=10.0)]  # pellets' are wide
     heads: Annotated[int, Field(ge=1, le=64)] = 1  # that T0, T1, … choose; a job uses one
+    tool: Annotated[int, Field(ge=0, lt=64)] = 0  # of them, that programs of ours take
     one_nozzle: bool = False  # and what they choose are filaments
     filament_diameter_mm: Annotated[float, Field(ge=1.0, le=3.5)] = 1.75
     max_speed_mm_s: AxisLimits
@@ -278,6 +279,11 @@ class PrinterProfile(_Profile):
                 "into a profile of your own that inherits this one."
             )
         return self.envelope
+
+    @property
+    def docks(self) -> bool:
+        """Whether a head must be taken, or its own heater chosen, before it prints."""
+        return self.heads > 1 and not self.one_nozzle
 
     @property
     def bed_box_mm(self) -> tuple[float, float, float, float]:

@@ -107,7 +107,7 @@ class Head:
         dock; of several filaments to one nozzle a hot one takes its own.
         """
         x, y, _ = self._printer.park_mm
-        docked = self._printer.heads > 1 and not self._printer.one_nozzle
+        docked = self._printer.docks
         if docked:
             self.lines.append(f"T{self._state.tool}")
             self.lines.append(f"G1 Z{number(self._clear_mm, 3)}{self._z_feed}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from manifold3d import Manifold
 
 from gcode.check import Policy, check, find_refusals
 from gcode.firmware import FirmwareCore
@@ -15,6 +16,10 @@ from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.profiles.own_settings import own_settings, printer_of_words
 from gcode.resumption import resume_at
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import slice_patch
+from gcode.surfaces import HeightField
+from gcode.writer import write
 
 SETTINGS = {
     "printer_settings_id": "Somebody's",
@@ -286,10 +291,26 @@ def test_a_job_goes_on_with_the_head_that_printed(tool: str) -> None:
     )
     text = orca_job(start, END, part, **HEADS)
     setup = own_setup(text).melting_all()
+    assert f"T{setup.printer.tool}" == tool
     made = resume_at(Program(text, "marlin"), setup, z_mm=1.0)
     lines = made.checked.program.text.split("\n")
     taken, heated = lines.index(tool), lines.index("M109 S210")
     assert lines.index("G28 X Y") < taken < heated
+
+
+def test_a_patch_is_laid_by_the_head_that_printed() -> None:
+    """regression: a tool changer's repair was printed by whichever head was taken, if any was."""
+    text = orca_job(f"{START}\nM109 T1 S210\nT1", END, **HEADS)
+    setup = own_setup(text).melting_all()
+    stands = Manifold.cube((16, 16, 3)).translate((90, 90, 0))
+    lacks = Manifold.cube((6, 6, 1)).translate((90, 90, 2))
+    field = HeightField.from_manifold(stands - lacks, 0.2, margin_mm=8.0)
+    grid = LayerGrid.from_setup(setup)
+    plan = slice_patch(lacks, setup, as_built=field, grid=grid, standalone=True)
+    lines = write(plan.toolpath, setup, title="x").text.split("\n")
+    heated = next(k for k, line in enumerate(lines) if line.startswith(("M104 S", "M109 S")))
+    assert lines.index("G28 X Y") < lines.index("T1") < heated
+    check(Program("\n".join(lines), "marlin"), setup, as_built=field)
 
 
 def test_a_head_that_a_job_leaves_hot_is_switched_off() -> None:

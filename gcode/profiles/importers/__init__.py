@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
-from gcode.profiles.importers.macros import ends_homing, heads_of, macros_named
+from gcode.profiles.importers.macros import ends_homing, head_used, heads_of, macros_named
 from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
@@ -174,6 +174,8 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
     for profile in made:
         notes += _settle(profile)
         _add_named(profile, source)
+        if profile.values.get("heads", 1) > 1:
+            profile.values["tool"] = min(head_used(text), profile.values["heads"] - 1)
         more += _within_range(profile)
     _as_hot_as_told(*made[:2])
     return ImportedFile(name, made, tuple(more), tuple(notes))

@@ -44,6 +44,7 @@ KLIPPERS_OWN = re.compile(
 )
 
 
+_TAKEN = re.compile(r"^[ \t]*T(\d+)\b", re.MULTILINE)
 _HEATED = re.compile(r"^[ \t]*M10[49] .*?\bT[1-9]", re.MULTILINE)
 _CHOSEN = re.compile(r"^[ \t]*(?:T|M10[49] .*?\bT)(\d+)\b", re.MULTILINE)
 MOST_HEADS = 64  # beyond are Bambu Lab's signs, T255 and T1000
@@ -67,6 +68,11 @@ def heads_of(settings: Mapping[str, str]) -> tuple[int, bool]:
     heated = any(_HEATED.search(text) for text in texts)
     one_nozzle = not heated and (shared or nozzles == 1)
     return max(nozzles, loaded, *named), one_nozzle
+
+
+def head_used(text: str) -> int:
+    """The head that a job, which uses one, takes last."""
+    return next((int(tool) for tool in reversed(_TAKEN.findall(text)) if int(tool) < MOST_HEADS), 0)
 
 
 def ends_homing(settings: Mapping[str, str]) -> bool:
