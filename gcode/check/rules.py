@@ -91,6 +91,7 @@ class Judge(Motion):
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
         own = {self._begins.name if self._begins else "", self._ends or ""}
         self._macros = macros | STARTS - {self._begins.name.upper() if self._begins else ""}
+        self._numbered_macros = self._macros - KNOWN_COMMANDS[program.dialect]
         self._waited_s, self._waited_at = 0.0, -1
         self._known = KNOWN_COMMANDS[program.dialect] | macros | {name.upper() for name in own}
         self._feels = touches.TOUCH_COMMANDS.get(program.dialect, "") if planned else ""
@@ -130,7 +131,7 @@ class Judge(Motion):
             return
         name = head.group(1) + head.group(2) + (f".{head.group(3)}" if head.group(3) else "")
         tool = _TOOL.fullmatch(name) is not None
-        if name in self._macros - KNOWN_COMMANDS[self._dialect]:
+        if name in self._numbered_macros:
             self._heats_unsaid = True
             if self._occupied and name.partition(".")[0] in PROBES:
                 self._refuse("probing over a standing part", name, "nothing may stand there")
