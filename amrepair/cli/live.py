@@ -17,6 +17,7 @@ from amrepair.cli.files import is_cloud, refuse_traps
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
+from gcode.cli.options import plain_text
 from gcode.progress import Progress
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:
     from amrepair.report.live import LiveView
 
-PROGRAM_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".nc"})
+PROGRAM_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".nc", ".bgcode"})
 VIEW_PORT = 8642
 TOKEN_VARIABLE = "AMREPAIR_TOKEN"
 
@@ -101,7 +102,7 @@ def _shown(path: Path) -> Callable[[LiveView], None]:
     if suffix in PROGRAM_SUFFIXES:
         from gcode.reader import read_job
 
-        job = read_job(path.read_text(encoding="utf-8", errors="replace"))
+        job = read_job(plain_text(path))
         return lambda page: page.show_job(job, name=name, grown=True)
     if suffix == ".safetensors":
         from amrepair.template import load_template

@@ -11,9 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.check import plain_kernels as plain
-from gcode.check.arcs import points_of_arc
+from gcode.check.arcs import centre_by_radius, points_of_arc
 from gcode.check.findings import Moves, Policy, Refusal, Text, Warnings
-from gcode.check.words import G91_MOVES_E, LENIENT_OF_MOVES, LINE_LIMIT
+from gcode.check.words import (
+    G91_MOVES_E,
+    GIVES_UP_UNHOMED,
+    LENIENT_OF_MOVES,
+    LINE_LIMIT,
+    NO_ARCS_BY_RADIUS,
+)
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader.text_kernels import INCH_MM
@@ -24,7 +30,8 @@ SHORT_MM = 0.05
 SECTION_SLACK = 1.05
 FLOW_SLACK = 1.05
 PLACE_SLACK_MM = 0.011
-UNIT_SLIP_MM_S = 1000.0  # a feed beyond this is a slip of units, whatever the firmware clamps
+# A feed beyond this is a slip of units, whatever the firmware clamps (FLSun's S1: 1,200 mm/s).
+UNIT_SLIP_MM_S = 1500.0
 # Firmwares clamp a feed to their own limit, and slicers ask for more (300 mm/s in Voron's own
 # printer.cfg, 350 to 500 in OrcaSlicer's profiles): far beyond it a file is another machine's.
 # Along Z and E slicers write the travel speed, whatever the axis does.
@@ -74,6 +81,7 @@ class Motion:
         self._alone = initial is None
         self._standing_top_mm = standing_top_mm
         self._stood = initial is not None or standing_top_mm is not None
+        self._stood_before = self._stood  # before the present move
         state = initial
         self._place: list[float | None] = [None] * 3 if state is None else [*state.position_mm]
         # A part stands on a machine that was not switched off, so Z is still true.
@@ -144,6 +152,10 @@ class Motion:
         """Whether no line has waited for a hotend that melts; what a macro did only it knows."""
         may_be_hot = self._heats_unsaid and self.policy is Policy.DANGER
         return self._ready_c < self._setup.printer.min_extrude_c and not may_be_hot
+
+    @property
+    def _lenient(self) -> bool:
+        return self.policy is Policy.DANGER
 
     @property
     def _occupied(self) -> bool:
@@ -251,12 +263,20 @@ class Motion:
         self._go(target, self._pushed(words), moved=bool(moved))
 
     def _unhomed(self, axis: int, words: dict[str, float | None]) -> None:
-        """Up and away from the bed is told in a user's job, where firmwares do it."""
+        """Up and away from the bed is told in a user's job, where firmwares do it.
+
+        So is any move where the firmware knows better: it has homed and heated by itself before the
+        job, or goes nowhere.
+        """
         value = (words["XYZ"[axis]] or 0.0) * self._unit
         to_mm = value if self._absolute else self._risen_mm + value
         rises = axis == 2 and to_mm > self._risen_mm and not (self._absolute and self._occupied)
         told = ("move before homing", "XYZ"[axis], "home first")
-        if rises and self._dialect in LENIENT_OF_MOVES and self.policy is Policy.DANGER:
+        gives_up = self._dialect in GIVES_UP_UNHOMED
+        if gives_up and not self._occupied and self._lenient:
+            self._warn("move before homing, unless the machine has begun by itself", *told[1:])
+            self._homed, self._heats_unsaid = [True] * 3, True
+        elif rises and not gives_up and self._lenient:
             self._risen_mm = to_mm
             self._warn(*told)
         else:
@@ -275,14 +295,23 @@ class Motion:
             return
         x0, y0, z0 = (float(v or 0.0) for v in here)
         x1, y1, z1 = (float(v or 0.0) for v in target)
-        if words.get("R") is not None:
-            self._refuse("arc told by its radius", "R", "I and J")
-            return
-        centre = tuple((words.get(letter) or 0.0) * self._unit for letter in "IJ")
         start, end = (x0, y0, z0), (x1, y1, z1)
+        centre = tuple((words.get(letter) or 0.0) * self._unit for letter in "IJ")
+        if words.get("R") is not None:
+            radius_mm = (words["R"] or 0.0) * self._unit
+            found = centre_by_radius(start, end, radius_mm, clockwise=clockwise)
+            if found is None or self._dialect in NO_ARCS_BY_RADIUS:
+                self._refuse(
+                    "arc told by its radius", f"R{words['R']:g}", "I and J, or one that fits"
+                )
+                return
+            centre = found
         apart_mm, points = points_of_arc(start, end, (centre[0], centre[1]), clockwise=clockwise)
-        if not points:
-            self._refuse("arc whose ends lie on two circles", f"{apart_mm:.3f} mm", "0.05 mm")
+        told = ("arc whose ends lie on two circles", f"{apart_mm:.3f} mm", "0.05 mm")
+        priming = (
+            1.0 if points and not self._occupied else math.inf
+        )  # FLSun's, along the bed's edge
+        if apart_mm > 0 and self._beyond(*told, priming):
             return
         for k, point in enumerate(points, 1):
             last = k == len(points)
@@ -302,6 +331,7 @@ class Motion:
             if pushed_mm > 0 and length_mm > SHORT_MM and min(start[2], end[2]) < LEAST_BEAD_Z_MM:
                 low_mm = min(start[2], end[2])
                 self._refuse("bead in the bed", f"Z {low_mm:g} mm", f"{LEAST_BEAD_Z_MM:g} mm")
+            self._stood_before = self._occupied
             if length_mm > 0:
                 self.moves.add(self._line, start, end, pushed_mm * self._area_mm2)
         elif moved and self._standing_top_mm is not None and pushed_mm <= 0:
@@ -387,7 +417,7 @@ class Motion:
         if section_mm2 > SECTION_SLACK * limit_mm2:
             told = (f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²")
             # Purging, before there is a part that a blob could be dragged into, is as thick as may.
-            gross = GROSS if self._occupied else math.inf
+            gross = GROSS if self._stood_before else math.inf
             self._beyond("bead too thick", *told, section_mm2 / limit_mm2, gross)
         self._melts(section_mm2)
 
@@ -434,5 +464,6 @@ class Motion:
         limit_mm = self._setup.printer.max_extrude_only_mm
         if self._pulled_mm > limit_mm:
             told = ("pulls filament back", f"{self._pulled_mm:.1f} mm", f"{limit_mm:g} mm")
-            if self._beyond(*told, self._pulled_mm / limit_mm):
+            # Unloading; that it prints on after that is refused.
+            if self._beyond(*told, self._pulled_mm / limit_mm, math.inf):
                 self._pulled_mm = 0.0  # said once

@@ -15,10 +15,12 @@ from gcode.check.words import (
     LENIENT_OF_TOOLS,
     LINE_LIMIT,
     NO_INCHES,
+    PARKS,
     PROBES,
     STARTS,
     parameters,
     start_heats,
+    without_lists,
     words_of,
 )
 from gcode.moves import ModalState, Program
@@ -32,8 +34,12 @@ HEATER_COMMANDS = {
     **dict.fromkeys(("M141", "M191"), "chamber"),
 }
 # Marlin's AUTOTEMP (B, F) and presets (I) set what no number here says.
-UNSAID_HEATS = frozenset("BFI")
-_COMMAND_HEAD = re.compile(r"([GMT])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+UNSAID_HEATS = {
+    (dialect, what): letters
+    for dialect in ("marlin", "prusa")
+    for what, letters in (("hotend", "BFI"), ("bed", "I"))
+}
+_COMMAND_HEAD = re.compile(r"([GMTP])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
 _NUMBERED_LINE = re.compile(r"N\s*\d")
 # M486 A tells an object's name
 FREE_TEXT = frozenset({"M117", "M118", "M486", "M708", "M862.3", "M862.6", "M115"})
@@ -42,9 +48,11 @@ _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 # A letter and a number, or a name and named words: some firmware's command.
 _OF_SOME_FIRMWARE = re.compile(r"[A-Z]\s*-?\d.*|[A-Z_]\w*(?: +\w+=\S+)*")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
+_OTHER_EXTRUDER = re.compile(r"EXTRUDER(\d+)")
 KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
 # Factors on flow (M221) and speed (M220), per cent.
 FACTOR_LIMITS = {"M221": ("flow factor", 50.0, 150.0), "M220": ("speed factor", 10.0, 200.0)}
+TO_PLACES = frozenset({"G0", "G1", "G2", "G3"})
 MOTORS_OFF = frozenset({"M18", "M84"})
 # Axes that no profile has, of idlers, turntables and second carriages.
 OTHER_AXES = frozenset("ABCUVW")
@@ -55,7 +63,12 @@ MOST_ADVANCE_S = 2.0
 # Prusa's scripts let filament be pushed from 155 °C on, to probe with a nozzle that does not ooze;
 # PLA melts at 150 to 160 °C.
 LEAST_COLD_C = 150.0
+MOST_CURRENT_A = 2.0  # as much as the drivers bear that printers mostly have (TMC2209)
 FULL_FAN = 255.0
+# Sailfish's homing, of axes by name: to their least place, and to their greatest, which is Z's away
+# from the bed.
+TO_THE_FAR_END = "G162"
+TO_AN_END = frozenset({"G161", TO_THE_FAR_END})
 HOMING_SLACK_MM = 0.2  # as much as the tip may press into what it prints on
 
 
@@ -78,12 +91,20 @@ class Judge(Motion):
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
         own = {self._begins.name if self._begins else "", self._ends or ""}
         self._macros = macros | STARTS - {self._begins.name.upper() if self._begins else ""}
+        self._numbered_macros = self._macros - KNOWN_COMMANDS[program.dialect]
         self._waited_s, self._waited_at = 0.0, -1
         self._known = KNOWN_COMMANDS[program.dialect] | macros | {name.upper() for name in own}
         self._feels = touches.TOUCH_COMMANDS.get(program.dialect, "") if planned else ""
         if self._feels:
             self._known |= {self._feels}
         self._tool: str | None = None
+        # The line that homed Z at the end, and how far E had gone by then.
+        self._end_homed: tuple[int, float] | None = None
+        # The temperatures of heads that do not print: told, and waited for.
+        self._parked_c: dict[str, tuple[float, float]] = {}
+        if setup.printer.heads > 1:
+            self._known |= {f"T{k}" for k in range(setup.printer.heads)}
+            self._known |= PARKS.get(program.dialect, frozenset())
 
     def read(self, number: int, raw: str) -> None:
         """Judge one line."""
@@ -102,15 +123,24 @@ class Judge(Motion):
         if _NUMBERED_LINE.match(upper):
             self._numbered("line number of its own", upper)
             return
+        if self._dialect == "reprap" and upper.startswith("T-1"):
+            upper = f"P0 {upper[3:]}"
         head = _COMMAND_HEAD.match(upper)
         if head is None:
             self._named(upper)
             return
         name = head.group(1) + head.group(2) + (f".{head.group(3)}" if head.group(3) else "")
         tool = _TOOL.fullmatch(name) is not None
+        if name in self._numbered_macros:
+            self._heats_unsaid = True
+            if self._occupied and name.partition(".")[0] in PROBES:
+                self._refuse("probing over a standing part", name, "nothing may stand there")
+            if name == "M98" and not self._occupied:  # it begins the job, as Klipper's START_PRINT
+                self._home({}, name)
+            return
         if name not in self._known and not (tool and self._dialect in LENIENT_OF_TOOLS):
             if tool:
-                self._refuse("another tool", name, "the only one, T0")
+                self._refuse("another tool", name, _heads_told(self._setup.printer.heads))
             else:
                 self._refuse("command unknown or not allowed", name, f"those of {self._dialect}")
             return
@@ -119,7 +149,10 @@ class Judge(Motion):
         if "*" in upper:
             self._numbered("checksum of its own", upper[upper.index("*") :])
             return
-        words, wrong = words_of(upper[head.end() :])
+        rest = upper[head.end() :]
+        if self._dialect == "reprap" and name not in TO_PLACES:
+            rest = without_lists(rest)
+        words, wrong = words_of(rest)
         if wrong is not None:
             self._refuse(*wrong)
         else:
@@ -136,6 +169,9 @@ class Judge(Motion):
         somebody asked to leave them.
         """
         self._backwards(text)
+        if self._end_homed and self.moves.sums.way_mm > self._end_homed[1]:
+            self._line, self._text = self._end_homed[0], text.line(self._end_homed[0])
+            self._refuse("homing Z onto a standing part", "printing goes on", "at the end alone")
         self._line, self._text = len(text), text.line(len(text))
         if not self._alone:
             return
@@ -143,6 +179,7 @@ class Judge(Motion):
             ("hotend", self._hotend_c, "M104 S0"),
             ("bed", self._bed_c, "M140 S0"),
             ("chamber", self._chamber_c, "M141 S0"),
+            *((f"hotend of {k}", c, f"M104 {k} S0") for k, (c, _) in self._parked_c.items()),
         )
         for what, value_c, off in heaters:
             if value_c <= 0:
@@ -174,17 +211,26 @@ class Judge(Motion):
         elif name in STARTS:
             self._home({}, name)
             for heat, key in start_heats(given):
-                self._heat(heat, {"S": self._number(given[key])})
+                several = [self._number(value) for value in given[key].split(",")]
+                self._heat(heat, {"S": max(several, key=lambda value: value or 0.0)})
         elif name == "TURN_OFF_HEATERS" or (self._ends and name == self._ends.upper()):
             self._hotend_c = self._ready_c = self._bed_c = self._chamber_c = 0.0
+            self._parked_c.clear()
             if name != "TURN_OFF_HEATERS":
                 self._place = [None] * 3  # it goes where it parks
         elif name == "SET_HEATER_TEMPERATURE":
             # Where no target is given, Klipper takes 0.
             target_c = self._number(given.get("TARGET", "0"))
-            self._heat(KLIPPER_HEATERS.get(given.get("HEATER", ""), "M141"), {"S": target_c})
+            heater = given.get("HEATER", "")
+            tool = _OTHER_EXTRUDER.fullmatch(heater)
+            which = "M104" if tool else KLIPPER_HEATERS.get(heater, "M141")
+            self._heat(which, {"S": target_c} | ({"T": float(tool[1])} if tool else {}))
         elif name == "SET_PRESSURE_ADVANCE":
             self._advance(self._number(given.get("ADVANCE")))
+        elif name == "SET_TMC_CURRENT":
+            for key in ("CURRENT", "HOLDCURRENT"):
+                current_a = self._number(given.get(key))
+                self._within(f"motor's {key.lower()}", current_a, 0.0, MOST_CURRENT_A, " A")
         elif name == "SET_GCODE_OFFSET":
             self._offset(given)
         elif name == "TEMPERATURE_WAIT":
@@ -233,16 +279,26 @@ class Judge(Motion):
             return None
 
     def _choose(self, tool: str) -> None:
-        """The only tool may have any number, but another one later would be another colour."""
-        before = self._tool or ("T0" if self.moves.sums.pushed else tool)
-        if tool != before:
+        """The only tool may have any number, but another one later would be another colour.
+
+        Of several heads one prints, and until it does another may be chosen.
+        """
+        several, pushed = self._setup.printer.heads > 1, self.moves.sums.pushed
+        before = self._tool or ("T0" if pushed or several else tool)
+        if tool != before and (pushed or not several):
             self._refuse("change of tool", tool, f"one tool: {before}")
-        self._tool = before
+            self._tool = before
+            return
+        if self._setup.printer.docks:
+            self._parked_c[before] = (self._hotend_c, self._ready_c)
+            self._hotend_c, self._ready_c = self._parked_c.pop(tool, (0.0, 0.0))
+            self._place = [None] * 3  # where it is picked up
+        self._tool = tool
 
     # ------------------------------------------------------------------ commands
 
     def _act(self, name: str, words: dict[str, float | None]) -> None:
-        if name in {"G0", "G1", "G2", "G3"}:
+        if name in TO_PLACES:
             self._other_axes(words)
         if name in {"G0", "G1"}:
             self._move(words)
@@ -250,8 +306,8 @@ class Judge(Motion):
             self._arc(words, clockwise=name == "G2")
         elif name == "G4":
             self._dwell(words)
-        elif name == "G28":
-            self._home(words)
+        elif name == "G28" or name in TO_AN_END:
+            self._home(words, name)
         elif name == self._feels:
             self._touch({letter: v and v * self._unit for letter, v in words.items()})
         elif name in PROBES and self._occupied:
@@ -271,7 +327,7 @@ class Judge(Motion):
             self._set_place(words)
         elif name in HEATER_COMMANDS:
             self._heat(name, words)
-        elif name == "M116":  # waits for all heaters
+        elif name in {"M116", "M6"}:  # wait for all heaters, and for the nozzle's
             self._ready_c = self._hotend_c
         elif name in {"G10", "M568"} and self._dialect == "reprap" and {"P", "L"} & words.keys():
             self._tool_settings(name, words)
@@ -311,8 +367,14 @@ class Judge(Motion):
                 self._refuse("cold extrusion allowed", told or name, f"S{LEAST_COLD_C:g} and more")
         elif name == "M200" and (words.get("D") or words.get("S")):
             self._refuse("extrusion told as a volume", name, "D0")
-        elif name == "G27":
-            self._place = [None] * 3  # up, and to where it parks
+        elif name in {"G27", "M132", "P0"}:
+            self._place = [None] * 3  # where it parks, and where its end stops are
+        elif name == "G5" and words:
+            self._refuse("curve that nothing here follows", name, "G1, G2 and G3")
+        elif name == "M211" and 0.0 in words.values():
+            self._refuse("end stops in software off", name, "S1")
+        elif name == "M108" and "T" not in words:  # Marlin's, which ends a wait for heat
+            self._refuse("end of a wait for heat", name, "the wait")
         elif name == "M558" and "P" in words:
             self._refuse("type of the probe that homes Z", name, "the machine's own")
         elif name == "M862.1":
@@ -361,7 +423,8 @@ class Judge(Motion):
         if "L" not in words:
             self._temperature("standby", waits.switched_c(words.get("R"), self._dialect))
             if "S" in words:
-                self._heat("M104", {"S": words["S"]})
+                tool = {"T": words["P"]} if self._setup.printer.heads > 1 else {}
+                self._heat("M104", {"S": words["S"]} | tool)
 
     def _shift(self, what: str, value_mm: float | None) -> None:
         if value_mm is not None and abs(value_mm) > PLACE_SLACK_MM:
@@ -383,19 +446,26 @@ class Judge(Motion):
         if value_c is None:
             self._refuse(f"{what} temperature missing", "no S", "a temperature")
             return
-        for letter in sorted(UNSAID_HEATS & words.keys()):
+        for letter in UNSAID_HEATS.get((self._dialect, what), ""):
+            if words.get(letter) is None:
+                continue
             self._refuse("temperature that the firmware chooses", f"{name} {letter}", "S alone")
         if what == "hotend":
-            tool = f"T{words.get('T') or 0.0:g}"
-            if tool not in {"T0", self._tool}:  # firmwares pass over one that is not there
-                if value_c != 0:
-                    self._refuse("hotend of another tool", tool, "the only one, T0")
+            heads, prints = self._setup.printer.heads, self._tool or "T0"
+            told = words.get("T")
+            tool = f"T{told or 0.0:g}" if told is not None or heads == 1 else prints
+            if not (0 <= (told or 0.0) < heads or tool in {"T0", prints}):
+                if value_c != 0:  # firmwares pass over one that is not there
+                    self._refuse("hotend of another tool", tool, _heads_told(heads))
                 return
         self._temperature(what, value_c)
         if what == "bed":
             self._bed_c = value_c
         elif what == "chamber":
             self._chamber_c = value_c
+        elif self._setup.printer.docks and tool != prints:
+            _, ready_c = self._parked_c.get(tool, (0.0, 0.0))
+            self._parked_c[tool] = value_c, value_c if name == "M109" else min(ready_c, value_c)
         else:
             self._hotend_c = value_c
             # The heater was waited for, or cools from now on.
@@ -409,13 +479,17 @@ class Judge(Motion):
         if value_c is not None and not 0 <= value_c <= limit_c:
             self._refuse(f"{what} temperature", f"{value_c:g} °C", f"{limit_c:g} °C")
 
-    def _home(self, words: dict[str, float | None], by: str = "G28 with Z") -> None:
+    def _home(self, words: dict[str, float | None], by: str) -> None:
         axes = [k for k, letter in enumerate("XYZ") if letter in words] or [0, 1, 2]
         printer = self._setup.printer
         if self._occupied and not (printer.delta or printer.homes_up):
-            if 2 in axes:
+            if 2 in axes and printer.ends_homing and self._lenient:
+                self._end_homed = self._end_homed or (self._line, self.moves.sums.way_mm)
+                self._warn("homing Z over the part, as the maker's end script does", by, "none")
+            elif 2 in axes and by != TO_THE_FAR_END:
                 unless = "" if self.policy is Policy.STRICT else ", or 'homes_up' in the profile"
-                self._refuse("homing Z onto a standing part", by, f"G28 X Y only{unless}")
+                told = f"{by} with Z" if by in {"G28", *TO_AN_END} else by
+                self._refuse("homing Z onto a standing part", told, f"G28 X Y only{unless}")
             else:
                 self._homes_above(self._place[2])
         for axis in axes:
@@ -456,3 +530,7 @@ class Judge(Motion):
         elif not {"X", "Y", "Z"} & words.keys():
             # Klipper, and older firmwares too, take all axes to be at 0 then
             self._refuse("shift of the coordinate system", "G92 without an axis", "only G92 E")
+
+
+def _heads_told(count: int) -> str:
+    return "the only one, T0" if count == 1 else f"those of {count} heads, from T0 on"

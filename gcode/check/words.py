@@ -2,7 +2,8 @@
 
 What changes the machine lastingly, or switches a protection off, is left out on purpose: EEPROM
 (M500, M502), steps per mm (M92), homing offsets (M206, M428), PID tuning, the numbers of lines
-(M110). So are curves whose course nothing here follows (G5), and tools that are picked up (P0).
+(M110). So are curves whose course nothing here follows (G5 with
+words; without, some makers' Marlins are told to resume after a power failure by it).
 
 Sources: marlinfw.org/docs/gcode; klipper3d.org/G-Codes.html; Duet's G-code dictionary; Prusa's
 `lib/Marlin` and `src/common/marlin_server` of Prusa-Firmware-Buddy, whose jobs slicers call Marlin;
@@ -15,6 +16,8 @@ import re
 from collections.abc import Iterator
 
 _OPTIONAL_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))?")
+_GIVEN = re.compile(r"""(?<=\s)([^\s=]+)(?:=("[^"]*"|'[^']*'|\S*))?""")
+_LIST = re.compile(r"[-+]?[\d.]+(?::[-+]?[\d.]+)+")
 _MOTION = "G0 G1 G2 G3 G4 G10 G11 G17 G20 G21 G28 G90 G91 G92"
 _COMMON = (
     "M17 M18 M73 M82 M83 M84 M104 M105 M106 M107 M109 M114 M115 M117 M118 M140 M141 M190 "
@@ -26,6 +29,10 @@ _MARLINS = (
     "M0 M1 M31 M75 M76 M77 M78 M80 M85 M113 M119 M123 M142 M145 M192 M200 M202 M302 M355 "
     "M412 M413 M911"
 )
+# Of Sailfish, and its heirs in Flashforge's and Dremel's printers: homing to the least and the
+# greatest end stop, waits for nozzle and bed, the tool's number, places kept of end stops, motor
+# currents, a fan of the housing; and end stops in software on.
+_MARLINS_HEIRS = "G161 G162 M6 M7 M108 M132 M907 M651 M652 M211"
 # Checks of printer, nozzle and firmware; the mass of the part, the area that is probed, pressure
 # advance; a stuck filament; a multi-material unit's own commands.
 _PRUSAS = (
@@ -34,14 +41,15 @@ _PRUSAS = (
 )
 
 KNOWN_COMMANDS: dict[str, frozenset[str]] = {
-    "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} {_MARLINS} {_PRUSAS} M217 M420 G12 G27 "
-                        "G33".split()),
+    "marlin": frozenset(f"{_MOTION} {_COMMON} {_PROBING} {_MARLINS} {_PRUSAS} {_MARLINS_HEIRS} "
+                        "M217 M420 G5 G12 G27 G30 G33".split()),
     "prusa": frozenset(f"{_MOTION} {_COMMON} {_PROBING} {_MARLINS} {_PRUSAS} M907 G76".split()),
     "klipper": frozenset(
         f"{_MOTION} {_COMMON} {_PROBING} SET_VELOCITY_LIMIT SET_PRESSURE_ADVANCE "
         "BED_MESH_CALIBRATE BED_MESH_PROFILE BED_MESH_CLEAR SET_HEATER_TEMPERATURE "
         "TEMPERATURE_WAIT TURN_OFF_HEATERS "
-        "QUAD_GANTRY_LEVEL SET_GCODE_OFFSET EXCLUDE_OBJECT_DEFINE EXCLUDE_OBJECT_START "
+        "QUAD_GANTRY_LEVEL PROBE SET_TMC_CURRENT SET_GCODE_OFFSET EXCLUDE_OBJECT_DEFINE "
+        "EXCLUDE_OBJECT_START "
         "EXCLUDE_OBJECT_END SET_PRINT_STATS_INFO CLEAR_PAUSE PRINT_START PRINT_END START_PRINT "
         "END_PRINT PAUSE AMREPAIR_SCAN Z_TILT_ADJUST SET_FILAMENT_SENSOR SET_INPUT_SHAPER "
         "SET_DISPLAY_TEXT SET_LED SET_FAN_SPEED RESPOND TIMELAPSE_TAKE_FRAME "
@@ -54,7 +62,7 @@ KNOWN_COMMANDS: dict[str, frozenset[str]] = {
 PROBES = frozenset(
     {
         *("G12", "G29", "G30", "G32", "G33", "G34", "G76", "G80", "G81"),
-        *("BED_MESH_CALIBRATE", "QUAD_GANTRY_LEVEL", "Z_TILT_ADJUST"),
+        *("BED_MESH_CALIBRATE", "QUAD_GANTRY_LEVEL", "Z_TILT_ADJUST", "PROBE"),
     }
 )
 # Macros that begin a job by convention: they home all axes, most of them probe, and they heat to
@@ -62,6 +70,9 @@ PROBES = frozenset(
 STARTS = frozenset({"START_PRINT", "PRINT_START"})
 # What names those parameters: EXTRUDER, EXTRUDER_TEMP, HOTEND, NOZZLE_TEMP; BED, BED_TEMP.
 _START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
+# Of a machine with several heads: what lays the present one down (Prusa's XL; RepRapFirmware's
+# `T-1`, which is read as this).
+PARKS = {"marlin": frozenset({"P0"}), "prusa": frozenset({"P0"}), "reprap": frozenset({"P0"})}
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
@@ -69,6 +80,10 @@ G90_SETS_E = frozenset({"marlin"})
 # homed, and it answers that stray words are no command and goes on; Klipper gives the job up at the
 # first, and refuses the second ("Must home axis first").
 LENIENT_OF_MOVES = frozenset({"marlin", "prusa"})
+# Whatever is configured ("Must home axis first").
+GIVES_UP_UNHOMED = frozenset({"klipper"})
+# Klipper's gcode_arcs.py: "G2/G3 does not support R moves"; the MK3's firmware reads I and J alone.
+NO_ARCS_BY_RADIUS = frozenset({"klipper", "prusa"})
 # Klipper refuses G20 (klippy/extras/gcode_move.py), the MK3's firmware passes over it; both go on
 # in millimetres.
 NO_INCHES = frozenset({"klipper", "prusa"})
@@ -79,15 +94,21 @@ LENIENT_OF_TOOLS = frozenset({"klipper"})
 
 
 def parameters(command: str) -> dict[str, str]:
-    """KEY=VALUE pairs of a named command, keys and values in capitals."""
-    pairs = (word.partition("=") for word in command.upper().split()[1:])
-    return {key: value for key, _, value in pairs}
+    """KEY=VALUE pairs of a named command, keys and values in capitals; quotes are kept."""
+    return {key: value or "" for key, value in _GIVEN.findall(command.upper())}
 
 
 def start_heats(given: dict[str, str]) -> Iterator[tuple[str, str]]:
     """The heaters that a macro of `STARTS` waits for: the command, and the parameter's key."""
     for command, names in _START_HEATS.items():
-        yield from ((command, key) for key in given if any(name in key for name in names))
+        for key, value in given.items():  # what is quoted is a plate's name
+            if any(name in key for name in names) and value[:1] not in {'"', "'"}:
+                yield command, key
+
+
+def without_lists(rest: str) -> str:
+    """RepRapFirmware's lists (`X10:90`, of several heaters or drives) as their largest value."""
+    return _LIST.sub(lambda found: max(found[0].split(":"), key=float), rest)
 
 
 def words_of(rest: str) -> tuple[dict[str, float | None], tuple[str, str, str] | None]:
@@ -105,7 +126,7 @@ def words_of(rest: str) -> tuple[dict[str, float | None], tuple[str, str, str] |
         if match is None or (match.end() < len(rest) and rest[match.end()] in ".0123456789"):
             return words, ("word that is no number", rest.strip(), "a letter and one number")
         letter, text = match.groups()
-        if letter in words:
+        if letter in words and (text, words[letter]) != (None, None):  # flags, of stray words
             return words, ("word given twice", letter, "once")
         words[letter] = None if text is None else float(text)
         at = match.end()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gcode.cli import console
-from gcode.cli.options import JsonOption
+from gcode.cli.options import JsonOption, plain_text
 from gcode.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,8 +42,10 @@ def import_(
 ) -> None:
     """Import a profile: every key is mapped, or listed with the reason."""
     from gcode.profiles.importers import file_name, import_profiles, to_toml
+    from gcode.profiles.importers.jobs import JOB_SUFFIXES
 
-    found = import_profiles(file, preset=preset, inherits=inherits)
+    text = plain_text(file) if file.suffix.lower() in JOB_SUFFIXES else None
+    found = import_profiles(file, preset=preset, inherits=inherits, text=text)
     folders = len(found.profiles) > 1
     paths = []
     for made in found.profiles:

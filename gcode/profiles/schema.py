@@ -203,11 +203,15 @@ class PrinterProfile(_Profile):
     bed_min_mm: Xy = (0.0, 0.0)  # its corner of least X and Y; beds about the origin have one below
     delta: bool = False  # three towers: the bed is round, homing lifts the head to their tops
     homes_up: bool = False  # homing Z takes the nozzle away from the bed
+    ends_homing: bool = False  # so its maker's end script does over the part, which shows no more
     max_z_mm: Positive
     reach_min_mm: Xy | None = None  # where the nozzle may go off the bed (purge, wiper); the bed
     reach_max_mm: Xy | None = None  # itself where left out
     off_bed_mm: Annotated[float, Field(ge=0, le=100)] = 0.0  # a user's job may, where nobody knows
-    nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=2.0)]
+    nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=10.0)]  # pellets' are wide
+    heads: Annotated[int, Field(ge=1, le=64)] = 1  # that T0, T1, … choose; a job uses one
+    tool: Annotated[int, Field(ge=0, lt=64)] = 0  # of them, that programs of ours take
+    one_nozzle: bool = False  # and what they choose are filaments
     filament_diameter_mm: Annotated[float, Field(ge=1.0, le=3.5)] = 1.75
     max_speed_mm_s: AxisLimits
     max_acceleration_mm_s2: AxisLimits
@@ -220,7 +224,7 @@ class PrinterProfile(_Profile):
     max_extrude_only_mm: Positive
     travel_speed_mm_s: Positive
     z_speed_mm_s: Positive
-    retraction_mm: Annotated[float, Field(ge=0, le=15)]
+    retraction_mm: Annotated[float, Field(ge=0, le=30)]
     retraction_speed_mm_s: Positive
     z_hop_mm: Annotated[float, Field(ge=0, le=5)]
     park_mm: Xyz
@@ -275,6 +279,11 @@ class PrinterProfile(_Profile):
                 "into a profile of your own that inherits this one."
             )
         return self.envelope
+
+    @property
+    def docks(self) -> bool:
+        """Whether a head must be taken, or its own heater chosen, before it prints."""
+        return self.heads > 1 and not self.one_nozzle
 
     @property
     def bed_box_mm(self) -> tuple[float, float, float, float]:

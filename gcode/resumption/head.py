@@ -101,15 +101,23 @@ class Head:
             self.lines.append("M420 S1")  # Marlin's G28 switches the mesh off (G28.md)
 
     def heat(self, hotend_c: float, bed_c: float) -> None:
-        """Bed first, the nozzle above the bed's edge meanwhile."""
+        """Bed first, the nozzle above the bed's edge meanwhile.
+
+        Of several heads the one that printed is taken before it is heated, as it may lie in its
+        dock; of several filaments to one nozzle a hot one takes its own.
+        """
         x, y, _ = self._printer.park_mm
+        docked = self._printer.docks
+        if docked:
+            self.lines.append(f"T{self._state.tool}")
+            self.lines.append(f"G1 Z{number(self._clear_mm, 3)}{self._z_feed}")
         if bed_c > 0:
             self.lines.append(f"M140 S{number(bed_c, 1)}")
         self.lines.append(f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}")
         if bed_c > 0:
             self.lines.append(f"M190 S{number(bed_c, 1)}")
         self.lines += [f"M104 S{number(hotend_c, 1)}", f"M109 S{number(hotend_c, 1)}"]
-        if self._state.tool:
+        if self._state.tool and not docked:
             self.lines.append(f"T{self._state.tool}")
 
     def prime_on_bed(self, x: float, y: float, dx: float, dy: float) -> None:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage, spatial
 
 from gcode.profiles import PrinterProfile
+from gcode.profiles.round_beds import kept_on
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
 
@@ -89,17 +90,9 @@ def _starts(printer: PrinterProfile) -> list[tuple[float, float]]:
     edges = [(float(x), float(y)) for y in (y0, y1) for x in xs]
     edges += [(float(x), float(y)) for x in (x0, x1) for y in ys]
     if printer.delta:
-        edges = [_on_the_ellipse(at, printer) for at in edges]
+        bed = printer.bed_min_mm, printer.bed_size_mm, INSET_MM
+        edges = [kept_on(at, *bed, to_edge=True) for at in edges]
     return [(printer.prime_mm[0], printer.prime_mm[1]), *edges]
-
-
-def _on_the_ellipse(at_mm: tuple[float, float], printer: PrinterProfile) -> tuple[float, float]:
-    """The place in the same direction at the edge of a round bed."""
-    middle = np.array(printer.bed_middle_mm)
-    radii = 0.5 * np.array(printer.bed_size_mm) - INSET_MM
-    towards = (np.array(at_mm) - middle) / radii
-    x, y = middle + radii * towards / np.linalg.norm(towards)
-    return float(x), float(y)
 
 
 def _bare(field: HeightField, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:

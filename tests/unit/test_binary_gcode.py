@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import heatshrink2
 import pytest
@@ -17,9 +18,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from amrepair.cli.live import show_file
 from gcode.cli.app import app
 from gcode.errors import InputError
+from gcode.reader import Job, read_job
 from gcode.reader.binary import is_binary, text_of
+
+if TYPE_CHECKING:
+    from amrepair.report.live import LiveView
+
+
+class Shown:
+    """A page that keeps how many layers it was shown."""
+
+    def __init__(self) -> None:
+        self.layers: list[int] = []
+
+    def show_job(self, job: Job, *, name: str, grown: bool) -> None:
+        self.layers.append(len(job.layers))
+
 
 NIBBLE = {c: k for k, c in enumerate("0123456789. \nGX")}
 JOB = """;TYPE:Custom
@@ -129,6 +146,24 @@ def test_another_version_is_told() -> None:
     data = struct.pack("<4sIH", b"GCDE", 2, 1) + binary(JOB)[10:]
     with pytest.raises(InputError, match="of version 2"):
         text_of(data, "job.bgcode")
+
+
+def test_a_binary_job_s_settings_are_imported(tmp_path: Path) -> None:
+    """regression: `gcode profiles import` found none in it."""
+    path = tmp_path / "job.bgcode"
+    path.write_bytes(binary(JOB))
+    run = CliRunner().invoke(app, ["profiles", "import", str(path), "--out", str(tmp_path / "own")])
+    assert run.exit_code == 0, run.output
+    (printer,) = (tmp_path / "own" / "printers").glob("*.toml")
+    assert 'dialect = "marlin" # gcode_flavor' in printer.read_text()
+
+
+def test_a_binary_job_is_shown_like_its_text(tmp_path: Path) -> None:
+    """regression: `amrepair view` took no such file."""
+    path, shown = tmp_path / "job.bgcode", Shown()
+    path.write_bytes(binary(JOB))
+    show_file(cast("LiveView", shown), path)
+    assert shown.layers == [len(read_job(JOB).layers)]
 
 
 def test_a_binary_job_is_checked_like_its_text(tmp_path: Path) -> None:

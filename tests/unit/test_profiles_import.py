@@ -209,6 +209,64 @@ def test_an_orca_machine_with_its_parent_beside_it(tmp_path: Path) -> None:
     assert "its parent is neither beside the file" in reasons(lonely)["inherits"]
 
 
+def test_a_preset_that_a_user_saved_in_orca_has_no_type(tmp_path: Path) -> None:
+    """regression: none of a user's own presets was read; the folder or its settings tell."""
+    mine = {
+        "name": "Mine",
+        "from": "User",
+        "printer_settings_id": "Mine",
+        "printable_height": "250",
+    }
+    assert read(tmp_path, "mine.json", json.dumps(mine)).profiles[0].kind == "printers"
+    folder = tmp_path / "user" / "default" / "filament"
+    folder.mkdir(parents=True)
+    saved = read(folder, "Mine PLA.json", json.dumps({"name": "Mine PLA", "from": "User"}))
+    assert saved.profiles[0].kind == "materials"
+
+
+def test_an_orca_preset_s_parent_is_its_vendor_s_own_before_another_s(tmp_path: Path) -> None:
+    """regression: what was inherited was whichever vendor's file of that name came first."""
+    profiles = tmp_path / "resources" / "profiles"
+    for vendor, height in (("Another", 100), ("OrcaFilamentLibrary", 200), ("Maker", 300)):
+        folder = profiles / vendor / "machine" / "base"
+        folder.mkdir(parents=True)
+        above = {"type": "machine", "name": "common", "printable_height": str(height)}
+        (folder / "common.json").write_text(json.dumps(above))
+    own = {"type": "machine", "name": "One", "inherits": "common"}
+
+    def height_mm() -> float:
+        found = read(profiles / "Maker" / "machine", "One.json", json.dumps(own))
+        return float(found.profiles[0].values["max_z_mm"])
+
+    assert height_mm() == 300.0
+    (profiles / "Maker" / "machine" / "base" / "common.json").unlink()
+    assert height_mm() == 200.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "heads"),
+    [
+        ({"machine_end_gcode": "T1000\nT255"}, None),
+        ({"machine_start_gcode": "M104 S200 T2"}, (3, False)),
+        ({"nozzle_diameter": ["0.4", "0.4"]}, (2, False)),
+        ({"nozzle_diameter": ["0.4"] * 5, "single_extruder_multi_material": "1"}, (5, True)),
+    ],
+)
+def test_heads_and_filaments_to_one_nozzle_are_told_apart(
+    tmp_path: Path, settings: dict[str, object], heads: tuple[int, bool] | None
+) -> None:
+    (made,) = read(tmp_path, "x.json", json.dumps({"type": "machine"} | settings)).profiles
+    found = made.values.get("heads"), made.values.get("one_nozzle")
+    assert found == (heads or (None, None))
+
+
+def test_a_limit_of_zero_is_none(tmp_path: Path) -> None:
+    """regression: 49 of Orca's machines were not read, whose makers leave limits at 0."""
+    content = {"type": "machine", "name": "x", "machine_max_speed_e": ["0", "0"]}
+    found = read(tmp_path, "x.json", json.dumps(content))
+    assert reasons(found)["machine_max_speed_e"] == "0 sets no limit"
+
+
 @pytest.mark.parametrize(
     ("content", "check"),
     [

@@ -1,18 +1,25 @@
 """Jobs as the scripts of printer makers begin and end them: what their slicers write is printed.
 
-The scripts are those of PrusaSlicer's bundles (118 presets of 19 makers), cut to what mattered.
+The scripts are those of PrusaSlicer's bundles (118 presets of 19 makers) and OrcaSlicer's profiles
+(329 machines of 53), cut to what mattered.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from manifold3d import Manifold
 
 from gcode.check import Policy, check, find_refusals
 from gcode.firmware import FirmwareCore
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.profiles.own_settings import own_settings, printer_of_words
+from gcode.resumption import resume_at
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import slice_patch
+from gcode.surfaces import HeightField
+from gcode.writer import write
 
 SETTINGS = {
     "printer_settings_id": "Somebody's",
@@ -60,6 +67,16 @@ def refused(text: str) -> list[str]:
         pytest.param("M84\nG1 Z5\nG28", id="up before homing, Chiron"),
         pytest.param("Start GCode begin\n1 @ 0.2mm/nG92 E0", id="stray words, Kobra 2"),
         pytest.param("M75\nM200 D0\nM413 S0\nM355 S1", id="timer and light"),
+        pytest.param("M211 S1\nG1 X40 Y40 Z9\nG2 X80 I30 E9", id="arc of two circles, FLSun"),
+        pytest.param(
+            "M104 S0\nM104 S215 T0\nG28\nM132 X Y Z A B\nG1 Z50 F420\nG161 X Y F3300\nM7 T0\n"
+            "M6 T0\nM651 S255\nM907 X100 A100\nM108 T0\nG1 X40 Y-9 Z5\nG1 X50 E5 F600",
+            id="Sailfish's, Flashforge and Dremel",
+        ),
+        pytest.param("G0 X0 Y0 Z9\nG0 E30 X10 Z0.2 F170\nG0 X40 E9", id="purged coming down, U1"),
+        pytest.param(
+            "G1 X30 Y9 Z0.3\nG3 X130 Y9 R139 E20 F600\nG5", id="arc by its radius, SeeMeCNC"
+        ),
     ],
 )
 def test_what_makers_scripts_begin_with_is_printed(start: str) -> None:
@@ -70,12 +87,13 @@ def test_what_makers_scripts_begin_with_is_printed(start: str) -> None:
 @pytest.mark.parametrize(
     "end",
     [
-        pytest.param("G1 E-80 F2000\nG1 Z150\nM104 S0\nM140 S0", id="filament unloaded, Elegoo"),
+        pytest.param("G1 E-800 F2000\nG1 Z150\nM104 S0\nM140 S0", id="filament unloaded, Elegoo"),
         pytest.param("G0 Z205\nM104 S0\nM140 S0", id="above the print's room, Jubilee"),
         pytest.param("G1 E2 F6000\nG1 E2\nG1 E2\nG1 E-15\nM702 C\nM104 S0\nM140 S0", id="MMU2S"),
         pytest.param("M104 S0\nM140 S0\nG27 P2\nM77", id="parked by its firmware"),
         pytest.param("G91\nG1 X0 Y180\nG90\nM104 S0\nM140 S0", id="cut short by Marlin, SV01"),
         pytest.param("M104 S0\nM140 S0\nM84\nG91\nG1 Z+0.5", id="up with motors off, Anycubic"),
+        pytest.param("M104 S0 T0\nM140 S0\nG162 Z F1800\nG28 X Y\nM652", id="Z away, Flashforge"),
     ],
 )
 def test_what_makers_scripts_end_with_is_printed(end: str) -> None:
@@ -96,6 +114,16 @@ def test_what_makers_scripts_end_with_is_printed(end: str) -> None:
         (job(f"{START}\nM9999"), "command unknown"),
         (job(KLIPPER, "G1 X-40\nprint_end"), "out of reach"),
         (job(START, f"G28\n{END}"), "homing Z onto a standing part"),
+        (job(START, f"G161 Z F600\n{END}"), "homing Z onto a standing part"),
+        (job(f"{START}\nG1 X9 Y9 Z1\nG2 X99 R30 E9"), "arc told by its radius"),  # too small
+        (job(KLIPPER, f"G2 X60 R90\n{END}"), "arc told by its radius"),
+        (job(f"{START}\nG5 X9 Y9 I1 P1"), "curve that nothing here follows"),
+        (job(f"{START}\nM211 S0"), "end stops in software off"),
+        (job(f"{START}\nM108"), "end of a wait for heat"),
+        (job(f"{KLIPPER}\nSET_KINEMATIC_POSITION Y=0"), "command unknown"),
+        (job(KLIPPER, f"PROBE\n{END}"), "probing over a standing part"),
+        (job(KLIPPER, f"M84\nG1 X5\n{END}"), "before homing"),  # the part stands there
+        (job("print_start EXTRUDER_TEMP=210,900 BED=60\nG90\nM83"), "hotend temperature"),
         (job(START, f"M84\nG1 Z5\n{END}"), "before homing"),
         (job(f"G90\nM83\nG1 Z12\nG28 X Y\n{HOT}\nG1 Z0.3"), "before homing"),  # no Z yet
         (job(START, f"M84\nG1 X5\n{END}"), "before homing"),
@@ -106,6 +134,242 @@ def test_what_makers_scripts_end_with_is_printed(end: str) -> None:
 )
 def test_what_can_hurt_the_part_is_refused_still(text: str, said: str) -> None:
     assert any(said in one for one in refused(text))
+
+
+def orca_job(start: str, end: str, part: str = PART, **settings: str) -> str:
+    """As OrcaSlicer writes it: its settings, with the preset's scripts among them, in a block."""
+    told = {
+        "printer_settings_id": "Somebody's",
+        "printable_area": "0x0,200x0,200x200,0x200",
+        "printable_height": "200",
+        "nozzle_diameter": "0.4",
+        "gcode_flavor": "klipper",
+        "machine_start_gcode": start.replace("\n", "\\n"),
+        "machine_end_gcode": end.replace("\n", "\\n"),
+        "curr_bed_type": "High Temp Plate",
+        **settings,
+    }
+    rows = "\n".join(f"; {key} = {value}" for key, value in told.items())
+    block = f"; CONFIG_BLOCK_START\n{rows}\n; CONFIG_BLOCK_END\n"
+    return f"; HEADER_BLOCK_START\n; generated by OrcaSlicer 2.3.1\n{start}\n{part}\n{end}\n{block}"
+
+
+def test_macros_that_a_preset_s_scripts_name_are_the_machine_s_own() -> None:
+    """regression: jobs of 16 of Orca's Klipper machines were refused for their makers' words."""
+    scripts = {"layer_change_gcode": "{if layer_num>0}_ON_LAYER LAYER={layer_num}{endif}\\nM8901"}
+    start, lines = f"{KLIPPER}\nclean_nozzle", "_ON_LAYER LAYER=1\nM8901 S1"
+    text = orca_job(start, f"{lines}\nprint_end", **scripts)
+    assert set(own_setup(text).printer.macros) >= {"CLEAN_NOZZLE", "_ON_LAYER", "M8901"}
+    assert refused(text) == []
+    (said,) = refused(orca_job(KLIPPER, "print_end").replace("print_end", "WIPE_IT\nprint_end", 1))
+    assert "WIPE_IT" in said, "what no script of the printer's names stays unknown"
+
+
+@pytest.mark.parametrize("own", ["FORCE_MOVE STEPPER=stepper_z DISTANCE=-5", "SAVE_CONFIG", "M500"])
+def test_no_script_makes_macros_of_klippers_own_commands(own: str) -> None:
+    (said,) = refused(orca_job(f"{KLIPPER}\n{own}", "print_end"))
+    assert "command unknown" in said
+
+
+def test_a_klipper_machine_that_begins_by_itself_may_be_homed_and_hot() -> None:
+    """regression: Flashforge's AD5M homes and heats before a job, which never says so."""
+    text = orca_job("M190 S60\nM104 S210\nG90\nM83\nG1 Z5 F600\nG1 X40 Y9 Z0.3\nG1 X60 E3", END)
+    assert refused(text) == []
+    setup = own_setup(text).melting_all()
+    report = check(Program(text, "klipper"), setup, policy=Policy.DANGER).report
+    assert ["has begun by itself" in str(one) for one in report.warnings] == [True]
+    assert find_refusals(Program(text, "klipper"), setup, policy=Policy.STRICT)
+
+
+def test_a_start_macro_may_be_told_a_temperature_for_each_head() -> None:
+    heads = 'START_PRINT EXTRUDER_TEMP=210,205 BED_TEMP=60 BED_TYPE="High Temp"\nG90\nM83'
+    assert refused(orca_job(heads, "END_PRINT")) == []
+
+
+def test_a_list_of_reprapfirmware_s_is_judged_by_its_largest_value() -> None:
+
+    assert refused(orca_job(f"{START}\nM557 P5 X10:90 Y20:80\nM568 P0 S210:200", END, **RRF)) == []
+    hot = refused(orca_job(f"{START}\nM568 P0 S210:900", END, **RRF))
+    assert any("hotend temperature" in one for one in hot)
+
+
+def test_a_job_s_own_filament_may_be_hotter_than_a_generic_printer_s_limit() -> None:
+    """regression: such a job was told to choose another material than its own."""
+    hot = START.replace("S210", "S280")
+    told = {"gcode_flavor": "marlin", "nozzle_temperature": "280", "hot_plate_temp": "115"}
+    text = orca_job(hot, END, **told)
+    assert (own_setup(text).printer.max_hotend_c, own_setup(text).printer.max_bed_c) == (280, 115)
+    assert refused(text) == []
+    assert any(
+        "hotend temperature" in one for one in refused(text.replace("M104 S280", "M104 S290"))
+    )
+    unsaid = orca_job(hot, END, gcode_flavor="marlin")
+    assert any("hotend temperature" in one for one in refused(unsaid))
+
+
+XL = """M17
+M862.1 T0 P0.4
+M104 T1 S0
+G0 Z5
+M109 T0 S170
+G28 XY
+T0 S1 L0 D0
+M84 E
+G28 Z
+P0 S1 L1 D0; park the tool
+M104 T0 S215
+M109 T0 S215
+T0 S1 L0 D0; pick the tool
+G92 E0
+G0 X30 Y-7 Z10 F9000
+G0 E10 X40 Z0.2 F500
+M83"""
+HEADS = {"nozzle_diameter": "0.4,0.4", "gcode_flavor": "marlin"}
+RRF = {"gcode_flavor": "reprapfirmware"}
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "settings"),
+    [
+        pytest.param(XL, "G1 Z20\nP0 S1\nM104 T0 S0\nM104 T1 S0\nM140 S0", HEADS, id="Prusa XL"),
+        pytest.param(
+            f"{START}\nM104 T1 S150\nT1\nM109 S210", f"M104 T0 S0\n{END}", HEADS, id="IDEX"
+        ),
+        pytest.param(
+            "G28\nM568 P1 S210 R160\nT1\nM116\nG90\nM83",
+            "G1 Z20\nG10 P1 S-273 R-273\nT-1",
+            HEADS | RRF,
+            id="a tool changer by RepRapFirmware",
+        ),
+        pytest.param(f"{KLIPPER}\nT1\nM104 T1 S210", "print_end", {}, id="told by its own scripts"),
+        pytest.param(
+            f"{START}\nT1",
+            END,
+            {
+                "gcode_flavor": "marlin",
+                "filament_type": "PLA;PETG",
+                "machine_start_gcode": "T[initial_extruder]",
+            },
+            id="the second of two filaments to one nozzle",
+        ),
+    ],
+)
+def test_a_job_that_uses_one_of_several_heads_is_judged(
+    start: str, end: str, settings: dict[str, str]
+) -> None:
+    """regression: each such job was told that its head is not the only one."""
+    text = orca_job(start, end, **settings)
+    assert own_setup(text).printer.heads == 2
+    assert refused(text) == []
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "said"),
+    [
+        (f"{START}\nT2", END, "another tool: T2, limit those of 2 heads"),
+        (f"{START}\nM104 T1 S900", END, "hotend temperature: 900 °C"),
+        (f"{START}\nM104 T4 S200", END, "hotend of another tool: T4"),
+        (f"{START}\nT1", END, "cold extrusion"),  # the first was heated, the second prints
+        (f"{START}\nM109 T1 S210\nM104 T1 S20\nT1", END, "cold extrusion"),
+        (START, f"T1\n{END}", "change of tool: T1, limit one tool: T0"),
+    ],
+)
+def test_heads_that_do_not_print_are_watched_too(start: str, end: str, said: str) -> None:
+    text = orca_job(start, end, **HEADS, machine_start_gcode="G28")
+    assert any(said in one for one in refused(text))
+
+
+@pytest.mark.parametrize("tool", ["T0", "T1"])
+def test_a_job_goes_on_with_the_head_that_printed(tool: str) -> None:
+    """regression: T0 was not taken, which lies in its dock after a power loss; others were heated
+    last."""
+    start = f"G28\nM190 S60\nM109 {tool} S210\n{tool}\nG90\nM83\nG92 E0"
+    beads = "G1 X100 E0.7 F1200\nG1 Y100 E0.7\nG1 X80 E0.7\nG1 Y80 E0.7"
+    part = "\n".join(
+        f";LAYER_CHANGE\n;Z:{0.2 * k:.1f}\nG1 X80 Y80 Z{0.2 * k:.1f} F6000\n{beads}"
+        for k in range(1, 11)
+    )
+    text = orca_job(start, END, part, **HEADS)
+    setup = own_setup(text).melting_all()
+    assert f"T{setup.printer.tool}" == tool
+    made = resume_at(Program(text, "marlin"), setup, z_mm=1.0)
+    lines = made.checked.program.text.split("\n")
+    taken, heated = lines.index(tool), lines.index("M109 S210")
+    assert lines.index("G28 X Y") < taken < heated
+
+
+def test_a_patch_is_laid_by_the_head_that_printed() -> None:
+    """regression: a tool changer's repair was printed by whichever head was taken, if any was."""
+    text = orca_job(f"{START}\nM109 T1 S210\nT1", END, **HEADS)
+    setup = own_setup(text).melting_all()
+    stands = Manifold.cube((16, 16, 3)).translate((90, 90, 0))
+    lacks = Manifold.cube((6, 6, 1)).translate((90, 90, 2))
+    field = HeightField.from_manifold(stands - lacks, 0.2, margin_mm=8.0)
+    grid = LayerGrid.from_setup(setup)
+    plan = slice_patch(lacks, setup, as_built=field, grid=grid, standalone=True)
+    lines = write(plan.toolpath, setup, title="x").text.split("\n")
+    heated = next(k for k, line in enumerate(lines) if line.startswith(("M104 S", "M109 S")))
+    assert lines.index("G28 X Y") < lines.index("T1") < heated
+    check(Program("\n".join(lines), "marlin"), setup, as_built=field)
+
+
+def test_a_head_that_a_job_leaves_hot_is_switched_off() -> None:
+    text = orca_job(f"{START}\nM104 T1 S180", END, **HEADS)
+    setup = own_setup(text).melting_all()
+    checked = check(Program(text, "marlin"), setup, policy=Policy.DANGER)
+    assert checked.report.added == ("M104 T1 S0",)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ("M4899 T3\nG1 X20", None),
+        ("M140 S60 Heatbed on", None),
+        ("M1000 S", "command unknown"),
+        ("M104 S210 B250", "temperature that the firmware chooses"),
+        ("M104 S200 S210", "word given twice"),
+    ],
+)
+def test_what_a_marlin_of_a_maker_s_own_passes_over_is_printed(
+    lines: str, said: str | None
+) -> None:
+    found = refused(orca_job(f"{START}\n{lines}", END, gcode_flavor="marlin"))
+    assert [said is not None and said in one for one in found] == [True] * (said is not None)
+
+
+@pytest.mark.parametrize(
+    ("changed", "more", "passes"),
+    [
+        (";;", "", True),
+        (";;", "G1 X80 Y80 Z0.2\nG1 X100 E0.7", False),  # it prints on
+        (";;", "G1 X80 Y80 Z0.2\nG1 X100 E0.7\nG28", False),
+        (";;machine_end_gcode", "", False),  # of the user's own making
+        (None, "", False),  # nobody tells
+    ],
+)
+def test_a_maker_s_end_script_may_home_a_machine_that_is_made_so(
+    changed: str | None, more: str, passes: bool
+) -> None:
+    """regression: 21 machines of Snapmaker and Qidi, which home Z away from the bed."""
+    told = {} if changed is None else {"different_settings_to_system": changed}
+    end = f"G0 Z6\nG28\n{more}\nM104 S0\nM140 S0"
+    found = refused(orca_job(START, end, gcode_flavor="marlin", **told))
+    assert [one for one in found if "homing Z onto a standing part" in one] == found
+    assert (not found) is passes
+
+
+def test_what_a_klipper_machine_s_motors_are_given_is_within_what_drivers_bear() -> None:
+    current = "SET_TMC_CURRENT STEPPER=extruder CURRENT="
+    assert refused(orca_job(f"{KLIPPER}\n{current}0.8", "print_end")) == []
+    assert any("current: 8 A" in one for one in refused(orca_job(f"{KLIPPER}\n{current}8", END)))
+
+
+def test_a_number_that_reprapfirmware_finds_on_its_card_is_a_macro() -> None:
+    assert refused(orca_job(f"{START}\nG1009 ; purge", END, **RRF)) == []
+    begins = 'M98 P"start_print.g" A105 C260\nG90\nM83'
+    assert refused(orca_job(begins, END, **RRF)) == []
+    (said,) = refused(orca_job(f"{START}\nM564 S0", END, **RRF))
+    assert "command unknown" in said
 
 
 BOX = "-100x-100,100x-100,100x100,-100x100"

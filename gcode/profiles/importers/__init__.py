@@ -21,11 +21,13 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
+from gcode.profiles.importers.macros import ends_homing, head_used, heads_of, macros_named
 from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
 from gcode.profiles.names import Kind, list_profiles
 from gcode.profiles.own_limits import own_fault
+from gcode.profiles.round_beds import kept_on
 from gcode.profiles.schema import PrinterProfile
 from gcode.profiles.store import MODELS, content_of
 
@@ -60,8 +62,10 @@ ASK_FOR = (
 )
 """Keys of a printer that are another machine's until somebody measures or writes them."""
 # How far off the bed that a slicer knows its printers' own scripts go to purge, wipe and park:
-# 12.6 mm at most, of 118 presets of 19 makers (PrusaSlicer's bundles).
-OFF_BED_MM = 15.0
+# 20 mm at most, of 118 presets of PrusaSlicer's and 329 of OrcaSlicer's (Bambu Lab's left out).
+OFF_BED_MM = 20.0
+# All-metal hotends are sold up to 300 °C, beds up to 120 °C (E3D's V6, Prusa's and Voron's).
+MOST_HOTEND_C, MOST_BED_C = 300.0, 120.0
 BED_EDGE_MM = 5.0
 """How far from the bed's edge an inherited place is kept."""
 
@@ -85,12 +89,18 @@ class ImportedFile:
 
 
 def import_profiles(
-    path: Path, *, preset: str | None = None, inherits: str | None = None
+    path: Path,
+    *,
+    preset: str | None = None,
+    inherits: str | None = None,
+    text: str | None = None,
 ) -> ImportedFile:
     """Read another program's profile.
 
     Parameters
     ----------
+    text
+        The file's, where it is known: a binary job's (`gcode.reader.binary`).
     preset
         Which preset of a PrusaSlicer bundle, as `print:NAME`.
     inherits
@@ -104,11 +114,12 @@ def import_profiles(
     ProfileError
         If a value is outside what our profiles allow.
     """
-    try:
-        kind = "replace" if path.suffix.lower() in JOB_SUFFIXES else "strict"
-        text = path.read_text(encoding="utf-8-sig", errors=kind)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text ({error}).") from error
+    if text is None:
+        try:
+            kind = "replace" if path.suffix.lower() in JOB_SUFFIXES else "strict"
+            text = path.read_text(encoding="utf-8-sig", errors=kind)
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path} cannot be read as text ({error}).") from error
     if path.suffix.lower() in JOB_SUFFIXES:
         found = import_job(str(path), text, inherits=inherits)
         if found is None:
@@ -130,6 +141,7 @@ def import_profiles(
         notes += filter(None, [bed_note(made[0])])
     for profile in made:
         notes += _settle(profile)
+        _add_named(profile, source)
         _validate(path, profile)
     return ImportedFile(str(path), made, left, tuple(notes))
 
@@ -161,7 +173,11 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
     notes, more = [], list(left)
     for profile in made:
         notes += _settle(profile)
+        _add_named(profile, source)
+        if profile.values.get("heads", 1) > 1:
+            profile.values["tool"] = min(head_used(text), profile.values["heads"] - 1)
         more += _within_range(profile)
+    _as_hot_as_told(*made[:2])
     return ImportedFile(name, made, tuple(more), tuple(notes))
 
 
@@ -230,14 +246,42 @@ def _settle(made: Imported) -> list[str]:
     return notes
 
 
+def _add_named(made: Imported, source: Source) -> None:
+    """What a preset's scripts name is the machine's: its heads, and its macros."""
+    if made.kind != "printers":
+        return
+    if ends_homing(source.values):
+        made.values["ends_homing"] = True
+    heads, one_nozzle = heads_of(source.values)
+    if heads > 1:
+        made.values |= {"heads": heads, "one_nozzle": one_nozzle}
+    content = {**content_of(made.kind, made.inherits), **made.values}
+    named = macros_named(source.values, content["dialect"])
+    known = {macro.split(maxsplit=1)[0].upper() for macro in content.get("macros", ())}
+    if set(named) - known:
+        made.values["macros"] = [*content.get("macros", ()), *sorted(set(named) - known)]
+
+
+def _as_hot_as_told(printer: Imported, material: Imported) -> None:
+    """A limit that is nobody's measurement yields to what the job's own filament is printed at."""
+    if printer.inherits not in _GENERIC_IDS:
+        return
+    above = content_of(printer.kind, printer.inherits)
+    for key, asked, most_c in (
+        ("max_hotend_c", ("hotend_c", "first_layer_hotend_c"), MOST_HOTEND_C),
+        ("max_bed_c", ("bed_c",), MOST_BED_C),
+    ):
+        told_c = max(material.values.get(one, 0.0) for one in asked)
+        if key not in printer.values and above[key] < told_c <= most_c:
+            printer.values[key] = told_c
+
+
 def _on_the_bed(place_mm: Sequence[float], bed: Mapping[str, Any]) -> list[float]:
     """A place that was told from the corner of another machine's bed, kept on this one."""
     corner, size = np.array(bed["bed_min_mm"]), np.array(bed["bed_size_mm"])
     at = corner + np.minimum(place_mm[:2], size - BED_EDGE_MM)
-    middle, radii = corner + 0.5 * size, 0.5 * size - BED_EDGE_MM
-    out = float(np.linalg.norm((at - middle) / radii))
-    if bed["delta"] and out > 1.0:
-        at = middle + (at - middle) / out
+    if bed["delta"]:
+        at = np.array(kept_on(at.tolist(), corner.tolist(), size.tolist(), BED_EDGE_MM))
     x_mm, y_mm = at.round(3).tolist()
     return [x_mm, y_mm, min(place_mm[2], bed["max_z_mm"])]
 

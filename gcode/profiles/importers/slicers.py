@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import configparser
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ _PATTERN = choice(
 
 def _axes(machine_speed: str) -> dict[str, Rule]:
     return {
-        f"machine_max_{theirs}_{axis}": Rule("printers", f"{ours}.{axis}", number)
+        f"machine_max_{theirs}_{axis}": Rule("printers", f"{ours}.{axis}", limit)
         for theirs, ours in (
             (machine_speed, "max_speed_mm_s"),
             ("acceleration", "max_acceleration_mm_s2"),
@@ -173,7 +174,7 @@ _PRUSA_KINDS: dict[str, Kind] = {
     "filament": "materials",
     "print": "processes",
 }
-_PRUSA_NAMES: dict[str, Kind] = {
+PROFILE_NAMES: dict[str, Kind] = {
     "printer_settings_id": "printers",
     "filament_settings_id": "materials",
     "print_settings_id": "processes",
@@ -198,6 +199,7 @@ _ORCA_KINDS: dict[str, Kind] = {
     "filament": "materials",
     "process": "processes",
 }
+_LIBRARY = "OrcaFilamentLibrary"  # the vendor from whose presets all others may inherit
 # Which part of an exported configuration is there, told by keys that each part always has.
 _TELLTALES: dict[str, Kind] = {
     "bed_shape": "printers",
@@ -231,7 +233,7 @@ def read_prusa(path: Path, text: str, preset: str | None) -> Source:
                 f"{path} has none of {', '.join(_TELLTALES)}; export it by PrusaSlicer's "
                 f"File, Export, Export Config."
             )
-        return Source(path.stem, kinds, values, _PRUSA_NAMES, REASONS)
+        return Source(path.stem, kinds, values, PROFILE_NAMES, REASONS)
     if preset not in presets:
         shown = ", ".join(repr(name) for name in presets if "*" not in name)
         raise InputError(
@@ -271,7 +273,7 @@ def read_orca(path: Path, text: str, chain: tuple[Path, ...] = ()) -> Source:
         content = json.loads(text)
     except ValueError as error:
         raise InputError(f"{path} is no valid JSON ({error}).") from error
-    kind = _ORCA_KINDS.get(str(content.get("type"))) if isinstance(content, dict) else None
+    kind = _orca_kind(path, content) if isinstance(content, dict) else None
     if kind is None:
         raise InputError(
             f"{path} is no OrcaSlicer preset: its 'type' is none of {', '.join(_ORCA_KINDS)}."
@@ -284,12 +286,24 @@ def read_orca(path: Path, text: str, chain: tuple[Path, ...] = ()) -> Source:
         above = read_orca(parent, parent.read_text(encoding="utf-8"), (*chain, path))
         values = {**above.values, **values}
         del values["inherits"]
-    del values["type"]
+    values.pop("type", None)
     missing = {
         "inherits": "its parent is neither beside the file nor among its slicer's presets: what "
         "that sets is not known here"
     }
     return Source(path.stem, (kind,), values, {"name": kind}, {**REASONS, **missing})
+
+
+def _orca_kind(path: Path, content: Mapping[str, Any]) -> Kind | None:
+    """What a preset describes: as it says, by its settings, by the folder that it lies in.
+
+    Those that come with the slicer have a `type`; what a user saves has none.
+    """
+    if "type" in content:
+        return _ORCA_KINDS.get(str(content["type"]))
+    named = next((kind for key, kind in PROFILE_NAMES.items() if key in content), None)
+    folders = (_ORCA_KINDS[part] for part in reversed(path.parts[:-1]) if part in _ORCA_KINDS)
+    return named or next(folders, None)
 
 
 def _parent_file(path: Path, name: str) -> Path | None:
@@ -303,10 +317,25 @@ def _parent_file(path: Path, name: str) -> Path | None:
     beside = path.parent / f"{name}.json"
     if beside.is_file():
         return beside
-    for folder in path.resolve().parents:
-        if folder.name in {"user", "system"}:
-            return next(iter(sorted((folder.parent / "system").glob(f"**/{name}.json"))), None)
+    for folder in _kept_in(path):
+        found = sorted(folder.rglob(f"{escape(name)}.json"))
+        if found:
+            return found[0]
     return None
+
+
+def _kept_in(path: Path) -> Iterator[Path]:
+    """Where presets of that kind are: the vendor's own first, then all vendors'."""
+    above = path.resolve().parents
+    kind = next((folder for folder in above if folder.name in _ORCA_KINDS), None)
+    if kind is not None:
+        yield kind
+    for folder in above:
+        if folder.name in {"user", "system", "profiles"}:
+            everyones = folder if folder.name == "profiles" else folder.parent / "system"
+            found = everyones.glob(f"*/{kind.name if kind else '*'}")
+            yield from sorted(found, key=lambda one: (one.parent.name != _LIBRARY, one))
+            return
 
 
 def _text(value: Any) -> str:
