@@ -14,6 +14,7 @@ from gcode.check import Policy, check, find_refusals
 from gcode.firmware import FirmwareCore
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
+from gcode.profiles.importers.macros import macros_named
 from gcode.profiles.own_settings import own_settings, printer_of_words
 from gcode.resumption import resume_at
 from gcode.slicing.layers import LayerGrid
@@ -469,3 +470,8 @@ def test_a_delta_s_job_is_checked_with_its_limits() -> None:
     assert check(program, setup, policy=Policy.DANGER).report.warnings == ()
     beyond = Program(text.replace("X100 E0.7", "X130 E0.7", 1), setup.printer.dialect)
     assert find_refusals(beyond, setup, policy=Policy.DANGER)
+
+
+def test_a_script_makes_no_macro_of_what_klipper_itself_gives_a_meaning_to() -> None:
+    script = "CLEAN_NOZZLE\\nZ_ENDSTOP_CALIBRATE\\nFORCE_MOVE STEPPER=x\\nSAVE_CONFIG\\nM206 Z1"
+    assert macros_named({"machine_start_gcode": script}, "klipper") == ("CLEAN_NOZZLE",)
