@@ -71,6 +71,33 @@ TOOLS = {
     "slot, wider": _box((4.0, 16.0, 20.0), (20.0, 9.0, 9.5)),
     "shallow slot": _box((1.6, 16.0, 20.0), (20.0, 9.0, 11.0)),
 }  # fmt: skip
+# parts with nothing under the middle of what is cut away, and the cut
+BORE = Solid.cylinder(34.0, 5.0, 5.0, 96).rotate((-90.0, 0.0, 0.0)).translate((22.0, 0.0, 6.5))
+OVER_AIR = {
+    "roof of a bore": (
+        _box(SIZE_MM, (0.0, 0.0, 0.0)) - BORE, _box((14.0, 34.0, 9.0), (15.0, 0.0, 10.2)),
+    ),
+    "lintel": (
+        _box((44.0, 5.0, 14.0), (0.0, 14.0, 0.0)) - _box((14.0, 5.0, 7.0), (15.0, 14.0, 3.0)),
+        _box((30.0, 5.0, 9.0), (7.0, 14.0, 10.0)),
+    ),
+    "plate on two legs": (
+        _box((26.0, 16.0, 12.0), (9.0, 9.0, 0.0)) - _box((18.0, 16.0, 10.0), (13.0, 9.0, 0.0)),
+        _box((26.0, 16.0, 9.0), (9.0, 9.0, 10.0)),
+    ),
+    "hole in a lid": (
+        _box((30.0, 30.0, 10.0), (7.0, 2.0, 0.0)) - _box((26.0, 26.0, 7.6), (9.0, 4.0, 1.0)),
+        Solid.cylinder(9.0, 5.0, 5.0, 96).translate((22.0, 17.0, 5.0)),
+    ),
+    "lid": (
+        _box((20.0, 20.0, 10.0), (12.0, 7.0, 0.0)) - _box((12.0, 12.0, 7.6), (16.0, 11.0, 1.0)),
+        _box((18.0, 18.0, 9.0), (13.0, 8.0, 8.6)),
+    ),
+    "span of 34 mm": (
+        _box((42.0, 16.0, 12.0), (1.0, 9.0, 0.0)) - _box((34.0, 16.0, 10.0), (5.0, 9.0, 0.0)),
+        _box((42.0, 16.0, 9.0), (1.0, 9.0, 10.0)),
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,8 +115,8 @@ def case_of(name: str) -> Case | None:
         part, kind, seed = name.split(":")
         cut = make_cut(part, kind, int(seed))
         return None if cut is None else Case(cut.whole, cut.rest, cut.piece)
-    block = Solid.cube(SIZE_MM).translate(AT_MM)
-    tool = TOOLS[name].translate(AT_MM)
+    solid, tool = OVER_AIR[name] if name in OVER_AIR else (Solid.cube(SIZE_MM), TOOLS[name])
+    block, tool = solid.translate(AT_MM), tool.translate(AT_MM)
     return Case(block, block - tool, block ^ tool)
 
 
@@ -114,7 +141,7 @@ def run(name: str, setup: PrintSetup, cell_mm: float, *, along_job: bool) -> dic
     )  # fmt: skip
     spent_s = time.process_time() - start_s
     program = write(plan.toolpath, setup, title="bench", resume=None, restore=False)
-    refused = find_refusals(program, setup, as_built=as_built)
+    refused = find_refusals(program, setup, as_built=as_built, patch=True)
     verdict = judge(
         program.text,
         mesh_of(case.rest),
@@ -179,7 +206,7 @@ HEADER = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    every = [*TOOLS, *(":".join(map(str, real)) for real in REAL)]
+    every = [*TOOLS, *OVER_AIR, *(":".join(map(str, real)) for real in REAL)]
     parser.add_argument("--cases", nargs="+", default=every)
     parser.add_argument("--printers", nargs="+", default=PRINTERS, choices=PRINTERS)
     parser.add_argument("--cell-mm", type=float, default=CELL_MM)

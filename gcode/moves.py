@@ -25,6 +25,7 @@ class Role(StrEnum):
     TOP_SOLID_INFILL = "Top solid infill"
     SPARSE_INFILL = "Internal infill"
     GAP_FILL = "Gap fill"
+    BRIDGE = "Bridge infill"
     CUSTOM = "Custom"
 
 

@@ -311,7 +311,7 @@ def _checked(
         plan.patch.toolpath, site.setup, title=title, resume=interruption, restore=False
     )
     try:
-        checked = check(program, site.setup, as_built=as_built, initial=interruption)
+        checked = check(program, site.setup, as_built=as_built, initial=interruption, patch=True)
     except CheckRefusedError as error:
         if strict:
             raise

@@ -51,8 +51,9 @@ class LeftPart:
     Attributes
     ----------
     key
-        `left_reach`, `left_bead` or `left_covered`: out of the head's reach; too small for a bead,
-        or with nothing that holds one; under what stands above it.
+        `left_reach`, `left_bead`, `left_covered` or `left_span`: out of the head's reach; too small
+        for a bead, or with nothing that holds one; under what stands above it; over a gap too wide
+        for a bridge.
     shape
         As columns, the surface of all of them.
     """

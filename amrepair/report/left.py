@@ -13,6 +13,7 @@ LEFT_KEYS = {
     LeftCause.OUT_OF_REACH: "left_reach",
     LeftCause.NO_BEAD: "left_bead",
     LeftCause.COVERED: "left_covered",
+    LeftCause.TOO_LONG: "left_span",
 }
 # Corners of a box, bits of which are X, Y, Z; faces counter-clockwise from outside.
 CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])

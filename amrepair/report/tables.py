@@ -18,6 +18,7 @@ LEFT_CAUSES = {
     "left_reach": "out of the head's reach",
     "left_bead": "no bead fits, or nothing holds one",
     "left_covered": "under what stands above it",
+    "left_span": "over a gap too wide for a bridge",
 }
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from gcode.check.contact import Contact, contact_of
 from gcode.check.findings import Moves, Policy, Refusal, Text, Touch
+from gcode.check.hanging import hanging
 from gcode.check.proof import CheckedProgram, CheckReport, _prove
 from gcode.check.rules import Judge
 from gcode.check.sweep import sweep
@@ -56,9 +57,12 @@ def find_refusals(
     as_built: HeightField | None = None,
     initial: ModalState | None = None,
     policy: Policy = Policy.STRICT,
+    patch: bool = False,
 ) -> tuple[Refusal, ...]:
     """Everything that speaks against printing a program, in its order; see `check`."""
-    return judge(program, setup, as_built=as_built, initial=initial, policy=policy).refusals
+    return judge(
+        program, setup, as_built=as_built, initial=initial, policy=policy, patch=patch
+    ).refusals
 
 
 def check(
@@ -70,6 +74,7 @@ def check(
     policy: Policy = Policy.STRICT,
     leave_heaters: bool = False,
     touches: tuple[Touch, ...] = (),
+    patch: bool = False,
     progress: Progress = silent,
 ) -> CheckedProgram:
     """Judge a program.
@@ -90,6 +95,8 @@ def check(
         The program may leave its heaters on.
     touches
         Where the program may feel for what stands there (G38.2), and how deep; nowhere else.
+    patch
+        It fills something in `as_built`: what it lays over air is judged as well.
 
     Raises
     ------
@@ -108,7 +115,7 @@ def check(
     """
     verdict = judge(
         program, setup, as_built=as_built, initial=initial, policy=policy,
-        leave_heaters=leave_heaters, touches=touches, progress=progress,
+        leave_heaters=leave_heaters, touches=touches, patch=patch, progress=progress,
     )  # fmt: skip
     refusals = verdict.refusals
     if refusals:
@@ -129,6 +136,7 @@ def judge(
     policy: Policy = Policy.STRICT,
     leave_heaters: bool = False,
     touches: tuple[Touch, ...] = (),
+    patch: bool = False,
     progress: Progress = silent,
 ) -> Verdict:
     """What `check` goes by, for whoever wants to know and not to print."""
@@ -164,6 +172,8 @@ def judge(
         hits, clearance_mm = sweep(one.moves, text, setup.printer, as_built)
         progress("sweep", 1.0, 1.0)
         refusals += hits
+        if patch:
+            refusals += hanging(one.moves, text, setup, as_built)
         if hits:
             contact = contact_of(hits[0], one.moves, setup.printer, as_built)
     refusals.sort(key=lambda refusal: refusal.line)

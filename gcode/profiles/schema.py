@@ -319,6 +319,11 @@ class MaterialProfile(_Profile):
     max_volumetric_mm3_s: Positive
     shrinkage_ratio: Annotated[float, Field(ge=0, le=0.1)] = 0.0
     repair_first_bead_delta_c: Annotated[float, Field(ge=0, le=30)] = 0.0
+    # the longest strand over air: OrcaSlicer's `max_bridge_length`, beyond which it supports them
+    max_bridge_mm: Annotated[float, Field(ge=0, le=100)] = 10.0
+    # one of length L sags by this times L²: 3D Orchard's table of gaps, up to 0.2 mm at 20 mm
+    bridge_sag_per_mm: Annotated[float, Field(ge=0, le=0.01)] = 0.0005
+    bridge_fan_ratio: Ratio | None = None  # over air; as ever where left out
 
 
 class ProcessProfile(_Profile):
@@ -340,6 +345,7 @@ class ProcessProfile(_Profile):
     solid_infill_speed_mm_s: Positive
     first_layer_speed_mm_s: Positive
     repair_speed_mm_s: Positive
+    bridge_speed_mm_s: Positive | None = None  # of strands over air; a repair's where left out
     acceleration_mm_s2: Positive
     infill_overlap_ratio: Ratio = 0.15
     max_gap_layers: Annotated[float, Field(ge=1, le=4)] = 2.0

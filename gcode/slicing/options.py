@@ -110,6 +110,37 @@ class DueOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class BridgeOptions:
+    """Strands over air, held at both ends; how long they may be is the material's.
+
+    Attributes
+    ----------
+    hold_mm
+        A line's width: as far a strand goes on over what holds its end (as PrusaSlicer's anchors).
+    loose_mm
+        Over so much of a span nothing may be wanted: a scan rounds off the rims of what holds.
+    least_layers
+        A strand thinner than this share of a layer is drawn out, not laid: the next pass spans it.
+    least_mm2
+        Less of a hollow is not worth a strand: what hangs beside its rim closes it.
+    beside_mm
+        Of the job's own lines: nearer than this to what is as high they are held from beside.
+    pressed_mm
+        The same of lines of our own, which are pressed against those beside them.
+    alike
+        Angles whose strands span the same but for this share: the shorter ones are laid.
+    """
+
+    hold_mm: float = 0.45
+    loose_mm: float = 0.3
+    least_layers: float = 0.5
+    least_mm2: float = 1.0
+    beside_mm: float = 0.5
+    pressed_mm: float = 0.8
+    alike: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
 class BeadOptions:
     """Beads of a pass.
 
@@ -313,6 +344,7 @@ class PatchOptions:
     columns: ColumnOptions = field(default_factory=ColumnOptions)
     heights: PassHeightOptions = field(default_factory=PassHeightOptions)
     due: DueOptions = field(default_factory=DueOptions)
+    bridges: BridgeOptions = field(default_factory=BridgeOptions)
     beads: BeadOptions = field(default_factory=BeadOptions)
     lines: JobLineOptions = field(default_factory=JobLineOptions)
     skin: SkinOptions = field(default_factory=SkinOptions)

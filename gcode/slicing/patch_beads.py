@@ -52,6 +52,14 @@ class Chain:
         """A point of it, halfway among its points."""
         return self.xy_mm[len(self.xy_mm) // 2]
 
+    def part(self, a: int, b: int) -> Chain:
+        """From one of its points to another."""
+        cold = None if self.cold is None else self.cold[a:b]
+        to = slice(a, b + 1)
+        return Chain(
+            self.xy_mm[to], self.z_mm[to], self.section_mm2[a:b], self.deep_mm[a:b], self.role, cold
+        )
+
     def reversed(self) -> Chain:
         """The same from its other end."""
         return replace(
@@ -237,9 +245,8 @@ def _by_lines(
     One line has four columns across it, the next one five: that is no reason to lay less of it.
     The total stays what it is. What lies beside the lines is added to the nearest as it is.
     """
-    under = np.flatnonzero(
-        job.over & beside_runs(runs, job.half_mm + model.options.beads.on_line_mm, model)
-    )
+    lines_mm, within_mm = [run.xy_mm for run in runs], job.half_mm + model.options.beads.on_line_mm
+    under = np.flatnonzero(job.over & beside_runs(lines_mm, within_mm, model))
     of_piece = shares.tree.query(model.points_mm[under])[1]
     number = np.bincount(of_piece, minlength=shares.tree.n)
     deep = np.bincount(of_piece, thick.ravel()[under], minlength=shares.tree.n)
@@ -250,10 +257,13 @@ def _by_lines(
     return (own + extra) * (float(volume_mm3.sum()) / whole_mm3 if whole_mm3 > 0 else 1.0)
 
 
-def beside_runs(runs: list[Bead], within_mm: float, model: PatchModel) -> Bool[np.ndarray, "ny nx"]:
-    """Columns whose middles lie no farther from a run."""
-    start = np.concatenate([run.xy_mm[:-1] for run in runs])
-    end = np.concatenate([run.xy_mm[1:] for run in runs])
+def beside_runs(
+    runs_mm: list[Float[np.ndarray, "_n 2"]], within_mm: float, model: PatchModel
+) -> Bool[np.ndarray, "ny nx"]:
+    """Columns whose middles lie no farther from a run of points."""
+    if not runs_mm:
+        return np.zeros(model.shape, dtype=bool)
+    start, end = (np.concatenate([xy[to] for xy in runs_mm]) for to in (slice(-1), slice(1, None)))
     within, level = np.full(len(start), within_mm), np.zeros(len(start))
     over = raster_kernels.beside_lines(
         start, end, within, level, model.origin_mm, model.cell_mm, *model.shape
@@ -280,16 +290,7 @@ def _split(chain: Chain, options: PatchOptions) -> list[Chain]:
     """Drop the pieces where there is nothing to lay."""
     keep = np.concatenate([[False], chain.section_mm2 > options.beads.least_section_mm2, [False]])
     edges = np.flatnonzero(np.diff(keep.astype(np.int8)))
-    return [
-        Chain(
-            chain.xy_mm[a : b + 1],
-            chain.z_mm[a : b + 1],
-            chain.section_mm2[a:b],
-            chain.deep_mm[a:b],
-            chain.role,
-        )
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
+    return [chain.part(a, b) for a, b in zip(*(edges[k::2].tolist() for k in (0, 1)), strict=True)]
 
 
 def contour(mask: Bool[np.ndarray, "ny nx"], model: PatchModel) -> Any:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from gcode.slicing.patch_free import ROUNDING_MM
+from gcode.slicing.patch_bridges import Bridges, bridges_at
+from gcode.slicing.patch_free import ROUNDING_MM, beside
 from gcode.slicing.patch_heights import Height
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_state import PatchState
@@ -18,21 +19,26 @@ from gcode.slicing.patch_state import PatchState
 class Due:
     """Thickness to lay by column, what is given up below where it is laid, and where in the air.
 
-    What `hangs` is as high as the nozzle once it is laid, whatever lies open below.
+    What `hangs` is as high as the nozzle once it is laid, whatever lies open below; `bridges` sag.
+    What is `loose` fell onto the floor: it fills, but holds nothing. What is `alone` no line of our
+    own would be held over, the job's might.
     """
 
     thick_mm: Float[np.ndarray, "ny nx"]
     sunk_mm: Float[np.ndarray, "ny nx"]
     hem: Bool[np.ndarray, "ny nx"]
     hangs: Bool[np.ndarray, "ny nx"]
+    loose: Bool[np.ndarray, "ny nx"]
+    bridges: Bridges
+    alone: Bool[np.ndarray, "ny nx"]
 
 
 def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
     """Thickness to lay by column now: the gap, where waiting would make it too deep for a bead.
 
-    Where it is too deep already (the nozzle could not get down there), a layer is drawn over it
-    as far as a bead holds on to what stands beside it, or falls onto the floor; what lies under it
-    is lost, and said.
+    Where it is too deep already (the nozzle could not get down there), a layer is drawn over it:
+    where strands span it between two holds, and else as far as a bead holds on to what is beside,
+    or falls onto the floor. What lies under it is lost, and said.
     """
     options = model.options
     below = model.wanted_below(at.z_mm)
@@ -52,7 +58,30 @@ def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
     )
     # a slope is cut in mid-layer, as slicers do: what ends below stays a step of half a layer
     active &= state.planar_top_mm > at.z_mm - 0.5 * at.layer_mm
-    return _lidded(model, at, thick, active, active & (gap > at.deep_mm), gap, at.layer_mm)
+    due = _lidded(model, state, at, thick, active, active & (gap > at.deep_mm), gap, at.layer_mm)
+    holds = _ends_hold(model, state, at, gap)
+    alone = active & ((due.thick_mm <= 0) | due.loose)
+    bridges = bridges_at(model, at, thick, active, gap, holds, alone)
+    return _bridged(due, bridges, np.minimum(gap, wanted), at)
+
+
+def _ends_hold(
+    model: PatchModel, state: PatchState, at: Height, over_mm: Float[np.ndarray, "ny nx"]
+) -> Bool[np.ndarray, "ny nx"]:
+    """Where what is under the tip is about as high as a layer, and has not fallen there."""
+    return (over_mm <= at.most_mm) & (over_mm >= -model.options.due.agree_mm) & ~state.loose
+
+
+def _bridged(due: Due, bridges: Bridges, thick: Float[np.ndarray, "ny nx"], at: Height) -> Due:
+    """With strands over air: they take the place of what hangs or falls there."""
+    lidded = np.where(thick > at.most_mm, at.layer_mm, thick)
+    return replace(
+        due,
+        thick_mm=np.where(bridges.over | bridges.ends, lidded, due.thick_mm),
+        sunk_mm=np.where(bridges.over, thick - lidded, due.sunk_mm),
+        loose=due.loose & ~bridges.over,
+        bridges=bridges,
+    )
 
 
 def due_of_job(
@@ -86,8 +115,18 @@ def due_of_job(
     # over what the job left open a strand has room to be round, and takes the place of lower ones
     open_below = at.z_mm - state.surface_mm > gap + options.due.agree_mm
     most_mm = np.where(open_below, at.most_mm, at.layer_mm)
-    due = _lidded(model, at, thick, active, deep & active, gap, most_mm)
-    return replace(due, hangs=due.hangs | open_below)
+    due = _lidded(model, state, at, thick, active, deep & active, gap, most_mm)
+    due = replace(due, hangs=due.hangs | open_below)
+    # where the job's lines find no hold, or span too much, strands of our own may
+    over_mm = at.z_mm - state.surface_mm
+    air = (due.thick_mm > 0) & (over_mm > at.deep_mm)
+    if not air.any():
+        return due
+    below = (over_mm <= at.deep_mm) & ~state.loose
+    alone = air & ~_held(model, below, air, model.free_at(at.reach))
+    holds = _ends_hold(model, state, at, over_mm)
+    bridges = bridges_at(model, at, due.thick_mm, due.thick_mm > 0, over_mm, holds, alone)
+    return replace(due, bridges=bridges, alone=alone & ~bridges.over)
 
 
 def _gone_at(model: PatchModel, at: Height) -> Bool[np.ndarray, "ny nx"]:
@@ -133,6 +172,7 @@ def hemmed(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
 
 def _lidded(
     model: PatchModel,
+    state: PatchState,
     at: Height,
     thick: Float[np.ndarray, "ny nx"],
     active: Bool[np.ndarray, "ny nx"],
@@ -147,42 +187,42 @@ def _lidded(
     near enough it lies under the nozzle all the same. Counted is only what that holds, wherever
     it comes to lie, so that none of it is too much.
     """
-    options = model.options
     sunk = np.zeros(model.shape)
+    loose = np.zeros(model.shape, dtype=bool)
     if deep.any():
-        # from the edge of what holds it, not from the middle of its last column
-        hang_mm = options.due.hold_mm + 0.5 * model.cell_mm
         holds = (active & ~deep) | (gap < at.most_mm)
-        held = beside(holds, deep, hang_mm, model.cell_mm)
-        blocked = ~model.free_at(at.reach)
-        held |= beside(holds & blocked, deep, hang_mm + options.beads.to_wall_mm, model.cell_mm)
+        free = model.free_at(at.reach)
+        firm = _held(model, holds & ~state.loose, deep, free)
+        held = firm | _held(model, holds & state.loose, deep, free)
         falls = deep & (gap <= model.drop_mm)
-        held |= falls & beside(~blocked, falls, model.spread_mm, model.cell_mm)
+        held |= falls & beside(free, falls, model.spread_mm, model.cell_mm)
+        loose = held & ~firm
         lidded = np.minimum(thick, most_mm)
         sunk = np.where(deep & held, thick - lidded, 0.0)
         thick = np.where(deep & held, lidded, thick)
         active = active & (~deep | held)
     nowhere = np.zeros(model.shape, dtype=bool)
-    return Due(np.where(active, thick, 0.0), sunk, nowhere, hangs=gap > at.deep_mm)
-
-
-def beside(
-    what: Bool[np.ndarray, "ny nx"],
-    asked: Bool[np.ndarray, "ny nx"],
-    within_mm: float,
-    cell_mm: float,
-) -> Bool[np.ndarray, "ny nx"]:
-    """Which columns lie within a distance of others; found for those asked about at least."""
-    near = np.zeros_like(what)
-    if not asked.any():
-        return near
-    margin = int(np.ceil(within_mm / cell_mm)) + 1
-    rows, columns = (
-        slice(max(int(at.min()) - margin, 0), int(at.max()) + margin + 1) for at in asked.nonzero()
+    thick, none = np.where(active, thick, 0.0), Bridges.none(model)
+    return Due(
+        thick, sunk, nowhere, hangs=gap > at.deep_mm, loose=loose, bridges=none, alone=nowhere
     )
-    apart = ndimage.distance_transform_edt(~what[rows, columns])
-    near[rows, columns] = apart * cell_mm <= within_mm + 1e-9
-    return near
+
+
+def _held(
+    model: PatchModel,
+    holds: Bool[np.ndarray, "ny nx"],
+    asked: Bool[np.ndarray, "ny nx"],
+    free: Bool[np.ndarray, "ny nx"],
+) -> Bool[np.ndarray, "ny nx"]:
+    """Of the columns asked about, those over which a bead holds on to what is beside."""
+    options = model.options
+    if not holds.any():
+        return np.zeros_like(asked)
+    # from the edge of what holds it, not from the middle of its last column
+    hang_mm = options.due.hold_mm + 0.5 * model.cell_mm
+    held = beside(holds, asked, hang_mm, model.cell_mm)
+    held |= beside(holds & ~free, asked, hang_mm + options.beads.to_wall_mm, model.cell_mm)
+    return held & asked
 
 
 def strips_along_walls(

@@ -164,3 +164,22 @@ def surely_free(
 ) -> Bool[np.ndarray, " n"]:
     """Whether the nozzle may be there, whichever way the text's last digit is rounded."""
     return _free_along(points_mm, points_mm, np.zeros(1), free, reach)
+
+
+def beside(
+    what: Bool[np.ndarray, "ny nx"],
+    asked: Bool[np.ndarray, "ny nx"],
+    within_mm: float,
+    cell_mm: float,
+) -> Bool[np.ndarray, "ny nx"]:
+    """Which columns lie within a distance of others; found for those asked about at least."""
+    near = np.zeros_like(what)
+    if not asked.any():
+        return near
+    margin = int(np.ceil(within_mm / cell_mm)) + 1
+    rows, columns = (
+        slice(max(int(at.min()) - margin, 0), int(at.max()) + margin + 1) for at in asked.nonzero()
+    )
+    apart = ndimage.distance_transform_edt(~what[rows, columns])
+    near[rows, columns] = apart * cell_mm <= within_mm + 1e-9
+    return near

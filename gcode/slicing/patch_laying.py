@@ -163,20 +163,39 @@ def emit(
     # along a surface they are in order: the lowest first
     chains = _walls_last(one.chains, pen.position_mm[:2]) if planar else one.chains
     for chain in chains:
+        _blow(pen, setup, over_air=chain.role is Role.BRIDGE)
         _go_to(pen, np.array([*chain.xy_mm[0], chain.z_mm[0]]), one, reach, model, setup)
         deep_mm = float(chain.deep_mm.mean())
         points_mm = np.column_stack([chain.xy_mm, chain.z_mm])
-        for a, b, slow in _stretches(chain, first=first):
+        for a, b, slow in _stretches(chain, first=first and chain.role is not Role.BRIDGE):
             pen.extrude(
                 points_mm[a : b + 1],
                 chain.section_mm2[a:b],
-                speed_mm_s=_first_mm_s(setup) if slow else setup.process.repair_speed_mm_s,
+                speed_mm_s=_first_mm_s(setup) if slow else _mm_s(chain.role, setup),
                 role=chain.role,
                 width_mm=width_of(float(chain.section_mm2.mean()) / deep_mm, deep_mm),
                 height_mm=deep_mm,
             )
         laid_mm3 += chain.volume_mm3
+    _blow(pen, setup, over_air=False)
     return laid_mm3
+
+
+def _mm_s(role: Role, setup: PrintSetup) -> float:
+    """How fast a bead is laid that does not lie on what has long been cold."""
+    process = setup.process
+    if role is Role.BRIDGE and process.bridge_speed_mm_s is not None:
+        return process.bridge_speed_mm_s
+    return process.repair_speed_mm_s
+
+
+def _blow(pen: Pen, setup: PrintSetup, *, over_air: bool) -> None:
+    """Cool as what comes next needs it: strands over air set before they sag."""
+    ordinary = setup.material.fan_ratio
+    ratio = setup.material.bridge_fan_ratio if over_air else ordinary
+    last = next((move.ratio for move in reversed(pen.moves) if isinstance(move, SetFan)), ordinary)
+    if ratio is not None and ratio != last:
+        pen.add(SetFan(ratio))
 
 
 def _stretches(chain: Chain, *, first: bool) -> Iterator[tuple[int, int, bool]]:

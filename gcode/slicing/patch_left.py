@@ -46,6 +46,8 @@ class LeftCause(enum.IntEnum):
     """The head would touch what stands beside it."""
     COVERED = 2
     """Something stands above it."""
+    TOO_LONG = 3
+    """Nothing is below it, and a bridge over it would be longer than the material bears."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,10 +142,12 @@ def left_over(
         if stuck_mm3 <= options.left.least_listed_mm3:
             continue
         ended = NOT_CLOSED if given_up[cells].any() else ""
-        for reason, part in _causes(state, model, kinds, cells, left[cells], apart=not ended):
+        for cause, reason, part in _causes(
+            state, model, kinds, cells, left[cells], apart=not ended
+        ):
             cause_mm3 = volume_mm3 * (1.0 - share) * part
-            if reason is None:
-                lost.append(Unprintable(cause_mm3, box, TOO_SMALL))
+            if cause in (LeftCause.NO_BEAD, LeftCause.TOO_LONG):
+                lost.append(Unprintable(cause_mm3, box, reason))
             else:
                 unreachable.append(Unreachable(cause_mm3, box, reason + ended))
     columns = _columns(state, model, kinds, left)
@@ -161,6 +165,7 @@ def _kinds(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
     kind = np.where(
         model.need_mm > _tips_mm(state, model), LeftCause.OUT_OF_REACH, LeftCause.NO_BEAD
     )
+    kind = np.where(state.too_long_mm > 0, LeftCause.TOO_LONG, kind)
     covered = model.floor_mm > model.top_mm + model.options.beads.least_thick_mm
     return np.where(covered, LeftCause.COVERED, kind)
 
@@ -198,29 +203,33 @@ def _causes(
     stuck: Float[np.ndarray, "a b"],
     *,
     apart: bool,
-) -> list[tuple[str | None, float]]:
-    """Why columns are not filled, and the shares of what is left; None where nothing hinders.
+) -> list[tuple[LeftCause, str, float]]:
+    """Why columns are not filled, in words too, and the shares of what is left.
 
-    Of each cause the column with most left says how far the head would go in. Unless `apart`, the
-    column with most left speaks for all.
+    Of each cause the column with most left says how far the head would go in, or how long a bridge
+    would be. Unless `apart`, the column with most left speaks for all.
     """
     options = model.options
     kind, tip = kinds[cells], _tips_mm(state, model)[cells]
     total = float(stuck.sum())
-    shares = np.bincount(kind.ravel(), stuck.ravel(), minlength=3) / total
-    worst = int(kind.flat[int(np.argmax(stuck))])
-    told = [k for k in range(3) if apart and shares[k] >= options.left.least_cause] or [worst]
+    shares = np.bincount(kind.ravel(), stuck.ravel(), minlength=len(LeftCause)) / total
+    worst = LeftCause(kind.flat[int(np.argmax(stuck))])
+    told = [k for k in LeftCause if apart and shares[k] >= options.left.least_cause] or [worst]
     found = []
     for k in told:
         at = int(np.argmax(np.where(kind == k, stuck, -1.0)))
         iy, ix = np.unravel_index(at, stuck.shape)
         place = (int(iy) + cells[0].start, int(ix) + cells[1].start)
-        reason = COVERED if k == LeftCause.COVERED else None
-        if k == LeftCause.OUT_OF_REACH:
+        cause, reason = k, COVERED if k is LeftCause.COVERED else TOO_SMALL
+        if k is LeftCause.TOO_LONG:
+            long_mm, limit_mm = float(state.too_long_mm[place]), model.material.max_bridge_mm
+            reason = f"a bridge over it would be too long: {long_mm:.0f} mm, limit {limit_mm:g} mm"
+        if k is LeftCause.OUT_OF_REACH:
             point = model.points_mm.reshape(*model.shape, 2)[place]
-            reason = model.reach.reason_at(point, float(tip[iy, ix]))
-        found.append((reason, float(shares[k])))
-    rest = 1.0 - sum(share for _, share in found)
-    most = max(range(len(found)), key=lambda n: found[n][1])
-    found[most] = (found[most][0], found[most][1] + rest)
+            touches = model.reach.reason_at(point, float(tip[iy, ix]))
+            cause, reason = (k, touches) if touches else (LeftCause.NO_BEAD, TOO_SMALL)
+        found.append((cause, reason, float(shares[k])))
+    rest = 1.0 - sum(share for _, _, share in found)
+    most = max(range(len(found)), key=lambda n: found[n][2])
+    found[most] = (*found[most][:2], found[most][2] + rest)
     return found

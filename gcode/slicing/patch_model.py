@@ -73,6 +73,7 @@ class PatchModel:
         self.most_mm = options.columns.most_thick_nozzles * setup.printer.nozzle_diameter_mm
         self.drop_mm = options.columns.drop_nozzles * setup.printer.nozzle_diameter_mm
         self.spread_mm = options.columns.spread_nozzles * setup.printer.nozzle_diameter_mm
+        self.material, self.line_width_mm = setup.material, setup.process.line_width_mm
         self._printer = setup.printer
         far_mm = options.columns.no_lift_mm
         self._window_mm = (x0 - far_mm, y0 - far_mm, x1 + far_mm, y1 + far_mm)

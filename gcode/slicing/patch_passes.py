@@ -12,13 +12,16 @@ from gcode.profiles import PrintSetup
 from gcode.slicing.infill import SOLID_ANGLES_RAD
 from gcode.slicing.job_lines import runs_of
 from gcode.slicing.layer_plan import Unprintable
-from gcode.slicing.patch_beads import Chain, begun_inside, draw, weighed
+from gcode.slicing.patch_beads import Chain, begun_inside, beside_runs, draw, weighed
+from gcode.slicing.patch_bridges import Holds
 from gcode.slicing.patch_due import Due, due_at, due_of_job, hemmed, strips_along_walls
 from gcode.slicing.patch_free import eased, free_between, free_runs
 from gcode.slicing.patch_heights import Height
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_skin import Skin
 from gcode.slicing.patch_state import PatchState
+
+MOST_SAG = 0.9  # of a strand's thickness, that is reckoned with: something of it lies in its column
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +62,13 @@ def plan_pass(
         due = due_of_job(model, state, at, planned)
     if not due.thick_mm.any():
         return None, state
-    laying = None
-    if planned is not None:
-        laying = _along_job(model, state, at, planned, due.thick_mm, setup)
-    if laying is None or laying.served < model.options.lines.served:
-        own = _along_own(model, state, at, due.thick_mm, setup)
-        if laying is None or (own is not None and own.served > laying.served):
-            laying = own
+    if planned is None:
+        laying = _along_own(model, state, at, due, setup)
+        if laying is not None:
+            beside_mm = model.options.bridges.pressed_mm
+            laying = _held(laying, Holds(model, state, at, beside_mm), model)
+    else:
+        laying, due = _along_either(model, state, at, planned, due, setup)
     if laying is None or not laying.chains:
         return None, state
     chains = tuple(_told_cold(chain, model, state, at) for chain in laying.chains)
@@ -101,47 +104,84 @@ def _after(
 ) -> PatchState:
     """Columns with these beads on them."""
     laid = laying.laid_mm
-    bridged = (laid > 0) & due.hangs
+    hangs = (laid > 0) & due.hangs
+    # as far as a strand sags it lies below what is wanted, and leaves as much to fill over it
+    sag = np.where(laid > 0, np.minimum(due.bridges.sag_mm, MOST_SAG * laid), 0.0)
     done = state.done_mm
     if planned is not None:
         done = np.where((laid > 0) & planned, at.z_mm, done)
     return replace(
         state,
-        surface_mm=np.where(bridged, at.z_mm, state.surface_mm + laid),
-        laid_mm=state.laid_mm + laid,
+        surface_mm=np.where(hangs, at.z_mm - sag, state.surface_mm + laid),
+        laid_mm=state.laid_mm + laid - sag,
         sunk_mm=state.sunk_mm + np.where(laid > 0, due.sunk_mm, 0.0),
         done_mm=done,
         hem=state.hem | due.hem,
+        loose=(state.loose & ~due.bridges.over) | (due.loose & (laid > 0)),
+        too_long_mm=np.maximum(due.bridges.too_long_mm, state.too_long_mm),
         lost=(*state.lost, *laying.lost),
     )
+
+
+def _along_either(
+    model: PatchModel,
+    state: PatchState,
+    at: Height,
+    planned: Bool[np.ndarray, "ny nx"],
+    due: Due,
+    setup: PrintSetup,
+) -> tuple[_Laying | None, Due]:
+    """Along the job's lines where they serve, else along what serves more; and what is due then."""
+    holds = Holds(model, state, at, model.options.bridges.beside_mm)
+    along = _along_job(model, state, at, planned, due.thick_mm, setup, holds)
+    if along is None or along.served < model.options.lines.served:
+        own = _along_own(model, state, at, due, setup, holds)
+        if along is None or (own is not None and own.served > along.served):
+            return None if own is None else _held(own, holds, model), due
+    return _held(along, holds, model), replace(due, bridges=due.bridges.unlaid(model))
+
+
+def _held(laying: _Laying, holds: Holds, model: PatchModel) -> _Laying:
+    """Without what would hang from one end where a line has no plastic further on."""
+    chains: list[Chain] = []
+    for chain in laying.chains:
+        chains += [chain.part(a, b) for a, b in holds.stretches(chain.xy_mm)]
+    if sum(len(c.section_mm2) for c in chains) == sum(len(c.section_mm2) for c in laying.chains):
+        return laying
+    near = beside_runs([c.xy_mm for c in chains], model.spread_mm, model)
+    return replace(laying, chains=chains, laid_mm=np.where(near, laying.laid_mm, 0.0))
 
 
 def _along_own(
     model: PatchModel,
     state: PatchState,
     at: Height,
-    thick: Float[np.ndarray, "ny nx"],
+    due: Due,
     setup: PrintSetup,
+    holds: Holds | None = None,
 ) -> _Laying | None:
-    """Along lines drawn into the columns."""
-    drawn = draw(thick, at.reach, SOLID_ANGLES_RAD[at.index % 2], model, setup)
-    if drawn is None:
-        return None
-    runs = [
-        begun_inside(run, model)
-        for bead in eased(drawn.beads, at.reach, model.reach)
-        for run in free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
-    ]
+    """Along lines drawn into the columns, and straight ones over air."""
+    thick, bridges = np.where(due.alone, 0.0, due.thick_mm), due.bridges
+    rest = np.where(bridges.over | bridges.ends, 0.0, thick)
+    drawn = draw(rest, at.reach, SOLID_ANGLES_RAD[at.index % 2], model, setup)
+    runs = list(bridges.strands)
+    if drawn is not None:
+        runs += [
+            begun_inside(run, model)
+            for bead in eased(drawn.beads, at.reach, model.reach)
+            for free in free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
+            for run in (holds.held(free) if holds is not None else (free,))
+        ]
     if not runs:
         return None
     tips_mm = [np.full(len(run.xy_mm), at.z_mm) for run in runs]
     strips = strips_along_walls(thick, at.z_mm, model, state)
     chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
-    lost_mm3 = drawn.lost_mm2 * drawn.height_mm
-    lost = []
-    if lost_mm3 > model.options.left.least_listed_mm3:
+    height_mm, lost = float(thick[thick > 0].mean()), []
+    if drawn is not None and drawn.lost_mm2 * height_mm > model.options.left.least_listed_mm3:
+        lost_mm3 = drawn.lost_mm2 * drawn.height_mm
         lost.append(_thin(drawn.region, at.z_mm, drawn.height_mm, lost_mm3))
-    return _Laying(chains, laid, _served(laid, thick), drawn.height_mm, lost)
+    return _Laying(chains, laid, _served(laid, due.thick_mm), height_mm, lost)
 
 
 def _along_job(
@@ -151,6 +191,7 @@ def _along_job(
     planned: Bool[np.ndarray, "ny nx"],
     thick: Float[np.ndarray, "ny nx"],
     setup: PrintSetup,
+    holds: Holds,
 ) -> _Laying | None:
     """Along what the job laid there, with as much of each line's plastic as is missing.
 
@@ -162,7 +203,11 @@ def _along_job(
     runs, job = runs_of(
         model.job.lines_at(at.z_mm),
         planned,
-        lambda bead: free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach)),
+        lambda bead: [
+            held
+            for run in free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
+            for held in holds.held(run)
+        ],
     )
     if not runs:
         return None

@@ -18,7 +18,8 @@ class PatchState:
     Attributes
     ----------
     surface_mm
-        Height predicted over each column; over a bridge the nozzle's, whatever lies open below.
+        Height predicted over each column; where something hangs the nozzle's, whatever lies open
+        below, less what a bridge sags.
     laid_mm, sunk_mm
         Thickness laid on each column, and given up under what hangs over it.
     done_mm
@@ -27,6 +28,10 @@ class PatchState:
         Where each column ends for passes at one height.
     hem
         Columns laid in the air beside a rim.
+    loose
+        Columns whose beads fell onto the floor, and those on top of them: no strand is held there.
+    too_long_mm
+        Where a bridge would be longer than the material bears, how long; 0 elsewhere.
     lost
         What was found too thin, pass by pass.
     """
@@ -37,6 +42,8 @@ class PatchState:
     done_mm: Float[np.ndarray, "ny nx"]
     planar_top_mm: Float[np.ndarray, "ny nx"]
     hem: Bool[np.ndarray, "ny nx"]
+    loose: Bool[np.ndarray, "ny nx"]
+    too_long_mm: Float[np.ndarray, "ny nx"]
     lost: tuple[Unprintable, ...] = ()
 
     @classmethod
@@ -50,6 +57,8 @@ class PatchState:
             done_mm=np.full(model.shape, -np.inf),
             planar_top_mm=model.top_mm,
             hem=np.zeros(model.shape, dtype=bool),
+            loose=np.zeros(model.shape, dtype=bool),
+            too_long_mm=nothing,
         )
 
     def left_below(self, model: PatchModel, z_mm: float) -> Float[np.ndarray, "ny nx"]:

@@ -94,7 +94,7 @@
   // ---- traces -------------------------------------------------------------------------------
   const LIGHTING = { ambient: 0.62, diffuse: 0.55, specular: 0.12, roughness: 0.7, fresnel: 0.1, facenormalsepsilon: 0, vertexnormalsepsilon: 0 };
   const LIGHT = { x: 4000 * data.facing[0], y: 6000 * data.facing[1], z: 9000 };
-  const LEFT = ["left_reach", "left_bead", "left_covered"];  // what a repair does not fill, by cause
+  const LEFT = ["left_reach", "left_bead", "left_covered", "left_span"];  // what a repair does not fill, by cause
   const ORDER = ["scan", "ghost", "edges", "missing", "excess", "past", "now", "unseen", ...LEFT];
   const solid = (name, colour, mesh, opacity, extra) => Object.assign({
     type: "mesh3d", name, color: colour, opacity, flatshading: true, lighting: LIGHTING, lightposition: LIGHT,

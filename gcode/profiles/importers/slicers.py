@@ -93,6 +93,7 @@ PRUSA: dict[str, Rule] = {
     "bed_temperature": Rule("materials", "bed_c", number),
     "filament_density": Rule("materials", "density_g_cm3", limit),
     "max_fan_speed": Rule("materials", "fan_ratio", percent),
+    "bridge_fan_speed": Rule("materials", "bridge_fan_ratio", percent),
     "extrusion_multiplier": Rule("materials", "flow_ratio", number),
     "filament_max_volumetric_speed": Rule("materials", "max_volumetric_mm3_s", limit),
     "layer_height": Rule("processes", "layer_height_mm", number),
@@ -114,6 +115,7 @@ PRUSA: dict[str, Rule] = {
     "first_layer_speed": Rule("processes", "first_layer_speed_mm_s", of_key("perimeter_speed")),
     "default_acceleration": Rule("processes", "acceleration_mm_s2", limit),
     "infill_overlap": Rule("processes", "infill_overlap_ratio", share),
+    "bridge_speed": Rule("processes", "bridge_speed_mm_s", limit),
 }
 
 
@@ -148,6 +150,7 @@ ORCA: dict[str, Rule] = {
     "hot_plate_temp": Rule("materials", "bed_c", number),
     "filament_density": Rule("materials", "density_g_cm3", limit),
     "fan_max_speed": Rule("materials", "fan_ratio", percent),
+    "overhang_fan_speed": Rule("materials", "bridge_fan_ratio", percent),
     "filament_flow_ratio": Rule("materials", "flow_ratio", number),
     "filament_max_volumetric_speed": Rule("materials", "max_volumetric_mm3_s", limit),
     "filament_shrink": Rule("materials", "shrinkage_ratio", _shrink),
@@ -168,6 +171,7 @@ ORCA: dict[str, Rule] = {
     "initial_layer_speed": Rule("processes", "first_layer_speed_mm_s", limit),
     "default_acceleration": Rule("processes", "acceleration_mm_s2", limit),
     "infill_wall_overlap": Rule("processes", "infill_overlap_ratio", share),
+    "bridge_speed": Rule("processes", "bridge_speed_mm_s", limit),
 }
 _PRUSA_KINDS: dict[str, Kind] = {
     "printer": "printers",

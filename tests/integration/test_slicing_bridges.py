@@ -1,0 +1,224 @@
+"""Patches over air: parts on two legs, whose columns are known without any of our own code."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import manifold3d as m3
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from amrepair.loop.sites import lines_of_job
+from amrepair.simulate.world import World
+from gcode.check import find_refusals
+from gcode.moves import ModalState, Program, SetFan
+from gcode.profiles import PrintSetup, load_setup
+from gcode.reader import job_for
+from gcode.slicing.job import plan_part
+from gcode.slicing.job_lines import JobLines
+from gcode.slicing.layers import LayerGrid
+from gcode.slicing.patch import LeftCause, PatchPlan, slice_patch
+from gcode.surfaces import HeightField
+from gcode.writer import write
+from tests.gcode_text import beads_of, points_of, steps_of
+from tests.integration.test_slicing_patch import motion_of
+
+SETUP = load_setup()
+LIMIT_MM = SETUP.material.max_bridge_mm
+PARK = (10.0, 200.0, 20.0)
+HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+FOOT_MM, WIDE_MM, LEG_MM, MIDDLE = 7.0, 6.0, 4.0, (75.0, 75.0)
+HOLD_MM = 0.9  # no bead ends farther over air than two lines' widths
+
+
+@dataclass(frozen=True)
+class OnLegs:
+    """A plate on two legs, turned about its middle, of which the plate is gone."""
+
+    gap_mm: float
+    plate_mm: float = 1.0
+    turned_deg: float = 0.0
+
+    def _box(self, x0: float, x1: float, z0: float, z1: float) -> m3.Manifold:
+        box = m3.Manifold.cube((x1 - x0, WIDE_MM, z1 - z0)).translate((x0, -0.5 * WIDE_MM, z0))
+        return box.rotate((0.0, 0.0, self.turned_deg)).translate((*MIDDLE, 0.0))
+
+    @property
+    def legs(self) -> m3.Manifold:
+        half = 0.5 * self.gap_mm
+        left = self._box(-half - LEG_MM, -half, 0.0, FOOT_MM)
+        return left + self._box(half, half + LEG_MM, 0.0, FOOT_MM)
+
+    @property
+    def plate(self) -> m3.Manifold:
+        far = 0.5 * self.gap_mm + LEG_MM
+        return self._box(-far, far, FOOT_MM, FOOT_MM + self.plate_mm)
+
+    def over_air_mm(self, points_mm: np.ndarray) -> np.ndarray:
+        """How far places are from the nearest leg; 0 over one."""
+        turn = np.radians(self.turned_deg)
+        across = np.array([np.cos(turn), np.sin(turn)])
+        return 0.5 * self.gap_mm - np.abs((points_mm[:, :2] - MIDDLE) @ across)
+
+    def planned(
+        self, setup: PrintSetup = SETUP, lines: JobLines | None = None
+    ) -> tuple[PatchPlan, Program, HeightField]:
+        field = HeightField.from_manifold(self.legs, 0.1, margin_mm=8.0)
+        grid = LayerGrid.from_setup(setup)
+        plan = slice_patch(
+            self.plate,
+            setup,
+            as_built=field,
+            grid=grid,
+            standalone=False,
+            start_mm=PARK,
+            lines=lines,
+        )
+        program = write(plan.toolpath, setup, title="legs", resume=HOT, restore=False)
+        return plan, program, field
+
+
+def strands_of(program: Program) -> list[np.ndarray]:
+    steps = [step for step in steps_of(program.text, PARK) if step.role == "Bridge infill"]
+    return [points_of(bead) for bead in beads_of(steps)]
+
+
+def first_pass_of(program: Program) -> list[np.ndarray]:
+    steps = steps_of(program.text, PARK)
+    lowest = min(step.end_mm[2] for step in steps if step.is_bead)
+    beads = [points_of(bead) for bead in beads_of(steps)]
+    return [bead for bead in beads if bead[0, 2] < lowest + 0.05]
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    gap_mm=st.floats(2.0, LIMIT_MM + 6.0),
+    plate_mm=st.floats(0.4, 1.0),
+    turned_deg=st.floats(0.0, 90.0),
+)
+def test_strands_end_on_legs_and_nothing_else_is_in_the_air(
+    gap_mm: float, plate_mm: float, turned_deg: float
+) -> None:
+    part = OnLegs(gap_mm, plate_mm, turned_deg)
+    _, program, field = part.planned()
+    for bead in first_pass_of(program):
+        out_mm = part.over_air_mm(bead)
+        # every end lies on a leg, or hangs beside one by a line's width
+        assert max(out_mm[0], out_mm[-1]) <= HOLD_MM
+        if out_mm.max() <= HOLD_MM:
+            continue
+        steps = np.diff(bead[:, :2], axis=0)
+        along = steps / np.hypot(*steps.T)[:, None]
+        on_air = (out_mm[:-1] > 0) & (out_mm[1:] > 0)
+        assert (along[on_air] @ along[on_air][0] > 0.999).all(), "a strand over air is straight"
+        assert np.hypot(*steps[on_air].T).sum() <= LIMIT_MM + 0.2
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT, patch=True)
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 33.0])
+def test_a_plate_between_legs_is_filled_in_the_world(turned_deg: float) -> None:
+    # before there were bridges: 0.52 of it, and nothing over the middle
+    part = OnLegs(12.0, 1.4, turned_deg)
+    plan, _, _ = part.planned()
+    world, whole = World((200.0, 200.0)), World((200.0, 200.0))
+    whole.add(part.legs + part.plate)
+    world.add(part.legs)
+    gone = whole.snapshot()
+    gone = gone.minus(world.snapshot(gone.window))
+    world.deposit(motion_of(plan.toolpath))
+    after = world.snapshot(gone.window)
+    assert gone.common(after).volume_mm3 >= 0.91 * gone.volume_mm3
+    # what strands sag by, 0.1 mm in the middle, lies below
+    assert after.minus(whole.snapshot(gone.window)).volume_mm3 <= 0.12 * gone.volume_mm3
+
+
+def test_the_next_pass_fills_what_strands_sag_by() -> None:
+    part = OnLegs(16.0)
+    sections = {}
+    for sag_per_mm in (0.0, 0.001):
+        material = SETUP.material.model_copy(update={"bridge_sag_per_mm": sag_per_mm})
+        plan, _, _ = part.planned(replace(SETUP, material=material))
+        sections[sag_per_mm] = plan.beads_mm3
+    # a parabola is two thirds as high on average as in its middle, over the gap
+    more_mm3 = 2 / 3 * 0.001 * 16.0**2 * 16.0 * WIDE_MM
+    assert sections[0.001] - sections[0.0] == pytest.approx(more_mm3, rel=0.15)
+
+
+def test_a_span_too_long_is_told_with_its_length_and_volume() -> None:
+    part = OnLegs(34.0)
+    plan, _, _ = part.planned()
+    [left] = [u for u in plan.unprintable if "bridge" in u.reason]
+    assert left.reason == "a bridge over it would be too long: 34 mm, limit 20 mm"
+    # beads step out from both legs by a line's width a pass
+    assert 0.6 * 34.0 * WIDE_MM < left.volume_mm3 < 34.0 * WIDE_MM
+    drawn = {each.cause: each.volume_mm3 for each in plan.left}
+    assert drawn[LeftCause.TOO_LONG] == pytest.approx(left.volume_mm3, rel=0.02)
+
+
+@pytest.mark.parametrize("gap_mm", [16.0, 26.0])
+def test_of_a_job_s_own_lines_none_hangs_from_one_end(gap_mm: float) -> None:
+    # its lines at 45 degrees span 1.4 times the gap, and turn over the air
+    part = OnLegs(gap_mm)
+    whole = write(plan_part(part.legs + part.plate, SETUP).toolpath, SETUP, title="job")
+    job = job_for(whole, SETUP.printer)
+    plan, program, field = part.planned(lines=lines_of_job(job, job.beads.layer >= 0))
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT, patch=True)
+    for bead in first_pass_of(program):
+        out_mm = part.over_air_mm(bead)
+        if out_mm.max() > HOLD_MM:
+            assert max(out_mm[0], out_mm[-1]) <= HOLD_MM
+    filled = plan.reachable_mm3 / part.plate.volume()
+    assert filled > 0.95 if gap_mm < LIMIT_MM else filled < 0.7
+
+
+def test_strands_lie_as_the_profile_says() -> None:
+    setup = load_setup(material="abs")
+    plan, program, _ = OnLegs(8.0).planned(setup)
+    fans = [move.ratio for move in plan.toolpath if isinstance(move, SetFan)]
+    assert fans == [0.15, 0.25, 0.15]
+    steps = steps_of(program.text, PARK)
+    fastest = {step.feed_mm_s for step in steps if step.is_bead and step.role == "Bridge infill"}
+    assert setup.process.bridge_speed_mm_s in {round(speed, 3) for speed in fastest}
+
+
+def test_strands_hold_on_nothing_that_fell() -> None:
+    # regression: they were anchored on beads that lay on a floor 2 mm below them
+    wall = m3.Manifold.cube((44.0, 5.0, 14.0)).translate((55.0, 70.0, 0.0))
+    wall -= m3.Manifold.cube((14.0, 5.0, 7.0)).translate((70.0, 70.0, 3.0))
+    # 3 mm of shoulder beside the window, and walls over it that keep the head off them
+    cut = m3.Manifold.cube((20.0, 5.0, 9.0)).translate((67.0, 70.0, 10.0)) ^ wall
+    field = HeightField.from_manifold(wall - cut, 0.1, margin_mm=8.0)
+    plan = slice_patch(
+        cut, SETUP, as_built=field, grid=LayerGrid.from_setup(SETUP), standalone=False,
+        start_mm=PARK,
+    )  # fmt: skip
+    program = write(plan.toolpath, SETUP, title="lintel", resume=HOT, restore=False)
+    assert not [strand for strand in strands_of(program) if np.ptp(strand[:, 0]) > 5.0]
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT, patch=True)
+
+
+def test_the_checker_knows_a_bridge_by_itself() -> None:
+    part = OnLegs(14.0)
+    _, program, field = part.planned()
+
+    def said(of: Program, setup: PrintSetup = SETUP) -> set[str]:
+        return {r.what for r in find_refusals(of, setup, as_built=field, initial=HOT, patch=True)}
+
+    assert said(program) == set()
+    # the same spans, of a material that bears less
+    short = SETUP.material.model_copy(update={"max_bridge_mm": 13.0})
+    assert said(program, replace(SETUP, material=short)) == {"bridge too long, or not straight"}
+    # it is asked of patches alone: a job's slicer knows its own bridges
+    assert not find_refusals(program, replace(SETUP, material=short), as_built=field, initial=HOT)
+    # a strand that ends in the middle: some of its moves lay nothing
+    lines = program.text.splitlines()
+    strand = lines.index(";TYPE:Bridge infill")
+    laid = [k for k in range(strand, len(lines)) if re.match(r"G1 X.* E[\d.]+", lines[k])]
+    for k in laid[15:20]:
+        lines[k] = re.sub(r" E[\d.]+", "", lines[k])
+    assert said(Program("\n".join(lines) + "\n", program.dialect)) == {
+        "strand over air that ends on nothing"
+    }
