@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from amrepair.errors import InputError
 
@@ -144,6 +144,13 @@ def moved(
 def box_of(points_mm: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "2 k"]:
     """(2, k) lowest and highest corner; axis by axis, an eighth of the time."""
     return np.array([[fold(along) for along in points_mm.T] for fold in (np.min, np.max)])
+
+
+def cells_of(
+    points_mm: Float[np.ndarray, "n k"], low_mm: Float[np.ndarray, " k"] | float, cell_mm: float
+) -> Int[np.ndarray, "n k"]:
+    """(n, k) the cell of a grid from `low_mm` on that holds each point."""
+    return np.floor((points_mm - low_mm) / cell_mm).astype(np.int64)
 
 
 def in_box(

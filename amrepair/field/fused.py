@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import fused_kernels as kernels
 from amrepair.field.options import USUAL_SURFELS, SurfelOptions
-from amrepair.frames import box_of
+from amrepair.frames import box_of, cells_of
 from amrepair.observe.views import Shares
 from amrepair.scans import Scan
 
@@ -127,7 +127,8 @@ def make_surfels(
     """Condense the points in `keep`; the cell follows their spacing."""
     box = box_of(points_mm[keep]) if keep.any() else np.zeros((2, 3))
     spacing_mm = _spacing(points_mm, keep, box, options)
-    cell_mm = float(np.clip(2.0 * spacing_mm, options.least_cell_mm, options.most_cell_mm))
+    cell_mm = options.cell_spacings * spacing_mm
+    cell_mm = float(np.clip(cell_mm, options.least_cell_mm, options.most_cell_mm))
     of_point, keys, strides = _numbered(points_mm, keep, box, cell_mm)
     # moments about one origin near the part keep float64 far from cancellation
     origin = box.mean(axis=0)
@@ -184,7 +185,7 @@ def _numbered(
     strides = (int(shape[1] * shape[2]), int(shape[2]))
     if np.prod(shape.astype(float)) <= MOST_COUNTED_CELLS:
         return *kernels.numbered(points_mm, keep, box_mm[0], cell_mm, shape), strides
-    index = np.floor((points_mm[keep] - box_mm[0]) / cell_mm).astype(np.int64) + 1
+    index = cells_of(points_mm[keep], box_mm[0], cell_mm) + 1
     of_point = np.full(len(points_mm), -1, np.int64)
     keys, of_point[keep] = np.unique(index @ np.array([*strides, 1]), return_inverse=True)
     return of_point, keys, strides

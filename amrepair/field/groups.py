@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from amrepair.arrays import Numbers, Points
 from amrepair.field.options import USUAL_SURFELS
+from amrepair.frames import cells_of
 
 # Pieces nearer than this are one defect, and so are cells of a field that touch at a corner.
 GROUP_MM, CELLS_APART = 1.2, 1.8
@@ -18,7 +21,7 @@ def group_points(points_mm: Points, *, reach_mm: float = GROUP_MM) -> Numbers:
     """(n,) group number of each point: those in touching cells of `reach_mm` belong together."""
     if len(points_mm) == 0:
         return np.zeros(0, np.int64)
-    index = np.floor((points_mm - points_mm.min(axis=0)) / reach_mm).astype(np.int64)
+    index = cells_of(points_mm, points_mm.min(axis=0), reach_mm)
     occupied = np.zeros(tuple(index.max(axis=0) + 1), bool)
     occupied[tuple(index.T)] = True
     numbered, _ = ndimage.label(occupied, structure=np.ones((3, 3, 3), bool))
@@ -36,6 +39,12 @@ def cell_numbers(index: Int[np.ndarray, "n k"]) -> Numbers:
     return np.unique(key, return_inverse=True)[1]
 
 
+def connected(one: Int[np.ndarray, " p"], other: Int[np.ndarray, " p"], count: int) -> Numbers:
+    """(count,) a number for each of some things, the same for those that pairs of them link."""
+    graph = coo_array((np.ones(len(one), bool), (one, other)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
 def touching_mm(cell_mm: float) -> float:
     """How far apart pieces of one defect may lie in a field of such cells, mm."""
     return max(GROUP_MM, CELLS_APART * cell_mm)
@@ -45,5 +54,5 @@ def area_per_point(surface_mm: Points) -> float:
     """Rough area per template point, mm², from how many cells they fill."""
     if len(surface_mm) == 0:
         return 0.0
-    cells = int(cell_numbers(np.floor(surface_mm / AREA_CELL_MM).astype(np.int64)).max()) + 1
+    cells = int(cell_numbers(cells_of(surface_mm, 0.0, AREA_CELL_MM)).max()) + 1
     return USUAL_SURFELS.area_per_cell * AREA_CELL_MM**2 * cells / len(surface_mm)

@@ -21,7 +21,7 @@ from amrepair.arrays import Mask, Numbers, Points, Values, VoxelMask, Voxels
 from amrepair.field.groups import group_points
 from amrepair.field.near import has_near, nearest_within
 from amrepair.field.options import OccupancyOptions
-from amrepair.frames import box_of, diagonal, in_box, unit_vectors
+from amrepair.frames import box_of, cells_of, diagonal, in_box, unit_vectors
 from amrepair.template.port import Template
 
 # Capacities are whole numbers of this share of a nat; none is larger than that many.
@@ -522,5 +522,5 @@ def _cells(
     points_mm: Points, low_mm: Float[np.ndarray, " 3"], voxel_mm: float, shape: tuple[int, ...]
 ) -> tuple[Int[np.ndarray, "n 3"], Mask]:
     """Voxel of each point, and whether it lies in the box."""
-    index = np.floor((points_mm - low_mm) / voxel_mm).astype(np.int64)
+    index = cells_of(points_mm, low_mm, voxel_mm)
     return index, np.asarray(((index >= 0) & (index < np.array(shape))).all(axis=1))

@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import scales_kernels as kernels
-from amrepair.frames import unit_vectors
+from amrepair.frames import cells_of, unit_vectors
 
 # Neighbours of one window face within 60° of each other: a curved surface is one, the two sides
 # of a wall and the faces of an edge are not.
@@ -180,8 +180,7 @@ def _grouped(
     place_mm: Points, normal: Points, cell_mm: float
 ) -> tuple[Numbers, Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
     """Order of the cells by the wider cell that holds them, where each begins, keys, strides."""
-    low = place_mm.min(axis=0)
-    index = np.floor((place_mm - low) / cell_mm).astype(np.int64) + 1
+    index = cells_of(place_mm, place_mm.min(axis=0), cell_mm) + 1
     shape = index.max(axis=0) + 2
     strides = (int(shape[1] * shape[2]), int(shape[2]))
     key = (index @ np.array([*strides, 1])) * kernels.SLOTS + ways_of(normal)

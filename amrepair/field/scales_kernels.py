@@ -23,10 +23,15 @@ RIDGE, TINY = 1e-3, 1e-9
 
 @njit(cache=True, nogil=True)
 def _median(values, n):
-    """The median of the first n values."""
-    ranked = np.sort(values[:n])
+    """The median of the first n values, which are put in order: few, so by insertion."""
+    for k in range(1, n):
+        value, j = values[k], k
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
     half = n // 2
-    return ranked[half] if n % 2 else 0.5 * (ranked[half - 1] + ranked[half])
+    return values[half] if n % 2 else 0.5 * (values[half - 1] + values[half])
 
 
 @njit(cache=True, nogil=True)
@@ -69,32 +74,41 @@ def neighbours(keys, stride_x, stride_y, normal, value, cosine, aside):
 
 
 @njit(cache=True, nogil=True)
-def _off_plane(place, value, table, count, i):
-    """(n,) distances of a window's values from the plane through them by least squares."""
-    n = count[i]
-    matrix = np.zeros((TREND_TERMS, TREND_TERMS))
-    right = np.zeros(TREND_TERMS)
-    row = np.ones(TREND_TERMS)
+def _off_plane(place, value, table, n, i, off):
+    """Distances of a window's values from the plane through them by least squares, into `off`."""
+    first, second = np.zeros(TREND_TERMS), np.zeros((TREND_TERMS, TREND_TERMS))
+    row = np.empty(TREND_TERMS)
     for k in range(n):
         j = table[i, k]
+        row[3] = value[j]
         for a in range(3):
-            row[a + 1] = place[j, a] - place[i, a]
+            row[a] = place[j, a] - place[i, a]
         for a in range(TREND_TERMS):
-            right[a] += row[a] * value[j]
-            for b in range(TREND_TERMS):
-                matrix[a, b] += row[a] * row[b]
-    across = RIDGE * (matrix[1, 1] + matrix[2, 2] + matrix[3, 3]) + TINY
-    for a in range(1, TREND_TERMS):
-        matrix[a, a] += across  # cells hardly reach across the surface that they lie on
-    trend = np.linalg.solve(matrix, right)
-    off = np.empty(n)
+            first[a] += row[a] / n
+            for b in range(a, TREND_TERMS):
+                second[a, b] += row[a] * row[b]
+    # cells hardly reach across the surface that they lie on
+    across = RIDGE * (second[0, 0] + second[1, 1] + second[2, 2]) + TINY
+    xx = second[0, 0] - n * first[0] * first[0] + across
+    yy = second[1, 1] - n * first[1] * first[1] + across
+    zz = second[2, 2] - n * first[2] * first[2] + across
+    xy = second[0, 1] - n * first[0] * first[1]
+    xz = second[0, 2] - n * first[0] * first[2]
+    yz = second[1, 2] - n * first[1] * first[2]
+    xv = second[0, 3] - n * first[0] * first[3]
+    yv = second[1, 3] - n * first[1] * first[3]
+    zv = second[2, 3] - n * first[2] * first[3]
+    ax, ay, az = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy  # the adjugate's rows
+    by, bz, cz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    whole = xx * ax + xy * ay + xz * az
+    gx = (ax * xv + ay * yv + az * zv) / whole
+    gy = (ay * xv + by * yv + bz * zv) / whole
+    gz = (az * xv + bz * yv + cz * zv) / whole
     for k in range(n):
         j = table[i, k]
-        at = trend[0]
-        for a in range(3):
-            at += trend[a + 1] * (place[j, a] - place[i, a])
-        off[k] = abs(value[j] - at)
-    return off
+        at = first[3] + gx * (place[j, 0] - place[i, 0] - first[0])
+        at += gy * (place[j, 1] - place[i, 1] - first[1])
+        off[k] = abs(value[j] - at - gz * (place[j, 2] - place[i, 2] - first[2]))
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -116,17 +130,15 @@ def window_statistics(table, count, place, value, weight, rank):
             if j != i:
                 apart[others] = abs(value[j] - value[i])
                 others += 1
-        ranked = np.sort(here[: count[i]])
-        half = count[i] // 2
-        out[0, i] = ranked[half] if count[i] % 2 else 0.5 * (ranked[half - 1] + ranked[half])
+        out[0, i] = _median(here, count[i])
         at = min(rank, count[i]) - 1
-        out[1, i], out[2, i] = ranked[at], ranked[count[i] - 1 - at]
+        out[1, i], out[2, i] = here[at], here[count[i] - 1 - at]
         out[3, i] = _median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
         if count[i] >= 2 * TREND_TERMS:
-            off = _off_plane(place, value, table, count, i)
+            _off_plane(place, value, table, count[i], i, apart)
             # a plane on a surface takes three of the n degrees of freedom
-            spread = _median(off, count[i]) / NORMAL_MEDIAN * np.sqrt(count[i] / (count[i] - 3.0))
-            out[3, i] = min(out[3, i], spread)
+            spread = _median(apart, count[i]) / NORMAL_MEDIAN
+            out[3, i] = min(out[3, i], spread * np.sqrt(count[i] / (count[i] - 3.0)))
         out[4, i] = total
     return out
 

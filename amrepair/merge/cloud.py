@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from amrepair.field.near import spacing_in
-from amrepair.frames import spread_directions
+from amrepair.frames import cells_of, spread_directions
 from amrepair.merge import fuse_kernels as kernels
 from amrepair.merge.options import USUAL_CLOUD
 
@@ -46,8 +46,7 @@ class SortedPoints:
         """Sort points; two empty layers of cells lie around them."""
         low = points_mm.min(axis=0) - 2.0 * cell_mm
         shape = np.floor((points_mm.max(axis=0) - low) / cell_mm).astype(np.int64) + 3
-        index = np.floor((points_mm - low) / cell_mm).astype(np.int64)
-        key = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+        key = np.ravel_multi_index(tuple(cells_of(points_mm, low, cell_mm).T), tuple(shape))
         order = np.argsort(key, kind="stable")
         start = np.zeros(int(np.prod(shape)) + 1, np.int64)
         np.cumsum(np.bincount(key, minlength=int(np.prod(shape))), out=start[1:])

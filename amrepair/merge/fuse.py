@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from amrepair.device import open3d
 from amrepair.errors import TemplateError
+from amrepair.frames import cells_of
 from amrepair.merge import fuse_kernels as kernels
 from amrepair.merge.cloud import SortedPoints
 from amrepair.merge.options import USUAL_FUSE, FuseOptions
@@ -83,10 +84,9 @@ class Spread:
         slack_mm
             (n,) of each point of the cloud: standard deviation of its scan's pose across it.
         """
-        shape = np.array(self.values_mm.shape)
-        index = np.floor((cloud.points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
-        index = np.clip(index, 0, shape - 1)
-        cell = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+        shape = self.values_mm.shape
+        index = cells_of(cloud.points_mm, self.origin_mm, self.cell_mm)
+        cell = np.ravel_multi_index(tuple(index.T), shape, mode="clip")
         pairs, which = np.unique(cell * cloud.scans + cloud.scan, return_inverse=True)
         each = np.bincount(which, weights=slack_mm) / np.bincount(which)
         place = pairs // cloud.scans
@@ -94,7 +94,7 @@ class Spread:
         cells, first, count = np.unique(place[order], return_index=True, return_counts=True)
         open_mm = np.zeros(int(np.prod(shape)))
         open_mm[cells] = each[order][first + count // 2]
-        grown = ndimage.maximum_filter(open_mm.reshape(tuple(shape)), size=3)
+        grown = ndimage.maximum_filter(open_mm.reshape(shape), size=3)
         return replace(self, values_mm=np.hypot(self.values_mm, grown).astype(np.float32))
 
 
@@ -212,9 +212,7 @@ def _outvoted(
         own = cloud.points_mm[against & (cloud.scan == s)]
         heard = nodes_mm[(overruled >> min(s, kernels.LAST_BIT)) & 1 == 1]
         places = np.concatenate([own, heard])
-        cell, count = np.unique(
-            np.floor((places - low) / radius_mm).astype(np.int64), axis=0, return_counts=True
-        )
+        cell, count = np.unique(cells_of(places, low, radius_mm), axis=0, return_counts=True)
         cell = cell[count >= options.outvoted_marks]
         if not len(cell):
             continue
@@ -278,9 +276,9 @@ def _contradicted(
     """(n,) points that most other scans contradict; (n,) in cells that hold next to nothing."""
     cell_mm = 2.2 * cloud.spacing_mm * np.sqrt(cloud.scans)
     low = cloud.points_mm.min(axis=0) - 2 * cell_mm
-    index = np.floor((cloud.points_mm - low) / cell_mm).astype(np.int64)
-    shape = index.max(axis=0) + 3
-    flat = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+    index = cells_of(cloud.points_mm, low, cell_mm)
+    shape = tuple(index.max(axis=0) + 3)
+    flat = np.ravel_multi_index(tuple(index.T), shape)
     key = cloud.scan * int(np.prod(shape)) + flat
     places, surfel = np.unique(key, return_inverse=True)
     count = np.bincount(surfel)

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.align.registration import bounded_inverse
-from amrepair.frames import diagonal, motion_about, moved
+from amrepair.frames import cells_of, diagonal, motion_about, moved
 from amrepair.merge.kept import KeptAnswers
 from amrepair.merge.options import USUAL_MERGE, JointOptions
 from amrepair.merge.threads import in_threads
@@ -303,7 +303,7 @@ def _scatter(
     edge_mm = options.patch_ratio * diagonal(pairs.points_mm)
     axis = np.argmax(np.abs(pairs.planes), axis=1)
     side = np.take_along_axis(pairs.planes, axis[:, None], axis=1)[:, 0] > 0.0
-    cell = np.floor((pairs.points_mm - low) / edge_mm).astype(np.int64)
+    cell = cells_of(pairs.points_mm, low, edge_mm)
     key = np.column_stack([first, second, cell, 2 * axis + side])
     _, start, patch = np.unique(key, axis=0, return_index=True, return_inverse=True)
     shared_mm = np.hypot(

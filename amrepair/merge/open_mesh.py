@@ -18,6 +18,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from amrepair.errors import TemplateError
+from amrepair.field.groups import group_points
 from amrepair.merge.fuse import solid_surface
 from amrepair.merge.winding import Shell
 from amrepair.template import GridSdf, MeshSdf, load_mesh
@@ -280,10 +281,7 @@ def _holes(
     bare = points[off]
     if not len(bare):
         return None, []
-    cell = np.floor((bare - bare.min(axis=0)) / (2.0 * spacing_mm)).astype(int)
-    box = np.zeros(tuple(cell.max(axis=0) + 1), bool)
-    box[tuple(cell.T)] = True
-    which = ndimage.label(box, np.ones((3, 3, 3)))[0][tuple(cell.T)]
+    which = group_points(bare, reach_mm=2.0 * spacing_mm)
     size = each_mm2 * np.bincount(which)
     limit_mm2 = 0.25 * np.pi * across_mm**2
     small, large = size[(size > 0) & (size <= limit_mm2)], size[size > limit_mm2]

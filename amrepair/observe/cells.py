@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Numbers, Points, Values
-from amrepair.frames import unit_vectors
+from amrepair.frames import cells_of, unit_vectors
 
 REACH_LENGTHS = 3.0  # exp(-3): what lies farther shares 5 % of its error and is left out
 SPLITS = 4  # 2⁴ blocks: a sixteenth of the surface is more than most regions of defects
@@ -52,8 +52,7 @@ def gather(
     """Return one observation a cell, view and side that the surface faces."""
     facing = np.argmax(np.abs(normal), axis=1)
     facing = facing + 3 * (normal[np.arange(len(normal)), facing] < 0)
-    low_mm = place_mm.min(axis=0)
-    box = np.floor((place_mm - low_mm) / side_mm).astype(np.int64)
+    box = cells_of(place_mm, place_mm.min(axis=0), side_mm)
     size = box.max(axis=0) + 1
     key = ((box[:, 0] * size[1] + box[:, 1]) * size[2] + box[:, 2]) * 6 + facing
     key = key * (int(view.max()) + 1) + view

@@ -41,20 +41,6 @@ def directions(points, index, sensor, origin, axes, count):
 
 
 @njit(cache=True, nogil=True)
-def cells_filled(directions, low, cell, columns, rows):
-    """How many cells of a coarse grid hold a direction."""
-    filled = np.zeros((rows, columns), np.bool_)
-    found = 0
-    for i in range(len(directions)):
-        column = min(int((directions[i, 0] - low[0]) / cell), columns - 1)
-        row = min(int((directions[i, 1] - low[1]) / cell), rows - 1)
-        if not filled[row, column]:
-            filled[row, column] = True
-            found += 1
-    return found
-
-
-@njit(cache=True, nogil=True)
 def fill(directions, low, pixel, rows, columns):
     """Mean distance of the nearest surface in each pixel; inf where nothing was seen.
 

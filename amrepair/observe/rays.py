@@ -196,9 +196,10 @@ def _image_spacing(
     """Mean spacing of directions from the share of a coarse grid that they fill."""
     extent = np.maximum(high - low, 1e-9)
     cell = float(np.sqrt(np.prod(extent) / max(len(rays) / 16, 1)))
-    columns, rows = (int(n) + 1 for n in extent / cell)
-    filled = kernels.cells_filled(rays, low, cell, columns, rows)
-    return float(np.sqrt(filled * cell**2 / len(rays)))
+    filled = np.zeros((extent / cell).astype(np.int64) + 1, bool)
+    at = ((rays[:, :2] - low) / cell).astype(np.int64)
+    filled[tuple(np.minimum(at, np.array(filled.shape) - 1).T)] = True
+    return float(np.sqrt(np.count_nonzero(filled) * cell**2 / len(rays)))
 
 
 def _facing(forward: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask
-from amrepair.field.groups import CELLS_APART
+from amrepair.field.groups import CELLS_APART, connected
 from amrepair.field.near import has_near
 from amrepair.field.scales import Scale
 from amrepair.regions.options import RegionOptions
@@ -84,8 +82,6 @@ def _reached(scale: Scale, seeds: Mask, through: Mask) -> Mask:
     cells = np.unique(scale.of_base[through])
     tree = cKDTree(scale.place_mm[cells])
     first, second = tree.query_pairs(CELLS_APART * scale.cell_mm, output_type="ndarray").T
-    beside = coo_array((np.ones(len(first), bool), (first, second)), shape=(len(cells), len(cells)))
-    _, group = connected_components(beside, directed=False)
-    of_base = group[np.searchsorted(cells, scale.of_base[through])]
+    of_base = connected(first, second, len(cells))[np.searchsorted(cells, scale.of_base[through])]
     reached[through] = np.isin(of_base, of_base[seeds[through]])
     return reached

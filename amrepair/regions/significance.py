@@ -18,15 +18,14 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.special import comb
 from scipy.stats import norm
 
 from amrepair.arrays import Numbers, Values
 from amrepair.field import scales_kernels
-from amrepair.field.groups import cell_numbers
+from amrepair.field.groups import cell_numbers, connected
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
+from amrepair.frames import cells_of
 from amrepair.regions.calibration import Calibration, Tail
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import Sites
@@ -304,10 +303,8 @@ def _freedom(
 
     A class too small to be told has those of the one whose value it took.
     """
-    edge_mm = 0.5 * options.far_mm
-    cell = np.floor(scale.place_mm / edge_mm).astype(np.int64)
-    patch = np.column_stack([cell, ways_of(scale.normal)])
-    patch_of = cell_numbers(patch)
+    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
+    patch_of = cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
     freedom = np.empty(classes)
     last = 1.0
     for k in range(classes):
@@ -377,9 +374,7 @@ def _peaks(scale: Scale, z: Values, start: float) -> Float[np.ndarray, " p"]:
     over = z > start
     window, cell = scale.cells_of(over)
     beside = over[cell]
-    touching = window[beside], cell[beside]
-    graph = coo_array((np.ones(len(touching[0]), bool), touching), shape=(len(z), len(z)))
-    group = connected_components(graph, directed=False)[1]
+    group = connected(window[beside], cell[beside], len(z))
     peak = np.full(len(z), -np.inf)
     np.maximum.at(peak, group[over], z[over])
     return np.sort(peak[peak > start])

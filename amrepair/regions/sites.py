@@ -14,7 +14,7 @@ from amrepair.errors import InputError
 from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.groups import cell_numbers
 from amrepair.field.near import nearest_within
-from amrepair.frames import diagonal, unit_vectors
+from amrepair.frames import cells_of, diagonal, unit_vectors
 from amrepair.observe.background import ON_PLANE_MM, background, refuse_wrong_scale
 from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
@@ -243,7 +243,7 @@ def agreed(
         if out or shares is None:
             return seen, sites, nuisance, out
         feet_mm = sites.place_mm[: sites.cells]
-        place = cell_numbers(np.floor(feet_mm / sites.cell_mm).astype(np.int64))[shares.place]
+        place = cell_numbers(cells_of(feet_mm, 0.0, sites.cell_mm))[shares.place]
         out = contradictions(
             replace(shares, place=place),
             point_sigma_mm=seen.surfels.spread_mm,

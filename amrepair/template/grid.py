@@ -18,7 +18,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from amrepair.errors import TemplateError
-from amrepair.frames import diagonal, unit_vectors
+from amrepair.frames import cells_of, diagonal, unit_vectors
 from amrepair.template import trilinear_kernels as kernels
 from amrepair.template.file import (
     read_template,
@@ -97,7 +97,7 @@ class Grid:
 
     def cell_of(self, points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 3"]:
         """(n, 3) indices of the coarse cells that hold the points, or the nearest ones."""
-        index = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
+        index = cells_of(points_mm, self.origin_mm, self.cell_mm)
         return np.clip(index, 0, np.array(self.block_of.shape) - 1)
 
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.frames import cells_of
 from amrepair.template.grid import GridSdf, stored_grid
 
 LEARNED_KIND = "learned"
@@ -39,7 +40,7 @@ class Tolerance:
 
     def at(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) spread at the points; beyond the cells that of the nearest."""
-        index = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
+        index = cells_of(points_mm, self.origin_mm, self.cell_mm)
         index = np.clip(index, 0, np.array(self.spread_mm.shape) - 1)
         return self.spread_mm[tuple(index.T)].astype(np.float64)
 

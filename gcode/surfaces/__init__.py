@@ -4,6 +4,6 @@ A height field answers "how high is the part here?" for the slicer (floor of a d
 checker (nozzle body against the part) and the writer (Z-hop). It does not know why it stands so.
 """
 
-from gcode.surfaces.heightfield import HeightField, flat_bed
+from gcode.surfaces.heightfield import HeightField
 
-__all__ = ["HeightField", "flat_bed"]
+__all__ = ["HeightField"]

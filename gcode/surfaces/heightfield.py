@@ -388,11 +388,6 @@ class HeightField:
         return cls.from_mesh(vertices, np.asarray(mesh.tri_verts, np.int64), cell_mm, box_mm=box_mm)
 
 
-def flat_bed(size_mm: tuple[float, float], cell_mm: float) -> HeightField:
-    """The empty bed."""
-    return HeightField.flat(size_mm, cell_mm)
-
-
 def footprint_rows(
     polygon_mm: Sequence[tuple[float, float]], cell_mm: float, *, aside_mm: float = 0.0
 ) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
