@@ -136,6 +136,7 @@ def test_an_interrupted_cell_scores_only_what_is_left(
     assert calls["n"] == before
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_results(dataset: Path, tmp_path: Path) -> None:
     script = (
         "import sys; from pathlib import Path; from amrepair.bench import run_bench\n"

@@ -98,6 +98,7 @@ SLOW = {
     "02_template_from_scans",
     "03_layerwise_loop",
     "04_real_printer_over_serial",
+    "06_benchmark",
     "07_custom_scanner",
     "08_custom_defect",
 }  # fits, whole runs

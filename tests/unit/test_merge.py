@@ -127,6 +127,7 @@ def test_a_hollow_that_one_scan_alone_saw_into_is_kept() -> None:
     assert fuse(joined(clouds)).rejected < 20
 
 
+@pytest.mark.slow
 def test_scans_find_each_other(part: AnalyticTemplate) -> None:
     scans = [placed(points_of(part, 15_000, s), s) for s in range(3)]
     found = placed_together(scans)

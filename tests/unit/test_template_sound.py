@@ -128,6 +128,7 @@ def test_prior_of_variances_is_found_again() -> None:
     assert found == pytest.approx(prior, rel=0.02)
 
 
+@pytest.mark.slow
 def test_scans_in_poses_of_their_own_are_laid_first_and_a_foreign_one_is_left_out() -> None:
     rng = np.random.default_rng(5)
     box = trimesh.creation.box(extents=SIZE_MM)
