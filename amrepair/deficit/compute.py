@@ -22,7 +22,12 @@ from amrepair.deficit.boxes import Sought
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.options import USUAL_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
-from amrepair.deficit.walls import with_rising_rims, with_sharp_walls
+from amrepair.deficit.walls import (
+    with_even_crests,
+    with_rising_rims,
+    with_sharp_walls,
+    with_whole_rims,
+)
 from amrepair.errors import DeficitError
 from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.field.groups import area_per_point
@@ -249,10 +254,14 @@ def _standing(
     designed: Any = template.solid()
     expected = designed.transform(build_from_template.matrix[:3])
     solid, lost_mm, designed_mm = standing_heights(seen, expected, missing, excess, options.heights)
-    points_mm, spacing_mm = build_from_template.apply(scan.points_mm), evidence.spacing_mm
+    points_mm = build_from_template.apply(scan.points_mm)
     sharp = with_sharp_walls(solid, lost_mm > 0, points_mm, scan.sigma_mm, options.walls)
-    known = with_what_stands_out(sharp, points_mm, scan.sigma_mm, spacing_mm, options.heights)
-    return with_rising_rims(known, lost_mm, designed_mm, spacing_mm, options.walls)
+    known = with_what_stands_out(
+        sharp, points_mm, scan.sigma_mm, evidence.spacing_mm, options.heights
+    )
+    even = with_even_crests(known, lost_mm, designed_mm, options.walls)
+    rising = with_rising_rims(even, lost_mm, designed_mm, evidence.spacing_mm, options.walls)
+    return with_whole_rims(rising, lost_mm, designed_mm, options.walls)
 
 
 def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...]:

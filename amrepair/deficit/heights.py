@@ -7,7 +7,6 @@ part stands as it was designed, and that margin; where it was designed open, not
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -18,6 +17,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points, Values
+from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
 from amrepair.field.near import has_near
@@ -241,9 +241,9 @@ def with_what_stands_out(
         Mean distance between neighbouring points.
     """
     off_mm = options.off_sigma * sigma_mm
-    out = points_mm[points_mm[:, 2] - off_mm > field.sample(points_mm[:, :2])]
-    for way in itertools.product((-1.0, 0.0, 1.0), repeat=2):
-        out = out[out[:, 2] - off_mm > field.sample(out[:, :2] + off_mm * np.array(way))]
+    points_mm = np.ascontiguousarray(points_mm)
+    higher = kernels.standing_out(points_mm, field.z_mm, field.origin_mm, field.cell_mm, off_mm)
+    out = points_mm[higher]
     if len(out) == 0:
         return field
     # itself is one of them

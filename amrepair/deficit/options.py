@@ -123,7 +123,7 @@ class HeightOptions:
 
 @dataclass(frozen=True, slots=True)
 class WallOptions:
-    """Walls and rims beside what is missing, in cells of the fine field.
+    """Walls, crests and rims beside what is missing, in cells of the fine field.
 
     Attributes
     ----------
@@ -139,11 +139,17 @@ class WallOptions:
         What lies farther from its plane than noise alone, on average, is more than one wall.
     most_slant
         Cosine: a wall is steeper than 75°.
+    crest_cells, crest_reach_cells
+        Thinner than a bead; and along it, as far as between two points that were seen.
+    splinter_mm
+        A crest that stands so little lower than designed has lost its points, no more.
     steep_mm
-        What is missing is deeper than this where rims are looked at.
-    edge_mm, rounded_spacings, rounded_mm
-        A fall from cell to cell that is a top's edge; how far from it tops are rounded off, and by
-        how much at most.
+        A face of what is missing is steep where it falls by this from a cell to the next (83°).
+    rounded_mm, rounded_cells, as_designed_mm, foot_cells
+        So much of a lip the solids' rounding may have taken, so many cells wide; what is as
+        designed; how far from it the foot of a face is looked for.
+    edge_mm, rounded_spacings
+        A fall from cell to cell that is a top's edge; how far from it tops are rounded off.
     sound_mm, least_sound, uneven_mm
         Beyond that, as far a top is looked at, at so many columns at least; and how even it is.
     """
@@ -155,10 +161,16 @@ class WallOptions:
     over_foot_sigma: float = 4.0
     most_spread_sigma: float = 1.75
     most_slant: float = 0.25
+    crest_cells: int = 4
+    crest_reach_cells: int = 2
+    splinter_mm: float = 0.3
     steep_mm: float = 0.8
+    rounded_mm: float = 0.4
+    rounded_cells: int = 3
+    as_designed_mm: float = 0.1
+    foot_cells: int = 2
     edge_mm: float = 0.4
     rounded_spacings: float = 1.5
-    rounded_mm: float = 0.4
     sound_mm: float = 0.8
     least_sound: int = 20
     uneven_mm: float = 0.04

@@ -17,7 +17,7 @@ from scipy import ndimage
 from amrepair.arrays import ColumnMask, HeightMap, Points
 from amrepair.deficit import walls_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, WallOptions
-from amrepair.frames import cells_of, in_box
+from amrepair.frames import in_box
 from gcode.surfaces import HeightField
 
 
@@ -55,6 +55,46 @@ def with_sharp_walls(
         options.most_spread_sigma * sigma_mm, options.most_slant,
     )  # fmt: skip
     return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+
+
+def with_even_crests(
+    field: HeightField,
+    lost_mm: HeightMap,
+    designed_mm: HeightMap,
+    options: WallOptions = USUAL_DEFICIT.walls,
+) -> HeightField:
+    """The as-built field, what is thinner than a bead beside what is missing as high as near by.
+
+    A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
+    what lies between two of its columns that were seen is no lower than the higher of them, and
+    where that is a little lower than designed, beside a steep face, it is as designed.
+
+    Parameters
+    ----------
+    lost_mm, designed_mm
+        How much is missing from each column, from end to end, and the top of what was expected.
+    """
+    gone = lost_mm > 0
+    if not gone.any():
+        return field
+    rows, columns = window_around(gone, options.crest_cells + options.beside_cells)
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
+    lost = lost_mm[rows, columns]
+    beside = ndimage.maximum_filter(gone[rows, columns], 2 * options.beside_cells + 1)
+    # where what is missing lies on what stands, not beside a wall that reads too far in
+    on = (lost > options.steep_mm) & (designed - lost < near + options.as_designed_mm)
+    foot_mm = ndimage.minimum_filter(np.where(on, near, np.inf), 2 * options.beside_cells + 1)
+    reach = 2 * options.crest_reach_cells + 1
+    # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
+    thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, options.crest_cells), reach)
+    crest = beside & (near - thick_mm > options.step_mm)
+    highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
+    # the tip of a worn edge falls off on its outside alone
+    cut = highest_mm - foot_mm > options.steep_mm
+    whole = cut & (designed > highest_mm) & (designed < highest_mm + options.splinter_mm)
+    near[crest] = np.where(whole, designed, highest_mm)[crest]
+    return field.raised(z_mm)
 
 
 def with_rising_rims(
@@ -98,6 +138,40 @@ def with_rising_rims(
     return field.raised(z_mm)
 
 
+def with_whole_rims(
+    field: HeightField,
+    lost_mm: HeightMap,
+    designed_mm: HeightMap,
+    options: WallOptions = USUAL_DEFICIT.walls,
+) -> HeightField:
+    """The as-built field, tops beside a steep face of what is missing as designed up to the face.
+
+    Solids round off such a lip by some tenths of a millimetre. Where a top is as designed up to a
+    few columns from a face, and falls steeply there, it ends at the face and not before; what lies
+    lower along a slope, as of a worn edge, is lower.
+
+    Parameters
+    ----------
+    lost_mm, designed_mm
+        How much is missing from each column, from end to end, and the top of what was expected.
+    """
+    deep = lost_mm > options.steep_mm  # beside a line that was skipped nothing stands as if cut
+    if not deep.any():
+        return field
+    rows, columns = window_around(deep, options.rounded_cells + options.beside_cells)
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
+    deep, lost = deep[rows, columns], lost_mm[rows, columns] > 0
+    off_mm = designed - near
+    foot_mm = ndimage.minimum_filter(np.where(deep, near, np.inf), 2 * options.foot_cells + 1)
+    lip = designed - foot_mm > options.steep_mm
+    whole = (np.abs(off_mm) < options.as_designed_mm) & ~ndimage.maximum_filter(lost, 3)
+    lip &= ndimage.maximum_filter(whole, 2 * options.rounded_cells + 1)
+    rounded = lip & (off_mm > 0) & (off_mm < options.rounded_mm)
+    near[rounded] = designed[rounded]
+    return field.raised(z_mm)
+
+
 def window_around(gone: ColumnMask, margin: int) -> tuple[slice, slice]:
     """Rows and columns of the window around those that something is missing from."""
     rows, columns = (
@@ -113,7 +187,7 @@ def _by_cell(
     ny, nx = shape
     high_mm = corner_mm + cell_mm * np.array([nx, ny])
     own = points_mm[in_box(points_mm[:, :2], corner_mm, high_mm)]
-    index = cells_of(own[:, :2], corner_mm, cell_mm)
+    index = np.floor((own[:, :2] - corner_mm) / cell_mm).astype(np.int64)
     cell = np.minimum(index[:, 1], ny - 1) * nx + np.minimum(index[:, 0], nx - 1)
     ends = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=ny * nx))])
     start = np.lib.stride_tricks.sliding_window_view(ends, nx + 1)[::nx]

@@ -10,7 +10,12 @@ from scipy import ndimage
 
 from amrepair.deficit.heights import as_built_heights, columns_of
 from amrepair.deficit.options import HeightOptions
-from amrepair.deficit.walls import with_rising_rims, with_sharp_walls
+from amrepair.deficit.walls import (
+    with_even_crests,
+    with_rising_rims,
+    with_sharp_walls,
+    with_whole_rims,
+)
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
@@ -106,6 +111,49 @@ def test_slopes_and_what_is_not_broken_stay_as_they_are() -> None:
     assert with_sharp_walls(outside, nothing, scanned(rest, 2), SIGMA_MM) is outside
 
 
+def test_a_crest_between_two_columns_that_were_seen_is_as_high_as_they() -> None:
+    """A horn read 0.8 mm low in the middle: the flat went 0.4 mm into it."""
+    block = Solid.cube((24.0, 20.0, 6.0))
+    tools = [
+        Solid.cube((30.0, 9.9, 4.0), True).translate((12.0, y, 6.0)) for y in (4.9, 15.05)
+    ]  # a fin of 0.25 mm is left between them
+    piece = block ^ (tools[0] + tools[1])
+    truth = HeightField.from_manifold(block - piece, CELL_MM, margin_mm=1.0)
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    fin = z_mm > 5.0
+    assert 0 < fin.sum() < 3 * z_mm.shape[1]
+    low = fin & (np.random.default_rng(3).random(z_mm.shape) < 0.3)
+    z_mm[low] -= 0.8
+    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    even = with_even_crests(rough, np.where(gone_from(truth, piece), 2.0, 0.0), designed.z_mm)
+    assert (even.z_mm[fin] > 5.9).mean() > 0.99
+    assert (even.z_mm[~fin] == z_mm[~fin]).all()
+
+
+def test_a_splinter_a_little_lower_than_designed_is_as_designed() -> None:
+    """Of 0.1 to 0.3 mm beside a pit, read 0.1 to 0.5 mm low: the flat went 0.2 mm into it."""
+    block = Solid.cube((24.0, 15.25, 6.0))
+    piece = Solid.cube((9.0, 9.0, 3.0)).translate((7.5, 6.0, 3.0))
+    truth = HeightField.from_manifold(block - piece, CELL_MM, margin_mm=1.0)
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    lost_mm = np.where(gone_from(truth, piece), 3.0, 0.0)
+    x, y = truth.centres_mm()
+    crest = ((y > 15.0) & (y < 15.25))[:, None] & ((x > 8.0) & (x < 16.0))[None, :]
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    z_mm[crest] -= np.random.default_rng(4).uniform(0.1, 0.45, int(crest.sum()))
+    low = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    even = with_even_crests(low, lost_mm, designed.z_mm)
+    assert crest.sum() > 100
+    assert np.abs(even.z_mm[crest] - 6.0).max() < 1e-6
+    # beside a line that was skipped nothing was cut: an idler's was filled to 0.83 instead of 0.92
+    skipped = with_even_crests(low, np.minimum(lost_mm, 0.4), designed.z_mm)
+    assert skipped.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.95
+    z_mm[crest] -= 1.0  # that is no rounding: it broke off lower
+    broken_off = with_even_crests(low, lost_mm, designed.z_mm)
+    assert broken_off.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.0
+
+
 @pytest.mark.parametrize("rises_deg", [20.0, 40.0])
 def test_a_worn_edge_rises_up_to_the_wall_behind_it(rises_deg: float) -> None:
     """Its last columns read as high as what lies three columns in: 0.2 mm low, and were hit."""
@@ -132,6 +180,69 @@ def test_a_worn_edge_rises_up_to_the_wall_behind_it(rises_deg: float) -> None:
     low = designed.z_mm - 0.02
     held = with_rising_rims(rounded, lost_mm, np.minimum(low, truth.z_mm), SPACING_MM)
     assert (held.z_mm <= np.maximum(np.minimum(low, truth.z_mm), z_mm)).all()
+
+
+def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
+    rest, piece = broken("notch", 0.0)
+    truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    beside = (ndimage.maximum_filter(z_mm, 3) > 5.9) & (np.abs(z_mm - 4.0) < 0.1)
+    z_mm[beside] += 0.9
+    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    even = with_even_crests(
+        rough, np.where(gone_from(truth, piece), 2.0, 0.0), np.full(z_mm.shape, 6.0)
+    )
+    assert beside.sum() > 300
+    assert (even.z_mm == z_mm).all()
+
+
+@pytest.mark.parametrize("turned", [0.0, 17.0])
+def test_a_sloping_top_ends_at_a_steep_face_and_not_before(turned: float) -> None:
+    """Its last column read 0.1 to 0.35 mm low, and the body went 0.22 mm into it."""
+    wedge = Solid.hull_points(
+        [(x, y, z) for x, high in ((0.0, 7.0), (24.0, 5.0)) for y in (0.0, 20.0) for z in (0, high)]
+    )
+    tool = Solid.cube((9.0, 30.0, 4.0), True).rotate((0.0, 0.0, turned))
+    tool = tool.translate((12.037, 10.071, 6.0))
+    truth = HeightField.from_manifold(wedge - tool, CELL_MM, margin_mm=1.0)
+    designed = HeightField.from_manifold(wedge, CELL_MM, margin_mm=1.0)
+    gone = gone_from(truth, wedge ^ tool)
+    lip = ~gone & ndimage.maximum_filter(gone, 3) & (truth.z_mm > 1.0)
+    assert lip.sum() > 300
+    z_mm = np.array(truth.z_mm, dtype=np.float64)
+    z_mm[lip] -= np.random.default_rng(5).uniform(0.1, 0.35, int(lip.sum()))
+    rounded = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    # the piece, rounded off as well, has the lip's columns, too
+    lost_mm = np.where(gone | lip, np.maximum(designed.z_mm - truth.z_mm, 1.0), 0.0)
+    whole = with_whole_rims(rounded, lost_mm, designed.z_mm)
+    assert np.abs(whole.z_mm - truth.z_mm).max() < 1e-6
+
+
+def test_a_worn_edge_is_no_lip() -> None:
+    block = Solid.cube((24.0, 20.0, 6.0))
+    tool = Solid.cube((30.0, 40.0, 20.0), True).translate((0.0, 0.0, 10.0))
+    tool = tool.rotate((0.0, 35.0, 0.0)).translate((21.037, 10.0, 5.0))
+    truth = HeightField.from_manifold(block - tool, CELL_MM, margin_mm=1.0)
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    noise = np.random.default_rng(6).normal(scale=0.05, size=truth.shape)
+    worn = HeightField(truth.origin_mm, CELL_MM, truth.z_mm + noise, truth.seen)
+    gone = gone_from(truth, block ^ tool)
+    assert gone.sum() > 5000
+    lost_mm = np.where(gone, designed.z_mm - truth.z_mm, 0.0)
+    assert (with_whole_rims(worn, lost_mm, designed.z_mm).z_mm == worn.z_mm).all()
+
+
+def test_beside_a_skipped_line_nothing_stands_as_if_cut() -> None:
+    """At the outline its columns lie as low as the bed: what was low beside it was raised."""
+    block = Solid.cube((24.0, 20.0, 6.0))
+    line = Solid.cube((12.0, 0.5, 0.4)).translate((6.0, 0.0, 5.6))
+    designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
+    z_mm = np.array(HeightField.from_manifold(block - line, CELL_MM, margin_mm=1.0).z_mm)
+    lost_mm = np.where(gone_from(designed, line), 0.4, 0.0)
+    z_mm[lost_mm > 0] = 0.0  # as a wall that stands a column farther in reads
+    z_mm[ndimage.maximum_filter(lost_mm, 5) > 0] -= 0.2
+    low = HeightField(designed.origin_mm, CELL_MM, z_mm, designed.seen)
+    assert (with_whole_rims(low, lost_mm, designed.z_mm).z_mm == z_mm).all()
 
 
 def test_cells_that_chance_left_empty_are_as_high_as_what_is_next_to_them() -> None:
