@@ -150,7 +150,7 @@ class Motion:
     @property
     def _cold(self) -> bool:
         """Whether no line has waited for a hotend that melts; what a macro did only it knows."""
-        may_be_hot = self._heats_unsaid and self.policy is Policy.DANGER
+        may_be_hot = self._heats_unsaid and self._lenient
         return self._ready_c < self._setup.printer.min_extrude_c and not may_be_hot
 
     @property

@@ -2,8 +2,8 @@
 
 What changes the machine lastingly, or switches a protection off, is left out on purpose: EEPROM
 (M500, M502), steps per mm (M92), homing offsets (M206, M428), PID tuning, the numbers of lines
-(M110). So are curves whose course nothing here follows (G5 with
-words; without, some makers' Marlins are told to resume after a power failure by it).
+(M110). So are curves whose course nothing here follows (G5 with words; without, some makers'
+Marlins are told to resume after a power failure by it).
 
 Sources: marlinfw.org/docs/gcode; klipper3d.org/G-Codes.html; Duet's G-code dictionary; Prusa's
 `lib/Marlin` and `src/common/marlin_server` of Prusa-Firmware-Buddy, whose jobs slicers call Marlin;

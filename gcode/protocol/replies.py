@@ -172,14 +172,16 @@ def _firmware(text: str) -> FirmwareInfo:
 def _error(text: str) -> Reply:
     if _FATAL.search(text):
         return CommandFailed(text, fatal=True)
-    if _LINE_ERROR.search(text):
+    if _LINE_ERROR.search(text) or _is_damaged_line_error(text):
         last = _LAST_LINE.search(text)
         return LineError(text, int(last.group(1)) if last else None)
     if _HARMLESS_ERROR.search(text):
         return Echo(f"Error:{text}")
     if text.lower().startswith("unknown command"):
         return UnknownCommand(text)
-    said = text.lower().rstrip("0123456789")
-    if any(SequenceMatcher(None, said, one).ratio() >= _ALIKE for one in _LINE_ERRORS):
-        return LineError(text, None)
     return CommandFailed(text, fatal=False)
+
+
+def _is_damaged_line_error(text: str) -> bool:
+    said = text.lower().rstrip("0123456789")
+    return any(SequenceMatcher(None, said, one).ratio() >= _ALIKE for one in _LINE_ERRORS)

@@ -193,8 +193,7 @@ def _blow(pen: Pen, setup: PrintSetup, *, over_air: bool) -> None:
     """Cool as what comes next needs it: strands over air set before they sag."""
     ordinary = setup.material.fan_ratio
     ratio = setup.material.bridge_fan_ratio if over_air else ordinary
-    last = next((move.ratio for move in reversed(pen.moves) if isinstance(move, SetFan)), ordinary)
-    if ratio is not None and ratio != last:
+    if ratio is not None and ratio != (ordinary if pen.fan_ratio is None else pen.fan_ratio):
         pen.add(SetFan(ratio))
 
 

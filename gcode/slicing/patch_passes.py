@@ -178,9 +178,10 @@ def _along_own(
     strips = strips_along_walls(thick, at.z_mm, model, state)
     chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
     height_mm, lost = float(thick[thick > 0].mean()), []
-    if drawn is not None and drawn.lost_mm2 * height_mm > model.options.left.least_listed_mm3:
+    if drawn is not None:
         lost_mm3 = drawn.lost_mm2 * drawn.height_mm
-        lost.append(_thin(drawn.region, at.z_mm, drawn.height_mm, lost_mm3))
+        if lost_mm3 > model.options.left.least_listed_mm3:
+            lost.append(_thin(drawn.region, at.z_mm, drawn.height_mm, lost_mm3))
     return _Laying(chains, laid, _served(laid, due.thick_mm), height_mm, lost)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from gcode.moves import Extrude, Move, Retract, Role, Travel
+from gcode.moves import Extrude, Move, Retract, Role, SetFan, Travel
 from gcode.profiles import PrintSetup
 from gcode.slicing.beads import Bead, width_of
 
@@ -30,10 +30,13 @@ class Pen:
         self.moves: list[Move] = []
         self.position_mm = np.asarray(position_mm, float).copy()
         self.retracted = False
+        self.fan_ratio: float | None = None  # not told yet
 
     def add(self, move: Move) -> None:
         """Append a move that does not change the place."""
         self.moves.append(move)
+        if isinstance(move, SetFan):
+            self.fan_ratio = move.ratio
 
     def retract(self) -> None:
         """Pull the filament back, once."""
