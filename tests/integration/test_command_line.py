@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -14,22 +13,10 @@ import numpy as np
 import pytest
 import trimesh
 
-ROOT = Path(__file__).parents[2]
-BIN = Path(sys.executable).parent
+from tests.commands import ROOT, call
+
 KNOB = ROOT / "examples" / "parts" / "knob.stl"
 DATA = os.environ.get("AMREPAIR_DATA")
-
-
-def call(*words: str | Path, program: str = "amrepair") -> subprocess.CompletedProcess[str]:
-    code = f"from {program}.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-        cwd=ROOT,
-    )
 
 
 def refused(done: subprocess.CompletedProcess[str], said: str) -> None:

@@ -23,6 +23,7 @@ from gcode.firmware import EmulatedPrinterProcess, FirmwareCore
 from gcode.moves import Program
 from gcode.profiles import EnvelopeSlice, PrinterProfile, PrintSetup, load_setup
 from gcode.resumption import Resumption, resume_at
+from tests.commands import call
 
 DATA = os.environ.get("AMREPAIR_DATA")
 
@@ -267,24 +268,13 @@ def test_a_full_bed_leaves_no_place_to_prime() -> None:
         resume_at(Program("\n".join(lines), "marlin"), setup_for("generic_marlin"), layer=3)
 
 
-def call(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    code = "from gcode.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code, *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-        cwd=ROOT,
-    )
-
-
 def test_the_command_line_makes_it_and_prints_it(tmp_path: Path) -> None:
     """From the file to the emulated printer: it stands at 2 mm, and the rest is printed."""
     job, out, field = tmp_path / "job.gcode", tmp_path / "rest.gcode", tmp_path / "stands.npz"
     job.write_text(tower(4.0).text)
     words = ["--printer", "generic_marlin"]
-    made = call("resume-at", job, "--z-mm", "2.0", *words, "-o", out, "--standing", field, "--json")
+    where = ["-o", out, "--standing", field, "--json"]
+    made = call("resume-at", job, "--z-mm", "2.0", *words, *where, program="gcode")
     assert made.returncode == 0, made.stderr
     told = json.loads(made.stdout)
     assert (told["layer"], told["standing_mm"], told["primed"]) == (10, 2.0, "on the bed")
@@ -297,9 +287,9 @@ def test_the_command_line_makes_it_and_prints_it(tmp_path: Path) -> None:
         emulator.take_motion()
         journal = tmp_path / "journal.sqlite"
         send = ("send", out, "--port", emulator.port, *words, "--journal", journal, "--json")
-        refused = call(*send)  # nobody said that something stands there
+        refused = call(*send, program="gcode")  # nobody said that something stands there
         assert refused.returncode == 2
-        done = call(*send, "--as-built", field)
+        done = call(*send, "--as-built", field, program="gcode")
         assert done.returncode == 0, done.stderr
         motion = emulator.take_motion()
         state = emulator.state()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from amrepair.frames import moved, rotation_from_vector
 from amrepair.scans import Scan, write_ply
 from amrepair.template import load_template
 from tests.analytic import AnalyticTemplate, box, cylinder, difference, sample_surface, union
+from tests.commands import call
 
 pytestmark = pytest.mark.slow  # half a minute each: whole fits
 
@@ -58,9 +58,7 @@ def written(path: Path, points: np.ndarray, seed: int) -> Path:
 
 
 def fitted(scans: list[Path], out: Path) -> subprocess.CompletedProcess[str]:
-    words = ["template", "fit", *map(str, scans), "-o", str(out), "--json"]
-    command = [sys.executable, "-W", "ignore", "-m", "amrepair", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+    return call("template", "fit", *scans, "-o", out, "--json", quiet=True)
 
 
 def test_views_of_two_parts_are_refused_with_the_groups_by_name(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,23 +12,11 @@ import trimesh
 from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan, write_ply
 from amrepair.template import LearnedSdf, MeshSdf, load_mesh, load_template
+from tests.commands import ROOT, call
 
 pytestmark = pytest.mark.slow  # a minute of work, all of it in other processes
 
-ROOT = Path(__file__).parents[2]
 PARTS = ROOT / "examples" / "parts"
-
-
-def call(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    code = "from amrepair.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code, *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-        cwd=ROOT,
-    )
 
 
 def write_scan(path: Path, part: str, seed: int, turn: float) -> Path:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +23,7 @@ from gcode.hosts import LinkLostError, PrintReport, connect
 from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.secret import ApiKey, find_key
 from gcode.hosts.web import Address, WebTiming
+from tests.commands import call
 
 KEY = "SECRET0123456789"
 QUICK = WebTiming(request_s=5.0, upload_s=5.0, answer_s=5.0, lost_s=0.3, poll_s=0.02)
@@ -424,20 +423,16 @@ def test_the_emergency_stop_is_m112_at_once(fake: FakeOctoPrint) -> None:
     assert fake.commands == ["M112"]
 
 
-def test_gcode_send_prints_through_it(fake: FakeOctoPrint, tmp_path: Path) -> None:
+def test_gcode_send_prints_through_it(
+    fake: FakeOctoPrint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     job = tmp_path / "job.gcode"
     job.write_text("G28\nG1 X10 Y10 F6000\n")
-    main = "from gcode.cli import main; main()"
     port = f"octoprint+{fake.server.base}"
 
     def send(key: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-c", main, "send", job, "--port", port, "--json"],
-            env={**os.environ, "OCTOPRINT_API_KEY": key},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        monkeypatch.setenv("OCTOPRINT_API_KEY", key)
+        return call("send", job, "--port", port, "--json", program="gcode")
 
     done = send(KEY)
     assert done.returncode == 0, done.stderr

@@ -28,6 +28,7 @@ from gcode.profiles import load_setup
 from gcode.protocol import command_in
 from gcode.slicing.job import slice_part
 from gcode.writer import write
+from tests.commands import call
 
 SIDE_MM, HIGH_MM, LAYER_MM = 24.0, 4.0, 0.2
 SETUP = load_setup("ender_3", "pla", "standard_0.20")  # sparse infill under five solid layers
@@ -204,8 +205,7 @@ def test_a_failure_leaves_the_job_and_ends_with_one_line(tmp_path: Path) -> None
     """The slicer shows what stands on standard error, and fails where the exit code is not 0."""
     file = tmp_path / "job.gcode"
     file.write_text("G28\nG1 X5\n")
-    words = [sys.executable, "-m", "amrepair", "postprocess", "--for", "marlin", str(file)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=120)
+    done = call("postprocess", "--for", "marlin", file)
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert "extrudes nothing" in done.stderr
