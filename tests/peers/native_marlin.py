@@ -14,10 +14,15 @@ import select
 import subprocess
 import threading
 import tty
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
 import pytest
+
+from gcode.firmware import MotionBatch
+from gcode.profiles import PrinterProfile, load_printer
 
 EXECUTED = re.compile(rb"echo:(?:N\d+ ?)?([GMT]\d[^*]*)")
 """Marlin tells every command that it carries out, after `M111 S1`."""
@@ -29,6 +34,67 @@ def native_marlin() -> str:
     if not Path(program).is_file():
         pytest.skip("AMREPAIR_MARLIN names no Marlin built for Linux")
     return program
+
+
+# As its default configuration has it.
+PROFILE = """
+inherits = "generic_marlin"
+name = "Native Marlin"
+bed_size_mm = [200.0, 200.0]
+max_z_mm = 200.0
+park_mm = [5.0, 195.0, 20.0]
+"""
+
+
+def profile(folder: Path) -> PrinterProfile:
+    """Its printer's profile, kept in a folder."""
+    path = folder / "native_marlin.toml"
+    path.write_text(PROFILE)
+    return load_printer(str(path))
+
+
+class Nozzle:
+    """Where commands that were carried out have it go, and what it pushes out on its way."""
+
+    def __init__(self) -> None:
+        self._at = np.zeros(3)
+        self._relative, self._pushes_relative, self._e_mm, self._f_mm_s = False, False, 0.0, 10.0
+        self._clock_s = 0.0
+
+    def follow(self, commands: Sequence[str]) -> MotionBatch:
+        """The moves of G0 and G1, with G90, G91, M82, M83, G92 E and G28."""
+        rows = [row for command in commands if (row := self._carry_out(command)) is not None]
+        return MotionBatch.from_bytes(np.array(rows, dtype=np.float64).tobytes())
+
+    def _carry_out(self, command: str) -> list[float] | None:
+        code, *words = command.split()
+        told = {word[0]: word[1:] for word in words}
+        if code in ("G90", "G91"):
+            self._relative = self._pushes_relative = code == "G91"
+        elif code in ("M82", "M83"):
+            self._pushes_relative = code == "M83"
+        elif code == "G92" and "E" in told:
+            self._e_mm = float(told["E"])
+        elif code == "G28":
+            for k, axis in enumerate("XYZ"):
+                if axis in told or not told:
+                    self._at[k] = 0.0
+        elif code in ("G0", "G1"):
+            return self._move({axis: float(value) for axis, value in told.items() if value})
+        return None
+
+    def _move(self, told: dict[str, float]) -> list[float]:
+        start = self._at.copy()
+        for k, axis in enumerate("XYZ"):
+            if axis in told:
+                self._at[k] = told[axis] + (start[k] if self._relative else 0.0)
+        pushed_mm = 0.0
+        if "E" in told:
+            pushed_mm = told["E"] - (0.0 if self._pushes_relative else self._e_mm)
+            self._e_mm += pushed_mm
+        self._f_mm_s = told.get("F", 60.0 * self._f_mm_s) / 60.0
+        self._clock_s += max(float(np.linalg.norm(self._at - start)), abs(pushed_mm)) / self._f_mm_s
+        return [*start, *self._at, pushed_mm, self._f_mm_s, self._clock_s]
 
 
 class NativeMarlin:
