@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := $(VENV)/.extras
+# What one worker compiles, the processes that tests start need not compile again.
+unexport PYTHONDONTWRITEBYTECODE
 # Tests wait for wires, killed processes and one another's kernels: two workers more than cores.
 WORKERS := $(shell $(PYTHON) -c "import os; print(2 + (os.cpu_count() or 1))")
 

@@ -20,6 +20,7 @@ from link_forks import Forks, until
 
 from gcode.cli import main
 from gcode.hosts.journal import Journal
+from tests.commands import call
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +144,7 @@ def test_the_command_line_goes_on_after_a_kill(
     first.communicate()
     assert first.returncode == -signal.SIGKILL
     until(lambda: b"targets of 0" in notes(bench.journal))
-    done = subprocess.run(
-        [*command, "--resume"], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = call(*words, "--resume", program="gcode", quiet=True)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["ok"]

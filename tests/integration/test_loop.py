@@ -37,15 +37,15 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def template() -> MeshSdf:
-    block = trimesh.creation.box(bounds=((0, 0, 0), (26, 22, 4)))
-    step = trimesh.creation.box(bounds=((3, 3, 3.9), (18, 16, 6)))
+    block = trimesh.creation.box(bounds=((0, 0, 0), (24, 18, 3)))
+    step = trimesh.creation.box(bounds=((3, 3, 2.9), (16, 14, 4.6)))
     return MeshSdf.from_mesh(trimesh.boolean.union([block, step], engine="manifold"))
 
 
 @pytest.fixture(scope="module")
 def plate() -> MeshSdf:
     """A third of the other's material, where one defect is enough."""
-    return MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (17, 13, 2.6))))
+    return MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (15, 12, 2.0))))
 
 
 def prepared(template: MeshSdf, *defects: str, process: str = "repair_0.20") -> PreparedRun:

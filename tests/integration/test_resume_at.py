@@ -124,10 +124,10 @@ def judge(made: Resumption, job: Program, setup: PrintSetup) -> Ran:
         ("plant-sign", "generic_marlin", 9),
         ("prusaslicer-cube", "prusa_mk3s", 37),
         ("prusaslicer-cube", "generic_reprap", 60),
-        ("screw", "generic_marlin", 110),
+        pytest.param("screw", "generic_marlin", 110, marks=pytest.mark.slow),
         ("vase", "ender_3", 300),
         ("cura_slicer", "voron_2_4", 12),
-        ("orca_slicer", "voron_2_4", 170),
+        pytest.param("orca_slicer", "voron_2_4", 170, marks=pytest.mark.slow),
     ],
 )
 def test_every_slicers_job_goes_on_move_for_move(name: str, printer: str, layer: int) -> None:

@@ -96,6 +96,7 @@ def test_adam_damaged_scan_is_refused(adam: Path, content: bytes) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_adam_runs_through_the_bench_in_two_processes(adam: Path, tmp_path: Path) -> None:
     report = run_bench(
         adam, format="3d-adam", methods=["btf-raw"], out=tmp_path / "out", seeds=[0, 1], jobs=2

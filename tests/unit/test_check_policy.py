@@ -143,10 +143,10 @@ def test_check_and_send_tell_warnings_and_what_they_add(tmp_path: Path) -> None:
     [
         ("plant-sign", "ender_3", ()),
         ("prusaslicer-cube", "ender_3", ()),
-        ("screw", "ender_3", ()),
+        pytest.param("screw", "ender_3", (), marks=pytest.mark.slow),
         ("vase", "generic_marlin", ()),
         ("cura_slicer", "creality_k1", ()),
-        ("orca_slicer", "creality_k1_max", ()),
+        pytest.param("orca_slicer", "creality_k1_max", (), marks=pytest.mark.slow),
     ],
 )
 def test_real_jobs_run_on_their_machines(name: str, printer: str, warned: tuple[str, ...]) -> None:
