@@ -124,7 +124,7 @@ def lines_of(part: Any, setup: PrintSetup) -> JobLines:
     """What our own slicer lays for a part."""
     program = write(plan_part(part, setup).toolpath, setup, title="bench")
     job = job_for(program, setup.printer)
-    return lines_of_job(job, job.beads.layer >= 0)
+    return lines_of_job(job, job.beads.layer >= 0, setup)
 
 
 def run(name: str, setup: PrintSetup, cell_mm: float, *, along_job: bool) -> dict[str, Any] | None:
@@ -141,7 +141,9 @@ def run(name: str, setup: PrintSetup, cell_mm: float, *, along_job: bool) -> dic
     )  # fmt: skip
     spent_s = time.process_time() - start_s
     program = write(plan.toolpath, setup, title="bench", resume=None, restore=False)
-    refused = find_refusals(program, setup, as_built=as_built, patch=True)
+    refused = find_refusals(
+        program, setup, as_built=as_built, patch=lines.bridges if lines else True
+    )
     verdict = judge(
         program.text,
         mesh_of(case.rest),

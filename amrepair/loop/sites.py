@@ -18,6 +18,7 @@ from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Detector, Site
 from amrepair.template import KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
+from gcode.check import JobBridges
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.slicing.job_lines import JobLines
@@ -82,7 +83,7 @@ def sites(
                 grid,
                 build_from_template,
                 calibration=NORMAL_NOISE,
-                lines=lines_of_job(job, every),
+                lines=lines_of_job(job, every, setup),
                 beside=_beside(job, every),
                 laid=_laid(job, every, kept),
             )
@@ -105,7 +106,7 @@ def sites(
             calibration=NORMAL_NOISE,
             planned=planned,
             beads=recent,
-            lines=lines_of_job(job, done),
+            lines=lines_of_job(job, done, setup),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
             beside=None if by_beads else _beside(job, done),
             laid=_laid(job, done, kept),
@@ -154,14 +155,18 @@ def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> Heig
     return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
 
 
-def lines_of_job(job: Job, which: Bool[np.ndarray, " n"]) -> JobLines:
-    """Some of a job's beads as lines that a patch may follow."""
+def lines_of_job(job: Job, which: Bool[np.ndarray, " n"], setup: PrintSetup) -> JobLines:
+    """Some of a job's beads as lines that a patch may follow, and what they bridge."""
     beads = job.beads
+    start, end, section = (
+        each[which] for each in (beads.start_mm, beads.end_mm, beads.section_mm2)
+    )
     rim = np.array([any(word in role.lower() for word in RIMS) for role in beads.roles])
     return JobLines(
-        beads.start_mm[which],
-        beads.end_mm[which],
-        beads.section_mm2[which],
+        start,
+        end,
+        section,
         beads.height_mm[which],
         rim[beads.role[which]],
+        bridges=JobBridges(start, end, section, setup.printer.nozzle_diameter_mm),
     )

@@ -26,7 +26,7 @@ from amrepair.repair.plan import RepairPlan
 from amrepair.repair.site import Site
 from amrepair.repair.stopwatch import Stopwatch
 from amrepair.scans import PROBE, Scan
-from gcode.check import check
+from gcode.check import JobBridges, check
 from gcode.errors import CheckRefusedError
 from gcode.estimate import estimate
 from gcode.moves import ModalState
@@ -109,7 +109,7 @@ def plan_repair(
     if not patch.toolpath.extrusions:
         return plan
     with watch("check"):
-        return _checked(plan, site, title=title, interruption=interruption, strict=strict)
+        return _checked(plan, site, lines, title=title, interruption=interruption, strict=strict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,7 +302,13 @@ def _slice(
 
 
 def _checked(
-    plan: RepairPlan, site: Site, *, title: str, interruption: ModalState | None, strict: bool
+    plan: RepairPlan,
+    site: Site,
+    lines: JobLines | None,
+    *,
+    title: str,
+    interruption: ModalState | None,
+    strict: bool,
 ) -> RepairPlan:
     """The plan with its program, written and checked, or with the reason why it has none."""
     assert plan.patch is not None
@@ -310,8 +316,11 @@ def _checked(
     program = write(
         plan.patch.toolpath, site.setup, title=title, resume=interruption, restore=False
     )
+    # what the job bridges counts where the checker has followed it itself
+    bridges = lines.bridges if lines is not None else None
+    patch = bridges if isinstance(bridges, JobBridges) else True
     try:
-        checked = check(program, site.setup, as_built=as_built, initial=interruption, patch=True)
+        checked = check(program, site.setup, as_built=as_built, initial=interruption, patch=patch)
     except CheckRefusedError as error:
         if strict:
             raise

@@ -7,11 +7,13 @@ Only `check` makes a `CheckedProgram`, and only that may be printed.
 
 from gcode.check.checker import Verdict, check, find_refusals, judge, policy_of
 from gcode.check.findings import Policy, Refusal, Touch, Warned
+from gcode.check.hanging import JobBridges
 from gcode.check.proof import CheckedProgram, CheckReport
 
 __all__ = [
     "CheckReport",
     "CheckedProgram",
+    "JobBridges",
     "Policy",
     "Refusal",
     "Touch",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from gcode.check.contact import Contact, contact_of
 from gcode.check.findings import Moves, Policy, Refusal, Text, Touch
-from gcode.check.hanging import hanging
+from gcode.check.hanging import JobBridges, hanging
 from gcode.check.proof import CheckedProgram, CheckReport, _prove
 from gcode.check.rules import Judge
 from gcode.check.sweep import sweep
@@ -57,7 +57,7 @@ def find_refusals(
     as_built: HeightField | None = None,
     initial: ModalState | None = None,
     policy: Policy = Policy.STRICT,
-    patch: bool = False,
+    patch: bool | JobBridges = False,
 ) -> tuple[Refusal, ...]:
     """Everything that speaks against printing a program, in its order; see `check`."""
     return judge(
@@ -74,7 +74,7 @@ def check(
     policy: Policy = Policy.STRICT,
     leave_heaters: bool = False,
     touches: tuple[Touch, ...] = (),
-    patch: bool = False,
+    patch: bool | JobBridges = False,
     progress: Progress = silent,
 ) -> CheckedProgram:
     """Judge a program.
@@ -96,7 +96,8 @@ def check(
     touches
         Where the program may feel for what stands there (G38.2), and how deep; nowhere else.
     patch
-        It fills something in `as_built`: what it lays over air is judged as well.
+        It fills something in `as_built`: what it lays over air is judged as well; by what its job
+        bridges too, where that is known.
 
     Raises
     ------
@@ -136,7 +137,7 @@ def judge(
     policy: Policy = Policy.STRICT,
     leave_heaters: bool = False,
     touches: tuple[Touch, ...] = (),
-    patch: bool = False,
+    patch: bool | JobBridges = False,
     progress: Progress = silent,
 ) -> Verdict:
     """What `check` goes by, for whoever wants to know and not to print."""
@@ -172,8 +173,9 @@ def judge(
         hits, clearance_mm = sweep(one.moves, text, setup.printer, as_built)
         progress("sweep", 1.0, 1.0)
         refusals += hits
-        if patch:
-            refusals += hanging(one.moves, text, setup, as_built)
+        if patch is not False:
+            job = patch if isinstance(patch, JobBridges) else None
+            refusals += hanging(one.moves, text, setup, as_built, job)
         if hits:
             contact = contact_of(hits[0], one.moves, setup.printer, as_built)
     refusals.sort(key=lambda refusal: refusal.line)

@@ -2,15 +2,17 @@
 
 A bead is held where something stands beside it or under it, or lies where the floor is near below.
 Where neither is, it hangs: a bridge, straight from one hold to the next, no longer than its
-material bears. What was laid in the same pass holds nothing, so each strand is judged as if it were
-alone; what fell onto a floor holds no strand's end.
+material bears, or than the job that it mends spans itself. What was laid in the same pass holds
+nothing, so each strand is judged as if it were alone; what fell onto a floor holds no strand's end.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from gcode.check import hanging_kernels as kernels
 from gcode.check.findings import Moves, Refusal, Text
@@ -29,55 +31,147 @@ DROP_NOZZLES = 6.0
 SPAN_SLACK_MM = 0.5  # of a span: rims are known to some cells
 LEAST_STRAIGHT = 0.9  # of a stretch's length, from end to end: a strand is straight while it sets
 STEP_MM = 0.2
+JOB_CELL_MM = 0.2  # of what a job has laid
 MOST_SAID = 20
 MOST_CELLS = 4_000_000
 
 
-def hanging(moves: Moves, text: Text, setup: PrintSetup, as_built: HeightField) -> list[Refusal]:
-    """Refusals for strands over air that are not held at both ends, or span too much."""
+class JobBridges:
+    """What a job's own lines span over air: its slicer trusts this printer and material with it.
+
+    Followed by the rule that patches are judged by, over what the job itself has laid below, from
+    an empty bed up; comments count for nothing. Only when it is first asked for.
+
+    Parameters
+    ----------
+    start_mm, end_mm
+        (n, 3) nozzle positions, build frame, in the order in which they are laid.
+    section_mm2
+        (n,) plastic cross-section.
+    bore_mm
+        Of the nozzle.
+    """
+
+    def __init__(
+        self,
+        start_mm: Float[np.ndarray, "n 3"],
+        end_mm: Float[np.ndarray, "n 3"],
+        section_mm2: Float[np.ndarray, " n"],
+        bore_mm: float,
+    ) -> None:
+        self._start_mm, self._end_mm, self._section_mm2 = start_mm, end_mm, section_mm2
+        self._bore_mm = bore_mm
+
+    def longest_mm(self) -> float:
+        """The longest straight span from hold to hold; 0 where there is none."""
+        return self._longest_mm
+
+    @cached_property
+    def _longest_mm(self) -> float:
+        start, end = self._start_mm, self._end_mm
+        if not len(start):
+            return 0.0
+        low, high = _box(start, end)
+        cell_mm = max(JOB_CELL_MM, math.sqrt(float(np.prod(high - low)) / MOST_CELLS))
+        ny, nx = (int(n) + 1 for n in np.ceil((high - low) / cell_mm)[::-1])
+        bed = HeightField(low, cell_mm, np.zeros((ny, nx)), np.ones((ny, nx), dtype=bool))
+        laid = np.ones(len(start), dtype=bool)
+        what, length_mm = _followed(start, end, self._section_mm2, laid, bed, self._bore_mm, 0.0)
+        spans_mm = length_mm[what == kernels.TOO_LONG]  # than nothing
+        return float(spans_mm.max()) + 2 * (STEP_MM + BESIDE_MM) if len(spans_mm) else 0.0
+
+
+def hanging(
+    moves: Moves,
+    text: Text,
+    setup: PrintSetup,
+    as_built: HeightField,
+    job: JobBridges | None = None,
+) -> list[Refusal]:
+    """Refusals for strands over air that are not held at both ends, or span too much.
+
+    Too much is more than the material bears, and more than the `job` itself bridges.
+    """
     laid = moves.pushed_mm3 > 0
     if not laid.any() or not as_built.z_mm.size:
         return []
     start, end, line = moves.start_mm, moves.end_mm, moves.line
-    both = np.concatenate([start[laid, :2], end[laid, :2]])
-    low, high = both.min(axis=0) - BESIDE_MM, both.max(axis=0) + BESIDE_MM
+    low, high = _box(start[laid], end[laid])
     near = as_built.crop((float(low[0]), float(low[1]), float(high[0]), float(high[1])))
     near = near.coarsened(max(1, math.ceil(math.sqrt(near.z_mm.size / MOST_CELLS))))
+    section_mm2 = moves.pushed_mm3 / np.maximum(np.linalg.norm(end - start, axis=1), 1e-9)
     bore_mm, limit_mm = setup.printer.nozzle_diameter_mm, setup.material.max_bridge_mm
-    long = np.linalg.norm(end - start, axis=1)
-    wrong, length_mm = kernels.follow(
-        start,
-        end,
+    longest_mm = _over_air_mm(limit_mm)
+    wrong, length_mm = _followed(start, end, section_mm2, laid, near, bore_mm, longest_mm)
+    if job is not None and (wrong == kernels.TOO_LONG).any():
+        limit_mm = max(limit_mm, job.longest_mm())
+        wrong[(wrong == kernels.TOO_LONG) & (length_mm <= _over_air_mm(limit_mm))] = 0
+    found = []
+    for k in np.flatnonzero(wrong)[:MOST_SAID]:
+        number, out_mm = int(line[k]), float(length_mm[k])
+        what, value, limit = {
+            kernels.FREE_END: (
+                "strand over air that ends on nothing",
+                f"{out_mm:.1f} mm out",
+                f"a hold within {BESIDE_MM:g} mm of both ends",
+            ),
+            kernels.TOO_LONG: (
+                "bridge too long", f"{out_mm + 2 * BESIDE_MM:.1f} mm", f"{limit_mm:.4g} mm",
+            ),
+            kernels.BENT: (
+                "bridge that is not straight",
+                f"{out_mm:.1f} mm along it",
+                f"{1 / LEAST_STRAIGHT - 1:.0%} more than from end to end",
+            ),
+        }[int(wrong[k])]  # fmt: skip
+        found.append(Refusal(number, text.line(number), what, value, limit))
+    return found
+
+
+def _over_air_mm(span_mm: float) -> float:
+    """How far a bead of a span goes over air where nothing is beside it."""
+    return max(span_mm + SPAN_SLACK_MM - 2 * BESIDE_MM, 0.0)
+
+
+def _box(
+    start_mm: Float[np.ndarray, "n 3"], end_mm: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Low and high corner of all that may hold some moves."""
+    both = np.concatenate([start_mm[:, :2], end_mm[:, :2]])
+    low, high = both.min(axis=0), both.max(axis=0)
+    return low - BESIDE_MM, high + BESIDE_MM
+
+
+def _followed(
+    start_mm: Float[np.ndarray, "n 3"],
+    end_mm: Float[np.ndarray, "n 3"],
+    section_mm2: Float[np.ndarray, " n"],
+    laid: Bool[np.ndarray, " n"],
+    stands: HeightField,
+    bore_mm: float,
+    longest_mm: float,
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """What is wrong with the stretch over air that a move ends, and how long that is, mm."""
+    return kernels.follow(
+        np.ascontiguousarray(start_mm),
+        np.ascontiguousarray(end_mm),
         laid,
         # over air nothing but the flat presses it aside
-        np.maximum(half_widths_mm(moves.pushed_mm3 / np.maximum(long, 1e-9), bore_mm), bore_mm),
-        near.z_mm.astype(np.float64),
-        near.origin_mm.astype(np.float64),
-        near.cell_mm,
-        _beside(near.cell_mm),
+        np.maximum(half_widths_mm(section_mm2, bore_mm), bore_mm),
+        stands.z_mm.astype(np.float64),
+        stands.origin_mm.astype(np.float64),
+        stands.cell_mm,
+        _beside(stands.cell_mm),
         (
             DEEP_NOZZLES * bore_mm,
             DROP_NOZZLES * bore_mm,
-            max(limit_mm + SPAN_SLACK_MM - 2 * BESIDE_MM, 0.0),
+            longest_mm,
             LEAST_STRAIGHT,
             BESIDE_MM,
             bore_mm,  # hardly more than a drop
             STEP_MM,
         ),
     )
-    found = []
-    for k in np.flatnonzero(wrong)[:MOST_SAID]:
-        number = int(line[k])
-        what, value = "strand over air that ends on nothing", f"{length_mm[k]:.1f} mm out"
-        limit = f"a hold within {BESIDE_MM:g} mm of both ends"
-        if wrong[k] == kernels.TOO_LONG:
-            what, value = (
-                "bridge too long, or not straight",
-                f"{length_mm[k] + 2 * BESIDE_MM:.1f} mm",
-            )
-            limit = f"{limit_mm:g} mm"
-        found.append(Refusal(number, text.line(number), what, value, limit))
-    return found
 
 
 def _beside(cell_mm: float) -> np.ndarray:

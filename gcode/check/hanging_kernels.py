@@ -9,7 +9,7 @@ from gcode.compiled import njit
 from gcode.surfaces.standing_kernels import across_row, columns_of, height_over, rows_of
 
 IN_AIR, ON_FLOOR, HELD_FAST = 0, 1, 2
-FREE_END, TOO_LONG = 1, 2
+FREE_END, TOO_LONG, BENT = 1, 2, 3
 SAME_PASS_MM = 0.015  # lower than this passes do not lie: what is laid now holds nothing beside it
 
 
@@ -103,7 +103,9 @@ def follow(start, end, laid, half, stands, origin, cell, near, limits):
                 if not (held_first and hold == HELD_FAST):
                     if run > tip:
                         wrong[k], length[k] = FREE_END, run
-                elif run > longest or (run > bends and chord < straight * run):
+                elif run > bends and chord < straight * run:
+                    wrong[k], length[k] = BENT, run
+                elif run > longest:
                     wrong[k], length[k] = TOO_LONG, run
             hangs, held_before = False, hold == HELD_FAST
         lay(stands, newest, loose, start[k], end[k], half[k], fell, origin, cell)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -24,6 +25,14 @@ ON_MM = 0.05  # of a line's middle
 EXACTLY_MM = 0.01  # how exactly it is told which columns lie in a line
 
 
+@runtime_checkable
+class Spans(Protocol):
+    """What a job spans over air."""
+
+    def longest_mm(self) -> float:
+        """The longest straight span from hold to hold; 0 where there is none."""
+
+
 @dataclass(frozen=True, slots=True)
 class JobLines:
     """Lines that a job laid, build frame.
@@ -38,6 +47,8 @@ class JobLines:
         (n,) whether it is a perimeter.
     gone_mm
         (g, 2, 3) stretches of them, from where to where, that were seen not to be there at all.
+    bridges
+        What they span over air, as whoever judges the patch will find it; None: nobody knows.
     """
 
     start_mm: Float[np.ndarray, "n 3"]
@@ -46,6 +57,7 @@ class JobLines:
     height_mm: Float[np.ndarray, " n"]
     rim: Bool[np.ndarray, " n"]
     gone_mm: Float[np.ndarray, "g 2 3"] = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    bridges: Spans | None = None
 
     def some(self, which: Bool[np.ndarray, " n"]) -> JobLines:
         """Some of them."""

@@ -1,9 +1,9 @@
 """Bridges of a patch: straight strands over air, each with both ends on what stands.
 
 A strand begins and ends on a line's width that is as high as the layer under it, and no span is
-longer than the material bears. Over each hollow all strands go one way: the one that spans most of
-it, and of those that span about as much the one with the shortest strands (as PrusaSlicer's
-BridgeDetector chooses it).
+longer than the material bears, or than the job spans itself. Over each hollow all strands go one
+way: the one that spans most of it, and of those that span about as much the one with the shortest
+strands (as PrusaSlicer's BridgeDetector chooses it).
 """
 
 from __future__ import annotations
@@ -116,9 +116,9 @@ def _over(
 ) -> Bridges:
     """Those found, and those over one more hollow."""
     angle_rad, least_mm, shortest_mm = _best_angle(model, kind, hollow)
-    too_long = hollow & np.isfinite(shortest_mm) & (shortest_mm > model.material.max_bridge_mm)
+    too_long = hollow & np.isfinite(shortest_mm) & (shortest_mm > model.longest_span_mm)
     found = replace(found, too_long_mm=np.where(too_long, shortest_mm, found.too_long_mm))
-    spanned = hollow & (least_mm <= model.material.max_bridge_mm)
+    spanned = hollow & (least_mm <= model.longest_span_mm)
     if not spanned.any():
         return found
     strands = _strands(model, at, kind, spanned, angle_rad)
@@ -162,7 +162,7 @@ class Holds:
             return whole
         lengths_mm = np.hypot(*np.diff(xy_mm, axis=0).T)
         keep = ~air
-        most_mm = model.material.max_bridge_mm - 2.0 * self._beside_mm
+        most_mm = model.longest_span_mm - 2.0 * self._beside_mm
         for a, b in stretches_of(air):
             ends = a > 0 and b < len(air) and held[a - 1] and held[b]
             long_mm, chord_mm = lengths_mm[a:b].sum(), np.hypot(*(xy_mm[b] - xy_mm[a]))
@@ -189,6 +189,21 @@ class _Strands:
     spacing_mm: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """Steps of half a column along a line: how many a hold takes, and what is loose of a span."""
+
+    step_mm: float
+    hold: int
+    loose: int
+
+    @classmethod
+    def of(cls, model: PatchModel) -> _Steps:
+        """On a patch's columns."""
+        step_mm, options = 0.5 * model.cell_mm, model.options.bridges
+        return cls(step_mm, round(options.hold_mm / step_mm), round(options.loose_mm / step_mm))
+
+
 def _best_angle(
     model: PatchModel, kind: UInt8[np.ndarray, "ny nx"], hollow: Bool[np.ndarray, "ny nx"]
 ) -> tuple[float, Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nx"]]:
@@ -201,13 +216,12 @@ def _best_angle(
     window = (slice(low[0], box[2] + margin), slice(low[1], box[3] + margin))
     near = np.ascontiguousarray(kind[window])
     inside = np.array([*(np.array(box[:2]) - low), *(np.array(box[2:]) - low)])
-    step_mm = 0.5 * model.cell_mm
-    most = model.material.max_bridge_mm / step_mm
-    anchor, loose = round(options.hold_mm / step_mm), round(options.loose_mm / step_mm)
+    steps = _Steps.of(model)
+    most = model.longest_span_mm / steps.step_mm
     best: tuple[float, float, float, Float[np.ndarray, "_a _b"]] | None = None
     shortest = np.full(near.shape, np.inf)
     for angle_rad in ANGLES_RAD:
-        least, within = kernels.spanned(near, angle_rad, inside, most, anchor, loose)
+        least, within = kernels.spanned(near, angle_rad, inside, most, steps.hold, steps.loose)
         np.minimum(shortest, least, out=shortest)
         longest = float(np.max(least, initial=0.0, where=least <= most))
         # about as much is as much
@@ -219,7 +233,7 @@ def _best_angle(
             best = (float(within), longest, float(angle_rad), least)
     assert best is not None
     full = [np.full(model.shape, np.inf) for _ in range(2)]
-    full[0][window], full[1][window] = best[3] * step_mm, shortest * step_mm
+    full[0][window], full[1][window] = best[3] * steps.step_mm, shortest * steps.step_mm
     return best[2], full[0], full[1]
 
 
@@ -265,28 +279,27 @@ def _held_on(
     found: _Strands,
 ) -> bool:
     """Add the strands that a line has; whether there is any."""
-    options = model.options.bridges
-    step_mm = 0.5 * model.cell_mm
+    steps = _Steps.of(model)
+    step_mm, hold = steps.step_mm, steps.hold
     length_mm = float(np.hypot(*(end_mm - start_mm)))
     along = (end_mm - start_mm) / length_mm
     x, y = (start_mm - model.origin_mm) / model.cell_mm
     stretches = np.empty((64, 2), np.int64)
-    anchor = round(options.hold_mm / step_mm)
     number = kernels.spans_on_line(
-        kind, x, y, 0.5 * along[0], 0.5 * along[1], int(length_mm / step_mm) + 1, anchor,
-        round(options.loose_mm / step_mm), stretches,
+        kind, x, y, 0.5 * along[0], 0.5 * along[1], int(length_mm / step_mm) + 1, hold,
+        steps.loose, stretches,
     )  # fmt: skip
     any_held = False
     for first, last in stretches[:number].tolist():
-        if (last - first + 1) * step_mm > model.material.max_bridge_mm:
+        if (last - first + 1) * step_mm > model.longest_span_mm:
             continue
-        xy = start_mm + np.array([[first - anchor], [last + anchor]]) * step_mm * along
+        xy = start_mm + np.array([[first - hold], [last + hold]]) * step_mm * along
         bead = Bead(xy, np.ones(1), Role.BRIDGE, closed=False)
         runs = free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
         if len(runs) == 1 and runs[0].length_mm > bead.length_mm - 1e-6:
             found.beads.append(runs[0])
-            found.from_mm.append((anchor - 0.5) * step_mm)
-            found.to_mm.append((last - first + anchor + 0.5) * step_mm)
+            found.from_mm.append((hold - 0.5) * step_mm)
+            found.to_mm.append((last - first + hold + 0.5) * step_mm)
             any_held = True
     return any_held
 

@@ -222,8 +222,8 @@ def _causes(
         place = (int(iy) + cells[0].start, int(ix) + cells[1].start)
         cause, reason = k, COVERED if k is LeftCause.COVERED else TOO_SMALL
         if k is LeftCause.TOO_LONG:
-            long_mm, limit_mm = float(state.too_long_mm[place]), model.material.max_bridge_mm
-            reason = f"a bridge over it would be too long: {long_mm:.0f} mm, limit {limit_mm:g} mm"
+            long_mm, limit = float(state.too_long_mm[place]), f"{model.longest_span_mm:.3g}"
+            reason = f"a bridge over it would be too long: {long_mm:.0f} mm, limit {limit} mm"
         if k is LeftCause.OUT_OF_REACH:
             point = model.points_mm.reshape(*model.shape, 2)[place]
             touches = model.reach.reason_at(point, float(tip[iy, ix]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,7 @@ class PatchModel:
         self.drop_mm = options.columns.drop_nozzles * setup.printer.nozzle_diameter_mm
         self.spread_mm = options.columns.spread_nozzles * setup.printer.nozzle_diameter_mm
         self.material, self.line_width_mm = setup.material, setup.process.line_width_mm
+        self._bridges = lines.bridges if lines is not None else None
         self._printer = setup.printer
         far_mm = options.columns.no_lift_mm
         self._window_mm = (x0 - far_mm, y0 - far_mm, x1 + far_mm, y1 + far_mm)
@@ -106,6 +108,15 @@ class PatchModel:
             minlength=self.shape[0] * self.shape[1],
         )
         return np.maximum(below.reshape(self.shape), 0.0)
+
+    @cached_property
+    def longest_span_mm(self) -> float:
+        """As far as a strand may go over air: what the material bears, or the job spans itself.
+
+        A column each way: rims are known to so much.
+        """
+        job_mm = self._bridges.longest_mm() if self._bridges is not None else 0.0
+        return max(self.material.max_bridge_mm, job_mm + 2.0 * self.cell_mm)
 
     @property
     def need_mm(self) -> Float[np.ndarray, "ny nx"]:
