@@ -18,7 +18,6 @@ was done did not end for minutes.
 
 from __future__ import annotations
 
-import fcntl
 import functools
 import importlib
 import os
@@ -34,6 +33,8 @@ import numba
 import numba.np.linalg
 from numba import get_num_threads, prange, set_num_threads
 from numba.core.runtime import nrt, nrtdynmod
+
+from gcode.locks import try_lock
 
 __all__ = ["get_num_threads", "njit", "prange", "set_num_threads"]
 
@@ -177,22 +178,18 @@ class _Turn:
             return False  # nothing can be kept there, either
         until_s = time.monotonic() + wait_s
         while True:
-            try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                if time.monotonic() > until_s:
-                    os.close(fd)
-                    return False
-                time.sleep(COMPILE_POLL_S)
-            else:
+            if try_lock(fd):
                 self._fd = fd
                 return True
+            if time.monotonic() > until_s:
+                os.close(fd)
+                return False
+            time.sleep(COMPILE_POLL_S)
 
     def give(self) -> None:
         """Give the turn to the next."""
         if self._fd >= 0:
             fd, self._fd = self._fd, -1
-            fcntl.flock(fd, fcntl.LOCK_UN)
             os.close(fd)
 
 

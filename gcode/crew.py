@@ -23,8 +23,14 @@ _asked: Callable[[int], Any] | None = None  # in a worker
 
 
 def cores() -> int:
-    """How many this process may use; 1 where processes cannot be forked."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
+    """How many this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)  # Linux's alone
+    return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
+
+
+def forks() -> int:
+    """How many processes may share work by forking; 1 where that is not safe."""
+    return cores() if sys.platform == "linux" else 1
 
 
 def in_order(ask: Callable[[int], R], count: int, *, workers: int) -> Iterator[R]:

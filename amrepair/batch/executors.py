@@ -6,12 +6,12 @@ whatever order they come. It knows nothing of results on disks: the supervisor k
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
 from amrepair.batch.options import Task, TaskOutcome, Work
 from amrepair.errors import InputError
+from gcode.crew import cores
 
 EXECUTOR_NAMES = ("process", "serial", "ray")
 
@@ -63,7 +63,7 @@ def make_executor(
         raise InputError(f"--executor is {name!r}; it is one of {', '.join(EXECUTOR_NAMES)}")
     if address is not None and name != "ray":
         raise InputError(f"--address belongs to --executor ray, the executor is {name}")
-    count = workers or len(os.sched_getaffinity(0))
+    count = workers or cores()
     if name == "serial":
         return Serial(work)
     if name == "process":

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import os
 import tempfile
@@ -18,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, runtime_checkable
 
 from amrepair.errors import InputError, MissingDependencyError
+from gcode.locks import try_lock
 from gcode.whole import write_bytes
 
 _STREAM_BYTES = 1 << 20
@@ -91,12 +91,10 @@ class Folder:
     def alone(self) -> Iterator[None]:
         """Hold a lock that ends with this process, however it ends."""
         with (self.path / ".lock").open("w") as stream:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            if not try_lock(stream.fileno()):
                 raise InputError(
                     f"another batch works in {self.path}; wait for its end or name another --out"
-                ) from error
+                )
             yield
 
 

@@ -8,7 +8,6 @@ no more. A port has one owner by the lock that the process takes on it.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import signal
 import subprocess
@@ -28,6 +27,7 @@ from amrepair.fleet.config import FleetConfig, FleetOptions, PrinterSpec
 from amrepair.fleet.desk import JUDGES, STATUS, answer, read_note, write_note
 from amrepair.fleet.judges import Judges
 from amrepair.loop.tape import read_events
+from gcode.locks import try_lock
 from gcode.process import one_thread
 
 BACK_OFF_S = 2.0
@@ -272,12 +272,10 @@ class Fleet:
         """One supervisor a folder; its printers may ask its judges as long as it is there."""
         self.options.out.mkdir(parents=True, exist_ok=True)
         with (self.options.out / ".lock").open("w") as stream:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            if not try_lock(stream.fileno()):
                 raise InputError(
                     f"another fleet works in {self.options.out}; end it or name another out"
-                ) from error
+                )
             self._judges = self._hired()
             try:
                 yield

@@ -166,11 +166,11 @@ class Tape:
 
     def _open(self, path: Path) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-        size = os.fstat(fd).st_size
-        if size and os.pread(fd, 1, size - 1) != b"\n":  # cut short by a kill
-            whole = os.pread(fd, size, 0).rfind(b"\n") + 1
-            os.ftruncate(fd, whole)
+        as_is = getattr(os, "O_BINARY", 0)  # Windows would end lines its own way
+        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | as_is, 0o644)
+        kept = path.read_bytes()
+        if not kept.endswith(b"\n"):  # cut short by a kill
+            os.ftruncate(fd, kept.rfind(b"\n") + 1)
         return fd
 
     def close(self) -> None:

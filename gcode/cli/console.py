@@ -267,11 +267,10 @@ def signals_end_it() -> Iterator[None]:
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
-    taken = [
-        number
-        for number in (signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) is signal.SIG_DFL
-    ]
+    ends = {signal.SIGTERM}
+    if sys.platform != "win32":
+        ends.add(signal.SIGHUP)
+    taken = [number for number in ends if signal.getsignal(number) is signal.SIG_DFL]
     for number in taken:
         signal.signal(number, interrupt)
     try:

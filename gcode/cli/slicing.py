@@ -129,13 +129,13 @@ def _whole(
     bars: console.Bars,
 ) -> _Made:
     """A whole job."""
-    from gcode.crew import cores
+    from gcode.crew import forks
     from gcode.slicing.job import slice_part
     from gcode.solids import read_closed
 
     with bars.stage("read solid"):
         shape, moved_mm = _placed(gives_back(read_closed)(solid), setup, place)
-    toolpath = gives_back(slice_part)(shape, setup, workers=workers or cores(), progress=bars)
+    toolpath = gives_back(slice_part)(shape, setup, workers=workers or forks(), progress=bars)
     where = _where(shape, moved_mm) if place == CENTRE else None
     solid_mm3 = float(shape.volume())
     del shape  # half of what is held

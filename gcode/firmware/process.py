@@ -22,7 +22,7 @@ import gcode
 from gcode.errors import LinkError
 from gcode.firmware.faults import FaultScript, parse_faults
 from gcode.firmware.motion import MotionBatch
-from gcode.firmware.serve import FRAME
+from gcode.firmware.serve import FRAME, require_terminals
 from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
 
@@ -83,6 +83,7 @@ class EmulatedPrinterProcess:
         self._start()
 
     def _start(self) -> None:
+        require_terminals()
         ours, theirs = socket.socketpair()
         package_root = str(Path(gcode.__file__).parent.parent)
         path = os.pathsep.join(filter(None, [package_root, os.environ.get("PYTHONPATH", "")]))

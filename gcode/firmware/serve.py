@@ -15,9 +15,8 @@ import os
 import select
 import socket
 import struct
-import termios
+import sys
 import time
-import tty
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -33,6 +32,15 @@ MOTION_FRAME_NUMBERS = 9 * 2000
 """Motion is sent on every 2,000 moves, so that the child's memory stays flat."""
 IDLE_S = 0.01
 """Nothing heard for this long: the printer goes on with what it has buffered."""
+
+
+def require_terminals() -> None:
+    """Raise InputError where no pseudo-terminal can be had."""
+    if sys.platform == "win32":
+        raise InputError(
+            "an emulated printer needs a pseudo-terminal, which Linux and macOS have; on Windows "
+            "use WSL"
+        )
 
 
 class PtyServer:
@@ -69,6 +77,10 @@ class PtyServer:
         self._open()
 
     def _open(self) -> None:
+        require_terminals()
+        import termios
+        import tty
+
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         attributes = termios.tcgetattr(self._slave)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from gcode.errors import InputError
@@ -60,6 +61,11 @@ def connect(
         raise InputError(
             f"{port!r} names no kind of printer; write a device path, octoprint+http://…, "
             f"moonraker+http://… or file:PATH."
+        )
+    if sys.platform == "win32":
+        raise InputError(
+            f"{port!r} is a printer on a cable, which takes Linux or macOS (on Windows: WSL); "
+            "print through octoprint+http://… or moonraker+http://…, or write file:PATH."
         )
     return SerialPrinter(
         port,

@@ -1,6 +1,6 @@
 """One sender per printer: an advisory lock that dies with its owner.
 
-`flock` on a file named after the port's device; the kernel drops it when the last process that
+It is on a file named after the port's device; the kernel drops it when the last process that
 holds the descriptor ends, however it ends. The supervisor of `safety` inherits the descriptor,
 so that nobody takes the printer between a sender's death and the heaters being switched off.
 
@@ -14,14 +14,15 @@ the machine, as the printer is.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import os
+import sys
 import tempfile
 import time
 from pathlib import Path
 
 from gcode.errors import LinkError, PortBusyError
+from gcode.locks import try_lock
 
 ORPHAN_S = 8.0
 """How long to wait for a dead sender's supervisor to finish."""
@@ -50,9 +51,7 @@ class PortLock:
         until_s = time.monotonic() + ORPHAN_S
         while True:
             fd = self._open()
-            try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+            if not try_lock(fd):
                 owner = _owner(fd)
                 os.close(fd)
                 if time.monotonic() >= until_s or (owner is not None and _alive(owner)):
@@ -67,7 +66,8 @@ class PortLock:
                 break
             os.close(fd)  # its last holder has removed it: try for the file that has the name now
         os.ftruncate(fd, 0)
-        os.pwrite(fd, str(os.getpid()).encode(), 0)
+        os.lseek(fd, 0, os.SEEK_SET)
+        os.write(fd, str(os.getpid()).encode())
         self.fd = fd
 
     def release(self) -> None:
@@ -81,7 +81,7 @@ class PortLock:
 
     def _open(self) -> int:
         try:
-            return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            return os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
             raise LinkError(
                 f"The lock of {self._port}, {self._path}, cannot be used ({error.strerror}); if "
@@ -97,12 +97,18 @@ class PortLock:
 
 
 def _owner(fd: int) -> int | None:
-    text = os.pread(fd, 32, 0).strip()
+    os.lseek(fd, 0, os.SEEK_SET)
+    text = os.read(fd, 32).strip()
     return int(text) if text.isdigit() else None
 
 
 def _alive(pid: int) -> bool:
-    """Whether a process lives; a zombie has no descriptors left and counts as dead."""
+    """Whether a process lives; a zombie has no descriptors left and counts as dead.
+
+    On Windows, where signal 0 is no question, and no supervisor outlives its sender: always.
+    """
+    if sys.platform == "win32":
+        return True
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:

@@ -8,10 +8,10 @@ import signal
 import numpy as np
 import pytest
 
-from gcode.crew import cores, in_order
+from gcode.crew import forks, in_order
 from gcode.errors import SliceError, WorkerError
 
-pytestmark = pytest.mark.skipif(cores() == 1 and os.name != "posix", reason="nothing can be forked")
+pytestmark = pytest.mark.skipif(forks() == 1 and os.name != "posix", reason="nothing can be forked")
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])

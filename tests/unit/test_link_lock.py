@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import subprocess
 import sys
@@ -13,6 +12,7 @@ import pytest
 from gcode.errors import LinkError, PortBusyError
 from gcode.hosts import lock as lock_module
 from gcode.hosts.lock import PortLock
+from gcode.locks import try_lock
 
 PORT = "/dev/ttyTEST"
 
@@ -45,15 +45,14 @@ def test_who_opened_the_file_before_it_was_removed_does_not_share_the_printer(
     """The race of removing lock files: a lock on a file without a name keeps nobody out."""
     first, second, third = (PortLock(PORT, folder=tmp_path) for _ in range(3))
     first.acquire()
-    flock = fcntl.flock
 
-    def late(fd: int, operation: int) -> None:
-        monkeypatch.setattr(lock_module.fcntl, "flock", flock)
-        first.release()  # between the second's open and its flock
+    def late(fd: int) -> bool:
+        monkeypatch.setattr(lock_module, "try_lock", try_lock)
+        first.release()  # between the second's open and its lock
         third.acquire()
-        flock(fd, operation)  # succeeds: nobody else has the removed file open
+        return try_lock(fd)  # succeeds: nobody else has the removed file open
 
-    monkeypatch.setattr(lock_module.fcntl, "flock", late)
+    monkeypatch.setattr(lock_module, "try_lock", late)
     with pytest.raises(PortBusyError):
         second.acquire()
     third.release()
