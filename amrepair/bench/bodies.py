@@ -104,6 +104,7 @@ def _little_bent(pose: Pose, scene: _Scene) -> Pieces:
         sigma_mm=max(
             scene.sigma_mm, options.clear_ratio / options.clear_sigmas * scene.diagonal_mm
         ),
+        options=options.bends,
     )
     if cuts[0].gain < chi2.isf(options.gain_probability, 6):
         return Pieces(pose)
@@ -288,8 +289,9 @@ class _Scene:
         """Both pieces, and the zone between them as the points tell it."""
         pieces = Pieces(standing, other, normal, through_mm)
         return with_zone(
-            pieces, self.cloud, self.template, limit_mm=self.limit_mm, sigma_mm=self.sigma_mm
-        )
+            pieces, self.cloud, self.template, limit_mm=self.limit_mm, sigma_mm=self.sigma_mm,
+            options=self.options.bends,
+        )  # fmt: skip
 
     def refined(
         self,

@@ -134,15 +134,8 @@ class Fused:
     coverage: Coverage
 
 
-def fuse(
-    cloud: Cloud, *, voxel_mm: float | None = None, options: FuseOptions = USUAL_FUSE
-) -> Fused:
+def fuse(cloud: Cloud, options: FuseOptions = USUAL_FUSE) -> Fused:
     """Fuse placed scans.
-
-    Parameters
-    ----------
-    voxel_mm
-        Edge of the grid; None follows the points.
 
     Raises
     ------
@@ -153,7 +146,7 @@ def fuse(
     keep = ~(against | lonely)
     points, normals, scan = cloud.points_mm[keep], cloud.normals[keep], cloud.scan[keep]
     radius_mm = reach_mm(cloud, options)
-    edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
+    edge = max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
     low, shape, nodes, index = _band(points, edge, radius_mm)
     cells = SortedPoints.of(points, radius_mm)
     field, excess, heard, overruled = kernels.fused_nodes(
@@ -321,7 +314,7 @@ def _band(
     if float(np.prod(shape.astype(np.float64))) > MAX_NODES:
         raise TemplateError(
             f"a grid of {edge:.3g} mm over these scans has {np.prod(shape):,} nodes, the limit is "
-            f"{MAX_NODES:,}; remove far clutter from the scans, or give a larger voxel"
+            f"{MAX_NODES:,}; remove far clutter from the scans"
         )
     occupied = np.zeros(tuple(shape), dtype=bool)
     occupied[tuple(np.rint((points_mm - low) / edge).astype(np.int64).T)] = True

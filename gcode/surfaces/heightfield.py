@@ -125,26 +125,6 @@ class HeightField:
             z_mm += (z[y1, x0] * (1 - u) + z[y1, x1] * u) * v
         return np.where(inside, z_mm, outside_mm)
 
-    def max_along(self, points_mm: Float[np.ndarray, "n d"], *, radius_mm: float = 0.0) -> float:
-        """Greatest height within `radius_mm` of a polyline's XY; 0 where it leaves the field."""
-        if not self.z_mm.size or len(points_mm) == 0:
-            return 0.0
-        step_mm = max(self.cell_mm, radius_mm) / 2
-        pieces = [np.asarray(points_mm[:1, :2], float)]
-        for start, end in zip(points_mm[:-1, :2], points_mm[1:, :2], strict=True):
-            n = max(1, math.ceil(float(np.linalg.norm(end - start)) / step_mm))
-            pieces.append(start + (end - start) * (np.arange(1, n + 1) / n)[:, None])
-        index = self.cells_of(np.concatenate(pieces))
-        reach = math.ceil(radius_mm / self.cell_mm)
-        dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
-        keep = (np.hypot(dy, dx) - 1.0) * self.cell_mm <= radius_mm
-        around = (index[:, None, :] + np.stack([dy[keep], dx[keep]], axis=1)).reshape(-1, 2)
-        ny, nx = self.shape
-        around = around[((around >= 0) & (around < (ny, nx))).all(axis=1)]
-        if len(around) == 0:
-            return 0.0
-        return max(0.0, float(self.z_mm[around[:, 0], around[:, 1]].max()))
-
     def max_within(
         self,
         polygon_mm: Sequence[tuple[float, float]],
