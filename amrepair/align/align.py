@@ -155,7 +155,7 @@ def _as_it_was_seen(
     to_sensor = scan.sensors_mm[scan.sensor_index[some]] - points
 
     def is_possible(matrix: Float[np.ndarray, "4 4"]) -> bool:
-        placed = points @ matrix[:3, :3].T + matrix[:3, 3]
+        placed = moved(points, matrix)
         distance, outward = template.distance_and_gradient(placed)
         near = np.abs(distance) <= found.inlier_mm
         facing = np.einsum("ni,ni->n", outward, to_sensor @ matrix[:3, :3].T) > 0.0

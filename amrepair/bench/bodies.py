@@ -24,7 +24,7 @@ from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.bench.bends import Pieces, Pose, best_cuts, with_zone
 from amrepair.bench.options import USUAL_BODIES, BodyOptions
-from amrepair.frames import diagonal, moved, rotation_from_vector, unit_vectors, ways_across
+from amrepair.frames import diagonal, moved, rigid, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
 
@@ -402,10 +402,7 @@ def _of_the_rest(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
     starts = [first]
     for vector in (*np.eye(3), *-np.eye(3)):
         turn = rotation_from_vector(options.piece_turn_rad * vector)
-        start = np.eye(4)
-        start[:3, :3] = turn @ first[:3, :3]
-        start[:3, 3] = turn @ (first[:3, 3] - middle) + middle
-        starts.append(start)
+        starts.append(rigid(turn @ first[:3, :3], turn @ (first[:3, 3] - middle) + middle))
     found = scene.refined(few, starts, options.second_ratio)
     yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
 
