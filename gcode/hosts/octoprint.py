@@ -30,10 +30,6 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     _capabilities: Capabilities | None = None
     _resends_before = 0
 
-    def __enter__(self) -> OctoPrintPrinter:
-        self.connect()
-        return self
-
     def _new_session(self, reach: ServerReach) -> OctoPrintSession:
         return OctoPrintSession(reach)
 
@@ -236,8 +232,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
                     f"{self.address.name} has not cancelled the print within "
                     f"{self._timing.answer_s:g} s; stop the printer there."
                 )
-            with self._session.news:
-                self._session.news.wait(0.1)
+            self.wait(0.1)
 
     def emergency_stop(self) -> None:
         """Have M112 sent past the queue; the printer must be reset afterwards."""
