@@ -53,22 +53,6 @@ class Window:
             self.origin_mm[1] + self.y0 * self.cell_mm,
         )
 
-    def union(self, other: Window) -> Window:
-        """The smallest window that holds both; of two grids that are the same."""
-        if (self.origin_mm, self.cell_mm) != (other.origin_mm, other.cell_mm):
-            raise InputError(
-                f"two worlds can be compared only on one grid, these have cells of {self.cell_mm} "
-                f"and {other.cell_mm} mm and corners {self.origin_mm} and {other.origin_mm}"
-            )
-        return Window(
-            self.origin_mm,
-            self.cell_mm,
-            min(self.y0, other.y0),
-            max(self.y1, other.y1),
-            min(self.x0, other.x0),
-            max(self.x1, other.x1),
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class IntervalMap:
