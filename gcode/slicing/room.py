@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy import ndimage, spatial
 
 from gcode.profiles import PrinterProfile
@@ -65,7 +64,11 @@ def _room_at(
         for dx, dy in ((1.0, 0.0), (0.0, 1.0)):
             points = np.array([x, y]) + along[:, None] * np.array([dx, dy])
             fits = points[-1, 0] <= x_max - 1.0 and points[-1, 1] <= y_max - 1.0
-            if fits and reach.free_at_points(points, free).all() and _bare(field, points).all():
+            if (
+                fits
+                and reach.free_at_points(points, free).all()
+                and (field.sample(points) <= 0).all()  # drawn on the bed, not on a brim
+            ):
                 return x, y, dx, dy
     return None
 
@@ -93,13 +96,3 @@ def _starts(printer: PrinterProfile) -> list[tuple[float, float]]:
         bed = printer.bed_min_mm, printer.bed_size_mm, INSET_MM
         edges = [kept_on(at, *bed, to_edge=True) for at in edges]
     return [(printer.prime_mm[0], printer.prime_mm[1]), *edges]
-
-
-def _bare(field: HeightField, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Whether nothing stands below the points: a line is drawn on the bed, not on a brim."""
-    index = field.cells_of(points_mm)
-    ny, nx = field.shape
-    inside = np.asarray(((index >= 0) & (index < (ny, nx))).all(axis=1))
-    index = np.where(inside[:, None], index, 0)
-    height_mm = np.asarray(field.z_mm)[index[:, 0], index[:, 1]]
-    return np.asarray(~inside | (height_mm <= 0))
