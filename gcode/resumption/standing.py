@@ -53,20 +53,9 @@ def with_solid(
     laid = standing_field(beads, line, printer)
     if excess.is_empty():
         return laid
-    there = over_reach(HeightField.from_manifold(excess, STANDING_CELL_MM), printer)
-    return HeightField(
-        laid.origin_mm, STANDING_CELL_MM, np.maximum(laid.z_mm, there.z_mm), laid.seen
-    )
+    return laid.raised_by(HeightField.from_manifold(excess, STANDING_CELL_MM))
 
 
 def over_reach(field: HeightField, printer: PrinterProfile) -> HeightField:
     """What stands in a field, on the whole reach of the nozzle; bare bed beyond the field."""
-    bare = _bare(printer)
-    (x0, y0), (ny, nx) = bare.origin_mm, bare.shape
-    x_mm, y_mm = field.centres_mm()
-    ix = np.floor((x_mm - x0) / STANDING_CELL_MM).astype(np.int64)
-    iy = np.floor((y_mm - y0) / STANDING_CELL_MM).astype(np.int64)
-    inside_x, inside_y = (ix >= 0) & (ix < nx), (iy >= 0) & (iy < ny)
-    cells = (iy[inside_y][:, None] * nx + ix[inside_x]).ravel()
-    np.maximum.at(bare.z_mm.reshape(-1), cells, field.z_mm[np.ix_(inside_y, inside_x)].ravel())
-    return bare
+    return _bare(printer).raised_by(field)

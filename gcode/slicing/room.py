@@ -19,19 +19,12 @@ BARE_RADIUS_MM = 6.0  # a strand that hangs from the nozzle falls into this circ
 def over_bed(field: HeightField, printer: PrinterProfile) -> HeightField:
     """A field as high or higher on coarse cells all over the nozzle's reach; bare beside it."""
     x0, y0, x1, y1 = printer.reach_box_mm
-    shape = (int(np.ceil((y1 - y0) / ROOM_CELL_MM)), int(np.ceil((x1 - x0) / ROOM_CELL_MM)))
     coarse = field.coarsened(max(1, int(ROOM_CELL_MM / field.cell_mm)))
-    xs, ys = coarse.centres_mm()
-    iy, ix = (
-        np.floor((at - low) / ROOM_CELL_MM).astype(np.int64) for at, low in ((ys, y0), (xs, x0))
-    )
-    rows, columns = (iy >= 0) & (iy < shape[0]), (ix >= 0) & (ix < shape[1])
-    z_mm = np.zeros(shape)
-    cells = np.ix_(iy[rows], ix[columns])
-    np.maximum.at(z_mm, cells, np.asarray(coarse.z_mm, np.float64)[np.ix_(rows, columns)])
+    bare = HeightField.flat((x1 - x0, y1 - y0), ROOM_CELL_MM, origin_mm=(x0, y0))
+    z_mm = bare.raised_by(coarse).z_mm
     # A cell reaches into the cells beside the one that holds its middle.
     z_mm = ndimage.maximum_filter(z_mm, 2 * int(np.ceil(0.5 * coarse.cell_mm / ROOM_CELL_MM)) + 1)
-    return HeightField(np.array([x0, y0]), ROOM_CELL_MM, z_mm, np.ones(shape, dtype=bool))
+    return bare.raised(z_mm)
 
 
 def room_for_line(

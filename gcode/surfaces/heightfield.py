@@ -216,6 +216,17 @@ class HeightField:
         """The same grid with heights max(z, own)."""
         return HeightField(self.origin_mm, self.cell_mm, np.maximum(self.z_mm, z_mm), self.seen)
 
+    def raised_by(self, other: HeightField) -> HeightField:
+        """As high as another field's cells whose middles lie within its own, or higher."""
+        x_mm, y_mm = other.centres_mm()
+        ix = np.floor((x_mm - self.origin_mm[0]) / self.cell_mm).astype(np.int64)
+        iy = np.floor((y_mm - self.origin_mm[1]) / self.cell_mm).astype(np.int64)
+        ny, nx = self.shape
+        rows, columns = (iy >= 0) & (iy < ny), (ix >= 0) & (ix < nx)
+        z_mm = self.z_mm.astype(np.float64)
+        np.maximum.at(z_mm, np.ix_(iy[rows], ix[columns]), other.z_mm[np.ix_(rows, columns)])
+        return HeightField(self.origin_mm, self.cell_mm, z_mm, self.seen)
+
     def write(self, path: Path) -> None:
         """Write `.npz` (all), `.tif`/`.tiff` (heights and placement) or `.npy` (heights)."""
         suffix = path.suffix.lower()
