@@ -54,19 +54,14 @@ __all__ = [
 
 # `align` and `detect` are rooms of this package: their functions go by a longer name up here.
 _HOMES = {
-    "AmrepairError": ("amrepair.errors", "AmrepairError"),
-    "RepairPlan": ("amrepair.repair", "RepairPlan"),
-    "Scan": ("amrepair.scans", "Scan"),
-    "Scanner": ("amrepair.scans", "Scanner"),
-    "Site": ("amrepair.repair", "Site"),
-    "Transform": ("amrepair.frames", "Transform"),
-    "align_scan": ("amrepair.align", "align"),
-    "detect_defects": ("amrepair.regions", "detect"),
-    "fit_template": ("amrepair.template", "fit_template"),
-    "open_template": ("amrepair.template", "open_template"),
-    "plan_repair": ("amrepair.repair", "plan_repair"),
-    "read_scan": ("amrepair.scans", "read_scan"),
-    "run_loop": ("amrepair.loop", "run_loop"),
+    "amrepair.align": "align as align_scan",
+    "amrepair.errors": "AmrepairError",
+    "amrepair.frames": "Transform",
+    "amrepair.loop": "run_loop",
+    "amrepair.regions": "detect as detect_defects",
+    "amrepair.repair": "RepairPlan, Site, plan_repair",
+    "amrepair.scans": "Scan, Scanner, read_scan",
+    "amrepair.template": "fit_template, open_template",
 }
 
 __getattr__, __dir__ = lazy_names(globals(), _HOMES)

@@ -83,10 +83,7 @@ class Transform:
         translation_mm: Float[np.ndarray, " 3"],
     ) -> Transform:
         """A motion from its (3, 3) rotation and (3,) translation in mm."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = rotation
-        matrix[:3, 3] = translation_mm
-        return cls(target, source, matrix)
+        return cls(target, source, rigid(rotation, translation_mm))
 
     @classmethod
     def on_bed(cls, x_mm: float, y_mm: float, z_mm: float, turn_deg: float) -> Transform:
@@ -108,10 +105,8 @@ class Transform:
 
     def inverse(self) -> Transform:
         """`source_from_target`."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.rotation.T
-        matrix[:3, 3] = -self.rotation.T @ self.translation_mm
-        return Transform(self.source, self.target, matrix)
+        back = self.rotation.T
+        return Transform(self.source, self.target, rigid(back, -back @ self.translation_mm))
 
     def __matmul__(self, other: Transform) -> Transform:
         """Compose: (a_from_b @ b_from_c) is a_from_c; frames that do not meet are refused."""
@@ -189,16 +184,34 @@ def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarra
     return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
 
 
+def rotation_of_quaternion(wxyz: Float[np.ndarray, 4 * k]) -> Float[np.ndarray, "*k 3 3"]:
+    """(*k, 3, 3) rotations of unit quaternions."""
+    w, x, y, z = wxyz
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
+
+
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], translation_mm: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """(4, 4) motion that turns about the origin, and then shifts."""
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, translation_mm
+    return motion
+
+
 def motion_about(
     centre_mm: Float[np.ndarray, " 3"],
     turn_rad: Float[np.ndarray, " 3"],
     shift_mm: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, "4 4"]:
     """(4, 4) motion that turns about a place by an axis-angle vector, and then shifts."""
-    motion = np.eye(4)
-    motion[:3, :3] = rotation_from_vector(turn_rad)
-    motion[:3, 3] = centre_mm + shift_mm - motion[:3, :3] @ centre_mm
-    return motion
+    turn = rotation_from_vector(turn_rad)
+    return rigid(turn, centre_mm + shift_mm - turn @ centre_mm)
 
 
 def ways_across(

@@ -63,19 +63,18 @@ __all__ = [
 
 # `check` and `estimate` are rooms of this package: their functions go by a longer name up here.
 _HOMES = {
-    "CheckedProgram": ("gcode.check", "CheckedProgram"),
-    "GcodeError": ("gcode.errors", "GcodeError"),
-    "HeightField": ("gcode.surfaces", "HeightField"),
-    "Program": ("gcode.moves", "Program"),
-    "check_program": ("gcode.check", "check"),
-    "connect": ("gcode.hosts", "connect"),
-    "estimate_program": ("gcode.estimate", "estimate"),
-    "load_setup": ("gcode.profiles", "load_setup"),
-    "read_job": ("gcode.reader", "read_job"),
-    "read_solid": ("gcode.solids", "read_solid"),
-    "slice_part": ("gcode.slicing.job", "slice_part"),
-    "slice_patch": ("gcode.slicing.patch", "slice_patch"),
-    "write_program": ("gcode.writer", "write"),
+    "gcode.check": "CheckedProgram, check as check_program",
+    "gcode.errors": "GcodeError",
+    "gcode.estimate": "estimate as estimate_program",
+    "gcode.hosts": "connect",
+    "gcode.moves": "Program",
+    "gcode.profiles": "load_setup",
+    "gcode.reader": "read_job",
+    "gcode.slicing.job": "slice_part",
+    "gcode.slicing.patch": "slice_patch",
+    "gcode.solids": "read_solid",
+    "gcode.surfaces": "HeightField",
+    "gcode.writer": "write as write_program",
 }
 
 __getattr__, __dir__ = lazy_names(globals(), _HOMES)

@@ -43,3 +43,13 @@ def places_along(
     owner, number = in_turn(count)
     share = (number + 0.5) / count[owner]
     return start_mm[owner] + (end_mm - start_mm)[owner] * share[:, None], owner
+
+
+def places_to_ends(
+    start_mm: Float[np.ndarray, "n k"], end_mm: Float[np.ndarray, "n k"], step_mm: float
+) -> tuple[Float[np.ndarray, "m k"], Int[np.ndarray, " m"]]:
+    """(m, k) both ends of each segment, and equal steps no longer than one; and whose each is."""
+    count = np.ceil(np.linalg.norm(end_mm - start_mm, axis=1) / step_mm).astype(np.int64) + 1
+    owner, number = in_turn(count)
+    share = number / np.maximum(count[owner] - 1, 1)
+    return start_mm[owner] + share[:, None] * (end_mm - start_mm)[owner], owner

@@ -12,6 +12,7 @@ import zipfile
 import zlib
 from array import array
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,16 +57,8 @@ def read_3mf(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3
     ValueError
         With a sentence, where the file is no 3MF, damaged, or unpacks beyond all measure.
     """
-    length = path.stat().st_size
-    _refuse_directory(path, length)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            model = _Model(archive, length)
-            return model.triangles()
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
-        raise ValueError(f"the zip file in it is damaged: {error}") from error
-    except expat.ExpatError as error:
-        raise ValueError(f"its XML is damaged: {error}") from error
+    with _opened(path) as model:
+        return model.triangles()
 
 
 def refuse_trap(path: Path) -> None:
@@ -79,11 +72,18 @@ def refuse_trap(path: Path) -> None:
     ValueError
         As `read_3mf`.
     """
+    with _opened(path) as model:
+        model.refuse_trap()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Model]:
+    """A file's model, nothing of it read; damage that shows later is told in a sentence."""
     length = path.stat().st_size
     _refuse_directory(path, length)
     try:
         with zipfile.ZipFile(path) as archive:
-            _Model(archive, length).refuse_trap()
+            yield _Model(archive, length)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
         raise ValueError(f"the zip file in it is damaged: {error}") from error
     except expat.ExpatError as error:

@@ -14,7 +14,6 @@ from amrepair.report import (
     BeadPath,
     Counter,
     Figures,
-    HeightMap,
     Outcome,
     RegionRow,
     ReportData,
@@ -24,6 +23,7 @@ from amrepair.report import (
     TemperatureSeries,
 )
 from gcode.moves import Extrude, LayerChange, Role, Toolpath, Travel
+from gcode.surfaces import HeightField
 
 ORIGIN_MM = np.array([100.0, 90.0, 0.0])
 SIZE_MM = np.array([60.0, 40.0, 8.0])
@@ -124,7 +124,7 @@ def patch(layers: int = 15, height_mm: float = 0.2) -> Toolpath:
     return Toolpath(tuple(moves))  # type: ignore[arg-type]
 
 
-def heights(*, broken: bool) -> HeightMap:
+def heights(*, broken: bool) -> HeightField:
     cell_mm = 0.25
     ny, nx = int(44 / cell_mm), int(64 / cell_mm)
     x, y = np.meshgrid((np.arange(nx) + 0.5) * cell_mm - 2, (np.arange(ny) + 0.5) * cell_mm - 2)
@@ -137,15 +137,7 @@ def heights(*, broken: bool) -> HeightMap:
         hole &= (y > POCKET_LOW_MM[1]) & (y < POCKET_HIGH_MM[1])
         z_mm = np.where(hole, POCKET_LOW_MM[2], z_mm)
     seen = ~((x > 53) & (x < 57) & (abs(y - 20) < 7))
-    corners = np.array([[12.0, 10], [24, 10], [24, 20], [12, 20]]) + ORIGIN_MM[:2]
-    return HeightMap(
-        origin_mm=ORIGIN_MM[:2] - 2.0,
-        cell_mm=cell_mm,
-        z_mm=z_mm,
-        seen=seen,
-        title="Finished part, seen from above",
-        outlines_mm=(corners,) if broken else (),
-    )
+    return HeightField(ORIGIN_MM[:2] - 2.0, cell_mm, z_mm, seen)
 
 
 def look(label: str, count: int, *, broken: bool, seed: int) -> ReportLook:
@@ -153,6 +145,7 @@ def look(label: str, count: int, *, broken: bool, seed: int) -> ReportLook:
     flags = np.where(
         scene.deviation_mm < -THRESHOLD_MM, 1, np.where(scene.deviation_mm > THRESHOLD_MM, 2, 0)
     )
+    corners = np.array([[12.0, 10], [24, 10], [24, 20], [12, 20]]) + ORIGIN_MM[:2]
     below = sampled(mesh_of(part()), 9000, np.random.default_rng(3))
     return ReportLook(
         label=label,
@@ -172,6 +165,7 @@ def look(label: str, count: int, *, broken: bool, seed: int) -> ReportLook:
         excess_mm3=float(blob().volume()),
         unseen_area_mm2=118.0,
         height_map=heights(broken=broken),
+        outlines_mm=(corners,) if broken else (),
     )
 
 

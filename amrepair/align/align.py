@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from amrepair.align.anywhere import Found, explained_if_mirrored, pose_from_anywhere
 from amrepair.align.bed import bed_prior, level_on_bed
-from amrepair.align.checks import refuse_repeated
 from amrepair.align.options import USUAL_ALIGN, AlignOptions
 from amrepair.align.pam import align_paper
 from amrepair.align.refine import Prior, Refined, refine
@@ -22,6 +21,8 @@ from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
 
 ALIGN_METHODS = ("robust", "paper")
+LOOK_AT = 5_000  # repeats of a few places show in a sample
+ALONG = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # places that differ along it differ
 SCAN_UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3}
 
 
@@ -78,7 +79,7 @@ def align(
             f"the scan {scan.source} has fewer points ({len(scan)}) than an alignment needs "
             f"({options.least_points})"
         )
-    refuse_repeated(scan, options.least_points)
+    _refuse_repeated(scan, options.least_points)
     rng = rng if rng is not None else np.random.default_rng(0)
     if method == "paper":
         _refuse_other_size(scan, template, options)
@@ -101,6 +102,25 @@ def align(
     _refuse_misfit(scan, refined, ratio, inlier_mm, options.guess.least_explained, "")
     answer = Found(refined, (), ratio, scan.points_mm, 0.0, sigma_mm, inlier_mm)
     return _registration(scan, answer, options)
+
+
+def _refuse_repeated(scan: Scan, least: int) -> None:
+    """Refuse a scan that says the same few places again and again.
+
+    Raises
+    ------
+    AlignmentError
+        If there are fewer different points than `least`.
+    """
+    step = max(1, len(scan) // LOOK_AT)
+    if len(np.unique(scan.points_mm[::step] @ ALONG)) >= least:
+        return
+    different = len(np.unique(scan.points_mm, axis=0))
+    if different < least:
+        raise AlignmentError(
+            f"the scan {scan.source} has only {different} different points among {len(scan)}; an "
+            f"alignment needs {least}; check the export"
+        )
 
 
 def _from_anywhere(
@@ -155,7 +175,7 @@ def _as_it_was_seen(
     to_sensor = scan.sensors_mm[scan.sensor_index[some]] - points
 
     def is_possible(matrix: Float[np.ndarray, "4 4"]) -> bool:
-        placed = points @ matrix[:3, :3].T + matrix[:3, 3]
+        placed = moved(points, matrix)
         distance, outward = template.distance_and_gradient(placed)
         near = np.abs(distance) <= found.inlier_mm
         facing = np.einsum("ni,ni->n", outward, to_sensor @ matrix[:3, :3].T) > 0.0

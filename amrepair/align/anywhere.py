@@ -31,7 +31,7 @@ from amrepair.align.poses import (
 from amrepair.align.refine import Refined
 from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
-from amrepair.frames import rotation_from_vector
+from amrepair.frames import moved, rigid, rotation_from_vector
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 
@@ -216,7 +216,7 @@ def _ask_the_whole(
     whole = sorted(refined(starts, clouds, hunt.template) + of_all, key=by_score)
     share = explained(whole[0][1], hunt.inlier_mm)
     without = hunt.best.matrix
-    off_mm = hunt.template.distance(clouds.dense_mm @ without[:3, :3].T + without[:3, 3])
+    off_mm = hunt.template.distance(moved(clouds.dense_mm, without))
     clearer = float((np.abs(off_mm) <= hunt.inlier_mm).mean()) + told.clearer_by
     if share > told.cleared or share > max(least_ratio, clearer):
         hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = clouds, whole, 0.0, points_mm
@@ -227,7 +227,7 @@ def _answer(hunt: _Hunt, rng: np.random.Generator) -> Found:
     best, others = _best_and_others(hunt)
     # The thinned cloud will not do: few scattered points fill as many voxels as many on a surface.
     sample = hunt.part_mm[rng.permutation(len(hunt.part_mm))[: hunt.options.poses.dense_points]]
-    residual = hunt.template.distance(sample @ best.matrix[:3, :3].T + best.matrix[:3, 3])
+    residual = hunt.template.distance(moved(sample, best.matrix))
     ratio = float((np.abs(residual) <= hunt.inlier_mm).mean())
     return Found(
         best, others, ratio, hunt.part_mm, hunt.left_out_ratio, hunt.sigma_mm, hunt.inlier_mm,
@@ -333,10 +333,9 @@ def _twins(best: Refined, clouds: Clouds, field: CoarseField) -> list[Float[np.n
     turned = []
     for turn in cube_rotations():
         for sides in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.eye(4)
-            matrix[:3, :3] = turn @ best.matrix[:3, :3]
-            matrix[:3, 3] = middle + np.array(sides) * (turn @ place) - matrix[:3, :3] @ centre
-            turned.append(matrix)
+            rotation = turn @ best.matrix[:3, :3]
+            shift = middle + np.array(sides) * (turn @ place) - rotation @ centre
+            turned.append(rigid(rotation, shift))
     poses = search(clouds.thinned, field, effort=options.twins, only=tuple(turned))
     limit_mm = options.worse * poses[0].score_mm + options.off_cells * field.cell_mm
     return [pose.matrix for pose in poses[: options.most_twins] if pose.score_mm <= limit_mm]

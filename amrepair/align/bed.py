@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from amrepair.align.options import USUAL_ALIGN, BedOptions
 from amrepair.align.refine import Prior
-from amrepair.frames import moved, rotation_from_vector
+from amrepair.frames import moved, rigid, rotation_from_vector
 from amrepair.template.port import Template
 
 
@@ -64,9 +64,7 @@ def level_on_bed(
                                         / max(float(np.linalg.norm(axis)), 1e-12)))  # fmt: skip
     pivot = centre + np.array([0.0, 0.0, fit[2] - target.mean() + 0.0])
     pivot[2] = low[2] + fit[2]
-    level = np.eye(4)
-    level[:3, :3] = turn
-    level[:3, 3] = pivot - turn @ pivot - np.array([0.0, 0.0, fit[2]])
+    level = rigid(turn, pivot - turn @ pivot - np.array([0.0, 0.0, fit[2]]))
     return level @ matrix, True
 
 

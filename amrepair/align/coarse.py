@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.frames import nearest_rotation
+from amrepair.frames import nearest_rotation, rigid
 
 VOXEL_RATIOS = (0.012, 0.02)  # of the part's diagonal
 
@@ -53,7 +53,7 @@ def _kiss(
         return None
     rotation = nearest_rotation(rotation)
     shift = np.asarray(answer.translation, dtype=np.float64).reshape(3)
-    return _pose(rotation, target + shift - rotation @ source)
+    return rigid(rotation, target + shift - rotation @ source)
 
 
 def _by_axes(
@@ -63,7 +63,7 @@ def _by_axes(
     source, target = _axes(points_mm), _axes(surface_mm)
     for turn in cube_rotations():
         rotation = target[0] @ turn @ source[0].T
-        yield _pose(rotation, target[1] - rotation @ source[1])
+        yield rigid(rotation, target[1] - rotation @ source[1])
 
 
 def _axes(
@@ -88,11 +88,3 @@ def cube_rotations() -> list[Float[np.ndarray, "3 3"]]:
             if np.linalg.det(matrix) > 0:
                 found.append(matrix)
     return found
-
-
-def _pose(
-    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix

@@ -16,7 +16,7 @@ from amrepair.align.options import FamilyOptions
 from amrepair.align.refine import Refined
 from amrepair.align.search import CoarseField, misfits_mm
 from amrepair.align.thinning import in_order, thin_out
-from amrepair.frames import rotation_from_vector
+from amrepair.frames import moved, rigid, rotation_from_vector
 from amrepair.template.port import Template
 
 
@@ -39,10 +39,8 @@ class Motion:
     ) -> Float[np.ndarray, "4 4"]:
         """(4, 4) the pose after a small step."""
         place = matrix[:3, :3] @ centre_mm + matrix[:3, 3]
-        moved = np.eye(4)
-        moved[:3, :3] = rotation_from_vector(step_mm * self.turn) @ matrix[:3, :3]
-        moved[:3, 3] = place + step_mm * self.shift - moved[:3, :3] @ centre_mm
-        return moved
+        turned = rotation_from_vector(step_mm * self.turn) @ matrix[:3, :3]
+        return rigid(turned, place + step_mm * self.shift - turned @ centre_mm)
 
 
 def motions(
@@ -162,7 +160,7 @@ def _turned(
     centre = matrix[:3, :3] @ cloud_mm.mean(axis=0) + matrix[:3, 3]
     through = centre + np.cross(axis, motion.shift) / rate
     few = cloud_mm[:: len(cloud_mm) // options.radius_points + 1]  # a radius needs no more
-    away = few @ matrix[:3, :3].T + matrix[:3, 3] - through
+    away = moved(few, matrix) - through
     radius_mm = float(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1).max())
     in_part = options.least_radius_ratio * diagonal_mm < radius_mm < diagonal_mm
     if not in_part or share > options.most_resisting * (rate * radius_mm) ** 2:
@@ -184,7 +182,7 @@ def _among(
     within_mm: float,
 ) -> bool:
     few = cloud_mm[:: max(1, len(cloud_mm) // 50)]
-    placed = few @ matrix[:3, :3].T + matrix[:3, 3]
+    placed = moved(few, matrix)
     others = few @ np.swapaxes(family[:, :3, :3], 1, 2) + family[:, None, :3, 3]
     return bool(np.linalg.norm(others - placed, axis=2).max(axis=1).min() < within_mm)
 
@@ -195,7 +193,7 @@ def _score(
     template: Template,
     cap_mm: float,
 ) -> float:
-    residual = np.abs(template.distance(cloud_mm @ matrix[:3, :3].T + matrix[:3, 3]))
+    residual = np.abs(template.distance(moved(cloud_mm, matrix)))
     return float(np.minimum(residual, cap_mm).mean())
 
 

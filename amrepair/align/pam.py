@@ -19,7 +19,7 @@ from amrepair.align.options import PUBLISHED_PAM, PamOptions
 from amrepair.align.registration import Registration
 from amrepair.device import open3d
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform, diagonal, nearest_rotation
+from amrepair.frames import Transform, diagonal, moved, nearest_rotation, rigid
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -105,7 +105,7 @@ def pam(
     for k in range(1, rounds + 1):
         progress("align", float(k - 1), float(rounds))
         step = _register(moving, target, prepared, options)
-        moving = moving @ step[:3, :3].T + step[:3, 3]
+        moving = moved(moving, step)
         pose = step @ pose  # the ICP result already holds the RANSAC step: composed once
         loss = _loss(moving, target, options, rng)
         if loss < threshold:
@@ -128,10 +128,7 @@ def _in_mm(
     radius_mm: float,
 ) -> Float[np.ndarray, "4 4"]:
     rotation = nearest_rotation(pose[:3, :3])  # ten products of rotations drift
-    found = np.eye(4)
-    found[:3, :3] = rotation
-    found[:3, 3] = middle + radius_mm * pose[:3, 3] - rotation @ start
-    return found
+    return rigid(rotation, middle + radius_mm * pose[:3, 3] - rotation @ start)
 
 
 def _cloud(points: Float[np.ndarray, "n 3"]) -> Any:
@@ -246,7 +243,7 @@ def align_paper(
         progress=progress,
     )
     matrix = found.matrix if guess is None else found.matrix @ guess.matrix
-    placed = scan.points_mm @ matrix[:3, :3].T + matrix[:3, 3]
+    placed = moved(scan.points_mm, matrix)
     residual_mm, gradient = template.distance_and_gradient(placed)
     # The method cannot place a scan better than its own last search radius.
     reach = options.icp_voxels if options.icp else options.ransac_voxels

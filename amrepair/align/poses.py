@@ -14,7 +14,7 @@ from jaxtyping import Float
 from amrepair.align.options import PoseOptions
 from amrepair.align.refine import Refined, refine_all
 from amrepair.align.thinning import Thinned
-from amrepair.frames import box_corners, diagonal
+from amrepair.frames import box_corners, diagonal, moved
 from amrepair.template.port import Template
 
 
@@ -163,7 +163,7 @@ def on_all(poses: Sequence[Refined], clouds: Clouds, template: Template) -> list
     """Poses judged on all points, where they are."""
     found = []
     for pose in poses:
-        placed = clouds.dense_mm @ pose.matrix[:3, :3].T + pose.matrix[:3, 3]
+        placed = moved(clouds.dense_mm, pose.matrix)
         found.append(
             clouds.scored(
                 Refined(

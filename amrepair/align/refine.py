@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.align import refine_kernels as kernels
-from amrepair.frames import nearest_rotation
+from amrepair.frames import nearest_rotation, rigid
 from amrepair.template.port import Distances, OnGrid
 
 MAX_ITERATIONS = 60
@@ -133,8 +133,7 @@ def refine_all(
     rotations = nearest_rotation(rotations)
     found = []
     for k, (rotation, place) in enumerate(zip(rotations, places, strict=True)):
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = rotation, place - rotation @ centre
+        matrix = rigid(rotation, place - rotation @ centre)
         information = hessians[k] / sigma_mm**2
         iterations, converged = ends[k]
         found.append(Refined(matrix, information, residuals[k], bool(converged), int(iterations)))

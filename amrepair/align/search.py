@@ -19,7 +19,7 @@ from jaxtyping import Float
 from amrepair.align import search_kernels as kernels
 from amrepair.align.options import USUAL_ALIGN, CoarseOptions, Effort
 from amrepair.align.thinning import Thinned
-from amrepair.frames import nearest_rotation
+from amrepair.frames import nearest_rotation, rigid, rotation_of_quaternion
 from amrepair.template.port import Template
 
 # Roots of x⁴ = x + 4 and 2 (Alexa, eq. 5).
@@ -154,7 +154,10 @@ def search(
         chosen = kernels.peaks(order, rotations, places, radius, apart, stage.keep)
         rotations, places, scores = rotations[chosen], places[chosen], scores[chosen]
     return [
-        Pose(_matrix(r, cell_mm * (p - r @ centre) + field.origin_mm), cell_mm * float(s))
+        Pose(
+            rigid(nearest_rotation(r), cell_mm * (p - r @ centre) + field.origin_mm),
+            cell_mm * float(s),
+        )
         for r, p, s in zip(rotations, places, scores, strict=True)
     ]
 
@@ -198,17 +201,4 @@ def spread_rotations(count: int) -> Float[np.ndarray, "k 3 3"]:
     alpha, beta = d / _PHI, d / _PSI
     x, y = small * np.sin(alpha), small * np.cos(alpha)
     z, w = large * np.sin(beta), large * np.cos(beta)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
-
-
-def _matrix(
-    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "4 4"]:
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = nearest_rotation(rotation), translation
-    return found
+    return rotation_of_quaternion(np.stack([w, x, y, z]))

@@ -46,13 +46,25 @@ def first_of_voxels(points, low, voxel, most, slots, chosen):
 
 
 @njit(cache=True, nogil=True)
+def _spread_bits(v):
+    """The 21 low bits of a number, two zeros after each."""
+    v = (v | (v << 32)) & 0x1F00000000FFFF
+    v = (v | (v << 16)) & 0x1F0000FF0000FF
+    v = (v | (v << 8)) & 0x100F00F00F00F00F
+    v = (v | (v << 4)) & 0x10C30C30C30C30C3
+    return (v | (v << 2)) & 0x1249249249249249
+
+
+@njit(cache=True, nogil=True)
 def morton_keys(points, low, edge, bits):
-    """(n,) numbers of the cubes that hold the points, along a Z-order curve (Morton 1966)."""
+    """(n,) numbers of the cubes that hold the points, along a Z-order curve (Morton 1966).
+
+    Of `bits` along each axis, 21 at most.
+    """
     keys = np.zeros(len(points), np.int64)
     most = (1 << bits) - 1
     for n in range(len(points)):
         for a in range(3):
             cell = min(int((points[n, a] - low[a]) / edge), most)
-            for b in range(bits):
-                keys[n] |= ((cell >> b) & 1) << (3 * b + a)
+            keys[n] |= _spread_bits(cell) << a
     return keys

@@ -18,10 +18,8 @@ __all__ = ["BatchKind", "BatchOptions", "BatchReport", "run_batch"]
 
 # Loaded when first used: a worker sets its threads before numpy is there.
 _HOMES = {
-    "BatchOptions": ("amrepair.batch.options", "BatchOptions"),
-    "BatchReport": ("amrepair.batch.run", "BatchReport"),
-    "BatchKind": ("amrepair.batch.options", "BatchKind"),
-    "run_batch": ("amrepair.batch.run", "run_batch"),
+    "amrepair.batch.options": "BatchKind, BatchOptions",
+    "amrepair.batch.run": "BatchReport, run_batch",
 }
 
 __getattr__, __dir__ = lazy_names(globals(), _HOMES)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.bench.options import USUAL_BENDS, BendOptions
+from amrepair.bench.options import BendOptions
 from amrepair.frames import diagonal, moved, unit_vectors
 from amrepair.template.port import Template
 
@@ -98,7 +98,7 @@ def with_zone(
     *,
     limit_mm: float,
     sigma_mm: float,
-    options: BendOptions = USUAL_BENDS,
+    options: BendOptions,
 ) -> Pieces:
     """The pieces with the zone that what lies about the plane between them tells.
 
@@ -158,7 +158,7 @@ def best_cuts(
     *,
     scale_mm: float,
     sigma_mm: float,
-    options: BendOptions = USUAL_BENDS,
+    options: BendOptions,
 ) -> list[Cut]:
     """The best cut across each main axis of the template's surface, the best first.
 

@@ -24,7 +24,7 @@ from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.bench.bends import Pieces, Pose, best_cuts, with_zone
 from amrepair.bench.options import USUAL_BODIES, BodyOptions
-from amrepair.frames import diagonal, moved, rotation_from_vector, unit_vectors, ways_across
+from amrepair.frames import diagonal, moved, rigid, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
 
@@ -104,6 +104,7 @@ def _little_bent(pose: Pose, scene: _Scene) -> Pieces:
         sigma_mm=max(
             scene.sigma_mm, options.clear_ratio / options.clear_sigmas * scene.diagonal_mm
         ),
+        options=options.bends,
     )
     if cuts[0].gain < chi2.isf(options.gain_probability, 6):
         return Pieces(pose)
@@ -288,8 +289,9 @@ class _Scene:
         """Both pieces, and the zone between them as the points tell it."""
         pieces = Pieces(standing, other, normal, through_mm)
         return with_zone(
-            pieces, self.cloud, self.template, limit_mm=self.limit_mm, sigma_mm=self.sigma_mm
-        )
+            pieces, self.cloud, self.template, limit_mm=self.limit_mm, sigma_mm=self.sigma_mm,
+            options=self.options.bends,
+        )  # fmt: skip
 
     def refined(
         self,
@@ -400,10 +402,7 @@ def _of_the_rest(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
     starts = [first]
     for vector in (*np.eye(3), *-np.eye(3)):
         turn = rotation_from_vector(options.piece_turn_rad * vector)
-        start = np.eye(4)
-        start[:3, :3] = turn @ first[:3, :3]
-        start[:3, 3] = turn @ (first[:3, 3] - middle) + middle
-        starts.append(start)
+        starts.append(rigid(turn @ first[:3, :3], turn @ (first[:3, 3] - middle) + middle))
     found = scene.refined(few, starts, options.second_ratio)
     yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
 

@@ -148,10 +148,9 @@ def earth_movers_distance(
     second: Float[np.ndarray, "m 3"],
     *,
     rng: np.random.Generator,
-    points: int = EMD_POINTS,
 ) -> float:
-    """Mean distance under the optimal bijection of `points` (or as many as there are)."""
-    count = min(points, len(first), len(second))
+    """Mean distance under the optimal bijection of some points (`EMD_POINTS` at most)."""
+    count = min(EMD_POINTS, len(first), len(second))
     a = first[np.sort(rng.permutation(len(first))[:count])]
     b = second[np.sort(rng.permutation(len(second))[:count])]
     cost = cdist(a, b)

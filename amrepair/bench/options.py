@@ -169,7 +169,7 @@ class BodyOptions:
     bends: BendOptions = BendOptions()
 
 
-USUAL_BENDS, USUAL_BODIES = BendOptions(), BodyOptions()
+USUAL_BODIES = BodyOptions()
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from amrepair.bench.house import class_template, repair_distance
 from amrepair.bench.method import ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
 from amrepair.bench.samples import Format
+from amrepair.frames import moved
 from amrepair.merge.cloud import planes, spacing_of
 from amrepair.template import MeshSdf
 from amrepair.template.paper import RELEASED_NETWORK as CODE_RECIPE
@@ -104,7 +105,7 @@ def make_pam_aligner(data: ClassInput, seed: int, cache: Path) -> Aligner:
         points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
         matrix = pam(points_mm, target.cloud_mm, options=options, rng=rng).matrix
-        placed = points_mm @ matrix[:3, :3].T + matrix[:3, 3]
+        placed = moved(points_mm, matrix)
         return placed, target.residual(placed)
 
     return place
@@ -132,7 +133,7 @@ class PaperModel:
             matrix = pam(points_mm, self.target.cloud_mm, options=self.options, rng=rng).matrix
         except PamError as error:
             matrix, aligned = error.matrix, False
-        placed = points_mm @ matrix[:3, :3].T + matrix[:3, 3]
+        placed = moved(points_mm, matrix)
         score = np.abs(self.template.distance(placed))
         return Scores(
             score, top_mean(score, TOP_SCORES), self.target.residual(placed), aligned=aligned

@@ -31,6 +31,7 @@ from amrepair.bench.synth_views import (
     sensors_around,
 )
 from amrepair.errors import InputError
+from amrepair.frames import moved, rigid
 from gcode.progress import Progress, silent
 
 MANIFEST = "synth.json"
@@ -269,10 +270,8 @@ def _made(
     )
     pose = np.eye(4)
     if not at_rest:
-        pose[:3, :3] = random_rotation(rng)
-        pose[:3, 3] = rng.uniform(-1, 1, 3) * part.diagonal_mm
-    points = surface.points_mm @ pose[:3, :3].T + pose[:3, 3]
-    cloud = SampleCloud(points, _labels(surface, sigma_mm))
+        pose = rigid(random_rotation(rng), rng.uniform(-1, 1, 3) * part.diagonal_mm)
+    cloud = SampleCloud(moved(surface.points_mm, pose), _labels(surface, sigma_mm))
     return _Made(cloud, role, kind, index, single, pose)
 
 

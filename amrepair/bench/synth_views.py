@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from amrepair.bench.options import USUAL_VIEWING
 from amrepair.device import open3d
 from amrepair.errors import InputError
-from amrepair.frames import diagonal, spread_directions
+from amrepair.frames import diagonal, rotation_of_quaternion, spread_directions
 from amrepair.template.surface import triangle_areas_normals
 
 
@@ -173,11 +173,4 @@ def look(
 
 def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
     """Uniform over all rotations (a normalised Gaussian quaternion)."""
-    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_of_quaternion((q := rng.normal(size=4)) / np.linalg.norm(q))

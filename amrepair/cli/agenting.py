@@ -18,7 +18,6 @@ from amrepair.cli.live import (
 )
 from amrepair.cli.options import (
     SCAN_TIMEOUT_S,
-    ProcessOption,
     ScannerOption,
     ScannerPoseOption,
     ScanTimeoutOption,
@@ -30,6 +29,7 @@ from amrepair.cli.options import (
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
+from gcode.cli.options import ProcessOption
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption
 from gcode.profiles import DEFAULT_PROCESS
 

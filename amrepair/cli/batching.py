@@ -13,10 +13,6 @@ import typer
 from amrepair.cli.inspect import KnownOption, TemplateOption
 from amrepair.cli.options import (
     CalibrationOption,
-    JsonOption,
-    MaterialOption,
-    PrinterOption,
-    ProcessOption,
     SeedOption,
     SensorOption,
     calibration_named,
@@ -25,6 +21,7 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import InputError
 from gcode.cli import console
+from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
 from gcode.process import one_thread
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 

@@ -7,17 +7,10 @@ from typing import Annotated
 
 import typer
 
-from amrepair.cli.options import (
-    SCAN_TIMEOUT_S,
-    JsonOption,
-    MaterialOption,
-    PrinterOption,
-    ProcessOption,
-    ScanTimeoutOption,
-    SeedOption,
-)
+from amrepair.cli.options import SCAN_TIMEOUT_S, ScanTimeoutOption, SeedOption
 from amrepair.errors import InputError
 from gcode.cli import console
+from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 

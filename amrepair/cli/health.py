@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from amrepair.cli.options import JsonOption
 from amrepair.doctor import CheckFinding, State, examine
 from gcode.cli import console
+from gcode.cli.options import JsonOption
 
 _STATE_MARKS = {State.OK: "ok  ", State.NOTE: "note", State.BAD: "BAD "}
 _STATE_COLOURS = {State.OK: "green", State.NOTE: "yellow", State.BAD: "bold red"}

@@ -12,7 +12,6 @@ import typer
 from amrepair.cli.files import read_early
 from amrepair.cli.options import (
     CalibrationOption,
-    JsonOption,
     SeedOption,
     SensorOption,
     calibration_named,
@@ -21,6 +20,7 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import InputError
 from gcode.cli import console
+from gcode.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from amrepair.align import Registration

@@ -23,11 +23,9 @@ from gcode.progress import Progress
 if TYPE_CHECKING:
     from amrepair.loop import Decision, Look
     from amrepair.repair import RepairPlan
+    from amrepair.report.live import LiveView
     from amrepair.report.operator import Operator
     from gcode.reader import Job
-
-if TYPE_CHECKING:
-    from amrepair.report.live import LiveView
 
 PROGRAM_SUFFIXES = frozenset({".gcode", ".gco", ".g", ".nc", ".bgcode"})
 VIEW_PORT = 8642
@@ -65,7 +63,7 @@ def view(
     refuse_traps(files)  # before what reads them is loaded
     for path in files:
         _refuse(path)
-    shown = [_shown(path) for path in files]
+    shown = [shown_as(path) for path in files]
     with console.starting():
         from amrepair.report.live import LiveView
 
@@ -80,19 +78,7 @@ def view(
         page.close()
 
 
-def show_file(page: LiveView, path: Path) -> None:
-    """Put a file on the page, by the ending of its name.
-
-    Raises
-    ------
-    InputError
-        If it is none that can be shown.
-    """
-    _refuse(path)
-    _shown(path)(page)
-
-
-def _shown(path: Path) -> Callable[[LiveView], None]:
+def shown_as(path: Path) -> Callable[[LiveView], None]:
     """Read a file, before any page is loaded; what puts it there."""
     import numpy as np
 

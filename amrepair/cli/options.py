@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from amrepair.errors import InputError
-from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,28 +17,6 @@ if TYPE_CHECKING:
     from amrepair.frames import Transform
     from amrepair.regions.calibration import Calibration
     from gcode.profiles import PrintSetup
-
-__all__ = [
-    "SCAN_TIMEOUT_S",
-    "CalibrationOption",
-    "JsonOption",
-    "MaterialOption",
-    "PrinterOption",
-    "ProcessOption",
-    "ScanTimeoutOption",
-    "ScannerOption",
-    "ScannerPoseOption",
-    "SeedOption",
-    "SensorOption",
-    "SoundOption",
-    "calibration_named",
-    "numbers",
-    "part_pose",
-    "require_approval",
-    "scaled_mesh",
-    "sensors",
-    "with_settings",
-]
 
 Options = TypeVar("Options")
 _SWITCH = {"true": True, "on": True, "yes": True, "false": False, "off": False, "no": False}

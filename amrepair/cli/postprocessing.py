@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from amrepair.cli.options import JsonOption
 from amrepair.errors import InputError
 from gcode.cli import console
+from gcode.cli.options import JsonOption
 from gcode.whole import put_in_place
 
 if TYPE_CHECKING:

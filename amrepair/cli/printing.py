@@ -18,8 +18,6 @@ from amrepair.cli.live import (
 )
 from amrepair.cli.options import (
     SCAN_TIMEOUT_S,
-    JsonOption,
-    ProcessOption,
     ScannerOption,
     ScannerPoseOption,
     ScanTimeoutOption,
@@ -32,6 +30,7 @@ from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
 from gcode.cli.judging import LeaveHeatersOption
+from gcode.cli.options import JsonOption, ProcessOption
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption
 from gcode.profiles import DEFAULT_PROCESS
 

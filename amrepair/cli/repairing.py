@@ -15,8 +15,6 @@ from amrepair.cli.files import read_early
 from amrepair.cli.inspect import TemplateOption
 from amrepair.cli.options import (
     CalibrationOption,
-    JsonOption,
-    ProcessOption,
     SeedOption,
     SensorOption,
     calibration_named,
@@ -26,7 +24,14 @@ from amrepair.cli.options import (
 )
 from amrepair.errors import AmrepairError, InputError
 from gcode.cli import console
-from gcode.cli.options import grid_of, job_of, program_text, refuse_standing
+from gcode.cli.options import (
+    JsonOption,
+    ProcessOption,
+    grid_of,
+    job_of,
+    program_text,
+    refuse_standing,
+)
 from gcode.cli.owning import JobMaterialOption, JobPrinterOption, job_setup
 from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_PROCESS

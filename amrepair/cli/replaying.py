@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from amrepair.cli.options import JsonOption
 from gcode.cli import console
+from gcode.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from amrepair.loop.replay import Replayed

@@ -18,17 +18,11 @@ from amrepair.cli.live import (
     ViewPlace,
     live_view,
 )
-from amrepair.cli.options import (
-    JsonOption,
-    MaterialOption,
-    PrinterOption,
-    ProcessOption,
-    SeedOption,
-    scaled_mesh,
-)
+from amrepair.cli.options import SeedOption, scaled_mesh
 from amrepair.errors import LoopError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
+from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:

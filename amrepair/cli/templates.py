@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amrepair.cli.files import refuse_traps, sort_inputs, write_mesh
-from amrepair.cli.options import JsonOption, SeedOption, sensors, with_settings
+from amrepair.cli.options import SeedOption, sensors, with_settings
 from amrepair.errors import InputError
 from gcode.cli import console
+from gcode.cli.options import JsonOption
 
 if TYPE_CHECKING:
     import numpy as np

@@ -22,7 +22,7 @@ RIDGE, TINY = 1e-3, 1e-9
 
 
 @njit(cache=True, nogil=True)
-def _median(values, n):
+def median(values, n):
     """The median of the first n values, which are put in order: few, so by insertion."""
     for k in range(1, n):
         value, j = values[k], k
@@ -130,14 +130,14 @@ def window_statistics(table, count, place, value, weight, rank):
             if j != i:
                 apart[others] = abs(value[j] - value[i])
                 others += 1
-        out[0, i] = _median(here, count[i])
+        out[0, i] = median(here, count[i])
         at = min(rank, count[i]) - 1
         out[1, i], out[2, i] = here[at], here[count[i] - 1 - at]
-        out[3, i] = _median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
+        out[3, i] = median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
         if count[i] >= 2 * TREND_TERMS:
             _off_plane(place, value, table, count[i], i, apart)
             # a plane on a surface takes three of the n degrees of freedom
-            spread = _median(apart, count[i]) / NORMAL_MEDIAN
+            spread = median(apart, count[i]) / NORMAL_MEDIAN
             out[3, i] = min(out[3, i], spread * np.sqrt(count[i] / (count[i] - 3.0)))
         out[4, i] = total
     return out
@@ -167,7 +167,7 @@ def window_medians(table, count, value):
             if not np.isnan(v):
                 here[found] = v
                 found += 1
-        out[i] = _median(here, found) if found else np.nan
+        out[i] = median(here, found) if found else np.nan
     return out
 
 
@@ -181,7 +181,7 @@ def group_medians(order, start, value):
         here = np.empty(size)
         for k in range(size):
             here[k] = value[order[start[i] + k]]
-        out[i] = _median(here, size)
+        out[i] = median(here, size)
     return out
 
 

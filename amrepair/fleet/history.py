@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from amrepair.errors import InputError
-from amrepair.fleet.chart import Chart, ChartOptions, chart
+from amrepair.fleet.chart import Chart, chart
 from amrepair.loop.tape import read_events
 
 # Looks within so much of height are looks at the same height.
@@ -153,7 +153,7 @@ class History:
         names = ("printer", "part", "runs", "looks", "repairs", "missing_mm3", "excess_mm3")
         return [dict(zip(names, row, strict=True)) for row in rows]
 
-    def lessons(self, options: ChartOptions | None = None) -> list[Lesson]:
+    def lessons(self) -> list[Lesson]:
         """A chart for each printer and height band, of what it left by itself."""
         with self._mutex:
             rows = self._db.execute(
@@ -164,15 +164,13 @@ class History:
         series: dict[tuple[str, int], list[tuple[float, float]]] = {}
         for printer, band, time_s, missing_mm3 in rows:
             series.setdefault((printer, band), []).append((time_s, missing_mm3))
-        return [_lesson(key, found, options) for key, found in series.items()]
+        return [_lesson(key, found) for key, found in series.items()]
 
 
-def _lesson(
-    key: tuple[str, int], found: Sequence[tuple[float, float]], options: ChartOptions | None
-) -> Lesson:
+def _lesson(key: tuple[str, int], found: Sequence[tuple[float, float]]) -> Lesson:
     printer, band = key
     times_s, values_mm3 = zip(*found, strict=True)
     return Lesson(
         printer, band * SAME_HEIGHT_MM, (band + 1) * SAME_HEIGHT_MM, times_s, values_mm3,
-        chart(values_mm3, options),
+        chart(values_mm3),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from amrepair.repair import RepairPlan
 from gcode.errors import GcodeError
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
-from gcode.resumption.flow import ChangedLayer, GapField, change_flow
+from gcode.resumption.flow import ChangedLayer, change_flow, gap_field
 
 NEXT_LAYER_CELL_MM = 0.2
 
@@ -35,7 +35,7 @@ def rewritten_layer(
     solids = gap_solids(deficit.missing, deficit.excess, verdicts, floor_mm=floor_mm)
     if not solids:
         return None
-    gap = GapField.from_solids(solids, NEXT_LAYER_CELL_MM)
+    gap = gap_field(solids, NEXT_LAYER_CELL_MM)
     try:
         return change_flow(job, setup, job.layers[layer].index, gap)
     except GcodeError:

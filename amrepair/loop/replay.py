@@ -40,7 +40,6 @@ class Replayed:
     look: int
     stop: str
     then: dict[str, Any]
-    now: dict[str, Any]
     differences: tuple[str, ...]
 
 
@@ -90,7 +89,7 @@ def decide_again(folder: Path, rules: Sequence[str] = ()) -> tuple[Replayed, ...
     for event in _recorded_looks(folder):
         now = decided_again(event["decision"], policy).to_json()
         said = _differences(event["decision"], now)
-        again.append(Replayed(event["look"], event["stop"], event["decision"], now, said))
+        again.append(Replayed(event["look"], event["stop"], event["decision"], said))
     return tuple(again)
 
 
@@ -137,7 +136,7 @@ def compare(then: dict[str, Any], look: Look) -> Replayed:
     ):
         if abs(value[0] - value[1]) > max(SAME_MM3, SAME_RATIO * abs(value[0])):
             said.append(f"{value[0]:.2f} mm³ {key} then, {value[1]:.2f} mm³ now")
-    return Replayed(look.number, look.stop.label, was, now, tuple(said))
+    return Replayed(look.number, look.stop.label, was, tuple(said))
 
 
 def _differences(was: dict[str, Any], now: dict[str, Any]) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from amrepair.loop.options import LoopOptions
 from amrepair.loop.pace import Pace
 from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.policy.unasked import Limits
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.calibration import Calibration, as_tuples
 from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template
@@ -31,7 +31,7 @@ from gcode.check import CheckedProgram, check, policy_of
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup, ProcessProfile, load_setup
 from gcode.reader import Job, job_for
-from gcode.whole import put_in_place
+from gcode.whole import write_bytes
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
 RUN_VERSION = 2
@@ -194,14 +194,11 @@ def keep(folder: Path, setting: Setting, job_text: str, template: Template) -> N
         If the folder cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _put(folder / JOB, job_text)
+        write_bytes(folder / JOB, job_text.encode())
         _keep_template(folder, template)
-        _put(
-            folder / SETTING,
-            json.dumps({"version": RUN_VERSION, **asdict(setting)}, indent=2, ensure_ascii=False)
-            + "\n",
-        )
+        said = {"version": RUN_VERSION, **asdict(setting)}
+        text = json.dumps(said, indent=2, ensure_ascii=False) + "\n"
+        write_bytes(folder / SETTING, text.encode())
     except OSError as error:
         raise InputError(
             f"the run's folder {folder} cannot be written ({error.strerror}); name another one"
@@ -228,7 +225,7 @@ def open_run(folder: Path) -> Recorded:
         raise InputError(f"{folder / SETTING} is of another version than {RUN_VERSION}")
     try:
         policy = PolicyOptions(**said.pop("policy"))
-        setting = Setting(policy=policy, **{key: _tuples(value) for key, value in said.items()})
+        setting = Setting(policy=policy, **{key: as_tuples(value) for key, value in said.items()})
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder / SETTING} cannot be read ({error})") from error
     setup = setting.setup()
@@ -276,12 +273,3 @@ def _whole(name: str) -> str:
 
 def _rows(transform: Transform) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(v) for v in row) for row in transform.matrix)
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
-
-
-def _put(path: Path, text: str) -> None:
-    with put_in_place(path) as draft:
-        draft.write_text(text, encoding="utf-8")

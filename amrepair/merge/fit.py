@@ -15,7 +15,7 @@ import amrepair
 from amrepair.errors import InputError
 from amrepair.frames import diagonal
 from amrepair.merge.cloud import outward_by, planes, spacing_of
-from amrepair.merge.fuse import Cloud, Fused, fuse
+from amrepair.merge.fuse import Cloud, Fused, fuse, widened
 from amrepair.merge.joint import Slack
 from amrepair.merge.options import USUAL_MERGE, MergeOptions
 from amrepair.merge.place import Placement, place
@@ -24,7 +24,7 @@ from amrepair.scans import Scan
 from amrepair.template import GridSdf, MeshSdf
 from amrepair.template.fit import fit_fast
 from amrepair.template.grid import Coverage
-from amrepair.template.learned import LearnedSdf, Tolerance
+from amrepair.template.learned import LearnedSdf
 from gcode.progress import Progress, silent
 
 METRE_MM, LEAST_PART_MM = 1000.0, 1.0  # no printed part is smaller: its numbers are metres
@@ -252,7 +252,7 @@ def _with_tolerance(
             if k in weak:
                 own = cloud.scan == place_
                 slack_mm[own] = weak[k].across(cloud.points_mm[own], cloud.normals[own])
-        spread = spread.widened(cloud, slack_mm)
+        spread = widened(spread, cloud, slack_mm)
     coverage: Coverage | None = None if fused.coverage.unseen_mm2 == 0.0 else fused.coverage
     fitted = replace(
         made,
@@ -261,7 +261,7 @@ def _with_tolerance(
     )
     if spread is None:
         return fitted
-    return LearnedSdf.on(fitted, Tolerance(spread.origin_mm, spread.cell_mm, spread.values_mm))
+    return LearnedSdf.on(fitted, spread)
 
 
 def _metadata(scans: Sequence[Scan], notes: Sequence[str], seed: int) -> dict[str, str]:

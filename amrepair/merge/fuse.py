@@ -22,6 +22,7 @@ from amrepair.merge.cloud import SortedPoints
 from amrepair.merge.options import USUAL_FUSE, FuseOptions
 from amrepair.template.extract import zero_level
 from amrepair.template.grid import Coverage, surface_elements
+from amrepair.template.learned import Tolerance
 from amrepair.template.mesh_sdf import MeshSdf
 from gcode.meshes import mesh_of
 from gcode.solids import as_manifold, is_valid
@@ -61,44 +62,6 @@ class Cloud:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
-    """Where the scans disagree.
-
-    Attributes
-    ----------
-    values_mm
-        (x, y, z) standard deviation between scans near the surface, 0 elsewhere.
-    """
-
-    origin_mm: Float[np.ndarray, " 3"]
-    cell_mm: float
-    values_mm: Float[np.ndarray, "x y z"]
-
-    def widened(self, cloud: Cloud, slack_mm: Float[np.ndarray, " n"]) -> Spread:
-        """With what the scans' own poses leave open.
-
-        Where several scans saw the surface, that of the middle one: the mean is theirs.
-
-        Parameters
-        ----------
-        slack_mm
-            (n,) of each point of the cloud: standard deviation of its scan's pose across it.
-        """
-        shape = self.values_mm.shape
-        index = cells_of(cloud.points_mm, self.origin_mm, self.cell_mm)
-        cell = np.ravel_multi_index(tuple(index.T), shape, mode="clip")
-        pairs, which = np.unique(cell * cloud.scans + cloud.scan, return_inverse=True)
-        each = np.bincount(which, weights=slack_mm) / np.bincount(which)
-        place = pairs // cloud.scans
-        order = np.lexsort((each, place))
-        cells, first, count = np.unique(place[order], return_index=True, return_counts=True)
-        open_mm = np.zeros(int(np.prod(shape)))
-        open_mm[cells] = each[order][first + count // 2]
-        grown = ndimage.maximum_filter(open_mm.reshape(shape), size=3)
-        return replace(self, values_mm=np.hypot(self.values_mm, grown).astype(np.float32))
-
-
-@dataclass(frozen=True, slots=True)
 class Fused:
     """What placed scans say together.
 
@@ -123,7 +86,7 @@ class Fused:
     """
 
     mesh: trimesh.Trimesh
-    spread: Spread | None
+    spread: Tolerance | None
     standard_error_mm: float
     unseen_ratio: float
     single_ratio: float
@@ -134,15 +97,8 @@ class Fused:
     coverage: Coverage
 
 
-def fuse(
-    cloud: Cloud, *, voxel_mm: float | None = None, options: FuseOptions = USUAL_FUSE
-) -> Fused:
+def fuse(cloud: Cloud, options: FuseOptions = USUAL_FUSE) -> Fused:
     """Fuse placed scans.
-
-    Parameters
-    ----------
-    voxel_mm
-        Edge of the grid; None follows the points.
 
     Raises
     ------
@@ -153,7 +109,7 @@ def fuse(
     keep = ~(against | lonely)
     points, normals, scan = cloud.points_mm[keep], cloud.normals[keep], cloud.scan[keep]
     radius_mm = reach_mm(cloud, options)
-    edge = voxel_mm or max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
+    edge = max(0.6 * radius_mm, float(np.ptp(points, axis=0).max()) / MOST_EDGES)
     low, shape, nodes, index = _band(points, edge, radius_mm)
     cells = SortedPoints.of(points, radius_mm)
     field, excess, heard, overruled = kernels.fused_nodes(
@@ -321,7 +277,7 @@ def _band(
     if float(np.prod(shape.astype(np.float64))) > MAX_NODES:
         raise TemplateError(
             f"a grid of {edge:.3g} mm over these scans has {np.prod(shape):,} nodes, the limit is "
-            f"{MAX_NODES:,}; remove far clutter from the scans, or give a larger voxel"
+            f"{MAX_NODES:,}; remove far clutter from the scans"
         )
     occupied = np.zeros(tuple(shape), dtype=bool)
     occupied[tuple(np.rint((points_mm - low) / edge).astype(np.int64).T)] = True
@@ -456,7 +412,7 @@ def _spread(
     index: Int[np.ndarray, "k 3"],
     box: tuple[Float[np.ndarray, " 3"], float, Int[np.ndarray, " 3"]],
     options: FuseOptions,
-) -> Spread:
+) -> Tolerance:
     """Variance between scans pooled over coarse cells: chance averages out, disagreement stays."""
     low, edge, shape = box
     used = close & np.isfinite(excess)
@@ -470,14 +426,38 @@ def _spread(
     found = np.sqrt(np.maximum(pooled, 0.0)).astype(np.float32)
     found[found < options.least_spread_noises * cloud.sigma_mm] = 0.0
     grown = ndimage.maximum_filter(found.reshape(tuple(size)), size=3)
-    return Spread(low - 0.5 * edge, SPREAD_CELLS * edge, grown)
+    return Tolerance(low - 0.5 * edge, SPREAD_CELLS * edge, grown)
 
 
-def _standard_error(cloud: Cloud, spread: Spread | None, radius_mm: float) -> float:
+def widened(spread: Tolerance, cloud: Cloud, slack_mm: Float[np.ndarray, " n"]) -> Tolerance:
+    """The spread between scans with what the scans' own poses leave open.
+
+    Where several scans saw the surface, that of the middle one: the mean is theirs.
+
+    Parameters
+    ----------
+    slack_mm
+        (n,) of each point of the cloud: standard deviation of its scan's pose across it.
+    """
+    shape = spread.spread_mm.shape
+    index = cells_of(cloud.points_mm, spread.origin_mm, spread.cell_mm)
+    cell = np.ravel_multi_index(tuple(index.T), shape, mode="clip")
+    pairs, which = np.unique(cell * cloud.scans + cloud.scan, return_inverse=True)
+    each = np.bincount(which, weights=slack_mm) / np.bincount(which)
+    place = pairs // cloud.scans
+    order = np.lexsort((each, place))
+    cells, first, count = np.unique(place[order], return_index=True, return_counts=True)
+    open_mm = np.zeros(int(np.prod(shape)))
+    open_mm[cells] = each[order][first + count // 2]
+    grown = ndimage.maximum_filter(open_mm.reshape(shape), size=3)
+    return replace(spread, spread_mm=np.hypot(spread.spread_mm, grown).astype(np.float32))
+
+
+def _standard_error(cloud: Cloud, spread: Tolerance | None, radius_mm: float) -> float:
     """How well the surface is known at the 99th percentile: noise, and scans that differ."""
     near = 0.36 * np.pi * (radius_mm / cloud.spacing_mm) ** 2
     noise_mm = cloud.sigma_mm / np.sqrt(max(near, 1.0))
-    if spread is None or not (spread.values_mm > 0).any():
+    if spread is None or not (spread.spread_mm > 0).any():
         return float(noise_mm)
-    high = float(np.quantile(spread.values_mm[spread.values_mm > 0], 0.99))
+    high = float(np.quantile(spread.spread_mm[spread.spread_mm > 0], 0.99))
     return float(np.hypot(noise_mm, high / np.sqrt(cloud.scans)))

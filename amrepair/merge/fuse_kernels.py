@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.eigen_kernels import least_axis
+from amrepair.field.scales_kernels import median
 from gcode.compiled import njit, prange
 
 # Most points that one fit looks at; denser clouds are thinned before.
@@ -257,20 +258,6 @@ def columns(places, normals, scan, index, low, cell, near, far, facing):
     return support, conflict, apart
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _median(values, n):
-    """Median of the first n values, which are sorted in place."""
-    for i in range(1, n):
-        v = values[i]
-        j = i - 1
-        while j >= 0 and values[j] > v:
-            values[j + 1] = values[j]
-            j -= 1
-        values[j + 1] = v
-    half = n // 2
-    return values[half] if n % 2 else 0.5 * (values[half - 1] + values[half])
-
-
 @njit(cache=True, nogil=True)
 def _gathered(place, points, normals, grid, radius, near, weight, height):
     """Points within a radius of a place: how many; their numbers, weights and signed heights."""
@@ -332,10 +319,10 @@ def _overruled(value, noise, rules, banned):
             who += 1
     if who < 2:
         return who, np.nan
-    middle = _median(said, who)
+    middle = median(said, who)
     for s in range(who):
         said[s] = abs(said[s] - middle)
-    scale = 1.4826 * _median(said, who)
+    scale = 1.4826 * median(said, who)
     kept, mean, variance = 0, 0.0, 0.0
     for s in range(scans):
         bound = max(rules.outlier_sigmas * max(scale, noise[s]), rules.outlier_mm)

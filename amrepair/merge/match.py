@@ -17,7 +17,7 @@ from scipy import ndimage
 from amrepair.align.coarse import by_features, poses_between
 from amrepair.align.search import spread_rotations
 from amrepair.align.search_kernels import peaks
-from amrepair.frames import moved, nearest_rotation
+from amrepair.frames import moved, nearest_rotation, rigid
 from amrepair.merge import search_kernels as kernels
 from amrepair.merge.options import MatchOptions, MergeOptions
 from amrepair.merge.threads import in_threads
@@ -184,10 +184,8 @@ def _search(
         places = np.ascontiguousarray(places[chosen])
     found = []
     for rotation, place in zip(rotations, places, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3] = nearest_rotation(rotation)
-        pose[:3, 3] = space.centre_mm + cell_mm * place - pose[:3, :3] @ other.centre_mm
-        found.append(pose)
+        turn = nearest_rotation(rotation)
+        found.append(rigid(turn, space.centre_mm + cell_mm * place - turn @ other.centre_mm))
     return found
 
 

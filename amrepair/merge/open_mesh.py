@@ -29,6 +29,7 @@ from amrepair.template.mesh_file import OpenMeshError, file_sha256, read_mesh
 from amrepair.template.nearest import TriangleTree
 from amrepair.template.surface import count_for_spacing, sample_surface, triangle_areas_normals
 from gcode.progress import Progress, silent
+from gcode.stretches import places_to_ends
 
 if TYPE_CHECKING:
     import trimesh
@@ -211,11 +212,7 @@ def _rims(
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     pairs, count = np.unique(edges, axis=0, return_counts=True)
     start, end = vertices[pairs[count != 2]].transpose(1, 0, 2)
-    steps = np.ceil(np.linalg.norm(end - start, axis=1) / (0.5 * edge)).astype(int) + 1
-    which = np.repeat(np.arange(len(steps)), steps)
-    step = np.arange(len(which)) - np.repeat(np.cumsum(steps) - steps, steps)
-    share = (step / np.maximum(steps[which] - 1, 1))[:, None]
-    return np.asarray(start[which] + share * (end - start)[which])
+    return places_to_ends(start, end, 0.5 * edge)[0]
 
 
 def _field(

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from amrepair.errors import AlignmentError, InputError
-from amrepair.frames import moved, nearest_rotation
+from amrepair.frames import moved, nearest_rotation, rigid
 from amrepair.merge.match import featured, searched
 from amrepair.merge.options import MergeOptions
 from amrepair.merge.views import Fit, Placed, View, joined
@@ -64,10 +64,8 @@ def _conf(text: str) -> dict[str, Float[np.ndarray, "4 4"]]:
     for line in text.splitlines():
         words = line.split()
         if len(words) == 9 and words[0] in {"bmesh", "mesh"}:
-            pose = np.eye(4)
-            pose[:3, :3] = Rotation.from_quat([float(w) for w in words[5:]]).inv().as_matrix()
-            pose[:3, 3] = [float(w) for w in words[2:5]]
-            found[words[1]] = pose
+            turn = Rotation.from_quat([float(w) for w in words[5:]]).inv().as_matrix()
+            found[words[1]] = rigid(turn, np.array([float(w) for w in words[2:5]]))
     return found
 
 
@@ -162,7 +160,6 @@ def _about(pose: Float[np.ndarray, "4 4"], angle: float, count: int) -> Placed:
     centre = np.linalg.lstsq(np.eye(3) - pose[:3, :3], across, rcond=None)[0]
     placed: Placed = {}
     for k in range(count):
-        placed[k] = np.eye(4)
-        placed[k][:3, :3] = Rotation.from_rotvec(k * abs(angle) * axis).as_matrix()
-        placed[k][:3, 3] = centre - placed[k][:3, :3] @ centre
+        rotation = Rotation.from_rotvec(k * abs(angle) * axis).as_matrix()
+        placed[k] = rigid(rotation, centre - rotation @ centre)
     return placed

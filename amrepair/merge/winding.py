@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from amrepair.align.thinning_kernels import morton_keys
 from amrepair.merge import winding_kernels as kernels
 
 LEAF_MM = 1.5
+CODE_BITS = 21  # leaves along each axis: as many as fit into one number
 # A node is one dipole beyond this many of its radii (Barill et al. use 2).
 BETA = 2.0
 # A patch of area a, seen from beside, is a disc: below this share of √a it is not a point.
@@ -48,7 +50,7 @@ class Shell:
         """Build the tree over patches."""
         area = np.linalg.norm(vector_mm2, axis=1)
         low = place_mm.min(axis=0) if len(place_mm) else np.zeros(3)
-        code = kernels.codes_of(np.ascontiguousarray(place_mm), low, LEAF_MM)
+        code = morton_keys(np.ascontiguousarray(place_mm), low, LEAF_MM, CODE_BITS)
         order = np.argsort(code, kind="stable")
         code = code[order]
         place, vector = place_mm[order], np.ascontiguousarray(vector_mm2[order])

@@ -9,30 +9,6 @@ from gcode.compiled import njit, prange
 
 
 @njit(cache=True, nogil=True)
-def spread_bits(v):
-    """The 21 low bits of a number, two zeros after each."""
-    v = v & 0x1FFFFF
-    v = (v | (v << 32)) & 0x1F00000000FFFF
-    v = (v | (v << 16)) & 0x1F0000FF0000FF
-    v = (v | (v << 8)) & 0x100F00F00F00F00F
-    v = (v | (v << 4)) & 0x10C30C30C30C30C3
-    return (v | (v << 2)) & 0x1249249249249249
-
-
-@njit(cache=True, nogil=True)
-def codes_of(places, low, cell):
-    """(n,) Morton codes of the cells that hold some places."""
-    codes = np.empty(len(places), np.int64)
-    for i in range(len(places)):
-        codes[i] = (
-            spread_bits(int((places[i, 0] - low[0]) / cell))
-            | (spread_bits(int((places[i, 1] - low[1]) / cell)) << 1)
-            | (spread_bits(int((places[i, 2] - low[2]) / cell)) << 2)
-        )
-    return codes
-
-
-@njit(cache=True, nogil=True)
 def joined(first, end, place, weight, vector, radius):
     """Nodes over those from `first` to `end`: weights, centres, vector areas and radii."""
     n = len(first)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Points, Values
-from amrepair.frames import unit_vectors
+from amrepair.frames import spread_directions, unit_vectors
 from amrepair.observe.rays import MIN_COSINE
 
 # One view sees what faces it; this share of its places may seem not to, at edges and by noise.
@@ -36,10 +36,7 @@ def _way_of_one_view(normal: Points) -> Float[np.ndarray, " 3"] | None:
     """(3,) the way that all but a few places face; None where they were seen from more sides."""
     if not len(normal):
         return None
-    index = np.arange(DIRECTIONS) + 0.5
-    z, turn = 1.0 - 2.0 * index / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * index
-    flat = np.sqrt(1.0 - z**2)
-    ways = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    ways = spread_directions(DIRECTIONS)
     facing = normal[:: len(normal) // FEW_PLACES + 1] @ ways.T
     least = np.quantile(facing, TURNED_AWAY, axis=0)
     best = int(np.argmax(least))

@@ -15,7 +15,7 @@ import numpy as np
 
 from amrepair.arrays import Values
 from amrepair.errors import InputError
-from gcode.whole import put_in_place
+from gcode.whole import write_bytes
 
 CALIBRATION_VERSION = 2
 
@@ -107,11 +107,8 @@ class Calibration:
         """
         path = file_of(self.name, folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with put_in_place(path) as draft:
-                draft.write_text(
-                    json.dumps({"version": CALIBRATION_VERSION, **asdict(self)}, indent=1) + "\n"
-                )
+            said = {"version": CALIBRATION_VERSION, **asdict(self)}
+            write_bytes(path, (json.dumps(said, indent=1) + "\n").encode())
         except OSError as e:
             raise InputError(f"{path}: the calibration cannot be written ({e.strerror})") from e
         return path
@@ -139,7 +136,7 @@ class Calibration:
                 raise InputError(
                     f"{path}: the calibration is of another version than {CALIBRATION_VERSION}"
                 )
-            return cls(**{key: _tuples(value) for key, value in said.items()})
+            return cls(**{key: as_tuples(value) for key, value in said.items()})
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
             raise InputError(f"{path}: the calibration cannot be read ({e}); make it again") from e
 
@@ -180,5 +177,6 @@ def users_folder() -> Path:
     return Path.home() / ".config" / "amrepair" / "calibrations"
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+def as_tuples(value: Any) -> Any:
+    """What JSON keeps as lists, as it was."""
+    return tuple(as_tuples(item) for item in value) if isinstance(value, list) else value

@@ -17,6 +17,7 @@ from amrepair.field.as_built import SOLID_MM, Evidence
 from amrepair.frames import in_box, unit_vectors
 from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
 from amrepair.template.port import Template
+from gcode.stretches import in_turn, places_to_ends
 
 LEVEL = 1e-9
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
@@ -57,14 +58,7 @@ class PlannedBeads:
 
     def samples_mm(self, step_mm: float) -> Points:
         """(p, 3) places along the middles of their tops, at most so far apart."""
-        length_mm = np.linalg.norm(self.end_mm - self.start_mm, axis=1)
-        count = np.ceil(length_mm / step_mm).astype(np.int64) + 1
-        line = np.repeat(np.arange(len(count)), count)
-        step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
-        share = step / np.maximum(count[line] - 1, 1)
-        return np.asarray(
-            self.start_mm[line] + share[:, None] * (self.end_mm - self.start_mm)[line]
-        )
+        return places_to_ends(self.start_mm, self.end_mm, step_mm)[0]
 
     def holds(self, points_mm: Points) -> Mask:
         """Which points lie in any of them: beside its line no farther than half its width."""
@@ -171,8 +165,7 @@ class _Paths:
         first = np.searchsorted(path, np.arange(path.max(initial=-1) + 1))
         path_mm = np.bincount(path, length_mm)
         count = np.ceil(path_mm / options.look_step_mm).astype(np.int64)
-        of = np.repeat(np.arange(len(count)), count)
-        number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        of, number = in_turn(count)
         step_mm = (path_mm / np.maximum(count, 1))[of]
         at_mm = ends_mm[first[of]] + (number + 0.5) * step_mm
         line = np.searchsorted(ends_mm[1:], at_mm)

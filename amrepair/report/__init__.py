@@ -12,7 +12,6 @@ if TYPE_CHECKING:
         BeadPath,
         Counter,
         Figures,
-        HeightMap,
         Outcome,
         RegionRow,
         ReportData,
@@ -29,7 +28,6 @@ __all__ = [
     "BeadPath",
     "Counter",
     "Figures",
-    "HeightMap",
     "Outcome",
     "RegionRow",
     "ReportData",
@@ -50,27 +48,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BeadPath": ("amrepair.report.data", "BeadPath"),
-    "Counter": ("amrepair.report.data", "Counter"),
-    "ReportDecision": ("amrepair.report.data", "ReportDecision"),
-    "Figures": ("amrepair.report.data", "Figures"),
-    "HeightMap": ("amrepair.report.data", "HeightMap"),
-    "ReportLook": ("amrepair.report.data", "ReportLook"),
-    "Outcome": ("amrepair.report.data", "Outcome"),
-    "RegionRow": ("amrepair.report.data", "RegionRow"),
-    "ReportData": ("amrepair.report.data", "ReportData"),
-    "SolidMesh": ("amrepair.report.data", "SolidMesh"),
-    "TemperatureSeries": ("amrepair.report.data", "TemperatureSeries"),
-    "outcome_of": ("amrepair.report.text", "outcome_of"),
-    "plan_is_enough": ("amrepair.report.assemble", "plan_is_enough"),
-    "regions_from_result": ("amrepair.report.data", "regions_from_result"),
-    "render_report": ("amrepair.report.document", "render_report"),
-    "report_of_loop": ("amrepair.report.assemble", "report_of_loop"),
-    "report_of_plan": ("amrepair.report.assemble", "report_of_plan"),
-    "summary": ("amrepair.report.text", "summary"),
-    "summary_of": ("amrepair.report.text", "summary_of"),
-    "summary_of_result": ("amrepair.report.text", "summary_of_result"),
-    "write_report": ("amrepair.report.document", "write_report"),
+    "amrepair.report.assemble": "plan_is_enough, report_of_loop, report_of_plan",
+    "amrepair.report.data": (
+        "BeadPath, Counter, Figures, Outcome, RegionRow, ReportData, ReportDecision, "
+        "ReportLook, SolidMesh, TemperatureSeries, regions_from_result"
+    ),
+    "amrepair.report.document": "render_report, write_report",
+    "amrepair.report.text": "outcome_of, summary, summary_of, summary_of_result",
 }
 
 __getattr__, __dir__ = lazy_names(globals(), _HOMES)

@@ -26,7 +26,6 @@ from amrepair.repair import RepairPlan
 from amrepair.report.data import (
     BeadPath,
     Counter,
-    HeightMap,
     RegionRow,
     ReportDecision,
     ReportLook,
@@ -259,7 +258,7 @@ def look_of(
         As in `ReportLook`.
     """
     build_from_template = plan.build_from_template
-    scan, anomaly, field = plan.scan, plan.anomaly, plan.deficit.as_built
+    scan, anomaly = plan.scan, plan.anomaly
     shown = of_the_part(plan)
     unseen = anomaly.template_points_mm[anomaly.template_label == int(Label.UNSEEN)]
     beads = None
@@ -283,14 +282,8 @@ def look_of(
         missing_mm3=plan.deficit.missing_mm3,
         excess_mm3=plan.deficit.excess_mm3,
         unseen_area_mm2=plan.deficit.unseen_area_mm2,
-        height_map=HeightMap(
-            field.origin_mm,
-            field.cell_mm,
-            field.z_mm,
-            field.seen,
-            f"Top surface, {label}",
-            outlines_mm(plan),
-        ),
+        height_map=plan.deficit.as_built,
+        outlines_mm=outlines_mm(plan),
         stop=stop,
         scanned_points=scanned_points or len(scan),
     )

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from gcode.moves import Extrude, LayerChange, Role, Toolpath
+from gcode.surfaces import HeightField
 
 
 class Outcome(StrEnum):
@@ -139,34 +140,6 @@ class BeadPath:
 
 
 @dataclass(frozen=True, slots=True)
-class HeightMap:
-    """The top surface at one look, seen from above.
-
-    Attributes
-    ----------
-    origin_mm
-        (2,) XY of the corner of cell [0, 0], build frame.
-    cell_mm
-        Edge of a square cell.
-    z_mm
-        (ny, nx) height of the top surface.
-    seen
-        (ny, nx) whether a sensor measured the cell; the others are drawn as unknown.
-    title
-        What is shown, such as `Layer 80, z = 16.0 mm`.
-    outlines_mm
-        Closed XY outlines of the defects, (k, 2) each.
-    """
-
-    origin_mm: Float[np.ndarray, " 2"]
-    cell_mm: float
-    z_mm: Float[np.ndarray, "ny nx"]
-    seen: Bool[np.ndarray, "ny nx"]
-    title: str = "Top surface"
-    outlines_mm: tuple[Float[np.ndarray, "_ 2"], ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class RegionRow:
     """One defect, as the table shows it.
 
@@ -276,7 +249,9 @@ class ReportLook:
     missing_mm3, excess_mm3
         Volumes at this look, as measured.
     height_map
-        The top surface at this look, or None.
+        The top surface at this look, or None; cells that are not `seen` are drawn as unknown.
+    outlines_mm
+        (k, 2) each: closed XY outlines of the defects, drawn over it.
     stop
         What the looks at one stop of a job have in common; they are compared with each other.
     scanned_points
@@ -302,7 +277,8 @@ class ReportLook:
     missing_mm3: float = 0.0
     excess_mm3: float = 0.0
     unseen_area_mm2: float = 0.0
-    height_map: HeightMap | None = None
+    height_map: HeightField | None = None
+    outlines_mm: tuple[Float[np.ndarray, "_ 2"], ...] = ()
     stop: str = ""
     scanned_points: int = 0
     smallest_mm: tuple[tuple[float, float], ...] = ()

@@ -13,7 +13,7 @@ from amrepair.report.data import ReportData
 from amrepair.report.page import body
 from amrepair.report.payload import payload
 from amrepair.report.tables import escape
-from gcode.whole import put_in_place
+from gcode.whole import write_bytes
 
 # The browser itself refuses every request, whatever a library may try.
 REPORT_POLICY = (
@@ -52,9 +52,7 @@ def write_report(data: ReportData, path: Path) -> None:
     """
     text = render_report(data)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with put_in_place(path) as draft:
-            draft.write_text(text, encoding="utf-8", newline="\n")
+        write_bytes(path, text.encode())
     except OSError as e:
         raise InputError(
             f"the report cannot be written to {path}: {e.strerror or e}; choose another folder"

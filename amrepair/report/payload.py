@@ -13,7 +13,7 @@ import numpy as np
 
 from amrepair.frames import in_box
 from amrepair.report import encode
-from amrepair.report.data import BeadPath, HeightMap, ReportData, ReportLook, SolidMesh
+from amrepair.report.data import BeadPath, ReportData, ReportLook, SolidMesh
 from amrepair.report.options import USUAL_PAGE
 
 AGREES_LABEL, MISSING_LABEL, EXCESS_LABEL = 0, 1, 2
@@ -178,7 +178,7 @@ def _look(look: ReportLook, index: int, share: int, scale_mm: float, side: tuple
             "area": [_rounded(area) for area, _ in look.smallest_mm],
             "depth": [_rounded(depth) for _, depth in look.smallest_mm],
         },
-        "heights": None if look.height_map is None else _heights(look.height_map, share),
+        "heights": _heights(look, share),
     }
 
 
@@ -248,9 +248,12 @@ def _histogram(look: ReportLook, scale_mm: float) -> Json:
     }
 
 
-def _heights(heights: HeightMap, share: int) -> Json:
+def _heights(look: ReportLook, share: int) -> Json | None:
     """The map on a grid coarse enough for the budget: the highest cell of each block."""
-    ny, nx = heights.z_mm.shape
+    heights = look.height_map
+    if heights is None:
+        return None
+    ny, nx = heights.shape
     block = max(1, math.ceil(math.sqrt(ny * nx * share / USUAL_PAGE.cells)))
     pad = ((0, -ny % block), (0, -nx % block))
     z_mm = np.pad(heights.z_mm, pad, mode="edge")
@@ -260,7 +263,7 @@ def _heights(heights: HeightMap, share: int) -> Json:
     top_mm = np.where(seen, z_mm, -np.inf).reshape(shape).max(axis=(1, 3))
     top_mm = np.where(seen_block, top_mm, 0.0)
     return {
-        "title": html.escape(heights.title),
+        "title": html.escape(f"Top surface, {look.label}"),
         "origin": [_rounded(float(v)) for v in heights.origin_mm],
         "cell": _rounded(heights.cell_mm * block),
         "shape": list(top_mm.shape),
@@ -268,7 +271,7 @@ def _heights(heights: HeightMap, share: int) -> Json:
         "seen": encode.integers(seen_block.reshape(-1).astype(np.int64)),
         "outlines": [
             [[_rounded(float(x)), _rounded(float(y))] for x, y in outline]
-            for outline in heights.outlines_mm
+            for outline in look.outlines_mm
         ],
     }
 

@@ -15,6 +15,8 @@ from jaxtyping import Float, Int
 
 from amrepair.errors import InputError
 from amrepair.simulate import columns_kernels as kernels
+from gcode.meshes import mesh_of
+from gcode.surfaces.raster_kernels import column_crossings
 
 _FIRST_POOL = 1 << 16
 
@@ -49,22 +51,6 @@ class Window:
         return (
             self.origin_mm[0] + self.x0 * self.cell_mm,
             self.origin_mm[1] + self.y0 * self.cell_mm,
-        )
-
-    def union(self, other: Window) -> Window:
-        """The smallest window that holds both; of two grids that are the same."""
-        if (self.origin_mm, self.cell_mm) != (other.origin_mm, other.cell_mm):
-            raise InputError(
-                f"two worlds can be compared only on one grid, these have cells of {self.cell_mm} "
-                f"and {other.cell_mm} mm and corners {self.origin_mm} and {other.origin_mm}"
-            )
-        return Window(
-            self.origin_mm,
-            self.cell_mm,
-            min(self.y0, other.y0),
-            max(self.y1, other.y1),
-            min(self.x0, other.x0),
-            max(self.x1, other.x1),
         )
 
 
@@ -252,16 +238,9 @@ class Columns:
         """A solid of the build frame as intervals along the column centres; cut at the bed."""
         x0, y0, _, x1, y1, _ = solid.bounding_box()
         window = self.box_window((x0, y0), (x1, y1))
-        mesh = solid.to_mesh64()
-        corners = np.ascontiguousarray(np.asarray(mesh.vert_properties)[:, :3])
-        triangles = np.ascontiguousarray(corners[np.asarray(mesh.tri_verts)], dtype=np.float64)
         ny, nx = window.shape
-        corner = window.corner_mm
-        column, height = kernels.crossings(
-            triangles.reshape(-1, 3, 3), corner[0], corner[1], self.cell_mm, ny, nx
-        )
-        order = np.lexsort((height, column))
-        offsets, spans = kernels.pair_crossings(column[order], height[order], ny * nx)
+        crossed, z, _ = column_crossings(*mesh_of(solid), *window.corner_mm, self.cell_mm, nx, ny)
+        offsets, spans = kernels.paired(crossed, z)
         return IntervalMap(window, offsets, spans)
 
     def copy(self) -> Columns:

@@ -298,66 +298,24 @@ def column_lengths(offsets, spans, z_low, z_high):
 
 
 @njit(cache=True, nogil=True)
-def crossings(triangles, x0, y0, cell, ny, nx):
-    """Where vertical lines through column centres cross triangles: column (m,) and z (m,).
+def paired(offset, z):
+    """Flat intervals of a closed surface from its crossings by column (`column_crossings`).
 
-    Edge rule: each projected edge owns its left end (half-open in y), so that shared edges
-    count once; triangles seen edge-on own nothing.
+    Those of a column are put in order, in place.
     """
-    count = 0
-    column = np.empty(1024, dtype=np.int64)
-    height = np.empty(1024)
-    for t in range(len(triangles)):
-        ax, ay, az = triangles[t, 0]
-        bx, by, bz = triangles[t, 1]
-        cx, cy, cz = triangles[t, 2]
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if area == 0.0:
-            continue
-        iy_low = max(0, int(np.ceil((min(ay, by, cy) - y0) / cell - 0.5)))
-        iy_high = min(ny - 1, int(np.floor((max(ay, by, cy) - y0) / cell - 0.5)))
-        for iy in range(iy_low, iy_high + 1):
-            y = y0 + (iy + 0.5) * cell
-            left, right = np.inf, -np.inf
-            for e in range(3):
-                px, py = triangles[t, e, 0], triangles[t, e, 1]
-                qx, qy = triangles[t, (e + 1) % 3, 0], triangles[t, (e + 1) % 3, 1]
-                if (py <= y) != (qy <= y):
-                    if py > qy or (py == qy and px > qx):
-                        px, py, qx, qy = qx, qy, px, py
-                    x = px + (y - py) / (qy - py) * (qx - px)
-                    left = min(left, x)
-                    right = max(right, x)
-            if right <= left:
-                continue
-            ix_low = max(0, int(np.ceil((left - x0) / cell - 0.5)))
-            ix_high = min(nx - 1, int(np.ceil((right - x0) / cell - 0.5)) - 1)
-            for ix in range(ix_low, ix_high + 1):
-                x = x0 + (ix + 0.5) * cell
-                u = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
-                v = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
-                if count == len(column):
-                    column = np.concatenate((column, np.empty_like(column)))
-                    height = np.concatenate((height, np.empty_like(height)))
-                column[count] = iy * nx + ix
-                height[count] = az + u * (bz - az) + v * (cz - az)
-                count += 1
-    return column[:count].copy(), height[:count].copy()
-
-
-@njit(cache=True, nogil=True)
-def pair_crossings(column, height, n):
-    """Flat intervals of a closed surface from its crossings, sorted by column then height."""
+    n = len(offset) - 1
     offsets = np.zeros(n + 1, dtype=np.int64)
-    spans = np.empty((len(column) // 2 + 1, 2))
+    spans = np.empty((len(z) // 2 + 1, 2))
     at = 0
-    i = 0
     for k in range(n):
-        begin = i
-        while i < len(column) and column[i] == k:
-            i += 1
-        for m in range(begin, i - 1, 2):
-            low, top = max(0.0, height[m]), height[m + 1]
+        for m in range(offset[k] + 1, offset[k + 1]):  # few: by insertion
+            height, i = z[m], m
+            while i > offset[k] and z[i - 1] > height:
+                z[i] = z[i - 1]
+                i -= 1
+            z[i] = height
+        for m in range(offset[k], offset[k + 1] - 1, 2):
+            low, top = max(0.0, z[m]), z[m + 1]
             if top > low + TOUCH_MM:
                 if at > offsets[k] and low <= spans[at - 1, 1] + TOUCH_MM:
                     spans[at - 1, 1] = max(spans[at - 1, 1], top)

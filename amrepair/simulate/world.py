@@ -25,7 +25,6 @@ from amrepair.simulate.defects import PlacedDefect
 from amrepair.simulate.deposit_kernels import LAYER, STATE_SIZE, deposit
 from amrepair.simulate.parameters import BeadModel, ThermalModel, WorldParameters
 from amrepair.simulate.strand_kernels import Head, Path, StandingColumns
-from amrepair.simulate.truth import Difference
 from gcode.firmware.motion import MotionBatch
 from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
@@ -246,12 +245,6 @@ class World:
         """The columns in use, and as far around them as plastic can have spread."""
         spread_mm = self.bead.spread_ratio * self.nozzle_diameter_mm
         return self.columns.window(margin_mm=spread_mm + self.cell_mm)
-
-    def missing_versus(self, reference: World) -> Difference:
-        """What this world lacks, and has too much, against a reference without defects."""
-        window = self.window().union(reference.window())
-        mine, other = self.snapshot(window), reference.snapshot(window)
-        return Difference(missing=other.minus(mine), excess=mine.minus(other))
 
     def top(self) -> HeightField:
         """The highest solid of every column in use, as a height field; all of it is seen."""

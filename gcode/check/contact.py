@@ -6,8 +6,7 @@ The sweep names the line; here that line is walked in small steps to find the pl
 from __future__ import annotations
 
 import base64
-import struct
-import zlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,16 +118,9 @@ def _shaded(field: HeightField) -> UInt8[np.ndarray, "ny nx 4"]:
 
 
 def _png(pixels: UInt8[np.ndarray, "ny nx 4"]) -> bytes:
-    """An image as PNG (ISO/IEC 15948), eight bits, with alpha."""
-    ny, nx = pixels.shape[:2]
+    """An image as PNG, with alpha."""
+    from PIL import Image
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        whole = kind + data
-        return struct.pack(">I", len(data)) + whole + struct.pack(">I", zlib.crc32(whole))
-
-    rows = np.zeros((ny, 1 + 4 * nx), np.uint8)
-    rows[:, 1:] = pixels.reshape(ny, 4 * nx)
-    head = struct.pack(">IIBBBBB", nx, ny, 8, 6, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        (chunk(b"IHDR", head), chunk(b"IDAT", zlib.compress(rows.tobytes())), chunk(b"IEND", b""))
-    )
+    packed = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(packed, "PNG")
+    return packed.getvalue()

@@ -32,8 +32,6 @@ class Wire:
     ----------
     damaged
         Bytes hit so far.
-    hidden
-        How often damage was drawn anew because no side could have noticed it.
     """
 
     def __init__(self, ratio: float, numbers: Numbers, *, seed: int) -> None:
@@ -41,7 +39,7 @@ class Wire:
         self._numbers = numbers
         self._rng = random.Random(seed)
         self._sent = b""  # of the line that is not ended yet
-        self.damaged = self.hidden = 0
+        self.damaged = 0
 
     def to_printer(self, waiting: bytes, data: bytes) -> bytes:
         """What arrives of `data`, `waiting` being the half line that arrived before it."""
@@ -54,7 +52,6 @@ class Wire:
             lines = (waiting + arrived).split(b"\n")
             if not any(self._passes(line) for line in lines if line not in sent):
                 return arrived
-            self.hidden += 1
         return b"\xff" + data  # what waits there would pass, however this line ends
 
     def to_host(self, data: bytes) -> bytes:

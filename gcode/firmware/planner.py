@@ -71,7 +71,6 @@ class Planner:
         self.head_end_s = math.inf  # end of the block being executed, inf if none is
         self._unit = (0.0, 0.0, 0.0, 0.0)
         self._last_speed = 0.0
-        self.moves_executed = 0
         self.moved_s = 0.0  # when the last move ended
         self._head_s = 0.0
 
@@ -144,7 +143,6 @@ class Planner:
         end_s = self.head_end_s
         block = self.blocks.popleft()
         self.executed.extend((*block.start, *block.end, block.filament_mm, block.commanded, end_s))
-        self.moves_executed += 1
         self.moved_s = end_s
         self.head_end_s = math.inf
         self.start_head(end_s)

@@ -34,12 +34,11 @@ BED_HEATER = HeaterModel(full_c=145.0, heat_tau_s=300.0, cool_tau_s=700.0)
 class Heater:
     """One heater with its target, asked for its temperature at any later time."""
 
-    __slots__ = ("_from_c", "_from_s", "model", "offset_c", "target_c")
+    __slots__ = ("_from_c", "_from_s", "model", "target_c")
 
     def __init__(self, model: HeaterModel) -> None:
         self.model = model
         self.target_c = 0.0
-        self.offset_c = 0.0
         self._from_c = AMBIENT_C
         self._from_s = 0.0
 

@@ -92,7 +92,7 @@ class FilePrinter:
             size += len(line) + 1
         progress("writing", 1.0, 1.0)
         seconds = self._clock() - start_s
-        return PrintReport(True, written, 0, 0, 0, size, seconds, end, (0.0, 0.0, 0.0), first)
+        return PrintReport(True, written, size, seconds, next_line=end, first_line=first)
 
     def finish_moves(self) -> None:
         """Nothing moves."""

@@ -17,6 +17,7 @@ _CODE_NAME = re.compile(r"([GM])\s*0*(\d+)")
 _TOUCH_LINE = re.compile(r"G38\.2\s+Z(?P<to>[-+.\d]+)|AMREPAIR_TOUCH\s+DEPTH=(?P<by>[.\d]+)")
 
 
+PROGRAM_LINES_AT_ONCE = 4096
 GO_MM_MIN, LIFT_MM_MIN = 6000, 600
 """Back to where the machine was, along the bed and along Z."""
 
@@ -62,13 +63,8 @@ def batches_of(
 
 def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tuple[int, str]]:
     """Lines to send with their numbers in the program; comments and empty lines left out."""
-    step = 4096
-    for start in range(first, end, step):
-        stop = min(end, start + step)
-        for offset, line in enumerate(checked.lines(start, stop)):
-            command = command_in(line)
-            if command:
-                yield start + offset, command
+    for numbers, commands in batches_of(checked, first, end, PROGRAM_LINES_AT_ONCE):
+        yield from zip(numbers, commands, strict=True)
 
 
 def modes_after(
@@ -81,8 +77,8 @@ def modes_after(
 ) -> Modes:
     """Return the modes after the lines [first, line) of a program, from `modes` before them."""
     modes = modes or Modes()
-    for start in range(first, line, 4096):
-        for text in checked.lines(start, min(line, start + 4096)):
+    for start in range(first, line, PROGRAM_LINES_AT_ONCE):
+        for text in checked.lines(start, min(line, start + PROGRAM_LINES_AT_ONCE)):
             modes = follow(modes, text, dialect)
     return modes
 

@@ -141,8 +141,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
         self._require_rest()
         while first < lines.stop:
             while self._held_back.is_set():
-                with self._session.news:
-                    self._session.news.wait(self._timing.poll_s)
+                self.wait(self._timing.poll_s)
             after = min(first + STEP_LINES, lines.stop)
             start = " START=1" if first == 0 else ""
             script = [f"{STEP_MACRO} PROGRAM={program} FROM={first} TO={after}{start}"]

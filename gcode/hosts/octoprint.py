@@ -236,8 +236,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
                     f"{self.address.name} has not cancelled the print within "
                     f"{self._timing.answer_s:g} s; stop the printer there."
                 )
-            with self._session.news:
-                self._session.news.wait(0.1)
+            self.wait(0.1)
 
     def emergency_stop(self) -> None:
         """Have M112 sent past the queue; the printer must be reset afterwards."""

@@ -252,8 +252,7 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
             progress("printing", float(told["done"]), float(len(commands)))
             if told["over"]:
                 return str(told.get("wrong") or "")
-            with self._session.news:
-                self._session.news.wait(self._timing.poll_s)
+            self.wait(self._timing.poll_s)
 
     # ------------------------------------------------------------------ touches
 
@@ -288,8 +287,7 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
             told = part_of(self._asked_about, "program")
             if not told or told["over"]:
                 return
-            with self._session.news:
-                self._session.news.wait(self._timing.poll_s)
+            self.wait(self._timing.poll_s)
 
     def _heat_of_before(self) -> tuple[float, float]:
         told = part_of(self._asked_about, "heat")

@@ -72,14 +72,14 @@ class PrintReport:
 
     ok: bool
     lines_acked: int
-    resends: int
-    stalls: int
-    spare_oks: int
     bytes_sent: int
     seconds: float
     next_line: int
-    round_trip_s: tuple[float, float, float]
     first_line: int
+    resends: int = 0
+    stalls: int = 0
+    spare_oks: int = 0
+    round_trip_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     warnings: tuple[str, ...] = ()
 
 

@@ -181,11 +181,6 @@ class ServedJob(ServerPrinter[Session]):
         """Whether the job rests where it asks for a look."""
         return self.rests_at() is not None
 
-    def wait(self, wait_s: float) -> None:
-        """Until there is news, or so long."""
-        with self._session.news:
-            self._session.news.wait(wait_s)
-
     def _is_the_jobs(self, checked: PrintableProgram) -> bool:
         """Whether the server prints it from the job's file."""
         anew = "" if self._rest_anew is None else self._rest_anew.checked.program.sha256
@@ -227,9 +222,9 @@ class ServedJob(ServerPrinter[Session]):
             self._print_at_rest(checked, range(first, lines.stop), progress)
         size = sum(len(text) + 1 for text in checked.lines(lines.start, end))
         return PrintReport(
-            ok=ok, lines_acked=sum(1 for _ in commands_of(checked, lines.start, end)), resends=0,
-            stalls=0, spare_oks=0, bytes_sent=size, seconds=self._clock() - start_s,
-            next_line=end, round_trip_s=(0.0, 0.0, 0.0), first_line=lines.start,
+            ok=ok, lines_acked=sum(1 for _ in commands_of(checked, lines.start, end)),
+            bytes_sent=size, seconds=self._clock() - start_s, next_line=end,
+            first_line=lines.start,
             warnings=() if ok else (f"{self.address.name} cancelled the print",),
         )  # fmt: skip
 
@@ -342,8 +337,7 @@ class ServedJob(ServerPrinter[Session]):
             except LinkError as error:
                 if self._clock() > until_s:
                     raise self._gone(0, 0, f"{error} It may be printing on by itself") from error
-            with self._session.news:
-                self._session.news.wait(self._timing.poll_s)
+            self.wait(self._timing.poll_s)
 
     def _gone(self, first: int, end: int, why: str) -> LinkLostError:
         return LinkLostError(

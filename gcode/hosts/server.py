@@ -368,12 +368,9 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
             ok=ok,
             lines_acked=acked,
             resends=resends,
-            stalls=0,
-            spare_oks=0,
             bytes_sent=len(job.data),
             seconds=self._clock() - start_s,
             next_line=next_line,
-            round_trip_s=(0.0, 0.0, 0.0),
             first_line=job.first,
             warnings=() if ok else (f"{self.address.name} cancelled the print",),
         )
@@ -423,6 +420,11 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
     def _uncertain(self, job: JobFile) -> str:
         """Which lines may have been carried out, in words."""
 
+    def wait(self, wait_s: float) -> None:
+        """Until there is news, or so long."""
+        with self._session.news:
+            self._session.news.wait(wait_s)
+
     def _patiently(self, job: JobFile, ask: Callable[[], Answer]) -> Answer:
         """Ask what became of the print; a server that went away gets time to come back.
 
@@ -438,8 +440,7 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
             except LinkError as error:
                 if self._clock() > until_s:
                     raise self._lost(job, f"{error} It may be printing on by itself") from error
-            with self._session.news:
-                self._session.news.wait(self._timing.poll_s)
+            self.wait(self._timing.poll_s)
 
     def _lost(self, job: JobFile, why: str) -> LinkLostError:
         return LinkLostError(

@@ -54,20 +54,12 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AxisLimits": ("gcode.profiles.schema", "AxisLimits"),
-    "DialectName": ("gcode.profiles.schema", "DialectName"),
-    "EnvelopeSlice": ("gcode.profiles.schema", "EnvelopeSlice"),
-    "MaterialProfile": ("gcode.profiles.schema", "MaterialProfile"),
-    "PrintSetup": ("gcode.profiles.setup", "PrintSetup"),
-    "PrinterProfile": ("gcode.profiles.schema", "PrinterProfile"),
-    "ProbeProfile": ("gcode.profiles.schema", "ProbeProfile"),
-    "ProcessProfile": ("gcode.profiles.schema", "ProcessProfile"),
-    "expand_script": ("gcode.profiles.setup", "expand_script"),
-    "kind_of": ("gcode.profiles.store", "kind_of"),
-    "load_material": ("gcode.profiles.store", "load_material"),
-    "load_printer": ("gcode.profiles.store", "load_printer"),
-    "load_process": ("gcode.profiles.store", "load_process"),
-    "load_setup": ("gcode.profiles.setup", "load_setup"),
+    "gcode.profiles.schema": (
+        "AxisLimits, DialectName, EnvelopeSlice, MaterialProfile, PrinterProfile, "
+        "ProbeProfile, ProcessProfile"
+    ),
+    "gcode.profiles.setup": "PrintSetup, expand_script, load_setup",
+    "gcode.profiles.store": "kind_of, load_material, load_printer, load_process",
 }
 
 __getattr__, __dir__ = lazy_names(globals(), _HOMES)

@@ -47,7 +47,6 @@ class Recovery:
         self.timing = timing or LinkTiming()
         self.state = State.UNGREETED
         self.resends = 0
-        self.probes = 0
         self.spare_oks = 0
         self._inbox = Inbox()
         self._out = bytearray()
@@ -196,7 +195,6 @@ class Recovery:
             # Nothing can be sent twice here, nor proved: wait, and in the end stop.
             self._deadline_s = since_s + limit_s
             return
-        self.probes += 1
         self._events.append(Probed(number))
         self._told = None
         self._go(Signal.SILENCE)

@@ -16,7 +16,6 @@ from gcode.dialects import dialect_of
 from gcode.moves import Program
 from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
-from gcode.reader.lines import comments_of, lines_of, tokens_of
 
 BLOCK_CHARS = 1 << 16  # some 2,000 lines: half a megabyte of words and states
 READ_STEPS = 4.0  # words, states, beads, layers: about a second each for a million lines
@@ -108,7 +107,33 @@ class BlockReader:
         starts: Int[np.ndarray, " n1"],
         kinds: Int[np.ndarray, " n"],
     ) -> list[tuple[int, str]]:
-        return [(self._line + line, text) for line, text in comments_of(data, starts, kinds)]
+        """Lines that are comments, with their numbers in the program."""
+        which = np.flatnonzero(kinds == ord(";")).tolist()
+        return [
+            (
+                self._line + i,
+                str(data[starts[i] : starts[i + 1]].tobytes(), "utf-8").removesuffix("\n"),
+            )
+            for i in which
+        ]
+
+
+def lines_of(text: str) -> tuple[UInt8[np.ndarray, " bytes"], Int[np.ndarray, " n1"]]:
+    """A text's bytes, and where each line begins, with the end."""
+    data = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
+    return data, np.concatenate([[0], np.flatnonzero(data == ord("\n")) + 1, [len(data)]])
+
+
+def tokens_of(
+    data: UInt8[np.ndarray, " bytes"], starts: Int[np.ndarray, " n1"]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
+    """Kinds, codes and words of lines, as `text_kernels.parse` fills them."""
+    count = len(starts) - 1
+    kinds, codes = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    words = np.zeros((count, len(kernels.LETTERS)))
+    letters = np.frombuffer(kernels.LETTERS, np.uint8)
+    kernels.parse(data, starts, letters, codes, kinds, words)
+    return kinds, codes, words
 
 
 def blocks_of(program: Program, chars: int = BLOCK_CHARS) -> Iterator[Block]:

@@ -24,7 +24,7 @@ from gcode.meshes import mesh_of
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
-from gcode.surfaces import raster_kernels
+from gcode.surfaces import HeightField, raster_kernels
 from gcode.units import filament_area_mm2
 
 LEAST_FACTOR, MOST_FLOW_FACTOR = 0.3, 1.8
@@ -35,51 +35,27 @@ HEADROOM = 0.98
 """Of the printer's limits, so that rounding does not exceed them."""
 
 
-@dataclass(frozen=True, slots=True)
-class GapField:
-    """How much deeper (negative: higher) the surface is than planned, over a regular XY grid.
+def gap_field(solids: Sequence[tuple[manifold3d.Manifold, float]], cell_mm: float) -> HeightField:
+    """How much deeper than planned (negative: higher) the surface is, by column, in mm.
 
-    Attributes
-    ----------
-    origin_mm
-        (2,) corner of cell [0, 0].
-    gap_mm
-        (ny, nx); 0 outside of the grid.
+    Thickness of what is missing (sign +1) or too much (sign −1); 0 beyond the field.
     """
-
-    origin_mm: Float[np.ndarray, " 2"]
-    cell_mm: float
-    gap_mm: Float[np.ndarray, "ny nx"]
-
-    @classmethod
-    def from_solids(
-        cls, solids: Sequence[tuple[manifold3d.Manifold, float]], cell_mm: float
-    ) -> GapField:
-        """Thickness of what is missing (sign +1) or too much (sign −1) in each column."""
-        boxes = np.array([solid.bounding_box() for solid, _ in solids]).reshape(-1, 2, 3)
-        low = np.floor(boxes[:, 0, :2].min(axis=0) / cell_mm) * cell_mm
-        size = np.ceil((boxes[:, 1, :2].max(axis=0) - low) / cell_mm).astype(int)
-        nx, ny = int(max(size[0], 1)), int(max(size[1], 1))
-        gap = np.zeros(ny * nx)
-        for solid, sign in solids:
-            vertices, faces = mesh_of(solid)
-            offset, z, up = raster_kernels.column_crossings(
-                vertices, faces, float(low[0]), float(low[1]), cell_mm, nx, ny
-            )
-            column = np.repeat(np.arange(ny * nx), np.diff(offset))
-            thick = np.bincount(column, weights=up * z, minlength=ny * nx)
-            level = np.bincount(column, weights=up, minlength=ny * nx)
-            # A column that meets an edge may miss a crossing, so it is left out.
-            gap += sign * np.where(level == 0, np.maximum(thick, 0.0), 0.0)
-        return cls(low, cell_mm, gap.reshape(ny, nx))
-
-    def at(self, xy_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """(n,) gap at places."""
-        index = np.floor((xy_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
-        ny, nx = self.gap_mm.shape
-        inside = ((index >= 0) & (index < (nx, ny))).all(axis=1)
-        index = np.clip(index, 0, (nx - 1, ny - 1))
-        return np.where(inside, self.gap_mm[index[:, 1], index[:, 0]], 0.0)
+    boxes = np.array([solid.bounding_box() for solid, _ in solids]).reshape(-1, 2, 3)
+    low = np.floor(boxes[:, 0, :2].min(axis=0) / cell_mm) * cell_mm
+    size = np.ceil((boxes[:, 1, :2].max(axis=0) - low) / cell_mm).astype(int)
+    nx, ny = int(max(size[0], 1)), int(max(size[1], 1))
+    gap = np.zeros(ny * nx)
+    for solid, sign in solids:
+        vertices, faces = mesh_of(solid)
+        offset, z, up = raster_kernels.column_crossings(
+            vertices, faces, float(low[0]), float(low[1]), cell_mm, nx, ny
+        )
+        column = np.repeat(np.arange(ny * nx), np.diff(offset))
+        thick = np.bincount(column, weights=up * z, minlength=ny * nx)
+        level = np.bincount(column, weights=up, minlength=ny * nx)
+        # A column that meets an edge may miss a crossing, so it is left out.
+        gap += sign * np.where(level == 0, np.maximum(thick, 0.0), 0.0)
+    return HeightField(low, cell_mm, gap.reshape(ny, nx), np.ones((ny, nx), bool))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +79,7 @@ class ChangedLayer:
     added_mm3: float
 
 
-def change_flow(job: Job, setup: PrintSetup, layer: int, gap: GapField) -> ChangedLayer | None:
+def change_flow(job: Job, setup: PrintSetup, layer: int, gap: HeightField) -> ChangedLayer | None:
     """Rewrite a layer; None where no bead of it runs over the field.
 
     Raises
@@ -136,7 +112,7 @@ class _Pen:
     """The layer's text so far; E goes on where the job's own would, plus what was added."""
 
     def __init__(
-        self, job: Job, setup: PrintSetup, layer: int, gap: GapField, initial: ModalState
+        self, job: Job, setup: PrintSetup, layer: int, gap: HeightField, initial: ModalState
     ) -> None:
         self.text: list[str] = []
         self.changed = 0
@@ -202,7 +178,7 @@ class _Pen:
                 self._most_mm2 / section,
                 self._most_mm3_s / max(section * feed_mm_s, 1e-9),
             )
-            wanted = 1.0 + self._gap.at(middles[:, :2]) / self._height_mm
+            wanted = 1.0 + self._gap.sample(middles[:, :2]) / self._height_mm
             factor = np.clip(wanted, LEAST_FACTOR, max(most, 1.0))
             filament_mm = section * length_mm / self._area_mm2 / count
             run: list[tuple[Float[np.ndarray, " 3"] | None, float, float]] = []

@@ -7,6 +7,7 @@ import numpy as np
 
 from gcode.profiles import PrinterProfile
 from gcode.reader.job import Beads
+from gcode.stretches import in_turn
 from gcode.surfaces import HeightField
 
 STANDING_CELL_MM = 1.0
@@ -15,9 +16,8 @@ SPAN = 2_000_000  # samples at a time: 50 MB
 
 def standing_field(beads: Beads, line: int, printer: PrinterProfile) -> HeightField:
     """The top surface of all beads laid by lines [0, line), on the whole reach of the nozzle."""
-    x0, y0, x1, y1 = printer.reach_box_mm
-    nx, ny = int(np.ceil((x1 - x0) / STANDING_CELL_MM)), int(np.ceil((y1 - y0) / STANDING_CELL_MM))
-    z_mm = np.zeros(ny * nx)
+    bare = _bare(printer)
+    (x0, y0), (ny, nx), z_mm = bare.origin_mm, bare.shape, bare.z_mm.reshape(-1)
     count = int(np.searchsorted(beads.line, line))
     start, end = beads.start_mm[:count], beads.end_mm[:count]
     half_mm = 0.5 * np.clip(beads.width_mm[:count], 0.3, 3.0)
@@ -27,9 +27,8 @@ def standing_field(beads: Beads, line: int, printer: PrinterProfile) -> HeightFi
     while first < count:
         last = max(first + 1, int(np.searchsorted(bounds, bounds[first] + SPAN)) - 1)
         pick = slice(first, last)
-        n = (steps[pick] + 1).astype(np.int64)
-        owner = np.repeat(np.arange(len(n)), n)
-        share = (np.arange(len(owner)) - np.repeat(np.cumsum(n) - n, n)) / steps[pick][owner]
+        owner, number = in_turn((steps[pick] + 1).astype(np.int64))
+        share = number / steps[pick][owner]
         points = start[pick][owner] + share[:, None] * (end - start)[pick][owner]
         for dx, dy in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
             ix = np.floor((points[:, 0] + dx * half_mm[pick][owner] - x0) / STANDING_CELL_MM)
@@ -38,9 +37,13 @@ def standing_field(beads: Beads, line: int, printer: PrinterProfile) -> HeightFi
             cell = (iy * nx + ix)[inside].astype(np.int64)
             np.maximum.at(z_mm, cell, points[inside, 2])
         first = last
-    return HeightField(
-        np.array([x0, y0]), STANDING_CELL_MM, z_mm.reshape(ny, nx), np.ones((ny, nx), dtype=bool)
-    )
+    return bare
+
+
+def _bare(printer: PrinterProfile) -> HeightField:
+    """The bare bed, on the whole reach of the nozzle."""
+    x0, y0, x1, y1 = printer.reach_box_mm
+    return HeightField.flat((x1 - x0, y1 - y0), STANDING_CELL_MM, origin_mm=(x0, y0))
 
 
 def with_solid(
@@ -50,23 +53,9 @@ def with_solid(
     laid = standing_field(beads, line, printer)
     if excess.is_empty():
         return laid
-    there = over_reach(HeightField.from_manifold(excess, STANDING_CELL_MM), printer)
-    return HeightField(
-        laid.origin_mm, STANDING_CELL_MM, np.maximum(laid.z_mm, there.z_mm), laid.seen
-    )
+    return laid.raised_by(HeightField.from_manifold(excess, STANDING_CELL_MM))
 
 
 def over_reach(field: HeightField, printer: PrinterProfile) -> HeightField:
     """What stands in a field, on the whole reach of the nozzle; bare bed beyond the field."""
-    x0, y0, x1, y1 = printer.reach_box_mm
-    nx, ny = int(np.ceil((x1 - x0) / STANDING_CELL_MM)), int(np.ceil((y1 - y0) / STANDING_CELL_MM))
-    x_mm, y_mm = field.centres_mm()
-    ix = np.floor((x_mm - x0) / STANDING_CELL_MM).astype(np.int64)
-    iy = np.floor((y_mm - y0) / STANDING_CELL_MM).astype(np.int64)
-    inside_x, inside_y = (ix >= 0) & (ix < nx), (iy >= 0) & (iy < ny)
-    cells = (iy[inside_y][:, None] * nx + ix[inside_x]).ravel()
-    z_mm = np.zeros(ny * nx)
-    np.maximum.at(z_mm, cells, field.z_mm[np.ix_(inside_y, inside_x)].ravel())
-    return HeightField(
-        np.array([x0, y0]), STANDING_CELL_MM, z_mm.reshape(ny, nx), np.ones((ny, nx), dtype=bool)
-    )
+    return _bare(printer).raised_by(field)

@@ -27,7 +27,7 @@ from gcode.resumption.head import RESUME_LIFT_MM, feed, height_over
 from gcode.resumption.resume_at import first_layer
 from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import standing_field
-from gcode.stretches import in_turn
+from gcode.stretches import places_to_ends
 from gcode.surfaces import HeightField
 
 FLAT_CELL_MM = 0.2
@@ -234,11 +234,7 @@ def _solid(
     if not len(start):
         return np.zeros(2), np.zeros((0, 0), dtype=bool)
     half_mm = 0.5 * float(np.median(beads.width_mm[pick]))
-    steps = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / (0.5 * FLAT_CELL_MM)), 1.0)
-    count = (steps + 1).astype(np.int64)
-    owner, number = in_turn(count)
-    share = number / steps[owner]
-    points = start[owner] + share[:, None] * (end - start)[owner]
+    points, _ = places_to_ends(start, end, 0.5 * FLAT_CELL_MM)
     rim = 2 * math.ceil(half_mm / FLAT_CELL_MM) + 1
     origin = np.floor(points.min(axis=0) / FLAT_CELL_MM) * FLAT_CELL_MM - rim * FLAT_CELL_MM
     cells = ((points - origin) / FLAT_CELL_MM).astype(np.int64)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from gcode.moves import Role
 from gcode.slicing import order_kernels as kernels
+from gcode.stretches import in_turn
 
 ROUND_LOSS = 1.0 - math.pi / 4.0  # of h: what a rounded edge lacks beside a square one
 
@@ -90,8 +91,7 @@ def divided(
 
     Returns (p + 1, 2) points, the chain's own among them, and (p,) the piece that each begins in.
     """
-    owner = np.repeat(np.arange(len(count)), count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    owner, step = in_turn(count)
     t = (step / count[owner])[:, None]
     points = xy_mm[owner] + (xy_mm[owner + 1] - xy_mm[owner]) * t
     return np.concatenate([points, xy_mm[-1:]]), owner

@@ -67,7 +67,6 @@ def plan_part(
     solid: Any,
     setup: PrintSetup,
     *,
-    grid: LayerGrid | None = None,
     options: PartOptions = USUAL_PART,
     workers: int = 1,
     progress: Progress = silent,
@@ -78,8 +77,6 @@ def plan_part(
     ----------
     solid
         A `manifold3d.Manifold` or a `gcode.meshes.ClosedMesh`, build frame, mm.
-    grid
-        Heights to lie on; the process profile's by default.
     options
         What profiles do not say.
     workers
@@ -93,7 +90,7 @@ def plan_part(
     """
     _refuse(solid, setup)
     solid = closed_mesh(solid)
-    grid, bore_mm = grid or LayerGrid.from_setup(setup), setup.printer.nozzle_diameter_mm
+    grid, bore_mm = LayerGrid.from_setup(setup), setup.printer.nozzle_diameter_mm
     slabs = plan_slabs(solid, grid, nozzle_diameter_mm=bore_mm, options=options)
     cuts = Cuts.of(solid, np.array([s.middle_mm for s in slabs]))
     layers = PartLayers(cuts, slabs, setup, options)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy import ndimage, spatial
 
 from gcode.profiles import PrinterProfile
@@ -20,19 +19,12 @@ BARE_RADIUS_MM = 6.0  # a strand that hangs from the nozzle falls into this circ
 def over_bed(field: HeightField, printer: PrinterProfile) -> HeightField:
     """A field as high or higher on coarse cells all over the nozzle's reach; bare beside it."""
     x0, y0, x1, y1 = printer.reach_box_mm
-    shape = (int(np.ceil((y1 - y0) / ROOM_CELL_MM)), int(np.ceil((x1 - x0) / ROOM_CELL_MM)))
     coarse = field.coarsened(max(1, int(ROOM_CELL_MM / field.cell_mm)))
-    xs, ys = coarse.centres_mm()
-    iy, ix = (
-        np.floor((at - low) / ROOM_CELL_MM).astype(np.int64) for at, low in ((ys, y0), (xs, x0))
-    )
-    rows, columns = (iy >= 0) & (iy < shape[0]), (ix >= 0) & (ix < shape[1])
-    z_mm = np.zeros(shape)
-    cells = np.ix_(iy[rows], ix[columns])
-    np.maximum.at(z_mm, cells, np.asarray(coarse.z_mm, np.float64)[np.ix_(rows, columns)])
+    bare = HeightField.flat((x1 - x0, y1 - y0), ROOM_CELL_MM, origin_mm=(x0, y0))
+    z_mm = bare.raised_by(coarse).z_mm
     # A cell reaches into the cells beside the one that holds its middle.
     z_mm = ndimage.maximum_filter(z_mm, 2 * int(np.ceil(0.5 * coarse.cell_mm / ROOM_CELL_MM)) + 1)
-    return HeightField(np.array([x0, y0]), ROOM_CELL_MM, z_mm, np.ones(shape, dtype=bool))
+    return bare.raised(z_mm)
 
 
 def room_for_line(
@@ -65,7 +57,11 @@ def _room_at(
         for dx, dy in ((1.0, 0.0), (0.0, 1.0)):
             points = np.array([x, y]) + along[:, None] * np.array([dx, dy])
             fits = points[-1, 0] <= x_max - 1.0 and points[-1, 1] <= y_max - 1.0
-            if fits and reach.free_at_points(points, free).all() and _bare(field, points).all():
+            if (
+                fits
+                and reach.free_at_points(points, free).all()
+                and (field.sample(points) <= 0).all()  # drawn on the bed, not on a brim
+            ):
                 return x, y, dx, dy
     return None
 
@@ -93,13 +89,3 @@ def _starts(printer: PrinterProfile) -> list[tuple[float, float]]:
         bed = printer.bed_min_mm, printer.bed_size_mm, INSET_MM
         edges = [kept_on(at, *bed, to_edge=True) for at in edges]
     return [(printer.prime_mm[0], printer.prime_mm[1]), *edges]
-
-
-def _bare(field: HeightField, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Whether nothing stands below the points: a line is drawn on the bed, not on a brim."""
-    index = field.cells_of(points_mm)
-    ny, nx = field.shape
-    inside = np.asarray(((index >= 0) & (index < (ny, nx))).all(axis=1))
-    index = np.where(inside[:, None], index, 0)
-    height_mm = np.asarray(field.z_mm)[index[:, 0], index[:, 1]]
-    return np.asarray(~inside | (height_mm <= 0))

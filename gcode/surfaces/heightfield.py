@@ -125,26 +125,6 @@ class HeightField:
             z_mm += (z[y1, x0] * (1 - u) + z[y1, x1] * u) * v
         return np.where(inside, z_mm, outside_mm)
 
-    def max_along(self, points_mm: Float[np.ndarray, "n d"], *, radius_mm: float = 0.0) -> float:
-        """Greatest height within `radius_mm` of a polyline's XY; 0 where it leaves the field."""
-        if not self.z_mm.size or len(points_mm) == 0:
-            return 0.0
-        step_mm = max(self.cell_mm, radius_mm) / 2
-        pieces = [np.asarray(points_mm[:1, :2], float)]
-        for start, end in zip(points_mm[:-1, :2], points_mm[1:, :2], strict=True):
-            n = max(1, math.ceil(float(np.linalg.norm(end - start)) / step_mm))
-            pieces.append(start + (end - start) * (np.arange(1, n + 1) / n)[:, None])
-        index = self.cells_of(np.concatenate(pieces))
-        reach = math.ceil(radius_mm / self.cell_mm)
-        dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
-        keep = (np.hypot(dy, dx) - 1.0) * self.cell_mm <= radius_mm
-        around = (index[:, None, :] + np.stack([dy[keep], dx[keep]], axis=1)).reshape(-1, 2)
-        ny, nx = self.shape
-        around = around[((around >= 0) & (around < (ny, nx))).all(axis=1)]
-        if len(around) == 0:
-            return 0.0
-        return max(0.0, float(self.z_mm[around[:, 0], around[:, 1]].max()))
-
     def max_within(
         self,
         polygon_mm: Sequence[tuple[float, float]],
@@ -235,6 +215,17 @@ class HeightField:
     def raised(self, z_mm: Float[np.ndarray, "ny nx"]) -> HeightField:
         """The same grid with heights max(z, own)."""
         return HeightField(self.origin_mm, self.cell_mm, np.maximum(self.z_mm, z_mm), self.seen)
+
+    def raised_by(self, other: HeightField) -> HeightField:
+        """As high as another field's cells whose middles lie within its own, or higher."""
+        x_mm, y_mm = other.centres_mm()
+        ix = np.floor((x_mm - self.origin_mm[0]) / self.cell_mm).astype(np.int64)
+        iy = np.floor((y_mm - self.origin_mm[1]) / self.cell_mm).astype(np.int64)
+        ny, nx = self.shape
+        rows, columns = (iy >= 0) & (iy < ny), (ix >= 0) & (ix < nx)
+        z_mm = self.z_mm.astype(np.float64)
+        np.maximum.at(z_mm, np.ix_(iy[rows], ix[columns]), other.z_mm[np.ix_(rows, columns)])
+        return HeightField(self.origin_mm, self.cell_mm, z_mm, self.seen)
 
     def write(self, path: Path) -> None:
         """Write `.npz` (all), `.tif`/`.tiff` (heights and placement) or `.npy` (heights)."""

@@ -9,6 +9,7 @@ import pytest
 from amrepair.simulate.defects import parse_defect, place
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
+from tests.worlds import missing_versus
 
 HEIGHT_MM, SPACING_MM, LINES = 0.2, 0.407, 48
 SIZE_MM = LINES * SPACING_MM
@@ -40,7 +41,7 @@ def test_refilling_a_defect_at_its_last_layer_brings_its_volume_back(text: str) 
     for index in range(placed.last_layer + 1):
         clean.deposit(layer(index))
         broken.deposit(layer(index), [placed])
-    before = broken.missing_versus(clean)
+    before = missing_versus(broken, clean)
     if placed.kind == "void":
         *_, a, b, _, _, _ = placed.flow_regions[0]
         expected = np.pi * a * b * 3 * HEIGHT_MM
@@ -57,7 +58,7 @@ def test_refilling_a_defect_at_its_last_layer_brings_its_volume_back(text: str) 
         )  # fmt: skip
         broken.deposit(patch)
         assert before.filled_mm3(broken) > 0.95 * before.missing_mm3
-        assert broken.missing_versus(clean).excess_mm3 < 0.05 * before.missing_mm3
+        assert missing_versus(broken, clean).excess_mm3 < 0.05 * before.missing_mm3
 
 
 def test_same_job_without_a_defect_is_the_same_world() -> None:
@@ -71,4 +72,4 @@ def test_same_job_without_a_defect_is_the_same_world() -> None:
     for index in range(6):
         clean.deposit(layer(index))
         again.deposit(layer(index), [none])
-    assert again.missing_versus(clean).missing_mm3 == 0.0
+    assert missing_versus(again, clean).missing_mm3 == 0.0

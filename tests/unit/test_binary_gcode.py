@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from amrepair.cli.live import show_file
+from amrepair.cli.live import shown_as
 from gcode.cli.app import app
 from gcode.errors import InputError
 from gcode.reader import Job, read_job
@@ -162,7 +162,7 @@ def test_a_binary_job_is_shown_like_its_text(tmp_path: Path) -> None:
     """regression: `amrepair view` took no such file."""
     path, shown = tmp_path / "job.bgcode", Shown()
     path.write_bytes(binary(JOB))
-    show_file(cast("LiveView", shown), path)
+    shown_as(path)(cast("LiveView", shown))
     assert shown.layers == [len(read_job(JOB).layers)]
 
 

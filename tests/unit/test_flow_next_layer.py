@@ -13,7 +13,8 @@ from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import Job, read_job
-from gcode.resumption.flow import GapField, change_flow
+from gcode.resumption.flow import change_flow, gap_field
+from gcode.surfaces import HeightField
 
 SETUP = load_setup("ender_3", "pla", "repair_0.20")
 AREA_MM2 = np.pi / 4 * 1.75**2
@@ -42,9 +43,9 @@ def job(*, absolute_e: bool, layers: int = 3) -> Job:
     return read_job(Program(text, "marlin"), dialect="marlin")
 
 
-def box(depth_mm: float, sign: float) -> GapField:
+def box(depth_mm: float, sign: float) -> HeightField:
     solid = m3.Manifold.cube((10.0, 9.0, depth_mm)).translate((95.0, 105.0, 0.2 - depth_mm))
-    return GapField.from_solids([(solid, sign)], 0.2)
+    return gap_field([(solid, sign)], 0.2)
 
 
 @pytest.mark.parametrize("absolute_e", [False, True])
@@ -99,7 +100,7 @@ def test_flow_stays_within_what_the_printer_can() -> None:
 def test_a_place_beside_the_layer_changes_nothing() -> None:
     made = job(absolute_e=False)
     far = m3.Manifold.cube((5.0, 5.0, 0.1)).translate((10.0, 10.0, 0.1))
-    assert change_flow(made, SETUP, 1, GapField.from_solids([(far, 1.0)], 0.2)) is None
+    assert change_flow(made, SETUP, 1, gap_field([(far, 1.0)], 0.2)) is None
 
 
 def test_relative_coordinates_are_refused() -> None:

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 import amrepair
 import gcode
 from amrepair.cli.app import app
-from amrepair.cli.live import ShownRun, show_file
+from amrepair.cli.live import ShownRun, shown_as
 from amrepair.errors import InputError, MissingDependencyError
 from amrepair.loop import Look, Stop
 from amrepair.policy.table import Action, Cover, Finding, Situation, decide, judge
@@ -357,7 +357,7 @@ def test_the_part_grows_with_the_print(view: LiveView, example_files: Path) -> N
 
 @pytest.mark.parametrize("name", ["scan.ply", "part.stl", "part.safetensors", "job.gcode"])
 def test_files_of_every_kind_are_shown(view: LiveView, example_files: Path, name: str) -> None:
-    show_file(view, example_files / name)
+    shown_as(example_files / name)(view)
     drawn = set(view._handles) | ({name} if view._job_steps else set())
     assert name in drawn
 

@@ -183,14 +183,11 @@ def test_where_normal_parts_differ_the_spread_says_so(part: AnalyticTemplate) ->
         cloud[top, 2] += lift
     fused = fuse(joined(clouds))
     assert fused.spread is not None
-    from amrepair.template.learned import Tolerance
-
-    spread = Tolerance(fused.spread.origin_mm, fused.spread.cell_mm, fused.spread.values_mm)
     truth_mm = float(np.std((-0.15, -0.05, 0.05, 0.15), ddof=1))
     middle = np.array([[30.0, 15.0, 18.0]])
-    assert spread.at(middle)[0] == pytest.approx(truth_mm, rel=0.3)
+    assert fused.spread.at(middle)[0] == pytest.approx(truth_mm, rel=0.3)
     flat = np.array([[20.0, 12.0, 0.0], [5.0, 20.0, 8.0], [20.0, 0.0, 4.0]])
-    assert spread.at(flat).max() < 0.02
+    assert fused.spread.at(flat).max() < 0.02
 
 
 def test_detection_forgives_what_normal_parts_differ_by(part: AnalyticTemplate) -> None:

@@ -12,11 +12,12 @@ from scipy.spatial import cKDTree
 
 from amrepair.frames import moved, rotation_from_vector, ways_across
 from amrepair.merge.fit import _said_weak
-from amrepair.merge.fuse import Cloud, Spread
+from amrepair.merge.fuse import Cloud, widened
 from amrepair.merge.joint import slacks, together
 from amrepair.merge.kept import KeptAnswers
 from amrepair.merge.views import Surface, View
 from amrepair.scans import Scan
+from amrepair.template.learned import Tolerance
 from tests.analytic import box, difference, sample_surface
 
 SIGMA_MM = 0.03
@@ -183,7 +184,7 @@ def test_tolerance_grows_where_only_a_weak_scan_looked() -> None:
     scan = np.repeat([0, 1, 2], [len(p) for p in points])
     every = np.concatenate(points)
     cloud = Cloud(every, np.tile([0.0, 0.0, 1.0], (len(every), 1)), scan, 3, 0.2, SIGMA_MM, 0.2)
-    spread = Spread(np.zeros(3), 1.0, np.full((30, 10, 1), 0.03, np.float32))
-    wider = spread.widened(cloud, np.where(scan == 2, 0.2, 0.0))
-    assert wider.values_mm[:8] == pytest.approx(0.03)
-    assert wider.values_mm[12:] == pytest.approx(np.hypot(0.03, 0.2))
+    spread = Tolerance(np.zeros(3), 1.0, np.full((30, 10, 1), 0.03, np.float32))
+    wider = widened(spread, cloud, np.where(scan == 2, 0.2, 0.0))
+    assert wider.spread_mm[:8] == pytest.approx(0.03)
+    assert wider.spread_mm[12:] == pytest.approx(np.hypot(0.03, 0.2))

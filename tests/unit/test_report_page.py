@@ -379,7 +379,7 @@ def test_a_look_of_a_plan_carries_normals_and_outlines(
     assert [area for area, _ in shown.smallest_mm] == sorted(a for a, _ in shown.smallest_mm)
     assert all(0.1 < depth < 1.0 for _, depth in shown.smallest_mm)
     assert shown.height_map is not None
-    (outline,) = shown.height_map.outlines_mm
+    (outline,) = shown.outlines_mm
     low, high = outline.min(axis=0), outline.max(axis=0)
     # what is missing is grown back by up to three times the tolerance's 0.2 mm at a rim
     assert low == pytest.approx([123.0, 80.0], abs=0.6)

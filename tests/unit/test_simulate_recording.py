@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from runpy import run_path
 
 import manifold3d as m3
 import numpy as np
@@ -19,13 +20,14 @@ from amrepair.simulate.recording import (
     ViewResiduals,
     edge_distance_mm,
     load_recording,
-    noise_figures,
     record,
     save_recording,
 )
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner
 from amrepair.simulate.world import World
 
+FIGURES = Path(__file__).parents[2] / "benchmarks" / "noise_figures.py"
+noise_figures = run_path(str(FIGURES))["noise_figures"]
 PITCH_MM = 0.5
 SIDE_MM, TOP_MM = 50.0, 6.0
 

@@ -9,6 +9,7 @@ import pytest
 from amrepair.errors import InputError
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
+from tests.worlds import missing_versus
 
 FILAMENT_MM2 = np.pi / 4 * 1.75**2
 HEIGHT_MM = 0.2
@@ -213,7 +214,7 @@ def test_how_motion_is_cut_into_batches_changes_nothing() -> None:
                 motion.time_s[rows],
             )
         )
-    difference = pieces.missing_versus(whole)
+    difference = missing_versus(pieces, whole)
     assert difference.missing_mm3 == 0.0
     assert difference.excess_mm3 == 0.0
 
@@ -226,12 +227,12 @@ def test_truth_counts_only_what_was_missing_as_filled() -> None:
     piece = m3.Manifold.cube((4, 4, 2)).translate((23, 23, 3))
     removed = broken.remove(piece)
     assert removed == pytest.approx(32.0, rel=1e-9)  # on the grid's own lines: exact
-    before = broken.missing_versus(whole)
+    before = missing_versus(broken, whole)
     assert before.missing_mm3 == pytest.approx(32.0, rel=1e-9)
     assert before.excess_mm3 == 0.0
     broken.add(m3.Manifold.cube((4, 4, 3)).translate((23, 23, 4)))  # half fills, half is too much
     assert before.filled_mm3(broken) == pytest.approx(16.0, rel=1e-9)
-    after = broken.missing_versus(whole)
+    after = missing_versus(broken, whole)
     assert after.missing_mm3 == pytest.approx(16.0, rel=1e-9)
     assert after.excess_mm3 == pytest.approx(32.0, rel=1e-9)
     assert after.within(np.array([[0, 0, 0], [60, 60, 5.5]])).excess_mm3 == pytest.approx(8.0)
