@@ -125,6 +125,8 @@ class BridgeOptions:
         Less of a hollow is not worth a strand: what hangs beside its rim closes it.
     beside_mm
         Of the job's own lines: nearer than this to what is as high they are held from beside.
+    beside_layers
+        What ends no more than so much of a layer below the tip is as high.
     pressed_mm
         The same of lines of our own, which are pressed against those beside them.
     alike
@@ -136,6 +138,7 @@ class BridgeOptions:
     least_layers: float = 0.5
     least_mm2: float = 1.0
     beside_mm: float = 0.5
+    beside_layers: float = 0.25
     pressed_mm: float = 0.8
     alike: float = 0.02
 

@@ -17,6 +17,7 @@ from scipy import ndimage
 from gcode.moves import Role
 from gcode.slicing import bridges_kernels as kernels
 from gcode.slicing.beads import Bead, spacing_of
+from gcode.slicing.patch_beads import beside_runs
 from gcode.slicing.patch_free import beside, free_between, free_runs
 from gcode.slicing.patch_heights import Height
 from gcode.slicing.patch_model import PatchModel
@@ -145,24 +146,60 @@ class Holds:
         self._held = ~asked | beside(below & ~state.loose, asked, within_mm, model.cell_mm)
         lies = (gap <= model.drop_mm) | beside(below, asked, within_mm, model.cell_mm)
         self._air = ~self._held & ~lies
+        # there a thin strand hangs over a floor that a thick one would lie on
+        self._gap, self._over_floor = gap, model.near & below & (gap > at.most_mm)
+        self._firm = ~self._over_floor
+        if self._over_floor.any():
+            under = (gap <= at.most_mm) & ~state.loose
+            high = gap <= model.options.bridges.beside_layers * at.layer_mm
+            for holds, near_mm in ((under, 0.5 * model.line_width_mm), (high, within_mm)):
+                self._firm |= beside(holds, self._over_floor, near_mm, model.cell_mm)
 
-    def stretches(self, xy_mm: Float[np.ndarray, "n 2"]) -> list[tuple[int, int]]:
-        """From which point to which a line lies on something, or hangs between two holds."""
-        whole = [(0, len(xy_mm) - 1)]
-        if not self._any:
-            return whole
+    def floored(
+        self, runs: list[Bead], thick: Float[np.ndarray, "ny nx"]
+    ) -> Float[np.ndarray, "ny nx"]:
+        """Thickness to lay, down to the floor under what is not held at both its ends.
+
+        From one end a thin strand droops onto a floor that it does not fill the gap to.
+        """
+        model = self._model
+        if not (self._over_floor & (thick > 0)).any():
+            return thick
+        droops = []
+        for run in runs:
+            firm = self._at(run.xy_mm, self._firm)
+            lengths_mm = np.hypot(*np.diff(run.xy_mm, axis=0).T)
+            for a, b in stretches_of(~firm):
+                held = firm.any() and (run.closed or (a > 0 and b < len(firm)))
+                if not held and lengths_mm[a:b].sum() > model.options.due.hold_mm:
+                    droops.append(run.xy_mm[a : b + 1])
+        under = beside_runs(droops, 0.5 * model.line_width_mm, model)
+        lies = under & self._over_floor & (thick > 0)
+        return np.where(lies, np.maximum(thick, self._gap), thick)
+
+    def _at(
+        self, xy_mm: Float[np.ndarray, "n 2"], what: Bool[np.ndarray, "ny nx"]
+    ) -> Bool[np.ndarray, " m"]:
+        """Of columns, by the middles between points; true beyond the patch."""
         model = self._model
         middles = 0.5 * (xy_mm[1:] + xy_mm[:-1])
         cells = np.floor((middles - model.origin_mm) / model.cell_mm).astype(np.int64)[:, ::-1]
         # a job's lines go on beyond the patch, where they lie
         inside = ((cells >= 0) & (cells < model.shape)).all(axis=1)
         rows, columns = np.where(inside[:, None], cells, 0).T
-        air, held = self._air[rows, columns] & inside, self._held[rows, columns] | ~inside
+        return np.asarray(what[rows, columns] | ~inside)
+
+    def stretches(self, xy_mm: Float[np.ndarray, "n 2"]) -> list[tuple[int, int]]:
+        """From which point to which a line lies on something, or hangs between two holds."""
+        whole = [(0, len(xy_mm) - 1)]
+        if not self._any:
+            return whole
+        air, held = ~self._at(xy_mm, ~self._air), self._at(xy_mm, self._held)
         if not air.any():
             return whole
         lengths_mm = np.hypot(*np.diff(xy_mm, axis=0).T)
         keep = ~air
-        most_mm = model.longest_span_mm - 2.0 * self._beside_mm
+        most_mm = self._model.longest_span_mm - 2.0 * self._beside_mm
         for a, b in stretches_of(air):
             ends = a > 0 and b < len(air) and held[a - 1] and held[b]
             long_mm, chord_mm = lengths_mm[a:b].sum(), np.hypot(*(xy_mm[b] - xy_mm[a]))

@@ -174,6 +174,8 @@ def _along_own(
         ]
     if not runs:
         return None
+    if holds is not None:
+        thick = holds.floored(runs, thick)
     tips_mm = [np.full(len(run.xy_mm), at.z_mm) for run in runs]
     strips = strips_along_walls(thick, at.z_mm, model, state)
     chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
@@ -212,6 +214,7 @@ def _along_job(
     )
     if not runs:
         return None
+    thick = holds.floored(runs, thick)
     tips_mm = [np.full(len(run.xy_mm), at.z_mm) for run in runs]
     strips = strips_along_walls(thick, at.z_mm, model, state)
     height_mm = float(thick[thick > 0].mean())

@@ -222,6 +222,37 @@ def test_a_job_s_spans_are_told_by_its_motions_alone(gap_mm: float, turned_deg: 
     assert JobBridges(start, end, section, 0.4).longest_mm() == 0.0
 
 
+def test_a_thin_strand_held_at_one_end_reaches_its_floor() -> None:
+    # regression: beyond the last line that it crosses a sparse line drooped onto the one two
+    # layers below it, and left its own place empty: of a void found late 0.68 was filled
+    x, y = MIDDLE
+    wall = m3.Manifold.cube((16.0, 0.4, 5.0)).translate((x - 8.0, y - 0.2, 0.0))
+    across = [m3.Manifold.cube((0.4, 8.0, 5.2)).translate((x + at, y - 4.0, 0.0)) for at in (-3, 3)]
+    standing = wall + across[0] + across[1]
+    gone = m3.Manifold.cube((11.0, 0.4, 0.2)).translate((x - 5.5, y - 0.2, 5.2))
+    start = np.array(
+        [[x - 8, y, 5.0], [x - 2.8, y - 4, 5.2], [x + 3.2, y - 4, 5.2], [x - 5.5, y, 5.4]]
+    )
+    end = np.array(
+        [[x + 8, y, 5.0], [x - 2.8, y + 4, 5.2], [x + 3.2, y + 4, 5.2], [x + 5.5, y, 5.4]]
+    )
+    height = np.full(4, 0.2)
+    lines = JobLines(start, end, 0.4 * height, height, np.zeros(4, dtype=bool))
+    plan = slice_patch(
+        gone, SETUP, as_built=HeightField.from_manifold(standing, 0.1, margin_mm=8.0),
+        grid=LayerGrid.from_setup(SETUP), standalone=False, start_mm=PARK, lines=lines,
+    )  # fmt: skip
+    by_place: dict[bool, list[float]] = {True: [], False: []}
+    for move in plan.toolpath.extrusions:
+        long_mm = np.hypot(*np.diff(move.points_mm[:, :2], axis=0).T)
+        off_mm = np.abs(0.5 * (move.points_mm[1:, 0] + move.points_mm[:-1, 0]) - x)
+        for inside in by_place:
+            where = (off_mm < 2.5) if inside else (off_mm > 3.9) & (off_mm < 5.0)
+            by_place[inside] += list(np.broadcast_to(move.section_mm2, long_mm.shape)[where])
+    assert np.mean(by_place[True]) == pytest.approx(0.4 * 0.2, rel=0.1)
+    assert np.mean(by_place[False]) == pytest.approx(0.4 * 0.4, rel=0.15)
+
+
 def test_strands_lie_as_the_profile_says() -> None:
     setup = load_setup(material="abs")
     plan, program, _ = OnLegs(8.0).planned(setup)
