@@ -143,8 +143,9 @@ class Holds:
         below, within_mm = gap <= at.deep_mm, beside_mm
         asked = model.near & ~below
         self._any = bool(asked.any())
-        self._held = ~asked | beside(below & ~state.loose, asked, within_mm, model.cell_mm)
-        lies = (gap <= model.drop_mm) | beside(below, asked, within_mm, model.cell_mm)
+        stands = below & ~state.hangs_at(at.z_mm)
+        self._held = ~asked | beside(stands & ~state.loose, asked, within_mm, model.cell_mm)
+        lies = (gap <= model.drop_mm) | beside(stands, asked, within_mm, model.cell_mm)
         self._air = ~self._held & ~lies
         # there a thin strand hangs over a floor that a thick one would lie on
         self._gap, self._over_floor = gap, model.near & below & (gap > at.most_mm)

@@ -69,7 +69,8 @@ def _ends_hold(
     model: PatchModel, state: PatchState, at: Height, over_mm: Float[np.ndarray, "ny nx"]
 ) -> Bool[np.ndarray, "ny nx"]:
     """Where what is under the tip is about as high as a layer, and has not fallen there."""
-    return (over_mm <= at.most_mm) & (over_mm >= -model.options.due.agree_mm) & ~state.loose
+    high = (over_mm <= at.most_mm) & (over_mm >= -model.options.due.agree_mm)
+    return high & ~state.loose & ~state.hangs_at(at.z_mm)
 
 
 def _bridged(due: Due, bridges: Bridges, thick: Float[np.ndarray, "ny nx"], at: Height) -> Due:
@@ -122,7 +123,7 @@ def due_of_job(
     air = (due.thick_mm > 0) & (over_mm > at.deep_mm)
     if not air.any():
         return due
-    below = (over_mm <= at.deep_mm) & ~state.loose
+    below = (over_mm <= at.deep_mm) & ~state.loose & ~state.hangs_at(at.z_mm)
     alone = air & ~_held(model, below, air, model.free_at(at.reach))
     holds = _ends_hold(model, state, at, over_mm)
     bridges = bridges_at(model, at, due.thick_mm, due.thick_mm > 0, over_mm, holds, alone)
@@ -190,7 +191,7 @@ def _lidded(
     sunk = np.zeros(model.shape)
     loose = np.zeros(model.shape, dtype=bool)
     if deep.any():
-        holds = (active & ~deep) | (gap < at.most_mm)
+        holds = ((active & ~deep) | (gap < at.most_mm)) & ~state.hangs_at(at.z_mm)
         free = model.free_at(at.reach)
         firm = _held(model, holds & ~state.loose, deep, free)
         held = firm | _held(model, holds & state.loose, deep, free)

@@ -118,6 +118,7 @@ def _after(
         done_mm=done,
         hem=state.hem | due.hem,
         loose=(state.loose & ~due.bridges.over) | (due.loose & (laid > 0)),
+        hung_mm=np.where(hangs, at.z_mm, state.hung_mm),
         too_long_mm=np.maximum(due.bridges.too_long_mm, state.too_long_mm),
         lost=(*state.lost, *laying.lost),
     )

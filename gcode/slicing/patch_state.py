@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float
 from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_model import PatchModel
 
+SAME_TIP_MM = 0.02  # passes nearer to each other lie beside, not on, each other
+
 
 @dataclass(frozen=True, slots=True)
 class PatchState:
@@ -30,6 +32,8 @@ class PatchState:
         Columns laid in the air beside a rim.
     loose
         Columns whose beads fell onto the floor, and those on top of them: no strand is held there.
+    hung_mm
+        Height at which each column was last laid over air; −∞ where it never was.
     too_long_mm
         Where a bridge would be longer than the material bears, how long; 0 elsewhere.
     lost
@@ -43,6 +47,7 @@ class PatchState:
     planar_top_mm: Float[np.ndarray, "ny nx"]
     hem: Bool[np.ndarray, "ny nx"]
     loose: Bool[np.ndarray, "ny nx"]
+    hung_mm: Float[np.ndarray, "ny nx"]
     too_long_mm: Float[np.ndarray, "ny nx"]
     lost: tuple[Unprintable, ...] = ()
 
@@ -58,8 +63,13 @@ class PatchState:
             planar_top_mm=model.top_mm,
             hem=np.zeros(model.shape, dtype=bool),
             loose=np.zeros(model.shape, dtype=bool),
+            hung_mm=np.full(model.shape, -np.inf),
             too_long_mm=nothing,
         )
+
+    def hangs_at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
+        """Columns that hang at a height: what is laid at the same height they do not hold."""
+        return np.asarray(self.hung_mm > z_mm - SAME_TIP_MM)
 
     def left_below(self, model: PatchModel, z_mm: float) -> Float[np.ndarray, "ny nx"]:
         """Thickness wanted below a height and not laid or given up; negative where more was."""

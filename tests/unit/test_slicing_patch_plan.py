@@ -12,6 +12,7 @@ from gcode.profiles import PrintSetup, load_setup
 from gcode.progress import silent
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.options import USUAL_PATCH
+from gcode.slicing.patch_bridges import Holds
 from gcode.slicing.patch_heights import Heights, Openings
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_passes import plan_pass
@@ -47,6 +48,26 @@ def test_a_pass_leaves_the_state_before_it_as_it_was(model: PatchModel) -> None:
     assert laid_mm3 == pytest.approx(columns_mm3, rel=0.05)
     for kept, now in zip(told, (before.surface_mm, before.laid_mm, before.sunk_mm), strict=True):
         np.testing.assert_array_equal(kept, now)
+
+
+def test_what_hangs_at_a_height_holds_nothing_laid_at_the_same(model: PatchModel) -> None:
+    # regression: a second pass at one height was held by the first, which hung; a roof's repair was
+    # refused by the checker, for which they are one
+    heights = Heights.of(model, GRID, SETUP, openings=Openings.EACH)
+    begun = PatchState.begun(model)
+    at = heights.at(len(heights.all_mm) - 1, begun, model)  # high over the pit's floor
+    left = np.zeros(model.shape, dtype=bool)
+    left[:, : model.shape[1] // 2] = True
+    state = replace(
+        begun,
+        surface_mm=np.where(left, at.z_mm, begun.surface_mm),
+        hung_mm=np.where(left, at.z_mm, begun.hung_mm),
+    )
+    middle_mm = model.origin_mm + 0.5 * model.cell_mm * np.array(model.shape[::-1])
+    across_mm = middle_mm + np.array([[0.2, 0.0], [0.4, 0.0], [0.6, 0.0]])
+    assert Holds(model, state, at, 0.8).stretches(across_mm) == []
+    lower = replace(state, hung_mm=np.where(left, at.z_mm - 0.2, begun.hung_mm))
+    assert Holds(model, lower, at, 0.8).stretches(across_mm) != []
 
 
 def _with(setup: PrintSetup, **weights: float) -> PrintSetup:
