@@ -127,6 +127,7 @@ def test_killed_while_it_touches_it_goes_on(forks: Forks, prepared: Path, tmp_pa
     assert f"touches: {planned}" in bench.told()
 
 
+@pytest.mark.slow
 def test_a_touch_that_met_nothing_is_gone_on_with(
     forks: Forks, prepared: Path, tmp_path: Path
 ) -> None:

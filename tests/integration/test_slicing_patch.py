@@ -496,7 +496,7 @@ def test_where_the_layers_lie_hardly_decides_how_much_of_a_pit_is_filled(higher_
     assert shares[1] == pytest.approx(shares[0], abs=0.02)
 
 
-@pytest.mark.parametrize("turn_deg", [30.0, 45.0])
+@pytest.mark.parametrize("turn_deg", [pytest.param(30.0, marks=pytest.mark.slow), 45.0])
 def test_how_a_groove_lies_to_the_grid_hardly_decides_how_much_is_filled(turn_deg: float) -> None:
     """Beads along slanting walls broke off wherever they left the cells that are free."""
     shares = []

@@ -57,7 +57,10 @@ def run(template: MeshSdf, points: np.ndarray, options: PamOptions) -> Registrat
     )
 
 
-@pytest.mark.parametrize("options", [STRICT, replace(RELEASED_PAM, target_points=15_000)])
+@pytest.mark.parametrize(
+    "options",
+    [STRICT, pytest.param(replace(RELEASED_PAM, target_points=15_000), marks=pytest.mark.slow)],
+)
 def test_a_full_scan_is_found_from_far_away(template: MeshSdf, options: PamOptions) -> None:
     points, truth = turned(cloud(template, 1), 1, 2.5)
     found = run(template, points, options)

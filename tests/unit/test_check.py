@@ -429,7 +429,15 @@ def test_what_is_laid_stands_in_the_way_of_what_follows() -> None:
 
 
 @pytest.mark.skipif("AMREPAIR_DATA" not in os.environ, reason="AMREPAIR_DATA is not set")
-@pytest.mark.parametrize("name", ["plant-sign", "prusaslicer-cube", "screw", "vase"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "plant-sign",
+        "prusaslicer-cube",
+        pytest.param("screw", marks=pytest.mark.slow),
+        "vase",
+    ],
+)
 def test_real_files_for_this_printer_pass(name: str) -> None:
     path = Path(os.environ["AMREPAIR_DATA"]) / "gcode" / f"{name}.gcode"
     text = path.read_text(errors="replace")

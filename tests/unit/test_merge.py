@@ -177,7 +177,7 @@ def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
 
 
 def test_where_normal_parts_differ_the_spread_says_so(part: AnalyticTemplate) -> None:
-    clouds = [points_of(part, 30_000, s) for s in range(4)]
+    clouds = [points_of(part, 20_000, s) for s in range(4)]
     for cloud, lift in zip(clouds, (-0.15, -0.05, 0.05, 0.15), strict=True):
         top = (np.linalg.norm(cloud[:, :2] - (30, 15), axis=1) < 5.5) & (cloud[:, 2] > 17.5)
         cloud[top, 2] += lift

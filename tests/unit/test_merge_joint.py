@@ -112,6 +112,7 @@ def test_scans_that_slip_as_a_group_do_not_wait_for_each_other() -> None:
     assert rmse_mm == pytest.approx(np.sqrt(2.0) * SIGMA_MM, rel=0.25)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_errs_at_grazing_angles_hardly_swells_the_part() -> None:
     """Sixteen sides seen by eight looks, each side farther out the nearer to edge-on it was seen.
 

@@ -215,7 +215,14 @@ def test_groups_that_share_too_little_stay_apart_and_both_are_told() -> None:
     assert "lies on the others with" in said
 
 
-@pytest.mark.parametrize("towards", [(1.0, 0.4, 0.8), (-0.6, 1.0, 0.5), (0.3, -1.0, -0.7)])
+@pytest.mark.parametrize(
+    "towards",
+    [
+        (1.0, 0.4, 0.8),
+        pytest.param((-0.6, 1.0, 0.5), marks=pytest.mark.slow),
+        pytest.param((0.3, -1.0, -0.7), marks=pytest.mark.slow),
+    ],
+)
 def test_where_a_sensor_stood_is_among_the_guesses(
     bracket: Shape, towards: tuple[float, float, float]
 ) -> None:

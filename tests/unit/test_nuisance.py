@@ -155,7 +155,9 @@ def test_scale_bow_and_pose_are_found_together() -> None:
 
 
 @pytest.mark.parametrize(
-    "template", [SPHERE, BOX, PLATE, BAR], ids=["sphere", "box", "plate", "bar"]
+    "template",
+    [SPHERE, BOX, pytest.param(PLATE, marks=pytest.mark.slow), BAR],
+    ids=["sphere", "box", "plate", "bar"],
 )
 def test_noise_alone_is_taken_for_nothing(template: analytic.AnalyticTemplate) -> None:
     wrong = 0

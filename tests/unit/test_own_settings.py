@@ -346,7 +346,7 @@ REAL = Path(os.environ.get("AMREPAIR_DATA", "none")) / "gcode"
     ("name", "machine", "bed_mm"),
     [
         ("plant-sign", "ender_3", (210.0, 220.0)),
-        ("orca_slicer", "creality_k1_max", (300.0, 300.0)),
+        pytest.param("orca_slicer", "creality_k1_max", (300.0, 300.0), marks=pytest.mark.slow),
         ("cura_slicer", "creality_k1_max", (300.0, 300.0)),
         ("prusaslicer-cube", None, (308.0, 245.0)),  # was held back until all of it worked
     ],
