@@ -23,6 +23,7 @@ import pytest
 
 from gcode.firmware import MotionBatch
 from gcode.profiles import PrinterProfile, load_printer
+from tests.gcode_text import steps_of
 
 EXECUTED = re.compile(rb"echo:(?:N\d+ ?)?([GMT]\d[^*]*)")
 """Marlin tells every command that it carries out, after `M111 S1`."""
@@ -57,44 +58,23 @@ class Nozzle:
     """Where commands that were carried out have it go, and what it pushes out on its way."""
 
     def __init__(self) -> None:
-        self._at = np.zeros(3)
-        self._relative, self._pushes_relative, self._e_mm, self._f_mm_s = False, False, 0.0, 10.0
-        self._clock_s = 0.0
+        self._commands: list[str] = []
+        self._taken = 0
 
     def follow(self, commands: Sequence[str]) -> MotionBatch:
-        """The moves of G0 and G1, with G90, G91, M82, M83, G92 E and G28."""
-        rows = [row for command in commands if (row := self._carry_out(command)) is not None]
-        return MotionBatch.from_bytes(np.array(rows, dtype=np.float64).tobytes())
-
-    def _carry_out(self, command: str) -> list[float] | None:
-        code, *words = command.split()
-        told = {word[0]: word[1:] for word in words}
-        if code in ("G90", "G91"):
-            self._relative = self._pushes_relative = code == "G91"
-        elif code in ("M82", "M83"):
-            self._pushes_relative = code == "M83"
-        elif code == "G92" and "E" in told:
-            self._e_mm = float(told["E"])
-        elif code == "G28":
-            for k, axis in enumerate("XYZ"):
-                if axis in told or not told:
-                    self._at[k] = 0.0
-        elif code in ("G0", "G1"):
-            return self._move({axis: float(value) for axis, value in told.items() if value})
-        return None
-
-    def _move(self, told: dict[str, float]) -> list[float]:
-        start = self._at.copy()
-        for k, axis in enumerate("XYZ"):
-            if axis in told:
-                self._at[k] = told[axis] + (start[k] if self._relative else 0.0)
-        pushed_mm = 0.0
-        if "E" in told:
-            pushed_mm = told["E"] - (0.0 if self._pushes_relative else self._e_mm)
-            self._e_mm += pushed_mm
-        self._f_mm_s = told.get("F", 60.0 * self._f_mm_s) / 60.0
-        self._clock_s += max(float(np.linalg.norm(self._at - start)), abs(pushed_mm)) / self._f_mm_s
-        return [*start, *self._at, pushed_mm, self._f_mm_s, self._clock_s]
+        """The moves of further commands, as `steps_of` reads them; each as fast as it was told."""
+        self._commands += commands
+        steps = steps_of("\n".join(self._commands))
+        took_s = [
+            max(float(np.linalg.norm(step.end_mm - step.start_mm)), abs(step.e_mm)) / step.feed_mm_s
+            for step in steps
+        ]
+        rows = [
+            [*step.start_mm, *step.end_mm, step.e_mm, step.feed_mm_s, time_s]
+            for step, time_s in zip(steps, np.cumsum(took_s), strict=True)
+        ]
+        new, self._taken = rows[self._taken :], len(rows)
+        return MotionBatch.from_bytes(np.array(new, dtype=np.float64).tobytes())
 
 
 class NativeMarlin:
