@@ -14,7 +14,7 @@ from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.deficit.options import DeficitOptions
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
-from amrepair.frames import diagonal
+from amrepair.frames import cells_of, diagonal
 from amrepair.regions import AnomalyMap, Label
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.template.port import Template
@@ -173,8 +173,7 @@ def _paths_out(sought: Sought, which: Numbers) -> Float[np.ndarray, "p 3"]:
     They tie the floor to the mouth where nobody sampled the walls between.
     """
     s, step_mm = sought.evidence.surfels, sought.options.voxels.path_step_mm
-    cell = np.floor(s.place_mm[which] / step_mm).astype(np.int64)
-    first = np.unique(cell, axis=0, return_index=True)[1]
+    first = np.unique(cells_of(s.place_mm[which], 0.0, step_mm), axis=0, return_index=True)[1]
     front, along = s.place_mm[which[first]], sought.evidence.normal[which[first]]
     found = [front[:0]]
     reach_mm = diagonal(sought.template.bounds_mm)

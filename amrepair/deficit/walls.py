@@ -17,7 +17,7 @@ from scipy import ndimage
 from amrepair.arrays import ColumnMask, HeightMap, Points
 from amrepair.deficit import walls_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, WallOptions
-from amrepair.frames import in_box
+from amrepair.frames import cells_of, in_box
 from gcode.surfaces import HeightField
 
 
@@ -187,7 +187,7 @@ def _by_cell(
     ny, nx = shape
     high_mm = corner_mm + cell_mm * np.array([nx, ny])
     own = points_mm[in_box(points_mm[:, :2], corner_mm, high_mm)]
-    index = np.floor((own[:, :2] - corner_mm) / cell_mm).astype(np.int64)
+    index = cells_of(own[:, :2], corner_mm, cell_mm)
     cell = np.minimum(index[:, 1], ny - 1) * nx + np.minimum(index[:, 0], nx - 1)
     ends = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=ny * nx))])
     start = np.lib.stride_tricks.sliding_window_view(ends, nx + 1)[::nx]

@@ -70,7 +70,7 @@ def _ends_hold(
 ) -> Bool[np.ndarray, "ny nx"]:
     """Where what is under the tip is about as high as a layer, and has not fallen there."""
     high = (over_mm <= at.most_mm) & (over_mm >= -model.options.due.agree_mm)
-    return high & ~state.loose & ~state.hangs_at(at.z_mm)
+    return high & state.firm_at(at.z_mm)
 
 
 def _bridged(due: Due, bridges: Bridges, thick: Float[np.ndarray, "ny nx"], at: Height) -> Due:
@@ -123,7 +123,7 @@ def due_of_job(
     air = (due.thick_mm > 0) & (over_mm > at.deep_mm)
     if not air.any():
         return due
-    below = (over_mm <= at.deep_mm) & ~state.loose & ~state.hangs_at(at.z_mm)
+    below = (over_mm <= at.deep_mm) & state.firm_at(at.z_mm)
     alone = air & ~_held(model, below, air, model.free_at(at.reach))
     holds = _ends_hold(model, state, at, over_mm)
     bridges = bridges_at(model, at, due.thick_mm, due.thick_mm > 0, over_mm, holds, alone)

@@ -71,6 +71,10 @@ class PatchState:
         """Columns that hang at a height: what is laid at the same height they do not hold."""
         return np.asarray(self.hung_mm > z_mm - SAME_TIP_MM)
 
+    def firm_at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
+        """Columns whose top holds a strand's end at a height: it neither fell nor hangs there."""
+        return ~self.loose & ~self.hangs_at(z_mm)
+
     def left_below(self, model: PatchModel, z_mm: float) -> Float[np.ndarray, "ny nx"]:
         """Thickness wanted below a height and not laid or given up; negative where more was."""
         return model.wanted_below(z_mm) - self.laid_mm - self.sunk_mm
