@@ -184,7 +184,7 @@ def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarra
     return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
 
 
-def rotation_of_quaternion(wxyz: Float[np.ndarray, 4 * k]) -> Float[np.ndarray, "*k 3 3"]:
+def rotation_of_quaternion(wxyz: Float[np.ndarray, " 4 *k"]) -> Float[np.ndarray, "*k 3 3"]:
     """(*k, 3, 3) rotations of unit quaternions."""
     w, x, y, z = wxyz
     rows = [

@@ -201,7 +201,7 @@ def _triangles_in(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     with np.errstate(all="ignore"):  # numbers beyond measure are refused by whoever asked
         mesh = trimesh.load(path, force="mesh", process=False)
-    if not isinstance(mesh, trimesh.Trimesh):
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
 

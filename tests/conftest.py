@@ -3,33 +3,17 @@
 from __future__ import annotations
 
 import importlib
-import importlib.machinery
 import os
 import shutil
 import signal
-import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from importlib.machinery import ModuleSpec
+from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import hypothesis
 import pytest
-from jaxtyping import install_import_hook
 
-
-class _KernelFinder:
-    """Keeps the run-time shape checks away from numba kernels, which compile their own."""
-
-    @staticmethod
-    def find_spec(
-        name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        if name.endswith("_kernels"):
-            return importlib.machinery.PathFinder.find_spec(name, path, target)
-        return None
-
+from tests import shapes
 
 # Workers share the cores: threads of one that spin for their turn take the other's time.
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
@@ -39,8 +23,7 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
 
 # a shell that starts the tests in the background has them ignore what some of them send
 signal.signal(signal.SIGINT, signal.default_int_handler)
-install_import_hook(["amrepair", "gcode"], "beartype.beartype")
-sys.meta_path.insert(0, _KernelFinder)  # type: ignore[arg-type]
+shapes.install(["amrepair", "gcode"])
 importlib.import_module("gcode.process").prepare()  # as the commands do
 
 hypothesis.settings.register_profile(

@@ -57,7 +57,8 @@ def _read_class(folder: Path) -> BenchClass:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"{folder}/test: two scans are named {twice}; rename one")
-    return BenchClass(folder.name, tuple(sound), meshes[0] if meshes else None, tuple(samples))
+    mesh = meshes[0] if meshes else None
+    return BenchClass(folder.name, tuple(sound), mesh, tuple(samples), read_points)
 
 
 def _files(folder: Path) -> list[Path]:

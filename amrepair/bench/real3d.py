@@ -51,7 +51,7 @@ def _read_class(folder: Path) -> BenchClass:
         for path in sorted((folder / "test").glob("*.pcd"))
         if "temp" not in path.name
     ]
-    return BenchClass(folder.name, tuple(named or clouds), None, tuple(samples))
+    return BenchClass(folder.name, tuple(named or clouds), None, tuple(samples), read_points)
 
 
 def _sample(class_name: str, path: Path, truth: Path) -> Sample:

@@ -125,7 +125,7 @@ class BenchClass:
     train: tuple[Path, ...]
     mesh: Path | None
     test: tuple[Sample, ...]
-    read_train: Callable[[Path], Points] = read_points
+    read_train: Callable[[Path], Points]
 
 
 @dataclass(frozen=True, slots=True)

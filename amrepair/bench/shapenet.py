@@ -73,7 +73,9 @@ def _read_class(folder: Path, meshes: Path) -> BenchClass:
         if "template" not in path.stem.removeprefix(folder.name)
     ]
     train = tuple(_clouds(folder / "train"))
-    return BenchClass(folder.name, train, _mesh_of(meshes, folder.name), tuple(samples))
+    return BenchClass(
+        folder.name, train, _mesh_of(meshes, folder.name), tuple(samples), read_points
+    )
 
 
 def _clouds(folder: Path) -> list[Path]:

@@ -29,7 +29,7 @@ STRAIGHT_DOWN = np.array([0.0, 0.0, 1.0])
 NUMBERS = "fiub"
 
 
-def load_npy(path: Path) -> Float[np.ndarray, ...]:
+def load_npy(path: Path) -> Float[np.ndarray, " ..."]:
     """An array of numbers; what it promises is held against the file before it is read.
 
     Raises
@@ -118,7 +118,7 @@ def read_npz(
     )
 
 
-def _members(path: Path) -> dict[str, Shaped[np.ndarray, ...]]:
+def _members(path: Path) -> dict[str, Shaped[np.ndarray, " ..."]]:
     """All arrays of an archive, by name; sizes are held against its directory first."""
     try:
         with zipfile.ZipFile(path) as archive:

@@ -438,7 +438,7 @@ def _greatest_of_next(
 
 def _read_heights(
     path: Path,
-) -> tuple[Float[np.ndarray, ...], dict[str, Any], Bool[np.ndarray, ...] | None]:
+) -> tuple[Float[np.ndarray, " ..."], dict[str, Any], Bool[np.ndarray, " ..."] | None]:
     """Heights, placement and seen mask of a file, as far as it carries them."""
     suffix = path.suffix.lower()
     readers = {".npz": _read_npz, ".tif": _read_tiff, ".tiff": _read_tiff, ".npy": _read_npy}
@@ -452,7 +452,7 @@ def _read_heights(
 
 def _read_npz(
     path: Path,
-) -> tuple[Float[np.ndarray, ...], dict[str, Any], Bool[np.ndarray, ...] | None]:
+) -> tuple[Float[np.ndarray, " ..."], dict[str, Any], Bool[np.ndarray, " ..."] | None]:
     with zipfile.ZipFile(path) as packed:
         for info in packed.infolist():
             with packed.open(info) as member:
@@ -466,7 +466,7 @@ def _read_npz(
         return z_mm, placement, archive["seen"].astype(bool)
 
 
-def _read_npy(path: Path) -> tuple[Float[np.ndarray, ...], dict[str, Any], None]:
+def _read_npy(path: Path) -> tuple[Float[np.ndarray, " ..."], dict[str, Any], None]:
     with path.open("rb") as file:
         _refuse_more_than_it_holds(path, file, path.stat().st_size)
     return np.load(path).astype(np.float64, copy=False), {}, None
@@ -488,7 +488,7 @@ def _refuse_too_many(cells: int) -> None:
         raise ValueError(f"it has {cells:,} cells, the limit is {MOST_READ_CELLS:,}")
 
 
-def _read_tiff(path: Path) -> tuple[Float[np.ndarray, ...], dict[str, Any], None]:
+def _read_tiff(path: Path) -> tuple[Float[np.ndarray, " ..."], dict[str, Any], None]:
     with quiet_tiff(path) as tiff:
         page = tiff.pages[0]
         _refuse_too_many(math.prod(page.shape))

@@ -15,7 +15,7 @@ from amrepair.bench.method import ClassInput, noise_mm
 from amrepair.bench.metrics import auroc
 from amrepair.bench.paper import Target
 from amrepair.bench.registry import BASELINES, PUBLISHED, make_method
-from amrepair.bench.samples import BenchClass, Format, Sample
+from amrepair.bench.samples import BenchClass, Format, Sample, read_points
 from amrepair.bench.synth_views import random_rotation
 from amrepair.errors import InputError
 
@@ -169,7 +169,7 @@ def test_a_sample_that_pam_gave_up_on_is_badly_aligned_once(tmp_path: Path) -> N
         Sample("c0", name, name, tmp_path, None if name == "good" else tmp_path, shapenet.load)
         for name in names
     )
-    one = BenchClass("c0", (), None, samples)
+    one = BenchClass("c0", (), None, samples, read_points)
     cell = Cell("pasdf-paper", one, Format.SHAPENET, 0, tmp_path)
     cell.folder.mkdir(parents=True)
     scored = {"score": np.arange(4.0), "label": np.array([0, 0, 1, 1])}

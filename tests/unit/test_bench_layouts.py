@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from amrepair.bench import run_bench
 from amrepair.bench.adam3d import read_part
 from amrepair.bench.cells import Cell, _judge
 from amrepair.bench.dataset import LAYOUTS, open_dataset
-from amrepair.bench.samples import UNLABELLED, BenchClass, Format
+from amrepair.bench.samples import UNLABELLED, Format
 from amrepair.errors import InputError
 
 ROWS, COLUMNS = 60, 80
@@ -175,7 +176,7 @@ def test_points_that_nobody_labelled_are_not_judged(tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     np.savetxt(tmp_path / "masks" / "c.txt", np.arange(50) % 2, fmt="%d")
     (one,) = open_dataset(tmp_path, "folder").classes
-    cell = Cell("btf-raw", BenchClass(one.name, one.train, None, one.test), Format.FOLDER, 0,
+    cell = Cell("btf-raw", replace(one, mesh=None), Format.FOLDER, 0,
                 tmp_path / "out")  # fmt: skip
     cell.folder.mkdir(parents=True)
     for sample in one.test:

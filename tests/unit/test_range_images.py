@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from jaxtyping import TypeCheckError
+from beartype.roar import BeartypeCallHintViolation
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
@@ -357,7 +357,9 @@ def test_moves_and_subsets_keep_what_stays_true(tmp_path: Path) -> None:
 
 def test_flags_and_grids_that_do_not_match_are_refused() -> None:
     scan = Scan(np.zeros((3, 3)), 0.03, "s")
-    with pytest.raises((InputError, TypeCheckError), match="edge"):  # shapes are checked before
+    with pytest.raises(
+        (InputError, BeartypeCallHintViolation), match="edge"
+    ):  # shapes are checked before
         replace(scan, edge=np.zeros(2, np.uint8))
     with pytest.raises(InputError, match="names point 3"):
         replace(scan, grids=(RangeGrid(np.array([[0, 3]], np.int32)),))
