@@ -19,8 +19,6 @@ from link_forks import Forks
 from gcode.hosts.journal import Journal
 
 LINES = 2500
-LATEST_S = 0.5
-"""Kills come up to this long after the start: from before the hello to after the last line."""
 STATED_S = 5.0
 """Within this time of a sender's death its supervisor has told the heaters to switch off."""
 _HEAT = re.compile(r"^M1(?:04|09|40|90) S(\d+)$", re.MULTILINE)
@@ -33,15 +31,23 @@ def forks() -> Iterator[Forks]:
 
 
 class Gallows:
-    """One bench, many deaths; `seen` counts what came of them."""
+    """One bench, many deaths; `seen` counts what came of them.
+
+    Kills come up to `job_s` after the start, from before the hello to about the last line: what a
+    job takes that nobody kills, on this machine and under what else it does now.
+    """
 
     def __init__(self, forks: Forks, folder: Path, seed: int) -> None:
         self.bench = Bench(forks, folder, lines=LINES, slow=False)
         self.forks, self.rng, self.seen = forks, random.Random(seed), Counter[str]()
+        began_s = time.monotonic()
+        assert forks.wait(self.bench.send()) == 0
+        self.job_s = time.monotonic() - began_s
+        self.bench.record.write_text("")  # the next job
 
     def moment(self) -> None:
         """Let a random time pass: a kill waits for no event."""
-        time.sleep(self.rng.uniform(0.0, LATEST_S))
+        time.sleep(self.rng.uniform(0.0, self.job_s))
 
     def start(self) -> int:
         """Go on where something has been printed, else begin."""
@@ -128,8 +134,9 @@ def hang(forks: Forks, folder: Path, kills: int, seed: int) -> Counter[str]:
 
 def test_thirty_kills_execute_nothing_twice(forks: Forks, tmp_path: Path) -> None:
     seen = hang(forks, tmp_path, 30, seed=1)
-    assert seen["senders killed"] > 9
-    assert seen["intervals true"] > 3
+    # a machine that grows quicker meanwhile lets many a job end first
+    assert seen["senders killed"] > 4
+    assert seen["intervals true"] > 1
 
 
 @pytest.mark.slow
