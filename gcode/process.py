@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import sys
 from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar
@@ -75,6 +76,19 @@ def gives_back(long_task: Callable[P, R]) -> Callable[P, R]:
                 ctypes.CDLL("libc.so.6").malloc_trim(0)
 
     return task
+
+
+def peak_mb() -> float | None:
+    """The most memory that this process has held so far, MB; None where the system tells nobody.
+
+    Linux counts in kB, macOS in bytes (getrusage(2) of each).
+    """
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
 def end_with_parent() -> None:

@@ -139,7 +139,7 @@ class TaskOutcome:
     files
         Bytes to be kept beside the result, by name.
     cost
-        `cpu_s`, `wall_s`, `read_bytes`, `peak_mb` of the worker so far.
+        `cpu_s`, `wall_s`, `read_bytes`; `peak_mb` of the worker so far, if the system tells.
     """
 
     scan_id: str

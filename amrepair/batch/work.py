@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from amrepair.scans import Scan, read_scan
 from amrepair.template import open_template
 from gcode.compiled import set_num_threads
 from gcode.errors import GcodeError
-from gcode.process import gives_back
+from gcode.process import gives_back, peak_mb
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -86,8 +85,9 @@ class Bench:
             "cpu_s": round(time.process_time() - cpu_s, 4),
             "wall_s": round(time.monotonic() - wall_s, 4),
             "read_bytes": size,
-            "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),
         }
+        if (peak := peak_mb()) is not None:
+            cost["peak_mb"] = round(peak, 1)
         return TaskOutcome(
             done.scan_id, done.figures, done.sentence, done.lasting, done.files, cost
         )

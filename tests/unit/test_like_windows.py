@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
+
+from gcode.process import one_thread
 
 ROOT = Path(__file__).parents[2]
 LIKE_WINDOWS = ROOT / "tests" / "like_windows.py"
@@ -16,7 +21,8 @@ KNOB = ROOT / "examples" / "parts" / "knob.stl"
 
 def like_windows(*words: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "ignore", str(LIKE_WINDOWS), *map(str, words)]
-    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    # the libraries are loaded before a batch says how many threads they have
+    environ = {**os.environ, "PYTHONPATH": str(ROOT), **one_thread()}
     return subprocess.run(
         command, capture_output=True, text=True, timeout=280, check=False, env=environ
     )
@@ -55,3 +61,19 @@ def test_an_emulated_printer_is_refused_in_one_sentence() -> None:
         "gcode: an emulated printer needs a pseudo-terminal, which Linux and macOS have; on "
         "Windows use WSL"
     )
+
+
+def test_a_folder_of_scans_is_judged(tmp_path: Path) -> None:
+    """Regression: a batch asked for `resource`, which Windows lacks."""
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=6.0)
+    mesh.export(tmp_path / "ball.stl")
+    (tmp_path / "scans").mkdir()
+    points, _ = trimesh.sample.sample_surface(mesh, 3000, seed=0)
+    np.savetxt(tmp_path / "scans" / "one.xyz", points, fmt="%.4f")
+    done = like_windows(
+        *("amrepair", "batch", "align", tmp_path / "scans", "--template", tmp_path / "ball.stl"),
+        *("--out", tmp_path / "out", "--executor", "serial"),
+    )
+    assert done.returncode == 0, done.stderr
+    (result,) = (tmp_path / "out" / "results").rglob("*.json")
+    assert "peak_mb" not in json.loads(result.read_text())["cost"]
