@@ -287,7 +287,6 @@ def _flow(
     if (
         options.clog_least < share < options.clog_most
         and _lasts(short[at:]) >= options.clog_lasts
-        and np.percentile(low[at:], 75) < options.clog_layers
         and wrong <= _apart(points[seen, :2], short, distance[seen, -1], options)
     ):
         return TypeGuess(DefectType.CLOG, 1.0 - wrong)
@@ -352,7 +351,12 @@ def _of_region(
         if lies and long_mm > options.string_aspect * wide_mm and wide_mm < options.string_width_mm:
             return TypeGuess(DefectType.STRING, _sure(long_mm / wide_mm, options.string_aspect))
         return TypeGuess(DefectType.BLOB, 0.95)
-    if flow is not None and flow.type is not DefectType.OVER_EXTRUSION:
+    layers = 0.0 if piece is None else piece.volume() / layer_mm / float(piece.project().area())
+    if flow is not None and (
+        flow.type is DefectType.UNDER_EXTRUSION
+        # what is gone of the layers below has a place
+        or (flow.type is DefectType.CLOG and layers <= options.clog_layers)
+    ):
         return flow
     long_mm, wide_mm, along = spread([piece] if piece is not None else [])
     if long_mm > options.skipped_aspect * wide_mm and not at_rim:
@@ -361,10 +365,7 @@ def _of_region(
             return TypeGuess(
                 DefectType.MISSING_BEADS, _sure(long_mm / wide_mm, options.skipped_aspect)
             )
-    whole_layers = piece is not None and (
-        piece.volume() > options.whole_layers * layer_mm * float(piece.project().area())
-    )
-    if whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
+    if layers > options.whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
         return TypeGuess(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
     return TypeGuess(region.type, 0.95)
 

@@ -10,12 +10,14 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from manifold3d import Manifold
 
 from amrepair.frames import Transform
 from amrepair.loop import kinds
 from amrepair.loop.kind_options import USUAL_KINDS
 from amrepair.loop.kinds import typed
 from amrepair.loop.shapes import last_beads
+from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import plan_repair
 from gcode.profiles import load_setup
@@ -171,24 +173,32 @@ def test_a_curl_is_one() -> None:
     assert found.type is DefectType.WARP
 
 
-@pytest.mark.parametrize(("layers", "kind"), [(0.8, DefectType.CLOG), (6.0, None)])
+@pytest.mark.parametrize(
+    ("layers", "kind"), [(0.8, DefectType.CLOG), (2.5, DefectType.CHIP), (6.0, DefectType.CHIP)]
+)
+@pytest.mark.parametrize("seen_layers", [0.8, 6.0])
 def test_what_broke_off_where_the_last_beads_end_is_no_clog(
     scene,  # type: ignore[no-untyped-def]
     layers: float,
-    kind: DefectType | None,
+    kind: DefectType,
+    seen_layers: float,
 ) -> None:
-    # regression: a chip six layers deep, where the last beads of a part lie, ended the run
+    # regression: a chip six layers deep, where the last beads of a part lie, ended the run; and so
+    # did one of which the top's points, near its rim, showed less than the solid that is missing
     job, stop, _, _ = scene
     beads = last_beads(job, stop.line)
     gone = np.arange(len(beads)) > 0.7 * len(beads)
-    top = kinds._Surface(
-        np.column_stack([beads[:, :2], np.full(len(beads), 3.0)]),
-        np.where(gone, -0.2 * layers, 0.0),
-        np.tile([0.0, 0.0, 1.0], (len(beads), 1)),
-        0.03,
+    top = top_of(np.where(gone, -0.2 * seen_layers, 0.0), beads[:, :2], 0.03)
+    flow = kinds._flow(top, job, stop.line, 0.2, USUAL_KINDS)
+    piece = Manifold.cube([3.0, 5.0, 0.2 * layers])
+    region = Region(
+        label=Label.MISSING, type=DefectType.CHIP, volume_mm3=piece.volume(), area_mm2=15.0,
+        depth_mm=0.2 * layers, box_mm=np.array([[0.0, 0.0, 0.0], [3.0, 5.0, 0.2 * layers]]),
+    )  # fmt: skip
+    found = kinds._of_region(
+        region, [piece], flow, job, stop.line, at_rim=True, layer_mm=0.2, options=USUAL_KINDS
     )
-    found = kinds._flow(top, job, stop.line, 0.2, USUAL_KINDS)
-    assert (found.type if found is not None else None) == kind
+    assert found.type is kind
 
 
 def short_top(beads: np.ndarray, gone: np.ndarray) -> kinds._Surface:
