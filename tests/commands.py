@@ -15,17 +15,18 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# Reads a call a line, and answers with how its process ended.
+# Reads a call a line, and answers with how its process ended; loads first what argv[1] says.
 SERVER = """
 import gc, importlib, json, os, signal, sys, warnings
-for name in ("amrepair.cli.app", "gcode.cli.app", "amrepair.repair", "amrepair.simulate"):
-    importlib.import_module(name)
+from os import fork  # which is gone where the system is to be like Windows
+from signal import alarm
+exec(sys.argv[1])
 gc.freeze()
 for line in sys.stdin:
     argv, environ, out, err, seconds, quiet = json.loads(line)
-    child = os.fork()
+    child = fork()
     if not child:
-        signal.alarm(seconds)
+        alarm(seconds)
         for path, number in ((os.devnull, 0), (out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_RDWR), number)
         os.environ.clear()
@@ -38,10 +39,17 @@ for line in sys.stdin:
 """
 
 
+LOADED = """
+for name in ("amrepair.cli.app", "gcode.cli.app", "amrepair.repair", "amrepair.simulate"):
+    importlib.import_module(name)
+"""
+LIKE_WINDOWS = "from tests import like_windows; like_windows.prepare()"
+
+
 @functools.cache
-def _server() -> subprocess.Popen[str]:
+def _server(first: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-c", SERVER],
+        [sys.executable, "-c", SERVER, first],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -50,13 +58,25 @@ def _server() -> subprocess.Popen[str]:
 
 
 def call(
-    *words: str | Path, program: str = "amrepair", seconds: int = 280, quiet: bool = False
+    *words: str | Path,
+    program: str = "amrepair",
+    seconds: int = 280,
+    quiet: bool = False,
+    windows: bool = False,
 ) -> subprocess.CompletedProcess[str]:
-    """Run `amrepair` or `gcode` from the repository's root; `quiet`: without Python's warnings.
+    """Run `amrepair` or `gcode` from the repository's root.
 
     One call at a time. A process that runs for more than so many seconds is killed: exit code −14.
+
+    Parameters
+    ----------
+    quiet
+        Without Python's warnings.
+    windows
+        Without what Python lacks on Windows (`tests/like_windows.py`).
     """
-    server, argv = _server(), [program, *map(str, words)]
+    server = _server(LIKE_WINDOWS if windows else LOADED)
+    argv = [program, *map(str, words)]
     assert server.stdin is not None
     assert server.stdout is not None
     with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as err:

@@ -1,6 +1,6 @@
-"""Runs a command as if the system were Windows: without what Python has on others alone.
+"""A process as if the system were Windows: without what Python has on others alone.
 
-    python tests/like_windows.py gcode check job.gcode
+    python -m tests.like_windows gcode check job.gcode
 
 Libraries are loaded before, as they are; ours find no fcntl, termios or fork.
 """
@@ -55,8 +55,8 @@ def _msvcrt() -> ModuleType:
     return made
 
 
-def main() -> None:
-    """Take away what Windows lacks, then run the command."""
+def prepare() -> None:
+    """Take away what Windows lacks."""
     for name in LIBRARIES:
         importlib.import_module(name)
     sys.modules["msvcrt"] = _msvcrt()
@@ -71,9 +71,9 @@ def main() -> None:
         module = importlib.import_module(name)
         sys.platform = "linux"
         vars(module)["sys"] = SimpleNamespace(**{**vars(sys), "platform": "win32"})
-    sys.argv = sys.argv[1:]
-    importlib.import_module(f"{sys.argv[0]}.cli").main()
 
 
 if __name__ == "__main__":
-    main()
+    prepare()
+    sys.argv = sys.argv[1:]
+    importlib.import_module(f"{sys.argv[0]}.cli").main()

@@ -3,59 +3,48 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from gcode.process import one_thread
+from tests.commands import call
 
 ROOT = Path(__file__).parents[2]
-LIKE_WINDOWS = ROOT / "tests" / "like_windows.py"
 KNOB = ROOT / "examples" / "parts" / "knob.stl"
-
-
-def like_windows(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "ignore", str(LIKE_WINDOWS), *map(str, words)]
-    # the libraries are loaded before a batch says how many threads they have
-    environ = {**os.environ, "PYTHONPATH": str(ROOT), **one_thread()}
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=280, check=False, env=environ
-    )
+like_windows = partial(call, windows=True, quiet=True)
 
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("windows") / "job.gcode"
-    done = like_windows("gcode", "slice", KNOB, "--process", "repair_0.30", "-o", path)
+    done = like_windows("slice", KNOB, "--process", "repair_0.30", "-o", path, program="gcode")
     assert done.returncode == 0, done.stderr
     return path
 
 
 def test_a_job_is_written_to_a_file(job: Path, tmp_path: Path) -> None:
-    done = like_windows("gcode", "send", job, "--port", f"file:{tmp_path / 'sent.gcode'}")
+    done = like_windows("send", job, "--port", f"file:{tmp_path / 'sent.gcode'}", program="gcode")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "sent.gcode").read_text().rstrip() == job.read_text().rstrip()
 
 
 def test_a_slicer_may_call_the_postprocessor(job: Path) -> None:
-    done = like_windows("amrepair", "postprocess", "--every", "20", job)
+    done = like_windows("postprocess", "--every", "20", job)
     assert done.returncode == 0, done.stderr
     assert "\nM601\n" in job.read_text()  # the printer's own pause
 
 
 def test_a_cable_is_refused_in_one_sentence(job: Path) -> None:
-    done = like_windows("gcode", "send", job, "--port", "COM3")
+    done = like_windows("send", job, "--port", "COM3", program="gcode")
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith("gcode: 'COM3' is a printer on a cable")
 
 
 def test_an_emulated_printer_is_refused_in_one_sentence() -> None:
-    done = like_windows("gcode", "emulate")
+    done = like_windows("emulate", program="gcode")
     assert done.returncode == 2
     assert done.stderr.strip() == (
         "gcode: an emulated printer needs a pseudo-terminal, which Linux and macOS have; on "
@@ -71,7 +60,7 @@ def test_a_folder_of_scans_is_judged(tmp_path: Path) -> None:
     points, _ = trimesh.sample.sample_surface(mesh, 3000, seed=0)
     np.savetxt(tmp_path / "scans" / "one.xyz", points, fmt="%.4f")
     done = like_windows(
-        *("amrepair", "batch", "align", tmp_path / "scans", "--template", tmp_path / "ball.stl"),
+        *("batch", "align", tmp_path / "scans", "--template", tmp_path / "ball.stl"),
         *("--out", tmp_path / "out", "--executor", "serial"),
     )
     assert done.returncode == 0, done.stderr
