@@ -161,6 +161,11 @@ def in_box(
     return inside
 
 
+def boxes_meet(one: Float[np.ndarray, "2 3"], other: Float[np.ndarray, "2 3"]) -> bool:
+    """Whether two boxes, lowest and highest corner each, have a place in common."""
+    return bool((one[0] <= other[1]).all() and (other[0] <= one[1]).all())
+
+
 def unit_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """The same directions, one long; zero stays zero."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))

@@ -14,7 +14,7 @@ from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.deficit.options import DeficitOptions
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
-from amrepair.frames import cells_of, diagonal
+from amrepair.frames import box_of, boxes_meet, cells_of, diagonal
 from amrepair.regions import AnomalyMap, Label
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.template.port import Template
@@ -26,8 +26,6 @@ class Sought:
 
     Attributes
     ----------
-    tau_mm
-        What is no farther from the template counts only by its label.
     gone
         Lines of the job that are not there; None where there are none, and for excess.
     """
@@ -36,9 +34,13 @@ class Sought:
     evidence: Evidence
     anomaly: AnomalyMap
     label: Label
-    tau_mm: float
     gone: PlannedBeads | None
     options: DeficitOptions
+
+    @property
+    def tau_mm(self) -> float:
+        """What is no farther from the template counts only by its label."""
+        return self.anomaly.threshold_mm
 
     @property
     def is_excess(self) -> bool:
@@ -96,28 +98,20 @@ class Sought:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """Corners (3,) each, and how thick what lies in it is."""
+    """(2, 3) its lowest and highest corner, and how thick what lies in it is."""
 
-    low_mm: Float[np.ndarray, " 3"]
-    high_mm: Float[np.ndarray, " 3"]
+    corners_mm: Float[np.ndarray, "2 3"]
     depth_mm: float
 
     @classmethod
     def around(cls, places_mm: Points, margin_mm: float, depth_mm: float) -> Box:
         """With a margin."""
-        return cls(places_mm.min(axis=0) - margin_mm, places_mm.max(axis=0) + margin_mm, depth_mm)
-
-    def overlaps(self, other: Box) -> bool:
-        """Whether two boxes have a place in common."""
-        return bool((self.low_mm <= other.high_mm).all() and (other.low_mm <= self.high_mm).all())
+        return cls(box_of(places_mm) + margin_mm * np.array([[-1.0], [1.0]]), depth_mm)
 
     def joined(self, other: Box) -> Box:
         """One around both, as fine as the finer of them needs."""
-        return Box(
-            np.minimum(self.low_mm, other.low_mm),
-            np.maximum(self.high_mm, other.high_mm),
-            min(self.depth_mm, other.depth_mm),
-        )
+        both_mm = np.concatenate([self.corners_mm, other.corners_mm])
+        return Box(box_of(both_mm), min(self.depth_mm, other.depth_mm))
 
 
 def boxes_of(sought: Sought) -> list[Box]:
@@ -193,7 +187,7 @@ def _merged(boxes: list[Box]) -> list[Box]:
     apart: list[Box] = []
     for box in boxes:
         whole = box
-        while beside := [other for other in apart if other.overlaps(whole)]:
+        while beside := [b for b in apart if boxes_meet(b.corners_mm, whole.corners_mm)]:
             apart.remove(beside[0])
             whole = whole.joined(beside[0])
         apart.append(whole)

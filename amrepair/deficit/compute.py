@@ -22,16 +22,10 @@ from amrepair.deficit.boxes import Sought
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.options import USUAL_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
-from amrepair.deficit.walls import (
-    with_even_crests,
-    with_rising_rims,
-    with_sharp_walls,
-    with_whole_rims,
-)
-from amrepair.errors import DeficitError
+from amrepair.deficit.walls import with_rims, with_sharp_walls
 from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.field.groups import area_per_point
-from amrepair.frames import Transform, in_box
+from amrepair.frames import Transform, box_of, boxes_meet, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
 from amrepair.regions.regions import classify
@@ -133,7 +127,6 @@ def compute_deficit(
     anomaly: AnomalyMap | None = None,
     *,
     build_from_template: Transform,
-    tolerance_mm: float | None = None,
     printed_z_mm: float | None = None,
     as_built: AsBuilt | None = None,
     beads: PlannedBeads | None = None,
@@ -150,8 +143,6 @@ def compute_deficit(
         What `detect` said about this scan; None runs it with its defaults.
     build_from_template
         Where the part stands on the bed.
-    tolerance_mm
-        τ; None takes the detection's threshold.
     printed_z_mm
         Height printed so far, build frame; None is the template's own top.
     as_built
@@ -169,9 +160,6 @@ def compute_deficit(
     """
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
-    tau_mm = anomaly.threshold_mm if tolerance_mm is None else tolerance_mm
-    if not tau_mm >= 0:
-        raise DeficitError(f"the tolerance is {tau_mm} mm; it must be ≥ 0")
     evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
     look = as_built.seen if as_built is not None else partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
@@ -179,7 +167,7 @@ def compute_deficit(
         options=options.heights,
     )  # fmt: skip
     sought = [
-        Sought(template, evidence, anomaly, label, tau_mm, gone, options)
+        Sought(template, evidence, anomaly, label, gone, options)
         for label, gone in ((Label.MISSING, lines), (Label.EXCESS, None))
     ]
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
@@ -204,7 +192,7 @@ def compute_deficit(
         missing=missing,
         excess=excess,
         regions=tuple(sorted(regions, key=lambda r: (int(r.label), -r.volume_mm3))),
-        tolerance_mm=tau_mm,
+        tolerance_mm=anomaly.threshold_mm,
         unseen_area_mm2=_unseen_area(anomaly),
         stands=Standing(stands),
         gone=lines,
@@ -221,15 +209,12 @@ def _evidence_of(
 ) -> tuple[Evidence, PlannedBeads | None]:
     """What is known of space, also around lines of the job that are gone; and those lines."""
     evidence = anomaly.evidence
-    if evidence is None:
-        raise DeficitError("the anomaly map carries no evidence; run detect on the scan first")
+    assert evidence is not None
     lines = None if beads is None else skipped(beads, evidence, template, options)
-    if lines is not None and not len(lines.width_mm):
-        lines = None
-    if lines is not None:
-        labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
-        evidence = with_stubs(evidence, scan, lines.samples_mm(options.look_step_mm), labelled)
-    return evidence, lines
+    if lines is None or not len(lines.width_mm):
+        return evidence, None
+    labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
+    return with_stubs(evidence, scan, lines.samples_mm(options.look_step_mm), labelled), lines
 
 
 def _in_build_frame(
@@ -254,14 +239,10 @@ def _standing(
     designed: Any = template.solid()
     expected = designed.transform(build_from_template.matrix[:3])
     solid, lost_mm, designed_mm = standing_heights(seen, expected, missing, excess, options.heights)
-    points_mm = build_from_template.apply(scan.points_mm)
+    points_mm, spacing_mm = build_from_template.apply(scan.points_mm), evidence.spacing_mm
     sharp = with_sharp_walls(solid, lost_mm > 0, points_mm, scan.sigma_mm, options.walls)
-    known = with_what_stands_out(
-        sharp, points_mm, scan.sigma_mm, evidence.spacing_mm, options.heights
-    )
-    even = with_even_crests(known, lost_mm, designed_mm, options.walls)
-    rising = with_rising_rims(even, lost_mm, designed_mm, evidence.spacing_mm, options.walls)
-    return with_whole_rims(rising, lost_mm, designed_mm, options.walls)
+    known = with_what_stands_out(sharp, points_mm, scan.sigma_mm, spacing_mm, options.heights)
+    return with_rims(known, lost_mm, designed_mm, spacing_mm, options.walls)
 
 
 def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...]:
@@ -275,15 +256,13 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
     deficit
         Of the same anomaly, with a build frame that is the template's.
     """
-
-    def touch(a: Region, b: Region) -> bool:
-        return a.label is b.label and bool(
-            (a.box_mm[0] <= b.box_mm[1]).all() and (b.box_mm[0] <= a.box_mm[1]).all()
-        )
-
     pieces: dict[int, list[Region]] = {k: [] for k in range(-1, len(anomaly.regions))}
     for piece in deficit.regions:
-        near = [k for k, region in enumerate(anomaly.regions) if touch(region, piece)]
+        near = [
+            k
+            for k, region in enumerate(anomaly.regions)
+            if region.label is piece.label and boxes_meet(region.box_mm, piece.box_mm)
+        ]
         off_mm = [np.abs(anomaly.regions[k].box_mm - piece.box_mm).max() for k in near]
         pieces[near[int(np.argmin(off_mm))] if near else -1].append(piece)
     found = pieces[-1]
@@ -292,13 +271,12 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
         if not own:
             found.append(region)
             continue
-        boxes = np.array([piece.box_mm for piece in own])
         found.append(
             replace(
                 own[0],
                 volume_mm3=sum(piece.volume_mm3 for piece in own),
                 area_mm2=sum(piece.area_mm2 for piece in own),
-                box_mm=np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]),
+                box_mm=box_of(np.concatenate([piece.box_mm for piece in own])),
                 depth_mm=region.depth_mm,
                 p_value=region.p_value,
             )
@@ -320,15 +298,14 @@ def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Tra
     volume = float(piece.volume())
     area = float(piece.surface_area()) / 2
     depth = min(float(np.ptp(bounds, axis=0).min()), 2 * volume / max(area, 1e-9))
-    kind = classify(label, depth_mm=depth, area_mm2=area, box_mm=bounds, template=template)
     moved = piece.transform(build_from_template.matrix[:3])
     return Region(
-        label=label,
-        type=kind,
-        volume_mm3=volume,
-        area_mm2=area,
-        depth_mm=depth,
-        box_mm=np.asarray(moved.bounding_box()).reshape(2, 3),
+        label,
+        classify(label, depth, area, bounds, template),
+        volume,
+        area,
+        depth,
+        np.asarray(moved.bounding_box()).reshape(2, 3),
         below_bead=volume < sought.options.bead_mm3,
         skipped=_is_skipped(bounds, sought.gone),
     )

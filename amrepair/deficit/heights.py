@@ -7,17 +7,17 @@ part stands as it was designed, and that margin; where it was designed open, not
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 from scipy import ndimage
 
 from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points, Values
-from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
 from amrepair.field.near import has_near
@@ -29,6 +29,8 @@ from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
 AROUND_CELL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
+# Ways to the columns about a point; most points lie on their own, and are asked no more.
+OWN_COLUMN_FIRST = sorted(itertools.product((-1.0, 0.0, 1.0), repeat=2), key=np.linalg.norm)
 
 
 def as_built_heights(
@@ -130,7 +132,7 @@ def standing_heights(
     """
     fine = fine_over(seen, options)
     ny, nx = fine.shape
-    whole, lost = (columns_of(solid, fine) for solid in (expected, missing))
+    whole, lost = (columns_of(solid, fine)[:2] for solid in (expected, missing))
     z_mm = raster_kernels.column_rest(*whole, *lost, options.film_mm, 0.0).reshape(ny, nx)
     at = cells_over(seen, fine)
     # a film that the scan sees, around there too, is what is left of the part
@@ -212,10 +214,8 @@ def cells_over(
     coarse: HeightField, fine: HeightField
 ) -> tuple[Int[np.ndarray, "ny 1"], Int[np.ndarray, "1 nx"]]:
     """Indices of the coarse field's cells under every cell of the fine one."""
-    x, y = fine.centres_mm()
     ny, nx = coarse.shape
-    iy = np.floor((y - coarse.origin_mm[1]) / coarse.cell_mm).astype(np.int64)
-    ix = np.floor((x - coarse.origin_mm[0]) / coarse.cell_mm).astype(np.int64)
+    iy, ix = coarse.rows_and_columns_of(fine)
     return np.clip(iy, 0, ny - 1)[:, None], np.clip(ix, 0, nx - 1)[None, :]
 
 
@@ -241,9 +241,9 @@ def with_what_stands_out(
         Mean distance between neighbouring points.
     """
     off_mm = options.off_sigma * sigma_mm
-    points_mm = np.ascontiguousarray(points_mm)
-    higher = kernels.standing_out(points_mm, field.z_mm, field.origin_mm, field.cell_mm, off_mm)
-    out = points_mm[higher]
+    out = points_mm
+    for way in OWN_COLUMN_FIRST:
+        out = out[out[:, 2] - off_mm > field.sample(out[:, :2] + off_mm * np.array(way))]
     if len(out) == 0:
         return field
     # itself is one of them
@@ -293,7 +293,7 @@ def without_missing(
     """
     if missing.is_empty():
         return seen
-    offset, z = columns_of(missing, seen)
+    offset, z, _ = columns_of(missing, seen)
     high_mm, low_mm = (
         sign * raster_kernels.column_top(offset, sign * z, -np.inf).reshape(seen.shape)
         for sign in (1.0, -1.0)
@@ -304,20 +304,12 @@ def without_missing(
 
 def columns_of(
     solid: manifold3d.Manifold, field: HeightField
-) -> tuple[Numbers, Float[np.ndarray, " crossings"]]:
-    """Crossings of a solid with the field's columns: where each column's begin, and heights."""
-    vertices, faces = mesh_of(solid)
+) -> tuple[Numbers, Float[np.ndarray, " crossings"], Num[np.ndarray, " crossings"]]:
+    """Crossings of a solid with the field's columns: where each column's begin; heights, ways."""
+    x, y = field.origin_mm.tolist()
     ny, nx = field.shape
-    offset, z, _ = raster_kernels.column_crossings(
-        vertices,
-        faces,
-        float(field.origin_mm[0]),
-        float(field.origin_mm[1]),
-        field.cell_mm,
-        nx,
-        ny,
-    )
-    return offset, z
+    offset, *crossed = raster_kernels.column_crossings(*mesh_of(solid), x, y, field.cell_mm, nx, ny)
+    return offset, *crossed
 
 
 def _tops(
@@ -364,16 +356,13 @@ def _close_gaps(
     the last of them.
     """
     groups, count = ndimage.label(~seen, structure=np.ones((3, 3)))
-    if count == 0:
-        return z_mm, seen
     size = np.bincount(groups.ravel(), minlength=count + 1)
     small = (size <= max(1, int(options.gap_mm2 / cell_mm**2)))[groups] & ~seen
     z_mm, known = z_mm.copy(), seen.copy()
-    while (small & ~known).any():  # from the rim in: a gap of a few cells has no more of them
+    while True:  # from the rim in: a gap of a few cells has no more of them
         highest = ndimage.maximum_filter(np.where(known, z_mm, -np.inf), 3)
         new = small & ~known & np.isfinite(highest)
         if not new.any():
-            break
+            return z_mm, known
         z_mm[new] = highest[new]
         known |= new
-    return z_mm, known

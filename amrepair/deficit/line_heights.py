@@ -16,13 +16,13 @@ from amrepair.deficit.heights import (
     around_walls,
     beside_walls,
     cells_over,
+    columns_of,
     fine_over,
     with_what_stands_out,
     without_missing,
 )
 from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.scans import Scan
-from gcode.meshes import mesh_of
 from gcode.slicing.job_lines import SAME_LEVEL_MM, JobLines
 from gcode.surfaces import HeightField, raster_kernels
 
@@ -133,8 +133,7 @@ def _planned(
     low_mm = float(missing.bounding_box()[2])
     (x0, y0, x1, y1), high_mm = near.box_mm, float(lines.end_mm[:, 2].max())
     lines = lines.near(np.array([x0, y0, -np.inf]), np.array([x1, y1, high_mm]))
-    vertices, faces = mesh_of(missing)
-    offsets, z, up = raster_kernels.column_crossings(vertices, faces, x0, y0, near.cell_mm, nx, ny)
+    offsets, z, up = columns_of(missing, near)
     column = np.repeat(np.arange(nx * ny), np.diff(offsets))
 
     def lost_below(level_mm: float) -> HeightMap:

@@ -9,7 +9,7 @@ from amrepair.regions.options import SkippedOptions
 
 @dataclass(frozen=True, slots=True)
 class VoxelOptions:
-    """Grids of distances around defects, and where they lie.
+    """Grids of distances around defects, where they lie, and which solids are made on them.
 
     Attributes
     ----------
@@ -26,6 +26,10 @@ class VoxelOptions:
         first, on a surface this even, this large, and facing out of the template by this cosine.
     path_step_mm
         Along ways from a void's floor to its mouth.
+    sliver_ratio
+        Under a layer's top, of the limit: what the surfel nearest to it is labelled for is missing.
+    crumb_mm3
+        Smaller pieces are what marching cubes makes of noise at a rim.
     """
 
     most: int = 1_000_000
@@ -39,20 +43,6 @@ class VoxelOptions:
     least_film_mm2: float = 5.0
     facing: float = 0.5
     path_step_mm: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class SolidOptions:
-    """Erode by the tolerance τ, subtract what stands, grow back.
-
-    Attributes
-    ----------
-    sliver_ratio
-        Under a layer's top, of the limit: what the surfel nearest to it is labelled for is missing.
-    crumb_mm3
-        Smaller pieces are what marching cubes makes of noise at a rim.
-    """
-
     sliver_ratio: float = 0.25
     crumb_mm3: float = 0.02
 
@@ -186,7 +176,7 @@ class DeficitOptions:
         One bead of 0.45 × 0.2 mm as long as two nozzle widths: less cannot be placed.
     early_mm3
         From so much on heights will be asked for: what a clean layer's crumbs never are.
-    skipped, voxels, solids, heights, walls
+    skipped, voxels, heights, walls
         Of each stage.
     """
 
@@ -194,7 +184,6 @@ class DeficitOptions:
     early_mm3: float = 0.5
     skipped: SkippedOptions = field(default_factory=SkippedOptions)
     voxels: VoxelOptions = field(default_factory=VoxelOptions)
-    solids: SolidOptions = field(default_factory=SolidOptions)
     heights: HeightOptions = field(default_factory=HeightOptions)
     walls: WallOptions = field(default_factory=WallOptions)
 

@@ -30,7 +30,7 @@ def pieces_of(sought: Sought, progress: Progress) -> list[manifold3d.Manifold]:
         found += [
             piece
             for piece in _solid_in_box(sought, box).decompose()
-            if piece.volume() >= sought.options.solids.crumb_mm3
+            if piece.volume() >= sought.options.voxels.crumb_mm3
         ]
     return found
 
@@ -38,12 +38,12 @@ def pieces_of(sought: Sought, progress: Progress) -> list[manifold3d.Manifold]:
 def _solid_in_box(sought: Sought, place: Box) -> manifold3d.Manifold:
     """Erode, subtract, grow back, clip: all on one grid of signed distances."""
     s, template = sought.evidence.surfels, sought.template
-    inside = in_box(s.place_mm, place.low_mm, place.high_mm) & sought.labelled
+    inside = in_box(s.place_mm, *place.corners_mm) & sought.labelled
     ways = np.abs(sought.evidence.normal[inside]).sum(axis=0)
     finest_mm = 2 * float(getattr(template, "voxel_mm", np.inf))  # of beads: two layers
     depth_mm = min(place.depth_mm, finest_mm)
     box = VoxelBox.around(
-        place.low_mm, place.high_mm, thickness_mm=depth_mm,
+        *place.corners_mm, thickness_mm=depth_mm,
         across=int(np.argmax(ways)) if inside.any() else 2, options=sought.options.voxels,
     )  # fmt: skip
     samples = box.samples_mm()
@@ -113,7 +113,7 @@ def _limits(
     if anomaly.top_z_mm is not None and not sought.is_excess:
         under = np.abs(f_mm - (samples_mm[:, 2] - anomaly.top_z_mm)) < ON_PLANE_MM
         limit_mm[under] = min(tau_mm, anomaly.top_threshold_mm)
-        sliver_mm = sought.options.solids.sliver_ratio * limit_mm[under]
+        sliver_mm = sought.options.voxels.sliver_ratio * limit_mm[under]
         thin_mm[under] = np.minimum(thin_mm[under], sliver_mm)
     return limit_mm, thin_mm
 
@@ -154,8 +154,6 @@ def _hangs_free(wanted: VoxelMask, may_be_gone: VoxelMask, gone: VoxelMask) -> V
     The roof of a hollow, an edge: thinner than what the erosion leaves, so no growing gets there.
     """
     groups, count = ndimage.label(wanted & ~gone)
-    if count == 0:
-        return np.zeros_like(gone)
     held = np.bincount(groups[~may_be_gone], minlength=count + 1) > 0
     beside = np.bincount(groups[ndimage.binary_dilation(gone)], minlength=count + 1) > 0
     for axis in range(3):

@@ -14,6 +14,7 @@ from skimage import measure
 from amrepair.arrays import Points, VoxelMask, Voxels
 from amrepair.deficit.options import USUAL_DEFICIT, VoxelOptions
 from amrepair.errors import DeficitError
+from gcode.solids import as_manifold, is_valid
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,28 +95,12 @@ def solid_from_field(box: VoxelBox, field_mm: Voxels) -> manifold3d.Manifold:
     limit = float(box.step_mm.max()) * 4
     padded = np.pad(np.clip(field_mm, -limit, limit), 1, constant_values=limit)
     extract: Any = measure.marching_cubes
-    vertices, faces, _, _ = extract(padded, 0.0, spacing=tuple(box.step_mm))
-    vertices = vertices.astype(np.float64) + (box.low_mm - box.step_mm)
-    solid = _manifold(vertices, faces)
-    if solid.status() != manifold3d.Error.NoError:
-        vertices, faces, _, _ = extract(padded, 0.0, spacing=tuple(box.step_mm), method="lorensen")
-        solid = _manifold(vertices.astype(np.float64) + (box.low_mm - box.step_mm), faces)
-    if solid.status() != manifold3d.Error.NoError:
-        raise DeficitError(
-            f"the surface of a defect near {np.round(box.low_mm, 1).tolist()} mm is not a valid "
-            f"solid ({solid.status()}); scan again with finer spacing"
-        )
-    return solid if solid.volume() > 0 else solid.mirror((0, 0, 0))
-
-
-def _manifold(vertices: Points, faces: np.ndarray) -> manifold3d.Manifold:
-    """A solid from marching cubes' output, turned outward."""
-    corners = vertices[faces]
-    signed = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
-    if signed < 0:
-        faces = faces[:, ::-1]
-    return manifold3d.Manifold(
-        manifold3d.Mesh64(
-            np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.uint64)
-        )
+    for method in ("lewiner", "lorensen"):
+        vertices, faces, _, _ = extract(padded, 0.0, spacing=tuple(box.step_mm), method=method)
+        solid: manifold3d.Manifold = as_manifold(vertices + (box.low_mm - box.step_mm), faces)
+        if is_valid(solid):
+            return solid
+    raise DeficitError(
+        f"the surface of a defect near {np.round(box.low_mm, 1).tolist()} mm is not a valid solid; "
+        "scan again with finer spacing"
     )

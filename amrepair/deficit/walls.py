@@ -9,6 +9,7 @@ of the wall itself, column by column, knows better.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -54,61 +55,17 @@ def with_sharp_walls(
         options.below_top_sigma * sigma_mm, options.over_foot_sigma * sigma_mm,
         options.most_spread_sigma * sigma_mm, options.most_slant,
     )  # fmt: skip
-    return HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+    return replace(field, z_mm=z_mm)
 
 
-def with_even_crests(
-    field: HeightField,
-    lost_mm: HeightMap,
-    designed_mm: HeightMap,
-    options: WallOptions = USUAL_DEFICIT.walls,
-) -> HeightField:
-    """The as-built field, what is thinner than a bead beside what is missing as high as near by.
-
-    A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
-    what lies between two of its columns that were seen is no lower than the higher of them, and
-    where that is a little lower than designed, beside a steep face, it is as designed.
-
-    Parameters
-    ----------
-    lost_mm, designed_mm
-        How much is missing from each column, from end to end, and the top of what was expected.
-    """
-    gone = lost_mm > 0
-    if not gone.any():
-        return field
-    rows, columns = window_around(gone, options.crest_cells + options.beside_cells)
-    z_mm = np.array(field.z_mm, dtype=np.float64)
-    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
-    lost = lost_mm[rows, columns]
-    beside = ndimage.maximum_filter(gone[rows, columns], 2 * options.beside_cells + 1)
-    # where what is missing lies on what stands, not beside a wall that reads too far in
-    on = (lost > options.steep_mm) & (designed - lost < near + options.as_designed_mm)
-    foot_mm = ndimage.minimum_filter(np.where(on, near, np.inf), 2 * options.beside_cells + 1)
-    reach = 2 * options.crest_reach_cells + 1
-    # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
-    thick_mm = ndimage.maximum_filter(ndimage.grey_opening(near, options.crest_cells), reach)
-    crest = beside & (near - thick_mm > options.step_mm)
-    highest_mm = ndimage.maximum_filter(np.where(crest, near, -np.inf), reach)
-    # the tip of a worn edge falls off on its outside alone
-    cut = highest_mm - foot_mm > options.steep_mm
-    whole = cut & (designed > highest_mm) & (designed < highest_mm + options.splinter_mm)
-    near[crest] = np.where(whole, designed, highest_mm)[crest]
-    return field.raised(z_mm)
-
-
-def with_rising_rims(
+def with_rims(
     field: HeightField,
     lost_mm: HeightMap,
     designed_mm: HeightMap,
     spacing_mm: float,
     options: WallOptions = USUAL_DEFICIT.walls,
 ) -> HeightField:
-    """The as-built field, tops that rise towards an edge extended up to it, or to the template.
-
-    Solids round off a sharp rim: its last columns read as high as what lies some points farther in,
-    up to 0.3 mm too low for a worn edge that rises at 45°. A plane through what lies beyond their
-    rounding knows better.
+    """The as-built field, crests, tops and lips beside what is missing as high as they stand.
 
     Parameters
     ----------
@@ -117,59 +74,91 @@ def with_rising_rims(
     spacing_mm
         Mean distance between neighbouring points.
     """
-    deep = lost_mm > options.steep_mm
-    if not deep.any():
+    gone = lost_mm > 0
+    if not gone.any():
         return field
-    rounded = math.ceil(options.rounded_spacings * spacing_mm / field.cell_mm)
-    reach = rounded + math.ceil(options.sound_mm / field.cell_mm)
-    rows, columns = window_around(deep, reach + options.beside_cells)
-    z_mm = np.array(field.z_mm, dtype=np.float64)
-    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
-    beside = ndimage.maximum_filter(deep[rows, columns], 2 * options.beside_cells + 1)
-    edge = near - ndimage.minimum_filter(near, 3) > options.edge_mm
-    rim = ndimage.maximum_filter(edge, 2 * rounded + 1)
-    iy, ix = (rim & beside & (near < designed)).nonzero()
-    up_mm = kernels.extended(
-        near.copy(), iy, ix, ~rim, reach, options.least_sound, options.uneven_mm
+    rounded, sound = (
+        math.ceil(mm / field.cell_mm)
+        for mm in (options.rounded_spacings * spacing_mm, options.sound_mm)
     )
-    up_mm = np.minimum(up_mm, designed[iy, ix])
-    low_mm = near[iy, ix]
-    near[iy, ix] = np.where(up_mm - low_mm < options.rounded_mm, up_mm, low_mm)
-    return field.raised(z_mm)
+    window = window_around(gone, options.beside_cells + max(rounded + sound, options.crest_cells))
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    lost, designed = lost_mm[window], designed_mm[window]
+    even = even_crests(z_mm[window], lost, designed, options)
+    risen = rising_rims(even, lost, designed, rounded, rounded + sound, options)
+    z_mm[window] = whole_rims(risen, lost, designed, options)
+    return replace(field, z_mm=z_mm)
 
 
-def with_whole_rims(
-    field: HeightField,
+def even_crests(
+    z_mm: HeightMap, lost_mm: HeightMap, designed_mm: HeightMap, options: WallOptions
+) -> HeightMap:
+    """What is thinner than a bead beside what is missing as high as near by.
+
+    A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
+    what lies between two of its columns that were seen is no lower than the higher of them, and
+    where that is a little lower than designed, beside a steep face, it is as designed.
+    """
+    beside = ndimage.maximum_filter(lost_mm > 0, 2 * options.beside_cells + 1)
+    # where what is missing lies on what stands, not beside a wall that reads too far in
+    on = (lost_mm > options.steep_mm) & (designed_mm - lost_mm < z_mm + options.as_designed_mm)
+    foot_mm = ndimage.minimum_filter(np.where(on, z_mm, np.inf), 2 * options.beside_cells + 1)
+    reach = 2 * options.crest_reach_cells + 1
+    # nothing thick as high beside it: what a wall's foot is rounded off by is no crest
+    thick_mm = ndimage.maximum_filter(ndimage.grey_opening(z_mm, options.crest_cells), reach)
+    crest = beside & (z_mm - thick_mm > options.step_mm)
+    highest_mm = ndimage.maximum_filter(np.where(crest, z_mm, -np.inf), reach)
+    # the tip of a worn edge falls off on its outside alone
+    cut = highest_mm - foot_mm > options.steep_mm
+    whole = cut & (designed_mm > highest_mm) & (designed_mm < highest_mm + options.splinter_mm)
+    return np.where(crest, np.where(whole, designed_mm, highest_mm), z_mm)
+
+
+def rising_rims(
+    z_mm: HeightMap,
     lost_mm: HeightMap,
     designed_mm: HeightMap,
-    options: WallOptions = USUAL_DEFICIT.walls,
-) -> HeightField:
-    """The as-built field, tops beside a steep face of what is missing as designed up to the face.
+    rounded: int,
+    reach: int,
+    options: WallOptions,
+) -> HeightMap:
+    """Tops that rise towards an edge extended up to it, or to the template.
+
+    Solids round off a sharp rim: its last columns read as high as what lies some points farther in,
+    up to 0.3 mm too low for a worn edge that rises at 45°. A plane through what lies beyond their
+    rounding knows better: `rounded` columns are rounded off, and it goes through those within
+    `reach`.
+    """
+    deep = lost_mm > options.steep_mm
+    beside = ndimage.maximum_filter(deep, 2 * options.beside_cells + 1)
+    edge = z_mm - ndimage.minimum_filter(z_mm, 3) > options.edge_mm
+    rim = ndimage.maximum_filter(edge, 2 * rounded + 1)
+    at = (rim & beside & (z_mm < designed_mm)).nonzero()
+    up_mm = kernels.extended(z_mm, *at, ~rim, reach, options.least_sound, options.uneven_mm)
+    up_mm = np.minimum(up_mm, designed_mm[at])
+    risen_mm, low_mm = z_mm.copy(), z_mm[at]
+    believed = up_mm - low_mm < options.rounded_mm
+    risen_mm[at] = np.where(believed, np.maximum(up_mm, low_mm), low_mm)
+    return risen_mm
+
+
+def whole_rims(
+    z_mm: HeightMap, lost_mm: HeightMap, designed_mm: HeightMap, options: WallOptions
+) -> HeightMap:
+    """Tops beside a steep face of what is missing as designed up to the face.
 
     Solids round off such a lip by some tenths of a millimetre. Where a top is as designed up to a
     few columns from a face, and falls steeply there, it ends at the face and not before; what lies
     lower along a slope, as of a worn edge, is lower.
-
-    Parameters
-    ----------
-    lost_mm, designed_mm
-        How much is missing from each column, from end to end, and the top of what was expected.
     """
     deep = lost_mm > options.steep_mm  # beside a line that was skipped nothing stands as if cut
-    if not deep.any():
-        return field
-    rows, columns = window_around(deep, options.rounded_cells + options.beside_cells)
-    z_mm = np.array(field.z_mm, dtype=np.float64)
-    near, designed = z_mm[rows, columns], designed_mm[rows, columns]
-    deep, lost = deep[rows, columns], lost_mm[rows, columns] > 0
-    off_mm = designed - near
-    foot_mm = ndimage.minimum_filter(np.where(deep, near, np.inf), 2 * options.foot_cells + 1)
-    lip = designed - foot_mm > options.steep_mm
-    whole = (np.abs(off_mm) < options.as_designed_mm) & ~ndimage.maximum_filter(lost, 3)
+    off_mm = designed_mm - z_mm
+    foot_mm = ndimage.minimum_filter(np.where(deep, z_mm, np.inf), 2 * options.foot_cells + 1)
+    lip = designed_mm - foot_mm > options.steep_mm
+    whole = (np.abs(off_mm) < options.as_designed_mm) & ~ndimage.maximum_filter(lost_mm > 0, 3)
     lip &= ndimage.maximum_filter(whole, 2 * options.rounded_cells + 1)
     rounded = lip & (off_mm > 0) & (off_mm < options.rounded_mm)
-    near[rounded] = designed[rounded]
-    return field.raised(z_mm)
+    return np.where(rounded, designed_mm, z_mm)
 
 
 def window_around(gone: ColumnMask, margin: int) -> tuple[slice, slice]:

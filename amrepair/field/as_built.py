@@ -111,8 +111,6 @@ class Evidence:
     def surface_clearance(self, points_mm: Points, f_mm: Values) -> Values:
         """Signed distance to the scanned surface itself (no rays), positive outside."""
         s, options = self.surfels, self.options
-        if len(s) == 0:
-            return np.full(len(points_mm), SOLID_MM)
         planes = SurfacePlanes(s.place_mm, s.deviation_mm, self.off, self.normal, s.tree)
         near = planes.nearest(points_mm, f_mm, options.neighbours, s.cell_mm)
         # beside, not above: the nearest plane does not reach there
@@ -186,10 +184,9 @@ def _seen_from_within(
     A sheet that is left on the bed lies within noise of the template's underside, yet its upper
     side was seen from above: it faces the other way, and what lies over it is empty.
     """
-    found = np.zeros_like(off)
-    facing = surfels.toward_sensors(which := np.flatnonzero(~off), scan)
-    if facing is None:
-        return found
+    found, which = np.zeros_like(off), np.flatnonzero(~off)
+    facing = surfels.toward_sensors(which, scan)
+    assert facing is not None
     gradient, along = _beside_template(template, surfels, which)
     back = (unit_vectors(facing) * gradient).sum(axis=1) < options.back_cosine
     found[which] = (along > options.faces.strip_cosine) & back

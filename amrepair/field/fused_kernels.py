@@ -80,16 +80,7 @@ def cell_sums(of_point, points, origin, deviation, cells):
             continue
         x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
         f = deviation[p]
-        out[i, 0] += x
-        out[i, 1] += y
-        out[i, 2] += z
-        out[i, 3] += f
-        out[i, 4] += x * x
-        out[i, 5] += y * y
-        out[i, 6] += z * z
-        out[i, 7] += x * y
-        out[i, 8] += x * z
-        out[i, 9] += y * z
-        out[i, 10] += f * f
-        out[i, 11] += 1.0
+        told = (x, y, z, f, x * x, y * y, z * z, x * y, x * z, y * z, f * f, 1.0)
+        for c in range(12):
+            out[i, c] += told[c]
     return out

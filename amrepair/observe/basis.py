@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import helmert
 
 from amrepair.arrays import Points
-from amrepair.errors import InputError
 
 BOWS = ((0, 1), (0, 2), (1, 2))  # (along, towards): a long axis bends towards a shorter one
 SCALE_AT, BOW_AT, VIEWS_AT = 6, 7, 11  # pose 0:6, bends 7:10, twist 10, views from 11 on
@@ -51,14 +50,6 @@ class NuisanceOptions:
     told_sigma: float = 2.0
     support_p: float = 0.01
 
-    def __post_init__(self) -> None:
-        for name in (field.name for field in fields(self)):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} is {value}; it must be a finite number above zero")
-        if self.support_p >= 1:
-            raise InputError(f"support_p is {self.support_p}; a probability lies below one")
-
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -80,10 +71,7 @@ class Frame:
         extent_mm = (high - low) / (np.ptp(EXTENT_PERCENT) / 100)
         extent_mm = np.minimum(extent_mm, np.ptp(along, axis=0))
         order = np.argsort(-extent_mm, kind="stable")
-        frame = cls(centre_mm, axes[order], extent_mm[order] / 2)
-        for array in (frame.centre_mm, frame.axes, frame.half_extent_mm):
-            array.setflags(write=False)
-        return frame
+        return cls(centre_mm, axes[order], extent_mm[order] / 2)
 
 
 def shape_columns(place_mm: Points, normal: Points, frame: Frame) -> Float[np.ndarray, "n 11"]:

@@ -53,9 +53,8 @@ def gather(
     facing = np.argmax(np.abs(normal), axis=1)
     facing = facing + 3 * (normal[np.arange(len(normal)), facing] < 0)
     box = cells_of(place_mm, place_mm.min(axis=0), side_mm)
-    size = box.max(axis=0) + 1
-    key = ((box[:, 0] * size[1] + box[:, 1]) * size[2] + box[:, 2]) * 6 + facing
-    key = key * (int(view.max()) + 1) + view
+    sizes = (*(box.max(axis=0) + 1), 6, int(view.max()) + 1)
+    key = np.ravel_multi_index((*box.T, facing, view), sizes)
     order = np.lexsort((deviation_mm, key))
     key, weight = key[order], weight[order]
     first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])

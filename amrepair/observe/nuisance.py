@@ -135,11 +135,6 @@ class Nuisance:
         return told
 
     @property
-    def centre_mm(self) -> Float[np.ndarray, " 3"]:
-        """What rotation, scale and bow are about."""
-        return self.frame.centre_mm
-
-    @property
     def flatness_mm(self) -> float:
         """How far apart two planes are that hold the bow of the first two axes between them."""
         u, v = np.meshgrid(STATIONS, STATIONS)
@@ -147,22 +142,23 @@ class Nuisance:
         return float(np.ptp(along_mm))
 
     def _told_views(self) -> list[str]:
-        offset = self.view_offset_mm
-        limit_mm = self.options.told_sigma * self.options.view_offset_sigma_mm
-        told = []
-        common_limit_mm = self.options.told_sigma * self.options.common_offset_sigma_mm
-        if len(offset) and abs(offset.mean()) > common_limit_mm:
-            side = "outside" if offset.mean() > 0 else "inside"
-            whole = "All views lie" if len(offset) > 1 else "The view lies"
-            told.append(f"{whole} {abs(offset.mean()):.2f} mm {side} the template.")
-        if len(offset) == 2 and abs(offset[1] - offset[0]) > limit_mm:
-            side = "outside" if offset[1] > offset[0] else "inside"
-            told.append(f"View 2 lies {abs(offset[1] - offset[0]):.2f} mm {side} view 1.")
-        for k in range(len(offset) if len(offset) > 2 else 0):
-            off_mm = float(offset[k] - np.median(np.delete(offset, k)))
-            if abs(off_mm) > limit_mm:
+        offset, options = self.view_offset_mm, self.options
+        told: list[str] = []
+
+        def tell(lies: str, off_mm: float, prior_mm: float, beside: str) -> None:
+            if abs(off_mm) > options.told_sigma * prior_mm:
                 side = "outside" if off_mm > 0 else "inside"
-                told.append(f"View {k + 1} lies {abs(off_mm):.2f} mm {side} the others.")
+                told.append(f"{lies} {abs(off_mm):.2f} mm {side} {beside}.")
+
+        if len(offset):
+            whole = "All views lie" if len(offset) > 1 else "The view lies"
+            tell(whole, offset.mean(), options.common_offset_sigma_mm, "the template")
+        if len(offset) == 2:
+            tell("View 2 lies", offset[1] - offset[0], options.view_offset_sigma_mm, "view 1")
+        elif len(offset) > 2:
+            for k in range(len(offset)):
+                off_mm = offset[k] - np.median(np.delete(offset, k))
+                tell(f"View {k + 1} lies", off_mm, options.view_offset_sigma_mm, "the others")
         return told
 
     def to_json(self) -> dict[str, object]:
@@ -182,7 +178,7 @@ class Nuisance:
             "translation_mm": self.twist[:3].tolist(),
             "rotation_rad": self.twist[3:].tolist(),
             "pose_error": error[:SCALE_AT].tolist(),
-            "centre_mm": self.centre_mm.tolist(),
+            "centre_mm": self.frame.centre_mm.tolist(),
             "sigma_mm": self.sigma_mm,
             "supported": list(self.supported),
             "used_ratio": self.used_ratio,
@@ -212,7 +208,7 @@ def fit_nuisance(
     deviation_mm
         (s,) signed, positive outside.
     weight
-        (s,) how much each site is worth beside the others; sites of weight zero are left out.
+        (s,) how much each site is worth beside the others, above zero.
     view
         (s,) which view saw the site, from 0; None: offsets of views are not asked for.
     tolerance_mm
@@ -222,29 +218,21 @@ def fit_nuisance(
     options
         The priors.
 
-    Returns
-    -------
-    Nuisance
-        With every term zero where there are no sites.
-
     Raises
     ------
     InputError
-        If the arrays do not belong together or a number cannot be used.
+        If a sound part may not deviate at all.
     """
-    named = {"place": place_mm, "normal": normal, "deviation": deviation_mm, "weight": weight}
-    _refuse(named, view, tolerance_mm, correlation_mm)
-    views = 0 if view is None else int(view.max(initial=-1)) + 1
-    used = weight > 0
-    if not used.any():
-        return _nothing(views, options)
-    side_mm = max(correlation_mm, float(np.ptp(place_mm[used], axis=0).max()) / CELLS_ACROSS, 1e-9)
+    if not tolerance_mm > 0:
+        raise InputError(f"the tolerance is {tolerance_mm} mm; it must be above zero")
+    views = 0 if view is None else int(view.max()) + 1
+    side_mm = max(correlation_mm, float(np.ptp(place_mm, axis=0).max()) / CELLS_ACROSS, 1e-9)
     cells = gather(
-        place_mm[used],
-        normal[used],
-        deviation_mm[used],
-        weight[used],
-        np.zeros(int(used.sum()), np.int64) if view is None else view[used],
+        place_mm,
+        normal,
+        deviation_mm,
+        weight,
+        np.zeros(len(weight), np.int64) if view is None else view,
         side_mm=side_mm,
         correlation_mm=correlation_mm,
     )
@@ -254,14 +242,14 @@ def fit_nuisance(
     physical, terms = priors(frame.half_extent_mm, views, options)
     solution, kept, spread = _supported(columns @ physical, terms, cells, tolerance_mm, options)
     on = physical[:, kept]
-    value, cov = on @ solution.unknown, on @ spread @ on.T
+    value = on @ solution.unknown
     return Nuisance(
         frame,
-        twist=_fixed(value[:SCALE_AT]),
+        twist=value[:SCALE_AT],
         scale_ratio=float(value[SCALE_AT]),
-        bow_mm=_fixed(value[BOW_AT:VIEWS_AT]),
-        view_offset_mm=_fixed(value[VIEWS_AT:]),
-        covariance=_fixed(cov),
+        bow_mm=value[BOW_AT:VIEWS_AT],
+        view_offset_mm=value[VIEWS_AT:],
+        covariance=on @ spread @ on.T,
         sigma_mm=solution.sigma_mm,
         supported=tuple(name for name, at in terms.items() if name != "pose" and kept[at].all()),
         used_ratio=float(cells.share @ solution.weight / cells.share.sum()),
@@ -309,46 +297,3 @@ def _chance(value: Values, spread: Float[np.ndarray, "q q"], at: Numbers, spare:
     within = spread[np.ix_(at, at)]
     size = float(value @ np.linalg.solve(within, value)) / len(value)
     return float(f_distribution.sf(size, len(value), spare))
-
-
-def _fixed(array: np.ndarray) -> np.ndarray:
-    array = np.array(array, float)
-    array.setflags(write=False)
-    return array
-
-
-def _nothing(views: int, options: NuisanceOptions) -> Nuisance:
-    return Nuisance(
-        Frame(_fixed(np.zeros(3)), _fixed(np.eye(3)), _fixed(np.zeros(3))),
-        twist=_fixed(np.zeros(6)),
-        scale_ratio=0.0,
-        bow_mm=_fixed(np.zeros(4)),
-        view_offset_mm=_fixed(np.zeros(views)),
-        covariance=_fixed(np.zeros((VIEWS_AT + views,) * 2)),
-        sigma_mm=0.0,
-        supported=(),
-        used_ratio=0.0,
-        independent=0.0,
-        options=options,
-    )
-
-
-def _refuse(
-    named: dict[str, np.ndarray],
-    view: np.ndarray | None,
-    tolerance_mm: float,
-    correlation_mm: float,
-) -> None:
-    for name, array in named.items():
-        bad = int(np.size(array) - np.isfinite(array).sum())
-        if bad:
-            raise InputError(f"{bad} numbers of the {name}s are not finite; leave those sites out")
-    weight = named["weight"]
-    if len(weight) and weight.min() < 0:
-        raise InputError(f"a weight is {weight.min():.3g}; weights must not be negative")
-    if view is not None and len(view) and view.min() < 0:
-        raise InputError(f"a view is numbered {view.min()}; views count from 0")
-    if not (np.isfinite(tolerance_mm) and tolerance_mm > 0):
-        raise InputError(f"the tolerance is {tolerance_mm} mm; it must be above zero")
-    if not (np.isfinite(correlation_mm) and correlation_mm >= 0):
-        raise InputError(f"the correlation length is {correlation_mm} mm; it must not be negative")

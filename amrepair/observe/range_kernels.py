@@ -80,16 +80,11 @@ def close_pinholes(depth, least):
             n = 0
             for rr in range(max(r - 1, 0), min(r + 2, rows)):
                 for cc in range(max(c - 1, 0), min(c + 2, columns)):
-                    here = depth[rr, cc]
-                    if np.isfinite(here):  # as many as eight, put in their order
-                        k = n
-                        while k > 0 and seen[k - 1] > here:
-                            seen[k] = seen[k - 1]
-                            k -= 1
-                        seen[k] = here
+                    if np.isfinite(depth[rr, cc]):
+                        seen[n] = depth[rr, cc]
                         n += 1
             if n >= least:
-                out[r, c] = 0.5 * (seen[(n - 1) // 2] + seen[n // 2])
+                out[r, c] = np.median(seen[:n])
     return out
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Numbers, Points, Values
-from amrepair.frames import Transform, box_of, unit_vectors
+from amrepair.frames import Transform, box_of, unit_vectors, ways_across
 from amrepair.observe import range_kernels as kernels
 from amrepair.scans import Scan
 from gcode.compiled import get_num_threads
@@ -205,7 +205,5 @@ def _image_spacing(
 def _facing(forward: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """Rows right, up, forward of a view along `forward`."""
     forward = forward / np.linalg.norm(forward)
-    helper = np.eye(3)[int(np.argmin(np.abs(forward)))]
-    right = np.cross(helper, forward)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
+    left, down = ways_across(forward)
+    return np.stack([-left, -down, forward])

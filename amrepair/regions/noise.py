@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -57,14 +57,9 @@ class Noise:
 
     def to_json(self) -> dict[str, object]:
         """As results have it."""
-        return {
-            "sigma_mm": self.sigma_mm,
-            "tail_share": self.tail_share,
-            "correlation_mm": self.correlation_mm,
-            "view_disagreement_mm": self.view_disagreement_mm,
-            "smallest": [{"area_mm2": a, "depth_mm": d} for a, d in self.smallest_mm],
-            "source": self.source,
-        }
+        said = asdict(self)
+        said["smallest"] = [{"area_mm2": a, "depth_mm": d} for a, d in said.pop("smallest_mm")]
+        return said
 
 
 def noise_of(

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.as_built import Evidence
 from amrepair.field.groups import area_per_point, group_points, touching_mm
+from amrepair.frames import box_of
 from amrepair.regions.anomaly import DefectType, Label, Region
 from amrepair.regions.noise import Noise
 from amrepair.regions.significance import Level
@@ -90,23 +91,15 @@ def _region(
     template: Template,
 ) -> Region:
     """Size and type of one group."""
-    box = np.stack([points_mm.min(axis=0), points_mm.max(axis=0)])
+    box = box_of(points_mm)
     depth = float(np.abs(deviation_mm).max()) if len(deviation_mm) else float(np.ptp(box, 0).min())
     area = max(len(deviation_mm), 1) * cell_mm**2
     volume = float(np.abs(deviation_mm).sum()) * cell_mm**2
-    return Region(
-        label=label,
-        type=classify(label, depth_mm=depth, area_mm2=area, box_mm=box, template=template),
-        volume_mm3=volume,
-        area_mm2=area,
-        depth_mm=depth,
-        box_mm=box,
-    )
+    return Region(label, classify(label, depth, area, box, template), volume, area, depth, box)
 
 
 def classify(
     label: Label,
-    *,
     depth_mm: float,
     area_mm2: float,
     box_mm: Float[np.ndarray, "2 3"],

@@ -240,21 +240,15 @@ def _wall_shift(
     """
     s = evidence.surfels
     shift = np.zeros_like(middle_mm)
-    if not len(middle_mm):
-        return shift
-    low_mm = float(middle_mm[:, 2].max()) - options.below_line_mm
+    low_mm = float(middle_mm[:, 2].max(initial=-np.inf)) - options.below_line_mm
     which = np.flatnonzero(
         (s.place_mm[:, 2] < low_mm)
         & (s.place_mm[:, 2] > low_mm - options.wall_mm)
         & (np.abs(s.deviation_mm) < options.most_shift_mm)
     )
-    if not len(which):
-        return shift
     outward = unit_vectors(template.distance_and_gradient(s.place_mm[which])[1])
     wall = np.abs(outward[:, 2]) < options.upright_wall
     which, outward = which[wall], outward[wall, :2]
-    if not len(which):
-        return shift
     near = cKDTree(s.place_mm[which, :2]).query(
         middle_mm[:, :2], k=options.wall_cells, distance_upper_bound=options.beside_wall_mm
     )[1]
@@ -284,8 +278,6 @@ def _shares(
     """
     by_surface = np.full(len(middle_mm), -1.0)
     by_both = by_surface.copy()
-    if not len(ask):
-        return by_surface, by_both
     told_mm = evidence.clearance(middle_mm[ask], template.distance(middle_mm[ask]))[0]
     looked_into = told_mm > SOLID_MM + 1e-6
     known = ask[looked_into]
@@ -318,11 +310,9 @@ def _seen_below(
     the line is wide: farther down, slanting rays get in past its side.
     """
     found = np.zeros(len(middle_mm), dtype=np.int64)
-    if not len(middle_mm):
-        return found
     place_mm = evidence.surfels.place_mm
     low_mm = middle_mm[:, 2] - half_mm
-    place_mm = place_mm[place_mm[:, 2] > (low_mm - width_mm).min()]
+    place_mm = place_mm[place_mm[:, 2] > (low_mm - width_mm).min(initial=np.inf)]
     near = cKDTree(place_mm[:, :2]).query_ball_point(
         middle_mm[:, :2], options.under_share * width_mm
     )

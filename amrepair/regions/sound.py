@@ -170,9 +170,8 @@ class Seen:
         """Of points, (n, 3) template frame; `known` is None where one sound scan is alone."""
         f_mm, gradient = template.distance_and_gradient(points_mm)
         normals = unit_vectors(gradient)
-        if options.template_is_known:
-            looked = np.ones(len(f_mm), bool)
-        else:
+        looked = np.ones(len(f_mm), bool)
+        if not options.template_is_known:
             looked = _looked(points_mm, f_mm, normals, template, known)
         expected_mm = spread_mm = shared = np.zeros(len(f_mm))
         if known is not None:

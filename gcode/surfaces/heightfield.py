@@ -92,6 +92,17 @@ class HeightField:
         index = np.floor((xy_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
         return np.ascontiguousarray(index[:, ::-1])
 
+    def rows_and_columns_of(
+        self, other: HeightField
+    ) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " columns"]]:
+        """Rows and columns of this field that hold the middles of another's; may lie outside."""
+        x_mm, y_mm = other.centres_mm()
+        iy, ix = (
+            np.floor((mm - low_mm) / self.cell_mm).astype(np.int64)
+            for mm, low_mm in ((y_mm, self.origin_mm[1]), (x_mm, self.origin_mm[0]))
+        )
+        return iy, ix
+
     def sample(
         self, xy_mm: Float[np.ndarray, "n 2"], *, smooth: bool = False, outside_mm: float = 0.0
     ) -> Float[np.ndarray, " n"]:
@@ -218,9 +229,7 @@ class HeightField:
 
     def raised_by(self, other: HeightField) -> HeightField:
         """As high as another field's cells whose middles lie within its own, or higher."""
-        x_mm, y_mm = other.centres_mm()
-        ix = np.floor((x_mm - self.origin_mm[0]) / self.cell_mm).astype(np.int64)
-        iy = np.floor((y_mm - self.origin_mm[1]) / self.cell_mm).astype(np.int64)
+        iy, ix = self.rows_and_columns_of(other)
         ny, nx = self.shape
         rows, columns = (iy >= 0) & (iy < ny), (ix >= 0) & (ix < nx)
         z_mm = self.z_mm.astype(np.float64)

@@ -262,7 +262,7 @@ def test_a_larger_tolerance_finds_no_more() -> None:
     anomaly = detect(scan, BLOCK)
     volumes = [
         compute_deficit(
-            scan, BLOCK, anomaly, build_from_template=IN_PLACE, tolerance_mm=tau
+            scan, BLOCK, replace(anomaly, threshold_mm=tau), build_from_template=IN_PLACE
         ).missing_mm3
         for tau in (0.15, 0.3, 0.6)
     ]

@@ -9,12 +9,13 @@ import trimesh
 from scipy import ndimage
 
 from amrepair.deficit.heights import as_built_heights, columns_of
-from amrepair.deficit.options import HeightOptions
+from amrepair.deficit.options import HeightOptions, WallOptions
 from amrepair.deficit.walls import (
-    with_even_crests,
-    with_rising_rims,
+    even_crests,
+    rising_rims,
+    whole_rims,
+    with_rims,
     with_sharp_walls,
-    with_whole_rims,
 )
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -27,6 +28,7 @@ CELL_MM, SIGMA_MM, SPACING_MM = 0.1, 0.04, 0.2
 # A column whose middle is so near to a wall may go either way: three standard deviations of the
 # mean of some twenty points.
 UNDECIDED_MM = 0.03
+OPTIONS = WallOptions()
 
 
 def scanned(solid: manifold3d.Manifold, seed: int) -> np.ndarray:
@@ -40,7 +42,7 @@ def scanned(solid: manifold3d.Manifold, seed: int) -> np.ndarray:
 
 def gone_from(field: HeightField, piece: manifold3d.Manifold) -> np.ndarray:
     """Columns of a field that a piece lies over."""
-    offset, _ = columns_of(piece, field)
+    offset = columns_of(piece, field)[0]
     return np.asarray((offset[1:] != offset[:-1]).reshape(field.shape))
 
 
@@ -124,11 +126,16 @@ def test_a_crest_between_two_columns_that_were_seen_is_as_high_as_they() -> None
     assert 0 < fin.sum() < 3 * z_mm.shape[1]
     low = fin & (np.random.default_rng(3).random(z_mm.shape) < 0.3)
     z_mm[low] -= 0.8
-    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
     designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
-    even = with_even_crests(rough, np.where(gone_from(truth, piece), 2.0, 0.0), designed.z_mm)
-    assert (even.z_mm[fin] > 5.9).mean() > 0.99
-    assert (even.z_mm[~fin] == z_mm[~fin]).all()
+    lost_mm = np.where(gone_from(truth, piece), 2.0, 0.0)
+    even_mm = even_crests(z_mm, lost_mm, designed.z_mm, OPTIONS)
+    assert (even_mm[fin] > 5.9).mean() > 0.99
+    assert (even_mm[~fin] == z_mm[~fin]).all()
+    # of a whole field, of which the window beside what is missing is looked at
+    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
+    field = with_rims(rough, lost_mm, designed.z_mm, SPACING_MM)
+    assert (field.z_mm[fin] > 5.9).mean() > 0.99
+    assert with_rims(rough, 0.0 * lost_mm, designed.z_mm, SPACING_MM) is rough
 
 
 def test_a_splinter_a_little_lower_than_designed_is_as_designed() -> None:
@@ -142,16 +149,15 @@ def test_a_splinter_a_little_lower_than_designed_is_as_designed() -> None:
     crest = ((y > 15.0) & (y < 15.25))[:, None] & ((x > 8.0) & (x < 16.0))[None, :]
     z_mm = np.array(truth.z_mm, dtype=np.float64)
     z_mm[crest] -= np.random.default_rng(4).uniform(0.1, 0.45, int(crest.sum()))
-    low = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
-    even = with_even_crests(low, lost_mm, designed.z_mm)
+    even_mm = even_crests(z_mm, lost_mm, designed.z_mm, OPTIONS)
     assert crest.sum() > 100
-    assert np.abs(even.z_mm[crest] - 6.0).max() < 1e-6
+    assert np.abs(even_mm[crest] - 6.0).max() < 1e-6
     # beside a line that was skipped nothing was cut: an idler's was filled to 0.83 instead of 0.92
-    skipped = with_even_crests(low, np.minimum(lost_mm, 0.4), designed.z_mm)
-    assert skipped.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.95
+    skipped_mm = even_crests(z_mm, np.minimum(lost_mm, 0.4), designed.z_mm, OPTIONS)
+    assert skipped_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.95
     z_mm[crest] -= 1.0  # that is no rounding: it broke off lower
-    broken_off = with_even_crests(low, lost_mm, designed.z_mm)
-    assert broken_off.z_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.0
+    broken_off_mm = even_crests(z_mm, lost_mm, designed.z_mm, OPTIONS)
+    assert broken_off_mm[crest & (x > 8.5) & (x < 15.5)].max() < 5.0
 
 
 @pytest.mark.parametrize("rises_deg", [20.0, 40.0])
@@ -170,16 +176,15 @@ def test_a_worn_edge_rises_up_to_the_wall_behind_it(rises_deg: float) -> None:
     inside = ((y > 1.5) & (y < 18.5))[:, None] & (x < 24.0)[None, :]
     last = inside & (x > 23.7)[None, :]
     z_mm[last] -= np.broadcast_to((x - 23.65) * rise, z_mm.shape)[last]
-    rounded = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
     lost_mm = np.maximum(designed.z_mm - truth.z_mm, 0.0)
-    risen = with_rising_rims(rounded, lost_mm, designed.z_mm, SPACING_MM)
-    assert np.abs(risen.z_mm - truth.z_mm)[last].max() < 0.05
-    assert (risen.z_mm[~last] == z_mm[~last]).mean() > 0.95
-    assert (risen.z_mm >= z_mm).all()
+    risen_mm = rising_rims(z_mm, lost_mm, designed.z_mm, 4, 12, OPTIONS)
+    assert np.abs(risen_mm - truth.z_mm)[last].max() < 0.05
+    assert (risen_mm[~last] == z_mm[~last]).mean() > 0.95
+    assert (risen_mm >= z_mm).all()
     # nothing stands higher than designed
-    low = designed.z_mm - 0.02
-    held = with_rising_rims(rounded, lost_mm, np.minimum(low, truth.z_mm), SPACING_MM)
-    assert (held.z_mm <= np.maximum(np.minimum(low, truth.z_mm), z_mm)).all()
+    low_mm = np.minimum(designed.z_mm - 0.02, truth.z_mm)
+    held_mm = rising_rims(z_mm, lost_mm, low_mm, 4, 12, OPTIONS)
+    assert (held_mm <= np.maximum(low_mm, z_mm)).all()
 
 
 def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
@@ -188,12 +193,9 @@ def test_what_rounds_off_the_foot_of_a_thick_wall_is_no_crest() -> None:
     z_mm = np.array(truth.z_mm, dtype=np.float64)
     beside = (ndimage.maximum_filter(z_mm, 3) > 5.9) & (np.abs(z_mm - 4.0) < 0.1)
     z_mm[beside] += 0.9
-    rough = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
-    even = with_even_crests(
-        rough, np.where(gone_from(truth, piece), 2.0, 0.0), np.full(z_mm.shape, 6.0)
-    )
+    lost_mm = np.where(gone_from(truth, piece), 2.0, 0.0)
     assert beside.sum() > 300
-    assert (even.z_mm == z_mm).all()
+    assert (even_crests(z_mm, lost_mm, np.full(z_mm.shape, 6.0), OPTIONS) == z_mm).all()
 
 
 @pytest.mark.parametrize("turned", [0.0, 17.0])
@@ -211,11 +213,10 @@ def test_a_sloping_top_ends_at_a_steep_face_and_not_before(turned: float) -> Non
     assert lip.sum() > 300
     z_mm = np.array(truth.z_mm, dtype=np.float64)
     z_mm[lip] -= np.random.default_rng(5).uniform(0.1, 0.35, int(lip.sum()))
-    rounded = HeightField(truth.origin_mm, CELL_MM, z_mm, truth.seen)
     # the piece, rounded off as well, has the lip's columns, too
     lost_mm = np.where(gone | lip, np.maximum(designed.z_mm - truth.z_mm, 1.0), 0.0)
-    whole = with_whole_rims(rounded, lost_mm, designed.z_mm)
-    assert np.abs(whole.z_mm - truth.z_mm).max() < 1e-6
+    whole_mm = whole_rims(z_mm, lost_mm, designed.z_mm, OPTIONS)
+    assert np.abs(whole_mm - truth.z_mm).max() < 1e-6
 
 
 def test_a_worn_edge_is_no_lip() -> None:
@@ -224,12 +225,11 @@ def test_a_worn_edge_is_no_lip() -> None:
     tool = tool.rotate((0.0, 35.0, 0.0)).translate((21.037, 10.0, 5.0))
     truth = HeightField.from_manifold(block - tool, CELL_MM, margin_mm=1.0)
     designed = HeightField.from_manifold(block, CELL_MM, margin_mm=1.0)
-    noise = np.random.default_rng(6).normal(scale=0.05, size=truth.shape)
-    worn = HeightField(truth.origin_mm, CELL_MM, truth.z_mm + noise, truth.seen)
+    worn_mm = truth.z_mm + np.random.default_rng(6).normal(scale=0.05, size=truth.shape)
     gone = gone_from(truth, block ^ tool)
     assert gone.sum() > 5000
     lost_mm = np.where(gone, designed.z_mm - truth.z_mm, 0.0)
-    assert (with_whole_rims(worn, lost_mm, designed.z_mm).z_mm == worn.z_mm).all()
+    assert (whole_rims(worn_mm, lost_mm, designed.z_mm, OPTIONS) == worn_mm).all()
 
 
 def test_beside_a_skipped_line_nothing_stands_as_if_cut() -> None:
@@ -241,8 +241,7 @@ def test_beside_a_skipped_line_nothing_stands_as_if_cut() -> None:
     lost_mm = np.where(gone_from(designed, line), 0.4, 0.0)
     z_mm[lost_mm > 0] = 0.0  # as a wall that stands a column farther in reads
     z_mm[ndimage.maximum_filter(lost_mm, 5) > 0] -= 0.2
-    low = HeightField(designed.origin_mm, CELL_MM, z_mm, designed.seen)
-    assert (with_whole_rims(low, lost_mm, designed.z_mm).z_mm == z_mm).all()
+    assert (whole_rims(z_mm, lost_mm, designed.z_mm, OPTIONS) == z_mm).all()
 
 
 def test_cells_that_chance_left_empty_are_as_high_as_what_is_next_to_them() -> None:
