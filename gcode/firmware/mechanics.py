@@ -224,6 +224,10 @@ class Mechanics:
     def arc(self, rest: bytes, *, clockwise: bool) -> None:
         """Queue the chords of a G2 or G3."""
         words = words_of(rest)
+        if self.variant.family == "klipper" and ("R" in words or not self.absolute):
+            what = "R moves" if "R" in words else "relative move mode"
+            self.replies.append(f"!! G2/G3 does not support {what}")
+            return
         start = (self.x, self.y, self.z)
         target, de_mm = self.target_of(words)
         centre = _arc_centre(start, target, words, self.unit_mm, clockwise=clockwise)
