@@ -23,8 +23,8 @@ LIFT = (
 )
 QUESTIONS = 3
 _TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
-_REFUSED = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
-_STARTS = re.compile(rb"^ok T:0\r?$", re.MULTILINE)
+_KLIPPER_REFUSES = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
+_KLIPPER_STARTS = re.compile(rb"^ok T:0\r?$", re.MULTILINE)
 """What Klipper answers to M105 before it knows its heaters (gcode.py, cmd_default)."""
 STARTS_S = 20.0
 """So long a Klipper that starts anew may take to know them."""
@@ -61,7 +61,7 @@ def make_safe(port_fd: int, *, lift: bool = True) -> str:
             return "THE PORT IS GONE, HEATERS COULD NOT BE REACHED"
         ok, heard = wait(port_fd, PORT_ANSWERS_S if answered or said < 2 else SILENT_S)
         answered += ok
-        if command in HEATERS_OFF and (refused := _REFUSED.search(heard)):
+        if command in HEATERS_OFF and (refused := _KLIPPER_REFUSES.search(heard)):
             refusal = refused.group(1).decode("ascii", "replace")
     if not answered:
         return "heaters told to switch off, NO ANSWER"
@@ -92,7 +92,7 @@ def confirmed_off(port_fd: int) -> bool:
         targets = dict(_TARGET.findall(heard))
         if b"T" in targets:
             return all(float(value) == 0.0 for value in targets.values())
-        if starts := _STARTS.search(heard) is not None:
+        if starts := _KLIPPER_STARTS.search(heard) is not None:
             time.sleep(PORT_ANSWERS_S)
     return False
 
