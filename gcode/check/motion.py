@@ -18,6 +18,7 @@ from gcode.check.words import (
     GIVES_UP_UNHOMED,
     LENIENT_OF_MOVES,
     LINE_LIMIT,
+    NO_ARCS_AFTER_G91,
     NO_ARCS_BY_RADIUS,
 )
 from gcode.moves import ModalState, Program
@@ -289,6 +290,9 @@ class Motion:
         pushed = self._pushed(words)
         if None in here or None in target or (not self._absolute and "R" in words):
             self._refuse("arc from an unknown place", "G2/G3", "a known place")
+            return
+        if not self._absolute and self._dialect in NO_ARCS_AFTER_G91:
+            self._refuse("arc after G91", "G2/G3", "G90 before it")
             return
         if (words.get("P") or 0.0) > 1:  # OrcaSlicer's spiral hops have P1
             self._refuse("arc of several turns", f"P{words['P']:g}", "P1")

@@ -84,6 +84,8 @@ LENIENT_OF_MOVES = frozenset({"marlin", "prusa"})
 GIVES_UP_UNHOMED = frozenset({"klipper"})
 # Klipper's gcode_arcs.py: "G2/G3 does not support R moves"; the MK3's firmware reads I and J alone.
 NO_ARCS_BY_RADIUS = frozenset({"klipper", "prusa"})
+# "G2/G3 does not support relative move mode" (klippy/extras/gcode_arcs.py).
+NO_ARCS_AFTER_G91 = frozenset({"klipper"})
 # Klipper refuses G20 (klippy/extras/gcode_move.py), the MK3's firmware passes over it; both go on
 # in millimetres.
 NO_INCHES = frozenset({"klipper", "prusa"})

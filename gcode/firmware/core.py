@@ -99,7 +99,8 @@ class FirmwareCore:
         if self.wire is not None:
             data = self.wire.to_printer(bytes(self._rx).rpartition(b"\n")[2], data)
         self._rx += data
-        if self.variant.emergency_parser and self.machine.wait is not None:
+        heeds = self.variant.emergency_parser or self.variant.family == "klipper"
+        if heeds and self.machine.wait is not None:
             self._emergency()
 
     def run(self, limit_s: float = math.inf, wall_s: float = 0.0) -> None:
@@ -173,6 +174,8 @@ class FirmwareCore:
                 raw = changed
         command = raw.partition(b";")[0].strip()
         if not command:
+            if self.variant.family == "klipper":
+                self._empty()
             return
         if self.variant.family != "klipper" and len(command) >= MAX_CMD_SIZE:
             command = command[: MAX_CMD_SIZE - 1]  # cut silently, as the firmware does
@@ -183,6 +186,13 @@ class FirmwareCore:
         self._execute(checked, faults)
         if "corrupt_out" in faults and len(self._out) > before + 1:
             self._out[before:] = _flip(bytes(self._out[before:-1]), self._rng) + b"\n"
+
+    def _empty(self) -> None:
+        """Klipper acknowledges empty lines, too, and refuses them once it has shut down."""
+        if self.machine.shut_down:
+            self.machine.refuse_shut_down()
+            self._say_all()
+        self._say("ok")
 
     def _accept(self, command: bytes, faults: dict[str, Fault]) -> bytes | None:
         """The command freed of number and checksum; None if it is refused or dropped."""
@@ -294,8 +304,11 @@ class FirmwareCore:
             if command == b"M112":
                 self.machine.kill("")
                 self._say_all()
+                if self.machine.shut_down:
+                    faults, self._pending_ok = self._pending_ok, {}
+                    self._ok(faults)
                 return
-            if wait is None:
+            if wait is None or not self.variant.emergency_parser:
                 continue
             if command == b"M410":
                 self.machine.quick_stop()
@@ -340,7 +353,8 @@ class FirmwareCore:
         if "thermal_runaway" in faults:
             machine.kill("Thermal Runaway, system stopped! Heater_ID: E0")
             self._say_all()
-            return None
+            if not machine.shut_down:
+                return None
         if "runout" in faults:
             self._say("//action:notification Filament Runout")
             self._say("//action:paused filament_runout 0")

@@ -29,6 +29,9 @@ class Machine(Mechanics):
         name, _, rest = command.partition(b" ")
         if self.variant.family == "klipper":
             name = name.upper()
+            if self.shut_down and name not in _AFTER_SHUTDOWN:
+                self.refuse_shut_down()
+                return False
         handler = self._commands.get(name)
         if handler is None:
             match = re.match(rb"([GM])\s*0*(\d+)(?:\.\d+)?", command)
@@ -118,6 +121,9 @@ class Machine(Mechanics):
         """Firmware retraction, which this firmware is built without."""
 
     def _g20(self, rest: bytes) -> None:
+        if self.variant.family == "klipper":
+            self.replies.append("!! Machine does not support G20 (inches) command")
+            return
         self.unit_mm = 25.4
 
     def _g21(self, rest: bytes) -> None:
@@ -413,6 +419,8 @@ class Machine(Mechanics):
         self.wait_for(self.planner.drained_s(self.clock_s))
 
 
+_AFTER_SHUTDOWN = frozenset({b"M105", b"M112", b"M114", b"M115"})
+"""What a Klipper that has shut down still carries out."""
 _IGNORED = """
 G11 G17 G18 G19 G80 M17 M20 M21 M73 M75 M76 M77 M78 M81 M85 M86 M110 M111 M113
 M116 M119 M142 M200 M206 M207 M208 M209 M211 M250 M300 M301 M304 M412 M413 M420 M421

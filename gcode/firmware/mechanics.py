@@ -126,6 +126,7 @@ class Mechanics:
         self.min_extrude_c = self.profile.min_extrude_c
         self.may_extrude_cold = False
         self.killed = False
+        self.shut_down = ""  # why; a Klipper that has shut down still answers
         self.auto_temperature_s = self.auto_position_s = 0.0
         self.message = ""
         self.wait = None
@@ -223,6 +224,10 @@ class Mechanics:
     def arc(self, rest: bytes, *, clockwise: bool) -> None:
         """Queue the chords of a G2 or G3."""
         words = words_of(rest)
+        if self.variant.family == "klipper" and ("R" in words or not self.absolute):
+            what = "R moves" if "R" in words else "relative move mode"
+            self.replies.append(f"!! G2/G3 does not support {what}")
+            return
         start = (self.x, self.y, self.z)
         target, de_mm = self.target_of(words)
         centre = _arc_centre(start, target, words, self.unit_mm, clockwise=clockwise)
@@ -267,21 +272,37 @@ class Mechanics:
         )
 
     def kill(self, why: str) -> None:
-        """Stop for good: heaters off, queue dropped, deaf until a reset."""
+        """Stop for good: heaters off, queue dropped; deaf until a reset, unless it is Klipper."""
+        if self.shut_down:
+            return
         place = self.planner.stop(self.clock_s, self.clock_s)
         if place is not None:
             self.x, self.y, self.z = place
-        for heater in (self.hotend, self.bed):
-            heater.set_target(0.0, self.clock_s)
         self.fan_ratio = 0.0
         self.wait = None
         if self.variant.family == "klipper":
-            self.replies.append(f"!! Shutdown due to {why or 'M112 command'}")
-        else:
-            if why:
-                self.replies.append(f"{self.variant.error_prefix}{why}")
-            self.replies.append(f"{self.variant.error_prefix}Printer halted. kill() called!")
+            for heater in (self.hotend, self.bed):
+                heater.cut(self.clock_s)  # its boards do so; klippy goes on telling the target
+            self.shut_down = why or "Shutdown due to M112 command"
+            self.replies.append("// Klipper state: Shutdown")
+            return
+        for heater in (self.hotend, self.bed):
+            heater.set_target(0.0, self.clock_s)
+        if why:
+            self.replies.append(f"{self.variant.error_prefix}{why}")
+        self.replies.append(f"{self.variant.error_prefix}Printer halted. kill() called!")
         self.killed = True
+
+    def refuse_shut_down(self) -> None:
+        """What a Klipper that has shut down says to whatever it is told."""
+        self.replies += [
+            f"// {self.shut_down}",
+            "// Once the underlying issue is corrected, use the",
+            '// "FIRMWARE_RESTART" command to reset the firmware, reload the',
+            "// config, and restart the host software.",
+            "// Printer is shutdown",
+            f"!! {self.shut_down}",
+        ]
 
     def quick_stop(self) -> None:
         """Drop the queue (M410)."""

@@ -34,11 +34,11 @@ BED_HEATER = HeaterModel(full_c=145.0, heat_tau_s=300.0, cool_tau_s=700.0)
 class Heater:
     """One heater with its target, asked for its temperature at any later time."""
 
-    __slots__ = ("_from_c", "_from_s", "model", "target_c")
+    __slots__ = ("_aim_c", "_from_c", "_from_s", "model", "target_c")
 
     def __init__(self, model: HeaterModel) -> None:
         self.model = model
-        self.target_c = 0.0
+        self.target_c = self._aim_c = 0.0
         self._from_c = AMBIENT_C
         self._from_s = 0.0
 
@@ -46,21 +46,27 @@ class Heater:
         """Aim at `target_c` from `now_s` on; 0 is off."""
         self._from_c = self.temperature_c(now_s)
         self._from_s = now_s
-        self.target_c = target_c
+        self.target_c = self._aim_c = target_c
+
+    def cut(self, now_s: float) -> None:
+        """Heat no more, whatever the target that is told."""
+        told_c = self.target_c
+        self.set_target(0.0, now_s)
+        self.target_c = told_c
 
     def temperature_c(self, now_s: float) -> float:
         """Temperature at `now_s`."""
         elapsed_s = now_s - self._from_s
-        if self.target_c > self._from_c:
-            full_c = max(self.model.full_c, self.target_c + 20.0)
+        if self._aim_c > self._from_c:
+            full_c = max(self.model.full_c, self._aim_c + 20.0)
             heated_c = full_c - (full_c - self._from_c) * math.exp(
                 -elapsed_s / self.model.heat_tau_s
             )
-            return min(heated_c, self.target_c)
+            return min(heated_c, self._aim_c)
         cooled_c = AMBIENT_C + (self._from_c - AMBIENT_C) * math.exp(
             -elapsed_s / self.model.cool_tau_s
         )
-        return max(cooled_c, min(self.target_c, self._from_c))
+        return max(cooled_c, min(self._aim_c, self._from_c))
 
     def reached_s(self, *, cooling: bool) -> float:
         """When the target is reached; now, where M109 S need not wait for cooling."""

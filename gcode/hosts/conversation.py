@@ -261,6 +261,8 @@ class SerialConversation:
         with self._mutex:
             heard: list[ev.Event] = []
             while not self._link.ready:
+                if self._link.ended:  # it would not be ready ever again
+                    self._lost("it has ended")
                 heard += self._pump()
             if command in self._asked:
                 self._asked[command] += 1

@@ -138,9 +138,7 @@ class GuardedConversation(SerialConversation):
             return
         ours = self._mutex.acquire(timeout=REST_S)  # another thread may print
         try:
-            if ours and self._comes_to_rest():
-                self._switch_off()
-            else:
+            if not (ours and self._comes_to_rest() and self._switched_off()):
                 self._go_past()
         except (LinkError, LocalProtocolError, OSError) as error:
             self._told_safe(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
@@ -175,13 +173,17 @@ class GuardedConversation(SerialConversation):
             )
         self._told_safe(word)
 
-    def _switch_off(self) -> None:
+    def _switched_off(self) -> bool:
+        """Heaters off and nozzle lifted; False where the link ended over it."""
         try:
             self.heaters_off()
             self._lift()
             self._told_safe(f"{self._heaters_now()}, nozzle lifted")
         except JournalError:  # numbered lines must be written down first, these need not
             self._told_safe(make_safe(self._fd))
+        except LinkError:
+            return False
+        return True
 
     def _heaters_now(self) -> str:
         """What the printer says of its heaters; an `ok` alone confirms nothing."""

@@ -23,6 +23,11 @@ LIFT = (
 )
 QUESTIONS = 3
 _TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
+_KLIPPER_REFUSES = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
+_KLIPPER_STARTS = re.compile(rb"^ok T:0\r?$", re.MULTILINE)
+"""What Klipper answers to M105 before it knows its heaters (gcode.py, cmd_default)."""
+STARTS_S = 20.0
+"""So long a Klipper that starts anew may take to know them."""
 PORT_ANSWERS_S = 0.5
 SILENT_S = 0.1
 """The same for who has not answered so far: its receive buffer holds all that is said."""
@@ -46,7 +51,7 @@ def make_safe(port_fd: int, *, lift: bool = True) -> str:
     Heaters first; then, with `lift`, the nozzle away from the part; heaters again, because a line
     may have been lost.
     """
-    answered = 0
+    answered, refusal = 0, ""
     os.set_blocking(port_fd, False)  # the sender may have died while it waited in a read
     write(port_fd, b"\n")  # ends the half line that a killed sender may have left
     wait(port_fd, 0.05)
@@ -54,25 +59,41 @@ def make_safe(port_fd: int, *, lift: bool = True) -> str:
     for said, command in enumerate(commands):
         if not write(port_fd, command + b"\n"):
             return "THE PORT IS GONE, HEATERS COULD NOT BE REACHED"
-        answered += wait(port_fd, PORT_ANSWERS_S if answered or said < 2 else SILENT_S)[0]
+        ok, heard = wait(port_fd, PORT_ANSWERS_S if answered or said < 2 else SILENT_S)
+        answered += ok
+        if command in HEATERS_OFF and (refused := _KLIPPER_REFUSES.search(heard)):
+            refusal = refused.group(1).decode("ascii", "replace")
     if not answered:
         return "heaters told to switch off, NO ANSWER"
     if confirmed_off(port_fd):
-        return "heaters off (the printer reports targets of 0)" + ", nozzle lifted" * lift
+        return "heaters off (the printer reports targets of 0)" + ", nozzle lifted" * (
+            lift and not refusal
+        )
+    if refusal:
+        return (
+            f"heaters told to switch off, nothing confirms it: the printer has stopped ({refusal}),"
+            f" which should switch them off by itself; see that they cool"
+        )
     return "heaters told to switch off, nothing confirms it"
 
 
 def confirmed_off(port_fd: int) -> bool:
     """Whether the printer itself reports that its heaters aim at 0.
 
-    An `ok` proves nothing: it may answer a line of the dead sender's.
+    An `ok` proves nothing: it may answer a line of the dead sender's. A Klipper that starts anew
+    is asked until it is there.
     """
-    for _ in range(QUESTIONS):
+    asked, starts, until_s = 0, False, time.monotonic() + STARTS_S
+    while asked < QUESTIONS or (starts and time.monotonic() < until_s):
+        asked += 1
         if not write(port_fd, b"M105\n"):
             return False
-        targets = dict(_TARGET.findall(wait(port_fd, PORT_ANSWERS_S)[1]))
+        heard = wait(port_fd, PORT_ANSWERS_S)[1]
+        targets = dict(_TARGET.findall(heard))
         if b"T" in targets:
             return all(float(value) == 0.0 for value in targets.values())
+        if starts := _KLIPPER_STARTS.search(heard) is not None:
+            time.sleep(PORT_ANSWERS_S)
     return False
 
 

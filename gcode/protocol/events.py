@@ -161,6 +161,13 @@ class PrinterReset:
 
 
 @dataclass(frozen=True, slots=True)
+class ShutDown:
+    """Klipper has stopped for good; the cause it tells whoever says something next."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class LinkLost:
     """The link gave up: no line after `last_acked` is known to be executed.
 
@@ -211,6 +218,7 @@ Said = (
     | Capability
     | HostAction
     | PrinterReset
+    | ShutDown
     | Unrecognised
 )
 """What a line of the printer may mean by itself, whatever it was asked."""

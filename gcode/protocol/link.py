@@ -36,6 +36,7 @@ from gcode.protocol.events import (
     Resend,
     ResendRefused,
     ResendRequested,
+    ShutDown,
     TemperatureReport,
     UnknownCommand,
     Unrecognised,
@@ -305,7 +306,14 @@ class Link(Recovery):
         elif isinstance(reply, PrinterReset):
             self._events.append(reply)
             self._on_reset(reply, now_s)
+        elif isinstance(reply, ShutDown):
+            self._events.append(reply)
+            if self.state not in (State.UNGREETED, _GREETING) and not self.ended:
+                self._shut_down = True
+                self._out += b"\n"  # answered with the cause, as anything is from now on
         elif isinstance(reply, CommandFailed):
+            if self._shut_down:
+                reply = CommandFailed(f"Klipper has shut down: {reply.text}", fatal=True)
             self._events.append(reply)
             if reply.fatal and Signal.HALT in TRANSITIONS[self.state]:
                 self._go(Signal.HALT)

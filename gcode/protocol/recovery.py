@@ -67,7 +67,7 @@ class Recovery:
         self._said_last: int | None = None
         self._questions = 0
         self._answered = False  # the dialect's question
-        self._moved = False
+        self._moved = self._shut_down = False
         self._told: PositionReport | None = None
 
     @property

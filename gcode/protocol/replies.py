@@ -23,6 +23,7 @@ from gcode.protocol.events import (
     PrinterReset,
     Resend,
     Said,
+    ShutDown,
     TemperatureReport,
     UnknownCommand,
     Unrecognised,
@@ -54,9 +55,10 @@ _UNKNOWN_COMMAND = re.compile(r"(?:echo:\s*|//\s*)?unknown command:.*", re.IGNOR
 _BANNER = re.compile(
     r"start"
     r"|(?:echo:\s*)?(?:PowerUp|External Reset|Brown out Reset|Watchdog Reset|Software Reset)\s*"
-    r"|//\s?Klipper state: (?:Disconnect|Shutdown|Startup|Ready)"
+    r"|//\s?Klipper state: (?:Disconnect|Startup|Ready)"
     r"|RepRapFirmware\b.* is up and running\.?"
 )
+_SHUT_DOWN = re.compile(r"//\s?Klipper state: Shutdown")
 # Transmission errors of Marlin, Prusa, Repetier and OctoPrint's virtual printer.
 _LINE_ERROR = re.compile(
     r"checksum|line number|expected line|last line|format error", re.IGNORECASE
@@ -116,6 +118,8 @@ def parse_reply(raw: bytes) -> Reply:
         return Waiting()
     if _BANNER.fullmatch(text):
         return PrinterReset(text)
+    if _SHUT_DOWN.fullmatch(text):
+        return ShutDown(text)
     if text.startswith("!!"):
         return CommandFailed(text[2:].strip(), fatal=_FATAL.search(text) is not None)
     if text[:6].lower() == "error:":

@@ -131,7 +131,7 @@ def test_m108_ends_a_wait_where_it_passes_the_queue(firmware: str, ends: bool) -
     assert (talk.machine.wait is None) == ends
 
 
-@pytest.mark.parametrize("firmware", DIALECTS)
+@pytest.mark.parametrize("firmware", ["marlin", "prusa", "reprap"])
 def test_m112_stops_for_good(firmware: str) -> None:
     talk = Talk(firmware)
     talk.say("M104 S200", "M140 S60")
@@ -139,6 +139,25 @@ def test_m112_stops_for_good(firmware: str) -> None:
     assert any("M112" in line or "halted" in line for line in said)
     assert (talk.machine.hotend.target_c, talk.machine.bed.target_c) == (0.0, 0.0)
     assert talk.say("G28", "M105") == []
+
+
+def test_a_klipper_that_has_shut_down_answers_on() -> None:
+    """As a live one did (tests/peers/test_klipper_live.py): it passes the queue, too."""
+    talk = Talk("klipper")
+    talk.say("M104 S200", "M140 S60", "G28", limit_s=200.0)
+    said = talk.say("M109 S220", "M112", limit_s=201.0)
+    warm_c = talk.machine.hotend.temperature_c(talk.machine.clock_s)
+    assert said.count("// Klipper state: Shutdown") == 1
+    assert talk.say("") == talk.say("M104 S0") != []
+    assert talk.say("G1 X5")[-2:] == ["!! Shutdown due to M112 command", "ok"]
+    (report,) = talk.say("M105")
+    assert "/220.0" in report, "it goes on telling its targets"
+    talk.machine.let_pass(talk.machine.clock_s + 300.0)
+    assert talk.machine.hotend.temperature_c(talk.machine.clock_s) < warm_c
+
+
+def test_klipper_takes_no_inches() -> None:
+    assert Talk("klipper").say("G20")[0].startswith("!! ")
 
 
 def test_m410_drops_what_is_queued() -> None:
@@ -207,6 +226,8 @@ def test_the_host_knows_where_the_extruder_is(lines: list[str], firmware: str) -
     """By `hosts.modes`, as the emulated firmware does: G90 and G91 mean four different things."""
     talk, modes = Talk(firmware), Modes()
     for line in ("G28", "M302 P1", "G92 E0", *lines):
+        if (line, firmware) == ("G20", "klipper"):
+            continue  # it refuses inches, and the job is over
         talk.say(line)
         modes = follow(modes, line, firmware)
     assert modes.position_mm.get("E", 0.0) == pytest.approx(talk.machine.e)

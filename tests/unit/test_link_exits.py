@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -239,6 +240,23 @@ def test_a_restart_is_noticed_where_lines_are_not_verified(
         told = it.told()
         printer.close()
     assert sum(line in lines for line in told) < (35 if "G28" in lines else 2)
+
+
+def test_a_klipper_that_shuts_down_is_heard_out(tmp_path: Path) -> None:
+    """regression: it "started anew", for no reason that was told; and then it was asked for ever.
+
+    A live Klipper gives the cause to whatever it is told next, and reports its targets unchanged.
+    """
+    with bench(tmp_path, firmware="klipper", faults="line 30 thermal_runaway") as it:
+        printer = SerialPrinter(it.emulator.port, dialect="klipper", supervise=False)
+        printer.connect()
+        with pytest.raises(PrinterError, match="Klipper has shut down: Thermal Runaway"):
+            printer.print(program([*HEAD, *MOVES[:60]]))
+        with pytest.raises(LinkLostError, match="has ended"):
+            printer.temperatures()
+        assert re.search(r"nothing confirms it: .* stopped \(Thermal", printer.notes[-1])
+        printer.close()
+    assert MOVES[40] not in it.told()
 
 
 def test_a_garbled_answer_does_not_cost_the_job_its_proof(tmp_path: Path) -> None:

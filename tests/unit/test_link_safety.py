@@ -8,6 +8,7 @@ import socket
 import sqlite3
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,8 +30,10 @@ def _no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial_host, "require_checked", lambda checked: None)
 
 
-def answering(report: bytes | None) -> tuple[str, list[bytes]]:
-    """Let the supervisor speak to a port that says ok to all and `report` to M105."""
+def answering(
+    report: bytes | Iterator[bytes] | None, *, to_commands: bytes = b"ok\n"
+) -> tuple[str, list[bytes]]:
+    """Let the supervisor speak to a port that says `report` to M105, or each of them in turn."""
     ours, theirs = socket.socketpair()
     heard: list[bytes] = []
 
@@ -39,7 +42,10 @@ def answering(report: bytes | None) -> tuple[str, list[bytes]]:
             for line in port:
                 heard.append(line.strip())
                 if line.strip() and report is not None:
-                    port.write(report if line == b"M105\n" else b"ok\n")
+                    if line != b"M105\n":
+                        port.write(to_commands)
+                    else:
+                        port.write(report if isinstance(report, bytes) else next(report))
 
     thread = threading.Thread(target=serve)
     thread.start()
@@ -72,6 +78,25 @@ def test_targets_of_zero_are_called_off(report: bytes) -> None:
     said, heard = answering(report)
     assert "heaters off" in said
     assert heard[-1] == b"M105"
+
+
+def test_a_klipper_that_has_shut_down_is_said_to_have() -> None:
+    """regression: nobody was told why; targets stay as they were, and the boards heat no more."""
+    refusal = b"// Lost communication with MCU 'mcu'\n!! Lost communication with MCU 'mcu'\nok\n"
+    said, _ = answering(b"ok B:60.0 /60.0 T0:201.1 /200.0\n", to_commands=refusal)
+    assert (
+        "nothing confirms it: the printer has stopped (Lost communication with MCU 'mcu')" in said
+    )
+
+
+def test_a_klipper_that_starts_anew_is_asked_until_it_knows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """regression: "nothing confirms it", a second before it said so; and no nozzle was lifted."""
+    monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.05)
+    reports = iter([*5 * [b"ok T:0\n"], b"ok B:60.0 /0.0 T0:201.1 /0.0\n"])
+    said, _ = answering(reports, to_commands=b"!! Printer is not ready\nok\n")
+    assert said == "heaters off (the printer reports targets of 0)"
 
 
 def test_no_answer_at_all_is_said_to_be_none(monkeypatch: pytest.MonkeyPatch) -> None:

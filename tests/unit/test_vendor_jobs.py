@@ -118,6 +118,7 @@ def test_what_makers_scripts_end_with_is_printed(end: str) -> None:
         (job(START, f"G161 Z F600\n{END}"), "homing Z onto a standing part"),
         (job(f"{START}\nG1 X9 Y9 Z1\nG2 X99 R30 E9"), "arc told by its radius"),  # too small
         (job(KLIPPER, f"G2 X60 R90\n{END}"), "arc told by its radius"),
+        (job(KLIPPER, f"G91\nG2 X4 I2 J0\nG90\n{END}"), "arc after G91"),
         (job(f"{START}\nG5 X9 Y9 I1 P1"), "curve that nothing here follows"),
         (job(f"{START}\nM211 S0"), "end stops in software off"),
         (job(f"{START}\nM108"), "end of a wait for heat"),
