@@ -56,7 +56,7 @@ def simulate(
             "--defect",
             help="TYPE[:key=value,…]: void, missing_beads, under_extrusion, chip, blob or none; "
             "may be repeated. "
-            f"Default: {', '.join(DEFAULT_DEFECTS)}.",
+            f"Default: {', '.join(DEFAULT_DEFECTS)}, where there is room.",
         ),
     ] = None,
     printer: PrinterOption = DEFAULT_PRINTER,
@@ -127,8 +127,9 @@ def simulate(
         with watch("template"):
             template = load_or_fit(mesh, seed=seed, progress=bars)
         prepared = prepare_run(
-            template, setup, defects, title=path.stem, seed=seed, watch=watch, progress=bars
-        )
+            template, setup, defects,
+            title=path.stem, where_room=not defect, seed=seed, watch=watch, progress=bars,
+        )  # fmt: skip
         folder.write_text("job.gcode", prepared.checked.program.text)
         with live_view(
             ViewPlace(view, view_host, view_port, token), ask=True, title=path.name
@@ -158,6 +159,8 @@ def simulate(
     with watch("report"), bars.shown(), bars.stage("report"):
         write_report(_report_data(run, path, result), folder.file("report.html"))
     within = run.report.within_tolerance
+    for why in prepared.left_out:
+        console.errors.print(f"A default defect is left out: {why}.")
     if run.report.stopped:
         console.errors.print(f"The run was ended: {run.report.stopped}.")
     if as_json:
@@ -238,6 +241,7 @@ def _result(
             "printer_clock_s": round(run.printer_clock_s, 1),
             "unprintable_mm3": rounded(sum(u.volume_mm3 for u in run.prepared.plan.unprintable)),
         },
+        "left_out": run.prepared.left_out,
         "speed_up": round(speed, 1),
         **({"touches": rounded([asdict(felt) for felt in run.felt])} if run.felt else {}),
     }

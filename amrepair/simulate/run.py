@@ -64,6 +64,8 @@ class PreparedRun:
         What will go wrong, and where.
     stops
         When the job rests to be scanned.
+    left_out
+        Why what else was to go wrong does not.
     """
 
     setup: PrintSetup
@@ -76,6 +78,7 @@ class PreparedRun:
     defects: tuple[PlacedDefect, ...]
     stops: tuple[Stop, ...]
     seed: int
+    left_out: tuple[str, ...] = ()
 
     @property
     def by_beads(self) -> bool:
@@ -154,11 +157,17 @@ def prepare_run(
     defects: Sequence[Defect],
     *,
     title: str,
+    where_room: bool = False,
     seed: int = 0,
     watch: Stopwatch | None = None,
     progress: Progress = silent,
 ) -> PreparedRun:
     """Slice, write, check and read the job; find places for the defects.
+
+    Parameters
+    ----------
+    where_room
+        Leave out a defect that the part has no room for, but not all of them.
 
     Raises
     ------
@@ -181,7 +190,15 @@ def prepare_run(
         progress("check job", 1.0, 1.0)
     rng = np.random.default_rng([seed, 1])
     tops_mm = np.array(plan.grid.tops_mm)
-    placed = tuple(place(defect, part, tops_mm, rng, beads=job.beads) for defect in defects)
+    placed: list[PlacedDefect] = []
+    left_out: list[str] = []
+    for defect in defects:
+        try:
+            placed.append(place(defect, part, tops_mm, rng, beads=job.beads))
+        except InputError as error:
+            left_out.append(str(error))
+            if not where_room or len(left_out) == len(defects):
+                raise
     layers = [d.last_layer for d in placed if d.last_layer is not None and len(d.layers)]
     if not any(d.layers or d.removed or d.added for d in placed):
         layers = [len(job.layers) // 2]  # nothing will be wrong: look once on the way all the same
@@ -196,6 +213,7 @@ def prepare_run(
         defects=tuple(d for d in placed if d.layers or d.removed or d.added),
         stops=plan_stops(job, layers),
         seed=seed,
+        left_out=tuple(left_out),
     )
 
 

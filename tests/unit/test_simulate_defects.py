@@ -7,15 +7,18 @@ from collections.abc import Callable
 import manifold3d as m3
 import numpy as np
 import pytest
+import trimesh
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans import ScanRequest
 from amrepair.simulate.defects import PlacedDefect, parse_defect, place
 from amrepair.simulate.part_files import bracket_path, part_path
+from amrepair.simulate.run import prepare_run
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner
 from amrepair.simulate.stage import Stage
 from amrepair.simulate.world import World
+from amrepair.template import MeshSdf
 from gcode.firmware.motion import MotionBatch
 from gcode.profiles import load_setup
 from gcode.reader import read_job
@@ -109,6 +112,21 @@ def test_part_without_room_is_refused() -> None:
     needle = m3.Manifold.cube((1, 1, 20))
     with pytest.raises(InputError, match="no room"):
         place(parse_defect("void"), needle, tops(needle), np.random.default_rng(0))
+
+
+def test_a_default_defect_without_room_is_left_out_and_said() -> None:
+    # regression: a printed hotend holder whose top is a dome's tip was refused after 48 s
+    spike = m3.Manifold.cylinder(5.0, 0.8, 0.1, 16).translate((15.0, 15.0, 3.9))
+    solid = (m3.Manifold.cube((30.0, 30.0, 4.0)) + spike).to_mesh64()
+    part = MeshSdf.from_mesh(trimesh.Trimesh(solid.vert_properties, solid.tri_verts))
+    asked, setup = [parse_defect("void"), parse_defect("chip")], load_setup(process="repair_0.30")
+    with pytest.raises(InputError, match="no room for the defect chip"):
+        prepare_run(part, setup, asked, title="spike")
+    with pytest.raises(InputError, match="no room for the defect chip"):
+        prepare_run(part, setup, asked[1:], title="spike", where_room=True)
+    run = prepare_run(part, setup, asked, title="spike", where_room=True)
+    assert [defect.kind for defect in run.defects] == ["void"]
+    assert len(run.left_out) == 1
 
 
 def test_bracket_is_found_and_other_names_are_refused() -> None:
