@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from clogged_block import AMREPAIR, ENVIRONMENT, PRUSA_SLICER, command, filament_of, sliced
+from clogged_block import AMREPAIR, ENVIRONMENT, GCODE, PRUSA_SLICER, command, filament_of, sliced
 from link_helpers import program
 from live_klipper import Api, LiveKlipper
-from peer_harness import wait_for
+from peer_harness import process, wait_for
 from test_moonraker_agent import Stack
 
 from amrepair.loop import run_loop
@@ -34,7 +34,7 @@ from gcode.hosts import LinkLostError, connect
 from gcode.hosts.serial import SerialPrinter
 from gcode.profiles import load_setup
 from gcode.reader import read_job
-from tests.gcode_text import FILAMENT_MM2
+from tests.gcode_text import FILAMENT_MM2, steps_of
 
 pytestmark = pytest.mark.peers
 
@@ -146,6 +146,39 @@ def test_what_it_refuses_ends_the_job(line: str, tmp_path: Path) -> None:
         with sender(klipper) as again:
             assert again.temperatures().hotend_target_c == 0.0
             assert again.position_mm()[:2] != (2.0, 2.0)
+
+
+@pytest.mark.timeout(600)
+def test_a_job_whose_sender_was_killed_goes_on_and_lays_every_bead_once(tmp_path: Path) -> None:
+    part, job = tmp_path / "block.stl", tmp_path / "block.gcode"
+    trimesh.creation.box((12.0, 10.0, 1.2)).export(part)
+    printer = ("--printer", "generic_klipper")
+    command(*GCODE, "slice", part, "-o", job, *printer)
+    with LiveKlipper(tmp_path) as klipper, Api(klipper.socket) as api:
+        to_it = ("--port", klipper.port, *printer, "--journal", tmp_path / "journal.sqlite")
+        sending = (*GCODE, "send", job, *to_it)
+        log = tmp_path / "send.log"
+        with process(*sending, log=log) as sender_process:
+            half_mm = sum(step.e_mm for step in steps_of(job.read_text()) if step.e_mm > 0) / 2
+
+            def state() -> dict[str, Any]:
+                return api.query(toolhead=["position"], extruder=["target"], heater_bed=["target"])
+
+            wait_for("half of it", lambda: state()["toolhead"]["position"][3] > half_mm, log, 300.0)
+            sender_process.kill()
+
+        def is_off() -> bool:
+            return state()["extruder"]["target"] == state()["heater_bed"]["target"] == 0.0
+
+        wait_for("the supervisor", is_off, log)
+        command(*sending, "--resume")
+        moved = klipper.moves.take()
+    beads = [step for step in steps_of(job.read_text()) if step.is_bead]
+    lays = np.hypot(*(moved.end_mm - moved.start_mm)[:, :2].T) > 0
+    assert moved.filament_mm[lays].sum() == pytest.approx(sum(b.e_mm for b in beads), abs=1e-3)
+    ends = iter(moved.end_mm[lays & (moved.filament_mm > 0)])
+    for bead in beads:
+        assert any(np.allclose(bead.end_mm, at, atol=1e-3) for at in ends), bead
 
 
 @pytest.mark.timeout(900)  # it moves in real time
