@@ -234,4 +234,5 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
 
 
 def _line(text: str) -> str:
+    text = text.partition("Once the underlying issue")[0]  # what Klipper says of every shutdown
     return " ".join(text.split()).rstrip(".")[:200] or "no reason given"

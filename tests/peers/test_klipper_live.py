@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import trimesh
 from clogged_block import AMREPAIR, ENVIRONMENT, GCODE, PRUSA_SLICER, command, filament_of, sliced
-from link_helpers import program
+from link_helpers import Unjudged, program
 from live_klipper import Api, LiveKlipper
 from peer_harness import process, wait_for
 from test_moonraker_agent import Stack
@@ -31,9 +31,12 @@ from gcode.errors import LinkError, PrinterError
 from gcode.firmware import FirmwareCore
 from gcode.firmware.motion import MotionBatch, MotionFile
 from gcode.hosts import LinkLostError, connect
+from gcode.hosts.port import NothingMetError
 from gcode.hosts.serial import SerialPrinter
+from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import read_job
+from gcode.resumption.klipper import TOUCH_MACRO
 from tests.gcode_text import FILAMENT_MM2, steps_of
 
 pytestmark = pytest.mark.peers
@@ -41,6 +44,15 @@ pytestmark = pytest.mark.peers
 MOVES = [
     f"G1 X{100 + 40 * math.cos(i / 20):.3f} Y{100 + 40 * math.sin(i / 17):.3f}" for i in range(400)
 ]
+Z_OFFSET_MM = -0.35
+PROBE = f"""\
+[include klipper_touch.cfg]
+[probe]
+pin: gpio13
+z_offset: {Z_OFFSET_MM}
+[force_move]
+enable_force_move: True
+"""
 PRESSURE_ADVANCE = "[extruder]\npressure_advance: 0.05\n"
 HEAD = ["G21", "G90", "M83", "G28", "G1 Z5 F300", "G1 F6000"]
 
@@ -146,6 +158,30 @@ def test_what_it_refuses_ends_the_job(line: str, tmp_path: Path) -> None:
         with sender(klipper) as again:
             assert again.temperatures().hotend_target_c == 0.0
             assert again.position_mm()[:2] != (2.0, 2.0)
+
+
+@pytest.mark.parametrize("at_mm", [1.0, -1.0])
+def test_it_feels_what_stands_there_or_that_nothing_does(
+    at_mm: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Our macro around its PROBE, which the pin ends in the midst of the way, or nothing does."""
+    monkeypatch.setenv("FELT_STEPS", str(round(at_mm * 50)))
+    (tmp_path / "klipper_touch.cfg").write_text(TOUCH_MACRO)
+    lines = ["G28", "G90", "G1 X100 Y100 Z3 F600", "AMREPAIR_TOUCH DEPTH=2.5 SPEED=2"]
+    touches = Unjudged(Program("\n".join(lines), "klipper"))
+    with LiveKlipper(tmp_path, PROBE) as klipper, sender(klipper) as printer:
+        if at_mm < 0.5:
+            with pytest.raises(NothingMetError, match="No trigger"):
+                printer.touch(touches, range(4))
+            assert printer.position_mm()[2] == pytest.approx(3.0 - 2.5 + 5.0, abs=1e-3)  # lifted
+        else:
+            met_mm = printer.touch(touches, range(4))
+            assert met_mm == pytest.approx(at_mm - Z_OFFSET_MM, abs=0.05)  # 0.02 mm a step
+            assert printer.position_mm()[2] == pytest.approx(at_mm, abs=0.1)
+        printer.command("G1 Z5 F600")
+        assert printer.place().z_mm == 5.0
+        moved = klipper.moves.take()
+    assert moved.end_mm[-1][2] == pytest.approx(5.0, abs=0.05)
 
 
 @pytest.mark.timeout(600)
