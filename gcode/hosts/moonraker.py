@@ -13,7 +13,7 @@ from collections.abc import Callable
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker_session import MoonrakerSession
-from gcode.hosts.moonraker_state import MOONRAKER_ENDS
+from gcode.hosts.moonraker_state import MOONRAKER_ENDS, cause_of
 from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
 from gcode.hosts.server import Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
@@ -64,7 +64,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         state = self._session.state
         if state.stopped:
             raise PrinterError(
-                f"Klipper behind {self.address.name} has stopped ({_line(state.klippy_message)}); "
+                f"Klipper behind {self.address.name} has stopped ({_why(state.klippy_message)}); "
                 f"mend the cause and run FIRMWARE_RESTART."
             )
         if state.busy:
@@ -163,7 +163,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
             return state.outcome == "complete"
         why = state.klippy_message if state.stopped else state.message
         raise PrinterError(
-            f"{self.address.name} reports a fault: {_line(why)}; {self._uncertain(job)}."
+            f"{self.address.name} reports a fault: {_why(why)}; {self._uncertain(job)}."
         )
 
     def _look(self, job: JobFile) -> None:
@@ -233,5 +233,5 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         self.command("TURN_OFF_HEATERS\nM107")
 
 
-def _line(text: str) -> str:
-    return " ".join(text.split()).rstrip(".")[:200] or "no reason given"
+def _why(text: str) -> str:
+    return cause_of(text)[:200] or "no reason given"

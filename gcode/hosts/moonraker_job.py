@@ -15,6 +15,7 @@ from gcode.errors import LinkError, PrinterError
 from gcode.hosts.modes import commands_of
 from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.moonraker_session import MoonrakerSession
+from gcode.hosts.moonraker_state import STOPPED, cause_of
 from gcode.hosts.port import NothingMetError, PrintableProgram
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
 from gcode.hosts.server import ServerReach
@@ -98,12 +99,17 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
 
     def _rest(self) -> tuple[bool, int]:
         told = self._session.query(
-            {"virtual_sdcard": ["is_active", "file_position"], "print_stats": ["state"]}
+            {
+                "virtual_sdcard": ["is_active", "file_position"],
+                "print_stats": ["state"],
+                "webhooks": ["state"],
+            }
         )
         card = told.get("virtual_sdcard", {})
         paused = told.get("print_stats", {}).get("state") == "paused"
         line = self._text.line_at(int(card.get("file_position") or 0))
-        return paused and not card.get("is_active", True), line
+        gone = told.get("webhooks", {}).get("state") in STOPPED  # nothing there goes on any more
+        return paused and not gone and not card.get("is_active", True), line
 
     def _has_it(self) -> bool:
         state = self._session.state
@@ -131,7 +137,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
                 f"{end + 1}; is amrepair.cfg included in printer.cfg?"
             )
         why = state.klippy_message if state.stopped else state.message
-        raise PrinterError(f"{self.address.name} reports a fault: {' '.join(why.split())[:200]}")
+        raise PrinterError(f"{self.address.name} reports a fault: {cause_of(why)[:200]}")
 
     # ------------------------------------------------------------------ at rest
 

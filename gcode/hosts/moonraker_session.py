@@ -9,7 +9,7 @@ from typing import Any
 
 import gcode
 from gcode.errors import LinkError, PortBusyError, PrinterError
-from gcode.hosts.moonraker_state import MOONRAKER_SUBSCRIPTION, KlippyState
+from gcode.hosts.moonraker_state import MOONRAKER_SUBSCRIPTION, KlippyState, cause_of
 from gcode.hosts.server import ServerReach, ServerSession
 from gcode.hosts.web import json_object, refused_key, sentence
 
@@ -114,7 +114,7 @@ class MoonrakerSession(ServerSession[KlippyState]):
             return refused_key(self.address, self._key)
         if match := _MESSAGE.search(text):  # Klipper's error object, printed
             text = match.group(2)
-        text = " ".join(text.split()).rstrip(".")[:300]
+        text = cause_of(text)[:300]
         if code == 503:
             return LinkError(f"{self.address.name} has no Klipper behind it ({text}); start it.")
         return PrinterError(f"{self.address.name} refuses {method}: {text}.")

@@ -111,6 +111,11 @@ class KlippyState:
         return self.ended or (self.print_file == self.file and self.busy)
 
 
+def cause_of(text: str) -> str:
+    """What Klipper says in one line, without what it says of every shutdown."""
+    return " ".join(text.partition("Once the underlying issue")[0].split()).rstrip(".")
+
+
 def _object(status: dict[str, Any], name: str) -> dict[str, Any]:
     found = status.get(name)
     return found if isinstance(found, dict) else {}

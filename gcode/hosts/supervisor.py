@@ -24,6 +24,7 @@ LIFT = (
 QUESTIONS = 3
 _TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 _KLIPPER_REFUSES = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
+_NOT_MOVED = re.compile(rb"^(?:!!|Error:)", re.MULTILINE)
 _KLIPPER_STARTS = re.compile(rb"^ok T:0\r?$", re.MULTILINE)
 """What Klipper answers to M105 before it knows its heaters (gcode.py, cmd_default)."""
 STARTS_S = 20.0
@@ -63,6 +64,8 @@ def make_safe(port_fd: int, *, lift: bool = True) -> str:
         answered += ok
         if command in HEATERS_OFF and (refused := _KLIPPER_REFUSES.search(heard)):
             refusal = refused.group(1).decode("ascii", "replace")
+        if command in LIFT and _NOT_MOVED.search(heard):
+            lift = False
     if not answered:
         return "heaters told to switch off, NO ANSWER"
     if confirmed_off(port_fd):

@@ -78,6 +78,10 @@ class Ledger:
                 self.wire_bytes -= len(self.data(earlier))
         self.acked = number
 
+    def fail(self) -> None:
+        """Note that what is under way has failed: its answer follows at once."""
+        self._last_slow = self.acked
+
     def expect_again(self, number: int) -> None:
         """Note that the printer wants line `number` next, whatever was acknowledged."""
         self.acked = number - 1

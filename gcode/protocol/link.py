@@ -315,6 +315,7 @@ class Link(Recovery):
             if self._shut_down:
                 reply = CommandFailed(f"Klipper has shut down: {reply.text}", fatal=True)
             self._events.append(reply)
+            self._ledger.fail()
             if reply.fatal and Signal.HALT in TRANSITIONS[self.state]:
                 self._go(Signal.HALT)
         elif isinstance(reply, UnknownCommand) and "*" in reply.text:

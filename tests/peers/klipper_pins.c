@@ -4,6 +4,7 @@
    printer with a nozzle and a bed that heat, wired as `live_klipper.CONFIG` says:
 
    line 4k+1 steps axis k, 4k+2 is its direction, 4k+3 its end stop, at its lowest end;
+   line 13 is a probe: it triggers FELT_STEPS (of the environment) above Z's end stop and below;
    line 23 heats the nozzle (analog 0), line 24 the bed (analog 1).
 
    A heater is a first-order system; an analog value is linear, 0 to 400 degrees.
@@ -17,12 +18,13 @@
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
 #include <time.h>
 #include <unistd.h>
 
-enum { FDS = 1024, LINES = 64, AXES = 3, NOZZLE = 23, BED = 24 };
+enum { FDS = 1024, LINES = 64, AXES = 3, PROBE = 13, NOZZLE = 23, BED = 24 };
 static const char GPIO[] = "/dev/gpiochip0";
 static const char ANALOG[] = "/sys/bus/iio/devices/iio:device0/in_voltage";
 static const double ROOM_C = 22.0, HIGHEST_C = 400.0, HIGHEST_VALUE = 4095.0;
@@ -65,6 +67,8 @@ static void write_line(int line, int value)
 static int read_line(int line)
 {
     int axis = (line - 1) / 4;
+    if (line == PROBE)
+        return getenv("FELT_STEPS") && steps[2] <= atol(getenv("FELT_STEPS"));
     return axis < AXES && line % 4 == 3 && steps[axis] <= 0;
 }
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from clogged_block import AMREPAIR, ENVIRONMENT, PRUSA_SLICER, command, filament_of, sliced
-from link_helpers import program
+from clogged_block import AMREPAIR, ENVIRONMENT, GCODE, PRUSA_SLICER, command, filament_of, sliced
+from link_helpers import Unjudged, program
 from live_klipper import Api, LiveKlipper
-from peer_harness import wait_for
+from peer_harness import process, wait_for
 from test_moonraker_agent import Stack
 
 from amrepair.loop import run_loop
@@ -31,16 +31,28 @@ from gcode.errors import LinkError, PrinterError
 from gcode.firmware import FirmwareCore
 from gcode.firmware.motion import MotionBatch, MotionFile
 from gcode.hosts import LinkLostError, connect
+from gcode.hosts.port import NothingMetError
 from gcode.hosts.serial import SerialPrinter
+from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import read_job
-from tests.gcode_text import FILAMENT_MM2
+from gcode.resumption.klipper import TOUCH_MACRO
+from tests.gcode_text import FILAMENT_MM2, steps_of
 
 pytestmark = pytest.mark.peers
 
 MOVES = [
     f"G1 X{100 + 40 * math.cos(i / 20):.3f} Y{100 + 40 * math.sin(i / 17):.3f}" for i in range(400)
 ]
+Z_OFFSET_MM = -0.35
+PROBE = f"""\
+[include klipper_touch.cfg]
+[probe]
+pin: gpio13
+z_offset: {Z_OFFSET_MM}
+[force_move]
+enable_force_move: True
+"""
 PRESSURE_ADVANCE = "[extruder]\npressure_advance: 0.05\n"
 HEAD = ["G21", "G90", "M83", "G28", "G1 Z5 F300", "G1 F6000"]
 
@@ -146,6 +158,63 @@ def test_what_it_refuses_ends_the_job(line: str, tmp_path: Path) -> None:
         with sender(klipper) as again:
             assert again.temperatures().hotend_target_c == 0.0
             assert again.position_mm()[:2] != (2.0, 2.0)
+
+
+@pytest.mark.parametrize("at_mm", [1.0, -1.0])
+def test_it_feels_what_stands_there_or_that_nothing_does(
+    at_mm: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Our macro around its PROBE, which the pin ends in the midst of the way, or nothing does."""
+    monkeypatch.setenv("FELT_STEPS", str(round(at_mm * 50)))
+    (tmp_path / "klipper_touch.cfg").write_text(TOUCH_MACRO)
+    lines = ["G28", "G90", "G1 X100 Y100 Z3 F600", "AMREPAIR_TOUCH DEPTH=2.5 SPEED=2"]
+    touches = Unjudged(Program("\n".join(lines), "klipper"))
+    with LiveKlipper(tmp_path, PROBE) as klipper, sender(klipper) as printer:
+        if at_mm < 0.5:
+            with pytest.raises(NothingMetError, match="No trigger"):
+                printer.touch(touches, range(4))
+            assert printer.position_mm()[2] == pytest.approx(3.0 - 2.5 + 5.0, abs=1e-3)  # lifted
+        else:
+            met_mm = printer.touch(touches, range(4))
+            assert met_mm == pytest.approx(at_mm - Z_OFFSET_MM, abs=0.05)  # 0.02 mm a step
+            assert printer.position_mm()[2] == pytest.approx(at_mm, abs=0.1)
+        printer.command("G1 Z5 F600")
+        assert printer.place().z_mm == 5.0
+        moved = klipper.moves.take()
+    assert moved.end_mm[-1][2] == pytest.approx(5.0, abs=0.05)
+
+
+@pytest.mark.timeout(600)
+def test_a_job_whose_sender_was_killed_goes_on_and_lays_every_bead_once(tmp_path: Path) -> None:
+    part, job = tmp_path / "block.stl", tmp_path / "block.gcode"
+    trimesh.creation.box((12.0, 10.0, 1.2)).export(part)
+    printer = ("--printer", "generic_klipper")
+    command(*GCODE, "slice", part, "-o", job, *printer)
+    with LiveKlipper(tmp_path) as klipper, Api(klipper.socket) as api:
+        to_it = ("--port", klipper.port, *printer, "--journal", tmp_path / "journal.sqlite")
+        sending = (*GCODE, "send", job, *to_it)
+        log = tmp_path / "send.log"
+        with process(*sending, log=log) as sender_process:
+            half_mm = sum(step.e_mm for step in steps_of(job.read_text()) if step.e_mm > 0) / 2
+
+            def state() -> dict[str, Any]:
+                return api.query(toolhead=["position"], extruder=["target"], heater_bed=["target"])
+
+            wait_for("half of it", lambda: state()["toolhead"]["position"][3] > half_mm, log, 300.0)
+            sender_process.kill()
+
+        def is_off() -> bool:
+            return state()["extruder"]["target"] == state()["heater_bed"]["target"] == 0.0
+
+        wait_for("the supervisor", is_off, log)
+        command(*sending, "--resume")
+        moved = klipper.moves.take()
+    beads = [step for step in steps_of(job.read_text()) if step.is_bead]
+    lays = np.hypot(*(moved.end_mm - moved.start_mm)[:, :2].T) > 0
+    assert moved.filament_mm[lays].sum() == pytest.approx(sum(b.e_mm for b in beads), abs=1e-3)
+    ends = iter(moved.end_mm[lays & (moved.filament_mm > 0)])
+    for bead in beads:
+        assert any(np.allclose(bead.end_mm, at, atol=1e-3) for at in ends), bead
 
 
 @pytest.mark.timeout(900)  # it moves in real time

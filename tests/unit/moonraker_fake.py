@@ -100,7 +100,7 @@ class AgentsMoonraker:
         elif method == "connection.register_remote_method":
             self.methods.add(params["method_name"])
         elif method == "server.info":
-            return {"klippy_state": "ready"}
+            return {"klippy_state": "shutdown" if self.klipper.shut_down else "ready"}
         elif method in {"printer.objects.query", "printer.objects.subscribe"}:
             objects = self.klipper.objects()
             return {
@@ -109,6 +109,8 @@ class AgentsMoonraker:
         elif method == "server.history.list":
             busy = self.klipper.print_state in {"printing", "paused"}
             status = "in_progress" if busy else "completed"
+            if self.klipper.shut_down:
+                status = "klippy_shutdown"
             row = {"job_id": f"{self.job_id:06X}", "filename": self.klipper.file, "status": status}
             return {"jobs": [row]}
         elif method == "printer.print.resume":

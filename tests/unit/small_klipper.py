@@ -69,6 +69,7 @@ class SmallKlipper:
         self._templates = jinja2.Environment("{%", "%}", "{", "}")
         self.executed: list[str] = []
         self.said: list[str] = []
+        self.shut_down = ""  # why: then every script is refused with it
         self.mutex = threading.RLock()
         self.reset()
 
@@ -99,7 +100,10 @@ class SmallKlipper:
         place = [self.modes.position_mm.get(axis, 0.0) for axis in "XYZE"]
         hotend, bed = self.modes.hotend_c, self.modes.bed_c
         return {
-            "webhooks": {"state": "ready", "state_message": "Printer is ready"},
+            "webhooks": {
+                "state": "shutdown" if self.shut_down else "ready",
+                "state_message": self.shut_down or "Printer is ready",
+            },
             "print_stats": {
                 "state": self.print_state, "filename": self.file, "message": self.message,
                 "total_duration": 0.0, "print_duration": 0.0, "filament_used": 0.0,
@@ -137,6 +141,8 @@ class SmallKlipper:
     def run_script(self, script: str) -> None:
         """A client's script: as a whole, nothing between its lines."""
         with self.mutex:
+            if self.shut_down:
+                raise CommandError(self.shut_down)
             self._process(script)
 
     def _process(self, script: str) -> None:

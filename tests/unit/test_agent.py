@@ -257,6 +257,31 @@ def test_klipper_restarts_while_the_print_rests(bench: Bench) -> None:
     assert len(steps) == 3, "nothing more of the repair is sent to a printer that forgot its place"
 
 
+def test_a_klipper_that_shuts_down_in_a_repair_is_not_asked_to_go_on(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """regression: its print still calls itself paused, so "Heat and go on" was offered."""
+    carried, steps = bench.klipper.run_script, []
+
+    def shut_down(script: str) -> None:
+        if script.startswith("_AMREPAIR_STEP"):
+            steps.append(script)
+            if len(steps) == 3:
+                bench.klipper.shut_down = (
+                    "MCU 'mcu' shutdown: Timer too close\nOnce the underlying issue is corrected, "
+                    'use the\n"FIRMWARE_RESTART" command\nPrinter is shutdown'
+                )
+        carried(script)
+
+    bench.klipper.run_script = shut_down  # type: ignore[method-assign]
+    bench.agent()
+    assert bench.klipper.print_state == "paused"
+    told = capsys.readouterr().err
+    assert re.search(r"no more looks at this print: .* Timer too close\.$", told, re.MULTILINE)
+    assert not any("Heat and go on" in script for script in bench.fake.scripts)
+    assert "M140 S0" not in bench.executed()
+
+
 def test_what_is_asked_at_the_wrong_time_is_one_sentence(ready: Ready, tmp_path: Path) -> None:
     klipper = SmallKlipper(tmp_path, shipped(MACROS))
     (tmp_path / "job.gcode").write_text("G28\nAMREPAIR_SCAN\n" + "G1 X1\n" * 5)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import pty
 import re
 import signal
 import sys
 import threading
 import time
+import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,14 +19,16 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 from link_forks import until
-from link_helpers import moves, profile, program
+from link_helpers import Unjudged, moves, profile, program
 
 import gcode.hosts.serial as serial_host
 from gcode.errors import LinkError, LocalProtocolError, PrinterError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import LinkLostError, supervisor
 from gcode.hosts.fast_path import waiting
+from gcode.hosts.port import NothingMetError
 from gcode.hosts.serial import SerialPrinter
+from gcode.moves import Program
 from gcode.protocol import Link
 from gcode.protocol import events as ev
 
@@ -309,3 +314,43 @@ def test_arcs_are_refused_before_anything_moves_where_the_firmware_has_none(tmp_
             printer.print(program([*HEAD, "G28 ; home", "; G2 is none", " g02 X1 Y1 I1 J0"]))
         assert printer.print(program([*HEAD, "G20", "G28", "G21", "G200"])).ok
     assert "G28 ; home" not in it.told()
+
+
+def test_a_touch_that_meets_nothing_leaves_the_link_as_it_was() -> None:
+    """regression: a live Klipper says `!!` a moment before its `ok`, and the link was given up.
+
+    Nobody asked then whether Z was put right, and whatever was asked next was waited for.
+    """
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    heard: list[bytes] = []
+
+    def answer() -> None:
+        with contextlib.suppress(OSError), os.fdopen(ours, "rb", buffering=0) as port:
+            for line in port:
+                heard.append(line.strip())
+                if line.startswith(b"AMREPAIR_TOUCH"):
+                    os.write(ours, b"!! No trigger on probe after full movement\n")
+                    time.sleep(0.05)
+                    os.write(ours, b"ok\n// amrepair: nothing was touched\n")
+                elif line.startswith(b"M105"):
+                    os.write(ours, b"ok B:20.0 /0.0 T0:20.0 /0.0\n")
+                elif line.startswith(b"M114"):
+                    os.write(ours, b"X:1.000 Y:1.000 Z:5.500 E:0.000\nok\n")
+                else:
+                    os.write(ours, b"ok\n")
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    printer = SerialPrinter(os.ttyname(theirs), dialect="klipper", supervise=False)
+    printer.connect()
+    os.close(theirs)
+    touches = Unjudged(Program("AMREPAIR_TOUCH DEPTH=2.5 SPEED=2", "klipper"))
+    with pytest.raises(NothingMetError):
+        printer.touch(touches, range(1))
+    assert printer.position_mm()[2] == 5.5
+    assert "nozzle lifted" in printer.notes[-1]
+    printer.close()
+    thread.join(10)
+    assert heard.count(b"G1 Z5 F600") == 1
+    assert not any(b"CLEAR_HOMED" in line for line in heard), "Z was put right"

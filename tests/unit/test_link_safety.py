@@ -99,6 +99,16 @@ def test_a_klipper_that_starts_anew_is_asked_until_it_knows(
     assert said == "heaters off (the printer reports targets of 0)"
 
 
+def test_a_nozzle_that_the_firmware_does_not_move_is_not_called_lifted() -> None:
+    """regression: a Klipper that had been restarted moves nothing before it is homed."""
+    with EmulatedPrinterProcess(printer=profile(), firmware="klipper") as emulator:
+        with SerialPrinter(emulator.port, dialect="klipper", supervise=False) as printer:
+            printer.command("M104 S100")
+            printer.make_safe()
+            assert printer.notes[-1] == "heaters off (the printer reports targets of 0)"
+        assert emulator.state()["hotend_target_c"] == 0
+
+
 def test_no_answer_at_all_is_said_to_be_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.01)
     said, _ = answering(None)
