@@ -314,7 +314,7 @@ def _part_only(
     above = placed[:, 2] > low[2] + options.guess.above_bed_mm
     # A flat part seen from below has no other points: then all points in the box count.
     keep = near & above if (near & above).sum() >= options.least_points else near
-    return points_mm[keep]
+    return np.compress(keep, points_mm, axis=0)
 
 
 def _other_size(scan: Scan, template: Template, told_jump: float) -> str:

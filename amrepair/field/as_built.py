@@ -132,11 +132,11 @@ def gather(
     """Collect the evidence of a scan whose off-template surfels and range images are known."""
     off = off | _strips(template, surfels, off, options)
     if images and off.any():
-        off |= _seen_from_within(scan, template, surfels, off, options)
+        off |= _seen_from_within(template, surfels, off, options)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
     faces = None
-    facing = surfels.toward_sensors(which, scan)
+    facing = surfels.toward_sensors(which)
     if facing is not None:
         normal[which] = _toward(surfels.planes(which), facing)
         surfels = surfels.halves_joined(which, normal[which])
@@ -150,9 +150,7 @@ def gather(
     return Evidence(surfels, off, normal, images, options, faces)
 
 
-def with_stubs(
-    evidence: Evidence, scan: Scan, gone_mm: Points, labelled: Bool[np.ndarray, " s"]
-) -> Evidence:
+def with_stubs(evidence: Evidence, gone_mm: Points, labelled: Bool[np.ndarray, " s"]) -> Evidence:
     """The same evidence, knowing the tops of what is left of walls one bead wide.
 
     Such a top lies inside the template, yet nearer to its side than any limit: where template
@@ -161,7 +159,7 @@ def with_stubs(
     s, options = evidence.surfels, evidence.options
     near = has_near(s.place_mm, gone_mm, options.stub_cells * s.cell_mm)
     which = np.flatnonzero(near & ~labelled & ~evidence.off & (s.deviation_mm < -options.stub_mm))
-    facing = s.toward_sensors(which, scan)
+    facing = s.toward_sensors(which)
     if facing is None or not len(which):
         return evidence
     off, normal = evidence.off.copy(), evidence.normal.copy()
@@ -177,7 +175,7 @@ def _toward(planes: Points, guide: Points) -> Points:
 
 
 def _seen_from_within(
-    scan: Scan, template: Template, surfels: Surfels, off: Mask, options: EvidenceOptions
+    template: Template, surfels: Surfels, off: Mask, options: EvidenceOptions
 ) -> Mask:
     """Surfels along the template's surface that were seen through the template.
 
@@ -185,7 +183,7 @@ def _seen_from_within(
     side was seen from above: it faces the other way, and what lies over it is empty.
     """
     found, which = np.zeros_like(off), np.flatnonzero(~off)
-    facing = surfels.toward_sensors(which, scan)
+    facing = surfels.toward_sensors(which)
     assert facing is not None
     gradient, along = _beside_template(template, surfels, which)
     back = (unit_vectors(facing) * gradient).sum(axis=1) < options.back_cosine

@@ -52,6 +52,8 @@ class Surfels:
         (n,) the surfel of each point, −1 for points left out.
     point_deviation_mm
         (n,) deviation of each point.
+    sensor_mm
+        (s, 3) mean place of what saw each point of a cell; None where nobody knows.
     """
 
     cell_mm: float
@@ -65,6 +67,7 @@ class Surfels:
     of_point: Int[np.ndarray, " m"]
     moments: Float[np.ndarray, "s 12"]
     point_deviation_mm: Float[np.ndarray, " m"]
+    sensor_mm: Points | None
 
     def __len__(self) -> int:
         return len(self.place_mm)
@@ -104,28 +107,27 @@ class Surfels:
 
     def by_view(self, view_index: Int[np.ndarray, " m"]) -> Shares:
         """What each view says of each cell that it saw, the cells rising."""
-        has = self.of_point >= 0
-        one = np.ones(int(has.sum()), np.int64)
-        each = Shares(self.of_point[has], view_index[has], self.point_deviation_mm[has], one)
-        return each.gathered()
+        views = int(view_index.max(initial=0)) + 1
+        count, total_mm = kernels.sums_by_view(
+            self.of_point, view_index, self.point_deviation_mm, len(self), views
+        )
+        place, view = np.nonzero(count)
+        seen = count[place, view]
+        return Shares(place, view, total_mm[place, view] / seen, seen)
 
-    def toward_sensors(self, which: Numbers, scan: Scan) -> Points | None:
+    def toward_sensors(self, which: Numbers) -> Points | None:
         """(n, 3) mean way from some cells' points to what saw them; None where nobody knows."""
-        if scan.sensors_mm is None or scan.sensor_index is None:
+        if self.sensor_mm is None:
             return None
-        if not len(which):
-            return np.zeros((0, 3))
-        own = np.flatnonzero(self.of_point >= 0)
-        cell, sensor_mm = self.of_point[own], scan.sensors_mm.T[:, scan.sensor_index[own]]
-        total_mm = np.stack([np.bincount(cell, along, len(self)) for along in sensor_mm], axis=1)
-        return np.asarray(total_mm[which] / self.count[which, None] - self.place_mm[which])
+        return np.asarray(self.sensor_mm[which] - self.place_mm[which])
 
 
 def make_surfels(
-    points_mm: Points, deviation_mm: Values, keep: Mask, options: SurfelOptions = USUAL_SURFELS
+    scan: Scan, deviation_mm: Values, keep: Mask, options: SurfelOptions = USUAL_SURFELS
 ) -> Surfels:
     """Condense the points in `keep`; the cell follows their spacing."""
-    box = box_of(points_mm[keep]) if keep.any() else np.zeros((2, 3))
+    points_mm, sensor_mm = scan.points_mm, None
+    box = box_of(np.compress(keep, points_mm, axis=0)) if keep.any() else np.zeros((2, 3))
     spacing_mm = _spacing(points_mm, keep, box, options)
     cell_mm = options.cell_spacings * spacing_mm
     cell_mm = float(np.clip(cell_mm, options.least_cell_mm, options.most_cell_mm))
@@ -136,6 +138,9 @@ def make_surfels(
     count, mean_f = sums[:, 11], sums[:, 3] / sums[:, 11]
     table = kernels.neighbour_table(keys, *strides)
     wide = kernels.neighbour_sums(table, np.ascontiguousarray(sums[:, [3, 11]]))
+    if scan.sensors_mm is not None and scan.sensor_index is not None:
+        told = of_point, scan.sensor_index, np.ascontiguousarray(scan.sensors_mm)
+        sensor_mm = kernels.sensor_sums(*told, len(keys)) / count[:, None]
     many = count >= 3
     variance = np.maximum(sums[:, 10] / count - mean_f**2, 0.0) * count / np.maximum(count - 1, 1)
     return Surfels(
@@ -150,6 +155,7 @@ def make_surfels(
         of_point=of_point,
         moments=sums,
         point_deviation_mm=deviation_mm,
+        sensor_mm=sensor_mm,
     )
 
 

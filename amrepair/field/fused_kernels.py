@@ -84,3 +84,25 @@ def cell_sums(of_point, points, origin, deviation, cells):
         for c in range(12):
             out[i, c] += told[c]
     return out
+
+
+@njit(cache=True, nogil=True)
+def sensor_sums(of_point, index, sensors, cells):
+    """(s, 3) sum over each cell's points of the place of what saw them."""
+    out = np.zeros((cells, 3))
+    for p in range(len(of_point)):
+        if of_point[p] >= 0:
+            for a in range(3):
+                out[of_point[p], a] += sensors[index[p], a]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def sums_by_view(of_point, view, deviation, cells, views):
+    """(s, v) how many of a cell's points each view saw, and their summed deviation."""
+    count, total = np.zeros((cells, views), np.int64), np.zeros((cells, views))
+    for p in range(len(of_point)):
+        if of_point[p] >= 0:
+            count[of_point[p], view[p]] += 1
+            total[of_point[p], view[p]] += deviation[p]
+    return count, total

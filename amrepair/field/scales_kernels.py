@@ -9,6 +9,8 @@ from gcode.compiled import njit, prange
 
 # Cells of a window of 3×3×3 with six ways to face; a surface crosses far fewer.
 MOST_NEIGHBOURS = 64
+# Cells by one thread, one after the other: their neighbours lie one after the other, too.
+TOGETHER = 256
 # Slots for the way a cell faces (±x, ±y, ±z), in its key; a power of two.
 SLOTS = 8
 # median |x| of a normal value of standard deviation 1 (scipy.stats.norm.ppf(0.75))
@@ -55,13 +57,18 @@ def neighbours(keys, stride_x, stride_y, normal, value, cosine, aside):
     n = keys.shape[0]
     table = np.empty((n, MOST_NEIGHBOURS), np.int32)
     count = np.zeros(n, np.int32)
-    for i in prange(n):
-        found = 0
-        cell = keys[i] // SLOTS
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                first = (cell + dx * stride_x + dy * stride_y - 1) * SLOTS
-                j = np.searchsorted(keys, first)
+    for part in prange((n + TOGETHER - 1) // TOGETHER):
+        begins = np.full(9, -1, np.int64)  # of each line of cells; they rise with the cell
+        for i in range(part * TOGETHER, min(n, (part + 1) * TOGETHER)):
+            found = 0
+            cell = keys[i] // SLOTS
+            for line in range(9):
+                beside = (line // 3 - 1) * stride_x + (line % 3 - 1) * stride_y
+                first = (cell + beside - 1) * SLOTS
+                j = begins[line] if begins[line] >= 0 else np.searchsorted(keys, first)
+                while j < n and keys[j] < first:
+                    j += 1
+                begins[line] = j
                 while j < n and keys[j] < first + 3 * SLOTS:
                     if found < MOST_NEIGHBOURS and (
                         j == i or _alike(normal, value, i, j, cosine, aside)
@@ -69,7 +76,7 @@ def neighbours(keys, stride_x, stride_y, normal, value, cosine, aside):
                         table[i, found] = j
                         found += 1
                     j += 1
-        count[i] = found
+            count[i] = found
     return table, count
 
 

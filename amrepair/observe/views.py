@@ -41,11 +41,12 @@ class Shares:
     @property
     def apart_mm(self) -> float | None:
         """Standard deviation of what views say of one place; None where no place had several."""
-        several = self.views > 1
+        views = self.views
+        several = views > 1
         if not several.any():
             return None
         mean_mm = np.bincount(self.place, self.value_mm) / np.maximum(np.bincount(self.place), 1)
-        off_mm, views = (self.value_mm - mean_mm[self.place])[several], self.views[several]
+        off_mm, views = (self.value_mm - mean_mm[self.place])[several], views[several]
         return MAD_TO_SIGMA * float(np.median(np.abs(off_mm) * np.sqrt(views / (views - 1.0))))
 
     def some(self, which: Mask) -> Shares:
@@ -107,7 +108,7 @@ def contradictions(
         apart_mm = told.value_mm[shared] - total[shared] / others[shared]
         noise_mm = point_sigma_mm * np.sqrt(1.0 / points[shared] + 1.0 / others[shared])
         table = []
-        for k in np.unique(told.view):
+        for k in np.flatnonzero(np.bincount(told.view)):
             own = told.view[shared] == k
             if own.sum() < LEAST_PLACES:
                 continue

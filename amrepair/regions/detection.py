@@ -178,7 +178,7 @@ def _bounded(
         options=options.evidence,
     )
     surface_label = _label_surface(seen, evidence, test)
-    return with_stubs(evidence, seen.scan, seen.surface_mm[test.gone], labelled), surface_label
+    return with_stubs(evidence, seen.surface_mm[test.gone], labelled), surface_label
 
 
 def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:

@@ -11,7 +11,7 @@ from amrepair.field.groups import CELLS_APART, connected
 from amrepair.field.near import has_near
 from amrepair.field.scales import Scale
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import LEAST_SIGMA_MM, Level
+from amrepair.regions.significance import LEAST_SIGMA_MM, Level, by_class
 
 
 def grown(
@@ -32,10 +32,12 @@ def grown(
     beside them. Where more is allowed than anywhere, by the job or by what sound parts differ by,
     all of that is none of a region.
     """
-    scale = levels[0].scale
+    first, scale = levels[0], levels[0].scale
     value_mm = scale.value_mm[scale.of_base]
     # what is normal where a place was seen as well: a defect's own slopes are no noise
-    noise_mm = options.grow_sigmas * levels[0].usual_mm[scale.of_base]
+    group = first.errors.group
+    usual_mm = by_class(group, first.error_mm, options)[group]
+    noise_mm = options.grow_sigmas * usual_mm[scale.of_base]
     more = tolerance_mm > anywhere_mm + LEAST_SIGMA_MM
     low_mm = np.where(more, tolerance_mm, options.grow_share * tolerance_mm) + noise_mm
     labels = np.zeros(tolerance_mm.shape, bool)

@@ -103,8 +103,6 @@ class Level:
         The scale, and its standard errors.
     tolerance_mm, error_mm
         (2, s) δ for missing and excess, and (s,) the standard error of the statistic.
-    usual_mm
-        (s,) median standard error of the windows that were seen as well.
     freedom
         (s,) degrees of freedom of the standard error.
     z
@@ -124,7 +122,6 @@ class Level:
     errors: Errors
     tolerance_mm: Float[np.ndarray, "2 s"]
     error_mm: Values
-    usual_mm: Values
     freedom: Values
     z: Float[np.ndarray, "2 s"]
     critical: Float[np.ndarray, " 2"]
@@ -227,7 +224,7 @@ def _errors(
     """What neighbouring cells differ by, and by how much, at most, whole windows wander."""
     classes = int(group.max()) + 1
     # what few neighbours tell by chance to be quiet is as noisy as places seen as well
-    usual = _by_class(group, scale.noise_mm, classes, options)[group]
+    usual = by_class(group, scale.noise_mm, options)[group]
     cell = np.maximum(np.maximum(scale.noise_mm, usual), LEAST_SIGMA_MM)
     window = MEDIAN_LOSS * cell / np.sqrt(scale.count)
     if calibration is None:
@@ -253,20 +250,25 @@ def seen_class(scale: Scale, facing: Values, step: float) -> Numbers:
     return np.maximum(-np.floor(np.log2(relative) / step), 0.0).astype(np.int64)
 
 
-def _by_class(
-    group: Numbers, value: Values, classes: int, options: RegionOptions, share: float = 0.5
+def by_class(
+    group: Numbers,
+    value: Values,
+    options: RegionOptions,
+    *,
+    share: float = 0.5,
+    classes: int | None = None,
 ) -> Float[np.ndarray, " c"]:
     """(c,) of a value in each class, what a share of them is below: the median, unless said.
 
     Never less in one that was seen less well, nor more by a larger factor than the square of how
     much less: at an angle θ of incidence errors of real views grow with 1/cos θ to 1/cos² θ.
     """
-    found = np.zeros(classes)
-    for k in range(classes):
+    found = np.zeros(int(group.max()) + 1 if classes is None else classes)
+    for k in range(len(found)):
         here = group == k
         if here.sum() >= options.least_cells:
             found[k] = float(np.quantile(value[here], share))
-    most = found[0] * 4.0 ** (options.seen_step * np.arange(classes))
+    most = found[0] * 4.0 ** (options.seen_step * np.arange(len(found)))
     return np.maximum.accumulate(np.minimum(found, most))
 
 
@@ -286,7 +288,7 @@ def _wander(
     off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_QUARTILE
     # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
     worse = np.maximum(group[one], group[other])
-    found = _by_class(worse, off_mm, classes, options, 0.25)
+    found = by_class(worse, off_mm, options, share=0.25, classes=classes)
     # a bent part wanders too, but no scanner does so smoothly and so far
     found *= min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
     return found, _freedom(scale, worse, (one, other), classes, options)
@@ -362,10 +364,9 @@ def _level(
         if tail.scale > 0:
             log_p[side] = np.maximum(log_p[side], tail.log_expected(safe))
             critical[side] = max(quantile, tail.exceeded_by(share))
-    usual_mm = _by_class(errors.group, error_mm, int(errors.group.max()) + 1, options)
     return Level(
-        scale, errors, tolerance_mm, error_mm, usual_mm[errors.group], freedom, z, critical,
-        quantile, log_p, (tails[0], tails[1]), (peaks[0], peaks[1]),
+        scale, errors, tolerance_mm, error_mm, freedom, z, critical, quantile, log_p,
+        (tails[0], tails[1]), (peaks[0], peaks[1]),
     )  # fmt: skip
 
 

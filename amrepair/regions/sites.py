@@ -132,7 +132,7 @@ def observed(
                 f"{options.background.most_excess_mm:g} mm of the template; check its frame, its "
                 "unit and that it shows this part"
             )
-        surfels = make_surfels(scan.points_mm, f_mm, keep, options.surfels)
+        surfels = make_surfels(scan, f_mm, keep, options.surfels)
         seen = images or () if asked is None else asked.result()
         if without and seen:
             assert scan.sensors_mm is not None
@@ -170,7 +170,7 @@ def sites_of(
     crossed_mm = seen.surface_mm[crossed.which]
     value_mm = np.concatenate([surfels.deviation_mm, -crossed.depth_mm])
     # what rays passed has no points of its own: it was seen as most places were
-    facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels)), seen.scan))
+    facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels))))
     typical, faced = (
         np.full(len(crossed_mm), float(np.median(told))) for told in (surfels.count, facing)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -147,11 +148,16 @@ class Scan:
 
         The grids are dropped: their gaps would no longer be gaps. The edge flags stay true.
         """
+        which = np.flatnonzero(keep) if keep.dtype == bool else keep
+
+        def some(of_each: Any) -> Any:
+            return None if of_each is None else of_each.take(which, axis=0)
+
         return replace(
             self,
-            points_mm=self.points_mm[keep],
-            normals=None if self.normals is None else self.normals[keep],
-            sensor_index=None if self.sensor_index is None else self.sensor_index[keep],
+            points_mm=some(self.points_mm),
+            normals=some(self.normals),
+            sensor_index=some(self.sensor_index),
             grids=None,
-            edge=None if self.edge is None else self.edge[keep],
+            edge=some(self.edge),
         )

@@ -12,6 +12,7 @@ from amrepair.deficit.options import HeightOptions
 from amrepair.field import faces_kernels
 from amrepair.field.fused import make_surfels
 from amrepair.regions.strands import on_strands
+from amrepair.scans import Scan
 from gcode.surfaces import HeightField
 from tests import analytic
 
@@ -88,7 +89,8 @@ def test_a_string_is_told_along_its_length_and_noise_is_not(seed: int, turned: f
     limits = {"systematic_mm": 0.2, "noise_mm": 0.3}
     for high_mm in (0.0, 0.6):
         high = points + high_mm * string[:, None] * (0.0, 0.0, 1.0)
-        surfels = make_surfels(high, high[:, 2] - 10.0, np.ones(len(high), bool))
+        scan = Scan(high, 0.03, "template")
+        surfels = make_surfels(scan, high[:, 2] - 10.0, np.ones(len(high), bool))
         maybe = surfels.wide_deviation_mm > 0.08
         on = on_strands(surfels, block, maybe, **limits)
         if not high_mm:
@@ -108,7 +110,8 @@ def test_where_cells_end_does_not_part_a_rough_surface(seed: int, below: float) 
     rng = np.random.default_rng(seed)
     rough = np.column_stack([rng.uniform(0.0, 12.0, (3600, 2)), rng.normal(0.0, 0.06, 3600)])
     points = np.vstack([rough, [0.0, 0.0, -below]])
-    surfels = make_surfels(points, points[:, 2], np.ones(len(points), bool))
+    scan = Scan(points, 0.0, "template")
+    surfels = make_surfels(scan, points[:, 2], np.ones(len(points), bool))
     top = np.flatnonzero(surfels.place_mm[:, 2] > -0.5)
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(top), 3))
     joined = surfels.halves_joined(top, up)
