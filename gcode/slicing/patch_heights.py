@@ -209,6 +209,7 @@ def _opening(
     options = model.options.heights
     need_mm = model.need_mm
     hollow = _hollow(model, tops_mm, most_mm) & (need_mm < model.top_mm - options.opens_below_mm)
+    hollow &= np.isfinite(need_mm)  # elsewhere nothing stands: the head was never out
     steps = np.ceil(need_mm[hollow] / options.flat_mm).astype(np.int64)
     if not len(steps):
         return np.zeros(0), np.zeros(0)

@@ -70,6 +70,16 @@ def test_what_hangs_at_a_height_holds_nothing_laid_at_the_same(model: PatchModel
     assert Holds(model, lower, at, 0.8).stretches(across_mm) != []
 
 
+def test_over_what_nothing_stands_beside_no_opening_is_looked_for() -> None:
+    # regression: with nothing above the deficit's floor the head needs no height at all, which
+    # made a height of minus infinity over a pit
+    block = m3.Manifold.cube((12.0, 12.0, 5.2)).translate((60.0, 60.0, 0.0))
+    pit = m3.Manifold.cube((4.0, 4.0, 2.0)).translate((64.0, 64.0, 3.2))
+    layer = m3.Manifold.cube((12.0, 12.0, 0.2)).translate((60.0, 60.0, 5.2))
+    over = PatchModel(layer, SETUP, HeightField.from_manifold(block - pit, 0.2, margin_mm=8.0))
+    assert not len(Heights.of(over, GRID, SETUP, openings=Openings.EACH).openings_mm)
+
+
 def _with(setup: PrintSetup, **weights: float) -> PrintSetup:
     return replace(setup, process=setup.process.model_copy(update=weights))
 
