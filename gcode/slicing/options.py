@@ -123,9 +123,6 @@ class BridgeOptions:
         A strand thinner than this share of a layer is drawn out, not laid: the next pass spans it.
     least_mm2
         Less of a hollow is not worth a strand: what hangs beside its rim closes it.
-    under_nozzles
-        In bores: a strand's end rests on what lies so near to its middle. Under the bore's rim
-        alone it is drawn past it.
     beside_mm
         Of the job's own lines: nearer than this to what is as high they are held from beside.
     beside_layers
@@ -140,7 +137,6 @@ class BridgeOptions:
     loose_mm: float = 0.3
     least_layers: float = 0.5
     least_mm2: float = 1.0
-    under_nozzles: float = 0.25
     beside_mm: float = 0.5
     beside_layers: float = 0.25
     pressed_mm: float = 0.8

@@ -148,14 +148,13 @@ class Holds:
         lies = (gap <= model.drop_mm) | beside(stands, asked, within_mm, model.cell_mm)
         self._air = ~self._held & ~lies
         # there a thin strand hangs over a floor that a thick one would lie on
-        hangs = model.near & (gap > at.most_mm)
-        self._gap, self._over_floor = gap, hangs & below
-        self._firm = ~hangs
+        self._gap, self._over_floor = gap, model.near & below & (gap > at.most_mm)
+        self._firm = ~self._over_floor
         if self._over_floor.any():
             under = (gap <= at.most_mm) & ~state.loose
             high = gap <= model.options.bridges.beside_layers * at.layer_mm
-            for holds, near_mm in ((under, model.under_mm), (high, within_mm)):
-                self._firm |= beside(holds, hangs, near_mm, model.cell_mm)
+            for holds, near_mm in ((under, 0.5 * model.line_width_mm), (high, within_mm)):
+                self._firm |= beside(holds, self._over_floor, near_mm, model.cell_mm)
 
     def floored(
         self, runs: list[Bead], thick: Float[np.ndarray, "ny nx"]

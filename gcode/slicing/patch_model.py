@@ -109,11 +109,6 @@ class PatchModel:
         )
         return np.maximum(below.reshape(self.shape), 0.0)
 
-    @property
-    def under_mm(self) -> float:
-        """How near to a strand's middle what holds it from below must be."""
-        return self.options.bridges.under_nozzles * self._printer.nozzle_diameter_mm
-
     @cached_property
     def longest_span_mm(self) -> float:
         """As far as a strand may go over air: what the material bears, or the job spans itself.

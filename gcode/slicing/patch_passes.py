@@ -199,7 +199,6 @@ def _along_job(
 ) -> _Laying | None:
     """Along what the job laid there, with as much of each line's plastic as is missing.
 
-    Where the head is kept off a line by little, it goes beside it.
     Where walls keep the head off, so that lines end before them, none of them goes along the wall:
     less is served.
     """
@@ -210,8 +209,7 @@ def _along_job(
         planned,
         lambda bead: [
             held
-            for near in eased([bead], at.reach, model.reach)
-            for run in free_runs(near, lambda a, b: free_between(a, b, at.reach, model.reach))
+            for run in free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
             for held in holds.held(run)
         ],
     )

@@ -16,7 +16,6 @@ from gcode.slicing.job_lines import JobLines, JobPieces, gathered
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.options import USUAL_PATCH
 from gcode.slicing.patch import PatchPlan, slice_patch
-from gcode.slicing.patch_free import ASIDE_MM
 from gcode.surfaces import HeightField, raster_kernels
 
 SETUP = load_setup()
@@ -119,20 +118,6 @@ def test_beads_lie_where_the_job_laid_them():
         USUAL_PATCH.beads.bond_ratio * missing.volume(), rel=0.03
     )
     assert sum(u.volume_mm3 for u in plan.unreachable) < 0.02 * missing.volume()
-
-
-def test_beside_a_wall_a_line_is_laid_as_near_as_the_head_gets():
-    # regression: the head was kept off its middle by less than a tenth of a millimetre, and a line
-    # of our own was laid instead, with other ends and more plastic
-    low_mm, y_mm = TOP_MM - HIGH_MM, Y0 + 20.5 * WIDE_MM
-    floor = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, low_mm)).translate((X0, Y0, 0.0))
-    wall = m3.Manifold.cube((LONG_MM, 1.0, TOP_MM + HIGH_MM)).translate((X0, y_mm - 1.53, 0.0))
-    missing = slab((4.0, 16.0), (20, 21), low_mm)
-    field = HeightField.from_manifold(floor + wall, 0.1, margin_mm=15.0)
-    plan = patched(missing, field, hatch(TOP_MM).some(np.arange(40) == 20))
-    assert np.abs(beads_of(plan)[:, 1] - y_mm).max() <= ASIDE_MM
-    laid_mm3 = USUAL_PATCH.beads.bond_ratio * missing.volume()
-    assert plan.beads_mm3 == pytest.approx(laid_mm3, rel=0.01)
 
 
 def test_a_line_that_a_scan_rounded_off_is_laid_whole():
