@@ -59,7 +59,11 @@ def _check(owner: ModuleType | type, module: ModuleType) -> None:
                 setattr(owner, name, type(value)(_checked(value.__func__, shapes)))
         elif isinstance(value, property):
             if shapes := _shapes(value.fget, module):
-                setattr(owner, name, property(_checked(value.fget, shapes)))
+                checked = property(_checked(value.fget, shapes), value.fset, value.fdel)
+                setattr(owner, name, checked)
+        elif isinstance(value, functools.cached_property):
+            if shapes := _shapes(value.func, module):
+                value.func = _checked(value.func, shapes)
         elif shapes := _shapes(value, module):
             setattr(owner, name, _checked(value, shapes))
 
