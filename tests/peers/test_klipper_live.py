@@ -21,16 +21,12 @@ from link_helpers import Unjudged, program
 from live_klipper import Api, LiveKlipper
 from peer_harness import process, wait_for
 from test_moonraker_agent import Stack
+from void_loop import fills_a_void
 
-from amrepair.loop import run_loop
-from amrepair.loop.sites import sites
-from amrepair.simulate.defects import parse_defect
-from amrepair.simulate.run import prepare_run, set_stage
-from amrepair.template import MeshSdf
 from gcode.errors import LinkError, PrinterError
 from gcode.firmware import FirmwareCore
 from gcode.firmware.motion import MotionBatch, MotionFile
-from gcode.hosts import LinkLostError, connect
+from gcode.hosts import LinkLostError
 from gcode.hosts.port import NothingMetError
 from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
@@ -219,31 +215,12 @@ def test_a_job_whose_sender_was_killed_goes_on_and_lays_every_bead_once(tmp_path
 
 @pytest.mark.timeout(900)  # it moves in real time
 def test_a_void_is_found_and_filled(tmp_path: Path) -> None:
-    """The whole loop: it heats, homes, prints, rests, goes aside, is looked at, mends and goes on.
-
-    Plastic and light alone are simulated, by what Klipper says that it moved.
-    """
-    part = MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (13, 10, 1.6))))
     setup = load_setup("generic_klipper", process="repair_0.20")
-    run = prepare_run(part, setup, [parse_defect("void:diameter=5,layers=2")], title="", seed=3)
     with LiveKlipper(tmp_path) as klipper:
-        stage = set_stage(run, klipper.moves.take)
-        with connect(
-            klipper.port, dialect="klipper", baud=250000, wire_log=tmp_path / "wire.log"
-        ) as printer:
-            report = run_loop(
-                run.job, run.checked, printer, stage,
-                sites(run.job, part, run.build_from_template, setup, by_beads=run.by_beads),
-                stops=run.stops,
-            )  # fmt: skip
-            cooling = printer.temperatures()
-        stage.finish()
-    assert [look.printed for look in report.looks].count(True) == 1
-    assert report.within_tolerance
-    truth = stage.truth[0]
-    assert truth.missing_mm3 > 4.0
-    assert truth.filled_mm3 > 0.9 * truth.missing_mm3
-    assert (cooling.hotend_target_c, cooling.bed_target_c) == (0.0, 0.0)
+        fills_a_void(
+            setup, klipper.port, klipper.moves.take,
+            dialect="klipper", baud=250000, wire_log=tmp_path / "wire.log",
+        )  # fmt: skip
 
 
 CLOG = np.array([[106.0, 107.0, 0.5], [112.0, 112.0, 1.25]])

@@ -11,19 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import trimesh
 from link_helpers import program
 from native_marlin import NativeMarlin, Nozzle, profile
+from void_loop import fills_a_void
 
 import gcode.hosts.serial as serial_host
-from amrepair.loop import run_loop
-from amrepair.loop.sites import sites
-from amrepair.simulate.defects import parse_defect
-from amrepair.simulate.run import prepare_run, set_stage
-from amrepair.template import MeshSdf
 from gcode.errors import PrinterError
 from gcode.firmware import MotionBatch
-from gcode.hosts import connect
 from gcode.hosts.serial import SerialPrinter
 from gcode.profiles import load_setup
 
@@ -90,32 +84,15 @@ def test_inches_that_it_was_built_without_end_the_job(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(900)  # it moves in real time
 def test_a_void_is_found_and_filled(tmp_path: Path) -> None:
-    """The whole loop: it heats, homes, prints, rests, goes aside, is looked at, mends and goes on.
-
-    Plastic and light alone are simulated, by what it says that it carried out.
-    """
-    part = MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (13, 10, 1.6))))
     setup = replace(load_setup(process="repair_0.20"), printer=profile(tmp_path))
-    run = prepare_run(part, setup, [parse_defect("void:diameter=5,layers=2")], title="", seed=3)
-    log, nozzle = tmp_path / "wire.log", Nozzle()
+    nozzle = Nozzle()
     with NativeMarlin(tmp_path) as marlin:
 
         def moved() -> MotionBatch:
             told, marlin.executed[:] = marlin.executed[:], []
             return nozzle.follow(told)
 
-        stage = set_stage(run, moved)
-        with connect(marlin.port, dialect="marlin", baud=115200, wire_log=log) as printer:
-            report = run_loop(
-                run.job, run.checked, printer, stage,
-                sites(run.job, part, run.build_from_template, setup, by_beads=run.by_beads),
-                stops=run.stops,
-            )  # fmt: skip
-            cooling = printer.temperatures()
-        stage.finish()
-    assert [look.printed for look in report.looks].count(True) == 1
-    assert report.within_tolerance
-    truth = stage.truth[0]
-    assert truth.missing_mm3 > 4.0
-    assert truth.filled_mm3 > 0.9 * truth.missing_mm3
-    assert (cooling.hotend_target_c, cooling.bed_target_c) == (0.0, 0.0)
+        fills_a_void(
+            setup, marlin.port, moved,
+            dialect="marlin", baud=115200, wire_log=tmp_path / "wire.log",
+        )  # fmt: skip
