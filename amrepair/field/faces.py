@@ -219,20 +219,34 @@ def _looked_at(
     kept = surfels.of_point >= 0
     far = np.abs(surfels.point_deviation_mm[kept]) > threshold_mm
     share = np.bincount(surfels.of_point[kept], far, len(surfels)) / surfels.count
-    near_cell = has_near(surfels.place_mm, surfels.place_mm[off], options.around_mm)
-    while True:
+    sigma_mm = max(scan.sigma_mm, surfels.spread_mm)
+
+    def around(places_mm: Points) -> Mask:
+        return has_near(surfels.place_mm, places_mm, options.around_mm)
+
+    def looked_at(cells: Mask) -> tuple[Mask, _Places]:
         chosen = np.zeros(len(scan.points_mm), bool)
-        chosen[kept] = near_cell[surfels.of_point[kept]]
-        found = _Places.of(
-            scan.points_mm[chosen], template, max(scan.sigma_mm, surfels.spread_mm), threshold_mm,
-            surfels.spacing_mm, options,
-        )  # fmt: skip
-        broken_mm = found.place_mm[found.is_broken]
-        beside = has_near(surfels.place_mm, broken_mm, options.around_mm) & ~near_cell
+        chosen[kept] = cells[surfels.of_point[kept]]
+        places = _Places.of(
+            scan.points_mm[chosen], template, sigma_mm, threshold_mm, surfels.spacing_mm, options
+        )
+        return chosen, places
+
+    near_cell = around(surfels.place_mm[off])
+    chosen, found = looked_at(near_cell)
+    last, rounds = found, 0
+    while True:
+        beside = around(last.place_mm[last.is_broken]) & ~near_cell
         # a film's cell has both its sides, and lies off as a whole only where one of them does
         if not (share[beside] > options.lone_ratio).any():
-            return near_cell, chosen, found
+            break
         near_cell |= beside
+        rounds += 1
+        # what is new, with what lies around it for its planes
+        last = looked_at(around(surfels.place_mm[beside]) & near_cell)[1]
+    if rounds:
+        chosen, found = looked_at(near_cell)
+    return near_cell, chosen, found
 
 
 def find_faces(
