@@ -17,13 +17,14 @@ from amrepair.align.thinning import in_order, thin_out
 from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, diagonal, in_box, moved
 from amrepair.scans import Scan
+from amrepair.scans.ply import MM_PER
 from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
 
 ALIGN_METHODS = ("robust", "paper")
 LOOK_AT = 5_000  # repeats of a few places show in a sample
 ALONG = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # places that differ along it differ
-SCAN_UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3}
+SCAN_UNITS = {"m": "metres", "in": "inches", "cm": "centimetres", "um": "micrometres"}
 
 
 def align(
@@ -332,13 +333,16 @@ def _refuse_other_size(scan: Scan, template: Template, options: AlignOptions) ->
     ratio, slack = size / max(other, 1e-12), options.unit_slack
     if options.smallest_ratio <= ratio <= options.largest_ratio:
         return
-    near = [unit for unit, mm in SCAN_UNITS.items() if 1 / slack < ratio * mm < slack]
+    units = [unit for unit in SCAN_UNITS if 1 / slack < ratio * MM_PER[unit] < slack]
+    near = [SCAN_UNITS[unit] for unit in units]
     near += [  # no drawing is in micrometres
-        f"a template in {unit}"
-        for unit, mm in SCAN_UNITS.items()
-        if mm > 1.0 and 1 / slack < ratio / mm < slack
+        f"a template in {name}"
+        for unit, name in SCAN_UNITS.items()
+        if MM_PER[unit] > 1.0 and 1 / slack < ratio / MM_PER[unit] < slack
     ]
     hint = f" ({' or '.join(near)} for millimetres?)" if near else ""
+    if units:
+        hint += f"; the scan's is said with --scan-unit {' or '.join(units)}"
     raise AlignmentError(
         f"the scan {scan.source} is {size:.3g} mm across, its template {other:.3g} mm: they cannot "
         f"be the same part in the same unit{hint}"

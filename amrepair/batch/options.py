@@ -42,6 +42,8 @@ class BatchOptions:
         As of `align`: less of a scan has to fit.
     sensors_mm
         Places of the sensors in the scans' frames, mm; none where the files tell.
+    scan_unit
+        Of the scans' lengths, where the files do not say it; None is mm.
     part_pose
         X, Y, Z in mm and the turn about Z in degrees at which each part stands on the bed; None
         where the scans are in the build frame. Only `repair` asks.
@@ -55,6 +57,7 @@ class BatchOptions:
     seed: int = 0
     part_is_known: bool = False
     sensors_mm: tuple[tuple[float, float, float], ...] = ()
+    scan_unit: str | None = None
     part_pose: tuple[float, float, float, float] | None = None
     on_fixture: bool = False
     printer: str = "prusa_mk3s"

@@ -112,7 +112,9 @@ class Bench:
         options = self._work.options
         build = options.kind is BatchKind.REPAIR and options.part_pose is None
         sensors = np.array(options.sensors_mm) if options.sensors_mm else None
-        scan = read_scan(path, frame="build" if build else "scanner", sensor_at=sensors)
+        scan = read_scan(
+            path, frame="build" if build else "scanner", sensor_at=sensors, unit=options.scan_unit
+        )
         held, found, confidence = self._template_of(scan)
         chosen = {"template": held.name, "confidence": confidence}
         if options.kind is BatchKind.REPAIR:

@@ -15,6 +15,7 @@ from amrepair.cli.options import (
     CalibrationOption,
     SeedOption,
     SensorOption,
+    UnitOption,
     calibration_named,
     numbers,
     sensors,
@@ -75,6 +76,7 @@ def _run(
     template: TemplateOption,
     out: OutOption,
     sensor_at: SensorOption = None,
+    scan_unit: UnitOption = None,
     executor: ExecutorOption = "process",
     workers: WorkersOption = None,
     address: AddressOption = None,
@@ -85,7 +87,7 @@ def _run(
     with console.starting():
         from amrepair.batch import run_batch
 
-    options, calibration = judging(seed=seed, sensors_mm=_places(sensor_at))
+    options, calibration = judging(seed=seed, sensors_mm=_places(sensor_at), scan_unit=scan_unit)
     bars = console.Bars()
     with console.signals_end_it(), bars.shown():
         report = run_batch(
@@ -116,8 +118,8 @@ def _run(
 def _command(name: str, *examples: str) -> Callable[[Callable[..., Judging]], Callable[..., None]]:
     """A command with the options that every batch has, and with those of its own.
 
-    What is decorated has its own options by keyword, takes `seed` and `sensors_mm` as they are, and
-    says what is to be done.
+    What is decorated has its own options by keyword, takes `seed`, `sensors_mm` and `scan_unit` as
+    they are, and says what is to be done.
     """
 
     def add(own: Callable[..., Judging]) -> Callable[..., None]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from amrepair.cli.options import SCAN_TIMEOUT_S, ScanTimeoutOption, SeedOption
+from amrepair.cli.options import SCAN_TIMEOUT_S, ScanTimeoutOption, SeedOption, UnitOption
 from amrepair.errors import InputError
 from gcode.cli import console
 from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
@@ -33,6 +33,7 @@ def calibrate_command(
     template: Annotated[
         Path | None, typer.Option(help="Template of the sound part, or its mesh.")
     ] = None,
+    scan_unit: UnitOption = None,
     name: Annotated[
         str | None, typer.Option(help="Keep what was learned by this name, for --calibration.")
     ] = None,
@@ -80,7 +81,7 @@ def calibrate_command(
     with console.starting():
         from amrepair.cli import calibrating, sound_parts
     if sound:
-        sound_parts.run(sound, template, name, seed=seed, as_json=as_json)
+        sound_parts.run(sound, template, name, scan_unit=scan_unit, seed=seed, as_json=as_json)
         return
     if template is not None or name is not None:
         raise InputError("--template and --name belong to --sound SCAN; name a sound part's scan")

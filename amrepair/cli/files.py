@@ -27,7 +27,9 @@ def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     return meshes, scans
 
 
-def read_early(scan: Path, frame: str, sensors_mm: np.ndarray | None, bars: console.Bars) -> Scan:
+def read_early(
+    scan: Path, frame: str, sensors_mm: np.ndarray | None, unit: str | None, bars: console.Bars
+) -> Scan:
     """A scan, read before whatever judges it is loaded: a broken file is refused at once.
 
     Raises
@@ -39,7 +41,7 @@ def read_early(scan: Path, frame: str, sensors_mm: np.ndarray | None, bars: cons
         from amrepair.scans import read_scan
 
     with bars.shown(), bars.stage("read scan"):
-        return read_scan(scan, frame=frame, sensor_at=sensors_mm)
+        return read_scan(scan, frame=frame, sensor_at=sensors_mm, unit=unit)
 
 
 def refuse_traps(paths: list[Path]) -> None:

@@ -14,6 +14,7 @@ from amrepair.cli.options import (
     CalibrationOption,
     SeedOption,
     SensorOption,
+    UnitOption,
     calibration_named,
     sensors,
     with_settings,
@@ -69,6 +70,7 @@ def align(
     ] = None,
     part_is_known: KnownOption = False,
     sensor_at: SensorOption = None,
+    scan_unit: UnitOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -79,7 +81,7 @@ def align(
         raise InputError(f"--pam belongs to --method paper, the method is {method}")
     _refuse_known_of_many(part_is_known, template)
     bars = console.Bars()
-    cloud = read_early(scan, "scanner", sensors(sensor_at), bars)
+    cloud = read_early(scan, "scanner", sensors(sensor_at), scan_unit, bars)
     with console.starting():
         import numpy as np
 
@@ -189,6 +191,7 @@ def detect(
     out: Annotated[Path, typer.Option(help="Folder for anomaly.npz, anomaly.ply, result.json.")],
     part_is_known: KnownOption = False,
     sensor_at: SensorOption = None,
+    scan_unit: UnitOption = None,
     calibration: CalibrationOption = None,
     smallest_mm: Annotated[
         float | None,
@@ -202,7 +205,7 @@ def detect(
     """Align a scan and say what is missing and what is too much."""
     _refuse_known_of_many(part_is_known, template)
     bars = console.Bars()
-    cloud = read_early(scan, "scanner", sensors(sensor_at), bars)
+    cloud = read_early(scan, "scanner", sensors(sensor_at), scan_unit, bars)
     known_errors = calibration_named(calibration)
     with console.starting():
         import numpy as np

@@ -126,6 +126,15 @@ SensorOption = Annotated[
 ]
 
 
+UnitOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scan-unit",
+        help="Of the scan's lengths (mm, cm, m, um, in), where the file does not say it: mm.",
+    ),
+]
+
+
 CalibrationOption = Annotated[
     str | None,
     typer.Option(

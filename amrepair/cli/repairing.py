@@ -17,6 +17,7 @@ from amrepair.cli.options import (
     CalibrationOption,
     SeedOption,
     SensorOption,
+    UnitOption,
     calibration_named,
     numbers,
     part_pose,
@@ -100,6 +101,7 @@ def repair(
         ),
     ] = False,
     sensor_at: SensorOption = None,
+    scan_unit: UnitOption = None,
     calibration: CalibrationOption = None,
     job: Annotated[
         Path | None, typer.Option(help="The job's G-code: repair layers lie on its layers.")
@@ -140,7 +142,7 @@ def repair(
         )
     bars = console.Bars()
     frame = "build" if scan_frame == "build" else "scanner"
-    cloud = read_early(scan, frame, sensors(sensor_at), bars)
+    cloud = read_early(scan, frame, sensors(sensor_at), scan_unit, bars)
     with console.starting():
         import numpy as np
 

@@ -21,7 +21,13 @@ from gcode.cli import console
 
 
 def run(
-    sound: Sequence[Path], template: Path | None, name: str | None, *, seed: int, as_json: bool
+    sound: Sequence[Path],
+    template: Path | None,
+    name: str | None,
+    *,
+    scan_unit: str | None,
+    seed: int,
+    as_json: bool,
 ) -> None:
     """Lay each scan in the template, look at its errors, keep what they have in common."""
     if template is None or name is None:
@@ -37,7 +43,7 @@ def run(
         field = open_template(template, progress=bars)
         for path in sound:
             with bars.stage(f"read {path.name}"):
-                cloud = read_scan(path, frame="scanner")
+                cloud = read_scan(path, frame="scanner", unit=scan_unit)
             pose = align(cloud, field, rng=np.random.default_rng(seed), progress=bars)
             with bars.stage(f"look at {path.name}"):
                 seen.append(judged_levels(detect(cloud.moved(pose.template_from_scan), field)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amrepair.cli.files import refuse_traps, sort_inputs, write_mesh
-from amrepair.cli.options import SeedOption, sensors, with_settings
+from amrepair.cli.options import SeedOption, UnitOption, sensors, with_settings
 from amrepair.errors import InputError
 from gcode.cli import console
 from gcode.cli.options import JsonOption
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from amrepair.merge import ScanFit, SoundFit
+    from amrepair.scans import Scan
     from amrepair.template import GridSdf, PaperSdf
 
 
@@ -58,6 +59,7 @@ def fit(
             "find each other surely; PLY and PCD files may carry it.",
         ),
     ] = None,
+    scan_unit: UnitOption = None,
     poses: Annotated[
         Path | None,
         typer.Option(
@@ -88,7 +90,8 @@ def fit(
     console.writable(output)
     bars = console.Bars()
     meshes, scans = sort_inputs(inputs)
-    for given, option in ((sensor_at, "sensor-at"), (poses, "poses"), (turntable, "turntable")):
+    words = (sensor_at, "sensor-at"), (scan_unit, "scan-unit"), (poses, "poses")
+    for given, option in (*words, (turntable, "turntable")):
         if given and not scans:
             raise InputError(f"--{option} belongs to scans, only meshes are given")
     if scans and recipe == "paper" and not meshes:
@@ -97,7 +100,8 @@ def fit(
     told: dict[str, Any] = {}
     with bars.shown():
         if scans and recipe == "fast":
-            made = _from_scans(scans, meshes, sensors(sensor_at), poses, turntable, seed, bars)
+            clouds = _clouds(scans, sensors(sensor_at), scan_unit)
+            made = _from_scans(clouds, scans, meshes, poses, turntable, seed, bars)
             template, told = made.template, made.as_json([str(path) for path in scans])
         elif recipe == "fast" and len(meshes) == 1:
             template = fit_mesh(meshes[0], seed=seed, progress=bars)
@@ -117,34 +121,38 @@ def fit(
         console.errors.print(f"  {note}")
 
 
-def _from_scans(
-    scans: list[Path],
-    meshes: list[Path],
-    places: np.ndarray | None,
-    poses: Path | None,
-    turntable_deg: float | None,
-    seed: int,
-    bars: console.Bars,
-) -> ScanFit | SoundFit:
+def _clouds(scans: list[Path], places: np.ndarray | None, unit: str | None) -> list[Scan]:
     import numpy as np
 
-    from amrepair.merge import fit_from_scans, learn_from_scans
-    from amrepair.merge.told import POSES_FILE, read_poses
     from amrepair.scans import read_scan
-    from amrepair.template import load_mesh
 
-    if len(meshes) > 1:
-        raise InputError(f"a template has one nominal mesh, {len(meshes)} were given")
     if places is not None and len(places) not in (1, len(scans)):
         raise InputError(
             f"--sensor-at is given {len(places)} times for {len(scans)} scans; give it once, or "
             "once for each"
         )
     each = [None] * len(scans) if places is None else np.broadcast_to(places, (len(scans), 3))
-    clouds = [
-        read_scan(path, frame="scanner", sensor_at=place)
+    return [
+        read_scan(path, frame="scanner", sensor_at=place, unit=unit)
         for path, place in zip(scans, each, strict=True)
     ]
+
+
+def _from_scans(
+    clouds: list[Scan],
+    scans: list[Path],
+    meshes: list[Path],
+    poses: Path | None,
+    turntable_deg: float | None,
+    seed: int,
+    bars: console.Bars,
+) -> ScanFit | SoundFit:
+    from amrepair.merge import fit_from_scans, learn_from_scans
+    from amrepair.merge.told import POSES_FILE, read_poses
+    from amrepair.template import load_mesh
+
+    if len(meshes) > 1:
+        raise InputError(f"a template has one nominal mesh, {len(meshes)} were given")
     if meshes:
         for given, option in ((poses, "poses"), (turntable_deg, "turntable")):
             if given is not None:

@@ -26,7 +26,7 @@ def refuse_wrong_scale(scan: Scan, template: Template) -> None:
     if 0 < scan_mm * 200 < part_mm:
         raise InputError(
             f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "
-            f"the scan looks like metres; multiply it by 1000"
+            "the scan looks like metres: read it as such (--scan-unit m)"
         )
     if scan_mm > 200 * part_mm:
         raise InputError(

@@ -88,22 +88,28 @@ def _grid_entries(
     return entries
 
 
-def millimetres_of(header: PlyHeader, path: Path) -> float:
-    """Millimetres in the file's unit: `comment unit m` or `obj_info unit m`; 1 without a word.
+def millimetres_of(header: PlyHeader, path: Path, given_mm: float | None) -> float:
+    """Millimetres in the file's unit: `comment unit m` or `obj_info unit m`; else as given, or 1.
 
     Raises
     ------
     InputError
-        If the unit is unknown.
+        If the unit is unknown, or another one is given.
     """
     unit = header.said("unit")
     if unit is None:
-        return 1.0
+        return given_mm or 1.0
     if unit.lower() not in MM_PER:
         raise InputError(
             f"{path}: the PLY file's unit is '{unit[:20]}'; known are {', '.join(MM_PER)}"
         )
-    return MM_PER[unit.lower()]
+    own_mm = MM_PER[unit.lower()]
+    if given_mm is not None and given_mm != own_mm:
+        raise InputError(
+            f"{path}: the PLY file says that its unit is '{unit}', of {own_mm:g} mm, and one of "
+            f"{given_mm:g} mm is given; leave the scan's unit out, or mend the file"
+        )
+    return own_mm
 
 
 def sensors_of(header: PlyHeader) -> Float[np.ndarray, "k 3"] | None:

@@ -3,7 +3,7 @@
 It reads, and refuses with one sentence what it cannot read; it does not clean or guess frames.
 Points that are not finite are refused, not dropped, but in range images: there NaN is the format's
 word for "nothing seen", a gap. Lengths are millimetres, but where the format (PTX, glTF) or the
-file (a PLY's `comment unit m`) says otherwise.
+file (a PLY's `comment unit m`) or the user says otherwise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from amrepair.errors import InputError, refused_as_ours
 from amrepair.scans.arrays import is_map, load_npy, read_height_map, read_npz
 from amrepair.scans.depth_map import read_depth_map
 from amrepair.scans.mesh import read_mesh
-from amrepair.scans.ply import millimetres_of, read_grid, sensors_of, write_ply
+from amrepair.scans.ply import MM_PER, millimetres_of, read_grid, sensors_of, write_ply
 from amrepair.scans.ptx import read_ptx
 from amrepair.scans.range_grid import NO_POINT, RangeGrid, edge_flags
 from amrepair.scans.scan import DEFAULT_SIGMA_MM, Scan
@@ -37,6 +37,7 @@ UNIT_LENGTH_WITHIN, UNIT_LENGTH_SHARE = 0.05, 0.9  # two digits; some programs h
 # glTF 2.0, 3.4: lengths are metres, and Y is up.
 GLTF_MM = 1000.0 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 HEIGHT_SUFFIXES = frozenset({".tif", ".tiff"})
+UNIT_IN_FORMAT = frozenset({".ptx", ".png", ".npz", ".glb", ".3mf"})
 
 __all__ = ["read_height_map", "read_scan", "write_ply"]
 
@@ -49,6 +50,7 @@ def read_scan(
     sensor_at: Sequence[float] | Float[np.ndarray, "k 3"] | None = None,
     cell_mm: float | None = None,
     origin_mm: tuple[float, float] | None = None,
+    unit: str | None = None,
 ) -> Scan:
     """Read a scan from a file.
 
@@ -69,11 +71,14 @@ def read_scan(
         sensor of each point.
     cell_mm, origin_mm
         Placement of height maps that do not carry it.
+    unit
+        Of the file's lengths (mm, cm, m, um, in), where it does not say it itself; None is mm.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, empty or of an unknown kind.
+        If the file is missing, damaged, empty or of an unknown kind, or the unit is unknown or
+        contradicts the file's own.
 
     Examples
     --------
@@ -87,11 +92,39 @@ def read_scan(
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
         raise InputError(f"{path}: {what}")
+    unit_mm = _given_mm(unit, path)
     # what overflows is refused as not finite
     with np.errstate(all="ignore"), refused_as_ours():
-        scan = _read(path, frame, cell_mm, origin_mm)
+        if unit_mm is None:
+            scan = _read(path, frame, cell_mm, origin_mm)
+        else:
+            scan = _read_in(unit_mm, path, frame)
         scan = _with_word(scan, sigma_mm, sensor_at)
         return _with_edges(scan)
+
+
+def _given_mm(unit: str | None, path: Path) -> float | None:
+    """Millimetres of the unit that the user says; None where nothing was said."""
+    if unit is None or unit.lower() in MM_PER:
+        return None if unit is None else MM_PER[unit.lower()]
+    raise InputError(f"{path}: the scan's unit is '{unit[:20]}'; known are {', '.join(MM_PER)}")
+
+
+def _read_in(unit_mm: float, path: Path, frame: str) -> Scan:
+    """A file of a format that leaves the unit open, in a unit that the user says."""
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return _read_ply(path, frame, unit_mm)
+    if suffix == ".pcd":
+        return _read_pcd(path, frame, unit_mm)
+    if suffix in MESH_SUFFIXES - UNIT_IN_FORMAT:
+        return read_mesh(path, frame, DEFAULT_SIGMA_MM, mm_from_file=unit_mm * np.eye(3))
+    maps = is_depth_map(path) or (suffix == ".npy" and is_map(path))
+    if suffix in POINT_SUFFIXES - UNIT_IN_FORMAT and not maps:
+        return _read_table(path, frame, unit_mm)
+    raise InputError(
+        f"{path}: a scan of this kind has its unit by its format; leave the scan's unit out"
+    )
 
 
 def _read(
@@ -106,13 +139,13 @@ def _read(
     if suffix == ".npz":
         return read_npz(path, frame, DEFAULT_SIGMA_MM, cell_mm, origin_mm)
     if suffix == ".ply":
-        return _read_ply(path, frame)
+        return _read_ply(path, frame, None)
     if suffix == ".pcd":
-        return _read_pcd(path, frame)
+        return _read_pcd(path, frame, 1.0)
     if suffix == ".ptx":
         return read_ptx(_bytes(path), path, frame=frame, sigma_mm=DEFAULT_SIGMA_MM)
     if suffix in POINT_SUFFIXES:
-        return _read_table(path, frame)
+        return _read_table(path, frame, 1.0)
     if suffix in MESH_SUFFIXES:
         unit = GLTF_MM if suffix == ".glb" else np.eye(3)
         return read_mesh(path, frame, DEFAULT_SIGMA_MM, mm_from_file=unit)
@@ -190,10 +223,10 @@ def _from_columns(
     return Scan(points, sigma_mm, frame, normals, sensors_mm, index, str(path), grids, edge)
 
 
-def _read_ply(path: Path, frame: str) -> Scan:
+def _read_ply(path: Path, frame: str, given_mm: float | None) -> Scan:
     data = _bytes(path)
     header = read_header(data, path)
-    unit_mm = millimetres_of(header, path)
+    unit_mm = millimetres_of(header, path, given_mm)
     if header.count_of("face") > 0:
         return read_mesh(path, frame, DEFAULT_SIGMA_MM, mm_from_file=unit_mm * np.eye(3))
     sigma_mm = DEFAULT_SIGMA_MM
@@ -213,7 +246,7 @@ def _read_ply(path: Path, frame: str) -> Scan:
     )  # fmt: skip
 
 
-def _read_pcd(path: Path, frame: str) -> Scan:
+def _read_pcd(path: Path, frame: str, unit_mm: float) -> Scan:
     columns, header = read_pcd(_bytes(path), path)
     grid = None
     if header.shape is not None:
@@ -226,7 +259,11 @@ def _read_pcd(path: Path, frame: str) -> Scan:
     if grid is not None and kind:
         grid = RangeGrid(grid.index, "perspective")
     names = ("normal_x", "normal_y", "normal_z")
-    return _from_columns(columns, path, frame, sensors_mm=sensors, normal_names=names, grid=grid)
+    return _from_columns(
+        columns, path, frame,
+        sensors_mm=None if sensors is None else unit_mm * sensors,
+        normal_names=names, grid=grid, unit_mm=unit_mm,
+    )  # fmt: skip
 
 
 def _without_gaps(
@@ -270,7 +307,7 @@ def _viewpoint(
     return place.reshape(1, 3), True
 
 
-def _read_table(path: Path, frame: str) -> Scan:
+def _read_table(path: Path, frame: str, unit_mm: float) -> Scan:
     """Text or .npy rows of x y z, or x y z nx ny nz; one line of names, or a count, may be before.
 
     Six columns may be x y z and a colour, too: normals are as long as one another, colours are not.
@@ -281,7 +318,8 @@ def _read_table(path: Path, frame: str) -> Scan:
     names = ["x", "y", "z"]
     if table.shape[1] == 6 and _are_unit(table[:, 3:]):
         names += ["nx", "ny", "nz"]
-    return _from_columns({n: table[:, i] for i, n in enumerate(names)}, path, frame)
+    columns = {n: table[:, i] for i, n in enumerate(names)}
+    return _from_columns(columns, path, frame, unit_mm=unit_mm)
 
 
 def _are_unit(vectors: Float[np.ndarray, "n 3"]) -> bool:

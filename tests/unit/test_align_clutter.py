@@ -218,8 +218,8 @@ def test_a_part_of_metres_is_aligned(noise_mm: float) -> None:
 @pytest.mark.parametrize(
     ("mm", "hint"),
     [
-        (1e3, r"\(metres for millimetres\?"),
-        (25.4, r"\(inches for"),
+        (1e3, r"\(metres for millimetres\?\); the scan's is said with --scan-unit m$"),
+        (25.4, r"\(inches for.*--scan-unit in$"),
         (10.0, r"\(centimetres for"),
         (1 / 25.4, r"\(a template in inches for"),  # regression: "mils for millimetres?"
         (1e-3, r"\(micrometres or a template in metres for"),

@@ -221,3 +221,46 @@ def test_several_sensors_need_to_be_told_apart(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="which of them saw each point"):
         read_scan(path, frame="scanner", sensor_at=np.array([[0, 0, 300.0], [300.0, 0, 300.0]]))
     assert read_scan(path, frame="scanner", sensor_at=(0.0, 0.0, 300.0)).sensor_index is not None
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a.ply", "a.pcd", "a.npy", "a.stl"])
+def test_a_unit_is_said_where_the_file_leaves_it_open(name: str, tmp_path: Path) -> None:
+    box = trimesh.creation.box((0.04, 0.03, 0.02))
+    points = box.vertices.view(np.ndarray)
+    path = tmp_path / name
+    if path.suffix == ".stl":
+        box.export(path)
+    elif path.suffix == ".npy":
+        np.save(path, points)
+    else:
+        rows = "\n".join(" ".join(f"{v:.6f}" for v in row) for row in points)
+        head = {
+            ".xyz": "",
+            ".ply": f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty float x\n"
+            "property float y\nproperty float z\nend_header\n",
+            ".pcd": "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+            f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0.5 1 0 0 0\nPOINTS {len(points)}\n"
+            "DATA ascii\n",
+        }
+        path.write_text(head[path.suffix] + rows + "\n")
+    scan = read_scan(path, frame="scanner", unit="m")
+    assert np.ptp(scan.points_mm, axis=0) == pytest.approx([40.0, 30.0, 20.0], rel=1e-4)
+    if path.suffix == ".pcd":  # its sensor stands in the file's unit, too
+        assert scan.sensors_mm == pytest.approx(np.array([[0.0, 0.0, 500.0]]))
+
+
+def test_a_unit_that_the_file_contradicts_or_nobody_knows_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\ncomment unit cm\nelement vertex 1\nproperty float x\n"
+        "property float y\nproperty float z\nend_header\n1 2 3\n"
+    )
+    assert read_scan(path, frame="scanner", unit="cm").points_mm.tolist() == [[10.0, 20.0, 30.0]]
+    with pytest.raises(InputError, match=r"its unit is 'cm', of 10 mm, and one of 1000 mm"):
+        read_scan(path, frame="scanner", unit="m")
+    with pytest.raises(InputError, match=r"the scan's unit is 'ells'; known are mm, cm, m"):
+        read_scan(path, frame="scanner", unit="ells")
+    image = tmp_path / "a.ptx"
+    image.write_text("1\n1\n")
+    with pytest.raises(InputError, match=r"has its unit by its format; leave the scan's unit out"):
+        read_scan(image, frame="scanner", unit="m")
