@@ -19,7 +19,7 @@ from beartype.roar import BeartypeCallHintViolation
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans import EDGE, FLYING, RangeGrid, Scan, read_scan, write_ply
-from amrepair.scans.viewpoint import _along_the_way, _Fit
+from amrepair.scans.viewpoint import ViewpointOptions, _along_the_way, _pixels, _pushbrooms
 from tests.range_images import (
     CAMERA_MM,
     HOLE,
@@ -163,12 +163,13 @@ def box_on_plane() -> np.ndarray:
     return xyz
 
 
-def turned() -> np.ndarray:
-    turn = trimesh.transformations.rotation_matrix(0.6, [1.0, 2.0, 0.5])[:3, :3]
-    return np.asarray(in_camera(perspective()) @ turn.T)
+def bent() -> np.ndarray:
+    """A camera's, then bent: no rays are straight."""
+    xyz = in_camera(perspective())
+    return xyz + np.stack([0.02 * xyz[..., 1] ** 2, 0 * xyz[..., 0], 0 * xyz[..., 0]], axis=2)
 
 
-@pytest.mark.parametrize("made", [box_on_plane, turned])
+@pytest.mark.parametrize("made", [box_on_plane, bent])
 def test_what_the_grid_does_not_tell_stays_unknown(
     tmp_path: Path, made: Callable[[], np.ndarray]
 ) -> None:
@@ -177,6 +178,45 @@ def test_what_the_grid_does_not_tell_stays_unknown(
     assert scan.sensors_mm is None
     assert told(scan).kind == "unknown"
     assert picture(scan, EDGE)[4:9, 9:15].any()  # the hole's edge is known all the same
+
+
+TURN = trimesh.transformations.rotation_matrix(0.6, [1.0, 2.0, 0.5])[:3, :3]
+AWAY_MM = np.array([30.0, -70.0, 20.0])
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.05])
+@pytest.mark.parametrize("made", [perspective, pushbroom])
+def test_a_turned_view_is_told_all_the_same(
+    tmp_path: Path, made: Callable[[], RangeImage], noise_mm: float
+) -> None:
+    """The dragon's range images are such: a sheet of light that moved askew to every axis."""
+    image = made()
+    noise = np.random.default_rng(0).normal(0, noise_mm, image.xyz.shape)
+    write_pcd_grid(tmp_path / "a.pcd", (image.xyz + noise) @ TURN.T + AWAY_MM)
+    scan = read_scan(tmp_path / "a.pcd", frame="scanner")
+    assert scan.sensors_mm is not None
+    assert scan.sensor_index is not None
+    true = np.broadcast_to(image.sensor_mm, scan.points_mm.shape).copy()
+    back = (scan.points_mm - AWAY_MM) @ TURN
+    if made is pushbroom:
+        true[:, 0] = back[:, 0]
+    got, want = (scan.sensors_mm[scan.sensor_index] - AWAY_MM) @ TURN - back, true - back
+    turn = np.linalg.norm(np.cross(got, want), axis=1)
+    turn /= np.linalg.norm(got, axis=1) * np.linalg.norm(want, axis=1)
+    assert (got * want).sum(axis=1).min() > 0
+    # a ray is right to a pixel over the depth that was seen: 20 mm
+    assert np.quantile(turn, 0.95) * 20 < PIXEL_MM * 1.01
+
+
+def test_a_turned_picture_of_a_wall_tells_no_sensor(tmp_path: Path) -> None:
+    """Any camera, and any slits, make a picture of a plane: a homography says nothing of rays."""
+    rows, columns = np.meshgrid(np.arange(40.0), np.arange(50.0), indexing="ij")
+    x, y = (columns - 25) / 60, (rows - 20) / 60
+    z = 300.0 / (1.0 + 0.3 * x - 0.2 * y)
+    noise = np.random.default_rng(1).normal(0, 0.02, (*z.shape, 3))
+    wall = np.stack([x * z, y * z, z], axis=2) + noise
+    write_pcd_grid(tmp_path / "a.pcd", wall @ TURN.T + AWAY_MM)
+    assert read_scan(tmp_path / "a.pcd", frame="scanner").sensors_mm is None
 
 
 def test_a_flat_wall_fits_two_models_and_is_not_guessed(tmp_path: Path) -> None:
@@ -245,15 +285,17 @@ def test_a_plys_unit_is_taken_at_its_word(tmp_path: Path) -> None:
         read_scan(tmp_path / "c.ply", frame="s")
 
 
-def test_a_sheet_of_rays_has_no_more_places_than_points() -> None:
+def test_a_sheet_of_rays_has_no_more_places_than_sheets() -> None:
     """regression: 1.3 TB for the places of a file with one damaged depth."""
     image = pushbroom()
-    points = image.xyz[image.seen]
+    points, grid = image.xyz[image.seen], RangeGrid.of_seen(image.seen)
+    seen = _pixels(points, grid, len(points))
+    assert seen is not None
+    (fit,) = _pushbrooms(seen, ViewpointOptions())
+    assert fit.slits is not None
     points[3, 2] = 1e12
-    grid = RangeGrid.of_seen(image.seen)
-    fit = _Fit("pushbroom", 0.0, 0.0, along=0, centre=(0.0, 300.0))
-    found = _along_the_way(points, grid, points, fit)
-    assert len(found.sensors_mm) <= len(points)
+    found = _along_the_way(points, grid, points, fit.slits)
+    assert len(found.sensors_mm) <= image.seen.shape[1]
     assert found.sensor_index.max() < len(found.sensors_mm)
 
 
