@@ -2,10 +2,16 @@
 
     AMREPAIR_DATA=… python benchmarks/bench_fill.py                  # all cases, a table
     python benchmarks/bench_fill.py --cases notch pit --printers voron_2_4 --cell-mm 0.1
+    python benchmarks/bench_fill.py --cases slot --printers prusa_mk3s --off-grid
 
 The deficit is the true one (a boolean of two solids) and so is the field of what stands there: what
 is lost here is lost in planning, not in a scan. `tests/judge`, which shares no code with the
 packages, says what its own head reaches and what the text's beads fill.
+
+Walls of the blocks lie along the columns of that field, and end with them. `--off-grid` turns and
+moves each case to five places where they do not: there narrow slots are filled less, and the
+cone comes up to 0.1 mm nearer to walls: half a column each of not knowing where wall and tip are.
+Depth is measured upright: beside a wall that its hexagon overlaps by 0.02 mm it is all the wall.
 """
 
 from __future__ import annotations
@@ -42,6 +48,10 @@ BESIDE_MM = 8.0  # as in a repair
 SIZE_MM = (44.0, 34.0, 12.0)
 AT_MM = (95.0, 85.0, 0.0)
 PRINTERS = ("prusa_mk3s", "ender_3", "voron_2_4", "creality_k1")
+# moved in X and Y, mm, and turned about the block's middle, degrees
+OFF_GRID = (
+    (0.03, 0.02, 0.0), (0.05, 0.05, 0.0), (0.02, 0.06, 8.0), (0.04, 0.01, 17.0), (0.01, 0.07, 33.0),
+)  # fmt: skip
 # of real parts, by the seeds of bench_judge
 REAL = (("prusa-x-carriage-back", "notch", 3), ("frame-guide", "corner", 1))
 
@@ -108,6 +118,17 @@ class Case:
     rest: Any
     piece: Any
 
+    def placed(self, x_mm: float, y_mm: float, turned_deg: float) -> Case:
+        """The same elsewhere on the bed, turned about the block's middle."""
+        x0_mm, y0_mm = (AT_MM[k] + 0.5 * SIZE_MM[k] for k in (0, 1))
+        to = (x0_mm + x_mm, y0_mm + y_mm, 0.0)
+        return Case(
+            *(
+                solid.translate((-x0_mm, -y0_mm, 0.0)).rotate((0.0, 0.0, turned_deg)).translate(to)
+                for solid in (self.whole, self.rest, self.piece)
+            )
+        )
+
 
 def case_of(name: str) -> Case | None:
     """A block with a cut, or a cut of a real part, named part:kind:seed."""
@@ -127,11 +148,21 @@ def lines_of(part: Any, setup: PrintSetup) -> JobLines:
     return lines_of_job(job, job.beads.layer >= 0, setup)
 
 
-def run(name: str, setup: PrintSetup, cell_mm: float, *, along_job: bool) -> dict[str, Any] | None:
+def run(
+    name: str,
+    setup: PrintSetup,
+    cell_mm: float,
+    *,
+    along_job: bool,
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> dict[str, Any] | None:
     """A case's figures; `along_job`, the patch may follow the lines that the job laid there."""
     case = case_of(name)
     if case is None:
         return None
+    if any(place):
+        case = case.placed(*place)
+        name += " at {:g}, {:g}, {:g} deg".format(*place)
     as_built = HeightField.from_manifold(case.rest, cell_mm, margin_mm=BESIDE_MM)
     lines = lines_of(case.whole, setup) if along_job else None
     start_s = time.process_time()
@@ -213,6 +244,7 @@ def main() -> None:
     parser.add_argument("--printers", nargs="+", default=PRINTERS, choices=PRINTERS)
     parser.add_argument("--cell-mm", type=float, default=CELL_MM)
     parser.add_argument("--along-job", action="store_true", help="on lines of the part's own job")
+    parser.add_argument("--off-grid", action="store_true", help="at five other places, and means")
     parser.add_argument("--results", type=Path, help="a line of JSON each, besides the table")
     parser.add_argument("--page", action="store_true", help="of the first printer's blocks")
     args = parser.parse_args()
@@ -220,16 +252,25 @@ def main() -> None:
     told: list[tuple[object, ...]] = []
     for name in args.cases:
         for printer in args.printers:
-            row = run(name, load_setup(printer=printer), args.cell_mm, along_job=args.along_job)
-            if row is None:
-                continue
-            print(line_of(row), flush=True)
-            if printer == args.printers[0] and name in TOOLS:
-                told.append(page_row(row))
-            if args.results:
-                with args.results.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
-    if args.page:
+            setup = load_setup(printer=printer)
+            rows = []
+            for place in OFF_GRID if args.off_grid else ((0.0, 0.0, 0.0),):
+                row = run(name, setup, args.cell_mm, along_job=args.along_job, place=place)
+                rows += [row] if row is not None else []
+            for row in rows:
+                print(line_of(row), flush=True)
+                if printer == args.printers[0] and name in TOOLS and not args.off_grid:
+                    told.append(page_row(row))
+                if args.results:
+                    with args.results.open("a") as file:
+                        file.write(json.dumps(row) + "\n")
+            if args.off_grid and rows:
+                filled = [row["filled_open"] for row in rows]
+                deepest_mm = max(row["contact_mm"] for row in rows)
+                print(
+                    f"{name}, {printer}: {np.mean(filled):.3f} filled, contact {deepest_mm:.2f} mm"
+                )
+    if args.page and not args.off_grid:
         from measured_page import write_rows  # beside this script
 
         write_rows("bench_fill", PAGE_HEADER, told)
