@@ -19,7 +19,6 @@ from gcode.firmware.machine import Machine
 from gcode.firmware.variants import BUILT_WITHOUT, FIRMWARES, Variant
 from gcode.profiles import PrinterProfile
 
-MAX_CMD_SIZE = 96
 _EMERGENCY = re.compile(rb"(?:^|\n)(?:N\d+ ?)?(M108|M112|M410)\b")
 _BUSY_EVERY_S = 2.0
 _MOST_REPORTS = 5000
@@ -99,8 +98,7 @@ class FirmwareCore:
         if self.wire is not None:
             data = self.wire.to_printer(bytes(self._rx).rpartition(b"\n")[2], data)
         self._rx += data
-        heeds = self.variant.emergency_parser or self.variant.family == "klipper"
-        if heeds and self.machine.wait is not None:
+        if self.variant.passes and self.machine.wait is not None:
             self._emergency()
 
     def run(self, limit_s: float = math.inf, wall_s: float = 0.0) -> None:
@@ -116,8 +114,8 @@ class FirmwareCore:
             self._waits_since_s = math.inf
             end = rx.find(b"\n")
             if end < 0:
-                if len(rx) > 4 * MAX_CMD_SIZE and self.variant.family != "klipper":
-                    del rx[:-MAX_CMD_SIZE]
+                if len(rx) > 4 * self.variant.line_bytes:
+                    del rx[: -self.variant.line_bytes]
                 return
             line = bytes(rx[:end])
             del rx[: end + 1]
@@ -174,12 +172,10 @@ class FirmwareCore:
                 raw = changed
         command = raw.partition(b";")[0].strip()
         if not command:
-            if self.variant.family == "klipper":
+            if self.variant.answers_empty:
                 self._empty()
             return
-        if self.variant.family != "klipper" and len(command) >= MAX_CMD_SIZE:
-            command = command[: MAX_CMD_SIZE - 1]  # cut silently, as the firmware does
-        checked = self._accept(command, faults)
+        checked = self._accept(command[: self.variant.line_bytes - 1], faults)
         if checked is None:
             return
         before = len(self._out)
@@ -301,6 +297,8 @@ class FirmwareCore:
         for match in _EMERGENCY.finditer(bytes(self._rx)):
             command = match.group(1)
             wait = self.machine.wait
+            if command not in self.variant.passes:
+                continue
             if command == b"M112":
                 self.machine.kill("")
                 self._say_all()
@@ -308,7 +306,7 @@ class FirmwareCore:
                     faults, self._pending_ok = self._pending_ok, {}
                     self._ok(faults)
                 return
-            if wait is None or not self.variant.emergency_parser:
+            if wait is None:
                 continue
             if command == b"M410":
                 self.machine.quick_stop()

@@ -27,14 +27,16 @@ class Machine(Mechanics):
     def execute(self, command: bytes) -> bool:
         """Carry out one command; False if it is not known. Replies go to `replies`."""
         name, _, rest = command.partition(b" ")
-        if self.variant.family == "klipper":
+        if self.variant.any_case:
             name = name.upper()
-            if self.shut_down and name not in _AFTER_SHUTDOWN:
-                self.refuse_shut_down()
-                return False
+            rest = rest.upper() if name.startswith(b"G") else rest
+            command = name + command[len(name) :]
+        if self.shut_down and name not in _ONCE_HALTED:
+            self.refuse_shut_down()
+            return False
         handler = self._commands.get(name)
         if handler is None:
-            match = re.match(rb"([GM])\s*0*(\d+)(?:\.\d+)?", command)
+            match = re.match(rb"([GMTP])\s*0*(\d+)(?:\.\d+)?", command)
             if match is None:
                 return self._unknown(command)
             name, rest = match.group(1) + match.group(2), command[match.end() :]
@@ -45,11 +47,10 @@ class Machine(Mechanics):
         return True
 
     def _unknown(self, command: bytes) -> bool:
-        if re.fullmatch(rb"T\d", command):
-            return True
         text = command.decode("latin-1")
-        name = text.split(" ")[0] if self.variant.family == "klipper" else text
-        self.replies.append(self.variant.unknown.format(command=name))
+        says = self.variant.no_tool if re.match(r"T\d", text) else self.variant.unknown
+        if says:
+            self.replies.append(says.format(command=text, name=text.split(" ")[0]))
         return False
 
     def _command_table(self) -> dict[bytes, Callable[[bytes], None]]:
@@ -57,22 +58,15 @@ class Machine(Mechanics):
         for name in dir(self):
             if re.fullmatch(r"_[gm]\d+", name):
                 table[name[1:].upper().encode()] = getattr(self, name)
-        if self.variant.family not in ("marlin", "reprap"):
-            table.pop(b"G38")  # neither Prusa's firmware nor Klipper has it
+        for named, way in self.variant.named.items():
+            table[named] = getattr(self, f"_{way}")
+        takes = self.variant.takes
+        if (heads := self.profile.heads) > 1:
+            takes |= {f"T{k}".encode() for k in range(heads)} | self.variant.parks
+        for taken in takes:
+            table.setdefault(taken, self._ignore)
         for unbuilt in self.variant.unbuilt:
             table.pop(unbuilt)
-        if self.variant.family == "klipper":
-            table[b"AMREPAIR_TOUCH"] = self._amrepair_touch
-            table[b"TEMPERATURE_WAIT"] = self._temperature_wait
-            table[b"SET_KINEMATIC_POSITION"] = self._set_kinematic_position
-            for name in ("PRINT_START", "START_PRINT"):
-                table[name.encode()] = self._start_print
-            for name in ("PRINT_END", "END_PRINT"):
-                table[name.encode()] = self._end_print
-        for name in _IGNORED:
-            table.setdefault(name.encode(), self._ignore)
-        if not self.variant.emergency_parser and self.variant.family == "klipper":
-            table.pop(b"M108")
         return table
 
     def _ignore(self, rest: bytes) -> None:
@@ -121,8 +115,8 @@ class Machine(Mechanics):
         """Firmware retraction, which this firmware is built without."""
 
     def _g20(self, rest: bytes) -> None:
-        if self.variant.family == "klipper":
-            self.replies.append("!! Machine does not support G20 (inches) command")
+        if "inches" in self.variant.refuses:
+            self.replies.append(self.variant.refuses["inches"])
             return
         self.unit_mm = 25.4
 
@@ -277,8 +271,8 @@ class Machine(Mechanics):
             if letter in words:
                 native = (self.x, self.y, self.z)[axis]
                 self.offset[axis] = words[letter] * self.unit_mm - native
-                if self.variant.family == "reprap":
-                    self.unhomed.discard(letter)  # GCodes::SetPositions takes them for homed
+                if self.variant.g92_homes:  # GCodes::SetPositions
+                    self.unhomed.discard(letter)
         if "E" in words:
             self.e = words["E"] * self.unit_mm
 
@@ -298,7 +292,7 @@ class Machine(Mechanics):
 
     def _m84(self, rest: bytes) -> None:
         words = words_of(rest)
-        if "S" in words and self.variant.family != "klipper":
+        if "S" in words and self.variant.m84_sets_time:
             self.motors_off_s = words["S"] or math.inf
         else:
             self.planner.moved_s = -math.inf
@@ -325,10 +319,7 @@ class Machine(Mechanics):
         self.wait_for(max(reached_s, self.planner.drained_s(self.clock_s)), heating=True)
 
     def _m105(self, rest: bytes) -> None:
-        if self.variant.temperatures_in_ok:
-            self.ok_text = " " + self.temperatures()
-        else:
-            self.replies.append(self.temperatures())
+        self.ok_text = " " + self.temperatures()
 
     def _m106(self, rest: bytes) -> None:
         self.fan_ratio = min(1.0, max(0.0, words_of(rest).get("S", 255.0) / 255.0))
@@ -354,7 +345,7 @@ class Machine(Mechanics):
 
     def _m115(self, rest: bytes) -> None:
         line = self.variant.firmware_line.format(machine=self.profile.name)
-        if self.variant.family == "klipper":
+        if self.variant.about_in_ok:
             self.ok_text = " " + line
             return
         self.replies.append(line)
@@ -419,13 +410,5 @@ class Machine(Mechanics):
         self.wait_for(self.planner.drained_s(self.clock_s))
 
 
-_AFTER_SHUTDOWN = frozenset({b"M105", b"M112", b"M114", b"M115"})
-"""What a Klipper that has shut down still carries out."""
-_IGNORED = """
-G11 G17 G18 G19 G80 M17 M20 M21 M73 M75 M76 M77 M78 M81 M85 M86 M110 M111 M113
-M116 M119 M142 M200 M206 M207 M208 M209 M211 M250 M300 M301 M304 M412 M413 M420 M421
-M486 M500 M501 M502 M503 M555 M572 M573 M575 M593 M600 M601 M602 M603 M701 M702 M851
-M862.1 M862.2 M862.3 M862.4 M862.5 M862.6 M862 M900 M906 M907 M914 M974 M569 M221.1 G5
-G26 G42 G60 G61 T0 M31 M27 M141 M191 M150 M355 M711
-""".split()  # noqa: SIM905
-"""Taken and answered, without anything that shows."""
+_ONCE_HALTED = frozenset({b"M105", b"M112", b"M114", b"M115"})
+"""What a firmware that has halted, and is not deaf, still carries out."""

@@ -111,10 +111,10 @@ class Mechanics:
         for heater in (self.hotend, self.bed):
             heater.set_target(0.0, self.clock_s)
         self.x = self.y = self.z = 0.0
-        self.e = 0.0  # logical, as G92 sets it
+        self.e = self.native_e = 0.0  # logical, as G92 sets it; and all of it
         self.offset = [0.0, 0.0, 0.0]  # logical = native + offset
         self.homed = False
-        self.unhomed = set("XYZ") if self.variant.unhomed else set()
+        self.unhomed = set("XYZ") if "unhomed" in self.variant.refuses else set()
         self.motors_off_s = self.variant.motors_off_s
         self.planner.moved_s = self.clock_s
         self.absolute = True
@@ -160,38 +160,53 @@ class Mechanics:
             self.feed_mm_s = mm_s_from_mm_min(words["F"] * self.unit_mm)
         return (here[0], here[1], here[2]), de
 
-    def move_to(self, target: tuple[float, float, float], de_mm: float) -> None:
-        """Queue a move; a full queue lets the clock run until there is room."""
+    def move_to(self, target: tuple[float, float, float], de_mm: float) -> bool:
+        """Queue a move; a full queue lets the clock run until there is room. False: refused."""
         if not self.planner.blocks:
             self._let_go()
         start = (self.x, self.y, self.z)
         if self.unhomed and any(
             axis in self.unhomed and a != b for axis, a, b in zip("XYZ", start, target, strict=True)
         ):
-            self.replies.append(self.variant.unhomed)
-            return
-        if de_mm:
-            self.e += de_mm
-            de_mm *= self.flow_ratio
-            if not self.may_extrude_cold and self.hotend.temperature_c(self.clock_s) < (
-                self.min_extrude_c
-            ):
-                self._cold()
-                de_mm = 0.0
-            elif self.clogged_moves > 0 and de_mm > 0:
-                self.clogged_moves -= 1
-                de_mm = 0.0
-            elif de_mm > MAX_EXTRUDE_MM:
-                self.replies.append("echo: too long extrusion prevented")
-                de_mm = 0.0
+            return self._refused("unhomed", target, de_mm)
         if self.homed:
-            target = self._soft_limits(target)
+            within = self._soft_limits(target)
+            if within != target and "out_of_range" in self.variant.refuses:
+                return self._refused("out_of_range", target, de_mm)
+            target = within
+        pushed_mm = de_mm * self.flow_ratio
+        if de_mm and self._too_cold():
+            if "cold" in self.variant.refuses:
+                return self._refused("cold", target, de_mm)
+            self.replies.append(self.variant.cold)
+            pushed_mm = 0.0
+        elif self.clogged_moves > 0 and pushed_mm > 0:
+            self.clogged_moves -= 1
+            pushed_mm = 0.0
+        elif pushed_mm > MAX_EXTRUDE_MM:
+            self.replies.append("echo: too long extrusion prevented")
+            pushed_mm = 0.0
+        self.e += de_mm
+        self.native_e += de_mm
         self.x, self.y, self.z = target
         planner = self.planner
         if planner.full:
             planner.start_head(self.clock_s)
             self.let_pass(max(planner.head_end_s, self.clock_s))
-        planner.push(start, target, de_mm, self.feed_mm_s * self.speed_ratio)
+        planner.push(start, target, pushed_mm, self.feed_mm_s * self.speed_ratio)
+        return True
+
+    def _refused(self, why: str, target: tuple[float, float, float], de_mm: float) -> bool:
+        """Say so; where it is and where it takes E to be stay as they were."""
+        x, y, z = target
+        to = f": {x:.3f} {y:.3f} {z:.3f} [{self.native_e + de_mm:.3f}]"
+        self.replies.append(self.variant.refuses[why].format(to=to))
+        return False
+
+    def _too_cold(self) -> bool:
+        return not self.may_extrude_cold and (
+            self.hotend.temperature_c(self.clock_s) < self.min_extrude_c
+        )
 
     def _let_go(self) -> None:
         """Let the motors go if they have rested for long; Marlin does not forget that it homed."""
@@ -199,14 +214,8 @@ class Mechanics:
             return
         self.let_go += 1
         self.planner.moved_s = self.clock_s
-        if self.variant.unhomed:
+        if "unhomed" in self.variant.refuses:
             self.unhomed = set("XYZ")
-
-    def _cold(self) -> None:
-        if self.variant.family == "klipper":
-            self.replies.append("!! Extrude below minimum temp")
-        else:
-            self.replies.append(f"{self.variant.echo_prefix} cold extrusion prevented")
 
     def _soft_limits(self, target: tuple[float, float, float]) -> tuple[float, float, float]:
         x0, y0, x1, y1 = self.profile.bed_box_mm
@@ -224,9 +233,10 @@ class Mechanics:
     def arc(self, rest: bytes, *, clockwise: bool) -> None:
         """Queue the chords of a G2 or G3."""
         words = words_of(rest)
-        if self.variant.family == "klipper" and ("R" in words or not self.absolute):
+        refusal = self.variant.refuses.get("arc")
+        if refusal and ("R" in words or not self.absolute):
             what = "R moves" if "R" in words else "relative move mode"
-            self.replies.append(f"!! G2/G3 does not support {what}")
+            self.replies.append(refusal.format(what=what))
             return
         start = (self.x, self.y, self.z)
         target, de_mm = self.target_of(words)
@@ -250,7 +260,8 @@ class Mechanics:
                 centre[1] + radius * math.sin(angle),
                 start[2] + (target[2] - start[2]) * ratio,
             )
-            self.move_to(target if index == count else point, de_mm / count)
+            if not self.move_to(target if index == count else point, de_mm / count):
+                return
 
     def record_jump(self, here: tuple[float, float, float]) -> None:
         """Record a move made outside of the queue, by homing."""
@@ -272,37 +283,27 @@ class Mechanics:
         )
 
     def kill(self, why: str) -> None:
-        """Stop for good: heaters off, queue dropped; deaf until a reset, unless it is Klipper."""
+        """Stop for good: heaters off, queue dropped; `why` is empty where M112 asked for it."""
         if self.shut_down:
             return
-        place = self.planner.stop(self.clock_s, self.clock_s)
-        if place is not None:
-            self.x, self.y, self.z = place
+        self.quick_stop()
         self.fan_ratio = 0.0
-        self.wait = None
-        if self.variant.family == "klipper":
-            for heater in (self.hotend, self.bed):
+        heaters = (self.hotend, self.bed)
+        if self.variant.once_halted:
+            for heater in heaters:
                 heater.cut(self.clock_s)  # its boards do so; klippy goes on telling the target
             self.shut_down = why or "Shutdown due to M112 command"
-            self.replies.append("// Klipper state: Shutdown")
-            return
-        for heater in (self.hotend, self.bed):
-            heater.set_target(0.0, self.clock_s)
-        if why:
-            self.replies.append(f"{self.variant.error_prefix}{why}")
-        self.replies.append(f"{self.variant.error_prefix}Printer halted. kill() called!")
-        self.killed = True
+        else:
+            for heater in heaters:
+                heater.set_target(0.0, self.clock_s)
+            if why:
+                self.replies.append(f"{self.variant.error_prefix}{why}")
+            self.killed = True
+        self.replies.append(self.variant.halted)
 
     def refuse_shut_down(self) -> None:
-        """What a Klipper that has shut down says to whatever it is told."""
-        self.replies += [
-            f"// {self.shut_down}",
-            "// Once the underlying issue is corrected, use the",
-            '// "FIRMWARE_RESTART" command to reset the firmware, reload the',
-            "// config, and restart the host software.",
-            "// Printer is shutdown",
-            f"!! {self.shut_down}",
-        ]
+        """What a firmware that has halted, and is not deaf, says to whatever it is told."""
+        self.replies += [text.format(why=self.shut_down) for text in self.variant.once_halted]
 
     def quick_stop(self) -> None:
         """Drop the queue (M410)."""
@@ -313,15 +314,9 @@ class Mechanics:
 
     def temperatures(self) -> str:
         """The text of a temperature report."""
-        hotend, bed, now_s = self.hotend, self.bed, self.clock_s
-        if self.variant.family == "klipper":
-            return (
-                f"B:{bed.temperature_c(now_s):.1f} /{bed.target_c:.1f} "
-                f"T0:{hotend.temperature_c(now_s):.1f} /{hotend.target_c:.1f}"
-            )
-        return (
-            f"T:{hotend.temperature_c(now_s):.2f} /{hotend.target_c:.2f} "
-            f"B:{bed.temperature_c(now_s):.2f} /{bed.target_c:.2f} @:0 B@:0"
+        heaters, now_s = (self.hotend, self.bed), self.clock_s
+        return self.variant.heat.format(
+            *(c for heater in heaters for c in (heater.temperature_c(now_s), heater.target_c))
         )
 
     def position_text(self, logical: list[float] | None = None) -> str:
@@ -330,14 +325,8 @@ class Mechanics:
             native + offset
             for native, offset in zip((self.x, self.y, self.z), self.offset, strict=True)
         ]
-        digits = self.variant.place_digits
-        text = " ".join(
-            f"{axis}:{mm:.{digits}f}" for axis, mm in zip("XYZE", (x, y, z, self.e), strict=True)
-        )
-        if self.variant.family in ("marlin", "prusa"):
-            steps = (int(self.x * 80), int(self.y * 80), int(self.z * 400))
-            text += f" Count X:{steps[0]} Y:{steps[1]} Z:{steps[2]}"
-        return text
+        steps = f"X:{int(self.x * 80)} Y:{int(self.y * 80)} Z:{int(self.z * 400)}"
+        return self.variant.place.format(x=x, y=y, z=z, e=self.e, steps=steps)
 
 
 def _axes(limits: AxisLimits) -> tuple[float, float, float, float]:

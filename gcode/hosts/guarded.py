@@ -36,6 +36,7 @@ class GuardedConversation(SerialConversation):
         self._supervisor: Supervisor | None = None
         self._lock = PortLock(line.port)
         self._book = JobBook(self._link, line.journal, line.clock)
+        self._safe_after = -1  # bytes sent when it was last made safe
 
     def __exit__(
         self,
@@ -132,14 +133,15 @@ class GuardedConversation(SerialConversation):
 
         An interrupt comes in the middle of a line, and then its answer is waited for. Where none
         comes, and while something heats, unnumbered lines go past it; after a lost link nobody
-        knows where the nozzle is, and it stays there.
+        knows where the nozzle is, and it stays there. Once is enough until something is sent.
         """
-        if self._serial is None:
+        if self._serial is None or self._safe_after == self._bytes_sent:
             return
         ours = self._mutex.acquire(timeout=REST_S)  # another thread may print
         try:
             if not (ours and self._comes_to_rest() and self._switched_off()):
                 self._go_past()
+            self._safe_after = self._bytes_sent
         except (LinkError, LocalProtocolError, OSError) as error:
             self._told_safe(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
         finally:

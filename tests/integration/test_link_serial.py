@@ -124,7 +124,7 @@ host.require_checked = lambda checked: None
 printer = host.SerialPrinter(sys.argv[1], journal=Journal(Path(sys.argv[2])))
 printer.connect()
 print("go", flush=True)
-printer.print(program(["M104 S200", "M140 S60", "M302 S0", "G28", *moves(200000)]))
+printer.print(program(["M104 S200", "M140 S60", "G28", *moves(200000)]))
 """
 
 
@@ -186,7 +186,7 @@ from gcode.cli import console
 host.require_checked = lambda checked: None
 with console.signals_end_it(), host.SerialPrinter(sys.argv[1], supervise=False) as printer:
     tell = lambda stage, done, total: done and print("go", flush=True)
-    printer.print(program(["M104 S200", "M302 S0", "G28", *moves(200000)]), progress=tell)
+    printer.print(program(["M104 S200", "G28", *moves(200000)]), progress=tell)
 """
 
 

@@ -6,8 +6,10 @@ import itertools
 import math
 import os
 import re
+import select
 import signal
 import threading
+import tty
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -154,6 +156,30 @@ def test_what_it_refuses_ends_the_job(line: str, tmp_path: Path) -> None:
         with sender(klipper) as again:
             assert again.temperatures().hotend_target_c == 0.0
             assert again.position_mm()[:2] != (2.0, 2.0)
+
+
+def test_the_emulated_one_answers_as_it_does(tmp_path: Path) -> None:
+    """Refused moves above all: what is said, and where it is and in which modes afterwards."""
+    lines = [
+        "G1 X5", "G28", "G1 X50 Y50 Z5 F6000", "M400", "G1 X500 F9000", "M114", "G91", "G1 X-100",
+        "M114", "G1 Y2", "G90", "M83", "G1 X60 E2", "M114", "G1 E-1", "M82", "G92 E3", "G1 X251 E9",
+        "M114", "G1 Z-50", "G2 X60 Y60 R20", "G91", "G2 X6 Y6 I3 J3", "G90", "M114", "T0", "T1",
+        "P0", "M9999 X1", "foo BAR=1", "g1 x40 f9000", "M400", "M114", "G20", "M0", "M108", "M302",
+        "M155 S1", "M203 X3", "M410", "G29", "", "M84 S30", "G1 X3", "M112", "G1 X4", "M114", "",
+    ]  # fmt: skip
+    core = FirmwareCore(load_setup("generic_klipper").printer, "klipper")
+    with LiveKlipper(tmp_path) as klipper, Path(klipper.port).open("r+b", buffering=0) as port:
+        tty.setraw(port)
+        for line in lines:
+            data = line.encode() + b"\n"
+            core.feed(data)
+            core.run()
+            port.write(data)
+            said = b""
+            while not re.search(rb"^ok\b.*\n", said, re.MULTILINE):
+                assert select.select([port], [], [], 30.0)[0], line
+                said += port.read(4096)
+            assert said == core.take_output(), line
 
 
 @pytest.mark.parametrize("at_mm", [1.0, -1.0])

@@ -48,7 +48,16 @@ ENDING = ("reset", "silent_reset", "thermal_runaway", "dead")
 
 OTHERS = (
     *("G28 X", "G4 P700", "M400", "M105", "M106 S128", "M117 hours", "M109 S40", "M140 S30"),
-    *("G92 E0", "M83", "T0", "G1 X5", "G0 Y7 F3000", "M118 E1 here", "M204 P900", "G2 X9 Y9 I2 J2"),
+    *(
+        "G92 E0",
+        "M83",
+        "M82",
+        "G1 X5",
+        "G0 Y7 F3000",
+        "M118 E1 here",
+        "M204 P900",
+        "G2 X9 Y9 I2 J2",
+    ),
 )
 
 
@@ -182,7 +191,7 @@ def _through_a_damaged_wire(
         seed=seed,
         by_moves=by_moves,
     )
-    lines = ["G28", "M302 P1", "M83"]
+    lines = ["G28", "M83"]
     lines += [
         f"G1 X{i % 180} Y{i * 7 % 180} E{0.02 + i % 7 * 0.01:.3f} F6000" for i in range(count)
     ]

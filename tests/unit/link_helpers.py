@@ -14,7 +14,7 @@ from gcode.profiles import AxisLimits, EnvelopeSlice, PrinterProfile
 
 
 def profile() -> PrinterProfile:
-    """A plain Cartesian printer, independent of the profile files."""
+    """A plain Cartesian printer that extrudes cold, independent of the profile files."""
     return PrinterProfile(
         id="test",
         name="test",
@@ -26,6 +26,7 @@ def profile() -> PrinterProfile:
         max_acceleration_mm_s2=AxisLimits(x=1000, y=1000, z=200, e=5000),
         max_jerk_mm_s=AxisLimits(x=8, y=8, z=2, e=4.5),
         max_hotend_c=280,
+        min_extrude_c=0,
         max_bed_c=110,
         max_volumetric_mm3_s=15,
         max_bead_section_mm2=0.64,

@@ -217,6 +217,71 @@ def test_an_unknown_command_is_told_and_acknowledged(firmware: str) -> None:
     assert "M9999" in said[0]
 
 
+COLD = "!! Extrude below minimum temp"
+
+
+def test_a_klipper_makes_no_move_that_it_refuses() -> None:
+    """As a live one: place and extruder stay, the feed is the refused move's, modes are kept."""
+    talk = Talk("klipper")
+    talk.machine.min_extrude_c = 170.0
+    assert talk.say("G1 X5") == ["!! Must home axis first: 5.000 0.000 0.000 [0.000]", "ok"]
+    talk.say("G28", "G1 X50 Y50 Z5 F6000", "M400")
+    here = ["X:50.000 Y:50.000 Z:5.000 E:0.000", "ok"]
+    for line, said in (
+        ("G1 X500 F900", "!! Move out of range: 500.000 50.000 5.000 [0.000]"),
+        ("G1 Z-5 F900", "!! Move out of range: 50.000 50.000 -5.000 [0.000]"),
+        ("G1 X60 E2 F900", COLD),
+        ("G1 E-1 F900", COLD),
+    ):
+        assert talk.say(line)[-2:] == [said, "ok"]
+        assert talk.say("M114") == here
+        assert talk.machine.feed_mm_s == 15.0
+    talk.say("M82", "G92 E3", "G91")
+    assert talk.say("G1 X-500")[-2].startswith("!! Move out of range: -450.000")
+    assert talk.say("M114") == ["X:50.000 Y:50.000 Z:5.000 E:3.000", "ok"]
+    talk.say("G90", "G1 X100 Y100")
+    before = len(talk.machine.planner.executed)
+    said = talk.say("G2 X100 Y99.9 I100 J0")
+    assert [line[:20] for line in said] == ["!! Move out of range", "ok"], (
+        "once, not chord by chord"
+    )
+    assert len(talk.machine.planner.executed) > before, "and it stays where the arc left the bed"
+    assert talk.machine.y > 101.0
+
+
+def test_a_marlin_does_as_much_of_a_move_as_it_can() -> None:
+    talk = Talk("marlin")
+    talk.machine.min_extrude_c = 170.0
+    talk.say("G28", "G1 X50 Y50 Z5 F6000")
+    assert talk.say("G1 X500 E2") == ["echo: cold extrusion prevented", "ok"]
+    talk.say("M400")
+    assert talk.machine.x == 210.0
+    assert talk.say("M114")[0].startswith("X:210.00 Y:50.00 Z:5.00 E:2.00 Count X:16800 Y:4000 Z:")
+
+
+@pytest.mark.parametrize(
+    ("firmware", "heads", "line", "said"),
+    [
+        ("marlin", 1, "T0", []),
+        ("marlin", 1, "T1", ["echo:T1 Invalid extruder"]),
+        ("marlin", 2, "T1", []),
+        ("marlin", 2, "P0 S1", []),
+        ("prusa", 5, "T5", ["echo:T5 Invalid extruder"]),
+        ("klipper", 1, "T1", ['// Unknown command:"T1"']),
+        ("klipper", 2, "T1", []),
+        ("klipper", 1, "P0", ['// Unknown command:"P0"']),
+        ("klipper", 1, "foo BAR=1", ['// Unknown command:"FOO"']),
+    ],
+)
+def test_tools_that_are_there_and_that_are_not(
+    firmware: str, heads: int, line: str, said: list[str]
+) -> None:
+    core = FirmwareCore(profile().model_copy(update={"heads": heads}), firmware)
+    core.feed(line.encode() + b"\n")
+    core.run()
+    assert core.take_output().decode().splitlines() == [*said, "ok"]
+
+
 E_MODES = ("M82", "M83", "G90", "G91", "G92 E0", "G1 E2 F300", "G1 X1 E3", "G20", "G21")
 
 
@@ -225,7 +290,7 @@ E_MODES = ("M82", "M83", "G90", "G91", "G92 E0", "G1 E2 F300", "G1 X1 E3", "G20"
 def test_the_host_knows_where_the_extruder_is(lines: list[str], firmware: str) -> None:
     """By `hosts.modes`, as the emulated firmware does: G90 and G91 mean four different things."""
     talk, modes = Talk(firmware), Modes()
-    for line in ("G28", "M302 P1", "G92 E0", *lines):
+    for line in ("G28", "G92 E0", *lines):
         if (line, firmware) == ("G20", "klipper"):
             continue  # it refuses inches, and the job is over
         talk.say(line)
@@ -239,7 +304,7 @@ def test_the_host_knows_where_the_extruder_is(lines: list[str], firmware: str) -
 def test_what_g91_does_to_the_extruder(firmware: str, e_mm: float) -> None:
     """Marlin: relative until M82; Klipper: relative while it lasts; the others: nothing."""
     talk = Talk(firmware)
-    talk.say("G28", "M302 P1", "M82", "G92 E10", "G91", "G1 E2 F300")
+    talk.say("G28", "M82", "G92 E10", "G91", "G1 E2 F300")
     assert talk.machine.e == pytest.approx(e_mm)
     talk.say("G90", "G1 E20 F300")
     assert talk.machine.e == pytest.approx(20.0)

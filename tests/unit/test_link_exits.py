@@ -32,7 +32,7 @@ from gcode.moves import Program
 from gcode.protocol import Link
 from gcode.protocol import events as ev
 
-HEAD = ["M104 S200", "M302 S0", "G28", "G1 Z2 F600", "M83"]
+HEAD = ["M104 S200", "G28", "G1 Z2 F600", "M83"]
 MOVES = moves(900)
 
 
@@ -241,7 +241,7 @@ def test_a_restart_is_noticed_where_lines_are_not_verified(
         printer = SerialPrinter(it.emulator.port, dialect=firmware, supervise=False)
         printer.connect()
         with pytest.raises(LinkError, match=said):
-            printer.print(program(["M302 S0", *lines]))
+            printer.print(program(lines))
         told = it.told()
         printer.close()
     assert sum(line in lines for line in told) < (35 if "G28" in lines else 2)
@@ -293,6 +293,18 @@ def test_who_interrupts_is_told_what_became_of_the_heaters(
     assert "printer: heaters off (the printer reports targets of 0), nozzle lifted" in caplog.text
 
 
+def test_a_printer_is_made_safe_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Regression: by the job that failed and by who gave it, each lifting and logging its line."""
+    with bench(tmp_path, firmware="klipper") as it:
+        printer = SerialPrinter(it.emulator.port, dialect="klipper", supervise=False)
+        with pytest.raises(PrinterError, match="out of range"), printer:
+            printer.print(program([*HEAD, "G1 X999", *MOVES[:5]]))
+    assert [r.getMessage() for r in caplog.records if r.name.startswith("gcode.hosts")] == [
+        "printer: heaters off (the printer reports targets of 0), nozzle lifted"
+    ]
+    assert it.told().count("G1 Z5 F600") == 1
+
+
 @pytest.mark.parametrize("fault", ["no_arcs", "no_inches"])
 def test_a_command_that_the_firmware_lacks_ends_the_job_where_it_matters(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
@@ -310,7 +322,7 @@ def test_a_command_that_the_firmware_lacks_ends_the_job_where_it_matters(
 
 def test_arcs_are_refused_before_anything_moves_where_the_firmware_has_none(tmp_path: Path) -> None:
     with bench(tmp_path, faults="always no_arcs") as it, SerialPrinter(it.emulator.port) as printer:
-        with pytest.raises(PrinterError, match=r"arcs .*first in line 8\b"):
+        with pytest.raises(PrinterError, match=r"arcs .*first in line 7\b"):
             printer.print(program([*HEAD, "G28 ; home", "; G2 is none", " g02 X1 Y1 I1 J0"]))
         assert printer.print(program([*HEAD, "G20", "G28", "G21", "G200"])).ok
     assert "G28 ; home" not in it.told()

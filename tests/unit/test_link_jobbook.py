@@ -27,7 +27,7 @@ def test_no_line_goes_out_before_the_disk_says_that_it_may(
     """At every write another connection to the journal already sees line and number reserved."""
     monkeypatch.setattr(serial_host, "require_checked", lambda checked: None)
     path = tmp_path / "journal.sqlite"
-    lines = ["M302 S0", *moves(300)]
+    lines = [*moves(300)]
     seen: list[int] = []
     with (
         EmulatedPrinterProcess(printer=profile()) as emulator,

@@ -18,7 +18,7 @@ from gcode.hosts.port import PrintReport
 from gcode.hosts.serial import SerialPrinter
 
 MOVES = moves(1100)
-LINES = ["G28", "M302 S0", "M83", *MOVES]
+LINES = ["G28", "M83", *MOVES]
 
 
 @pytest.fixture(autouse=True)
