@@ -95,7 +95,11 @@ def agent(
             "stood.",
         ),
     ] = False,
-    once: Annotated[bool, typer.Option("--once", help="End after one print.")] = False,
+    once: Annotated[
+        bool,
+        typer.Option("--once", help="End after one print, with the exit code of a loop: 0 done, 2 "
+                     "not looked at, 3 not within tolerance, 4 its looks were ended."),
+    ] = False,
     macros: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write the printer's macros, to be included in "
@@ -128,7 +132,7 @@ def agent(
 
     address, key = _server(moonraker, octoprint, api_key_file)
     errors = calibration_named(sound)
-    serving.serve(
+    code = serving.serve(
         serving.Served(
             address, key, Path(str(template)), out, (printer, material, process), calibration,
             ViewPlace(view or octoprint is not None, view_host, view_port, token), once=once,
@@ -139,6 +143,8 @@ def agent(
             },
         )
     )  # fmt: skip
+    if code:
+        raise typer.Exit(code)
 
 
 def _server(

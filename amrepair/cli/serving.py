@@ -17,8 +17,8 @@ from amrepair.cli.running import (
     print_run,
 )
 from amrepair.cli.scanners import known_scanner
-from amrepair.cli.telling import Begun, written
-from amrepair.errors import AmrepairError, InputError
+from amrepair.cli.telling import Begun, exit_code_of, written
+from amrepair.errors import AmrepairError, InputError, LoopError
 from amrepair.loop.calibrate import read_calibration
 from amrepair.loop.looks import LoopReport
 from amrepair.loop.tape import read_events
@@ -59,8 +59,8 @@ class Served:
     said: dict[str, Any]
 
 
-def serve(told: Served) -> None:
-    """Serve a printer's prints until interrupted.
+def serve(told: Served) -> int:
+    """Serve a printer's prints until interrupted; the exit code of the last, where it is the last.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def serve(told: Served) -> None:
                 machine.require_touches()
             talk.listen()
             talk.say("the agent is here.")
-            _Service(told, machine, talk).run()
+            return _Service(told, machine, talk).run()
     except KeyboardInterrupt:
         console.errors.print(
             "A print that rests at a look stays so, heaters off; one that goes on goes on. "
@@ -140,9 +140,10 @@ class _Service:
     def __init__(self, told: Served, machine: ServedJob[Any], talk: Talk) -> None:
         self._told, self._machine, self._talk = told, machine, talk
         self._held: int | None = None
+        self._exit_code = 0
 
-    def run(self) -> None:
-        """One print after another."""
+    def run(self) -> int:
+        """One print after another; as a loop's, the exit code of the last."""
         served: UnderWay | None = None
         away = False
         while True:
@@ -158,7 +159,7 @@ class _Service:
                 away = False
             if job is None or job == served:
                 if served is not None and job is None and self._told.once and not away:
-                    return
+                    return self._exit_code
                 self._machine.wait(LOOK_S)
                 continue
             served = job
@@ -177,14 +178,16 @@ class _Service:
 
     def _print(self, job: UnderWay) -> None:
         """Serve one print."""
-        found, self._held = None, None
+        found, self._held, self._exit_code = None, None, 0
         try:
             found = self._begin(job)
             if found is None:
                 self._held = self._machine.rests_at()
+                self._exit_code = LoopError.exit_code
                 return
             self._run(*found)
         except (AmrepairError, GcodeError) as error:
+            self._exit_code = error.exit_code
             if found is None:
                 self._talk.say(f"{job.name} is printed without looks: {error}", wrong=True)
             else:
@@ -243,6 +246,7 @@ class _Service:
             )  # fmt: skip
         result = written(begun, report, warmth, watch, bars)
         self._talk.end_prompt()
+        self._exit_code = exit_code_of(report)
         if report.stopped:
             self._ended(report.stopped, begun)
         else:

@@ -87,9 +87,15 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
             f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
             f"amrepair loop --resume {folder.path} --approve ask"
         )
-        raise typer.Exit(LoopError.exit_code)
-    if not within:
-        raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+    if code := exit_code_of(report):
+        raise typer.Exit(code)
+
+
+def exit_code_of(report: LoopReport) -> int:
+    """Of a run: 4 where it was ended, 3 where what was printed is not within tolerance."""
+    if report.stopped:
+        return LoopError.exit_code
+    return 0 if report.within_tolerance else console.NOT_WITHIN_TOLERANCE
 
 
 def placed_solid(template: Template, placed: Transform) -> Any:

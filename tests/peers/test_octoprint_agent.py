@@ -116,10 +116,10 @@ class Stack:
         assert answer.status_code == 204, answer.text
 
 
-def ended(agent: subprocess.Popen[bytes], stack: Stack) -> None:
-    """The agent has ended by itself, and well."""
+def ended(agent: subprocess.Popen[bytes], stack: Stack, *, code: int = 0) -> None:
+    """The agent has ended by itself, and says how."""
     wait_for("the agent's end", lambda: agent.poll() is not None, stack.log, 200.0)
-    assert agent.returncode == 0, stack.said()
+    assert agent.returncode == code, stack.said()
 
 
 @pytest.fixture
@@ -246,7 +246,7 @@ def test_a_touch_that_meets_nothing_ends_the_looks_and_not_the_print(stack: Stac
     wait_for("the question", lambda: stack.state()["prompt"], stack.log)
     answer = stack.web.http.post("/plugin/amrepair/press", json={"what": "go on"})
     assert answer.status_code == 200, answer.text
-    ended(agent, stack)
+    ended(agent, stack, code=4)
     assert stack.state()["print"]["ended"] == "done"
     lines = job.read_text().split("\n")
     first = next(k for k, line in enumerate(lines) if line.startswith("@amrepair"))
@@ -273,8 +273,7 @@ def test_one_of_two_objects_is_given_up_and_the_other_goes_on(stack: Stack) -> N
              stack.log)  # fmt: skip
     end(agent)
     agent = stack.agent("--approve", "auto")
-    wait_for("the agent's end", lambda: agent.poll() is not None, stack.log, 200.0)
-    assert agent.returncode == 0, stack.said()
+    ended(agent, stack, code=3)
     assert "Given up, so that the other objects could go on" in stack.said()
     assert stack.state()["print"]["ended"] == "done"
     batch = MotionFile(stack.motion).take()

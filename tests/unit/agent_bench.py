@@ -83,13 +83,13 @@ class Bench:
             self.fake.start("small_pla.gcode")
         self.answers(text)
 
-    def agent(self, approve: str = "auto", **changed: Any) -> None:
+    def agent(self, approve: str = "auto", **changed: Any) -> int:
         said = {"scanner": f"watch:{self.folder}", "approve": approve, "scan_timeout_s": 1.0,
                 "sound": (), "seed": 0}  # fmt: skip
         told = {"template": self.ready.template, "out": self.folder / "runs", "named": PRINTER,
                 "calibration": None, "page": ViewPlace(False, "", 0, None), "once": True,
                 "pose_confirmed": False, "said": said}  # fmt: skip
-        serving.serve(
+        return serving.serve(
             serving.Served(
                 Address.parse(f"moonraker+{self.fake.url}"), ApiKey(""), **{**told, **changed}
             )

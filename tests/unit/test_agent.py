@@ -183,7 +183,7 @@ def test_no_is_no(bench: Bench, ready: Ready) -> None:
             bench.klipper.run_script("AMREPAIR_APPROVE ANSWER=no")
 
     bench.answers = press
-    bench.agent("ask")
+    assert bench.agent("ask") == 3, "not within tolerance"
     assert bench.klipper.print_state == "complete"
     assert not [event for event in bench.events() if event.get("kind") == "repair"]
 
@@ -207,7 +207,7 @@ def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
             bench.klipper.run_script("AMREPAIR_RESUME")
 
     bench.answers = press
-    bench.agent()
+    assert bench.agent() == 4
     assert ended == ["0 0 paused"], "heaters are off and the print rests"
     assert "no more looks at this print" in bench.told()
     assert bench.klipper.print_state == "complete", "somebody let it go on"
@@ -274,7 +274,7 @@ def test_a_klipper_that_shuts_down_in_a_repair_is_not_asked_to_go_on(
         carried(script)
 
     bench.klipper.run_script = shut_down  # type: ignore[method-assign]
-    bench.agent()
+    assert bench.agent() == 4
     assert bench.klipper.print_state == "paused"
     told = capsys.readouterr().err
     assert re.search(r"no more looks at this print: .* Timer too close\.$", told, re.MULTILINE)
@@ -313,11 +313,11 @@ def test_a_print_that_cannot_be_looked_at_is_printed(
     path = bench.folder / "gcodes" / "small_pla.gcode"
     if trouble == "no look":
         path.write_text(bench.ready.text.replace(";AMREPAIR_LOOK", ";look"))
-        bench.agent()
+        assert bench.agent() == 2
         assert "has no looks in it, name 'amrepair postprocess'" in bench.told()
     else:
         (tmp_path / "parts").mkdir()
-        bench.agent(template=tmp_path / "parts")
+        assert bench.agent(template=tmp_path / "parts") == 2
         assert "no part in" in bench.told()
     assert bench.klipper.print_state == "complete"
     assert not [line for line in bench.klipper.said if "Traceback" in line]
