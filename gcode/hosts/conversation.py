@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import re
 import select
 import threading
 import time
@@ -21,20 +20,16 @@ from typing import NoReturn, TypeVar
 
 import serial
 
-from gcode.errors import LinkError, LocalProtocolError, PrinterError
+from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.journal import Journal
 from gcode.hosts.port import Capabilities, LinkLostError, Temperatures
+from gcode.hosts.unknown import fault_of
 from gcode.hosts.wirelog import WireLog
 from gcode.protocol import Link, LinkDialect, LinkTiming
 from gcode.protocol import events as ev
 from gcode.protocol.lines import numbered
 
 Answer = TypeVar("Answer")
-_NEEDED = re.compile(
-    r'command: ?"?(G0*(?:[0-3]|20|28|9[0-2])|M(?:82|83|104|109))(?![\d.])[^*]*$', re.IGNORECASE
-)
-"""A command that moves, says how words are meant, or melts, as it stood in the program: what has a
-checksum in it is a line that lost its number, and is sent again."""
 REPORT_TRIES = 10
 """At one damaged byte in 200 a report is damaged every fourth time: ten in a row, one in 10^6."""
 MOST_WAIT_S = 0.5
@@ -404,12 +399,9 @@ class SerialConversation:
         elif isinstance(event, ev.Probed):
             self._stalls += 1
         elif isinstance(event, ev.UnknownCommand):
-            self._warnings.append(event.text)
-            if self._failure is None and (needed := _NEEDED.search(event.text)):
-                self._failure = PrinterError(
-                    f"The printer's firmware does not know {needed.group(1)} ({event.text}): what "
-                    f"follows it would be printed wrong."
-                )
+            if event.text not in self._warnings:
+                self._warnings.append(event.text)
+            self._failure = self._failure or fault_of(event.text)
         elif self._failure is not None:
             pass  # the first fault is the cause, the rest its consequences
         elif isinstance(event, ev.CommandFailed):

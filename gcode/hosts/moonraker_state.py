@@ -6,6 +6,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from gcode.hosts.unknown import UnknownCommands
+
 MOONRAKER_ENDS = ("complete", "cancelled", "error")
 STOPPED = ("shutdown", "error")
 MOONRAKER_SUBSCRIPTION: dict[str, list[str] | None] = {
@@ -34,6 +36,8 @@ class KlippyState:
         How the followed print ended: one of `MOONRAKER_ENDS`.
     file_position
         Bytes of the followed file that Klipper has taken into its queue.
+    unknown
+        Commands that Klipper has not known since the print is followed.
     methods, called
         What macros of the printer may call, and what they have called, oldest first.
     """
@@ -48,6 +52,7 @@ class KlippyState:
     moved: bool = False
     stale: bool = False
     outcome: str = ""
+    unknown: UnknownCommands = field(default_factory=UnknownCommands)
     answers: dict[int, dict[str, Any]] = field(default_factory=dict)
     methods: tuple[str, ...] = ()
     called: deque[tuple[str, dict[str, Any]]] = field(default_factory=deque)
@@ -70,6 +75,7 @@ class KlippyState:
     def follow(self, file: str) -> None:
         """Follow the print of a file from now on."""
         self.file, self.file_position, self.outcome, self.moved = file, 0, "", False
+        self.unknown = UnknownCommands()
 
     def take(self, message: object) -> None:
         """Take one message; what is not understood is left alone."""
@@ -84,10 +90,11 @@ class KlippyState:
         elif isinstance(method, str) and method in _KLIPPY_NEWS:
             self.klippy = _KLIPPY_NEWS[method]
             self.stale = True
-        elif method == "notify_status_update":
-            parameters = message.get("params")
-            if isinstance(parameters, list) and parameters and isinstance(parameters[0], dict):
-                self.take_status(parameters[0])
+        elif isinstance(params := message.get("params"), list) and params:
+            if method == "notify_status_update" and isinstance(params[0], dict):
+                self.take_status(params[0])
+            elif method == "notify_gcode_response":
+                self.unknown.hear(str(params[0]))
 
     def take_status(self, status: dict[str, Any]) -> None:
         """Take objects of Klipper, whole or what changed of them."""

@@ -6,6 +6,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from gcode.hosts.unknown import UnknownCommands
+
 OCTOPRINT_ENDS = ("PrintDone", "PrintFailed", "PrintCancelled")
 BUSY_STATES = ("printing", "paused", "pausing", "resuming", "cancelling", "finishing")
 
@@ -24,6 +26,8 @@ class ServerState:
         It has changed since the follower last looked.
     terminal
         Lines of the server's terminal while somebody waits for an answer, else None.
+    unknown
+        Commands that the printer has not known since the print is followed.
     plugin, told
         Whose messages are taken, and the last one.
     """
@@ -37,6 +41,7 @@ class ServerState:
     moved: bool = False
     resends: int = 0
     outcome: str = ""
+    unknown: UnknownCommands = field(default_factory=UnknownCommands)
     terminal: deque[str] | None = None
     plugin: str = ""
     told: dict[str, Any] = field(default_factory=dict)
@@ -64,6 +69,7 @@ class ServerState:
     def follow(self, file: str) -> None:
         """Follow the print of a file from now on."""
         self.file, self.file_position, self.outcome, self.error = file, 0, "", ""
+        self.unknown = UnknownCommands()
 
     def take(self, message: object) -> None:
         """Take one message of the push socket; what is not understood is left alone."""
@@ -90,9 +96,11 @@ class ServerState:
         if isinstance(resends, dict) and isinstance(resends.get("count"), int):
             self.resends = resends["count"]
         self._take_progress(news)
-        if with_log and self.terminal is not None:
-            logs = news.get("logs")
-            self.terminal.extend(str(line) for line in (logs if isinstance(logs, list) else ()))
+        logs = news.get("logs")
+        for line in map(str, logs if with_log and isinstance(logs, list) else ()):
+            self.unknown.hear(line.removeprefix("Recv: "))
+            if self.terminal is not None:
+                self.terminal.append(line)
 
     def _take_progress(self, news: dict[str, Any]) -> None:
         if _path(news) != self.file:

@@ -25,6 +25,7 @@ from gcode.hosts.lock import PortLock
 from gcode.hosts.port import LinkLostError, PrintableProgram, Printer, PrintReport
 from gcode.hosts.proof import require_arcs, require_checked
 from gcode.hosts.secret import ApiKey
+from gcode.hosts.unknown import UnknownCommands
 from gcode.hosts.upload import JobFile, part_prefix
 from gcode.hosts.web import Address, PushSocket, WebClient, WebLog, WebTiming, heaters_word
 from gcode.progress import Progress, silent
@@ -40,6 +41,7 @@ class News(Protocol):
 
     moved: bool
     file_position: int
+    unknown: UnknownCommands
 
     @property
     def ended(self) -> bool:
@@ -372,7 +374,10 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
             seconds=self._clock() - start_s,
             next_line=next_line,
             first_line=job.first,
-            warnings=() if ok else (f"{self.address.name} cancelled the print",),
+            warnings=(
+                *self._session.state.unknown.told,
+                *(() if ok else (f"{self.address.name} cancelled the print",)),
+            ),
         )
 
     @abstractmethod
@@ -390,11 +395,16 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         while True:
             with session.news:
                 session.news.wait_for(
-                    lambda: state.ended or state.moved or not session.is_told, self._timing.poll_s
+                    lambda: (
+                        state.ended or state.moved or state.unknown.fault or not session.is_told
+                    ),
+                    self._timing.poll_s,
                 )
                 state.moved = False
                 ended = state.ended
             progress("printing", float(state.file_position), float(len(job.data)))
+            if state.unknown.fault is not None:
+                raise state.unknown.fault
             if ended:
                 return self._outcome(job)
             if session.is_told and self._clock() - looked_s < LOOK_EVERY * self._timing.poll_s:

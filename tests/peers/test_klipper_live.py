@@ -25,10 +25,11 @@ from peer_harness import process, wait_for
 from test_moonraker_agent import Stack
 from void_loop import fills_a_void
 
+import gcode.hosts.server as server_host
 from gcode.errors import LinkError, PrinterError
 from gcode.firmware import FirmwareCore
 from gcode.firmware.motion import MotionBatch, MotionFile
-from gcode.hosts import LinkLostError
+from gcode.hosts import LinkLostError, connect
 from gcode.hosts.port import NothingMetError
 from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
@@ -297,6 +298,21 @@ class LiveStack(Stack):
     def start(self, macros: Path) -> None:
         self.printer = self.keep.enter_context(Clogged(self.folder, f"[include {macros}]\n"))
         self.start_moonraker()
+
+
+def test_an_unknown_command_is_told_through_moonraker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_host, "require_checked", lambda checked: None)
+    lines = ["G28", "G1 X50 Y50 F6000", "M900 K0.1", "T0", "M900 K0.2", *MOVES[:20]]
+    with ExitStack() as keep:
+        stack = LiveStack(tmp_path, keep)
+        stack.start(Path("/dev/null"))
+        printer = keep.enter_context(connect(f"moonraker+{stack.url}", dialect="klipper"))
+        report = printer.print(program(lines))
+        stack.web.http.close()
+    assert report.ok
+    assert report.warnings == ('// Unknown command:"M900"', '// Unknown command:"T0"')
 
 
 @pytest.mark.timeout(900)

@@ -336,6 +336,35 @@ def test_the_emergency_stop_has_its_own_endpoint_and_ends_the_print(fake: FakeMo
     assert "Shutdown due to webhooks request; lines 1 to 24 are uncertain" in str(caught[0])
 
 
+def test_an_unknown_command_is_told_once(fake: FakeMoonraker) -> None:
+    """Regression: on a serial port it was, through Moonraker nobody heard of it."""
+    said = '// Unknown command:"M900"'
+
+    def prints() -> None:
+        for text in (said, said, "// probe at 1,2 is z=0.1"):
+            fake.server.push({"method": "notify_gcode_response", "params": [text]})
+        fake.finish()
+
+    fake.on_print = prints
+    with printer_at(fake) as printer:
+        assert printer.print(JOB).warnings == (said,)
+        fake.on_print = fake.finish
+        assert printer.print(JOB).warnings == ()
+
+
+def test_an_unknown_command_ends_the_print_where_it_matters(fake: FakeMoonraker) -> None:
+    fake.on_print = lambda: fake.server.push(
+        {"method": "notify_gcode_response", "params": ['// Unknown command:"G2"']}
+    )
+    with (
+        pytest.raises(PrinterError, match="does not know G2"),
+        printer_at(fake) as printer,
+    ):
+        printer.print(JOB)
+    assert "printer.print.cancel" in fake.calls
+    assert fake.scripts[0] == "TURN_OFF_HEATERS\nM107"
+
+
 def test_a_failing_command_in_the_file_is_the_printers_fault(fake: FakeMoonraker) -> None:
     fake.on_print = lambda: fake.stats(state="error", message="Extrude below minimum temp\nSee")
     with (

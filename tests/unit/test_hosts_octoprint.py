@@ -205,6 +205,18 @@ def test_a_part_of_a_program_uploads_that_part(fake: FakeOctoPrint) -> None:
     assert (report.lines_acked, report.first_line, report.next_line) == (3, 3, 6)
 
 
+def test_an_unknown_command_is_told_once(fake: FakeOctoPrint) -> None:
+    said = 'echo:Unknown command: "M900 K0.1"'
+
+    def prints() -> None:
+        fake.push(logs=["Send: N9 M900 K0.1*77", f"Recv: {said}", f"Recv: {said}", "Recv: ok"])
+        fake.finish()
+
+    fake.on_print = prints
+    with printer_at(fake) as printer:
+        assert printer.print(JOB).warnings == (said,)
+
+
 def test_questions_are_answered_from_the_terminal(fake: FakeOctoPrint) -> None:
     with printer_at(fake) as printer:
         assert printer.position_mm() == (1.5, 2.25, 3.0)
