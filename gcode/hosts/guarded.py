@@ -121,7 +121,7 @@ class GuardedConversation(SerialConversation):
         """Send M112, past every queue that the firmware lets it pass."""
         self._write(b"\nM112\n")
         self._ended_by = "an emergency stop was asked for"
-        self._link.give_up(self._ended_by)
+        self._link.give_up(self._ended_by, stopped=True)
 
     def heaters_off(self) -> None:
         """Switch hotend, bed and fan off, acknowledged."""

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 
 from gcode.errors import JournalError
 from gcode.hosts.journal import Journal
+from gcode.hosts.modes import before_commands
 from gcode.hosts.port import PrintableProgram
 from gcode.protocol import HISTORY_LINES, Link
 from gcode.protocol.events import TemperatureReport
@@ -41,6 +42,7 @@ class JobBook:
         self._journal = journal
         self._clock = clock
         self._sent: deque[tuple[int, int]] = deque(maxlen=2 * HISTORY_LINES)
+        self._checked: PrintableProgram | None = None
         self._first = self._end = 0
         self._reserved = 0  # end of the journal's open step; 0 if none is open
         self._coming = 0  # what it is being extended to; 0 if it is not
@@ -48,16 +50,17 @@ class JobBook:
         self._noted_s = self._noted_bed_c = -math.inf
         self.lines_sent = 0
 
-    def open(self, first: int, end: int) -> None:
-        """Turn to a new page: program lines [first, end)."""
+    def open(self, checked: PrintableProgram, first: int, end: int) -> None:
+        """Turn to a new page: lines [first, end) of a program."""
         self._sent.clear()
+        self._checked = checked
         self._first, self._end = first, end
         self._reserved = self._coming = self.lines_sent = 0
 
-    def begin(self, checked: PrintableProgram, port: str) -> None:
+    def begin(self, port: str) -> None:
         """Write the job down."""
-        if self._journal is not None:
-            self._journal.begin(checked.program.sha256, port, self._first, self._end)
+        if self._journal is not None and self._checked is not None:
+            self._journal.begin(self._checked.program.sha256, port, self._first, self._end)
 
     # ------------------------------------------------------------------ ahead of the wire
 
@@ -130,13 +133,19 @@ class JobBook:
         return self._sent[-1][1] if self._sent else self._first - 1
 
     @property
-    def executed_line(self) -> int:
+    def acked_line(self) -> int:
         """The last program line whose number is acknowledged."""
         acked = self._link.last_acked
-        for number, index in reversed(self._sent):
-            if number <= acked:
-                return index
-        return self._first - 1
+        return next((index for n, index in reversed(self._sent) if n <= acked), self._first - 1)
+
+    @property
+    def executed_line(self) -> int:
+        """The last program line that is acknowledged, and not lost in buffers since."""
+        line = self.acked_line
+        if self._link.forgot and self._checked is not None:
+            most = self._link.dialect.buffered_lines
+            line = before_commands(self._checked, self._first, line + 1, most) - 1
+        return line
 
     @property
     def lines_acked(self) -> int:
@@ -160,7 +169,9 @@ class JobBook:
         """Write down what a lost link leaves uncertain; a full disk must not stop a safe exit."""
         if self._journal is not None:
             with contextlib.suppress(JournalError):
-                self._journal.lost(self.executed_line + 1, self.last_sent_line + 1)
+                self._journal.lost(
+                    self.acked_line + 1, self.last_sent_line + 1, forgot=self._link.forgot
+                )
 
     def note(self, text: str) -> None:
         """Write a remark down, if that is possible."""

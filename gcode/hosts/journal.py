@@ -51,7 +51,7 @@ CREATE TABLE IF NOT EXISTS job (
     end_line INTEGER NOT NULL,
     acked INTEGER NOT NULL,       -- every program line below is acknowledged
     reserved INTEGER NOT NULL,    -- no program line from here on was ever sent
-    phase TEXT NOT NULL,          -- printing, finished
+    phase TEXT NOT NULL,          -- printing, forgotten, finished
     started_s REAL NOT NULL
 );
 CREATE TABLE IF NOT EXISTS step (
@@ -270,9 +270,13 @@ class Journal:
         """Say that every program line below `acked` has been received, proved by an answer."""
         self._run("UPDATE job SET acked = ?, reserved = ? WHERE id = ?", acked, acked, self._job)
 
-    def lost(self, acked: int, sent: int) -> None:
-        """Say that the link is lost: acknowledged below `acked`, nothing sent from `sent` on."""
-        self._run("UPDATE job SET acked = ?, reserved = ? WHERE id = ?", acked, sent, self._job)
+    def lost(self, acked: int, sent: int, *, forgot: bool = False) -> None:
+        """Say that the link is lost: acknowledged below `acked`, nothing sent from `sent` on.
+
+        With `forgot`, the printer has lost what waited in its buffers as well.
+        """
+        progress = (acked, sent, "forgotten" if forgot else "printing", self._job)
+        self._run("UPDATE job SET acked = ?, reserved = ?, phase = ? WHERE id = ?", *progress)
 
     def settle(self, job: int, line: int) -> None:
         """Say of an earlier session's job: all below `line` is executed, nothing else was sent.

@@ -67,6 +67,17 @@ def commands_of(checked: PrintableProgram, first: int, end: int) -> Iterator[tup
         yield from zip(numbers, commands, strict=True)
 
 
+def before_commands(checked: PrintableProgram, first: int, line: int, count: int) -> int:
+    """The line from which on `count` commands come before `line`; no line before `first`."""
+    start = line
+    while start > first:
+        start = max(first, start - 2 * count)
+        found = [index for index, _ in commands_of(checked, start, line)]
+        if len(found) >= count:
+            return found[-count]
+    return first
+
+
 def modes_after(
     checked: PrintableProgram,
     line: int,

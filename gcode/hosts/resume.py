@@ -17,7 +17,7 @@ from typing import NoReturn
 
 from gcode.hosts.guarded import PAUSE_LIFT_MM
 from gcode.hosts.journal import FOREIGN_LINES, JobRecord, Journal, Step
-from gcode.hosts.modes import Modes, commands_of, follow, modes_after
+from gcode.hosts.modes import Modes, before_commands, commands_of, follow, modes_after
 from gcode.hosts.port import LinkLostError, PrintableProgram, PrintReport, ResumeRefusedError
 from gcode.hosts.serial import SerialPrinter
 from gcode.progress import Progress, silent
@@ -237,6 +237,8 @@ class _Resumption:
     def _line_by_place(self, place: PositionReport) -> int:
         """The program line to send next, if the nozzle's place fits one line alone."""
         job = self._job
+        if job.phase == "forgotten":
+            self._refuse("the printer has stopped or started anew since", reset=True)
         doubtful = [index for index, _ in commands_of(self._checked, job.acked, job.reserved)]
         if len(doubtful) > MOST_IN_DOUBT:
             self._refuse(f"{len(doubtful)} lines are in doubt and the firmware counts none")
@@ -251,7 +253,8 @@ class _Resumption:
         if at_origin or not (fitting if self._anew else len(fitting) == 1):
             self._refuse(
                 f"the firmware counts no lines, and the nozzle's place fits {len(fitting)} of the "
-                f"{len(doubtful) + 1} places where it may have been"
+                f"{len(doubtful) + 1} places where it may have been",
+                reset=at_origin or not fitting,
             )
         self._settled_at(fitting[0])
         return fitting[0]
@@ -310,7 +313,8 @@ class _Resumption:
         job = self._job
         known = job.acked - 1
         if reset:  # what waited in its buffers is gone
-            known = max(job.first_line - 1, known - self._printer.dialect.buffered_lines)
+            most = self._printer.dialect.buffered_lines
+            known = before_commands(self._checked, job.first_line, job.acked, most) - 1
         sent = max(job.reserved - 1, known)
         raise ResumeRefusedError(
             f"The job cannot be resumed: {why}. Program lines up to {known + 1} are executed, "

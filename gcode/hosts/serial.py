@@ -118,7 +118,7 @@ class SerialPrinter(GuardedConversation):
         self._round_trips = RoundTrips()
         self._warnings.clear()
         self._abort_asked.clear()
-        self._book.open(first, end)
+        self._book.open(checked, first, end)
         self._printing = True
         try:
             with self._mutex:
@@ -159,7 +159,7 @@ class SerialPrinter(GuardedConversation):
         self, checked: PrintableProgram, first: int, end: int, progress: Progress
     ) -> bool:
         """Stream, and prove that all has arrived; False if the job was aborted."""
-        self._book.begin(checked, self.port)
+        self._book.begin(self.port)
         whole = self._stream(checked, first, end, progress)
         if whole or self._comes_to_rest():
             self._prove()
@@ -414,10 +414,20 @@ class SerialPrinter(GuardedConversation):
             asked.get(event.action.split()[0], lambda: None)()
 
     def _fault(self, text: str) -> Exception:
-        return PrinterError(
-            f"The printer reports a fault: {text}; the last program line known to be executed is "
-            f"{self._book.executed_line + 1}."
-        )
+        where = ""
+        if self._printing:
+            where = (
+                f"; the last program line known to be executed is {self._book.executed_line + 1}"
+                f"{self._forgotten()}"
+            )
+        return PrinterError(f"The printer reports a fault: {text}{where}.")
+
+    def _forgotten(self) -> str:
+        """What may have become of the lines after the last that is known to be executed."""
+        if not self._link.forgot:
+            return ""
+        most = self._link.dialect.buffered_lines
+        return f" (up to {most} acknowledged after it may have been lost in its buffers)"
 
     def _lost_error(self, why: str) -> LinkLostError:
         executed, last_sent = self._book.executed_line, self._book.last_sent_line
@@ -428,8 +438,9 @@ class SerialPrinter(GuardedConversation):
         )
         return LinkLostError(
             f"The link to {self.port} is lost: {why}; program lines up to "
-            f"{executed + 1} are acknowledged, {doubt}; its heaters may be on: find out where the "
-            f"printer is before going on.",
+            f"{executed + 1} are {'executed' if self._link.forgot else 'acknowledged'}"
+            f"{self._forgotten()}, {doubt}; its heaters may be on: find out where the printer is "
+            f"before going on.",
             executed,
             last_sent,
             why=why,

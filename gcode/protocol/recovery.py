@@ -67,7 +67,7 @@ class Recovery:
         self._said_last: int | None = None
         self._questions = 0
         self._answered = False  # the dialect's question
-        self._moved = self._shut_down = False
+        self._moved = self._shut_down = self._reset = False
         self._told: PositionReport | None = None
 
     @property
@@ -80,8 +80,17 @@ class Recovery:
         """Whether the link has ended (`LOST`, `HALTED`) and only `hello` leads on."""
         return self.state is State.LOST or self.state is State.HALTED
 
-    def give_up(self, why: str) -> list[Event]:
-        """End the link for a reason of the caller's (the port is gone, an error was seen)."""
+    @property
+    def forgot(self) -> bool:
+        """Whether the printer has stopped or started anew: what waited in its buffers is gone."""
+        return self._reset or self.state is State.HALTED
+
+    def give_up(self, why: str, *, stopped: bool = False) -> list[Event]:
+        """End the link for a reason of the caller's (the port is gone, an error was seen).
+
+        With `stopped` the printer was told to stop at once.
+        """
+        self._reset = self._reset or stopped
         if self.state not in (State.UNGREETED, State.HALTED, State.LOST):
             self._lose(why)
         events, self._events = self._events, []
@@ -169,6 +178,7 @@ class Recovery:
             self._go(Signal.RESET)
             self._deadline_s = min(self._deadline_s, now_s + self.timing.resend_grace_s)
         elif self.state not in (State.UNGREETED, State.LOST):
+            self._reset = True
             self._lose(f"the printer started anew ({reset.banner})", Signal.RESET)
 
     # ------------------------------------------------------------------ time

@@ -30,7 +30,9 @@ from gcode.errors import LinkError, PrinterError
 from gcode.firmware import FirmwareCore
 from gcode.firmware.motion import MotionBatch, MotionFile
 from gcode.hosts import LinkLostError, connect
+from gcode.hosts.journal import Journal
 from gcode.hosts.port import NothingMetError
+from gcode.hosts.resume import resume
 from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
 from gcode.profiles import load_setup
@@ -146,6 +148,54 @@ def test_what_ends_a_job_is_told(
         with pytest.raises(LinkError):
             printer.temperatures()
         printer.close()
+
+
+def place_of(move: str) -> list[float]:
+    return [float(word[1:]) for word in move.split()[1:]]
+
+
+def test_what_a_shutdown_loses_is_not_called_executed(tmp_path: Path) -> None:
+    """It acknowledges what it has planned, seconds ahead; a job so ended is not gone on with."""
+    job = program([*HEAD, *(f"{move} F3000" for move in MOVES), "M84"])
+    stopped_at: list[list[float]] = []
+    journal = Journal(tmp_path / "journal.sqlite")
+
+    def refused() -> str:
+        again = SerialPrinter(klipper.port, dialect="klipper", supervise=False, journal=journal)
+        with pytest.raises(LinkError) as caught:
+            resume(again, job, release_c=40.0)
+        again.close()
+        return str(caught.value)
+
+    with LiveKlipper(tmp_path) as klipper:
+
+        def stop() -> None:
+            with Api(klipper.socket) as api:
+                told = api.query(motion_report=["live_position"])["motion_report"]
+                stopped_at.append(told["live_position"][:2])
+                api.call("emergency_stop")
+
+        timer = threading.Timer(12.0, stop)
+        timer.start()
+        sending = SerialPrinter(klipper.port, dialect="klipper", supervise=False, journal=journal)
+        with pytest.raises(PrinterError, match="has shut down") as caught, sending:
+            sending.print(job)
+        timer.join()
+        assert "executed is 0 (up to 1000 acknowledged after it may have been" in str(caught.value)
+        latest = journal.latest()
+        assert latest is not None
+        assert latest.phase == "forgotten"
+        away = [math.dist(place_of(move), stopped_at[0]) for move in MOVES]
+        assert away.index(min(away)) + 5 < latest.reserved - len(HEAD), "these it has acknowledged"
+        assert "Shutdown due to webhooks request" in refused()
+        with Api(klipper.socket) as api:
+            api.call("gcode/firmware_restart")
+        wait_for("it is there again", klipper.is_ready, klipper.log)
+        for home in (False, True):
+            if home:
+                with sender(klipper) as printer:
+                    printer.command("G28")
+            assert re.search("stopped or started anew.*lines up to 0 are executed", refused())
 
 
 @pytest.mark.parametrize("line", ["G20", "G1 X500", "G1 X50 F0", "G2 X50 Y50 R60", "G1 E60"])

@@ -255,8 +255,10 @@ def test_a_klipper_that_shuts_down_is_heard_out(tmp_path: Path) -> None:
     with bench(tmp_path, firmware="klipper", faults="line 30 thermal_runaway") as it:
         printer = SerialPrinter(it.emulator.port, dialect="klipper", supervise=False)
         printer.connect()
-        with pytest.raises(PrinterError, match="Klipper has shut down: Thermal Runaway"):
+        with pytest.raises(PrinterError, match="Klipper has shut down: Thermal Runaway") as caught:
             printer.print(program([*HEAD, *MOVES[:60]]))
+        # regression: all that was acknowledged was called executed, though never moved
+        assert "known to be executed is 0 (up to 1000 acknowledged after" in str(caught.value)
         with pytest.raises(LinkLostError, match="has ended"):
             printer.temperatures()
         assert re.search(r"nothing confirms it: .* stopped \(Thermal", printer.notes[-1])

@@ -6,6 +6,7 @@ import os
 import re
 import sqlite3
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts.file import FilePrinter
 from gcode.hosts.jobbook import JobBook
 from gcode.hosts.journal import Journal
-from gcode.protocol import Link
+from gcode.protocol import LINK_DIALECTS, Link
 
 
 def test_no_line_goes_out_before_the_disk_says_that_it_may(
@@ -64,7 +65,7 @@ def test_an_ok_that_is_taken_back_is_not_called_executed() -> None:
     link.hello(0.0)
     link.receive(b"ok\n", 0.0)
     book = JobBook(link, None, lambda: 0.0)
-    book.open(10, 20)
+    book.open(program(["G1"] * 20), 10, 20)
     for index in (10, 12, 13):
         book.before_line(index)
         link.send(f"G1 X{index}", 0.0)
@@ -76,9 +77,30 @@ def test_an_ok_that_is_taken_back_is_not_called_executed() -> None:
     assert (book.executed_line, book.last_sent_line) == (10, 13)
 
 
+@pytest.mark.parametrize(("dialect", "known"), [("marlin", 20), ("klipper", 9)])
+@pytest.mark.parametrize("said", ["Error:Printer halted. kill() called!", "start"])
+def test_what_waited_in_a_stopped_printers_buffers_is_not_called_executed(
+    dialect: str, known: int, said: str
+) -> None:
+    """Regression: what was acknowledged was; a Klipper acknowledges what it has yet to move."""
+    few = {"buffered_lines": 40} if dialect == "marlin" else {}
+    link = Link(replace(LINK_DIALECTS[dialect], **few))
+    link.hello(0.0)
+    link.receive(b"ok\n", 0.0)
+    book = JobBook(link, None, lambda: 0.0)
+    book.open(program(["; comment", "G1 X1"] * 60), 10, 120)
+    for index in range(11, 101, 2):
+        book.before_line(index)
+        link.send(f"G1 X{index}", 0.0)
+        link.receive(b"ok\n", 0.0)
+    assert book.executed_line == 99
+    link.receive(said.encode() + b"\n", 1.0)
+    assert book.executed_line == known
+
+
 def test_before_the_first_line_nothing_is_executed() -> None:
     book = JobBook(Link(), None, lambda: 0.0)
-    book.open(5, 9)
+    book.open(program([]), 5, 9)
     assert (book.executed_line, book.last_sent_line, book.lines_acked) == (4, 4, 0)
 
 
