@@ -114,7 +114,7 @@ def plain_text(path: Path) -> str:
         raise InputError(f"{path} cannot be read ({error.strerror}).") from error
     if binary.is_binary(data):
         return binary.text_of(data, str(path))
-    text = data.decode("utf-8", "replace").replace("\r\n", "\n").replace("\r", "\n")
+    text = data.decode("utf-8-sig", "replace").replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         raise InputError(f"{path} is no text; give a program as plain or Prusa's binary G-code.")
     return text

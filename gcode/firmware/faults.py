@@ -12,6 +12,8 @@ The faults themselves are carried out by `core` and, where the port is concerned
 
 from __future__ import annotations
 
+import contextlib
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -127,5 +129,9 @@ def _parse_fault(words: list[str]) -> Fault:
         name, _, number = rest.pop(0).partition("=")
         if name not in ("s", "n") or rest:
             raise ValueError("takes one value, s=… or n=…")
-        value = float(number)
+        value = math.nan
+        with contextlib.suppress(ValueError):
+            value = float(number)
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"has {number!r} for {name}, a number from 0 on")
     return Fault(when, count, kind, value)  # type: ignore[arg-type]

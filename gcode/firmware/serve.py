@@ -81,6 +81,8 @@ class PtyServer:
         import termios
         import tty
 
+        if self.link.exists() and not self.link.is_symlink():
+            raise InputError(f"{self.link} is there already and no port of ours; name another.")
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         attributes = termios.tcgetattr(self._slave)
@@ -88,9 +90,13 @@ class PtyServer:
         termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
         os.set_blocking(self._master, False)
         temporary = self.link.with_name(self.link.name + ".new")
-        temporary.unlink(missing_ok=True)
-        temporary.symlink_to(os.ttyname(self._slave))
-        temporary.replace(self.link)
+        try:
+            temporary.unlink(missing_ok=True)
+            temporary.symlink_to(os.ttyname(self._slave))
+            temporary.replace(self.link)
+        except OSError as error:
+            self._close()
+            raise InputError(f"{self.link} cannot be made ({error.strerror}).") from error
 
     def _close(self) -> None:
         for fd in (self._slave, self._master):

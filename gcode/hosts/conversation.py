@@ -7,6 +7,7 @@ It opens the port, greets, tests, asks and listens; it knows nothing of programs
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import os
 import select
@@ -35,6 +36,16 @@ REPORT_TRIES = 10
 MOST_WAIT_S = 0.5
 PROOF_QUIET_S = 0.2
 """A printer that has said nothing for so long has nothing left to say."""
+
+
+def _no_port(error: OSError) -> str:
+    """Why, and what to do."""
+    if error.errno is None:  # a file that is none
+        return "it is no serial port; give a device's path"
+    why = os.strerror(error.errno)
+    if error.errno == errno.EACCES:
+        return f"{why}; have your user added to the group that owns it (dialout, mostly)"
+    return f"{why}; check the path, the cable and the printer's switch"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +119,7 @@ class SerialConversation:
         try:
             device.open()
         except (serial.SerialException, OSError) as error:
-            raise LinkError(f"{self.port} cannot be opened ({error}); check the path.") from error
+            raise LinkError(f"{self.port} cannot be opened: {_no_port(error)}.") from error
         self._serial = device
         self._fd = device.fileno()
         self._set_up_port()

@@ -78,12 +78,14 @@ CREATE TABLE IF NOT EXISTS temperature (
 def default_path(port: str) -> Path | None:
     """Where a port's journal is kept unless told otherwise: one a printer, in the user's state.
 
-    None for a server or a file, which keep no journal here.
+    None for a server or a file, which keep no journal here. A link is followed by no one: what it
+    leads to may change.
     """
     if "://" in port or port.startswith("file:"):
         return None
     folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return folder / "gcode" / f"{hashlib.sha256(port.encode()).hexdigest()[:16]}.sqlite"
+    name = hashlib.sha256(str(Path(port).absolute()).encode()).hexdigest()[:16]
+    return folder / "gcode" / f"{name}.sqlite"
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ class PortLock:
     """The right to speak to one printer."""
 
     def __init__(self, port: str, *, folder: Path | None = None) -> None:
-        real = str(Path(port).resolve()) if port.startswith("/") else port
+        real = port if "://" in port else str(Path(port).resolve())
         name = hashlib.sha256(real.encode()).hexdigest()[:16]
         self._port = port
         self._path = (folder or Path(tempfile.gettempdir())) / f"gcode-port-{name}.lock"

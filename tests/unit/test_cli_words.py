@@ -105,6 +105,14 @@ def test_a_file_without_gcode_passes_no_check(tmp_path: Path, content: bytes, sa
         program_text(path)
 
 
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
+def test_a_program_as_editors_leave_it(tmp_path: Path, end: bytes) -> None:
+    """Regression: the mark that some put before UTF-8 was refused as a word of the first line."""
+    path = tmp_path / "job.gcode"
+    path.write_bytes(b"\xef\xbb\xbf" + end.join([b"G28", b"G1 X1 ; \xc3\xbc"]))
+    assert program_text(path) == "G28\nG1 X1 ; ü"
+
+
 def test_a_folder_is_no_text(tmp_path: Path) -> None:
     with pytest.raises(GcodeInputError, match="Is a directory"):
         plain_text(tmp_path)

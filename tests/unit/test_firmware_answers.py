@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 sys.path.insert(0, str(Path(__file__).parent))
 from link_helpers import profile
 
-from gcode.firmware import FirmwareCore
+from gcode.errors import InputError
+from gcode.firmware import FirmwareCore, parse_faults
+from gcode.firmware.serve import PtyServer
 from gcode.hosts.modes import Modes, follow
 from gcode.protocol import checksum
 
@@ -280,6 +282,27 @@ def test_tools_that_are_there_and_that_are_not(
     core.feed(line.encode() + b"\n")
     core.run()
     assert core.take_output().decode().splitlines() == [*said, "ok"]
+
+
+@pytest.mark.parametrize("there", ["file", "folder", "nowhere"])
+def test_a_port_takes_the_place_of_nothing(there: str, tmp_path: Path) -> None:
+    """Regression: 'gcode emulate --link FILE' put its port in the place of that file."""
+    link = tmp_path / "port"
+    if there == "file":
+        link.write_text("precious")
+    elif there == "folder":
+        link.mkdir()
+    else:
+        link = tmp_path / "nowhere" / "port"
+    with pytest.raises(InputError, match=r"there already|cannot be made \(No such"):
+        PtyServer(FirmwareCore(profile()), link)
+    assert there != "file" or link.read_text() == "precious"
+
+
+@pytest.mark.parametrize("value", ["s=abc", "s=-5", "s=nan", "s=inf", "s="])
+def test_a_fault_takes_a_number(value: str) -> None:
+    with pytest.raises(InputError, match=f"has '{value[2:]}' for {value[0]}, a number from 0 on"):
+        parse_faults(f"line 3 silence {value}")
 
 
 E_MODES = ("M82", "M83", "G90", "G91", "G92 E0", "G1 E2 F300", "G1 X1 E3", "G20", "G21")

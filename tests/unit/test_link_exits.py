@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import pty
 import re
@@ -14,6 +15,7 @@ import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -280,6 +282,26 @@ def test_nothing_is_waited_for_on_a_port_that_was_never_opened() -> None:
     for ask in (printer.heaters_off, printer.temperatures):
         with pytest.raises(LocalProtocolError, match="not connected"):
             ask()
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [("nothing", "No such file or directory; check the path"), ("file", "it is no serial port"),
+     ("folder", "Is a directory; check"), ("forbidden", "Permission denied; have your user added")],
+)  # fmt: skip
+def test_a_port_that_cannot_be_opened_is_one_sentence(
+    what: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = tmp_path / "tty"
+    if what == "folder":
+        port.mkdir()
+    elif what != "nothing":
+        port.touch()
+    if what == "forbidden":  # root may open anything
+        denied = PermissionError(errno.EACCES, "Permission denied")
+        monkeypatch.setattr("serial.Serial.open", Mock(side_effect=denied))
+    with pytest.raises(LinkError, match=f"cannot be opened: {said}"):
+        SerialPrinter(str(port)).connect()
 
 
 def test_who_interrupts_is_told_what_became_of_the_heaters(

@@ -11,6 +11,7 @@ import pytest
 
 from gcode.errors import LinkError, PortBusyError
 from gcode.hosts import lock as lock_module
+from gcode.hosts.journal import default_path
 from gcode.hosts.lock import PortLock
 from gcode.locks import try_lock
 
@@ -37,6 +38,23 @@ def test_the_second_is_refused_and_its_refusal_changes_nothing(tmp_path: Path) -
     first.release()
     second.acquire()
     second.release()
+
+
+@pytest.mark.parametrize("name", ["tty", "./tty", "link", "sub/../link"])
+def test_a_printer_has_one_lock_by_whatever_name(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: a relative path was another printer, and two senders shared it."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "tty").touch()
+    (tmp_path / "link").symlink_to("tty")
+    monkeypatch.chdir(tmp_path)
+    first = PortLock(str(tmp_path / "tty"), folder=tmp_path / "sub")
+    first.acquire()
+    with pytest.raises(PortBusyError):
+        PortLock(name, folder=tmp_path / "sub").acquire()
+    first.release()
+    assert default_path("tty") == default_path(str(tmp_path / "tty")) != default_path("link")
 
 
 def test_who_opened_the_file_before_it_was_removed_does_not_share_the_printer(
