@@ -92,6 +92,7 @@ class SerialConversation:
         self._stalls = self._bytes_sent = 0
         self._refused_numbers: list[int] = []
         self._greeted = False
+        self._bytes_heard = 0  # since the hello
 
     # ------------------------------------------------------------------ for those who build on it
 
@@ -106,6 +107,17 @@ class SerialConversation:
 
     def _lost_error(self, why: str) -> LinkLostError:
         return LinkLostError(f"The link to {self.port} is lost: {why}.", -1, -1, why=why)
+
+    def _stranger(self) -> LinkLostError:
+        """What is there has not answered the hello."""
+        said = (
+            "what it says is no answer, so its speed is another, most likely: see 'baud' of its "
+            "profile"
+            if self._bytes_heard
+            else "is it switched on, and this its port?"
+        )
+        why = f"no answer at {self._line.baud} baud; {said}"
+        return LinkLostError(f"The printer on {self.port} does not greet: {why}", -1, -1, why=why)
 
     # ------------------------------------------------------------------ connection
 
@@ -150,7 +162,7 @@ class SerialConversation:
             self._log = None
 
     def _greet(self, number: int = 0) -> None:
-        self._greeted = False
+        self._greeted, self._bytes_heard = False, 0
         self._failure, self._ended_by = None, ""
         self._write(self._link.hello(self._clock(), number=number))
         while not self._greeted:
@@ -370,6 +382,7 @@ class SerialConversation:
         if not data:
             self._lost("the port was closed")
         now_s = self._clock()
+        self._bytes_heard += len(data)
         if self._log is not None:
             self._log.add(now_s, b"<", data)
         return self._digest(self._link.receive(data, now_s))
@@ -418,5 +431,5 @@ class SerialConversation:
         elif isinstance(event, ev.CommandFailed):
             self._failure = self._fault(event.text)
         elif isinstance(event, ev.LinkLost):
-            self._failure = self._lost_error(event.why)
+            self._failure = self._lost_error(event.why) if self._greeted else self._stranger()
         self._on_other_event(event)

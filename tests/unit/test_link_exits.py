@@ -31,7 +31,7 @@ from gcode.hosts.fast_path import waiting
 from gcode.hosts.port import NothingMetError
 from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
-from gcode.protocol import Link
+from gcode.protocol import Link, LinkTiming
 from gcode.protocol import events as ev
 
 HEAD = ["M104 S200", "G28", "G1 Z2 F600", "M83"]
@@ -302,6 +302,22 @@ def test_a_port_that_cannot_be_opened_is_one_sentence(
         monkeypatch.setattr("serial.Serial.open", Mock(side_effect=denied))
     with pytest.raises(LinkError, match=f"cannot be opened: {said}"):
         SerialPrinter(str(port)).connect()
+
+
+@pytest.mark.parametrize(
+    ("says", "said"), [(b"\x00\xe0\xfe", "its speed is another"), (b"", "is it switched on")]
+)
+def test_a_printer_at_another_speed_is_told_from_one_that_is_off(says: bytes, said: str) -> None:
+    """Regression: for both, 'program lines up to 0 are acknowledged, heaters may be on'."""
+    theirs, ours = os.openpty()
+    tty.setraw(ours)
+    quick = LinkTiming(give_up_s=0.4, doubt_s=0.02)
+    printer = SerialPrinter(os.ttyname(ours), baud=57600, timing=quick, supervise=False)
+    threading.Thread(target=lambda: os.read(theirs, 99) and os.write(theirs, says)).start()
+    with pytest.raises(LinkLostError, match=f"does not greet: no answer at 57600 baud; .*{said}"):
+        printer.connect()
+    os.close(theirs)
+    os.close(ours)
 
 
 def test_who_interrupts_is_told_what_became_of_the_heaters(
