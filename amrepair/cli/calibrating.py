@@ -35,6 +35,7 @@ class Source:
     job: Path | None
     layer: int
     timeout_s: float
+    scan_unit: str | None
 
 
 def write_target(path: Path, ids: tuple[str, str, str], *, as_json: bool) -> None:
@@ -70,6 +71,8 @@ def run(
         cloud = _scan(setup, source, bars)
         found = calibrate(cloud, standing, options=options, rng=np.random.default_rng(seed))
     about = {"printer": setup.printer.id, "scan": cloud.source}
+    if source.scan_unit is not None:
+        about["scan_unit"] = source.scan_unit.lower()
     write_calibration(output, found, about)
     if as_json:
         console.show_json({**found.to_json(), **about, "calibration": str(output), "seed": seed})
@@ -110,11 +113,11 @@ def _scan(setup: PrintSetup, source: Source, bars: console.Bars) -> Scan:
     if scan is not None:
         if port is not None or scanner is not None:
             raise InputError("--scan is a scan that there is; leave --port and --scanner out")
-        return read_scan(scan, frame="scanner")
+        return read_scan(scan, frame="scanner", unit=source.scan_unit)
     if port is None or scanner is None:
         raise InputError("give --port and --scanner to print and scan the target, or --scan FILE")
     nowhere = Transform.identity("build", "scanner")  # where it hangs is what is sought
-    eye = open_scanner(scanner, Bed(nowhere, source.timeout_s, setup))
+    eye = open_scanner(scanner, Bed(nowhere, source.timeout_s, setup, scan_unit=source.scan_unit))
     checked = _target(setup)
     machine = connect(
         port,

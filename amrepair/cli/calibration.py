@@ -92,7 +92,7 @@ def calibrate_command(
     calibrating.run(
         output,
         (printer, material, process),
-        calibrating.Source(port, scanner, scan, job, layer, scan_timeout_s),
+        calibrating.Source(port, scanner, scan, job, layer, scan_timeout_s, scan_unit),
         max_residual_mm=max_residual_mm,
         seed=seed,
         as_json=as_json,

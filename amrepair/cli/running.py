@@ -26,7 +26,7 @@ from amrepair.loop import (
     plan_stops,
     run_loop,
 )
-from amrepair.loop.calibrate import read_calibration
+from amrepair.loop.calibrate import calibrated_unit, read_calibration
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
 from amrepair.loop.options import UNASKED
@@ -194,7 +194,7 @@ def new_run(
     text = program_text(job_file)
     setup, own = job_setup(text, job_file, *named)
     _ = setup.printer.head  # refused before any work
-    pose = read_calibration(calibration)
+    pose, unit = read_calibration(calibration), calibrated_unit(calibration)
     known_scanner(said["scanner"])  # refused before any work
     if said["scanner"] == PROBE:
         _ = setup.printer.feeler
@@ -238,7 +238,7 @@ def new_run(
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
         copies=() if expected is field else placed, by_beads=True,
-        adaptive=pace, marked=looks.marked,
+        scan_unit=unit or "", adaptive=pace, marked=looks.marked,
         limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
@@ -312,6 +312,7 @@ def print_run(
         Bed(
             setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed,
             printer=machine, job=begun.job, progress=page.watching(bars),
+            scan_unit=setting.scan_unit or None,
         ),
     )  # fmt: skip
     page.show_run(begun.job, placed_solid(begun.template, setting.placed))

@@ -39,6 +39,8 @@ class Bed:
         The printer itself, connected, and what it prints: for its own probe, which touches.
     progress
         Told of touches.
+    scan_unit
+        Of the files that a watched folder gets, where they do not say it; None is mm.
     """
 
     build_from_scanner: Transform
@@ -48,6 +50,7 @@ class Bed:
     printer: Printer | None = None
     job: Job | None = None
     progress: Progress = silent
+    scan_unit: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +91,9 @@ class OwnScanner:
 
 def _watched(where: str, bed: Bed) -> Scanner:
     return WatchedFolderScanner(
-        Path(where), build_from_scanner=bed.build_from_scanner, timeout_s=bed.timeout_s
-    )
+        Path(where), build_from_scanner=bed.build_from_scanner, timeout_s=bed.timeout_s,
+        unit=bed.scan_unit,
+    )  # fmt: skip
 
 
 def _simulated(where: str, bed: Bed) -> Scanner:

@@ -21,6 +21,7 @@ from amrepair.align.thinning import thin_out
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans import Scan
+from amrepair.scans.ply import MM_PER
 from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
 from gcode.whole import put_in_place
@@ -323,6 +324,22 @@ def _apart(a: Transform, b: Transform) -> float:
     """Angle between two poses, rad."""
     cosine = (np.trace((a.matrix @ np.linalg.inv(b.matrix))[:3, :3]) - 1.0) / 2.0
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def calibrated_unit(path: Path | None) -> str | None:
+    """The unit of the scanner's files, where its calibration was made with one.
+
+    Raises
+    ------
+    InputError
+        If it is none that a scan may have.
+    """
+    unit = None if path is None else json.loads(path.read_text()).get("scan_unit")
+    if unit is not None and unit not in MM_PER:
+        raise InputError(
+            f"the calibration {path} says that scans are in '{unit}'; known are {', '.join(MM_PER)}"
+        )
+    return unit
 
 
 def read_calibration(path: Path | None) -> Transform:

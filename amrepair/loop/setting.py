@@ -66,6 +66,8 @@ class Setting:
     sound
         What sound parts look like to the scanner, where somebody named it: name, scans, widths,
         wander and tails, as `Calibration` has them. Empty: the run learns from its first layers.
+    scan_unit
+        Of the scanner's files, where they do not say it; empty: mm.
     """
 
     printer: str
@@ -90,6 +92,7 @@ class Setting:
     leave_heaters: bool = False
     marked: int | None = None
     sound: tuple[Any, ...] = ()
+    scan_unit: str = ""
 
     @classmethod
     def of(

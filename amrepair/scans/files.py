@@ -89,6 +89,7 @@ class WatchedFolderScanner:
         poll_s: float = 0.1,
         sigma_mm: float | None = None,
         sensor_at: Sequence[float] | None = None,
+        unit: str | None = None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -97,7 +98,7 @@ class WatchedFolderScanner:
         self._folder = folder
         self._pose = build_from_scanner or Transform.identity("build", "scanner")
         self._timeout_s, self._settle_s, self._poll_s = timeout_s, settle_s, poll_s
-        self._sigma_mm, self._sensor_at = sigma_mm, sensor_at
+        self._sigma_mm, self._sensor_at, self._unit = sigma_mm, sensor_at, unit
         self._clock, self._sleep = clock, sleep
         self._done = {(p, *_stamp(p)) for p in self._files()}
         self._digests: set[bytes] = set()
@@ -192,8 +193,9 @@ class WatchedFolderScanner:
                 self._forget(path)
                 return None, f"{path.name} repeats an earlier scan"
             scan = read_scan(
-                path, frame="scanner", sigma_mm=self._sigma_mm, sensor_at=self._sensor_at
-            )
+                path, frame="scanner", sigma_mm=self._sigma_mm, sensor_at=self._sensor_at,
+                unit=self._unit,
+            )  # fmt: skip
         except (InputError, OSError) as e:
             # The file may still be half written; a change of size or time brings it back.
             return None, f"{path.name} cannot be read: {e}"

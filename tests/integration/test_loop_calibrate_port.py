@@ -13,8 +13,7 @@ import trimesh
 
 from amrepair.cli import calibrating
 from amrepair.frames import Transform, rotation_from_vector
-from amrepair.loop.calibrate import read_calibration, target_solid
-from amrepair.scans import Scan, write_ply
+from amrepair.loop.calibrate import calibrated_unit, read_calibration, target_solid
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.profiles import load_printer
 
@@ -49,8 +48,8 @@ def test_the_scanner_is_found_from_a_printed_target(tmp_path: Path) -> None:
             whole = machine.clock_s() > finished_s
             cloud = noisy if whole else pose.inverse().apply(bed)
             jitter = rng.normal(scale=1e-4, size=(1, 3))
-            write_ply(Scan(cloud + jitter, 0.03, "scanner"), tmp_path / "aside.ply")
-            (tmp_path / "aside.ply").rename(drop / f"{k:04d}.ply")
+            np.save(tmp_path / "aside.npy", (cloud + jitter) / 1000.0)  # as robots have it: metres
+            (tmp_path / "aside.npy").rename(drop / f"{k:04d}.npy")
 
     with EmulatedPrinterProcess("prusa", printer=printer) as machine:
         finished_s = 0.7 * calibrating_seconds()
@@ -58,7 +57,7 @@ def test_the_scanner_is_found_from_a_printed_target(tmp_path: Path) -> None:
         eye.start()
         began = time.monotonic()
         try:
-            source = calibrating.Source(machine.port, f"watch:{drop}", None, None, 0, 60.0)
+            source = calibrating.Source(machine.port, f"watch:{drop}", None, None, 0, 60.0, "m")
             calibrating.run(out, IDS, source, max_residual_mm=0.15, seed=0, as_json=False)
         finally:
             over.set()
@@ -66,6 +65,7 @@ def test_the_scanner_is_found_from_a_printed_target(tmp_path: Path) -> None:
         print(f"{machine.clock_s():.0f} s of the printer's clock in {time.monotonic() - began:.0f}")
         laid_mm = float(machine.take_motion().filament_mm.clip(min=0).sum())
     assert laid_mm > 100.0  # the target was printed
+    assert calibrated_unit(out) == "m"  # so the loop reads this scanner's files
     found = read_calibration(out)
     off = found @ pose.inverse()
     corners = np.array([[0.0, 0, 0], [x, 0, 0], [0, y, 0], [x, y, 0]])

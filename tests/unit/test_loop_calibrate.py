@@ -16,6 +16,7 @@ from amrepair.loop.calibrate import (
     TARGET_MM,
     PoseCalibration,
     calibrate,
+    calibrated_unit,
     read_calibration,
     target_solid,
     write_calibration,
@@ -114,6 +115,12 @@ def test_the_file_is_what_the_loop_reads(tmp_path: Path) -> None:
     assert json.loads(path.read_text())["residual_mm"] == 0.04
     assert np.array_equal(read_calibration(None).matrix, np.eye(4))
     said = json.loads(path.read_text())
+    assert calibrated_unit(None) is calibrated_unit(path) is None
+    path.write_text(json.dumps(said | {"scan_unit": "m"}))
+    assert calibrated_unit(path) == "m"
+    path.write_text(json.dumps(said | {"scan_unit": "ell"}))
+    with pytest.raises(InputError, match="scans are in 'ell'; known are mm, cm, m"):
+        calibrated_unit(path)
     said["build_from_scanner"][0][0] *= 1.1
     path.write_text(json.dumps(said))
     with pytest.raises(InputError, match="no rigid motion"):

@@ -50,6 +50,15 @@ def test_takes_the_new_file_not_the_old_one(tmp_path: Path) -> None:
     assert np.array_equal(scanner.scan(ask(3)).points_mm, make(1).points_mm)
 
 
+def test_files_in_metres_are_read_as_such(tmp_path: Path) -> None:
+    time = Time()
+    scanner = WatchedFolderScanner(
+        tmp_path, timeout_s=5.0, unit="m", clock=time.clock, sleep=time.sleep
+    )
+    time.plan = [(1.0, lambda: np.save(tmp_path / "new.npy", make(1).points_mm / 1000.0))]
+    assert scanner.scan(ask(3)).points_mm == pytest.approx(make(1).points_mm)
+
+
 def test_waits_for_a_file_that_still_grows(tmp_path: Path) -> None:
     time = Time()
     scanner = watcher(tmp_path, time)
