@@ -238,7 +238,7 @@ def new_run(
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
         copies=() if expected is field else placed, by_beads=True,
-        scan_unit=unit or "", adaptive=pace, marked=looks.marked,
+        scan_unit=unit, adaptive=pace, marked=looks.marked,
         limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
@@ -312,7 +312,7 @@ def print_run(
         Bed(
             setting.scanner_pose, setting.scan_timeout_s, setup, setting.seed,
             printer=machine, job=begun.job, progress=page.watching(bars),
-            scan_unit=setting.scan_unit or None,
+            scan_unit=setting.scan_unit,
         ),
     )  # fmt: skip
     page.show_run(begun.job, placed_solid(begun.template, setting.placed))

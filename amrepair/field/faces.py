@@ -234,17 +234,16 @@ def _looked_at(
 
     near_cell = around(surfels.place_mm[off])
     chosen, found = looked_at(near_cell)
-    last, rounds = found, 0
+    last = found
     while True:
         beside = around(last.place_mm[last.is_broken]) & ~near_cell
         # a film's cell has both its sides, and lies off as a whole only where one of them does
         if not (share[beside] > options.lone_ratio).any():
             break
         near_cell |= beside
-        rounds += 1
         # what is new, with what lies around it for its planes
         last = looked_at(around(surfels.place_mm[beside]) & near_cell)[1]
-    if rounds:
+    if last is not found:
         chosen, found = looked_at(near_cell)
     return near_cell, chosen, found
 

@@ -21,7 +21,7 @@ from amrepair.align.thinning import thin_out
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans import Scan
-from amrepair.scans.ply import MM_PER
+from amrepair.scans.ply import mm_per
 from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
 from gcode.whole import put_in_place
@@ -334,11 +334,9 @@ def calibrated_unit(path: Path | None) -> str | None:
     InputError
         If it is none that a scan may have.
     """
-    unit = None if path is None else json.loads(path.read_text()).get("scan_unit")
-    if unit is not None and unit not in MM_PER:
-        raise InputError(
-            f"the calibration {path} says that scans are in '{unit}'; known are {', '.join(MM_PER)}"
-        )
+    unit = None if path is None else _words(path)[1].get("scan_unit")
+    if unit is not None:
+        mm_per(str(unit), f"the calibration {path} says that scans are in")
     return unit
 
 
@@ -352,13 +350,7 @@ def read_calibration(path: Path | None) -> Transform:
     """
     if path is None:
         return Transform.identity("build", "scanner")
-    try:
-        matrix = np.array(json.loads(path.read_text())["build_from_scanner"], float)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"the calibration {path} cannot be read ({error}); it is a JSON object with "
-            "build_from_scanner, a 4×4 matrix"
-        ) from error
+    matrix, _ = _words(path)
     if matrix.shape != (4, 4):
         raise InputError(f"the calibration {path} holds {matrix.shape}, not 4×4")
     turn = matrix[:3, :3]
@@ -368,3 +360,15 @@ def read_calibration(path: Path | None) -> Transform:
             "calibrate again"
         )
     return Transform("build", "scanner", matrix)
+
+
+def _words(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """The matrix that the file holds, and all that it says."""
+    try:
+        words = json.loads(path.read_text())
+        return np.array(words["build_from_scanner"], float), words
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"the calibration {path} cannot be read ({error}); it is a JSON object with "
+            "build_from_scanner, a 4×4 matrix"
+        ) from error

@@ -67,7 +67,7 @@ class Setting:
         What sound parts look like to the scanner, where somebody named it: name, scans, widths,
         wander and tails, as `Calibration` has them. Empty: the run learns from its first layers.
     scan_unit
-        Of the scanner's files, where they do not say it; empty: mm.
+        Of the scanner's files, where they do not say it; None: mm.
     """
 
     printer: str
@@ -92,7 +92,7 @@ class Setting:
     leave_heaters: bool = False
     marked: int | None = None
     sound: tuple[Any, ...] = ()
-    scan_unit: str = ""
+    scan_unit: str | None = None
 
     @classmethod
     def of(

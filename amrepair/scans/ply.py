@@ -88,6 +88,19 @@ def _grid_entries(
     return entries
 
 
+def mm_per(unit: str, said: str) -> float:
+    """Millimetres of a unit by its short name.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name; it begins with what was `said` and where.
+    """
+    if unit.lower() not in MM_PER:
+        raise InputError(f"{said} '{unit[:20]}'; known are {', '.join(MM_PER)}")
+    return MM_PER[unit.lower()]
+
+
 def millimetres_of(header: PlyHeader, path: Path, given_mm: float | None) -> float:
     """Millimetres in the file's unit: `comment unit m` or `obj_info unit m`; else as given, or 1.
 
@@ -99,11 +112,7 @@ def millimetres_of(header: PlyHeader, path: Path, given_mm: float | None) -> flo
     unit = header.said("unit")
     if unit is None:
         return given_mm or 1.0
-    if unit.lower() not in MM_PER:
-        raise InputError(
-            f"{path}: the PLY file's unit is '{unit[:20]}'; known are {', '.join(MM_PER)}"
-        )
-    own_mm = MM_PER[unit.lower()]
+    own_mm = mm_per(unit, f"{path}: the PLY file's unit is")
     if given_mm is not None and given_mm != own_mm:
         raise InputError(
             f"{path}: the PLY file says that its unit is '{unit}', of {own_mm:g} mm, and one of "

@@ -19,7 +19,7 @@ from amrepair.errors import InputError, refused_as_ours
 from amrepair.scans.arrays import is_map, load_npy, read_height_map, read_npz
 from amrepair.scans.depth_map import read_depth_map
 from amrepair.scans.mesh import read_mesh
-from amrepair.scans.ply import MM_PER, millimetres_of, read_grid, sensors_of, write_ply
+from amrepair.scans.ply import millimetres_of, mm_per, read_grid, sensors_of, write_ply
 from amrepair.scans.ptx import read_ptx
 from amrepair.scans.range_grid import NO_POINT, RangeGrid, edge_flags
 from amrepair.scans.scan import DEFAULT_SIGMA_MM, Scan
@@ -92,62 +92,46 @@ def read_scan(
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
         raise InputError(f"{path}: {what}")
-    unit_mm = _given_mm(unit, path)
+    given_mm = None if unit is None else mm_per(unit, f"{path}: the scan's unit is")
     # what overflows is refused as not finite
     with np.errstate(all="ignore"), refused_as_ours():
-        if unit_mm is None:
-            scan = _read(path, frame, cell_mm, origin_mm)
-        else:
-            scan = _read_in(unit_mm, path, frame)
+        scan = _read(path, frame, cell_mm, origin_mm, given_mm)
         scan = _with_word(scan, sigma_mm, sensor_at)
         return _with_edges(scan)
 
 
-def _given_mm(unit: str | None, path: Path) -> float | None:
-    """Millimetres of the unit that the user says; None where nothing was said."""
-    if unit is None or unit.lower() in MM_PER:
-        return None if unit is None else MM_PER[unit.lower()]
-    raise InputError(f"{path}: the scan's unit is '{unit[:20]}'; known are {', '.join(MM_PER)}")
-
-
-def _read_in(unit_mm: float, path: Path, frame: str) -> Scan:
-    """A file of a format that leaves the unit open, in a unit that the user says."""
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        return _read_ply(path, frame, unit_mm)
-    if suffix == ".pcd":
-        return _read_pcd(path, frame, unit_mm)
-    if suffix in MESH_SUFFIXES - UNIT_IN_FORMAT:
-        return read_mesh(path, frame, DEFAULT_SIGMA_MM, mm_from_file=unit_mm * np.eye(3))
-    maps = is_depth_map(path) or (suffix == ".npy" and is_map(path))
-    if suffix in POINT_SUFFIXES - UNIT_IN_FORMAT and not maps:
-        return _read_table(path, frame, unit_mm)
-    raise InputError(
-        f"{path}: a scan of this kind has its unit by its format; leave the scan's unit out"
-    )
-
-
 def _read(
-    path: Path, frame: str, cell_mm: float | None, origin_mm: tuple[float, float] | None
+    path: Path,
+    frame: str,
+    cell_mm: float | None,
+    origin_mm: tuple[float, float] | None,
+    given_mm: float | None,
 ) -> Scan:
-    """By the ending of its name, as the file has it."""
+    """By the ending of its name, as the file has it; `given_mm` is the unit that the user says."""
     suffix = path.suffix.lower()
-    if is_depth_map(path):
+    is_image = is_depth_map(path)
+    is_height = suffix in HEIGHT_SUFFIXES or (suffix == ".npy" and is_map(path))
+    if given_mm is not None and (is_image or is_height or suffix in UNIT_IN_FORMAT):
+        raise InputError(
+            f"{path}: a scan of this kind has its unit by its format; leave the scan's unit out"
+        )
+    unit_mm = given_mm or 1.0
+    if is_image:
         return read_depth_map(path, frame=frame, sigma_mm=DEFAULT_SIGMA_MM)
-    if suffix in HEIGHT_SUFFIXES or (suffix == ".npy" and is_map(path)):
+    if is_height:
         return read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
     if suffix == ".npz":
         return read_npz(path, frame, DEFAULT_SIGMA_MM, cell_mm, origin_mm)
     if suffix == ".ply":
-        return _read_ply(path, frame, None)
+        return _read_ply(path, frame, given_mm)
     if suffix == ".pcd":
-        return _read_pcd(path, frame, 1.0)
+        return _read_pcd(path, frame, unit_mm)
     if suffix == ".ptx":
         return read_ptx(_bytes(path), path, frame=frame, sigma_mm=DEFAULT_SIGMA_MM)
     if suffix in POINT_SUFFIXES:
-        return _read_table(path, frame, 1.0)
+        return _read_table(path, frame, unit_mm)
     if suffix in MESH_SUFFIXES:
-        unit = GLTF_MM if suffix == ".glb" else np.eye(3)
+        unit = GLTF_MM if suffix == ".glb" else unit_mm * np.eye(3)
         return read_mesh(path, frame, DEFAULT_SIGMA_MM, mm_from_file=unit)
     known = sorted(POINT_SUFFIXES | MESH_SUFFIXES | HEIGHT_SUFFIXES)
     raise InputError(f"{path}: a scan is one of {', '.join(known)}, not '{suffix}'")

@@ -287,9 +287,11 @@ def _pencil(
     told = (whole @ p[:4]) / beyond
     asked = np.column_stack([whole, -told[:, None] * corners]) / beyond[:, None]
     # each of the independent points tells as much as all of them in the mean
-    inverse = np.linalg.pinv((rows * weight[:, None]) / np.sqrt(len(pixel)), rcond=1e-12)
-    spread = np.linalg.norm(asked @ inverse, axis=1) * np.sqrt(square / options.independent)
-    if spread.max() > options.within_pixels or np.linalg.matrix_rank(rows) < rows.shape[1]:
+    _, size, ways = np.linalg.svd(rows * weight[:, None] / np.sqrt(len(pixel)), full_matrices=False)
+    if size[-1] <= size[0] * len(pixel) * np.finfo(float).eps:
+        return parallel
+    spread = np.linalg.norm(asked @ ways.T / size, axis=1) * np.sqrt(square / options.independent)
+    if spread.max() > options.within_pixels:
         return parallel
     return _Pencil(p[:4], np.append(p[4:], 1.0), off)
 

@@ -121,6 +121,9 @@ def test_the_file_is_what_the_loop_reads(tmp_path: Path) -> None:
     path.write_text(json.dumps(said | {"scan_unit": "ell"}))
     with pytest.raises(InputError, match="scans are in 'ell'; known are mm, cm, m"):
         calibrated_unit(path)
+    path.write_text("no JSON")
+    with pytest.raises(InputError, match="cannot be read"):
+        calibrated_unit(path)
     said["build_from_scanner"][0][0] *= 1.1
     path.write_text(json.dumps(said))
     with pytest.raises(InputError, match="no rigid motion"):

@@ -260,6 +260,10 @@ def test_a_unit_that_the_file_contradicts_or_nobody_knows_is_refused(tmp_path: P
         read_scan(path, frame="scanner", unit="m")
     with pytest.raises(InputError, match=r"the scan's unit is 'ells'; known are mm, cm, m"):
         read_scan(path, frame="scanner", unit="ells")
+    other = tmp_path / "a.step"
+    other.write_text("ISO-10303-21;")
+    with pytest.raises(InputError, match=r"a scan is one of .*, not '\.step'"):
+        read_scan(other, frame="scanner", unit="m")
     image = tmp_path / "a.ptx"
     image.write_text("1\n1\n")
     with pytest.raises(InputError, match=r"has its unit by its format; leave the scan's unit out"):
