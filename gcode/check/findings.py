@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -76,14 +77,14 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """Something beyond a profile's figures that a user's own job may do.
+    """One thing that is told of many lines: beyond a profile's figures, or refused.
 
     Attributes
     ----------
     lines
         How many lines do it.
     worst
-        The line that goes furthest beyond.
+        The line that goes furthest beyond; the first one of what is refused.
     """
 
     lines: int
@@ -92,6 +93,15 @@ class Warned:
     def __str__(self) -> str:
         more = f"; {self.lines} lines do" if self.lines > 1 else ""
         return f"{self.worst}{more}"
+
+
+def by_kind(refusals: Iterable[Refusal]) -> tuple[Warned, ...]:
+    """The first refusal of each kind, with how many there are of it."""
+    found: dict[str, Warned] = {}
+    for refusal in refusals:
+        before = found.get(refusal.what, Warned(0, refusal))
+        found[refusal.what] = Warned(before.lines + 1, before.worst)
+    return tuple(found.values())
 
 
 class Warnings:

@@ -286,7 +286,7 @@ class Judge(Motion):
         several, pushed = self._setup.printer.heads > 1, self.moves.sums.pushed
         before = self._tool or ("T0" if pushed or several else tool)
         if tool != before and (pushed or not several):
-            self._refuse("change of tool", tool, f"one tool: {before}")
+            self._refuse("change of tool or filament", tool, f"{before}, as it began")
             self._tool = before
             return
         if self._setup.printer.docks:

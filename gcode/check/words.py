@@ -12,6 +12,7 @@ and the scripts of PrusaSlicer's bundles, which every job of their printers begi
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 
@@ -73,7 +74,9 @@ _START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
 # Of a machine with several heads: what lays the present one down (Prusa's XL; RepRapFirmware's
 # `T-1`, which is read as this).
 PARKS = {"marlin": frozenset({"P0"}), "prusa": frozenset({"P0"}), "reprap": frozenset({"P0"})}
-LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": 4095, "reprap": 255}
+# Klipper has none: what came of a line is kept until its end (klippy/gcode.py, _process_data;
+# klippy/extras/virtual_sdcard.py). OrcaSlicer tells an object's outline in lines of 9,000 characters.
+LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": math.inf, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})
 # Marlin's software end stops cut a move short at the machine's own, it moves axes that are not

@@ -59,6 +59,7 @@ def check(
     with console.starting():
         from gcode.check import judge, policy_of
         from gcode.check.contact import draw
+        from gcode.check.findings import by_kind
         from gcode.moves import Program
 
     if picture is not None:
@@ -105,10 +106,8 @@ def check(
             console.errors.print(f"First contact: {contact}.")
         elif field is not None:
             console.errors.print("The head touches nothing of what stands there.")
-        for refusal in refusals[:20]:
-            console.errors.print(str(refusal))
-        if len(refusals) > 20:
-            console.errors.print(f"and {len(refusals) - 20} more")
+        for refused in by_kind(refusals):
+            console.errors.print(str(refused))
     else:
         tell_warnings(file, verdict.report)
         if other is not None:

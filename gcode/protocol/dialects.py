@@ -6,6 +6,7 @@ The words of G-code are the business of `gcode.dialects`; here is only what the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +21,8 @@ class LinkDialect:
         The firmware refuses a line whose number is not the next one and whose checksum is
         wrong, so that sending a line again is idempotent: the ground of every recovery.
     max_line_bytes
-        The longest line the firmware takes; longer ones are cut silently (MAX_CMD_SIZE).
+        The longest line the firmware takes; longer ones are cut silently (MAX_CMD_SIZE). Infinity
+        where a line may be of any length.
     rx_bytes
         Receive buffer of the firmware: what may be under way beyond one line.
     buffered_lines
@@ -39,7 +41,7 @@ class LinkDialect:
     name: str
     numbered: bool
     verifies: bool
-    max_line_bytes: int
+    max_line_bytes: float
     rx_bytes: int
     buffered_lines: int = 80
     motors_off_s: float = 120.0
@@ -58,13 +60,14 @@ LINK_DIALECTS: dict[str, LinkDialect] = {
     # it is at zero, then, and refuses to move until it is homed. No line is sent again. Its
     # look-ahead is seconds long (toolhead.py, BUFFER_TIME_HIGH 2 s): 1000 of the shortest moves.
     # M84 takes no S there: it lets go at once. After [idle_timeout], 600 s, a move is refused
-    # until all axes are homed.
+    # until all axes are homed. It reads 4096 bytes at a time and keeps a line's beginning until its
+    # end comes (gcode.py, _process_data).
     "klipper": LinkDialect(
-        "klipper", False, False, 4095, 4095, 1000, motors_off_s=600.0, question=b"M114"
+        "klipper", False, False, inf, 4095, 1000, motors_off_s=600.0, question=b"M114"
     ),
     # RepRapFirmware 3.6 drops a line with a bad checksum silently and executes a repeated
     # number again (StringParser::LineFinished): a line without an answer cannot be sent twice,
     # nor does an answer to a later question tell whether it was dropped.
     # An idle motor keeps 30 % of its current (M906 I30) and its place.
-    "reprap": LinkDialect("reprap", True, False, 255, 255, motors_off_s=float("inf")),
+    "reprap": LinkDialect("reprap", True, False, 255, 255, motors_off_s=inf),
 }

@@ -71,7 +71,7 @@ def wire_line(number: int, command: str, dialect: LinkDialect) -> WireLine:
                 f"The line of {len(data)} bytes exceeds the {dialect.max_line_bytes} that "
                 f"{dialect.name} takes before cutting it silently; shorten it: {command[:60]!r}."
             )
-        text = text[:-excess].rstrip()
+        text = text[: -int(excess)].rstrip()
         data = numbered(number, text) if dialect.numbered else text + b"\n"
     return WireLine(number, command, data, _takes_long(text.decode("ascii")))
 

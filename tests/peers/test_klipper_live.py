@@ -64,14 +64,17 @@ def sender(klipper: LiveKlipper) -> SerialPrinter:
 
 def test_it_goes_where_the_program_says(tmp_path: Path) -> None:
     """By its own account of its tool head: absolute and relative words, G92, retractions, arcs."""
+    outline = ",".join(f"[{100 + k / 8},100]" for k in range(800))
     straight = [
+        f"EXCLUDE_OBJECT_DEFINE NAME=round CENTER=110,110 POLYGON=[{outline}]",
         *HEAD, "M109 S200", "M400", "G92 E0", "M82", *MOVES[:20], "G1 E3 F600",
         *(f"G1 X{100 + i} Y{90 - i} E{3 + i / 20:.3f} F2400" for i in range(20)),
         "M83", "G1 E-2.5 F1800", "G91", "G1 X-6 Y4 F4000", "G1 Z0.4 F300", "G1 E2.5 F1800",
         "G1 X3 Y1 E0.12 F1200", "G90", "G92 X50 Y60", "G1 X55 Y62.5 E0.2",
     ]  # fmt: skip
     lines = [*straight, "G2 X65 Y62.5 I5 J0 E0.4", "G3 X60 Y57.5 I0 J-5 E0.6", "G92 X120 Y110"]
-    with LiveKlipper(tmp_path, PRESSURE_ADVANCE) as klipper, sender(klipper) as printer:
+    told = f"{PRESSURE_ADVANCE}[exclude_object]\n"
+    with LiveKlipper(tmp_path, told) as klipper, sender(klipper) as printer:
         assert printer.print(program(lines)).ok
         place = printer.place()
         moved = klipper.moves.take()

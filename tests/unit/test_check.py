@@ -444,6 +444,15 @@ def test_real_files_for_this_printer_pass(name: str) -> None:
     assert not find_refusals(program(text), SETUP)
 
 
+def test_a_line_for_klipper_may_be_of_any_length() -> None:
+    """regression: jobs of OrcaSlicer for round parts, whose outlines fill 9,000 characters."""
+    outline = "".join(f"[{100 + k / 8},100]," for k in range(800))
+    line = f"EXCLUDE_OBJECT_DEFINE NAME=benchy CENTER=110,110 POLYGON=[{outline[:-1]}]"
+    job = GOOD.replace("G28 W", "G28").replace("G90", f"{line}\nG90")
+    assert len(line) > 8000
+    assert not find_refusals(Program(job, "klipper"), load_setup("generic_klipper"))
+
+
 @pytest.mark.skipif("AMREPAIR_DATA" not in os.environ, reason="AMREPAIR_DATA is not set")
 @pytest.mark.parametrize("name", ["cura_slicer", "orca_slicer"])
 def test_real_files_for_a_k1_max_pass_there_and_nowhere_smaller(name: str) -> None:

@@ -202,6 +202,8 @@ def test_a_job_s_own_filament_may_be_hotter_than_a_generic_printer_s_limit() -> 
     text = orca_job(hot, END, **told)
     assert (own_setup(text).printer.max_hotend_c, own_setup(text).printer.max_bed_c) == (280, 115)
     assert refused(text) == []
+    flow = orca_job(START, END, **told, filament_max_volumetric_speed="25,21")
+    assert own_setup(flow).max_volumetric_mm3_s == 25.0  # regression: 9, warned of in every line
     assert any(
         "hotend temperature" in one for one in refused(text.replace("M104 S280", "M104 S290"))
     )
@@ -273,7 +275,7 @@ def test_a_job_that_uses_one_of_several_heads_is_judged(
         (f"{START}\nM104 T4 S200", END, "hotend of another tool: T4"),
         (f"{START}\nT1", END, "cold extrusion"),  # the first was heated, the second prints
         (f"{START}\nM109 T1 S210\nM104 T1 S20\nT1", END, "cold extrusion"),
-        (START, f"T1\n{END}", "change of tool: T1, limit one tool: T0"),
+        (START, f"T1\n{END}", "change of tool or filament: T1, limit T0, as it began"),
     ],
 )
 def test_heads_that_do_not_print_are_watched_too(start: str, end: str, said: str) -> None:

@@ -64,8 +64,9 @@ ASK_FOR = (
 # How far off the bed that a slicer knows its printers' own scripts go to purge, wipe and park:
 # 20 mm at most, of 118 presets of PrusaSlicer's and 329 of OrcaSlicer's (Bambu Lab's left out).
 OFF_BED_MM = 20.0
-# All-metal hotends are sold up to 300 °C, beds up to 120 °C (E3D's V6, Prusa's and Voron's).
-MOST_HOTEND_C, MOST_BED_C = 300.0, 120.0
+# All-metal hotends are sold up to 300 °C, beds up to 120 °C (E3D's V6, Prusa's and Voron's). The
+# fastest of them melt 75 mm³/s (Vez3D's Goliath, its maker's figure).
+MOST_HOTEND_C, MOST_BED_C, MOST_MELTED_MM3_S = 300.0, 120.0, 75.0
 BED_EDGE_MM = 5.0
 """How far from the bed's edge an inherited place is kept."""
 
@@ -177,7 +178,7 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
         if profile.values.get("heads", 1) > 1:
             profile.values["tool"] = min(head_used(text), profile.values["heads"] - 1)
         more += _within_range(profile)
-    _as_hot_as_told(*made[:2])
+    _as_able_as_told(*made[:2])
     return ImportedFile(name, made, tuple(more), tuple(notes))
 
 
@@ -262,18 +263,22 @@ def _add_named(made: Imported, source: Source) -> None:
         made.values["macros"] = [*content.get("macros", ()), *sorted(set(named) - known)]
 
 
-def _as_hot_as_told(printer: Imported, material: Imported) -> None:
-    """A limit that is nobody's measurement yields to what the job's own filament is printed at."""
+def _as_able_as_told(printer: Imported, material: Imported) -> None:
+    """A limit that is nobody's measurement yields to what the job's own filament is printed at.
+
+    A slicer's limit of a filament's flow is what hotend and filament melt together.
+    """
     if printer.inherits not in _GENERIC_IDS:
         return
     above = content_of(printer.kind, printer.inherits)
-    for key, asked, most_c in (
+    for key, asked, most in (
         ("max_hotend_c", ("hotend_c", "first_layer_hotend_c"), MOST_HOTEND_C),
         ("max_bed_c", ("bed_c",), MOST_BED_C),
+        ("max_volumetric_mm3_s", ("max_volumetric_mm3_s",), MOST_MELTED_MM3_S),
     ):
-        told_c = max(material.values.get(one, 0.0) for one in asked)
-        if key not in printer.values and above[key] < told_c <= most_c:
-            printer.values[key] = told_c
+        told = max(material.values.get(one, 0.0) for one in asked)
+        if key not in printer.values and above[key] < told <= most:
+            printer.values[key] = told
 
 
 def _on_the_bed(place_mm: Sequence[float], bed: Mapping[str, Any]) -> list[float]:
