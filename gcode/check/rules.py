@@ -39,7 +39,7 @@ UNSAID_HEATS = {
     for dialect in ("marlin", "prusa")
     for what, letters in (("hotend", "BFI"), ("bed", "I"))
 }
-_COMMAND_HEAD = re.compile(r"([GMTP])\s*0*(\d+)(?:\.(\d+))?(?![A-Z_])")
+_COMMAND_HEAD = re.compile(r"([GMTP])\s*0*(\d+)(?:\.(\d+))?(?![\d._]|[A-Z][A-Z_])")
 _NUMBERED_LINE = re.compile(r"N\s*\d")
 # M486 A tells an object's name
 FREE_TEXT = frozenset({"M117", "M118", "M486", "M708", "M862.3", "M862.6", "M115"})

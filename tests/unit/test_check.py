@@ -444,6 +444,18 @@ def test_real_files_for_this_printer_pass(name: str) -> None:
     assert not find_refusals(program(text), SETUP)
 
 
+@pytest.mark.parametrize("spaced", ["G1 X90 E3 F1000", "G1 X90 E30 F1000", "G1 X290 E3 F1000"])
+def test_words_need_no_spaces_between(spaced: str) -> None:
+    """regression: 'G1X90E3F1000', which every firmware reads, was an unknown command."""
+    plain = GOOD.replace("G1 X90 E3 F1000", spaced)
+    compact = "\n".join(
+        line.replace(" ", "") if line[:1] in "GM" else line for line in plain.split("\n")
+    )
+    assert compact.count(" ") == 3  # of the comment
+    found, expected = (find_refusals(program(text), SETUP) for text in (compact, plain))
+    assert [(one.what, one.value) for one in found] == [(one.what, one.value) for one in expected]
+
+
 def test_a_line_for_klipper_may_be_of_any_length() -> None:
     """regression: jobs of OrcaSlicer for round parts, whose outlines fill 9,000 characters."""
     outline = "".join(f"[{100 + k / 8},100]," for k in range(800))
