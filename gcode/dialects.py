@@ -14,6 +14,7 @@ from gcode.errors import InputError
 
 WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 """A letter and its number."""
+_CODE = re.compile(r"([GMTP])\s*0*(\d+)(?:\.(\d+))?(?![\d._]|[A-Z][A-Z_])")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,26 @@ def dialect_of(name: str) -> Dialect:
         raise InputError(
             f"There is no dialect '{name}'; there are {', '.join(DIALECTS)}."
         ) from None
+
+
+def command_of(line: str) -> tuple[str, str]:
+    """Name of a line's command and what follows it, in capitals; both empty where there is none.
+
+    Firmwares need no space after a code, and pass over zeros before its number. A command by name
+    ends at a space.
+
+    Examples
+    --------
+    >>> command_of("g01X5F600 ; away"), command_of("START_PRINT bed=60")
+    (('G1', 'X5F600'), ('START_PRINT', 'BED=60'))
+    """
+    command = line.partition(";")[0].strip().upper()
+    code = _CODE.match(command)
+    if code is None:
+        name, rest = (*command.split(maxsplit=1), "", "")[:2]
+        return name, rest
+    letter, number_, after = code.groups()
+    return f"{letter}{number_}{f'.{after}' if after else ''}", command[code.end() :].lstrip()
 
 
 def fan_command(ratio: float) -> str:

@@ -75,7 +75,7 @@ _START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
 # `T-1`, which is read as this).
 PARKS = {"marlin": frozenset({"P0"}), "prusa": frozenset({"P0"}), "reprap": frozenset({"P0"})}
 # Klipper has none: what came of a line is kept until its end (klippy/gcode.py, _process_data;
-# klippy/extras/virtual_sdcard.py). OrcaSlicer tells an object's outline in lines of 9,000 characters.
+# klippy/extras/virtual_sdcard.py). OrcaSlicer tells outlines in 9,000 characters.
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": math.inf, "reprap": 255}
 # Marlin's G90 and G91 set the extruder's mode too.
 G90_SETS_E = frozenset({"marlin"})

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 
+from gcode.dialects import command_of
 from gcode.estimate import Estimate
 from gcode.moves import Program
 
 # at the beginning of a line: the whole text is searched at once, a million lines in a quarter of
 # a second
 _HEATS_OR_HOMES = re.compile(
-    r"^[ \t]*(M10[49]|M1[49]0|G28)\b([^;\n]*)", re.IGNORECASE | re.MULTILINE
+    r"^[ \t]*((?:M10[49]|M1[49]0|G28)(?!\d)[^;\n]*)", re.IGNORECASE | re.MULTILINE
 )
 _HEATERS = {"nozzle": ("M104", "M109"), "bed": ("M140", "M190")}
-_DEGREES = re.compile(r"\b[SR](\d+(?:\.\d+)?)")
+_DEGREES = re.compile(r"[SR]\s*(\d+(?:\.\d+)?)")
 
 
 def what_it_does(program: Program, cost: Estimate | None) -> str:
@@ -24,9 +25,7 @@ def what_it_does(program: Program, cost: Estimate | None) -> str:
     cost
         The program's own estimate; None for one that lays nothing.
     """
-    commands = [
-        (name.upper(), rest.upper()) for name, rest in _HEATS_OR_HOMES.findall(program.text)
-    ]
+    commands = [command_of(line) for line in _HEATS_OR_HOMES.findall(program.text)]
     said = [*_heats(commands), _homes(commands)]
     if cost is None:
         return ", ".join([*said, "lays no filament"])

@@ -9,11 +9,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from gcode.dialects import WORD, dialect_of
+from gcode.dialects import WORD, command_of, dialect_of
 from gcode.hosts.port import PrintableProgram
 from gcode.protocol import command_in
 
-_CODE_NAME = re.compile(r"([GM])\s*0*(\d+)")
 _TOUCH_LINE = re.compile(r"G38\.2\s+Z(?P<to>[-+.\d]+)|AMREPAIR_TOUCH\s+DEPTH=(?P<by>[.\d]+)")
 
 
@@ -96,15 +95,13 @@ def modes_after(
 
 def follow(modes: Modes, text: str, dialect: str) -> Modes:
     """Return the modes after one more line."""
-    command = text.partition(";")[0].strip().upper()
-    touch = _TOUCH_LINE.match(command)
+    name, rest = command_of(text)
+    touch = _TOUCH_LINE.match(f"{name} {rest}")
     if touch is not None:
         return _touched(modes, touch)
-    match = _CODE_NAME.match(command)
-    if match is None:
+    if name[:1] not in ("G", "M"):
         return modes
-    name = match.group(1) + match.group(2)
-    words = {letter: float(value) for letter, value in WORD.findall(command[match.end() :])}
+    words = {letter: float(value) for letter, value in WORD.findall(rest)}
     if name in ("G0", "G1", "G2", "G3"):
         return _move(modes, words, g91_moves_e=dialect_of(dialect).g91_moves_e)
     if name in ("G90", "G91"):
@@ -120,7 +117,7 @@ def follow(modes: Modes, text: str, dialect: str) -> Modes:
         place = {letter: words[letter] * modes.unit_mm for letter in "XYZE" if letter in words}
         return replace(modes, position_mm={**modes.position_mm, **place})
     if name == "G28":
-        gone: set[str] = {letter for letter in "XYZ" if letter in command[3:]} or set("XYZ")
+        gone: set[str] = {letter for letter in "XYZ" if letter in rest} or set("XYZ")
         return replace(
             modes,
             position_mm={k: v for k, v in modes.position_mm.items() if k not in gone},

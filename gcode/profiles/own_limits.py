@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Iterator
 
-from gcode.dialects import dialect_of
+from gcode.dialects import command_of, dialect_of
 from gcode.profiles.schema import PrinterProfile
 
 _CLOSE_WORD = re.compile(r"([A-Z])([-+]?(?:\d+\.?\d*|\.\d+))")
@@ -59,8 +59,7 @@ class _Start:
 
     def wrong_with(self, line: str) -> Iterator[str]:
         """The limits that the next line breaks, as phrases."""
-        command = line.partition(";")[0].strip().upper()
-        name, _, rest = command.partition(" ")
+        name, rest = command_of(line)
         words = {letter: float(value) for letter, value in _CLOSE_WORD.findall(rest)}
         if "{" in rest:  # what a material fills in is judged with that material
             return

@@ -15,6 +15,7 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
+from gcode.dialects import command_of
 from gcode.errors import LocalProtocolError
 from gcode.protocol.dialects import LinkDialect
 
@@ -151,7 +152,7 @@ def _numbered_at_once(
 
 
 def _takes_long(text: str) -> bool:
-    name = text.partition(" ")[0]
+    name, _ = command_of(text)
     return name in SLOW_COMMANDS or _MACRO_NAME.match(name) is not None
 
 

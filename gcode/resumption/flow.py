@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import manifold3d
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.check import CheckedProgram, check, policy_of
-from gcode.dialects import WORD, number
+from gcode.dialects import WORD, command_of, number
 from gcode.errors import InputError
 from gcode.meshes import mesh_of
 from gcode.moves import ModalState, Program
@@ -134,26 +134,23 @@ class _Pen:
 
     def line(self, line: int, raw: str) -> None:
         """Take the job's line over, changed or not."""
-        command = raw.partition(";")[0].strip().upper()
-        if command.startswith(("M82", "M83")):
-            self._absolute_e = command.startswith("M82")
-        if command.startswith("G92") and "E" in command:
+        name, rest = command_of(raw)
+        if name in ("M82", "M83"):
+            self._absolute_e = name == "M82"
+        if name == "G92" and "E" in rest:
             self._offset_mm = 0.0
+        words = dict(WORD.findall(rest))
         rows = self._beads.get(line)
-        if rows is None:
-            self.text.append(self._shifted(raw, command))
-            return
-        pieces = self._pieces(rows, line)
-        if all(abs(factor - 1.0) < SAME_FACTOR for _, _, factor in pieces):
-            self.text.append(self._shifted(raw, command))
+        pieces = [] if rows is None else self._pieces(rows, line)
+        if rows is None or all(abs(factor - 1.0) < SAME_FACTOR for _, _, factor in pieces):
+            self.text.append(self._shifted(raw, name, words))
             return
         self.changed += 1
-        if not command.startswith(("G1", "G0")) or len(rows) > 1:  # an arc keeps its shape
+        if name not in ("G0", "G1") or len(rows) > 1:  # an arc keeps its shape
             filament = sum(mm for _, mm, _ in pieces)
             factor = sum(mm * f for _, mm, f in pieces) / filament
-            self._write(line, command, [(None, filament, factor)])
-            return
-        self._write(line, command, pieces)
+            pieces = [(None, filament, factor)]
+        self._write(line, name, words, pieces)
 
     def end(self, state: ModalState) -> None:
         """The extruder's count is the job's own again."""
@@ -193,12 +190,11 @@ class _Pen:
     def _write(
         self,
         line: int,
-        command: str,
+        name: str,
+        words: Mapping[str, str],
         pieces: Sequence[tuple[Float[np.ndarray, " 3"] | None, float, float]],
     ) -> None:
         """One move a piece; feed with the first."""
-        words = dict(WORD.findall(command))
-        name = command.split(maxsplit=1)[0]
         e_mm = self._job.state_after(line).e_mm + self._offset_mm
         for k, (end, filament_mm, factor) in enumerate(pieces):
             pushed_mm = filament_mm * factor + self._owed_mm
@@ -218,14 +214,10 @@ class _Pen:
             feed = [f"F{words['F']}"] if "F" in words and k == 0 else []
             self.text.append(" ".join([name, *places, f"E{text}", *feed]))
 
-    def _shifted(self, raw: str, command: str) -> str:
+    def _shifted(self, raw: str, name: str, words: Mapping[str, str]) -> str:
         """An unchanged line; an absolute E moves along with what was added before."""
-        if not (
-            self._absolute_e and self._offset_mm and command.startswith(("G0", "G1", "G2", "G3"))
-        ):
-            return raw
-        words = dict(WORD.findall(command))
-        if "E" not in words:
+        moves = name in ("G0", "G1", "G2", "G3") and "E" in words
+        if not (self._absolute_e and self._offset_mm and moves):
             return raw
         return re.sub(
             r"[Ee]\s*[-+]?(?:\d+\.?\d*|\.\d+)",

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcode.check import CheckedProgram, check, policy_of
-from gcode.dialects import number
+from gcode.dialects import command_of, number
 from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrintSetup
@@ -28,10 +28,7 @@ ONTO_STEP_MM = 0.5  # along the first layer's beads
 UNEVEN_RATIO = 0.5  # of a layer: what the first one bridges or is pressed into
 HELD_RATIO = 0.98  # of the first layer that must lie on something
 TOP_PERCENT = 95.0  # what is higher are single points of a scan's noise
-_MOVED_COMMAND = re.compile(r"^\s*[Gg][0123](?!\d)")
-_HOMES_XY_ALONE = re.compile(r"G28(?!\d)(?=.*[XY])(?!.*Z)")
 _Z = re.compile(r"([Zz])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
-_RELATIVE = re.compile(r"^\s*G9([01])\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,18 +133,17 @@ def _raised(lines: list[str], by_mm: float, *, absolute: bool, first: int) -> li
     out = []
     for number_, line in enumerate(lines, first + 1):
         code, mark, comment = line.partition(";")
-        mode = _RELATIVE.match(code)
-        if mode is not None:
-            absolute = mode.group(1) == "0"
-        command = code.strip().upper()
-        shifts = command.startswith("G92") and _Z.search(code) is not None
-        homes_z = command.startswith("G28") and not _HOMES_XY_ALONE.match(command)
-        if shifts or homes_z or command.startswith("G20"):
+        name, rest = command_of(code)
+        if name in ("G90", "G91"):
+            absolute = name == "G90"
+        shifts = name == "G92" and "Z" in rest
+        homes_z = name == "G28" and ("Z" in rest or not {"X", "Y"} & set(rest))
+        if shifts or homes_z or name == "G20":
             raise InputError(
                 f"Line {number_} ({code.strip()!r}) changes what a height means, and cannot be "
                 "raised; slice the job without it."
             )
-        if absolute and _MOVED_COMMAND.match(code):
+        if absolute and name in ("G0", "G1", "G2", "G3"):
             code = _Z.sub(lambda m: f"{m.group(1)}{number(float(m.group(2)) + by_mm, 5)}", code)
         out.append(f"{code}{mark}{comment}")
     return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from gcode.dialects import command_of
 from gcode.errors import ReadError
 from gcode.reader import Job
 
@@ -14,7 +15,6 @@ _OTHER_COMMANDS = ("M141", "M486", "EXCLUDE_OBJECT_DEFINE", "G17", "G18", "G19")
 REPLAYED = frozenset((*_LIMITS, *_FACTOR_COMMANDS, *_OTHER_COMMANDS))
 """Limits, factors, pressure advance, planes, chamber, names of objects: the last word counts."""
 _PLANES = frozenset({"G17", "G18", "G19"})
-_SETTING_NAME = re.compile(r"([GMT]\d+(?:\.\d+)?|[A-Z_]{3,}\w*)\s*(.*)")
 _KEY = re.compile(r"([A-Z_]+)=?")
 _MACRO_HEAT = re.compile(
     r"\b(BED|EXTRUDER|HOTEND|NOZZLE|TOOL)\w*?(?:_?TEMP\w*)?\s*=\s*(\d+(?:\.\d+)?)"
@@ -55,10 +55,7 @@ def settings_before(job: Job, line: int) -> Settings:
     says_bed = levelled = False
     for number, raw in enumerate(job.program.text.split("\n")[:line], start=1):
         command = raw.partition(";")[0].strip()
-        match = _SETTING_NAME.match(command)
-        if match is None:
-            continue
-        name, rest = match.groups()
+        name, rest = command_of(command)
         if name == "G92" and re.search(r"[XYZ]", rest):
             raise ReadError(
                 f"Line {number} ({command!r}) shifts the coordinate system, which a job begun "
@@ -72,8 +69,8 @@ def settings_before(job: Job, line: int) -> Settings:
             levelled = True
         elif name in ("M140", "M190"):
             says_bed = True
-        elif name[0] not in "GMT":
-            for what, value in _MACRO_HEAT.findall(rest.upper()):
+        elif name[:1] not in ("G", "M", "T"):
+            for what, value in _MACRO_HEAT.findall(rest):
                 macro_c["bed" if what == "BED" else "hotend"] = float(value)
     state = job.state_after(line)
     bed_c = state.bed_c or macro_c.get("bed", 0.0)
@@ -91,4 +88,4 @@ def _key(name: str, rest: str) -> tuple[str, ...]:
         return ("plane",)
     if name in ("EXCLUDE_OBJECT_DEFINE", "M106"):
         return (name, rest)
-    return (name, *sorted(_KEY.findall(re.sub(r"[-+]?\d*\.?\d+", " ", rest.upper()))))
+    return (name, *sorted(_KEY.findall(re.sub(r"[-+]?\d*\.?\d+", " ", rest))))

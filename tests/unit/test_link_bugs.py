@@ -320,10 +320,11 @@ def test_bug_12_opening_the_port_raises_no_dtr(monkeypatch: pytest.MonkeyPatch) 
     assert seen == [False, False]
 
 
-def test_bug_13_a_slow_command_never_forces_the_next_line() -> None:
+@pytest.mark.parametrize("command", ["M190 S110", "M190S110", "m0190 s110"])
+def test_bug_13_a_slow_command_never_forces_the_next_line(command: str) -> None:
     """OctoPrint#553, #2026: ten minutes of heating without a word; one line is under way."""
     link = greeted()
-    line = link.send("M190 S110", 0.0)
+    line = link.send(command, 0.0)
     now_s = 0.0
     while now_s < 600.0:
         now_s = link.next_deadline_s()

@@ -231,6 +231,7 @@ OWN_LIMITS = {
     "standing": ('start_gcode = "M83\\nG1 X5 Y5\\nG1 E60 F100"', "60 mm of filament standing"),
     "reach": ('start_gcode = "G1 X5 Y-9"', "Y -9 mm is out of reach, 0 to 220 mm"),
     "hotend": ('start_gcode = "M104 S300"', "the hotend at 300 °C, 'max_hotend_c' is 260"),
+    "close words": ('start_gcode = "M104S300"', "the hotend at 300 °C, 'max_hotend_c' is 260"),
     "place": ("prime_mm = [5.0, 400.0, 0.3]", "'prime_mm': Y 400 mm is out of reach"),
     "priming": ("prime_length_mm = 60.0", "'prime_length_mm' = 60 .*'max_extrude_only_mm' = 50"),
 }  # fmt: skip
