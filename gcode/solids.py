@@ -75,14 +75,14 @@ def read_solid(path: Path) -> Any:
             f"{path}: the mesh is no closed surface (NotManifold), nor when vertices within "
             f"{WELD_RATIO * extent:.2g} mm are joined; repair it first."
         )
+    if solid.volume() < 0:
+        _log.warning("%s: turned outside out: its triangles faced inwards", path.name)
+        solid = first_closed(vertices, faces[:, ::-1])[0]
     solid, overlap_mm3 = unite_overlaps(solid)
     if overlap_mm3 > 0:
         _log.warning("%s: bodies overlapped by %.3g mm³ and were united", path.name, overlap_mm3)
     if solid.volume() <= 1e-9 * extent**3:
-        raise InputError(
-            f"{path}: the mesh encloses {solid.volume():.3g} mm³, which is no solid; is it inside "
-            "out?"
-        )
+        raise InputError(f"{path}: the mesh encloses {solid.volume():.3g} mm³, which is no solid.")
     return solid
 
 

@@ -2,8 +2,8 @@
 
 The 3MF core specification 1.3 and, of the production extension, paths of objects. Sizes are judged
 by the zip file's own directory before anything is unpacked, XML is taken without a document type
-or entities, and parts that are used many times are counted before they are laid out. Units are not
-read: what is in the file is millimetres, as in every mesh file here.
+or entities, and parts that are used many times are counted before they are laid out. Each model
+part's lengths are in the unit that it tells, and given in millimetres.
 """
 
 from __future__ import annotations
@@ -34,6 +34,15 @@ MOST_NESTED = 32  # components in components
 _GROWS = "{name} has a document type or entities, which no 3MF has"
 _END_OF_DIRECTORY = b"PK\x05\x06"
 _END_BYTES, _COMMENT_BYTES = 22, 65_535
+# Zip64 (PKWARE's APPNOTE 4.3.14 to 4.3.16): what does not fit four bytes, or might not, is told by
+# a record before the end, and a locator between them.
+_ELSEWHERE = 0xFFFFFFFF
+_END_OF_DIRECTORY_64, _END_BYTES_64, _LOCATOR_BYTES = b"PK\x06\x06", 56, 20
+# Core specification 1.3, 3.4.1 (ST_Unit), in mm.
+UNITS_MM = {
+    "micron": 0.001, "millimeter": 1.0, "centimeter": 10.0,
+    "inch": 25.4, "foot": 304.8, "meter": 1000.0,
+}  # fmt: skip
 _IDENTITY = np.hstack([np.eye(3), np.zeros((3, 1))])
 
 Key = tuple[str, str]  # which model part of the file, and the object's number in it
@@ -99,6 +108,9 @@ def _refuse_directory(path: Path, length: int) -> None:
     if at < 0 or len(tail) - at < _END_BYTES:
         raise ValueError("it is no 3MF file: a zip file has a directory at its end, this has none")
     size = int.from_bytes(tail[at + 12 : at + 16], "little")
+    record = tail[max(0, at - _LOCATOR_BYTES - _END_BYTES_64) : at]
+    if size == _ELSEWHERE and record.startswith(_END_OF_DIRECTORY_64):
+        size = int.from_bytes(record[40:48], "little")
     if size > min(length, MOST_DIRECTORY_BYTES):
         raise ValueError(
             f"its directory takes {size} bytes, the limit is {min(length, MOST_DIRECTORY_BYTES)}"
@@ -139,7 +151,8 @@ class _Model:
                 )
             with np.errstate(all="ignore"):  # what is no place is refused by whoever asked
                 points.append(vertices @ pose[:, :3].T + pose[:, 3])
-            faces.append(corners + count)
+            mirrored = np.linalg.det(pose[:, :3]) < 0
+            faces.append((corners[:, ::-1] if mirrored else corners) + count)
             count += len(vertices)
         return np.concatenate(points), np.concatenate(faces)
 
@@ -253,16 +266,18 @@ class _Reader:
     def __init__(self, model: _Model, name: str) -> None:
         self._model, self._name = model, name
         self._object: _Object | None = None
+        self._unit_mm = 1.0
 
     def start(self, tag: str, values: dict[str, str]) -> None:
         """One element begins."""
         tag = _local(tag)
         if tag == "vertex" and self._object is not None:
-            self._object.numbers.extend(
-                (_real(values, "x"), _real(values, "y"), _real(values, "z"))
-            )
+            unit_mm = self._unit_mm
+            self._object.numbers.extend(unit_mm * _real(values, axis) for axis in "xyz")
         elif tag == "triangle" and self._object is not None:
             self._object.corners.extend(_whole(values, k) for k in ("v1", "v2", "v3"))
+        elif tag == "model":
+            self._unit_mm = _unit(values.get("unit", "millimeter"))
         elif tag == "object":
             self._object = self._model.add((self._name, values.get("id", "")))
         elif tag == "component" and self._object is not None:
@@ -273,11 +288,19 @@ class _Reader:
     def _use(self, values: dict[str, str]) -> Use:
         elsewhere = next((v for k, v in values.items() if _local(k) == "path"), None)
         part = self._name if elsewhere is None else elsewhere.lstrip("/")
-        return (part, values.get("objectid", "")), _pose(values.get("transform"))
+        pose = _pose(values.get("transform"))
+        turn, shift_mm = pose[:, :3], self._unit_mm * pose[:, 3:]
+        return (part, values.get("objectid", "")), np.hstack([turn, shift_mm])
 
 
 def _local(name: str) -> str:
     return name.rpartition(":")[2]
+
+
+def _unit(name: str) -> float:
+    if name not in UNITS_MM:
+        raise ValueError(f"its unit is {name!r:.40}; 3MF knows {', '.join(UNITS_MM)}")
+    return UNITS_MM[name]
 
 
 def _real(values: dict[str, str], key: str) -> float:

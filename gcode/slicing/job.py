@@ -92,6 +92,11 @@ def plan_part(
     solid = closed_mesh(solid)
     grid, bore_mm = LayerGrid.from_setup(setup), setup.printer.nozzle_diameter_mm
     slabs = plan_slabs(solid, grid, nozzle_diameter_mm=bore_mm, options=options)
+    if not slabs:
+        raise SliceError(
+            f"The part is {np.ptp(solid.bounding_box()[2::3]):.3g} mm high, which makes no layer "
+            f"of {grid.first_layer_height_mm:g} mm; is its file in another unit? Scale it."
+        )
     cuts = Cuts.of(solid, np.array([s.middle_mm for s in slabs]))
     layers = PartLayers(cuts, slabs, setup, options)
     pen = Pen(setup, np.array(setup.printer.park_mm, float))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcode.errors import InputError
-from gcode.solids import read_solid, read_triangles, weld
+from gcode.solids import read_closed, read_solid, read_triangles, weld
 
 
 def test_bodies_that_touch_along_an_edge_stay_apart(tmp_path: Path) -> None:
@@ -100,3 +102,72 @@ def test_an_stl_file_of_text_is_read(tmp_path: Path) -> None:
     path = tmp_path / "box.stl"
     trimesh.creation.box((2.0, 3.0, 4.0)).export(path, file_type="stl_ascii")
     assert read_solid(path).volume() == pytest.approx(24.0)
+
+
+def built(path: Path, item: str, unit: str = "") -> Path:
+    """A 3MF file of one cube of 10, used once."""
+    cube = trimesh.creation.box((10.0, 10.0, 10.0))
+    vertices = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in cube.vertices)
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in cube.faces)
+    mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{triangles}</triangles></mesh>"
+    model = (
+        f'<model {unit} xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">'
+        f'<resources><object id="1">{mesh}</object></resources><build>{item}</build></model>'
+    )
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("3D/3dmodel.model", model)
+    return path
+
+
+USED = '<item objectid="1"/>'
+MOVED = '<item objectid="1" transform="1 0 0 0 1 0 0 0 1 2 0 0"/>'
+MIRRORED = '<item objectid="1" transform="-1 0 0 0 1 0 0 0 1 2 0 0"/>'
+
+
+@pytest.mark.parametrize(
+    ("item", "unit", "box_mm"),
+    [
+        (USED, "", (-5.0, 5.0)),
+        (MOVED, 'unit="inch"', (-76.2, 177.8)),
+        (USED, 'unit="centimeter"', (-50.0, 50.0)),
+        (MIRRORED, "", (-3.0, 7.0)),  # regression: was inside out
+    ],
+)
+def test_3mf_units_and_mirrored_uses(
+    tmp_path: Path, item: str, unit: str, box_mm: tuple[float, float]
+) -> None:
+    """regression: lengths in inches and metres were millimetres."""
+    solid = read_solid(built(tmp_path / "cube.3mf", item, unit))
+    assert solid.volume() > 0
+    assert solid.bounding_box()[::3] == pytest.approx(box_mm)
+
+
+def test_3mf_of_an_unknown_unit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unit is 'ell'; 3MF knows micron"):
+        read_solid(built(tmp_path / "cube.3mf", USED, 'unit="ell"'))
+
+
+def test_a_3mf_file_may_have_a_directory_of_zip64(tmp_path: Path) -> None:
+    """regression: Microsoft's programs write one into small files too; they were refused."""
+    plain = built(tmp_path / "plain.3mf", USED).read_bytes()
+    at = plain.rfind(b"PK\x05\x06")
+    count, size, start = (
+        int.from_bytes(plain[at + a : at + b], "little") for a, b in ((10, 12), (12, 16), (16, 20))
+    )
+    record = struct.pack("<4sQHHLLQQQQ", b"PK\x06\x06", 44, 45, 45, 0, 0, count, count, size, start)
+    locator = struct.pack("<4sLQL", b"PK\x06\x07", 0, at, 1)
+    end = plain[at : at + 8] + b"\xff" * 12 + plain[at + 20 :]
+    path = tmp_path / "zip64.3mf"
+    path.write_bytes(plain[:at] + record + locator + end)
+    assert read_solid(path).volume() == pytest.approx(1000.0)
+    path.write_bytes(plain[:at] + end)  # nothing tells how large the directory is
+    with pytest.raises(InputError, match="its directory takes 4294967295 bytes"):
+        read_solid(path)
+
+
+def test_a_mesh_that_is_inside_out_is_turned(tmp_path: Path) -> None:
+    box = trimesh.creation.box((10.0, 10.0, 10.0))
+    box.invert()
+    box.export(tmp_path / "box.stl")
+    assert read_solid(tmp_path / "box.stl").volume() == pytest.approx(1000.0)
+    assert read_closed(tmp_path / "box.stl").volume() == pytest.approx(1000.0)
