@@ -84,8 +84,11 @@ def agent(
     sound: SoundOption = None,
     scan_timeout_s: ScanTimeoutOption = SCAN_TIMEOUT_S,
     out: Annotated[
-        Path, typer.Option(help="Folder for the runs, one a print; a run begun there is gone on "
-                           "with.")
+        Path,
+        typer.Option(
+            "--out", "-o",
+            help="Folder for the runs, one a print; a run begun there is gone on with.",
+        ),
     ] = Path("out/agent"),
     pose_confirmed: Annotated[
         bool,

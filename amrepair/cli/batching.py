@@ -43,7 +43,10 @@ SourceArgument = Annotated[
     ),
 ]
 OutOption = Annotated[
-    str, typer.Option(help="Folder for results, table, overview; gone on with; may be s3://….")
+    str,
+    typer.Option(
+        "--out", "-o", help="Folder for results, table, overview; gone on with; may be s3://…."
+    ),
 ]
 ExecutorOption = Annotated[
     str, typer.Option(help="process (spawned workers), serial (none), or ray.")

@@ -37,7 +37,10 @@ def bench(
     dataset: Annotated[Path, typer.Argument(help="Folder of the data set.")],
     layout: FormatOption,
     method: Annotated[list[str], typer.Option("--method", help=METHOD_HELP)],
-    out: Annotated[Path, typer.Option(help="Folder for the results; gone on with if it has some.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Folder for the results; gone on with if it has some."),
+    ],
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     checkpoint: Annotated[
         Path | None, typer.Option(help="Pretrained weights, for the methods that need them.")
@@ -82,7 +85,7 @@ def bench(
 )
 def synth(
     parts: Annotated[list[Path], typer.Argument(help="Meshes; each becomes a class.")],
-    out: Annotated[Path, typer.Option(help="Folder of the data set.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the data set.")],
     layout: WrittenOption,
     seed: SeedOption = 0,
     smallest: Annotated[

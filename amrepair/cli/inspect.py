@@ -188,7 +188,9 @@ def chosen_part(known: Recognition) -> dict[str, Any]:
 def detect(
     scan: Annotated[Path, typer.Argument(help="Point cloud, height map or scanned mesh, mm.")],
     template: TemplateOption,
-    out: Annotated[Path, typer.Option(help="Folder for anomaly.npz, anomaly.ply, result.json.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for anomaly.npz, anomaly.ply, result.json.")
+    ],
     part_is_known: KnownOption = False,
     sensor_at: SensorOption = None,
     scan_unit: UnitOption = None,

@@ -90,7 +90,9 @@ def loop(
     calibration: ScannerPoseOption = None,
     sound: SoundOption = None,
     scan_timeout_s: ScanTimeoutOption = SCAN_TIMEOUT_S,
-    out: Annotated[Path, typer.Option(help="Folder for result, scans, report.")] = Path("out/loop"),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for result, scans, report.")
+    ] = Path("out/loop"),
     resume: Annotated[
         Path | None,
         typer.Option(

@@ -86,9 +86,9 @@ def simulate(
     view_port: PortOption = VIEW_PORT,
     token: TokenOption = None,
     seed: SeedOption = 0,
-    out: Annotated[Path, typer.Option(help="Folder for result, G-code, scans, report.")] = Path(
-        "out/simulate"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for result, G-code, scans, report.")
+    ] = Path("out/simulate"),
     as_json: JsonOption = False,
 ) -> None:
     """Print a part on an emulated printer, break it, find what is missing and print only that."""
