@@ -125,7 +125,8 @@ def _scan(setup: PrintSetup, source: Source, bars: console.Bars) -> Scan:
         baud=setup.printer.baud,
         journal=default_path(port),
     )
-    machine.connect()
+    with bars.stage("connect"):
+        machine.connect()
     try:
         machine.print(checked, progress=bars)
         machine.finish_moves()

@@ -317,7 +317,8 @@ def print_run(
     )  # fmt: skip
     page.show_run(begun.job, placed_solid(begun.template, setting.placed))
     if not going_on:
-        machine.connect()
+        with bars.stage("connect"):
+            machine.connect()
     page.drives(machine.pause, machine.resume)
     expected = sites(
         begun.job,

@@ -111,7 +111,8 @@ def send(
     if resume and not isinstance(machine, SerialPrinter):
         raise InputError(f"{port} cannot be resumed on; only a printer's own port can.")
     if not resume:
-        machine.connect()  # a printer that refuses us is not ours to abort
+        with bars.shown(), bars.stage("connect"):
+            machine.connect()  # a printer that refuses us is not ours to abort
     try:
         with console.signals_end_it(), bars.shown():
             if resume and isinstance(machine, SerialPrinter):

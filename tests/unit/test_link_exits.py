@@ -305,13 +305,20 @@ def test_a_port_that_cannot_be_opened_is_one_sentence(
 
 
 @pytest.mark.parametrize(
-    ("says", "said"), [(b"\x00\xe0\xfe", "its speed is another"), (b"", "is it switched on")]
+    ("says", "give_up_s", "said"),
+    [
+        (b"\x00\xe0\xfe", 0.4, "its speed is another"),
+        (bytes(range(256)), 600.0, "its speed is another"),  # regression: told after a minute
+        (b"", 0.4, "is it switched on"),
+    ],
 )
-def test_a_printer_at_another_speed_is_told_from_one_that_is_off(says: bytes, said: str) -> None:
+def test_a_printer_at_another_speed_is_told_from_one_that_is_off(
+    says: bytes, give_up_s: float, said: str
+) -> None:
     """Regression: for both, 'program lines up to 0 are acknowledged, heaters may be on'."""
     theirs, ours = os.openpty()
     tty.setraw(ours)
-    quick = LinkTiming(give_up_s=0.4, doubt_s=0.02)
+    quick = LinkTiming(give_up_s=give_up_s, doubt_s=0.02)
     printer = SerialPrinter(os.ttyname(ours), baud=57600, timing=quick, supervise=False)
     threading.Thread(target=lambda: os.read(theirs, 99) and os.write(theirs, says)).start()
     with pytest.raises(LinkLostError, match=f"does not greet: no answer at 57600 baud; .*{said}"):
