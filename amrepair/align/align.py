@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -27,12 +27,29 @@ ALONG = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # places that differ along 
 SCAN_UNITS = {"m": "metres", "in": "inches", "cm": "centimetres", "um": "micrometres"}
 
 
+@dataclass(frozen=True, slots=True)
+class SoFar:
+    """What stands of a part in mid-print, as its job has laid it.
+
+    Attributes
+    ----------
+    planned
+        In the template's frame.
+    from_mm
+        Height there from which on it is to be trusted: planned beads may end in mid-air below.
+    """
+
+    planned: Template
+    from_mm: float
+
+
 def align(
     scan: Scan,
     template: Template,
     *,
     method: str = "robust",
     guess: Transform | None = None,
+    so_far: SoFar | None = None,
     part_is_known: bool = False,
     options: AlignOptions = USUAL_ALIGN,
     rng: np.random.Generator | None = None,
@@ -46,6 +63,10 @@ def align(
         In any frame; bed around the part is welcome where there is a guess.
     guess
         Template from the scan's frame, good to the options' bounds; only refinement runs then.
+    so_far
+        What a guess is refined on in mid-print, where walls and infill lie open that no drawing
+        has: drawn walls alone pull the pose aside by tenths of a millimetre where one is missing.
+        The bed is found by `template` all the same.
     part_is_known
         The scan is of this part and no mirror image, however bent: less of it has to fit.
     options
@@ -97,7 +118,7 @@ def align(
             f"the guess starts from frame {guess.source}, the scan {scan.source} is in {scan.frame}"
         )
     sigma_mm, inlier_mm = options.explained.limits_mm(scan.sigma_mm)
-    refined = _from_guess(scan, template, guess, sigma_mm, options, rng)
+    refined = _from_guess(scan, template, so_far, guess, sigma_mm, options, rng)
     progress("align", 1.0, 1.0)
     ratio = float((np.abs(refined.residual_mm) <= inlier_mm).mean())
     _refuse_misfit(scan, refined, ratio, inlier_mm, options.guess.least_explained, "")
@@ -257,6 +278,7 @@ def _registration(scan: Scan, found: Found, options: AlignOptions) -> Registrati
 def _from_guess(
     scan: Scan,
     template: Template,
+    so_far: SoFar | None,
     guess: Transform,
     sigma_mm: float,
     options: AlignOptions,
@@ -269,6 +291,8 @@ def _from_guess(
         levelled, on_bed = level_on_bed(scan.points_mm, template, guess.matrix, options.bed)
     step = max(1, len(scan) // options.guess.most_points)
     points = _part_only(scan.points_mm[::step], template, levelled, options)
+    if so_far is not None:
+        points = np.compress(moved(points, levelled)[:, 2] > so_far.from_mm, points, axis=0)
     if len(points) < least:
         raise AlignmentError(
             f"the scan {scan.source} has {len(points)} points where the part should stand; check "
@@ -280,7 +304,7 @@ def _from_guess(
     prior = bed_prior(np.deg2rad(bound_deg), bound_mm, options.bed) if on_bed else wide
     found = refine(
         points,
-        template,
+        template if so_far is None else so_far.planned,
         levelled,
         start_scale_mm=options.guess.start_scale_mm,
         end_scale_mm=options.poses.scale_mm(sigma_mm),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align import AlignOptions, SoFar
 from amrepair.frames import Transform, unit_vectors
 from amrepair.regions.sites import RoundedUp
 from amrepair.repair.site import Site
@@ -15,20 +17,15 @@ from amrepair.template.laid import LaidBeads
 from amrepair.template.port import Template, is_off_bed
 
 
-def outside_open_infill(scan: Scan, site: Site, guess: Transform | None) -> Scan:
-    """Without the points that look into sparse infill: deep inside the part, as CAD has it.
+def so_far(site: Site) -> SoFar | None:
+    """What the job's own beads have made of the part, to lay a scan on; None of a finished part."""
+    if site.planned is None:
+        return None
+    return SoFar(site.planned, _trusted_from(site.planned, site) if is_cut(site) else -np.inf)
 
-    A layer or two above the bottom's skin they are not deep; then the beads tell them.
-    """
-    if site.planned is None or guess is None:
-        return scan
-    points_mm = guess.apply(scan.points_mm)
-    inside_mm = site.template.distance(points_mm)
-    keep = inside_mm > -site.options.open_infill_mm
-    shallow = np.flatnonzero(keep & (inside_mm < -site.grid.layer_height_mm))
-    as_planned_mm = np.abs(site.planned.distance(points_mm[shallow]))
-    keep[shallow] = as_planned_mm > 0.5 * np.abs(inside_mm[shallow])
-    return scan.subset(keep)
+
+def _trusted_from(planned: Template, site: Site) -> float:
+    return float(planned.bounds_mm[0, 2]) + site.options.planned_edge_mm
 
 
 def is_cut(site: Site) -> bool:
@@ -88,8 +85,21 @@ def of_layer(scan: Scan, site: Site) -> Scan:
     if not is_cut(site):
         return scan
     assert site.planned is not None
-    low_mm = float(site.planned.bounds_mm[0, 2]) + site.options.planned_edge_mm
-    return scan.subset(scan.points_mm[:, 2] > low_mm)
+    return scan.subset(scan.points_mm[:, 2] > _trusted_from(site.planned, site))
+
+
+def aligning(site: Site) -> AlignOptions:
+    """How a scan is aligned: of a low print, points from half its height on are the part's.
+
+    After the first layer of 0.2 mm nothing of it is higher over the bed than a finished part's
+    points have to be.
+    """
+    top_mm, options = top_of_layer(site), site.options.align
+    if top_mm is None:
+        return options
+    half_mm = 0.5 * (top_mm - float(site.template.bounds_mm[0, 2]))
+    guess = replace(options.guess, above_bed_mm=min(options.guess.above_bed_mm, half_mm))
+    return replace(options, guess=guess)
 
 
 def top_of_layer(site: Site) -> float | None:

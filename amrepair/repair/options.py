@@ -18,9 +18,6 @@ class RepairOptions:
     ----------
     planned_edge_mm
         A planned template ends below; so near to its end its distances are not to be trusted.
-    open_infill_mm
-        Deeper inside than this, beyond a calibration's error, infill is open (or something is
-        missing: that tells nothing of the pose, either).
     off_the_part_mm, over_beside_mm, on_bed_mm
         What lies beside the part: so far off it, no higher than it was to be by this much, and
         higher than what is taken for the bed.
@@ -38,7 +35,6 @@ class RepairOptions:
     """
 
     planned_edge_mm: float = 1.0
-    open_infill_mm: float = 0.5
     off_the_part_mm: float = 0.3
     over_beside_mm: float = 0.3
     on_bed_mm: float = 0.2

@@ -174,12 +174,12 @@ def _align(
         if known is not None:
             registration = Registration.known(known)
         else:
-            outer = in_view.outside_open_infill(scan, site, guess)
             registration = align(
-                outer,
+                scan,
                 site.template,
                 guess=guess,
-                options=site.options.align,
+                so_far=in_view.so_far(site),
+                options=in_view.aligning(site),
                 rng=rng,
                 progress=progress,
             )

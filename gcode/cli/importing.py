@@ -138,7 +138,9 @@ def _show(found: ImportedFile, paths: list[Path]) -> None:
     if not found.left:
         console.out.print("Every key of the source is in them.")
         return
-    console.out.print(f"{len(found.left)} keys are not mapped (--json tells all, with their values):")
+    console.out.print(
+        f"{len(found.left)} keys are not mapped (--json tells all, with their values):"
+    )
     for row in found.left:
         if row.reason != NO_COUNTERPART:
             value = " ".join(row.source_value.split())[:SHOWN]
