@@ -10,6 +10,8 @@ from jaxtyping import Float
 from amrepair.simulate.options import USUAL_RECORDING
 from amrepair.simulate.recording import SIGMA_OF_MAD
 
+FARTHEST_PAIR_MM = 12.0
+
 
 @dataclass(frozen=True, slots=True)
 class NoiseFigures:
@@ -53,7 +55,7 @@ def noise_figures(residual_mm: Float[np.ndarray, "k ny nx"], pitch_mm: float) ->
     clipped = np.clip(residual_mm.astype(np.float64) - middle, -limit, limit)
     variance = float(np.nanvar(clipped))
     lags, correlation = [0.0], [1.0]
-    for step in range(1, int(USUAL_RECORDING.lags_mm / pitch_mm) + 1):
+    for step in range(1, int(FARTHEST_PAIR_MM / pitch_mm) + 1):
         squares, pairs = 0.0, 0
         for one, other in (
             (clipped[:, step:], clipped[:, :-step]),

@@ -22,11 +22,9 @@ class Role(StrEnum):
     EXTERNAL_PERIMETER = "External perimeter"
     PERIMETER = "Perimeter"
     SOLID_INFILL = "Solid infill"
-    TOP_SOLID_INFILL = "Top solid infill"
     SPARSE_INFILL = "Internal infill"
     GAP_FILL = "Gap fill"
     BRIDGE = "Bridge infill"
-    CUSTOM = "Custom"
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,8 +119,8 @@ def patch(layers: int = 15, height_mm: float = 0.2) -> Toolpath:
         if index % 2:
             points[:, :2] = (points[:, :2] - low[:2])[:, ::-1] * (12 / 10, 10 / 12) + low[:2]
         moves.append(Travel(points[:1], 150.0))
-        role = Role.SOLID_INFILL if index < layers - 1 else Role.TOP_SOLID_INFILL
-        moves.append(Extrude(points, np.full(len(points) - 1, 0.09), 40.0, role, 0.45, height_mm))
+        section_mm2 = np.full(len(points) - 1, 0.09)
+        moves.append(Extrude(points, section_mm2, 40.0, Role.SOLID_INFILL, 0.45, height_mm))
     return Toolpath(tuple(moves))  # type: ignore[arg-type]
 
 

@@ -2,9 +2,49 @@
 
 from __future__ import annotations
 
-from amrepair.simulate.columns import Window
-from amrepair.simulate.truth import Difference
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from amrepair.simulate.columns import IntervalMap, Window
 from amrepair.simulate.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What a world lacked, and had too much, at one moment.
+
+    Attributes
+    ----------
+    missing, excess
+        Intervals of the reference that were not there, and the other way about.
+    """
+
+    missing: IntervalMap
+    excess: IntervalMap
+
+    @property
+    def missing_mm3(self) -> float:
+        """Volume missing."""
+        return self.missing.volume_mm3
+
+    @property
+    def excess_mm3(self) -> float:
+        """Volume too much."""
+        return self.excess.volume_mm3
+
+    def within(self, box_mm: Float[np.ndarray, "2 3"]) -> Difference:
+        """The difference within a box of the build frame."""
+        return Difference(self.missing.clipped(box_mm), self.excess.clipped(box_mm))
+
+    def thicker_than(self, length_mm: float) -> Difference:
+        """Only where it is taller than `length_mm`: what a bead could fill."""
+        return Difference(self.missing.thicker_than(length_mm), self.excess.thicker_than(length_mm))
+
+    def filled_mm3(self, world: World) -> float:
+        """Volume that was missing then and is solid in `world` now."""
+        return self.missing.common(world.snapshot(self.missing.window)).volume_mm3
 
 
 def missing_versus(world: World, reference: World) -> Difference:

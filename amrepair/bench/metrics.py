@@ -27,7 +27,15 @@ EMD_POINTS = 1024
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """Both areas for one set of labels; NaN where the labels hold one class only."""
+    """Both areas for one set of labels; NaN where the labels hold one class only.
+
+    Attributes
+    ----------
+    auroc
+        Probability that an anomalous item scores higher than a normal one, ties counting half.
+    aupr
+        Average precision: Σ (recall step) × precision, without interpolation.
+    """
 
     auroc: float
     aupr: float
@@ -59,8 +67,8 @@ def _steps(
     return hits, last_of_tie + 1 - hits
 
 
-def auroc(labels: Shaped[np.ndarray, " n"], scores: Shaped[np.ndarray, " m"]) -> float:
-    """Probability that an anomalous item scores higher than a normal one, ties counting half.
+def detection(labels: Shaped[np.ndarray, " n"], scores: Shaped[np.ndarray, " m"]) -> Detection:
+    """Both areas from one sort.
 
     Parameters
     ----------
@@ -69,21 +77,11 @@ def auroc(labels: Shaped[np.ndarray, " n"], scores: Shaped[np.ndarray, " m"]) ->
     scores
         (n,) higher is more anomalous; infinities are allowed, NaN is not.
 
-    Returns
-    -------
-    float
-        0…1; NaN where one of the classes is empty.
+    Raises
+    ------
+    InputError
+        If there is not one score for each label, a score is NaN, or a label neither 0 nor 1.
     """
-    return detection(labels, scores).auroc
-
-
-def aupr(labels: Shaped[np.ndarray, " n"], scores: Shaped[np.ndarray, " m"]) -> float:
-    """Average precision: Σ (recall step) × precision, without interpolation; NaN as `auroc`."""
-    return detection(labels, scores).aupr
-
-
-def detection(labels: Shaped[np.ndarray, " n"], scores: Shaped[np.ndarray, " m"]) -> Detection:
-    """Both areas from one sort."""
     truth, values = _checked(labels, scores)
     positives = int(truth.sum())
     negatives = len(truth) - positives

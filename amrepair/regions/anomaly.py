@@ -41,7 +41,6 @@ class DefectType(StrEnum):
     WARP = "warp"
     DETACHED = "detached"
     CLOG = "clog"
-    UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,17 +55,6 @@ def integers(values: np.ndarray) -> Encoded:
     return _packed(array.astype(kind))
 
 
-def decoded(encoded: Encoded) -> np.ndarray:
-    """What the page's script makes of an encoded array; the inverse of the functions above."""
-    kind = {"u1": "|u1", "u2": "<u2", "u4": "<u4"}[str(encoded["type"])]
-    shape = tuple(int(n) for n in _items(encoded["shape"]))
-    flat = np.frombuffer(base64.b64decode(str(encoded["data"])), dtype=kind).reshape(shape)
-    if "scale" not in encoded:
-        return flat.astype(np.int64)
-    scale, offset = np.array(_items(encoded["scale"])), np.array(_items(encoded["offset"]))
-    return flat * scale + offset
-
-
 def thinned(
     points_mm: Float[np.ndarray, "n 3"], important: np.ndarray, *, budget: int
 ) -> Int[np.ndarray, " k"]:
@@ -157,12 +146,6 @@ def _packed(array: np.ndarray, **extra: Sequence[float]) -> Encoded:
         **extra,
         "data": base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii"),
     }
-
-
-def _items(value: object) -> list[int | float]:
-    if not isinstance(value, list):
-        raise TypeError(f"an encoded array holds a list here, not {type(value).__name__}")
-    return value
 
 
 def _every(indices: np.ndarray, count: int) -> np.ndarray:

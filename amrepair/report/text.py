@@ -32,7 +32,6 @@ _DEFECT_NAMES = {
     "warp": ("warped place", "warped places"),
     "detached": ("part off the bed", "parts off the bed"),
     "clog": ("clog", "clogs"),
-    "unknown": ("region of unknown kind", "regions of unknown kind"),
 }
 HEADLINES = {
     Outcome.WITHIN_TOLERANCE: "Within tolerance",

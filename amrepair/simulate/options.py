@@ -79,14 +79,11 @@ class RecordingOptions:
         Depth that changes faster than on such a slope is an edge.
     clip_sigmas
         Pairs are compared within: a few points far off would say all.
-    lags_mm
-        How far apart pairs are compared.
     """
 
     farthest_mm: float = 5.0
     steepest_deg: float = 80.0
     clip_sigmas: float = 3.0
-    lags_mm: float = 12.0
 
 
 USUAL_RECORDING = RecordingOptions()

@@ -164,7 +164,7 @@ def checksum(data: bytes) -> int:
 def numbered(number: int, text: bytes) -> bytes:
     """Put number and checksum around a command."""
     body = b"N%d %b" % (number, text)
-    return b"%b*%d\n" % (body, reduce(xor, body))
+    return b"%b*%d\n" % (body, checksum(body))
 
 
 def command_in(line: str) -> str:

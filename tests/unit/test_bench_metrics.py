@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from amrepair.bench.metrics import (
-    aupr,
-    auroc,
     cloud_distance,
     detection,
     earth_movers_distance,
@@ -37,7 +35,7 @@ def test_auroc_is_the_share_of_pairs_in_order(items: list[tuple[int, int]]) -> N
         1.0 if a > b else 0.5 if a == b else 0.0
         for a, b in itertools.product(scores[labels == 1], scores[labels == 0])
     ]
-    assert auroc(labels, scores) == pytest.approx(np.mean(pairs), abs=1e-12)
+    assert detection(labels, scores).auroc == pytest.approx(np.mean(pairs), abs=1e-12)
 
 
 @given(ITEMS)
@@ -49,7 +47,7 @@ def test_aupr_is_the_sum_over_thresholds(items: list[tuple[int, int]]) -> None:
         recall = (labels[chosen] == 1).sum() / labels.sum()
         area += (recall - recall_before) * (labels[chosen] == 1).mean()
         recall_before = recall
-    assert aupr(labels, scores) == pytest.approx(area, abs=1e-12)
+    assert detection(labels, scores).aupr == pytest.approx(area, abs=1e-12)
 
 
 @given(ITEMS, st.randoms(use_true_random=False))
@@ -61,16 +59,16 @@ def test_order_of_the_items_does_not_matter(items: list[tuple[int, int]], random
 
 def test_infinite_scores_rank_first_and_monotone_maps_change_nothing() -> None:
     labels = np.array([0, 1, 0, 1])
-    assert auroc(labels, np.array([0.0, np.inf, 1.0, np.inf])) == 1.0
+    assert detection(labels, np.array([0.0, np.inf, 1.0, np.inf])).auroc == 1.0
     scores = np.array([0.1, 0.4, 0.35, 0.8])
-    assert auroc(labels, scores) == auroc(labels, np.exp(5 * scores)) == 1.0
-    assert auroc(labels, -scores) == 0.0
-    assert auroc(labels, np.zeros(4)) == 0.5
+    assert detection(labels, scores).auroc == detection(labels, np.exp(5 * scores)).auroc == 1.0
+    assert detection(labels, -scores).auroc == 0.0
+    assert detection(labels, np.zeros(4)).auroc == 0.5
 
 
 def test_one_class_alone_has_no_area() -> None:
-    assert np.isnan(auroc(np.zeros(3, np.int64), np.arange(3.0)))
-    assert np.isnan(aupr(np.ones(3, np.int64), np.arange(3.0)))
+    assert np.isnan(detection(np.zeros(3, np.int64), np.arange(3.0)).auroc)
+    assert np.isnan(detection(np.ones(3, np.int64), np.arange(3.0)).aupr)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +83,7 @@ def test_what_cannot_be_judged_is_refused(
     labels: np.ndarray, scores: np.ndarray, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        auroc(labels, scores)
+        detection(labels, scores)
 
 
 def test_cloud_distances_of_a_shifted_grid() -> None:
