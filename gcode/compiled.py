@@ -11,6 +11,9 @@ A kernel that may add up in any order (`fastmath`) and is called by another is i
 process that loads the caller from disk the caller's copy, which adds up in another order: the same
 scan, judged twice, differed in its fourteenth digit.
 
+A kernel is compiled for types of arguments, not for values: numba compiles a kernel that another
+calls with `True` or `1` in its text once more for that very value, and no kernel asks for it.
+
 Threads are OpenMP's, and sleep while they wait. Where numba finds a TBB it takes that first, whose
 threads spin: beside one other busy process an alignment took six times as long, and a process that
 was done did not end for minutes.
@@ -25,13 +28,13 @@ import secrets
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when the first of its threads starts
 
 import numba
 import numba.np.linalg
-from numba import get_num_threads, prange, set_num_threads
+from numba import get_num_threads, prange, set_num_threads, types
 from numba.core.runtime import nrt, nrtdynmod
 
 from gcode.locks import try_lock
@@ -95,10 +98,11 @@ runtime_when_asked()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit`, kept safely where it is kept (`cache=True`)."""
+    """`numba.njit`, once for each type of arguments, and kept safely where it is kept."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
+        compile_for_types(dispatcher)
         kept = getattr(dispatcher._cache, "_cache_file", None)
         if kept is not None:
             keep_safely(kept)
@@ -106,6 +110,17 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return dispatcher
 
     return compiled
+
+
+def compile_for_types(dispatcher: Any) -> None:
+    """Take literal arguments of a kernel's call in another one for what they are an example of."""
+    asked, unliteral = dispatcher.get_call_template, cast(Any, types.unliteral)
+
+    def template(args: Any, kws: Any) -> Any:
+        named = {name: unliteral(kind) for name, kind in kws.items()}
+        return asked(tuple(unliteral(kind) for kind in args), named)
+
+    dispatcher.get_call_template = template
 
 
 def keep_safely(kept: Any) -> None:

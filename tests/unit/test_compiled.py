@@ -97,6 +97,22 @@ def test_every_kernel_is_kept_safely() -> None:
             assert "from numba" not in path.read_text(), path
 
 
+@compiled.njit()
+def plus(value: int, twice: bool) -> int:
+    return 2 * value if twice else value
+
+
+@compiled.njit()
+def both(value: int, twice: bool) -> int:
+    return plus(value, True) + plus(1, twice)
+
+
+def test_a_value_in_a_kernels_text_is_no_type_of_its_own() -> None:
+    """The longest kernel took its six seconds twice: for a truth and for `True`."""
+    assert both(5, False) == 11
+    assert [str(kind) for kinds in plus.signatures for kind in kinds] == ["int64", "bool"]
+
+
 def test_threads_are_those_that_sleep_while_they_wait() -> None:
     """TBB's spin, beside other processes, and kept one that was done from ending."""
     size = np.ones((1, 2, 2, 2), dtype=np.float32)
