@@ -34,12 +34,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when the first of it
 
 import numba
 import numba.np.linalg
+import numpy as np
 from numba import get_num_threads, prange, set_num_threads, types
 from numba.core.runtime import nrt, nrtdynmod
+from numba.extending import overload
+from numba.np import arrayobj
 
 from gcode.locks import try_lock
 
-__all__ = ["get_num_threads", "njit", "prange", "set_num_threads"]
+__all__ = ["get_num_threads", "njit", "prange", "read_only", "set_num_threads"]
 
 _KERNEL_PACKAGES = ("gcode", "amrepair")
 _PROCESS_TOKEN = secrets.token_hex(4)
@@ -93,8 +96,26 @@ def runtime_when_asked() -> None:
     kind.library = property(library)
 
 
+def shapes_unsaid() -> None:
+    """Where a kernel assigns an array to a slice of another shape, say so without the shapes.
+
+    To write them out numba compiles its functions for text with the first kernel of a process that
+    assigns to a slice: two seconds, and one more for arrays of two dimensions.
+    """
+    without_text: Any = getattr(arrayobj, "ol_raise_with_shape_context_generic", None)
+    if without_text is None:
+        return  # a numba that does it otherwise
+
+    def differ(src_shapes: Any, index_shape: Any) -> None:
+        raise NotImplementedError
+
+    overload(differ)(without_text)
+    arrayobj.raise_with_shape_context = differ
+
+
 without_scipy()
 runtime_when_asked()
+shapes_unsaid()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -110,6 +131,17 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return dispatcher
 
     return compiled
+
+
+def read_only(array: Any, kind: Any = None) -> np.ndarray:
+    """A contiguous array that nobody writes to, for a kernel that only reads it.
+
+    numba compiles a kernel once for arrays that may be written to and once for those that may not.
+    A scan's points may not, what is computed from them may: a kernel that takes both gets both so.
+    """
+    shown = np.ascontiguousarray(array, dtype=kind).view()
+    shown.setflags(write=False)
+    return shown
 
 
 def compile_for_types(dispatcher: Any) -> None:

@@ -24,7 +24,8 @@ from amrepair.deficit.heights import (
 from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.scans import Scan
 from gcode.slicing.job_lines import SAME_LEVEL_MM, JobLines
-from gcode.surfaces import HeightField, raster_kernels
+from gcode.surfaces import HeightField
+from gcode.surfaces.lines import heights_by_lines
 
 
 def standing_in_job(
@@ -142,11 +143,10 @@ def _planned(
 
     def over(some: JobLines) -> HeightMap:
         within = 0.5 * some.section_mm2 / np.maximum(some.height_mm, SAME_LEVEL_MM)
-        found = raster_kernels.beside_lines(
-            some.start_mm[:, :2], some.end_mm[:, :2], within, some.end_mm[:, 2],
-            near.origin_mm, near.cell_mm, ny, nx,
+        return heights_by_lines(
+            some.start_mm, some.end_mm, within, some.end_mm[:, 2],
+            low_mm=near.origin_mm, cell_mm=near.cell_mm, shape=near.shape,
         )  # fmt: skip
-        return np.asarray(found)
 
     tops_mm = lines.end_mm[:, 2]
     stands_mm = np.maximum(over(lines.some(tops_mm <= low_mm)), 0.0)

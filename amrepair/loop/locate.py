@@ -23,7 +23,7 @@ from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 from gcode.reader import Beads, Job
 from gcode.stretches import places_along
-from gcode.surfaces import raster_kernels
+from gcode.surfaces.lines import near_lines
 
 # Names of the outermost bead: PrusaSlicer and SuperSlicer, OrcaSlicer and Bambu, Cura and
 # ideaMaker, Simplify3D, KISSlicer.
@@ -187,12 +187,11 @@ def _things(
     low = np.minimum(start_mm, end_mm).min(axis=0) - 2.0
     high = np.maximum(start_mm, end_mm).max(axis=0) + 2.0
     nx, ny = (int(v) for v in np.ceil((high - low) / THING_CELL_MM))
-    covered = raster_kernels.beside_lines(
-        np.ascontiguousarray(start_mm), np.ascontiguousarray(end_mm),
-        np.full(len(start_mm), half_mm + 0.5 * THING_CELL_MM), np.zeros(len(start_mm)),
-        low, THING_CELL_MM, ny, nx,
+    covered = near_lines(
+        start_mm, end_mm, half_mm + 0.5 * THING_CELL_MM,
+        low_mm=low, cell_mm=THING_CELL_MM, shape=(ny, nx),
     )  # fmt: skip
-    groups, _ = ndimage.label(covered > -np.inf, structure=np.ones((3, 3)))
+    groups, _ = ndimage.label(covered, structure=np.ones((3, 3)))
     x, y = np.floor((0.5 * (start_mm + end_mm) - low) / THING_CELL_MM).astype(np.int64).T
     mine = groups[y, x]
     _, first, number = np.unique(mine, return_index=True, return_inverse=True)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from gcode.reader import Beads
-from gcode.surfaces import raster_kernels
+from gcode.surfaces.lines import near_lines
 
 OUTLINE_CELL_MM = 0.15
 OUTLINE_LAYERS = 40  # evenly spread: enough walls to register by
@@ -66,13 +66,9 @@ def _at_the_edge(
     nx, ny = (int(v) for v in np.ceil((high - low) / cell))
 
     def covered(pick: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "ny nx"]:
-        count = int(pick.sum())
-        return (
-            raster_kernels.beside_lines(
-                np.ascontiguousarray(start_mm[pick]), np.ascontiguousarray(end_mm[pick]),
-                np.full(count, half_mm + 0.5 * cell), np.zeros(count), low, cell, ny, nx,
-            )
-            > -np.inf
+        return near_lines(
+            start_mm[pick], end_mm[pick], half_mm + 0.5 * cell,
+            low_mm=low, cell_mm=cell, shape=(ny, nx),
         )  # fmt: skip
 
     voids, count = ndimage.label(~covered(np.ones(len(closed), bool)))

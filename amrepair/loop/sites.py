@@ -23,7 +23,8 @@ from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
-from gcode.surfaces import HeightField, raster_kernels
+from gcode.surfaces import HeightField
+from gcode.surfaces.lines import heights_by_lines
 
 # Around what the job lays beside the part: strands spread, and stringy ones stray.
 STRINGS_MM, BESIDE_CELL_MM = 0.4, 0.25
@@ -143,14 +144,14 @@ def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:
 def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> HeightField:
     """How high some of a job's beads stand, build frame; −inf farther than that beside them."""
     beads = job.beads
-    start, end = (np.ascontiguousarray(xyz[pick]) for xyz in (beads.start_mm, beads.end_mm))
+    start, end = beads.start_mm[pick], beads.end_mm[pick]
     within = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6) + wider_mm
     low, high = box_of(np.concatenate([start, end])[:, :2])
     low = low - float(within.max())
     nx, ny = (int(v) for v in np.ceil((high + float(within.max()) - low) / BESIDE_CELL_MM))
-    z_mm = raster_kernels.beside_lines(
-        start[:, :2], end[:, :2], within, np.maximum(start[:, 2], end[:, 2]),
-        low, BESIDE_CELL_MM, ny, nx,
+    z_mm = heights_by_lines(
+        start, end, within, np.maximum(start[:, 2], end[:, 2]),
+        low_mm=low, cell_mm=BESIDE_CELL_MM, shape=(ny, nx),
     )  # fmt: skip
     return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
 

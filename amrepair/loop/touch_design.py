@@ -29,7 +29,8 @@ from amrepair.loop.looks import Stop
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.slicing.reach import Reach
-from gcode.surfaces import HeightField, raster_kernels
+from gcode.surfaces import HeightField
+from gcode.surfaces.lines import heights_by_lines
 
 CENTRED = 12
 """Steps towards the middle of a cell: to a twelfth of its radius."""
@@ -149,9 +150,8 @@ def flats_of(
     low = np.minimum(start, end).min(axis=0)[:2] - rim_mm
     high = np.maximum(start, end).max(axis=0)[:2] + rim_mm
     nx, ny = (int(v) for v in np.ceil((high - low) / options.cell_mm))
-    flat = [np.ascontiguousarray(xyz[:, :2]) for xyz in (start, end)]
-    top_mm = raster_kernels.beside_lines(
-        *flat, half_mm, end[:, 2].copy(), low, options.cell_mm, ny, nx
+    top_mm = heights_by_lines(
+        start, end, half_mm, end[:, 2], low_mm=low, cell_mm=options.cell_mm, shape=(ny, nx)
     )
     laid = np.isfinite(top_mm)
     tip = _disc(probe.tip_radius_mm, options.cell_mm)

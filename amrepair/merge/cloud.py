@@ -16,6 +16,7 @@ from amrepair.field.near import spacing_in
 from amrepair.frames import cells_of, spread_directions
 from amrepair.merge import fuse_kernels as kernels
 from amrepair.merge.options import USUAL_CLOUD
+from gcode.compiled import read_only
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +231,7 @@ def _seen_from(
 ) -> Float[np.ndarray, "s 3"]:
     """(s, 3) sums of the directions in which places see far past the points' discs."""
     step = len(points_mm) // USUAL_CLOUD.hiding_points + 1
-    place, plane = (np.ascontiguousarray(each[::step]) for each in (points_mm, normals))
+    place, plane = (read_only(each[::step]) for each in (points_mm, normals))
     disc_mm = USUAL_CLOUD.disc_spacings * spacing_mm * float(np.sqrt(step))
     extent_mm = float(np.ptp(place, axis=0).max())
     cell_mm = max(disc_mm, extent_mm / USUAL_CLOUD.most_cells)

@@ -17,6 +17,7 @@ from amrepair.frames import diagonal, moved, spread_directions, ways_across
 from amrepair.merge import sight_kernels as kernels
 from amrepair.merge.cloud import outward, planes, spacing_of
 from amrepair.merge.options import USUAL_MERGE, SightOptions
+from gcode.compiled import read_only
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +77,9 @@ class DepthImage:
         if way is not None:
             axes = np.stack([np.cross(way, axes[2]), way, axes[2]])
         sheet = int(way is not None)
-        camera = kernels.Camera(sensor_mm, axes, distance_mm / pixel_mm, distance_mm, sheet)
-        u, v, reach = kernels.pixels(np.ascontiguousarray(points_mm), camera)
+        eye_mm = np.array(sensor_mm)
+        camera = kernels.Camera(eye_mm, axes, distance_mm / pixel_mm, distance_mm, sheet)
+        u, v, reach = kernels.pixels(read_only(points_mm), camera)
         pixel = np.stack([u, v], axis=1)
         first = pixel.min(axis=0) - 3
         pixel -= first

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from gcode.reader import Job
-from gcode.surfaces import raster_kernels
+from gcode.surfaces.lines import near_lines
 
 COVER_CELL_MM = 0.4  # about a bead
 MOST_LAYER_CELLS = 1_000_000  # of a layer: a bed of 400 mm, some hundredths of a second
@@ -31,15 +31,9 @@ def covered_mm2(job: Job) -> Float[np.ndarray, " layers"]:
     areas, open_before = np.zeros(len(job.layers)), np.zeros((ny, nx), bool)
     for layer in range(len(job.layers)):
         part = slice(int(bounds[layer]), int(bounds[layer + 1]))
-        laid = (
-            raster_kernels.beside_lines(
-                np.ascontiguousarray(beads.start_mm[part, :2]),
-                np.ascontiguousarray(beads.end_mm[part, :2]),
-                0.5 * beads.width_mm[part] + 0.25 * cell_mm,
-                np.zeros(part.stop - part.start),
-                low, cell_mm, ny, nx,
-            )
-            > -np.inf
+        laid = near_lines(
+            beads.start_mm[part], beads.end_mm[part], 0.5 * beads.width_mm[part] + 0.25 * cell_mm,
+            low_mm=low, cell_mm=cell_mm, shape=(ny, nx),
         )  # fmt: skip
         areas[layer] = float((laid & open_before).sum()) * cell_mm**2
         open_before = ndimage.binary_fill_holes(laid) & ~laid

@@ -17,7 +17,7 @@ from gcode.compiled import njit, prange
 HALF_COLUMNS = 1.5  # half the spot's width, in columns
 SEARCH_MM = 0.4  # how far along its ray a hit may move: the diagonal of the spot
 BISECTIONS = 7  # 0.8 mm / 2^7 = 0.006 mm
-MISS, BED, PART = 0, 1, 2
+BED, PART = 1, 2
 
 
 @njit(cache=True)
@@ -43,10 +43,9 @@ def share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z):
 
 
 @njit(cache=True)
-def first_hit(offsets, spans, top, z_top, x0, y0, cell, s, g):
-    """Parameter t of the first hit from s to g (on the bed, z = 0), and whether it is the part."""
+def first_hit(offsets, spans, top, z_top, x0, y0, cell, s, dx, dy, dz):
+    """Parameter t of the first hit from s, by (dx, dy, dz) to the bed, and what it is."""
     ny, nx = top.shape
-    dx, dy, dz = g[0] - s[0], g[1] - s[1], g[2] - s[2]
     t_in, t_out = 0.0, 1.0
     if s[2] > z_top:
         t_in = (z_top - s[2]) / dz
@@ -96,6 +95,7 @@ def first_hit(offsets, spans, top, z_top, x0, y0, cell, s, g):
             return 1.0, BED
 
 
+# Rays are numbers, not arrays: with arrays in their loops these two took thrice as long to compile.
 @njit(cache=True, parallel=True)
 def cast(offsets, spans, top, x0, y0, cell, half_z, sensor, targets):
     """Hits (n, 3), outward unit normals (n, 3) and kinds (n,) of rays from a sensor to the bed."""
@@ -105,46 +105,49 @@ def cast(offsets, spans, top, x0, y0, cell, half_z, sensor, targets):
     normals = np.zeros((n, 3))
     kinds = np.zeros(n, dtype=np.int64)
     z_top = top.max() + 1e-6
+    sx, sy, sz = sensor[0], sensor[1], sensor[2]
     for r in prange(n):
-        t, kind = first_hit(offsets, spans, top, z_top, x0, y0, cell, sensor, targets[r])
-        direction = targets[r] - sensor
-        length = np.sqrt((direction**2).sum())
-        direction = direction / length
-        kinds[r] = kind
-        if kind == BED:
-            points[r] = targets[r]
+        dx, dy, dz = targets[r, 0] - sx, targets[r, 1] - sy, targets[r, 2] - sz
+        t, kinds[r] = first_hit(offsets, spans, top, z_top, x0, y0, cell, sensor, dx, dy, dz)
+        if kinds[r] == BED:
+            points[r, 0], points[r, 1], points[r, 2] = targets[r, 0], targets[r, 1], targets[r, 2]
             normals[r, 2] = 1.0
             continue
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx / length, dy / length, dz / length
         reach = t * length
         near, far = reach - SEARCH_MM, reach + SEARCH_MM
-        a, b = sensor + near * direction, sensor + far * direction
-        outside = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, a[0], a[1], a[2])
-        inside = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, b[0], b[1], b[2])
+        x, y, z = sx + near * dx, sy + near * dy, sz + near * dz
+        outside = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z)
+        x, y, z = sx + far * dx, sy + far * dy, sz + far * dz
+        inside = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z)
         if outside < 0.5 < inside:
             for _ in range(BISECTIONS):
                 reach = 0.5 * (near + far)
-                p = sensor + reach * direction
-                share = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, p[0], p[1], p[2])
-                if share < 0.5:
+                x, y, z = sx + reach * dx, sy + reach * dy, sz + reach * dz
+                if share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z) < 0.5:
                     near = reach
                 else:
                     far = reach
             reach = 0.5 * (near + far)
-        p = sensor + reach * direction
-        points[r] = p
+        x, y, z = sx + reach * dx, sy + reach * dy, sz + reach * dz
+        points[r, 0], points[r, 1], points[r, 2] = x, y, z
+        size = 0.0
         for axis in range(3):
-            delta = cell if axis < 2 else half_z
-            q = p.copy()
-            q[axis] += delta
-            plus = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, q[0], q[1], q[2])
-            q[axis] -= 2 * delta
-            minus = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, q[0], q[1], q[2])
-            normals[r, axis] = (minus - plus) / delta
-        size = np.sqrt((normals[r] ** 2).sum())
+            ax, ay = (cell if axis == 0 else 0.0), (cell if axis == 1 else 0.0)
+            az = half_z if axis == 2 else 0.0
+            x, y, z = points[r, 0] + ax, points[r, 1] + ay, points[r, 2] + az
+            plus = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z)
+            x, y, z = x - 2 * ax, y - 2 * ay, z - 2 * az
+            minus = share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z)
+            normals[r, axis] = (minus - plus) / (ax + ay + az)
+            size += normals[r, axis] ** 2
+        size = np.sqrt(size)
         if size > 0.0:
-            normals[r] /= size
+            for axis in range(3):
+                normals[r, axis] /= size
         else:
-            normals[r] = -direction
+            normals[r, 0], normals[r, 1], normals[r, 2] = -dx, -dy, -dz
     return points, normals, kinds
 
 
@@ -154,10 +157,12 @@ def unhidden(offsets, spans, top, x0, y0, cell, eye, points, tolerance):
     n = len(points)
     seen = np.zeros(n, dtype=np.bool_)
     z_top = top.max() + 1e-6
+    ex, ey, ez = eye[0], eye[1], eye[2]
     for r in prange(n):
-        way = points[r] - eye
-        aim = eye + way * (eye[2] / -way[2])
-        t, _ = first_hit(offsets, spans, top, z_top, x0, y0, cell, eye, aim)
-        reach = t * np.sqrt(((aim - eye) ** 2).sum())
-        seen[r] = reach >= np.sqrt((way**2).sum()) - tolerance
+        wx, wy, wz = points[r, 0] - ex, points[r, 1] - ey, points[r, 2] - ez
+        far = ez / -wz
+        dx, dy, dz = ex + wx * far - ex, ey + wy * far - ey, ez + wz * far - ez
+        t, _ = first_hit(offsets, spans, top, z_top, x0, y0, cell, eye, dx, dy, dz)
+        reach = t * np.sqrt(dx * dx + dy * dy + dz * dz)
+        seen[r] = reach >= np.sqrt(wx * wx + wy * wy + wz * wz) - tolerance
     return seen

@@ -28,6 +28,7 @@ from amrepair.template.file import (
     write_template,
 )
 from amrepair.template.shape import MeshShape
+from gcode.compiled import read_only
 
 if TYPE_CHECKING:
     import trimesh
@@ -102,14 +103,14 @@ class Grid:
 
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) signed distance, mm."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        points = read_only(points_mm, np.float64)
         return np.asarray(kernels.evaluate(points, *self.numbers))
 
     def distance_and_gradient(
         self, points_mm: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
         """(n,) signed distance, mm, and (n, 3) its gradient within the cell."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        points = read_only(points_mm, np.float64)
         distance, gradient = kernels.evaluate_with_gradient(points, *self.numbers)
         return np.asarray(distance), np.asarray(gradient)
 

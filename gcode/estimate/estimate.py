@@ -100,8 +100,9 @@ class _Taken:
     def add(self, block: Block) -> None:
         """The next one."""
         steps, pushed, feed = block.moves()
-        own = slice(block.first_line, block.end_line)
-        kernels.limits(steps, pushed, feed, *self._limits, self._before, self._planned[:, own])
+        kernels.limits(
+            steps, pushed, feed, *self._limits, self._before, self._planned, block.first_line
+        )
         self._lines = block.end_line
         # Filament that was retracted must come forward again before more of it counts.
         sums_mm = np.cumsum(np.concatenate([[self._pushed_mm], pushed]))

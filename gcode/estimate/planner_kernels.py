@@ -9,13 +9,14 @@ from gcode.compiled import njit
 
 
 @njit(cache=True, nogil=True)
-def limits(steps, pushed, feed, max_speed, max_acceleration, jerk, before, planned):
+def limits(steps, pushed, feed, max_speed, max_acceleration, jerk, before, planned, first):
     """What each line's move may do by itself and after the one before it.
 
     `before` (6,), which is changed: unit vector of the last move, its speed, whether there was one.
-    `planned` (4, n) takes lengths (zero for what does not move), cruising speeds, accelerations and
-    speeds at entry. Junction speed is classic jerk's: no axis may change its speed by more than its
-    jerk at once. Accelerations are at most the X axis's where more than one moves.
+    `planned` (4, n) takes, from column `first` on, lengths (zero for what does not move), cruising
+    speeds, accelerations and speeds at entry. Junction speed is classic jerk's: no axis may change
+    its speed by more than its jerk at once. Accelerations are at most the X axis's where more than
+    one moves.
     """
     unit = np.zeros(4)
     for k in range(len(pushed)):
@@ -51,7 +52,13 @@ def limits(steps, pushed, feed, max_speed, max_acceleration, jerk, before, plann
                 if change > jerk[axis]:
                     worst = min(worst, jerk[axis] / change)
             limit *= worst
-        planned[0, k], planned[1, k], planned[2, k], planned[3, k] = distance, speed, a, limit
+        own = first + k
+        planned[0, own], planned[1, own], planned[2, own], planned[3, own] = (
+            distance,
+            speed,
+            a,
+            limit,
+        )
         before[:4] = unit
         before[4], before[5] = speed, 1.0
 

@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from gcode.firmware.motion import MotionBatch
 from gcode.profiles import PrinterProfile
-from gcode.surfaces import HeightField, raster_kernels
+from gcode.surfaces import HeightField
+from gcode.surfaces.lines import heights_by_lines
 from gcode.units import filament_area_mm2
 
 LAID_CELL_MM = 0.25
@@ -46,10 +47,8 @@ class Laid:
         surface = self.surface
         under_mm = surface.sample(0.5 * (start_mm + end_mm)[:, :2])
         height_mm = np.maximum(end_mm[:, 2] - under_mm, LEAST_STRAND_MM)
-        rows, columns = surface.shape
-        top_mm = raster_kernels.beside_lines(
-            np.ascontiguousarray(start_mm[:, :2]), np.ascontiguousarray(end_mm[:, :2]),
-            0.5 * section_mm2 / height_mm, np.ascontiguousarray(end_mm[:, 2]),
-            surface.origin_mm, surface.cell_mm, rows, columns,
+        top_mm = heights_by_lines(
+            start_mm, end_mm, 0.5 * section_mm2 / height_mm, end_mm[:, 2],
+            low_mm=surface.origin_mm, cell_mm=surface.cell_mm, shape=surface.shape,
         )  # fmt: skip
         np.maximum(surface.z_mm, top_mm, out=surface.z_mm)

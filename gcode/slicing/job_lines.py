@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from gcode.moves import Role
 from gcode.slicing.beads import Bead
 from gcode.slicing.options import USUAL_PATCH, JobLineOptions
-from gcode.surfaces import raster_kernels as kernels
+from gcode.surfaces.lines import near_lines
 
 SAME_LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
 ON_MM = 0.05  # of a line's middle
@@ -173,11 +173,11 @@ class JobColumns:
         if len(lines.rim) == 0:
             return None
         half_mm = 0.5 * lines.section_mm2 / lines.height_mm
-        over = kernels.beside_lines(
-            lines.start_mm[:, :2], lines.end_mm[:, :2], half_mm + EXACTLY_MM, lines.end_mm[:, 2],
-            self._corner_mm, self._cell_mm, *self.near.shape,
+        over = near_lines(
+            lines.start_mm, lines.end_mm, half_mm + EXACTLY_MM,
+            low_mm=self._corner_mm, cell_mm=self._cell_mm, shape=self.near.shape,
         )  # fmt: skip
-        return np.asarray((over > -np.inf) & self.near)
+        return over & self.near
 
 
 @dataclass(frozen=True, slots=True)

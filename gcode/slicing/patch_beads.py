@@ -22,7 +22,7 @@ from gcode.slicing.options import FillOptions, PatchOptions
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
-from gcode.surfaces import raster_kernels
+from gcode.surfaces.lines import near_lines
 
 CORNER_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
 
@@ -264,11 +264,9 @@ def beside_runs(
     if not runs_mm:
         return np.zeros(model.shape, dtype=bool)
     start, end = (np.concatenate([xy[to] for xy in runs_mm]) for to in (slice(-1), slice(1, None)))
-    within, level = np.full(len(start), within_mm), np.zeros(len(start))
-    over = raster_kernels.beside_lines(
-        start, end, within, level, model.origin_mm, model.cell_mm, *model.shape
+    return near_lines(
+        start, end, within_mm, low_mm=model.origin_mm, cell_mm=model.cell_mm, shape=model.shape
     )
-    return np.asarray(over > -np.inf)
 
 
 def _smooth(

@@ -113,6 +113,30 @@ def test_a_value_in_a_kernels_text_is_no_type_of_its_own() -> None:
     assert [str(kind) for kinds in plus.signatures for kind in kinds] == ["int64", "bool"]
 
 
+@compiled.njit()
+def put(target: np.ndarray, given: np.ndarray) -> None:
+    target[1:] = given
+
+
+def test_an_array_of_another_shape_is_refused_without_functions_for_text() -> None:
+    """numba's words for it took two seconds to compile, in every process."""
+    target = np.zeros(3)
+    put(target, np.ones(2))
+    assert target.tolist() == [0.0, 1.0, 1.0]
+    with pytest.raises(ValueError, match="cannot assign slice from input of different size"):
+        put(target, np.ones(3))
+
+
+def test_what_is_read_alone_is_of_one_type_whoever_may_write_to_it() -> None:
+    mine, told = np.zeros((4, 3)), np.zeros((4, 3))
+    told.setflags(write=False)
+    assert numba.typeof(mine) != numba.typeof(told)
+    shown = [compiled.read_only(each) for each in (mine, told, mine[::2], mine.astype(np.float32))]
+    assert {str(numba.typeof(each)) for each in shown[:3]} == {str(numba.typeof(told))}
+    assert compiled.read_only(shown[3], np.float64).dtype == np.float64
+    assert mine.flags.writeable
+
+
 def test_threads_are_those_that_sleep_while_they_wait() -> None:
     """TBB's spin, beside other processes, and kept one that was done from ending."""
     size = np.ones((1, 2, 2, 2), dtype=np.float32)

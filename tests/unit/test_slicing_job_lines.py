@@ -16,7 +16,8 @@ from gcode.slicing.job_lines import JobLines, JobPieces, gathered
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.options import USUAL_PATCH
 from gcode.slicing.patch import PatchPlan, slice_patch
-from gcode.surfaces import HeightField, raster_kernels
+from gcode.surfaces import HeightField
+from gcode.surfaces.lines import heights_by_lines, near_lines
 
 SETUP = load_setup()
 PARK = (10.0, 200.0, 20.0)
@@ -65,7 +66,9 @@ def test_columns_beside_lines_are_those_that_shapes_hold(seed: int) -> None:
     within = rng.uniform(0.05, 0.8, 6)
     low, cell_mm, (ny, nx) = np.array([1.0, 2.0]), 0.13, (60, 70)
     height = rng.uniform(0, 5, 6)
-    found = raster_kernels.beside_lines(start, end, within, height, low, cell_mm, ny, nx)
+    where = {"low_mm": low, "cell_mm": cell_mm, "shape": (ny, nx)}
+    found = heights_by_lines(start, end, within, height, **where)
+    assert np.array_equal(near_lines(start, end, within, **where), found > -np.inf)
     x, y = (low[axis] + (np.arange(n) + 0.5) * cell_mm for axis, n in ((0, nx), (1, ny)))
     middles = shapely.points(*np.meshgrid(x, y))
     truth = np.full((ny, nx), -np.inf)

@@ -1,0 +1,59 @@
+"""Columns near lines, seen from above: which they are, and how high the highest line there is."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gcode.surfaces import raster_kernels as kernels
+
+
+def near_lines(
+    start_mm: Float[np.ndarray, "n _a"],
+    end_mm: Float[np.ndarray, "n _a"],
+    within_mm: float | Float[np.ndarray, " n"],
+    *,
+    low_mm: Float[np.ndarray, " 2"],
+    cell_mm: float,
+    shape: tuple[int, int],
+) -> Bool[np.ndarray, "ny nx"]:
+    """Columns whose middles lie within some distance of lines; parameters of `heights_by_lines`."""
+    none_mm = np.zeros(len(start_mm))
+    heights_mm = heights_by_lines(
+        start_mm, end_mm, within_mm, none_mm, low_mm=low_mm, cell_mm=cell_mm, shape=shape
+    )
+    return np.asarray(heights_mm > -np.inf)
+
+
+def heights_by_lines(
+    start_mm: Float[np.ndarray, "n _a"],
+    end_mm: Float[np.ndarray, "n _a"],
+    within_mm: float | Float[np.ndarray, " n"],
+    height_mm: Float[np.ndarray, " n"],
+    *,
+    low_mm: Float[np.ndarray, " 2"],
+    cell_mm: float,
+    shape: tuple[int, int],
+) -> Float[np.ndarray, "ny nx"]:
+    """(ny, nx) greatest height of the lines that columns' middles lie near to; −inf beside them.
+
+    Parameters
+    ----------
+    start_mm, end_mm
+        (n, 2) or (n, 3) ends, build frame; lines are seen from above.
+    within_mm
+        How far each reaches aside.
+    height_mm
+        (n,) of each.
+    low_mm
+        (2,) corner of column [0, 0].
+    cell_mm, shape
+        Edge of a column, and how many there are: (ny, nx).
+    """
+    start, end = (np.ascontiguousarray(at[:, :2], dtype=np.float64) for at in (start_mm, end_mm))
+    within, height = (
+        np.ascontiguousarray(np.broadcast_to(each, len(start)), dtype=np.float64)
+        for each in (within_mm, height_mm)
+    )
+    found = kernels.beside_lines(start, end, within, height, low_mm, cell_mm, *shape)
+    return np.asarray(found)
