@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from manifold3d import CrossSection, FillRule
 
+from gcode.compiled import read_only
 from gcode.meshes_kernels import bodies_of, contours_at, crossing, paired
 
 
@@ -34,6 +35,9 @@ class ClosedMesh:
     vertices_mm: Float[np.ndarray, "n 3"]
     faces: Int[np.ndarray, "m 3"]
     across: Int[np.ndarray, " h"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices_mm", read_only(self.vertices_mm))
 
     def is_empty(self) -> bool:
         """Whether it has no faces."""
@@ -97,8 +101,8 @@ def mesh_of(solid: Any) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"
     if isinstance(solid, ClosedMesh):
         return solid.vertices_mm, solid.faces
     mesh = solid.to_mesh64() if hasattr(solid, "to_mesh64") else solid.to_mesh()
-    vertices = np.ascontiguousarray(np.asarray(mesh.vert_properties, np.float64)[:, :3])
-    return vertices, np.ascontiguousarray(np.asarray(mesh.tri_verts, np.int64))
+    vertices = np.asarray(mesh.vert_properties, np.float64)[:, :3]
+    return read_only(vertices), np.ascontiguousarray(np.asarray(mesh.tri_verts, np.int64))
 
 
 def box_of_solid(solid: Any) -> Float[np.ndarray, "2 3"]:

@@ -47,7 +47,7 @@ def with_sharp_walls(
     near = z_mm[rows, columns]
     beside = ndimage.maximum_filter(gone[rows, columns], 2 * options.beside_cells + 1)
     step_mm = ndimage.maximum_filter(near, 3) - ndimage.minimum_filter(near, 3)
-    iy, ix = (beside & (step_mm > options.step_mm)).nonzero()
+    iy, ix = map(np.ascontiguousarray, (beside & (step_mm > options.step_mm)).nonzero())
     corner_mm = field.origin_mm + np.array([columns.start, rows.start]) * field.cell_mm
     sorted_mm, start = _by_cell(points_mm, corner_mm, field.cell_mm, near.shape)
     near[iy, ix] = kernels.sharpened(
@@ -133,7 +133,7 @@ def rising_rims(
     beside = ndimage.maximum_filter(deep, 2 * options.beside_cells + 1)
     edge = z_mm - ndimage.minimum_filter(z_mm, 3) > options.edge_mm
     rim = ndimage.maximum_filter(edge, 2 * rounded + 1)
-    at = (rim & beside & (z_mm < designed_mm)).nonzero()
+    at = tuple(map(np.ascontiguousarray, (rim & beside & (z_mm < designed_mm)).nonzero()))
     up_mm = kernels.extended(z_mm, *at, ~rim, reach, options.least_sound, options.uneven_mm)
     up_mm = np.minimum(up_mm, designed_mm[at])
     risen_mm, low_mm = z_mm.copy(), z_mm[at]

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from amrepair.arrays import Mask, Numbers, Points
 from amrepair.field import near_kernels as kernels
 from amrepair.frames import box_of
+from gcode.compiled import read_only
 
 # In one grid; cells of a larger one are wider than the distance asked for.
 MOST_NEAR_CELLS = 16_000_000
@@ -49,7 +50,7 @@ def _beside(
     """
     if len(asked_mm) == 0 or len(points_mm) == 0:
         return np.full(len(asked_mm), -1, dtype=np.int32), np.zeros(len(asked_mm), dtype=np.int32)
-    asked, points = (np.ascontiguousarray(places) for places in (asked_mm, points_mm))
+    asked, points = (read_only(places) for places in (asked_mm, points_mm))
     low, high = box_of(asked)
     size_mm = high - low + 3.0 * within_mm
     # by a hair wider: what rounding puts into the next cell is looked for there

@@ -129,7 +129,8 @@ def window_statistics(table, count, place, value, weight, rank):
     out = np.empty((5, n))
     for i in prange(n):
         here, apart = np.empty(MOST_NEIGHBOURS), np.empty(MOST_NEIGHBOURS)
-        others, total = 0, 0.0
+        # counts and places as whole numbers of one kind: else what is called is compiled for two
+        size, own, others, total = np.int64(count[i]), np.int64(i), 0, 0.0
         for k in range(count[i]):
             j = table[i, k]
             here[k] = value[j]
@@ -137,14 +138,14 @@ def window_statistics(table, count, place, value, weight, rank):
             if j != i:
                 apart[others] = abs(value[j] - value[i])
                 others += 1
-        out[0, i] = median(here, count[i])
+        out[0, i] = median(here, size)
         at = min(rank, count[i]) - 1
         out[1, i], out[2, i] = here[at], here[count[i] - 1 - at]
         out[3, i] = median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
         if count[i] >= 2 * TREND_TERMS:
-            _off_plane(place, value, table, count[i], i, apart)
+            _off_plane(place, value, table, size, own, apart)
             # a plane on a surface takes three of the n degrees of freedom
-            spread = median(apart, count[i]) / NORMAL_MEDIAN
+            spread = median(apart, size) / NORMAL_MEDIAN
             out[3, i] = min(out[3, i], spread * np.sqrt(count[i] / (count[i] - 3.0)))
         out[4, i] = total
     return out

@@ -160,7 +160,7 @@ def passed(images: tuple[RangeImage, ...], surface_mm: Points, normals: Points) 
 def _image(scan: Scan, k: int) -> RangeImage | None:
     """Bin one sensor's points by direction; None where it saw next to nothing."""
     assert scan.sensors_mm is not None
-    sensor_mm = scan.sensors_mm[k]
+    sensor_mm = scan.sensors_mm[k].copy()
     count, mean = kernels.mean_seen_by(scan.points_mm, scan.sensor_index, k)
     if count < LEAST_RAY_POINTS:
         return None

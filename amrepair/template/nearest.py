@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from amrepair.template import nearest_kernels as kernels
 from amrepair.template.surface import triangle_areas_normals
+from gcode.compiled import read_only
 
 # A point starts from its neighbour's triangle: many are asked in an order in which they are near.
 SORTED, SORT_CELLS = 20_000, 64
@@ -93,7 +94,7 @@ class TriangleTree:
 
     def nearest(self, points_mm: Float[np.ndarray, "n 3"]) -> Nearest:
         """What of the triangles is nearest to points."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        points = read_only(points_mm, np.float64)
         if len(points) < SORTED:
             size, which, place, side = kernels.nearest(points, self.sure, *self._numbers)
             return Nearest(size, side, self.face[which], place)
@@ -105,12 +106,14 @@ class TriangleTree:
         )
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        size, which, place, side = kernels.nearest(points[order], self.sure, *self._numbers)
+        size, which, place, side = kernels.nearest(
+            read_only(points[order]), self.sure, *self._numbers
+        )
         return Nearest(size[back], side[back], self.face[which[back]], place[back])
 
     def inside(self, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """(n,) whether points lie inside a closed mesh."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        points = read_only(points_mm, np.float64)
         return np.asarray(kernels.crossed_odd(points, WAY, *self._numbers))
 
     @property

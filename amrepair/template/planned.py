@@ -19,6 +19,7 @@ from amrepair.template import planned_kernels as kernels
 from amrepair.template.cut import CutTemplate
 from amrepair.template.options import USUAL_PLANNED, PlannedOptions
 from amrepair.template.port import Template
+from gcode.compiled import read_only
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +115,7 @@ class PlannedSdf:
 
     def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(n,) signed distance, mm; beyond the grid a lower bound of it."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        points = read_only(points_mm, np.float64)
         return np.asarray(kernels.interpolate(points, self.origin_mm, self.voxel_mm, self._field))
 
     def distance_and_gradient(

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gcode.compiled import read_only
 from gcode.errors import InputError
 from gcode.surfaces import raster_kernels as kernels
 from gcode.surfaces.sizes import (
@@ -357,7 +358,7 @@ class HeightField:
                 f"use cells larger than {cell_mm:g} mm."
             )
         offset, z, _ = kernels.column_crossings(
-            np.ascontiguousarray(vertices, np.float64),
+            read_only(vertices, np.float64),
             np.ascontiguousarray(faces, np.int64),
             box_mm[0],
             box_mm[1],

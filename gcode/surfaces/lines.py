@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gcode.compiled import read_only
 from gcode.surfaces import raster_kernels as kernels
 
 
@@ -50,10 +51,9 @@ def heights_by_lines(
     cell_mm, shape
         Edge of a column, and how many there are: (ny, nx).
     """
-    start, end = (np.ascontiguousarray(at[:, :2], dtype=np.float64) for at in (start_mm, end_mm))
+    start, end = (read_only(at[:, :2], np.float64) for at in (start_mm, end_mm))
     within, height = (
-        np.ascontiguousarray(np.broadcast_to(each, len(start)), dtype=np.float64)
-        for each in (within_mm, height_mm)
+        read_only(np.broadcast_to(each, len(start)), np.float64) for each in (within_mm, height_mm)
     )
     found = kernels.beside_lines(start, end, within, height, low_mm, cell_mm, *shape)
     return np.asarray(found)
