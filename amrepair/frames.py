@@ -189,6 +189,12 @@ def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarra
     return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
 
 
+def turned_rad(rotation: Float[np.ndarray, "3 3"]) -> float:
+    """By how much a rotation turns, about whatever axis; 0 to π."""
+    cosine = (np.trace(rotation) - 1.0) / 2.0
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
 def rotation_of_quaternion(wxyz: Float[np.ndarray, " 4 *k"]) -> Float[np.ndarray, "*k 3 3"]:
     """(*k, 3, 3) rotations of unit quaternions."""
     w, x, y, z = wxyz

@@ -13,18 +13,17 @@ from amrepair.align.options import USUAL_ALIGN, AlignOptions
 from amrepair.align.pam import align_paper
 from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
+from amrepair.align.sizes import other_size, refuse_other_size
 from amrepair.align.thinning import in_order, thin_out
 from amrepair.errors import AlignmentError, InputError, PartMovedError
-from amrepair.frames import Transform, diagonal, in_box, moved
+from amrepair.frames import Transform, in_box, moved, turned_rad
 from amrepair.scans import Scan
-from amrepair.scans.ply import MM_PER
 from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
 
 ALIGN_METHODS = ("robust", "paper")
 LOOK_AT = 5_000  # repeats of a few places show in a sample
 ALONG = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # places that differ along it differ
-SCAN_UNITS = {"m": "metres", "in": "inches", "cm": "centimetres", "um": "micrometres"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +103,14 @@ def align(
     _refuse_repeated(scan, options.least_points)
     rng = rng if rng is not None else np.random.default_rng(0)
     if method == "paper":
-        _refuse_other_size(scan, template, options)
+        refuse_other_size(scan, template, options)
         found = align_paper(
             scan, template, options=options.paper, guess=guess, rng=rng, progress=progress
         )
         return replace(found, options=options)
     progress("align", 0.0, 1.0)
     if guess is None:
-        _refuse_other_size(scan, template, options)
+        refuse_other_size(scan, template, options)
         return _from_anywhere(scan, template, part_is_known, options, rng, progress)
     if guess.source != scan.frame:
         raise InputError(
@@ -173,7 +172,7 @@ def _from_anywhere(
         if found.left_out_ratio > 0.0:  # what was left out may be half of the other hand
             whole = ratio * (1.0 - found.left_out_ratio)
             _refuse_mirrored(scan, template, found, scan.points_mm, whole, options, rng)
-    sizes = _other_size(scan, template, options.told_size_jump)
+    sizes = other_size(scan, template, options.told_size_jump)
     if found.left_out_ratio > options.much_left_out and not part_is_known:
         least = options.least_of_rest
         sizes = f" ({found.left_out_ratio:.0%} of the scan are taken for its surroundings){sizes}"
@@ -314,8 +313,7 @@ def _from_guess(
     away = found.matrix @ np.linalg.inv(guess.matrix)
     centre = points.mean(axis=0) @ guess.matrix[:3, :3].T + guess.matrix[:3, 3]
     moved_mm = float(np.linalg.norm(away[:3, :3] @ centre + away[:3, 3] - centre))
-    cosine = np.clip(0.5 * (np.trace(away[:3, :3]) - 1.0), -1.0, 1.0)
-    turned_deg = float(np.rad2deg(np.arccos(cosine)))
+    turned_deg = float(np.rad2deg(turned_rad(away[:3, :3])))
     if moved_mm > bound_mm or turned_deg > bound_deg:
         raise PartMovedError(
             f"the scan {scan.source} fits its template only {moved_mm:.2f} mm and "
@@ -340,35 +338,3 @@ def _part_only(
     # A flat part seen from below has no other points: then all points in the box count.
     keep = near & above if (near & above).sum() >= options.least_points else near
     return np.compress(keep, points_mm, axis=0)
-
-
-def _other_size(scan: Scan, template: Template, told_jump: float) -> str:
-    """What to add to a refusal, where the sizes differ much."""
-    size = diagonal(scan.points_mm)
-    other = diagonal(template.bounds_mm)
-    if 1.0 / told_jump < size / max(other, 1e-12) < told_jump:
-        return ""
-    return f" (the scan is {size:.3g} mm across, its template {other:.3g} mm)"
-
-
-def _refuse_other_size(scan: Scan, template: Template, options: AlignOptions) -> None:
-    size = diagonal(scan.points_mm)
-    other = diagonal(template.bounds_mm)
-    ratio, slack = size / max(other, 1e-12), options.unit_slack
-    if options.smallest_ratio <= ratio <= options.largest_ratio:
-        return
-    units = [unit for unit in SCAN_UNITS if 1 / slack < ratio * MM_PER[unit] < slack]
-    near = [SCAN_UNITS[unit] for unit in units]
-    near += [  # no drawing is in micrometres
-        f"a template in {name}"
-        for unit, name in SCAN_UNITS.items()
-        if MM_PER[unit] > 1.0 and 1 / slack < ratio / MM_PER[unit] < slack
-    ]
-    hint = f" ({' or '.join(near)} for millimetres?)" if near else ""
-    if units:
-        hint += f"; the scan's is said with --scan-unit {' or '.join(units)}"
-    raise AlignmentError(
-        f"the scan {scan.source} is {size:.3g} mm across, its template {other:.3g} mm: they cannot "
-        f"be the same part in the same unit{hint}"
-        + ("" if near or ratio > 1.0 else ", or it shows too little of it")
-    )

@@ -26,7 +26,7 @@ from amrepair.loop import (
     plan_stops,
     run_loop,
 )
-from amrepair.loop.calibrate import calibrated_unit, read_calibration
+from amrepair.loop.calibrate import read_calibration
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
 from amrepair.loop.options import UNASKED
@@ -194,7 +194,7 @@ def new_run(
     text = program_text(job_file)
     setup, own = job_setup(text, job_file, *named)
     _ = setup.printer.head  # refused before any work
-    pose, unit = read_calibration(calibration), calibrated_unit(calibration)
+    pose, unit = read_calibration(calibration)
     known_scanner(said["scanner"])  # refused before any work
     if said["scanner"] == PROBE:
         _ = setup.printer.feeler

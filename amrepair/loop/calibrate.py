@@ -19,7 +19,7 @@ from jaxtyping import Float
 from amrepair.align.refine import refine
 from amrepair.align.thinning import thin_out
 from amrepair.errors import AlignmentError, InputError
-from amrepair.frames import Transform, rotation_from_vector
+from amrepair.frames import Transform, rotation_from_vector, turned_rad
 from amrepair.scans import Scan
 from amrepair.scans.ply import mm_per
 from amrepair.template.port import Template
@@ -322,35 +322,29 @@ def _residual(
 
 def _apart(a: Transform, b: Transform) -> float:
     """Angle between two poses, rad."""
-    cosine = (np.trace((a.matrix @ np.linalg.inv(b.matrix))[:3, :3]) - 1.0) / 2.0
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return turned_rad((a.matrix @ np.linalg.inv(b.matrix))[:3, :3])
 
 
-def calibrated_unit(path: Path | None) -> str | None:
-    """The unit of the scanner's files, where its calibration was made with one.
+def read_calibration(path: Path | None) -> tuple[Transform, str | None]:
+    """The pose of a scanner, build from scanner, and its files' unit where one was said with it.
 
-    Raises
-    ------
-    InputError
-        If it is none that a scan may have.
-    """
-    unit = None if path is None else _words(path)[1].get("scan_unit")
-    if unit is not None:
-        mm_per(str(unit), f"the calibration {path} says that scans are in")
-    return unit
-
-
-def read_calibration(path: Path | None) -> Transform:
-    """The pose of a scanner: build from scanner; identity where there is no file.
+    The pose is identity where there is no file.
 
     Raises
     ------
     InputError
-        If the file holds none.
+        If the file holds no pose, or its unit is none that a scan may have.
     """
     if path is None:
-        return Transform.identity("build", "scanner")
-    matrix, _ = _words(path)
+        return Transform.identity("build", "scanner"), None
+    try:
+        words = json.loads(path.read_text())
+        matrix, unit = np.array(words["build_from_scanner"], float), words.get("scan_unit")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"the calibration {path} cannot be read ({error}); it is a JSON object with "
+            "build_from_scanner, a 4×4 matrix"
+        ) from error
     if matrix.shape != (4, 4):
         raise InputError(f"the calibration {path} holds {matrix.shape}, not 4×4")
     turn = matrix[:3, :3]
@@ -359,16 +353,6 @@ def read_calibration(path: Path | None) -> Transform:
             f"the calibration {path} is no rigid motion: its rotation stretches or mirrors; "
             "calibrate again"
         )
-    return Transform("build", "scanner", matrix)
-
-
-def _words(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    """The matrix that the file holds, and all that it says."""
-    try:
-        words = json.loads(path.read_text())
-        return np.array(words["build_from_scanner"], float), words
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"the calibration {path} cannot be read ({error}); it is a JSON object with "
-            "build_from_scanner, a 4×4 matrix"
-        ) from error
+    if unit is not None:
+        mm_per(str(unit), f"the calibration {path} says that scans are in")
+    return Transform("build", "scanner", matrix), unit

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from amrepair.frames import Transform
+from amrepair.frames import Transform, turned_rad
 from amrepair.loop.findings import matching
 from amrepair.loop.kind_options import USUAL_KINDS, KindOptions
 from amrepair.loop.shapes import bead_way, last_beads, spread, tall_mm
@@ -172,9 +172,8 @@ def _came_off(
     some = points[:: max(1, len(points) // options.most_points)]
     centre = placed.apply(some).mean(axis=0, keepdims=True)
     off_mm = float(np.linalg.norm(moved.apply(centre) - centre))
-    cosine = float(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0))
-    turned_rad = float(np.arccos(cosine))
-    share = max(off_mm / options.moved_mm, turned_rad / np.deg2rad(options.moved_deg))
+    turned_deg = float(np.rad2deg(turned_rad(moved.rotation)))
+    share = max(off_mm / options.moved_mm, turned_deg / options.moved_deg)
     return TypeGuess(DefectType.DETACHED, _sure(share, 1.0)) if share > 1.0 else None
 
 

@@ -1,4 +1,4 @@
-"""Background: points of a scan that are none of the part: bed, skirt, far clutter, a wrong unit."""
+"""Background: points of a scan that are none of the part: bed, skirt, far clutter."""
 
 from __future__ import annotations
 
@@ -6,33 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Mask, Points, Values
-from amrepair.errors import InputError
-from amrepair.frames import diagonal
 from amrepair.observe.options import USUAL_BACKGROUND, BackgroundOptions
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
 # The template's distance is the height under a plane: to rounding.
 ON_PLANE_MM = 1e-4
-# So many points tell a scan's size, to the factor between two units.
-SIZE_POINTS = 20_000
-
-
-def refuse_wrong_scale(scan: Scan, template: Template) -> None:
-    """Metres or inches read as millimetres: the sizes differ by the factor between the units."""
-    some = scan.points_mm[:: max(1, len(scan) // SIZE_POINTS)]
-    scan_mm = float(np.linalg.norm(np.ptp(some, axis=0)))
-    part_mm = diagonal(template.bounds_mm)
-    if 0 < scan_mm * 200 < part_mm:
-        raise InputError(
-            f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "
-            "the scan looks like metres: read it as such (--scan-unit m)"
-        )
-    if scan_mm > 200 * part_mm:
-        raise InputError(
-            f"the scan {scan.source} spans {scan_mm:.3g} mm and the template {part_mm:.3g} mm: "
-            f"the scan looks like micrometres, or the template like metres; convert one to mm"
-        )
 
 
 def background(

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.align.sizes import refuse_wrong_scale
 from amrepair.arrays import Mask, Points, Values
 from amrepair.errors import InputError
 from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.groups import cell_numbers
 from amrepair.field.near import nearest_within
 from amrepair.frames import cells_of, diagonal, unit_vectors
-from amrepair.observe.background import ON_PLANE_MM, background, refuse_wrong_scale
+from amrepair.observe.background import ON_PLANE_MM, background
 from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance

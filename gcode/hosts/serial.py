@@ -288,7 +288,7 @@ class SerialPrinter(GuardedConversation):
         try:
             report = self.print(checked, lines=lines, progress=progress)
         except PrinterError as error:
-            self._forget_z(command)
+            self._forget_z()
             raise NothingMetError(f"{error}") from error
         if not report.ok:
             raise PrinterError(
@@ -298,14 +298,14 @@ class SerialPrinter(GuardedConversation):
             self.make_safe()
             how = (
                 "write its macro by 'gcode touch --klipper-macro FILE', include it in printer.cfg"
-                if command == TOUCH_COMMANDS["klipper"]
+                if self.dialect.touches_by_macro
                 else "build it with G38_PROBE_TARGET, or set Z by hand, with paper below the nozzle"
             )
             raise PrinterError(
                 f"The printer's firmware does not know {command}, so nothing was touched; the "
                 f"nozzle was lifted and the heaters are off: {how}."
             )
-        if command != TOUCH_COMMANDS["klipper"]:
+        if not self.dialect.touches_by_macro:
             return self.place().z_mm
         said = [match for text in self.said if (match := _TOUCHED.fullmatch(text.strip()))]
         if not said:
@@ -316,9 +316,9 @@ class SerialPrinter(GuardedConversation):
             )
         return float(said[-1].group(1))
 
-    def _forget_z(self, command: str) -> None:
-        """Klipper's Z may still be the one that the macro lowered: then it must be homed first."""
-        if command != TOUCH_COMMANDS["klipper"]:
+    def _forget_z(self) -> None:
+        """Z may still be the one that the macro lowered: then it must be homed first."""
+        if not self.dialect.touches_by_macro:
             return
         with contextlib.suppress(LinkError, LocalProtocolError):
             self.command(f"G4 P{1000 * HEARD_S:.0f}")

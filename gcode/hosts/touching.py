@@ -96,13 +96,8 @@ def touch_z(
 
 
 def tell_z(printer: SerialPrinter, z_mm: float) -> None:
-    """Have the firmware take its Z for this, where the nozzle is now; nothing moves.
-
-    Klipper moves no axis that it does not take for homed, and G92 does not make it so.
-    """
-    z = number(z_mm, 3)
-    klipper = printer.dialect.name == "klipper"
-    printer.command(f"SET_KINEMATIC_POSITION Z={z}" if klipper else f"G92 Z{z}")
+    """Have the firmware take its Z for this, where the nozzle is now; nothing moves."""
+    printer.command(printer.dialect.set_z.format(z=number(z_mm, 3)))
 
 
 def felt(

@@ -36,6 +36,11 @@ class LinkDialect:
         asked for. Empty where a line may be lost, too: then nothing can be proved.
     hold_motors
         Command after which they are held for good; empty where there is none.
+    set_z
+        Command that has the axis be at `{z}` from now on, and taken for homed.
+    touches_by_macro
+        A touch is a macro of ours, which says where it ended and lowers Z for it; else G38.2,
+        after which the place is asked for.
     """
 
     name: str
@@ -47,6 +52,8 @@ class LinkDialect:
     motors_off_s: float = 120.0
     hold_motors: str = ""
     question: bytes = b""
+    set_z: str = "G92 Z{z}"
+    touches_by_macro: bool = False
 
 
 LINK_DIALECTS: dict[str, LinkDialect] = {
@@ -60,10 +67,20 @@ LINK_DIALECTS: dict[str, LinkDialect] = {
     # it is at zero, then, and refuses to move until it is homed. No line is sent again. Its
     # look-ahead is seconds long (toolhead.py, BUFFER_TIME_HIGH 2 s): 1000 of the shortest moves.
     # M84 takes no S there: it lets go at once. After [idle_timeout], 600 s, a move is refused
-    # until all axes are homed. It reads 4096 bytes at a time and keeps a line's beginning until its
-    # end comes (gcode.py, _process_data).
+    # until all axes are homed. It moves no axis that it does not take for homed, and G92 does not
+    # make it so. It reads 4096 bytes at a time and keeps a line's beginning until its end comes
+    # (gcode.py, _process_data).
     "klipper": LinkDialect(
-        "klipper", False, False, inf, 4095, 1000, motors_off_s=600.0, question=b"M114"
+        "klipper",
+        numbered=False,
+        verifies=False,
+        max_line_bytes=inf,
+        rx_bytes=4095,
+        buffered_lines=1000,
+        motors_off_s=600.0,
+        question=b"M114",
+        set_z="SET_KINEMATIC_POSITION Z={z}",
+        touches_by_macro=True,
     ),
     # RepRapFirmware 3.6 drops a line with a bad checksum silently and executes a repeated
     # number again (StringParser::LineFinished): a line without an answer cannot be sent twice,

@@ -13,7 +13,7 @@ import trimesh
 
 from amrepair.cli import calibrating
 from amrepair.frames import Transform, rotation_from_vector
-from amrepair.loop.calibrate import calibrated_unit, read_calibration, target_solid
+from amrepair.loop.calibrate import read_calibration, target_solid
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.profiles import load_printer
 
@@ -65,8 +65,8 @@ def test_the_scanner_is_found_from_a_printed_target(tmp_path: Path) -> None:
         print(f"{machine.clock_s():.0f} s of the printer's clock in {time.monotonic() - began:.0f}")
         laid_mm = float(machine.take_motion().filament_mm.clip(min=0).sum())
     assert laid_mm > 100.0  # the target was printed
-    assert calibrated_unit(out) == "m"  # so the loop reads this scanner's files
-    found = read_calibration(out)
+    found, unit = read_calibration(out)
+    assert unit == "m"  # so the loop reads this scanner's files
     off = found @ pose.inverse()
     corners = np.array([[0.0, 0, 0], [x, 0, 0], [0, y, 0], [x, y, 0]])
     assert np.abs(off.apply(corners) - corners).max() < 0.1

@@ -16,7 +16,6 @@ from amrepair.loop.calibrate import (
     TARGET_MM,
     PoseCalibration,
     calibrate,
-    calibrated_unit,
     read_calibration,
     target_solid,
     write_calibration,
@@ -111,19 +110,22 @@ def test_the_file_is_what_the_loop_reads(tmp_path: Path) -> None:
     pose = pose_of(np.random.default_rng(5))
     path = tmp_path / "calibration.json"
     write_calibration(path, PoseCalibration(pose, 0.04, 0.03, 2.0, 500), {"printer": "x"})
-    assert np.abs(read_calibration(path).matrix - pose.matrix).max() < 1e-12
+    found, unit = read_calibration(path)
+    assert np.abs(found.matrix - pose.matrix).max() < 1e-12
+    assert unit is None
     assert json.loads(path.read_text())["residual_mm"] == 0.04
-    assert np.array_equal(read_calibration(None).matrix, np.eye(4))
+    found, unit = read_calibration(None)
+    assert np.array_equal(found.matrix, np.eye(4))
+    assert unit is None
     said = json.loads(path.read_text())
-    assert calibrated_unit(None) is calibrated_unit(path) is None
     path.write_text(json.dumps(said | {"scan_unit": "m"}))
-    assert calibrated_unit(path) == "m"
+    assert read_calibration(path)[1] == "m"
     path.write_text(json.dumps(said | {"scan_unit": "ell"}))
     with pytest.raises(InputError, match="scans are in 'ell'; known are mm, cm, m"):
-        calibrated_unit(path)
+        read_calibration(path)
     path.write_text("no JSON")
     with pytest.raises(InputError, match="cannot be read"):
-        calibrated_unit(path)
+        read_calibration(path)
     said["build_from_scanner"][0][0] *= 1.1
     path.write_text(json.dumps(said))
     with pytest.raises(InputError, match="no rigid motion"):
